@@ -1,0 +1,1 @@
+"""Unmodelled effects, one family a file."""

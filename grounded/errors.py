@@ -1,0 +1,31 @@
+"""The one error that is the user's to mend.
+
+Its text says what was found, what was expected, and what to do next. Anything else that is raised
+is a mistake of ours and keeps its traceback.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+
+class GroundedError(Exception):
+    """A misuse or a bad input; the message is complete and meant for a person."""
+
+
+def nearest(name: str, valid: Iterable[str]) -> str:
+    """Returns ", did you mean 'x'?" for the valid name closest to `name`, or the list of names.
+
+    Args:
+        name: what was found.
+        valid: the names that would have been right.
+    """
+    from difflib import get_close_matches
+
+    names = list(valid)
+    close = get_close_matches(name, names, n=1, cutoff=0.6)
+    if close:
+        return f"did you mean '{close[0]}'?"
+    if not names:
+        return "none is defined"
+    return "valid names: " + ", ".join(names)

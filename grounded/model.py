@@ -1,0 +1,187 @@
+"""Model: the user's crude model, with names, units and the facts its arrays need.
+
+A model is a function of named states `s`, inputs `a` and parameters `p` in plain NumPy,
+
+    derivative(s, a, p) -> ds/dt        or        step(s, a, p, dt) -> next state,
+
+both returning a dict of state names. Inside, states and inputs are arrays in the order in which
+they were declared; `x` and `u` are those arrays (the control literature's letters), `s` and `a`
+the user's (the paper's).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from types import MappingProxyType
+from typing import Any, Literal
+
+import numpy as np
+
+from grounded.compile import System, system_of
+from grounded.errors import GroundedError, nearest
+from grounded.frozen import Array, readonly
+
+Function = Callable[..., Mapping[str, Any]]
+
+
+@dataclass(frozen=True)
+class Param:
+    """A model parameter: value, unit, and the bounds that a fit keeps (None: free)."""
+
+    value: float
+    unit: str = "1"
+    low: float | None = None
+    high: float | None = None
+
+    def __post_init__(self) -> None:
+        if not np.isfinite(self.value):
+            raise GroundedError(f"a parameter's value must be a finite number, got {self.value}")
+        low = -np.inf if self.low is None else self.low
+        high = np.inf if self.high is None else self.high
+        if not low <= self.value <= high:
+            raise GroundedError(f"a parameter's value {self.value} lies outside [{low}, {high}]")
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """Named states and inputs with units, parameters, and the dynamics.
+
+    Args:
+        states: name -> unit.
+        inputs: name -> unit.
+        params: name -> Param.
+        angles: states whose differences wrap to [-pi, pi].
+        roles: optional meaning of states (position, heading, speed, ...), used by effects, pictures.
+        derivative: ds/dt, integrated over a control step by `integrator` under a zero-order hold.
+        step: the next state itself, any Python callable; instead of `derivative`.
+        integrator: "rk4" (one step of Runge-Kutta a control step) or "euler".
+        name: for messages and files.
+
+    Raises:
+        GroundedError: for a name used twice, an unknown angle or role, neither or both functions.
+    """
+
+    states: Mapping[str, str]
+    inputs: Mapping[str, str]
+    params: Mapping[str, Param] = field(default_factory=dict)
+    angles: tuple[str, ...] = ()
+    roles: Mapping[str, str | tuple[str, ...]] = field(default_factory=dict)
+    derivative: Function | None = None
+    step: Function | None = None
+    integrator: Literal["rk4", "euler"] = "rk4"
+    name: str = "model"
+
+    def __post_init__(self) -> None:
+        for attribute in ("states", "inputs", "params", "roles"):
+            value = MappingProxyType(dict(getattr(self, attribute)))
+            object.__setattr__(self, attribute, value)
+        object.__setattr__(self, "angles", tuple(self.angles))
+        if (self.derivative is None) == (self.step is None):
+            raise GroundedError(
+                f"model '{self.name}' needs exactly one of derivative= (ds/dt) and step= (next state)"
+            )
+        if self.integrator not in ("rk4", "euler"):
+            raise GroundedError(f"integrator must be 'rk4' or 'euler', got '{self.integrator}'")
+        if not self.states or not self.inputs:
+            raise GroundedError(f"model '{self.name}' needs at least one state and one input")
+        self._check_names()
+
+    def _check_names(self) -> None:
+        names = [*self.states, *self.inputs, *self.params]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise GroundedError(f"model '{self.name}' uses the name '{twice[0]}' twice")
+        for name in names:
+            if not name.isidentifier():
+                raise GroundedError(f"model '{self.name}': '{name}' is not a valid Python name")
+        for name in self.angles:
+            if name not in self.states:
+                raise GroundedError(f"angle '{name}' is not a state: {nearest(name, self.states)}")
+        for role, targets in self.roles.items():
+            for name in (targets,) if isinstance(targets, str) else targets:
+                if name not in self.states and name not in self.inputs:
+                    raise GroundedError(
+                        f"role '{role}' names '{name}', which is neither a state nor an input: "
+                        + nearest(name, [*self.states, *self.inputs])
+                    )
+
+    @property
+    def n(self) -> int:
+        """Number of states."""
+        return len(self.states)
+
+    @property
+    def m(self) -> int:
+        """Number of inputs."""
+        return len(self.inputs)
+
+    @cached_property
+    def state_names(self) -> tuple[str, ...]:
+        """States in array order."""
+        return tuple(self.states)
+
+    @cached_property
+    def input_names(self) -> tuple[str, ...]:
+        """Inputs in array order."""
+        return tuple(self.inputs)
+
+    @cached_property
+    def param_names(self) -> tuple[str, ...]:
+        """Parameters in array order."""
+        return tuple(self.params)
+
+    @cached_property
+    def values(self) -> Array:
+        """Parameter values (k,)."""
+        return readonly([param.value for param in self.params.values()])
+
+    @cached_property
+    def angle_mask(self) -> Any:
+        """Which states are angles, (n,) of bool."""
+        return readonly([name in self.angles for name in self.states], dtype=np.bool_)
+
+    @cached_property
+    def system(self) -> System:
+        """The model as numbers: compiled where it can be traced, differenced where not."""
+        function = self.derivative if self.derivative is not None else self.step
+        assert function is not None
+        return system_of(
+            function,
+            kind="derivative" if self.derivative is not None else "step",
+            states=self.state_names,
+            inputs=self.input_names,
+            params=self.param_names,
+            integrator=self.integrator,
+            angles=tuple(bool(a) for a in self.angle_mask),
+        )
+
+    def difference(self, a: Array, b: Array) -> Array:
+        """a - b for arrays (..., n) of states; angles wrapped to [-pi, pi]."""
+        d = np.asarray(a, float) - np.asarray(b, float)
+        mask = self.angle_mask
+        d[..., mask] -= 2 * np.pi * np.rint(d[..., mask] / (2 * np.pi))
+        return d
+
+    def with_values(self, values: Mapping[str, float]) -> Model:
+        """A copy with other parameter values; bounds are widened where a value lies outside.
+
+        Raises:
+            GroundedError: for a name that is not a parameter.
+        """
+        params = dict(self.params)
+        for name, value in values.items():
+            if name not in params:
+                raise GroundedError(
+                    f"'{name}' is not a parameter of model '{self.name}': {nearest(name, params)}"
+                )
+            old = params[name]
+            params[name] = Param(
+                float(value),
+                old.unit,
+                None if old.low is None else min(old.low, value),
+                None if old.high is None else max(old.high, value),
+            )
+        return dataclasses.replace(self, params=params)

@@ -1,0 +1,1 @@
+"""Systems that come with grounded, by the same door as the user's own."""

@@ -1,0 +1,57 @@
+"""Trial: one real run on the control grid. A simulated run is a Rollout, never a Trial."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from grounded.errors import GroundedError
+from grounded.frozen import Array, readonly
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """States s_0 .. s_T and the COMMANDED inputs a_0 .. a_{T-1}, sampled every dt.
+
+    T is the horizon, or less when the run ended early. Angles are unwrapped.
+
+    Raises:
+        GroundedError: if the arrays do not fit each other.
+    """
+
+    states: Array  # (T + 1, n)
+    inputs: Array  # (T, m)
+    dt: float  # [s]
+    state_names: tuple[str, ...]
+    input_names: tuple[str, ...]
+    id: str = ""  # content hash of the stored file, "" before it is stored
+    candidate: str = ""  # the candidate that was run; "" for a log that ran none
+    start_inputs: Array | None = None  # (m,) held before t = 0; None: zero
+
+    def __post_init__(self) -> None:
+        states, inputs = readonly(self.states), readonly(self.inputs)
+        n, m = len(self.state_names), len(self.input_names)
+        if states.ndim != 2 or states.shape[1] != n:
+            raise GroundedError(f"a trial of {n} states needs an array (T+1, {n}), got {states.shape}")
+        if inputs.shape != (len(states) - 1, m):
+            raise GroundedError(
+                f"a trial of {len(states)} states and {m} inputs needs inputs of shape "
+                f"({len(states) - 1}, {m}), got {inputs.shape}"
+            )
+        object.__setattr__(self, "states", states)
+        object.__setattr__(self, "inputs", inputs)
+        if self.start_inputs is not None:
+            object.__setattr__(self, "start_inputs", readonly(self.start_inputs))
+
+    @property
+    def steps(self) -> int:
+        """T, the number of control steps that were run."""
+        return len(self.inputs)
+
+    @property
+    def finite_steps(self) -> int:
+        """Steps before the first state or input that is not a finite number."""
+        bad = ~np.isfinite(self.states).all(axis=1)
+        bad[:-1] |= ~np.isfinite(self.inputs).all(axis=1)
+        return int(np.argmax(bad)) - 1 if bad.any() else self.steps
