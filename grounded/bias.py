@@ -1,0 +1,81 @@
+"""Step 4: the ORIGINAL model plus a time-dependent bias, so that it replays a trial exactly.
+
+    f_t^(i+1)(s, a) = f_t(s, a) + s_{t+1}^(i) - f_t(s_t^(i), a_t^(i))
+
+The bias is measured on one trial (or on the mean of repeated ones) and added to the model that was
+never changed by an earlier trial: errors do not pile up. In the biased model the trial's own policy
+gives the trial's own states, so derivatives are taken along the true states (section 4.1).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from grounded.errors import GroundedError
+from grounded.frozen import Array
+from grounded.rollout import augmented
+from grounded.task import Task
+from grounded.trial import Trial
+
+
+@dataclass(frozen=True, eq=False)
+class Grounding:
+    """A trial as the biased model sees it: bias (H, n), z (H + 1, nz), inputs (H, m)."""
+
+    bias: Array
+    z: Array
+    inputs: Array
+
+
+def effective_inputs(z: Array, inputs: Array, delay: Array, depths: tuple[int, ...], n: int) -> Array:
+    """What the actuators receive, (T, m): commands after their transport delay (in steps)."""
+    received = np.empty_like(inputs)
+    first = n
+    for j, depth in enumerate(depths):
+        queue = np.column_stack([inputs[:, j], z[: len(inputs), first : first + depth]])
+        whole = int(np.floor(delay[j] + 1e-9))
+        part = delay[j] - whole
+        received[:, j] = queue[:, whole]
+        if part > 1e-9:
+            received[:, j] = (1 - part) * queue[:, whole] + part * queue[:, whole + 1]
+        first += depth
+    return received
+
+
+def ground(task: Task, trial: Trial, *, exact: bool = False) -> Grounding:
+    """The bias that makes the task's model replay a trial (step 4).
+
+    Args:
+        task: gives the original model, with its latency.
+        trial: a whole trial, T = H, finite.
+        exact: measure the bias of the exact model, not of the smoothed planning model.
+
+    Raises:
+        GroundedError: if the trial is short or not finite: its bias is not known to the end.
+    """
+    if trial.steps != task.horizon or trial.finite_steps < trial.steps:
+        raise GroundedError(
+            f"a bias needs a whole trial of {task.horizon} steps; this one is finite for "
+            f"{trial.finite_steps}"
+        )
+    problem = task.problem(exact=exact)
+    past = task.past if trial.start_inputs is None else trial.start_inputs
+    z = augmented(problem, trial.states, trial.inputs, past)
+    received = effective_inputs(z, trial.inputs, problem.delay, problem.depths, task.model.n)
+    predicted = problem.system.step(
+        trial.states[:-1], received, problem.p, problem.dt, problem.smoothing
+    )
+    # s_{t+1} - f(s_t, a_t); NOT wrapped: replay must land on the recorded number itself.
+    return Grounding(trial.states[1:] - predicted, z, trial.inputs)
+
+
+def residuals(task: Task, trial: Trial) -> Array:
+    """One-step residuals of the exact model on a trial, (T, n), angles wrapped."""
+    problem = task.problem(exact=True)
+    past = task.past if trial.start_inputs is None else trial.start_inputs
+    z = augmented(problem, trial.states, trial.inputs, past)
+    received = effective_inputs(z, trial.inputs, problem.delay, problem.depths, task.model.n)
+    predicted = problem.system.step(trial.states[:-1], received, problem.p, problem.dt)
+    return task.model.difference(trial.states[1:], predicted)

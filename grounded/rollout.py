@@ -1,0 +1,55 @@
+"""Rollout: a simulated run, in the model as it is or with a bias. A real run is a Trial."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from grounded.compile import Problem
+from grounded.frozen import Array, readonly
+from grounded.policy import Policy
+
+
+@dataclass(frozen=True, eq=False)
+class Rollout:
+    """Augmented states z (H + 1, nz), inputs (H, m) and the utility (minus infinity: diverged)."""
+
+    z: Array
+    inputs: Array
+    utility: float
+    n: int
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "z", readonly(self.z))
+        object.__setattr__(self, "inputs", readonly(self.inputs))
+
+    @property
+    def states(self) -> Array:
+        """States s_0 .. s_H, (H + 1, n)."""
+        return self.z[:, : self.n]
+
+
+def simulate(problem: Problem, policy: Policy) -> Rollout:
+    """Runs a policy in the problem's model, closed loop, inputs clipped to the limits."""
+    swarm = problem.system.rollout(problem, policy.feedforward, policy.gain, policy.reference)
+    cost = float(swarm.cost[0])
+    utility = -cost if np.isfinite(cost) else -np.inf
+    return Rollout(swarm.z[0], swarm.u[0], utility, problem.system.n)
+
+
+def augmented(problem: Problem, states: Array, inputs: Array, past: Array) -> Array:
+    """z_0 .. z_T of a recorded run: states (T + 1, n) beside the inputs sent before each.
+
+    Args:
+        problem: gives the history depths.
+        states: (T + 1, n).
+        inputs: commands (T, m).
+        past: the input held before t = 0, (m,).
+    """
+    columns = [states]
+    for j, depth in enumerate(problem.depths):
+        sent = np.concatenate([np.full(depth, past[j]), inputs[:, j]])
+        T = len(inputs)
+        columns.append(np.stack([sent[depth - 1 - i : depth + T - i] for i in range(depth)], axis=1))
+    return np.hstack(columns)

@@ -1,0 +1,188 @@
+"""Task: what is to be done, by which model, and how it is judged.
+
+Everything is checked here, once, so that inner code need not. `Task.problem` turns a task into the
+plain arrays that the kernels work on.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from grounded.compile import Problem
+from grounded.errors import GroundedError
+from grounded.frozen import Array, readonly
+from grounded.model import Model
+from grounded.policy import Policy
+from grounded.trial import Trial
+from grounded.utility import Reward, step_rewards
+
+MAX_HORIZON = 200_000  # a control step is a few kB of gains: a bound against nonsense
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """A manoeuvre: follow `target` for `horizon` steps of `dt` from `start`.
+
+    Args:
+        model: the crude model (n states, m inputs).
+        dt: control interval [s].
+        target: (H + 1, n), angles unwrapped; NaN for a state that is not tracked.
+        reward: quadratic weights.
+        start: s_0 (n,).
+        past: the input held before t = 0 (m,).
+        low, high: hard limits of the inputs (m,), infinite where there is none.
+        feedback: False for an open-loop sequence of inputs.
+        latency: transport delay of each input [s] (m,).
+        input_target: (H, m), what the input penalty compares with; None for zero.
+        safety_low, safety_high: bounds on predicted states (n,), infinite where there is none.
+        smoothing: width over which the PLANNING model blends indicator terms (`np.where`, `abs`).
+
+    Raises:
+        GroundedError: for sizes that do not fit, limits the wrong way round, a target that is not
+            finite where it is weighted.
+    """
+
+    model: Model
+    dt: float
+    target: Array
+    reward: Reward
+    start: Array
+    past: Array
+    low: Array
+    high: Array
+    feedback: bool = True
+    latency: Array | None = None
+    input_target: Array | None = None
+    safety_low: Array | None = None
+    safety_high: Array | None = None
+    smoothing: float = 0.05
+
+    def __post_init__(self) -> None:
+        n, m = self.model.n, self.model.m
+        H = len(self.target) - 1
+        defaults = {
+            "latency": np.zeros(m),
+            "input_target": np.zeros((max(H, 0), m)),
+            "safety_low": np.full(n, -np.inf),
+            "safety_high": np.full(n, np.inf),
+        }
+        shapes = {"target": (H + 1, n), "start": (n,), "past": (m,), "low": (m,), "high": (m,)}
+        shapes |= {"latency": (m,), "input_target": (H, m), "safety_low": (n,), "safety_high": (n,)}
+        for name, shape in shapes.items():
+            given = getattr(self, name)
+            value = readonly(defaults[name] if given is None else given)
+            if value.shape != shape:
+                raise GroundedError(f"task: {name} must have shape {shape}, got {value.shape}")
+            object.__setattr__(self, name, value)
+        self._check_values(H)
+
+    def _check_values(self, H: int) -> None:
+        if not 1 <= H <= MAX_HORIZON:
+            raise GroundedError(f"task: the horizon must be 1 to {MAX_HORIZON} steps, got {H}")
+        if not (np.isfinite(self.dt) and self.dt > 0):
+            raise GroundedError(f"task: dt must be a positive number of seconds, got {self.dt}")
+        assert self.latency is not None
+        for i, name in enumerate(self.model.input_names):
+            if not self.low[i] < self.high[i]:
+                raise GroundedError(
+                    f"[limits] {name}: the lower limit {self.low[i]:g} must be below the upper "
+                    f"limit {self.high[i]:g}"
+                )
+            if not 0 <= self.latency[i] <= 50 * self.dt:
+                raise GroundedError(
+                    f"[task] latency of {name} must be 0 to 50 control steps "
+                    f"({50 * self.dt:g} s), got {self.latency[i]:g} s"
+                )
+        weighted = self.reward.state + self.reward.terminal > 0
+        for i, name in enumerate(self.model.state_names):
+            bad = ~np.isfinite(self.target[:, i])
+            if weighted[i] and bad.any():
+                raise GroundedError(
+                    f"[reward] weighs state '{name}', but the target has no value for it at step "
+                    f"{int(np.argmax(bad))}: add the column '{name}' to the target or drop the weight"
+                )
+        if not np.isfinite(self.start).all():
+            raise GroundedError(f"task: the start state must be finite, got {self.start.tolist()}")
+
+    @property
+    def horizon(self) -> int:
+        """H, the number of control steps."""
+        return len(self.target) - 1
+
+    @cached_property
+    def hash(self) -> str:
+        """16 hex digits over all that the utility of a real trial depends on; not the model's
+        parameters, which may change while the task stays."""
+        digest = hashlib.sha256()
+        digest.update(repr((self.model.state_names, self.model.input_names)).encode())
+        digest.update(repr((float(self.dt), self.feedback)).encode())
+        reward = self.reward
+        weights = (reward.state, reward.terminal, reward.input, reward.input_change)
+        for array in (self.target, self.start, self.past, self.low, self.high, *weights):
+            digest.update(np.ascontiguousarray(array).tobytes())
+        digest.update(np.ascontiguousarray(self.input_target).tobytes())
+        return digest.hexdigest()[:16]
+
+    def with_model(self, model: Model) -> Task:
+        """The same task with another model of the same states and inputs."""
+        return dataclasses.replace(self, model=model)
+
+    def problem(self, bias: Array | None = None, *, exact: bool = False) -> Problem:
+        """The arrays for the kernels; `exact` switches off the smoothing of indicator terms."""
+        model, H = self.model, self.horizon
+        weight = np.tile(self.reward.state, (H + 1, 1))
+        weight[-1] += self.reward.terminal
+        assert self.latency is not None and self.input_target is not None
+        return Problem(
+            system=model.system,
+            p=model.values,
+            dt=self.dt,
+            start=self.start,
+            past=self.past,
+            delay=self.latency / self.dt,
+            bias=np.zeros((H, model.n)) if bias is None else bias,
+            target=np.where(np.isfinite(self.target), self.target, 0.0),
+            state_weight=weight,
+            input_target=self.input_target,
+            input_weight=self.reward.input,
+            change_weight=self.reward.input_change,
+            low=self.low,
+            high=self.high,
+            angles=model.angle_mask,
+            smoothing=0.0 if exact else self.smoothing,
+        )
+
+    def policy(self, ubar: Array, gain: Array | None, reference: Array | None) -> Policy:
+        """A policy for this task: feed-forward (H, m), gain (H, m, nz), reference (H, nz)."""
+        return Policy(
+            feedforward=ubar,
+            low=self.low,
+            high=self.high,
+            dt=self.dt,
+            state_names=self.model.state_names,
+            input_names=self.model.input_names,
+            depths=self.problem().depths,
+            angles=tuple(bool(a) for a in self.model.angle_mask),
+            past=self.past,
+            gain=gain if self.feedback else None,
+            reference=reference if self.feedback else None,
+        )
+
+    def rewards(self, trial: Trial) -> Array:
+        """The reward of every step of a trial, (T + 1,); NaN where the trial is not finite."""
+        T = trial.steps
+        assert self.input_target is not None
+        error = self.model.difference(trial.states, self.target[: T + 1])
+        past = self.past if trial.start_inputs is None else trial.start_inputs
+        return step_rewards(self.reward, error, trial.inputs, self.input_target[:T], past)
+
+    def utility(self, trial: Trial) -> float:
+        """U of a real trial (section 2); -inf for one that ended early or is not finite."""
+        if trial.steps < self.horizon or trial.finite_steps < self.horizon:
+            return -np.inf
+        return float(self.rewards(trial).sum())

@@ -1,0 +1,64 @@
+"""The quadratic reward: penalties on the distance to a target, on inputs and on their changes.
+
+    U = - sum_{t=0}^{H} |s_t - target_t|^2_W  - |s_H - target_H|^2_{W_H}
+        - sum_{t=0}^{H-1} |a_t - a_target_t|^2_R + |a_t - a_{t-1}|^2_S
+
+Section 2 (utility) and section 5 (the rewards of the experiments: deviation from the desired
+trajectory, non-zero inputs, changes of inputs). Weights multiply squared errors, without a half.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from grounded.errors import GroundedError
+from grounded.frozen import Array, readonly
+
+
+@dataclass(frozen=True, eq=False)
+class Reward:
+    """Weights per step: state (n,), terminal (n,) on the last state, input (m,), input_change (m,).
+
+    Raises:
+        GroundedError: if a weight is negative or not finite.
+    """
+
+    state: Array
+    terminal: Array
+    input: Array
+    input_change: Array
+
+    def __post_init__(self) -> None:
+        for name in ("state", "terminal", "input", "input_change"):
+            weights = readonly(getattr(self, name))
+            if not np.isfinite(weights).all() or (weights < 0).any():
+                raise GroundedError(
+                    f"[reward] {name}: weights must be finite and not negative, got {weights.tolist()}"
+                )
+            object.__setattr__(self, name, weights)
+
+
+def step_rewards(
+    reward: Reward,
+    error: Array,
+    inputs: Array,
+    input_target: Array,
+    past: Array,
+) -> Array:
+    """The reward of every step, (H + 1,): negative penalties, summing to the utility.
+
+    Args:
+        reward: the weights.
+        error: s_t - target_t with angles wrapped, (H + 1, n); NaN where not tracked.
+        inputs: a_0 .. a_{H-1}, (H, m).
+        input_target: what inputs are compared with, (H, m); zero for the paper's penalty.
+        past: the input held before t = 0, (m,).
+    """
+    tracked = np.where(np.isnan(error) & (reward.state + reward.terminal == 0), 0.0, error)
+    penalty = tracked**2 @ reward.state
+    penalty[-1] += tracked[-1] ** 2 @ reward.terminal
+    change = np.diff(np.vstack([past, inputs]), axis=0)
+    penalty[:-1] += (inputs - input_target) ** 2 @ reward.input + change**2 @ reward.input_change
+    return np.asarray(-penalty)
