@@ -1,0 +1,52 @@
+"""From a few lines of NumPy to numbers: trace, differentiate, compile; or difference.
+
+`system_of` is the door: it returns the fastest path that a user's function allows, and the paths
+agree, so that nobody above needs to know which one it was.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from grounded.compile.interpreted import Integrator, Kind
+from grounded.compile.names import Named
+from grounded.compile.problem import Problem, history_depths
+from grounded.compile.python import DifferencedSystem
+from grounded.compile.system import Backward, Swarm, System
+
+__all__ = ["Backward", "Named", "Problem", "Swarm", "System", "history_depths", "system_of"]
+
+
+def system_of(
+    function: Callable[..., Mapping[str, Any]],
+    *,
+    kind: Kind,
+    states: Sequence[str],
+    inputs: Sequence[str],
+    params: Sequence[str],
+    integrator: Integrator = "rk4",
+    angles: Sequence[bool] = (),
+) -> System:
+    """The System of a user's function.
+
+    Args:
+        function: f(s, a, p) -> ds/dt, or f(s, a, p, dt) -> next state, dicts of state names.
+        kind: "derivative" or "step".
+        states: names in array order; likewise `inputs` and `params`.
+        inputs: see `states`.
+        params: see `states`.
+        integrator: "rk4" or "euler", for a derivative.
+        angles: (n,) which states wrap.
+
+    Raises:
+        GroundedError: if the function can't be a model of these names, naming its file and line.
+    """
+    return DifferencedSystem(
+        function,
+        kind=kind,
+        states=states,
+        inputs=inputs,
+        params=params,
+        integrator=integrator,
+    )

@@ -48,7 +48,15 @@ class System(Protocol):
     note: str  # why it is not compiled, naming the line; empty when it is
 
     def step(self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0) -> Array:
-        """x (N, n), u (N, m) -> next x (N, n)."""
+        """From x (N, n), u (N, m) to the next x (N, n)."""
+        ...
+
+    def check(self, x: Array, u: Array, p: Array, dt: float) -> None:
+        """Compares a trace with the user's own function at points x (N, n), u (N, m).
+
+        Raises:
+            GroundedError: where they differ, with both values.
+        """
         ...
 
     def linearise(

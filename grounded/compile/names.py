@@ -1,0 +1,88 @@
+"""What a user's function receives: named states, inputs and parameters.
+
+`s.v` and `s["v"]` are the same value: a number, an array of samples, or an expression while the
+function is traced. An unknown name is the user's slip, so the error names the line that asked for
+it and the nearest name that exists.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from types import FrameType
+from typing import Any
+
+from grounded.errors import GroundedError, nearest
+
+
+class Named(Mapping[str, Any]):
+    """Values by attribute and by item, in declared order; also a read-only mapping.
+
+    Args:
+        what: "state", "input" or "parameter", for messages.
+        names: the names, in order.
+        values: one value a name.
+    """
+
+    def __init__(self, what: str, names: Sequence[str], values: Sequence[Any]) -> None:
+        self.__dict__.update(zip(names, values, strict=True))
+        object.__setattr__(self, " what", what)  # a key that no valid name can collide with
+
+    def __getattr__(self, name: str) -> Any:
+        """Only reached for a name that does not exist."""
+        if name.startswith("__"):
+            raise AttributeError(name)
+        raise self._unknown(name, sys._getframe(1))
+
+    def __getitem__(self, name: str) -> Any:
+        try:
+            return self.__dict__[name]
+        except (KeyError, TypeError):
+            raise self._unknown(name, sys._getframe(1)) from None
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        raise GroundedError(
+            f"{line_of(sys._getframe(1))}: a {self.__dict__[' what']} can't be assigned to; "
+            f"use a local variable for '{name}'"
+        )
+
+    def __iter__(self) -> Iterator[str]:
+        return (name for name in self.__dict__ if name != " what")
+
+    def __len__(self) -> int:
+        return len(self.__dict__) - 1
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.__dict__ and name != " what"
+
+    def _unknown(self, name: object, frame: FrameType) -> GroundedError:
+        what = self.__dict__[" what"]
+        return GroundedError(
+            f"{line_of(frame)}: there is no {what} '{name}': {nearest(str(name), list(self))}"
+        )
+
+
+def line_of(frame: FrameType) -> str:
+    """file:line of a stack frame."""
+    return f"{frame.f_code.co_filename}:{frame.f_lineno}"
+
+
+def where(function: Any) -> str:
+    """file:line where a callable is defined, or its representation when Python can't tell."""
+    function = getattr(function, "func", function)  # functools.partial
+    function = getattr(function, "__wrapped__", function)
+    if not hasattr(function, "__code__"):  # a bound method, or an object with __call__
+        function = getattr(function, "__func__", getattr(type(function), "__call__", None))  # noqa: B004
+    code = getattr(function, "__code__", None)
+    return f"{code.co_filename}:{code.co_firstlineno}" if code is not None else repr(function)
+
+
+def raised_at(error: BaseException, function: Any) -> str:
+    """file:line of the deepest frame of `error` that lies in the file that defines `function`."""
+    home = where(function).rpartition(":")[0]
+    trace, found = error.__traceback__, where(function)
+    while trace is not None:
+        if trace.tb_frame.f_code.co_filename == home:
+            found = f"{home}:{trace.tb_lineno}"
+        trace = trace.tb_next
+    return found

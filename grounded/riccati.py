@@ -1,0 +1,71 @@
+"""Riccati: the best small change of every input, and the feedback that goes with it.
+
+About a trajectory (zbar, ubar) the problem is replaced by its quadratic model (Gauss-Newton: the
+curvature of the dynamics is left out), and the value of being at z_t is swept back in time,
+
+    V_t(dz) = min over du of  1/2 [dz du]' Q_t [dz du] + [Q_z Q_u] [dz du],
+
+whose minimiser is du = k_t + K_t dz. Three things are this project's own:
+
+- the state is z = [x, inputs already sent], so input changes and transport delays are exact;
+- limits of the inputs are part of each step's quadratic programme (Tassa, Mansard, Todorov,
+  "Control-limited differential dynamic programming", ICRA 2014): clamped inputs get no feedback;
+- diag(damping) is added to Q_uu when the step is chosen, and left out of V (Tassa, Erez, Todorov,
+  IROS 2012, eq. 11), so that d1 and d2 predict the true quadratic change.
+
+The sweep itself belongs to a system (`compile/sweep.py`, or a compiled kernel): here it is made to
+succeed, by raising the damping until every Q_uu is positive definite.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from grounded.compile import Backward, Problem
+from grounded.frozen import Array
+
+FLOOR = 1e-6  # first regularisation after a failed factorisation
+GROWTH = 10.0
+CEILING = 1e10
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """Gains of one sweep, and the regularisation `mu` at which it went through."""
+
+    gains: Backward
+    mu: float
+
+    @property
+    def ok(self) -> bool:
+        """Whether the sweep went through at all."""
+        return self.gains.failed_at < 0
+
+
+def input_scale(problem: Problem) -> Array:
+    """The natural unit of damping for each input (m,): the curvature 2 (R + S) of its own cost.
+
+    An input without a cost of its own takes the mean of the others, or 1.
+    """
+    scale = 2.0 * (problem.input_weight + problem.change_weight)
+    positive = scale[scale > 0]
+    return np.where(scale > 0, scale, positive.mean() if positive.size else 1.0)
+
+
+def sweep(
+    problem: Problem, z: Array, u: Array, damping: Array | None = None, mu: float = 0.0
+) -> Sweep:
+    """Sweeps back along z (H+1, nz), u (H, m) with damping (m,) + mu * input_scale.
+
+    mu grows tenfold after each failure; when it passes 1e10 the failed sweep is returned, with
+    `ok` False: the trajectory or the model holds no finite numbers.
+    """
+    base = np.zeros(problem.system.m) if damping is None else np.asarray(damping, float)
+    scale = input_scale(problem)
+    while True:
+        gains = problem.system.backward(problem, z, u, base + mu * scale)
+        if gains.failed_at < 0 or mu >= CEILING:
+            return Sweep(gains, mu)
+        mu = max(FLOOR, GROWTH * mu)
