@@ -62,7 +62,10 @@ def trim(model: Model, speed: Array, turn_rate: Array, dt: float = 0.02) -> Trim
         worst = float(np.abs(error).max())
         if not np.isfinite(worst) or worst < 1e-10:
             break
-        step = np.linalg.solve(slope, -error[..., None])[..., 0]
+        try:
+            step = np.linalg.solve(slope, -error[..., None])[..., 0]
+        except np.linalg.LinAlgError:  # no air: no surface turns it
+            break
         scale = np.minimum(1.0, 0.5 / np.maximum(np.abs(step / (1 + speed[:, None])).max(1), 1e-12))
         x[:, free] += scale[:, None] * step[:, : len(free)]
         a += scale[:, None] * step[:, len(free) :]
