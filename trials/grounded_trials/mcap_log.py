@@ -1,0 +1,35 @@
+"""Our own files: trials and candidates as MCAP, written and read back to the last bit.
+
+A trial has channels `/state` and `/input`, a message a sample, with one double a name; step k is
+stamped k dt after the start. A candidate has `/policy` (lists feedforward[m], gain[m * nz] row by
+row, reference[nz], a message a control step), `/predicted_state` and `/predicted_input`. Both have
+the metadata record `grounded`, a table of strings:
+
+    format            "grounded trial 1" or "grounded candidate 1"
+    dt                control interval [s]
+    states, inputs    JSON objects, name -> unit, in array order
+    candidate         (trial) the candidate that was run, "" for none
+    start_inputs      (trial) JSON list, the inputs held before t = 0, or null
+    policy            (candidate) JSON object: low, high (null: no limit), past, depths, angles, z
+
+and whatever the writer adds. A trial carries the candidate's file as attachment `policy`.
+Numbers in text are Python's repr: they come back exactly. Every file is complete and has all its
+checksums, or it is refused.
+"""
+
+from grounded_trials.candidate_file import candidate_bytes, read_candidate, write_candidate
+from grounded_trials.own_files import CANDIDATE, RESERVED, TRIAL
+from grounded_trials.trial_file import TrialWriter, read_trial, trial_bytes, write_trial
+
+__all__ = [
+    "CANDIDATE",
+    "RESERVED",
+    "TRIAL",
+    "TrialWriter",
+    "candidate_bytes",
+    "read_candidate",
+    "read_trial",
+    "trial_bytes",
+    "write_candidate",
+    "write_trial",
+]

@@ -1,0 +1,110 @@
+"""Writing MCAP: protobuf channels of named doubles, a table of strings, attached files.
+
+The only importer of the mcap package. Files are not compressed: a trial is small, its numbers
+compress badly, and so equal input gives equal bytes whatever the version of a compressor.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping, Sequence
+from typing import IO
+
+import numpy as np
+
+from grounded.frozen import Array
+
+LIBRARY = "grounded"
+
+
+class LogWriter:
+    """Writes one file: metadata and attachments first, then messages, flushed in time."""
+
+    def __init__(self, stream: IO[bytes]) -> None:
+        from mcap.writer import CompressionType, Writer
+
+        self._stream = stream
+        self._writer = Writer(stream, compression=CompressionType.NONE, enable_data_crcs=True)
+        self._writer.start(profile="", library=LIBRARY)
+        self._sequences: dict[int, int] = {}
+
+    def metadata(self, name: str, table: Mapping[str, str]) -> None:
+        """Adds a table of strings."""
+        self._writer.add_metadata(name, dict(table))
+
+    def attachment(self, name: str, media_type: str, data: bytes) -> None:
+        """Adds a file."""
+        self._writer.add_attachment(0, 0, name, media_type, data)
+
+    def channel(
+        self, topic: str, message: str, names: Sequence[str], *, repeated: bool = False
+    ) -> int:
+        """Opens a protobuf channel; its message has one double (or list of doubles) a name."""
+        descriptor = file_descriptor_set(message, names, repeated=repeated)
+        schema = self._writer.register_schema(f"grounded.{message}", "protobuf", descriptor)
+        return self._writer.register_channel(topic, "protobuf", schema)
+
+    def message(self, channel: int, time_ns: int, data: bytes) -> None:
+        """Adds a message that was sampled, and logged, at `time_ns`."""
+        sequence = self._sequences.get(channel, 0)
+        self._sequences[channel] = sequence + 1
+        self._writer.add_message(channel, time_ns, data, time_ns, sequence)
+
+    def flush(self) -> None:
+        """Hands everything written so far to the operating system."""
+        self._writer.flush()  # type: ignore[no-untyped-call]
+
+    def finish(self) -> None:
+        """Ends the file; the stream stays open."""
+        self._writer.finish()  # type: ignore[no-untyped-call]
+        self._stream.flush()
+
+
+def file_descriptor_set(message: str, names: Sequence[str], *, repeated: bool = False) -> bytes:
+    """A serialised FileDescriptorSet of one proto3 message of doubles, numbered from 1."""
+    from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorSet
+
+    files = FileDescriptorSet()
+    file = files.file.add(name=f"grounded/{message}.proto", package="grounded", syntax="proto3")
+    definition = file.message_type.add(name=message)
+    label = FieldDescriptorProto.LABEL_REPEATED if repeated else FieldDescriptorProto.LABEL_OPTIONAL
+    for number, name in enumerate(names, start=1):
+        definition.field.add(
+            name=name, number=number, label=label, type=FieldDescriptorProto.TYPE_DOUBLE
+        )
+    return bytes(files.SerializeToString(deterministic=True))
+
+
+def encode_doubles(values: Array) -> list[bytes]:
+    """Protobuf messages of doubles numbered from 1; values (N, k) -> N messages.
+
+    Zeros are written too, so that every message has the same length and -0.0 survives.
+    """
+    tags = [_varint(number << 3 | 1) for number in range(1, values.shape[1] + 1)]
+    form = struct.Struct("<" + "".join(f"{len(tag)}sd" for tag in tags))
+    messages = []
+    for row in values.tolist():
+        parts: list[bytes | float] = []
+        for tag, value in zip(tags, row, strict=True):
+            parts += (tag, value)
+        messages.append(form.pack(*parts))
+    return messages
+
+
+def encode_lists(lists: Sequence[Array]) -> bytes:
+    """One protobuf message of packed repeated doubles, numbered from 1; an empty list is absent."""
+    parts = []
+    for number, values in enumerate(lists, start=1):
+        data = np.ascontiguousarray(values, dtype="<f8").tobytes()
+        if data:
+            parts += [_varint(number << 3 | 2), _varint(len(data)), data]
+    return b"".join(parts)
+
+
+def _varint(value: int) -> bytes:
+    parts = bytearray()
+    while value > 0x7F:
+        parts.append(value & 0x7F | 0x80)
+        value >>= 7
+    parts.append(value)
+    return bytes(parts)

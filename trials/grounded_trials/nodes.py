@@ -1,0 +1,83 @@
+"""What a message path walks over: the same place in many messages at once.
+
+A node stands for one value of a type in each of its rows; row i belongs to message `rows[i]`.
+Walking yields new nodes: `field` goes into a struct, `items` into an array (a message then has as
+many rows as items, or none), `keep` drops rows. `numbers` and `texts` read the values. CDR,
+ROS 1, protobuf and JSON each implement this and nothing else.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from grounded_trials.message_types import Type
+
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+Floats = NDArray[np.float64]
+
+
+class BadMessage(Exception):
+    """A message's bytes don't fit its schema; `message` is its index in the batch."""
+
+    def __init__(self, message: int, found: str) -> None:
+        self.message = int(message)
+        super().__init__(found)
+
+
+class BadPath(Exception):
+    """A path does not fit the type of the messages; the text says where and what would fit."""
+
+
+class Node(Protocol):
+    """One value of `type` in each row; rows are sorted by message."""
+
+    type: Type
+    rows: Ints
+
+    def field(self, name: str) -> Node:
+        """The struct's field; rows where it is absent drop out."""
+
+    def items(self, start: int, stop: int) -> Node:
+        """The array's items from start to stop, both included; negative counts from the end."""
+
+    def keep(self, chosen: Bools) -> Node:
+        """The rows where `chosen` is true."""
+
+    def numbers(self) -> Floats:
+        """The values of a number, a row each."""
+
+    def equals(self, text: str) -> Bools:
+        """Where a text is `text`."""
+
+
+def choose_items(counts: Ints, start: int, stop: int) -> tuple[Ints, Ints]:
+    """Which items a slice takes: (row, index) for arrays of counts[row] items.
+
+    Both ends are included and negative ones count from the end, as in Foxglove; what lies outside
+    the array is left out.
+    """
+    first = np.maximum(counts + start, 0) if start < 0 else np.full_like(counts, start)
+    last = counts + stop if stop < 0 else np.minimum(counts - 1, stop)
+    if start == stop and start < 0:  # one item from the end: none where the array is too short
+        first = counts + start
+        last = np.where(first < 0, first - 1, first)
+    lengths = np.maximum(last - first + 1, 0)
+    rows = np.repeat(np.arange(len(counts)), lengths)
+    offset = np.arange(len(rows)) - np.repeat(np.cumsum(lengths) - lengths, lengths)
+    return rows, first[rows] + offset
+
+
+def texts_equal(buffer: bytes, start: Ints, length: Ints, text: bytes) -> Bools:
+    """Where the `length` bytes at `start` are exactly `text`."""
+    equal: Bools = length == len(text)
+    octets = np.frombuffer(buffer, dtype=np.uint8)
+    at = np.flatnonzero(equal)
+    for i, octet in enumerate(text):
+        at = at[octets[start[at] + i] == octet]
+    result = np.zeros(len(start), dtype=np.bool_)
+    result[at] = True
+    return result

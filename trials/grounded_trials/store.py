@@ -1,0 +1,266 @@
+"""The store: a folder of files that only grows; a file's identity is the hash of its content.
+
+A file is named  t0007-3f9a0c2d51b8e644.mcap : its number in the order of arrival, and the first
+16 hex digits of the SHA-256 of its bytes. Names are all there is: the folder can be copied to
+another machine, and its order goes with it. (Two files with one number, from two folders that
+were joined, are ordered by their hashes.) The hash is computed again at every read.
+
+A file is copied to a temporary name in the same folder, synced, renamed, and the folder synced;
+only then is it acknowledged. A lock keeps other processes out. What a killed process leaves
+behind is a temporary file, which the next one removes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+from grounded.errors import GroundedError
+
+DIGITS = 16  # hex digits of the hash in a name
+_NAME = re.compile(r"^([a-z]+)(\d{4,})-([0-9a-f]{16})(\.\w+)$")
+_BLOCK = 2**20
+
+
+@dataclass(frozen=True)
+class Stored:
+    """A file of the store."""
+
+    path: Path
+    number: int
+    digest: str  # the first 16 hex digits of its SHA-256, from its name
+
+    @property
+    def id(self) -> str:
+        """Its short name, such as t0007."""
+        return self.path.name.split("-")[0]
+
+
+@dataclass(frozen=True)
+class Added:
+    """What became of a file that was given to the store."""
+
+    sha256: str
+    path: Path
+    known: bool  # it was there already
+
+    @property
+    def id(self) -> str:
+        """Its short name, such as t0007."""
+        return self.path.name.split("-")[0]
+
+
+@dataclass(frozen=True)
+class Damaged:
+    """A stored file whose content is not what it was, or a file that does not belong there."""
+
+    path: Path
+    reason: str
+
+
+class Store:
+    """A folder of content-addressed files; `prefix` is the letter of their short names."""
+
+    def __init__(self, folder: str | Path, prefix: str = "t") -> None:
+        self.folder, self.prefix = Path(folder), prefix
+
+    def list(self) -> tuple[Stored, ...]:
+        """The files in the order of their arrival; nothing is read but the folder.
+
+        Raises:
+            GroundedError: if the folder can't be read.
+        """
+        try:
+            names = [path.name for path in self.folder.iterdir()]
+        except FileNotFoundError:
+            return ()
+        except OSError as error:
+            raise GroundedError(f"{self.folder} can't be read: {error.strerror}") from None
+        found = []
+        for name in names:
+            match = _NAME.match(name)
+            if match and match[1] == self.prefix:
+                found.append(Stored(self.folder / name, int(match[2]), match[3]))
+        return tuple(sorted(found, key=lambda s: (s.number, s.digest)))
+
+    def find(self, key: str) -> Stored:
+        """The file whose short name, name, or hash (from 4 digits on) is `key`.
+
+        Raises:
+            GroundedError: if there is none, or more than one.
+        """
+        entries = self.list()
+        hits = [s for s in entries if key in (s.id, s.path.name)]
+        if not hits and len(key) >= 4:
+            hits = [s for s in entries if s.digest.startswith(key[:DIGITS])]
+        if len(hits) == 1:
+            return hits[0]
+        if not hits:
+            last = f"the last is {entries[-1].id}" if entries else "it is empty"
+            raise GroundedError(f"{self.folder} has no file '{key}'; {last}")
+        names = ", ".join(s.path.name for s in hits)
+        raise GroundedError(f"'{key}' may be any of {names}; give more of the hash")
+
+    def read(self, key: str | Stored) -> bytes:
+        """The content of a file, checked against its hash.
+
+        Raises:
+            GroundedError: if it is not there, can't be read, or has changed.
+        """
+        entry = key if isinstance(key, Stored) else self.find(key)
+        try:
+            data = entry.path.read_bytes()
+        except OSError as error:
+            raise GroundedError(f"{entry.path} can't be read: {error.strerror}") from None
+        if hashlib.sha256(data).hexdigest()[:DIGITS] != entry.digest:
+            raise GroundedError(
+                f"{entry.path} is damaged: its content does not have the hash in its name; "
+                "restore it from a backup, or ingest the original log again to replace it"
+            )
+        return data
+
+    def add(self, source: str | Path | bytes, suffix: str = ".mcap") -> Added:
+        """Takes a copy of a file, or of bytes; the same content is kept once.
+
+        When it returns, the content is on the disk. A stored file that was damaged is replaced by
+        its good copy; the damaged one is kept as `NAME.damaged`.
+
+        Raises:
+            GroundedError: if the source can't be read or the folder not be written.
+        """
+        with self._locked():
+            self._sweep()
+            temporary = self.folder / f".{self.prefix}-{os.getpid()}.tmp"
+            try:
+                digest = _copy(source, temporary)
+                return self._place(temporary, digest, suffix)
+            except OSError as error:
+                raise self._unwritable(error) from None
+            finally:
+                temporary.unlink(missing_ok=True)
+
+    def verify(self) -> tuple[Damaged, ...]:
+        """Reads every file; returns those that changed, and names that do not belong here.
+
+        Raises:
+            GroundedError: if the folder can't be read.
+        """
+        damaged = []
+        for entry in self.list():
+            try:
+                self.read(entry)
+            except GroundedError as error:
+                damaged.append(Damaged(entry.path, str(error)))
+        return tuple(damaged)
+
+    def _place(self, temporary: Path, digest: str, suffix: str) -> Added:
+        entries = self.list()
+        for entry in entries:
+            if entry.digest == digest[:DIGITS]:
+                if _hash_file(entry.path) == digest:
+                    return Added(digest, entry.path, known=True)
+                entry.path.replace(entry.path.with_name(entry.path.name + ".damaged"))
+                temporary.rename(entry.path)
+                sync_folder(self.folder)
+                return Added(digest, entry.path, known=False)
+        number = entries[-1].number + 1 if entries else 1
+        path = self.folder / f"{self.prefix}{number:04d}-{digest[:DIGITS]}{suffix}"
+        temporary.rename(path)
+        sync_folder(self.folder)
+        return Added(digest, path, known=False)
+
+    def _sweep(self) -> None:
+        """Removes what killed processes left; the lock says that none is at work."""
+        for path in self.folder.glob(f".{self.prefix}-*.tmp"):
+            path.unlink(missing_ok=True)
+
+    @contextmanager
+    def _locked(self) -> Iterator[None]:
+        import fcntl
+
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            descriptor = os.open(self.folder / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
+        except OSError as error:
+            raise self._unwritable(error) from None
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+            yield
+        finally:
+            os.close(descriptor)
+
+    def _unwritable(self, error: OSError) -> GroundedError:
+        if error.filename is not None and Path(str(error.filename)).parent != self.folder:
+            return GroundedError(f"{error.filename} can't be read: {error.strerror}")
+        return GroundedError(
+            f"{self.folder} can't be written: {error.strerror}; nothing was stored, make room or "
+            "give yourself the right to write there"
+        )
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """Writes a file that is complete or not there: temporary name, sync, rename, sync the folder.
+
+    Raises:
+        GroundedError: if it can't be written.
+    """
+    temporary = path.with_name(f".{path.name}-{os.getpid()}.tmp")
+    try:
+        try:
+            _copy(data, temporary, mode=0o644)
+            temporary.replace(path)
+            sync_folder(path.parent)
+        finally:
+            temporary.unlink(missing_ok=True)
+    except OSError as error:
+        raise GroundedError(f"{path} can't be written: {error.strerror}") from None
+
+
+def sync_folder(folder: Path) -> None:
+    """Makes the names in a folder durable."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _copy(source: str | Path | bytes, target: Path, mode: int = 0o444) -> str:
+    """Copies to a new file, on the disk when it returns; the SHA-256 of what was copied."""
+    hasher = hashlib.sha256()
+    descriptor = os.open(target, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
+    with os.fdopen(descriptor, "wb") as out:
+        for block in _blocks(source):
+            hasher.update(block)
+            out.write(block)
+        out.flush()
+        os.fchmod(out.fileno(), mode)
+        os.fsync(out.fileno())
+    return hasher.hexdigest()
+
+
+def _blocks(source: str | Path | bytes) -> Iterator[bytes]:
+    if isinstance(source, bytes):
+        yield source
+        return
+    with Path(source).open("rb") as stream:
+        yield from _read_blocks(stream)
+
+
+def _read_blocks(stream: BinaryIO) -> Iterator[bytes]:
+    while block := stream.read(_BLOCK):
+        yield block
+
+
+def _hash_file(path: Path) -> str:
+    hasher = hashlib.sha256()
+    with path.open("rb") as stream:
+        for block in _read_blocks(stream):
+            hasher.update(block)
+    return hasher.hexdigest()
