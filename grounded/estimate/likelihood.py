@@ -1,0 +1,177 @@
+"""Process and measurement noise by maximum likelihood of the innovations.
+
+The likelihood is that of `grounded.estimate.filter`; its slopes by the variances come from one pass
+of the smoother; L-BFGS climbs in the logarithms of the variances, in which they cannot turn
+negative. The linearisation is held fixed while the noise moves and renewed between climbs: a track
+filtered with the wrong noise is not where to linearise.
+
+A variance that the data do not see (a sensor without noise, a state that strays in no trial) would
+sink for ever; it stops at a floor far below what is visible.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from grounded.compile import System
+from grounded.estimate.batch import Batch, batch_of
+from grounded.estimate.filter import Filtered, fixed_steps, model_steps, run
+from grounded.estimate.measurement import Measurement
+from grounded.estimate.noise import Noise
+from grounded.estimate.record import Record
+from grounded.estimate.smoother import smooth
+from grounded.frozen import Array
+
+FLOOR = 1e-4  # of the visible scatter: below it a std is zero
+ROUNDS = 4  # of linearising anew
+ENOUGH = 0.2  # [nats] a round that gains less is the last
+ROWS = 20_000  # more samples than this teach the noise nothing new
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseEstimate:
+    """The noise, its log-likelihood, what is seen of it, and how the search ended."""
+
+    noise: Noise
+    loglik: float
+    process_seen: tuple[bool, ...]  # (n,) False: at the floor, or nothing says anything about it
+    measurement_seen: tuple[bool, ...]  # (ny,)
+    status: str
+
+
+def maximum_likelihood(
+    system: System,
+    p: Array,
+    batch: Batch,
+    measurement: Measurement,
+    start: Noise,
+    *,
+    rounds: int = ROUNDS,
+) -> NoiseEstimate:
+    """Climbs from `start` to the most likely noise.
+
+    Args:
+        system: the dynamics (n states).
+        p: its parameters (k,).
+        batch: the trials.
+        measurement: ny channels.
+        start: where to begin, see `first_noise`.
+        rounds: how often to linearise anew at most.
+    """
+    advance = model_steps(system, p, batch)
+    best = run(batch, measurement, start, advance)
+    noise = start
+    seen = np.zeros(len(start.process) + measurement.ny, dtype=bool)
+    status = "converged"
+    for round_ in range(rounds):
+        if not np.isfinite(best.loglik):
+            status = best.status
+            break
+        trial, seen = _climb(batch, measurement, noise, best, start)
+        after = run(batch, measurement, trial, advance)
+        gain = after.loglik - best.loglik
+        if gain > 0:
+            noise, best = trial, after
+        if not gain > ENOUGH:
+            break
+        if round_ == rounds - 1:
+            status = "still rising"
+    n = len(noise.process)
+    return NoiseEstimate(
+        noise, best.loglik, tuple(map(bool, seen[:n])), tuple(map(bool, seen[n:])), status
+    )
+
+
+def first_noise(batch: Batch, measurement: Measurement, dt: float) -> Noise:
+    """A rough noise, from how smooth the measurements are: robust, and only a place to begin.
+
+    Second differences of a smooth signal are measurement noise (times sqrt 6); a tenth of the
+    first differences is what the model may miss in a step.
+    """
+    n = batch.start.shape[1]
+    r, q = np.empty(measurement.ny), np.full(n, 0.05 * np.sqrt(dt))
+    for c, i in enumerate(measurement.states):
+        y = np.where(batch.seen[..., c], batch.y[..., c], np.nan)
+        one, two = np.diff(y, axis=0), np.diff(y, n=2, axis=0)
+        scale = float(np.nanstd(y)) if np.isfinite(y).any() else 1.0
+        least = max(1e-4 * scale, 1e-9)
+        r[c] = max(_spread(two) / np.sqrt(6), least)
+        if i >= 0 and np.isfinite(one).any():
+            q[i] = max(0.1 * _spread(one), least)
+    return Noise(q, r, dt)
+
+
+def enough(records: Sequence[Record], rng: np.random.Generator | None = None) -> list[Record]:
+    """As many records as the noise can learn from: all, or a draw of about `ROWS` samples."""
+    total = sum(r.steps for r in records)
+    if total <= ROWS:
+        return list(records)
+    rng = np.random.default_rng(0) if rng is None else rng
+    kept: list[Record] = []
+    for index in rng.permutation(len(records)):
+        kept.append(records[index])
+        if sum(r.steps for r in kept) >= ROWS:
+            break
+    return kept
+
+
+def _climb(
+    batch: Batch, measurement: Measurement, noise: Noise, about: Filtered, start: Noise
+) -> tuple[Noise, Array]:
+    """The best noise for a fixed linearisation, and which variances the data see."""
+    from scipy.optimize import minimize
+
+    n, dt = len(noise.process), noise.dt
+    advance = fixed_steps(about)
+
+    def cost(theta: Array) -> tuple[float, Array]:
+        std = np.exp(0.5 * theta)
+        filtered = run(batch, measurement, Noise(std[:n], std[n:], dt), advance)
+        if not np.isfinite(filtered.loglik):
+            return 1e12, np.zeros_like(theta)
+        return -filtered.loglik / batch.count, -_slope(filtered, batch, theta, dt) / batch.count
+
+    visible = np.concatenate([start.process, start.measurement])
+    theta = 2 * np.log(np.concatenate([noise.process, noise.measurement]))
+    low = 2 * np.log(FLOOR * visible)
+    bounds = list(zip(low, 2 * np.log(1e4 * visible), strict=True))
+    options = {"maxiter": 60, "ftol": 1e-9, "gtol": 1e-6}
+    found = minimize(cost, theta, jac=True, method="L-BFGS-B", bounds=bounds, options=options).x
+    std = np.exp(0.5 * found)
+    return Noise(std[:n], std[n:], dt), found > low + 2.0
+
+
+def _slope(filtered: Filtered, batch: Batch, theta: Array, dt: float) -> Array:
+    """Slope of the log-likelihood by the log variances, (n + ny,)."""
+    back = smooth(filtered, batch)
+    by_q = np.sum(back.process_slope * batch.dt[..., None] / dt, axis=(0, 1))
+    by_r = np.sum(back.measurement_slope, axis=(0, 1))
+    for c in range(len(by_r)):
+        by_r[c] += back.start_slope[batch.start_channel == c].sum()
+    return np.concatenate([by_q, by_r]) * np.exp(theta)
+
+
+def _spread(values: Array) -> float:
+    """A robust standard deviation; the plain one where more than half of the values are equal."""
+    finite = values[np.isfinite(values)]
+    if len(finite) == 0:
+        return 0.0
+    mad = 1.4826 * float(np.median(np.abs(finite - np.median(finite))))
+    return mad if mad > 0 else float(np.std(finite))
+
+
+def noise_of_records(
+    system: System,
+    p: Array,
+    records: Sequence[Record],
+    measurement: Measurement,
+    latency: Array,
+    rng: np.random.Generator | None = None,
+) -> NoiseEstimate:
+    """Noise of records from scratch; see `grounded.estimate.noise_of` for the arguments."""
+    batch = batch_of(enough(records, rng), measurement, system.n, latency)
+    dt = round(float(np.median(batch.dt[batch.valid])), 9)
+    return maximum_likelihood(system, p, batch, measurement, first_noise(batch, measurement, dt))

@@ -1,0 +1,113 @@
+"""Measurement: what the sensors see of a state, y = h(x) + v.
+
+The default measures states as they are. A camera that sees two markers, a gyroscope, an encoder
+are a function h of states (N, n) -> (N, ny), with its Jacobian or without (then it is differenced).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from grounded.errors import GroundedError, nearest
+from grounded.frozen import Array
+from grounded.model import Model
+
+DIFFERENCE = 1e-6  # step of the central difference, relative to max(1, |x|)
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """ny channels y = h(x).
+
+    Args:
+        names: of the channels.
+        function: h, states (N, n) -> (N, ny).
+        jacobian: h_x, (N, n) -> (N, ny, n).
+        angles: channels whose innovations wrap, (ny,).
+        states: index of the state that a channel measures directly, -1 where none, (ny,).
+    """
+
+    names: tuple[str, ...]
+    function: Callable[[Array], Array]
+    jacobian: Callable[[Array], Array]
+    angles: tuple[bool, ...]
+    states: tuple[int, ...]
+
+    @property
+    def ny(self) -> int:
+        """Number of channels."""
+        return len(self.names)
+
+    def innovation(self, y: Array, predicted: Array) -> Array:
+        """The innovation y - predicted, (..., ny); angles wrapped to [-pi, pi]."""
+        e = y - predicted
+        if any(self.angles):
+            mask = np.array(self.angles)
+            e[..., mask] -= 2 * np.pi * np.rint(e[..., mask] / (2 * np.pi))
+        return e
+
+
+def of_states(model: Model, names: Sequence[str] | None = None) -> Measurement:
+    """States measured as they are; all of them unless `names` says which.
+
+    Raises:
+        GroundedError: for a name that is not a state.
+    """
+    names = model.state_names if names is None else tuple(names)
+    for name in names:
+        if name not in model.states:
+            raise GroundedError(f"'{name}' is not a state: {nearest(name, model.states)}")
+    index = [model.state_names.index(name) for name in names]
+    pick = np.eye(model.n)[index]
+    return Measurement(
+        names=names,
+        function=lambda x: np.asarray(x[:, index]),
+        jacobian=lambda x: np.broadcast_to(pick, (len(x), *pick.shape)),
+        angles=tuple(name in model.angles for name in names),
+        states=tuple(index),
+    )
+
+
+def of_function(
+    names: Sequence[str],
+    function: Callable[[Array], Array],
+    jacobian: Callable[[Array], Array] | None = None,
+    angles: Sequence[str] = (),
+) -> Measurement:
+    """Any measurement function h.
+
+    Args:
+        names: of the ny channels.
+        function: h, states (N, n) -> (N, ny).
+        jacobian: h_x (N, n) -> (N, ny, n); None: central differences.
+        angles: channels whose innovations wrap.
+
+    Raises:
+        GroundedError: for an angle that is not a channel.
+    """
+    for name in angles:
+        if name not in names:
+            raise GroundedError(f"angle '{name}' is not measured: {nearest(name, names)}")
+    return Measurement(
+        names=tuple(names),
+        function=function,
+        jacobian=_differenced(function) if jacobian is None else jacobian,
+        angles=tuple(name in angles for name in names),
+        states=(-1,) * len(names),
+    )
+
+
+def _differenced(function: Callable[[Array], Array]) -> Callable[[Array], Array]:
+    def jacobian(x: Array) -> Array:
+        N, n = x.shape
+        h = DIFFERENCE * np.maximum(1.0, np.abs(x))  # (N, n)
+        shift = h[:, None, :] * np.eye(n)  # (N, n, n): row i moves state i
+        up = function((x[:, None] + shift).reshape(N * n, n))
+        down = function((x[:, None] - shift).reshape(N * n, n))
+        slopes = (up - down).reshape(N, n, -1) / (2 * h)[:, :, None]
+        return np.asarray(slopes.transpose(0, 2, 1))
+
+    return jacobian

@@ -1,0 +1,229 @@
+"""Record: what was measured and what was commanded, each on its own clock.
+
+    y_i = h(x(t_i)) + v_i,         u_j(t) = command_j(t - latency_j)
+
+A camera at 30 Hz and a controller at 20 Hz are one record: states are estimated at the instants
+`times`, and the input that acts over [t_i, t_i+1] is the mean of the held commands over
+[t_i - latency, t_i+1 - latency]. On a common grid this is the delay queue of
+`grounded.compile.problem`, any fraction of a step included; it is piecewise linear in the latency,
+whose derivative is therefore known. A sample that was lost is NaN.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from grounded.errors import GroundedError
+from grounded.frozen import Array, readonly
+from grounded.model import Model
+from grounded.trial import Trial
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """One run. ny measured channels, m inputs, n states.
+
+    Args:
+        times: instants at which states are estimated, ascending [s], (T + 1,).
+        measured: y, NaN where nothing was measured, (T + 1, ny).
+        command_times: when each command was sent, ascending [s], (M,).
+        commands: held from its time on, (M, m).
+        past: held before the first command, (m,); None: zero.
+        start: mean of the first state where no channel measures it, (n,); None: zero.
+        start_std: its standard deviation, (n,); None: 1 in the state's unit.
+        id: of the trial it came from.
+
+    Raises:
+        GroundedError: if the arrays do not fit each other or times do not ascend.
+    """
+
+    times: Array
+    measured: Array
+    command_times: Array
+    commands: Array
+    past: Array | None = None
+    start: Array | None = None
+    start_std: Array | None = None
+    id: str = ""
+
+    def __post_init__(self) -> None:
+        for name in ("times", "measured", "command_times", "commands"):
+            object.__setattr__(self, name, readonly(getattr(self, name)))
+        past = np.zeros(self.commands.shape[-1]) if self.past is None else self.past
+        object.__setattr__(self, "past", readonly(past))
+        for times, rows, what in (
+            (self.times, self.measured, "measured"),
+            (self.command_times, self.commands, "commands"),
+        ):
+            if times.ndim != 1 or rows.ndim != 2 or len(times) != len(rows) or not len(times):
+                raise GroundedError(
+                    f"a record needs one row of {what} for each of its times (at least one); got "
+                    f"times {times.shape} and {what} {rows.shape}"
+                )
+            if not (np.diff(times) > 0).all():
+                raise GroundedError(f"the times of a record's {what} must ascend")
+        if not np.isfinite(self.commands).all():
+            object.__setattr__(self, "commands", _held(self.commands, np.asarray(self.past)))
+
+    @property
+    def steps(self) -> int:
+        """T."""
+        return len(self.times) - 1
+
+    def received(self, latency: Array) -> tuple[Array, Array]:
+        """What the actuators receive over each step (T, m), and its derivative by the latency.
+
+        Args:
+            latency: of each input [s], (m,).
+        """
+        m = self.commands.shape[1]
+        mean, slope = np.empty((self.steps, m)), np.empty((self.steps, m))
+        step = np.diff(self.times)
+        for j in range(m):
+            total, value = self._integral(self.times - latency[j], j)
+            mean[:, j] = np.diff(total) / step
+            slope[:, j] = -np.diff(value) / step
+        return mean, slope
+
+    def _integral(self, t: Array, j: int) -> tuple[Array, Array]:
+        """Integral of command j from the first command to t, and the command at t itself.
+
+        At the instant of a change the command is the mean of both sides: a whole number of steps
+        of latency then has the two-sided derivative.
+        """
+        past = np.asarray(self.past)
+        knots, values = self.command_times, np.append(past[j], self.commands[:, j])
+        total = np.append(0.0, np.cumsum(values[1:-1] * np.diff(knots)))
+        near = 1e-6 * (self.times[-1] - self.times[0]) / max(self.steps, 1)
+        index = np.searchsorted(knots, t, side="right")
+        at = np.maximum(index - 1, 0)
+        integral = total[at] + values[index] * (t - knots[at])
+        before = np.searchsorted(knots, t - near, side="right")
+        after = np.searchsorted(knots, t + near, side="right")
+        return integral, 0.5 * (values[before] + values[after])
+
+
+def _held(commands: Array, past: Array) -> Array:
+    """Commands with lost samples replaced by the one before."""
+    whole = np.vstack([past, commands])
+    bad = ~np.isfinite(whole)
+    row = np.where(bad, 0, np.arange(len(whole))[:, None])
+    held = np.take_along_axis(whole, np.maximum.accumulate(row, axis=0), axis=0)[1:]
+    return np.asarray(readonly(held))
+
+
+def record_of(model: Model, trial: Trial) -> Record:
+    """A trial as a record that measures every state of the model the trial has.
+
+    States are matched by name; one the trial does not have is NaN: not measured.
+
+    Raises:
+        GroundedError: if the trial lacks an input of the model or has none of its states.
+    """
+    from grounded.errors import nearest
+
+    for name in model.input_names:
+        if name not in trial.input_names:
+            raise GroundedError(
+                f"the trial has no input '{name}' of model '{model.name}': "
+                + nearest(name, trial.input_names)
+            )
+    if not set(model.state_names) & set(trial.state_names):
+        raise GroundedError(
+            f"the trial measures none of the states of model '{model.name}' "
+            f"({', '.join(model.state_names)}); it has {', '.join(trial.state_names)}"
+        )
+    measured = np.full((len(trial.states), model.n), np.nan)
+    for i, name in enumerate(model.state_names):
+        if name in trial.state_names:
+            measured[:, i] = trial.states[:, trial.state_names.index(name)]
+    measured[~np.isfinite(measured)] = np.nan
+    order = [trial.input_names.index(name) for name in model.input_names]
+    times = np.arange(len(trial.states), dtype=float) * trial.dt
+    past = None if trial.start_inputs is None else trial.start_inputs[order]
+    return Record(
+        times=times,
+        measured=measured,
+        command_times=times[: max(trial.steps, 1)],
+        commands=trial.inputs[:, order] if trial.steps else np.zeros((1, model.m)),
+        past=past,
+        id=trial.id,
+    )
+
+
+def merged(
+    times: Array,
+    measured: Array,
+    command_times: Array,
+    commands: Array,
+    past: Array | None = None,
+    *,
+    resolution: float = 1e-6,
+) -> Record:
+    """A record whose states live at the instants of measurements AND of commands.
+
+    For a camera and a controller of different rates; instants closer than `resolution` [s] are one.
+    The commands act exactly when they were sent, up to their latency.
+
+    Args:
+        times: of the measurements [s], (N,).
+        measured: (N, ny).
+        command_times: [s], (M,).
+        commands: (M, m).
+        past: held before the first command, (m,).
+        resolution: [s].
+    """
+    inside = (command_times >= times[0]) & (command_times <= times[-1])
+    ticks = np.unique(np.round(np.concatenate([times, command_times[inside]]) / resolution))
+    where = np.searchsorted(ticks, np.round(np.asarray(times) / resolution))
+    rows = np.full((len(ticks), measured.shape[1]), np.nan)
+    rows[where] = measured
+    return Record(np.asarray(ticks * resolution), rows, command_times, commands, past)
+
+
+def cut(record: Record, seconds: float) -> list[Record]:
+    """The record in pieces of about `seconds`, each with an unknown start of its own.
+
+    Filters run over many pieces at once, so that half an hour costs little more than a minute.
+    """
+    span = record.times[-1] - record.times[0]
+    pieces = max(1, round(span / seconds))
+    edges = np.linspace(0, record.steps, pieces + 1).round().astype(int)
+    return [part(record, int(a), int(b)) for a, b in pairwise(edges)]
+
+
+def part(record: Record, first: int, last: int) -> Record:
+    """Rows first .. last of a record; the commands stay whole, so that latency needs no start."""
+    keep_start = record.start if first == 0 else None
+    return Record(
+        record.times[first : last + 1],
+        record.measured[first : last + 1],
+        record.command_times,
+        record.commands,
+        record.past,
+        keep_start,
+        record.start_std,
+        record.id,
+    )
+
+
+def records_of(model: Model, trials: Sequence[Trial | Record]) -> list[Record]:
+    """Trials and records, all as records.
+
+    Raises:
+        GroundedError: if there is none, or one that does not fit the model.
+    """
+    records = [t if isinstance(t, Record) else record_of(model, t) for t in trials]
+    if not records:
+        raise GroundedError("there are no trials to estimate from; ingest at least one")
+    for record in records:
+        if record.commands.shape[1] != model.m:
+            raise GroundedError(
+                f"model '{model.name}' has {model.m} inputs, a record has "
+                f"{record.commands.shape[1]}"
+            )
+    return records
