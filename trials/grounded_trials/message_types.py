@@ -81,4 +81,12 @@ class Struct:
         return self.name
 
 
-Type = Number | Text | Array | Struct
+@dataclass(frozen=True)
+class Dynamic:
+    """A value whose type only the message tells (JSON)."""
+
+    def __str__(self) -> str:
+        return "value"
+
+
+Type = Number | Text | Array | Struct | Dynamic

@@ -35,8 +35,13 @@ class BadPath(Exception):
 class Node(Protocol):
     """One value of `type` in each row; rows are sorted by message."""
 
-    type: Type
-    rows: Ints
+    @property
+    def type(self) -> Type:
+        """What each row holds."""
+
+    @property
+    def rows(self) -> Ints:
+        """The message of each row."""
 
     def field(self, name: str) -> Node:
         """The struct's field; rows where it is absent drop out."""
@@ -46,6 +51,12 @@ class Node(Protocol):
 
     def keep(self, chosen: Bools) -> Node:
         """The rows where `chosen` is true."""
+
+    def numbered(self, rows: Ints) -> Node:
+        """The same values with other numbers for their rows."""
+
+    def names(self) -> tuple[str, ...]:
+        """The fields of a struct."""
 
     def numbers(self) -> Floats:
         """The values of a number, a row each."""

@@ -8,7 +8,7 @@ message that is absent has no row.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +45,14 @@ class ProtobufNode:
             self.wire[chosen],
             self.default,
         )
+
+    def numbered(self, rows: Ints) -> ProtobufNode:
+        """See `nodes.Node`."""
+        return replace(self, rows=rows)
+
+    def names(self) -> tuple[str, ...]:
+        """See `nodes.Node`."""
+        return tuple(self.type.by_name) if isinstance(self.type, Struct) else ()
 
     def field(self, name: str) -> ProtobufNode | ProtobufItems:
         """See `nodes.Node`."""
@@ -124,8 +132,16 @@ class ProtobufItems:
         chosen = first[owner] + index
         a = self.all
         return ProtobufNode(
-            a.buffer, a.type, a.rows[chosen], a.start[chosen], a.end[chosen], a.wire[chosen]
+            a.buffer, a.type, self.rows[owner], a.start[chosen], a.end[chosen], a.wire[chosen]
         )
+
+    def numbered(self, rows: Ints) -> ProtobufItems:
+        """See `nodes.Node`."""
+        return ProtobufItems(self.type, rows, self.owner, self.all)
+
+    def names(self) -> tuple[str, ...]:
+        """See `nodes.Node`."""
+        return ()
 
     def field(self, name: str) -> ProtobufNode | ProtobufItems:
         """See `nodes.Node`; only a struct has fields."""

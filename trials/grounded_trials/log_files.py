@@ -1,0 +1,73 @@
+"""Which files a log consists of: one, several in order, or a bag's folder with split files."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import BinaryIO
+
+from grounded.errors import GroundedError
+
+_LISTED = re.compile(r"^\s*-\s+(?:path:\s*)?[\"']?([^\"'\s#]+\.mcap)[\"']?\s*$", re.MULTILINE)
+_DIGITS = re.compile(r"(\d+)")
+
+
+def log_files(paths: str | Path | Sequence[str | Path]) -> tuple[Path, ...]:
+    """The MCAP files of a log in order.
+
+    Args:
+        paths: a file, files in order, or the folder of a bag. A folder's metadata.yaml says which
+            files it has and in which order; without it, all *.mcap in the order of their numbers.
+
+    Raises:
+        GroundedError: if one of them is missing, or a folder has none.
+    """
+    given = [paths] if isinstance(paths, str | Path) else list(paths)
+    files: list[Path] = []
+    for path in map(Path, given):
+        files.extend(_bag(path) if path.is_dir() else [path])
+    for path in files:
+        if not path.exists():
+            raise GroundedError(f"{path} does not exist")
+    if not files:
+        raise GroundedError("no log was given")
+    return tuple(files)
+
+
+def _bag(folder: Path) -> list[Path]:
+    listing = folder / "metadata.yaml"
+    try:
+        text = listing.read_text("utf-8") if listing.exists() else ""
+        inside = [path for path in folder.iterdir() if path.suffix == ".mcap"]
+    except (OSError, UnicodeDecodeError) as error:
+        raise GroundedError(f"{folder} can't be read as a bag: {error}") from None
+    names = list(dict.fromkeys(Path(name).name for name in _LISTED.findall(text)))
+    if names:  # names only: a listing can't lead out of its folder
+        missing = [name for name in names if not (folder / name).exists()]
+        if missing:
+            raise GroundedError(
+                f"{listing} lists {missing[0]}, which is not in the folder; "
+                "give the files that are there one by one"
+            )
+        return [folder / name for name in names]
+    if not inside:
+        raise GroundedError(f"{folder} holds no *.mcap file")
+    return sorted(inside, key=lambda path: _natural(path.name))
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    """Sorts bag_2 before bag_10."""
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in _DIGITS.split(name)]
+
+
+def open_log(path: Path) -> BinaryIO:
+    """Opens a log for reading.
+
+    Raises:
+        GroundedError: if it can't be.
+    """
+    try:
+        return path.open("rb")
+    except OSError as error:
+        raise GroundedError(f"{path} can't be read: {error.strerror}") from None
