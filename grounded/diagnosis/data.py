@@ -1,0 +1,216 @@
+"""Trials as the diagnosis sees them: one flat record, cut into runs of equal length.
+
+A filter steps through time in Python, so all trials step together, and a long trial is cut into
+runs of at most 200 steps: since the whole state is measured, a run that starts anew loses next to
+nothing. What has a memory (commands, delays) is computed on whole trials first.
+
+Notation: S trials, B runs of L steps, n states, m inputs. Flat arrays hold all trials one after
+the other: states (sum T + S, n), steps (sum T, ...).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from grounded.effects import Scales, scales_of
+from grounded.errors import GroundedError
+from grounded.frozen import Array
+from grounded.model import Model
+from grounded.trial import Trial
+
+LONGEST_RUN = 200  # steps
+MOST_NUMBERS = 6e6  # of one (L, B, N, N) array: above it, evenly spaced runs are used
+
+
+@dataclass(frozen=True, eq=False)
+class Data:
+    """All trials of a diagnosis; built by `prepare`."""
+
+    model: Model
+    dt: float
+    states: Array  # (sum T + S, n) measured, angles unwrapped, NaN where missing
+    commands: Array  # (S, T_max, m), the last command repeated to the end
+    held: Array  # (S, m) the input held before t = 0
+    latency: Array  # (m,) [s] that the task already models
+    lengths: Any  # (S,) of int, T of each trial
+    state_at: Any  # (B, L + 1) of int, into states
+    step_at: Any  # (B, L) of int, into flat steps
+    valid: Array  # (B, L) 1.0 where the step was run
+    trial_of: Any  # (B,) of int
+    scales: Scales
+    skipped: int  # runs left out because there are too many
+    ids: tuple[str, ...]
+
+    @property
+    def count(self) -> int:
+        """S, the number of trials."""
+        return len(self.lengths)
+
+    @property
+    def steps(self) -> int:
+        """Steps that the runs hold."""
+        return int(self.valid.sum())
+
+    @cached_property
+    def y(self) -> Array:
+        """Measured states by run, time-major (L + 1, B, n); NaN replaced by the last value."""
+        return np.ascontiguousarray(_filled(self.states)[self.state_at].swapaxes(0, 1))
+
+    @cached_property
+    def seen(self) -> Array:
+        """1.0 where a state was measured and its step was run, (L + 1, B, n)."""
+        there = np.isfinite(self.states[self.state_at])
+        run = np.concatenate([np.ones((len(self.valid), 1)), self.valid], axis=1)
+        return np.ascontiguousarray((there * run[:, :, None]).swapaxes(0, 1))
+
+    @cached_property
+    def time(self) -> Array:
+        """Time since the trial began at the start of each step, (L, B) [s]."""
+        flat = np.concatenate([np.arange(T) * self.dt for T in self.lengths])
+        return np.ascontiguousarray(flat[self.step_at].T)
+
+    def runs(self, per_step: Array) -> Array:
+        """Per-step values on whole trials (S, T_max, m) -> by run (L, B, m)."""
+        flat = np.concatenate([per_step[i, :T] for i, T in enumerate(self.lengths)])
+        return np.ascontiguousarray(flat[self.step_at].swapaxes(0, 1))
+
+    def delayed(self, inputs: Array) -> Array:
+        """What arrives of (S, T_max, m) after the latency that the task already models."""
+        out = np.empty_like(inputs)
+        for j, latency in enumerate(self.latency):
+            out[:, :, j] = shifted(inputs[:, :, j], self.held[:, j], latency / self.dt)
+        return out
+
+
+def shifted(signal: Array, held: Array, steps: float) -> Array:
+    """A held signal (S, T) delayed by any fraction of steps: its mean over each step."""
+    whole = int(np.floor(steps + 1e-9))
+    part = max(0.0, steps - whole)
+    T = signal.shape[1]
+    line = np.concatenate([np.repeat(held[:, None], whole + 1, axis=1), signal], axis=1)
+    return (1 - part) * line[:, 1 : T + 1] + part * line[:, :T]
+
+
+def prepare(
+    model: Model, trials: Sequence[Trial], latency: Array | None = None, past: Array | None = None
+) -> Data:
+    """Trials of one time grid as one record.
+
+    Args:
+        model: the crude model.
+        trials: at least one with two finite steps; what follows the first gap in the inputs or the
+            last finite state is left out, gaps in single states stay (as missing).
+        latency: transport delay of the inputs [s] that is already modelled (m,).
+        past: the input held before t = 0 where a trial does not say (m,).
+
+    Raises:
+        GroundedError: for trials of other states or inputs, of different dt, or with nothing in them.
+    """
+    _check(model, trials)
+    used = [(trial, _usable(trial)) for trial in trials]
+    used = [(trial, T) for trial, T in used if T >= 2]
+    if not used:
+        raise GroundedError(
+            "no trial holds two finite steps: nothing to diagnose; run `grounded verify` or ingest "
+            "a trial that ran"
+        )
+    dt, m = used[0][0].dt, model.m
+    lengths = np.array([T for _, T in used])
+    commands = np.empty((len(used), int(lengths.max()), m))
+    held = np.zeros((len(used), m))
+    before = np.zeros(m) if past is None else past
+    for i, (trial, T) in enumerate(used):
+        commands[i, :T] = trial.inputs[:T]
+        commands[i, T:] = trial.inputs[T - 1]
+        held[i] = before if trial.start_inputs is None else trial.start_inputs
+    states = np.concatenate([trial.states[: T + 1] for trial, T in used])
+    steps = np.concatenate([trial.inputs[:T] for trial, T in used])
+    state_at, step_at, valid, trial_of = _cut(lengths)
+    keep = _spread(len(step_at), step_at.shape[1] * model.n**2 * 4)
+    return Data(
+        model=model,
+        dt=dt,
+        states=states,
+        commands=commands,
+        held=held,
+        latency=np.zeros(m) if latency is None else np.asarray(latency, float),
+        lengths=lengths,
+        state_at=state_at[keep],
+        step_at=step_at[keep],
+        valid=valid[keep],
+        trial_of=trial_of[keep],
+        scales=scales_of(model, states, steps, dt, float(lengths.max() * dt)),
+        skipped=len(step_at) - len(keep),
+        ids=tuple(trial.id for trial, _ in used),
+    )
+
+
+def _check(model: Model, trials: Sequence[Trial]) -> None:
+    if not trials:
+        raise GroundedError("there are no trials to diagnose: run or ingest one first")
+    for trial in trials:
+        for what, found, known in (
+            ("states", trial.state_names, model.state_names),
+            ("inputs", trial.input_names, model.input_names),
+        ):
+            if tuple(found) != tuple(known):
+                raise GroundedError(
+                    f"trial '{trial.id or '?'}' has the {what} {', '.join(found)}; the model "
+                    f"'{model.name}' has {', '.join(known)}"
+                )
+        if abs(trial.dt - trials[0].dt) > 1e-9 * trials[0].dt:
+            raise GroundedError(
+                f"trials have different time steps ({trials[0].dt:g} s and {trial.dt:g} s): "
+                "diagnose them apart"
+            )
+
+
+def _usable(trial: Trial) -> int:
+    """Steps up to the first missing input or the last state of which anything is known."""
+    bad = ~np.isfinite(trial.inputs).all(axis=1)
+    last = int(np.argmax(bad)) if bad.any() else trial.steps
+    known = np.flatnonzero(np.isfinite(trial.states).any(axis=1))
+    return min(last, int(known[-1]) if len(known) else 0)
+
+
+def _cut(lengths: Any) -> tuple[Any, Any, Array, Any]:
+    """Index arrays of runs: each trial in equal parts of at most LONGEST_RUN steps."""
+    pieces = []
+    step0 = state0 = 0
+    for i, T in enumerate(lengths):
+        parts = int(np.ceil(T / LONGEST_RUN))
+        edges = np.linspace(0, T, parts + 1).astype(int)
+        pieces += [(i, step0 + a, state0 + a, b - a) for a, b in zip(edges, edges[1:], strict=False)]
+        step0, state0 = step0 + T, state0 + T + 1
+    L = max(length for *_, length in pieces)
+    offsets = np.arange(L + 1)
+    state_at = np.array([s + np.minimum(offsets, length) for _, _, s, length in pieces])
+    step_at = np.array([s + np.minimum(offsets[:-1], length - 1) for _, s, _, length in pieces])
+    valid = np.array([(offsets[:-1] < length).astype(float) for *_, length in pieces])
+    return state_at, step_at, valid, np.array([i for i, *_ in pieces])
+
+
+def _spread(count: int, numbers: float) -> Any:
+    """Evenly spaced runs, as many as fit in memory."""
+    most = max(1, int(MOST_NUMBERS / numbers))
+    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(int))
+
+
+def _filled(states: Array) -> Array:
+    """NaN replaced by the last finite value of its column (by the next at the start)."""
+    if np.isfinite(states).all():
+        return states
+    out = states.copy()
+    for column in out.T:
+        good = np.flatnonzero(np.isfinite(column))
+        if len(good) == 0:
+            column[:] = 0.0
+            continue
+        where = np.searchsorted(good, np.arange(len(column)), side="right") - 1
+        column[:] = column[good[np.maximum(where, 0)]]
+    return out

@@ -1,0 +1,166 @@
+"""The Kalman filter along many trials at once, and the gradient of its likelihood.
+
+About a track xbar (any), the error e_t = x_t - xbar_t of a trial obeys, to first order,
+
+    e_{t+1} = F_t e_t + d_t + c_t + w_t,     d_t = f(xbar_t, u_t) - xbar_{t+1}
+    c_{t+1} = phi c_t + eta_t                              (coloured process noise, optional)
+    r_t     = e_t + v_t,                     r_t = y_t - xbar_t
+
+with diagonal Q = var(w), R = var(v). The gains do not depend on the data, so they are computed once
+(`gains`) and any number of columns is filtered with them (`innovations`): the residual itself, and
+what each candidate effect would add to d_t or r_t. Whitened by the innovations' covariance, each
+candidate becomes a small least-squares problem.
+
+`smoother` runs back (de Jong 1989; Koopman & Shephard 1992): with u_t and r_t its adjoints and D_t,
+N_t their covariances, d loglik / d R = (u u' - D) / 2 and d loglik / d Q = (r r' - N) / 2.
+
+Arrays are time-major: L steps, B runs, N states of the filter (n, or 2 n with coloured noise), C
+columns. A missing measurement is a False in `seen`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from grounded.frozen import Array
+
+UNKNOWN = 1e6  # standard deviations: how little is known of a state that was not measured at t = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Gains:
+    """What does not depend on the data: A (L, B, N, N), K (L, B, N, n), whitener (L, B, n, n)."""
+
+    A: Array
+    K: Array
+    whiten: Array  # W with W S W' = 1
+    logdet: Array  # (L, B) log det S over what was seen
+    seen: Array  # (L + 1, B, n) 1.0 or 0.0
+
+
+def transition(F: Array, phi: float | None) -> Array:
+    """A of the filter: F alone, or [[F, 1], [0, phi]] beside coloured noise."""
+    if phi is None:
+        return F
+    L, B, n, _ = F.shape
+    A = np.zeros((L, B, 2 * n, 2 * n))
+    A[:, :, :n, :n] = F
+    i = np.arange(n)
+    A[:, :, i, n + i] = 1.0
+    A[:, :, n + i, n + i] = phi
+    return A
+
+
+def gains(A: Array, Q: Array, R: Array, seen: Array, start: Array) -> Gains:
+    """The covariance recursion.
+
+    Args:
+        A: (L, B, N, N).
+        Q: variances (L, B, N), or broadcastable to it.
+        R: variances (L + 1, B, n), or broadcastable.
+        seen: (L + 1, B, n), 1.0 where a measurement is there.
+        start: (B, N - n) variance of the coloured noise at t = 0.
+
+    Raises:
+        numpy.linalg.LinAlgError: when a covariance is not finite.
+    """
+    L, B, N, _ = A.shape
+    n = seen.shape[-1]
+    Q, R = np.broadcast_to(Q, (L, B, N)), np.broadcast_to(R, (L + 1, B, n))
+    K, whiten, logdet = np.empty((L, B, N, n)), np.empty((L, B, n, n)), np.empty((L, B))
+    i, k = np.arange(n), np.arange(N)
+    P = np.zeros((B, N, N))
+    P[:, i, i] = R[0] * np.where(seen[0] > 0, 1.0, UNKNOWN)
+    P[:, k[n:], k[n:]] = start
+    whole = bool(seen.all())
+    for t in range(L):
+        P = A[t] @ P @ A[t].swapaxes(1, 2)
+        P[:, k, k] += Q[t]
+        S, PH = P[:, :n, :n].copy(), P[:, :, :n]
+        if whole:
+            S[:, i, i] += R[t + 1]
+        else:
+            mask = seen[t + 1]
+            S *= mask[:, :, None] * mask[:, None, :]
+            S[:, i, i] += np.where(mask > 0, R[t + 1], 1.0)
+            PH = PH * mask[:, None, :]
+        chol = np.linalg.cholesky(S)
+        W = np.linalg.inv(chol)
+        half = PH @ W.swapaxes(1, 2)
+        K[t] = half @ W
+        P = P - half @ half.swapaxes(1, 2)
+        whiten[t] = W
+        logdet[t] = 2 * np.log(chol[:, i, i]).sum(axis=1)
+    return Gains(A, K, whiten, logdet, seen)
+
+
+def innovations(g: Gains, d: Array, r: Array, *, track: bool = False) -> tuple[Array, Array | None]:
+    """Filters columns: whitened innovations (L, B, n, C), and the filtered e (L + 1, B, n, C).
+
+    Args:
+        g: the gains.
+        d: what each column adds to a step (L, B, n, C).
+        r: what each column adds to a measurement (L + 1, B, n, C), or (L + 1, 1, 1, 1) of zeros.
+        track: also return the filtered errors.
+    """
+    L, B, n, C = d.shape
+    N = g.A.shape[-1]
+    out = np.empty((L, B, n, C))
+    filtered = np.empty((L + 1, B, n, C)) if track else None
+    M = np.zeros((B, N, C))
+    M[:, :n] = r[0] * g.seen[0][:, :, None]
+    if filtered is not None:
+        filtered[0] = M[:, :n]
+    whole = bool(g.seen.all())
+    for t in range(L):
+        M = g.A[t] @ M
+        M[:, :n] += d[t]
+        nu = r[t + 1] - M[:, :n]
+        if not whole:
+            nu = nu * g.seen[t + 1][:, :, None]
+        M += g.K[t] @ nu
+        out[t] = g.whiten[t] @ nu
+        if filtered is not None:
+            filtered[t + 1] = M[:, :n]
+    return out, filtered
+
+
+@dataclass(frozen=True, eq=False)
+class Adjoint:
+    """What the likelihood says of each disturbance: u, D (L, B, n) of v; r, N (L, B, N) of w."""
+
+    u: Array
+    D: Array
+    r: Array
+    N: Array
+
+
+def smoother(g: Gains, white: Array) -> Adjoint:
+    """The backward pass for one column of whitened innovations, (L, B, n)."""
+    L, B, N, _ = g.A.shape
+    n = white.shape[-1]
+    u, D = np.empty((L, B, n)), np.empty((L, B, n))
+    r, Nd = np.empty((L, B, N)), np.empty((L, B, N))
+    q, Nq = np.zeros((B, N)), np.zeros((B, N, N))
+    for t in range(L - 1, -1, -1):
+        W, K = g.whiten[t], g.K[t]
+        Wt, Kt = W.swapaxes(1, 2), K.swapaxes(1, 2)
+        ut = (Wt @ white[t][:, :, None])[:, :, 0] - (Kt @ q[:, :, None])[:, :, 0]
+        NK = Nq @ K
+        Dt = Wt @ W + Kt @ NK
+        seen = g.seen[t + 1]
+        u[t], D[t] = ut * seen, np.einsum("bii->bi", Dt) * seen
+        q = q.copy()
+        q[:, :n] += ut * seen
+        Nr = Nq.copy()
+        NK = NK * seen[:, None, :]
+        Nr[:, :, :n] -= NK
+        Nr[:, :n, :] -= NK.swapaxes(1, 2)
+        Nr[:, :n, :n] += Dt * seen[:, :, None] * seen[:, None, :]
+        r[t], Nd[t] = q, np.einsum("bii->bi", Nr)
+        At = g.A[t].swapaxes(1, 2)
+        q = (At @ q[:, :, None])[:, :, 0]
+        Nq = At @ Nr @ g.A[t]
+    return Adjoint(u, D, r, Nd)

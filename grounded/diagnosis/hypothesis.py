@@ -1,0 +1,235 @@
+"""What a hypothesis predicts: the model, some effects with their values, its parameters shifted.
+
+    x_{t+1} = f_h(x_t, commands)        y_t = x_t + offset_h(x)
+
+Effects on inputs act on the command sequence of the whole trial; rates act by Strang splitting,
+half before and half after the model's step; sensor effects act on what is compared with the log.
+The very equations that `grounded.effects.wrap` adopts, evaluated on arrays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from grounded.compile import Named
+from grounded.diagnosis.data import Data, shifted
+from grounded.effects import (
+    Effect,
+    InputFamily,
+    MemoryFamily,
+    ParamFamily,
+    RateFamily,
+    SensorDelayFamily,
+    SensorFamily,
+)
+from grounded.effects.registry import partner
+from grounded.frozen import Array
+from grounded.model import Model
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """Effects with their values, and shifts of the model's parameters (k,) with a prior.
+
+    `spread` is the prior standard deviation of every shift in units of `param_scale`; 0: the
+    parameters are taken as they are.
+    """
+
+    effects: tuple[Effect, ...] = ()
+    values: tuple[Mapping[str, float], ...] = ()
+    shift: Array | None = None
+    spread: float = 0.0
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The effects' names."""
+        return tuple(effect.name for effect in self.effects)
+
+    @property
+    def theta(self) -> Array:
+        """Free values of all effects in order, (k_effects,)."""
+        pairs = zip(self.effects, self.values, strict=True)
+        return np.array([v[q.name] for e, v in pairs for q in e.free], float)
+
+    def with_theta(self, theta: Array) -> Hypothesis:
+        """The same effects with other free values, kept inside their bounds."""
+        values, at = [], 0
+        for effect in self.effects:
+            some: dict[str, float] = dict(effect.fixed)
+            for q in effect.free:
+                some[q.name] = float(np.clip(theta[at], q.low, q.high))
+                at += 1
+            values.append(some)
+        return replace(self, values=tuple(values))
+
+    def plus(self, effect: Effect, values: Mapping[str, float]) -> Hypothesis:
+        """One more effect."""
+        whole = {**effect.fixed, **values}
+        return replace(self, effects=(*self.effects, effect), values=(*self.values, whole))
+
+    def minus(self, name: str) -> Hypothesis:
+        """One effect less."""
+        keep = [i for i, effect in enumerate(self.effects) if effect.name != name]
+        return replace(
+            self,
+            effects=tuple(self.effects[i] for i in keep),
+            values=tuple(self.values[i] for i in keep),
+        )
+
+
+def param_scale(model: Model) -> Array:
+    """What a relative error of 1 means for each parameter (k,): its size, or its range if zero."""
+    found = []
+    for param in model.params.values():
+        size = abs(param.value)
+        if size == 0 and param.low is not None and param.high is not None:
+            size = 0.5 * (param.high - param.low)
+        found.append(size)
+    return np.array(found, float)
+
+
+@dataclass(frozen=True, eq=False)
+class Predictor:
+    """Evaluates hypotheses on one Data. Shapes: tracks (L + 1, B, n), inputs (L, B, m)."""
+
+    data: Data
+    _inputs: dict[Any, Array] = field(default_factory=dict)
+
+    def inputs(self, h: Hypothesis) -> Array:
+        """What the actuators receive under a hypothesis, by run (L, B, m)."""
+        acting = [
+            (e, v)
+            for e, v in zip(h.effects, h.values, strict=True)
+            if isinstance(e.family, InputFamily | MemoryFamily)
+        ]
+        key = tuple((e.name, tuple(sorted(v.items()))) for e, v in acting)
+        if key not in self._inputs:
+            if len(self._inputs) > 64:
+                self._inputs.clear()
+            u = self.data.commands
+            for effect, values in acting:
+                u = transformed(effect, values, u, self.data)
+            self._inputs[key] = self.data.runs(self.data.delayed(u))
+        return self._inputs[key]
+
+    def params(self, h: Hypothesis) -> Array:
+        """The model's parameters under a hypothesis (k,)."""
+        p = np.array(self.data.model.values)
+        if h.shift is not None:
+            p = p + h.shift
+        names = self.data.model.param_names
+        for effect, values in zip(h.effects, h.values, strict=True):
+            if isinstance(effect.family, ParamFamily):
+                p[names.index(effect.site.target)] += values["d"]
+        return p
+
+    def step(self, x: Array, u: Array, p: Array) -> Array:
+        """The model's own step at any leading shape."""
+        model = self.data.model
+        flat = model.system.step(
+            np.ascontiguousarray(x.reshape(-1, model.n)),
+            np.ascontiguousarray(u.reshape(-1, model.m)),
+            p,
+            self.data.dt,
+        )
+        return flat.reshape(x.shape)
+
+    def next(self, h: Hypothesis, x: Array) -> Array:
+        """f_h at the start of every step: x (L, B, n) -> (L, B, n)."""
+        return self.advance(h, x, self.inputs(h), self.data.time)
+
+    def advance(self, h: Hypothesis, x: Array, u: Array, t: Array) -> Array:
+        """One step of a hypothesis from x (..., n) with received inputs u (..., m) at times t."""
+        p, dt = self.params(h), self.data.dt
+        rates = [
+            (e, v)
+            for e, v in zip(h.effects, h.values, strict=True)
+            if isinstance(e.family, RateFamily)
+        ]
+        if not rates:
+            return self.step(x, u, p)
+        before = self.added_rate(rates, x, u, p, t)
+        after = self.step(x + 0.5 * dt * before, u, p)
+        later = self.added_rate(rates, after, u, p, t + dt)
+        result = after + 0.5 * dt * later
+        for i, j in self.tied():
+            result[..., j] += later[..., i] - before[..., i]
+        return result
+
+    def tied(self) -> list[tuple[int, int]]:
+        """(heading, heading rate) where the rate is only carried along."""
+        names = self.data.model.state_names
+        key = ("tied",)
+        if key not in self._inputs:
+            found = [(i, k) for i, n in enumerate(names) if (k := partner(self.data.model, n))]
+            self._inputs[key] = np.array([(i, names.index(k)) for i, k in found]).reshape(-1, 2)
+        return [(int(i), int(j)) for i, j in self._inputs[key]]
+
+    def added_rate(self, rates: Any, x: Array, u: Array, p: Array, t: Array) -> Array:
+        """Sum of the rates of (effect, values) pairs at x (..., n), (..., n) per second."""
+        model, dt = self.data.model, self.data.dt
+        names = model.state_names
+        s = Named("state", names, list(np.moveaxis(x, -1, 0)))
+        a = Named("input", model.input_names, list(np.moveaxis(u, -1, 0)))
+        own: Any = {}
+        if any(effect.family.needs_own for effect, _ in rates):
+            rate = model.difference(self.step(x, u, p), x) / dt
+            own = Named("state", names, list(np.moveaxis(rate, -1, 0)))
+        total = np.zeros_like(x)
+        for effect, values in rates:
+            added = effect.family.rate(s, a, own, t, values, effect.site)
+            for name, value in added.items():
+                total[..., names.index(name)] += value
+        return total
+
+    def offset(self, h: Hypothesis, track: Array) -> Array | float:
+        """y - x under a hypothesis along a track (L + 1, B, n); 0.0 where nothing is measured wrong."""
+        sensors = [
+            (e, v)
+            for e, v in zip(h.effects, h.values, strict=True)
+            if isinstance(e.family, SensorFamily | SensorDelayFamily)
+        ]
+        if not sensors:
+            return 0.0
+        names, total = self.data.model.state_names, np.zeros_like(track)
+        for effect, values in sensors:
+            i = names.index(effect.site.target)
+            total[..., i] += sensor_offset(effect, values, track[..., i], self.data.dt)
+        return total
+
+
+def sensor_offset(effect: Effect, values: Mapping[str, float], track: Array, dt: float) -> Array:
+    """What a sensor effect adds to the log of its state along a track (L + 1, B)."""
+    if isinstance(effect.family, SensorFamily):
+        return np.asarray(effect.family.measure(track, values) - track)
+    steps = values["d"] / dt
+    slope = np.vstack([track[1:2] - track[:1], np.diff(track, axis=0)])
+    whole, part = int(np.floor(steps)), steps - np.floor(steps)
+    first = track[:1] - slope[:1] * np.arange(whole + 1, 0, -1)[:, None]  # as if it came so
+    line = np.concatenate([first, track])
+    count = len(track)
+    old = (1 - part) * line[1 : count + 1] + part * line[:count]
+    return old - track
+
+
+def transformed(effect: Effect, values: Mapping[str, float], u: Array, data: Data) -> Array:
+    """Commands (S, T, m) after an input or memory effect."""
+    family, names = effect.family, data.model.input_names
+    out = u.copy()
+    for target in effect.site.targets:
+        j = names.index(target)
+        if isinstance(family, InputFamily):
+            t = np.arange(u.shape[1]) * data.dt
+            out[:, :, j] = family.effect(u[:, :, j], t[None, :], values)
+        elif isinstance(family, MemoryFamily):
+            if family.name == "delay":  # the same as its queue, at once
+                out[:, :, j] = shifted(u[:, :, j], data.held[:, j], values["d"] / data.dt)
+                continue
+            z = tuple([data.held[:, j]] * family.depth(values, data.dt))
+            for t in range(u.shape[1]):
+                out[:, t, j], z = family.advance(u[:, t, j], z, values, data.dt)
+    return out

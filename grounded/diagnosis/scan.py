@@ -1,0 +1,295 @@
+"""A first look at every candidate: what would it add, and how much likelier would the data be?
+
+Each candidate's columns (what it adds to a step, or to a measurement) are filtered with the gains
+of one fit and compared with its innovations:
+
+    linear quantity     a column for a unit of it; its value in one solve
+    scanned quantity    a column for each grid value: the whole change, coefficient one; together
+                        with linear quantities (a patch's strength, a wave's two amplitudes) these
+                        are solved at each grid point
+
+What the fit already estimates (its effects' values, the parameters' shifts) is projected out, so
+that a candidate is credited only with what they can't explain.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from grounded.compile import Named
+from grounded.diagnosis import filter as kalman
+from grounded.diagnosis.hypothesis import Predictor, sensor_offset, transformed
+from grounded.diagnosis.refine import Fit
+from grounded.effects import (
+    Effect,
+    InputFamily,
+    MemoryFamily,
+    ParamFamily,
+    RateFamily,
+    SensorDelayFamily,
+    SensorFamily,
+)
+from grounded.frozen import Array
+
+BLOCK = 160  # columns filtered at once
+MOST_NUMBERS = 1.2e7  # of one block of whitened columns
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What a scan found of a candidate: the best values, the gain in log-likelihood there."""
+
+    effect: Effect
+    values: dict[str, float]
+    gain: float
+    second: dict[str, float] | None = None  # another grid point that is nearly as good
+
+
+@dataclass(frozen=True, eq=False)
+class _Column:
+    effect: int  # index of the candidate
+    point: int  # index of its grid point
+    name: str  # linear quantity, or "" for the whole change at a grid point
+    d: Array  # (L, B, n) or empty
+    r: Array  # (L + 1, B, n) or empty
+
+
+def scan(predictor: Predictor, fit: Fit, candidates: Sequence[Effect]) -> list[Look]:
+    """Every candidate beside what `fit` already holds; same order as the candidates."""
+    context = _Context(predictor, fit)
+    results: dict[tuple[int, int], list[tuple[str, float, Array, Array]]] = {}
+    pending: list[_Column] = []
+    size = max(8, min(BLOCK, int(MOST_NUMBERS / fit.white.size)))
+    for i, effect in enumerate(candidates):
+        for point, grid in enumerate(grid_points(effect)):
+            together = context.columns(i, point, effect, grid)
+            if pending and len(pending) + len(together) > size:
+                context.filter(pending, results)
+                pending = []
+            pending += together
+    if pending:
+        context.filter(pending, results)
+    return [context.best(i, effect, results) for i, effect in enumerate(candidates)]
+
+
+def grid_points(effect: Effect) -> list[dict[str, float]]:
+    """All combinations of scanned values; one empty point for an effect that is all linear."""
+    scanned = [q for q in effect.free if q.grid]
+    grids = [q.grid for q in scanned]
+    names = [q.name for q in scanned]
+    return [dict(zip(names, point, strict=True)) for point in itertools.product(*grids)]
+
+
+class _Context:
+    """What all candidates share: the fit's track, Jacobian and gains."""
+
+    def __init__(self, predictor: Predictor, fit: Fit) -> None:
+        self.predictor, self.fit = predictor, fit
+        data, h = predictor.data, fit.hypothesis
+        model = data.model
+        L, B = data.time.shape
+        self.x = fit.track[:-1]
+        self.u = predictor.inputs(h)
+        self.p = predictor.params(h)
+        self.after = predictor.advance(h, self.x, self.u, data.time)
+        flat = (
+            np.ascontiguousarray(self.x.reshape(-1, model.n)),
+            np.ascontiguousarray(self.u.reshape(-1, model.m)),
+        )
+        self.needs_params = True
+        f_x, self.f_u, f_p = model.system.sensitivities(*flat, self.p, data.dt)
+        self.F = f_x.reshape(L, B, model.n, model.n)
+        self.f_p = f_p.reshape(L, B, model.n, -1)
+        noise = fit.noise
+        phi = noise.structure.phi(data.dt)
+        self.gains = kalman.gains(
+            kalman.transition(self.F, phi),
+            noise.process(data.dt),
+            noise.measurement(L),
+            data.seen,
+            noise.start(B),
+        )
+        self.white = fit.white
+        self.base = self._base()
+
+    def _base(self) -> Array:
+        """Whitened columns of what the fit estimates, orthogonalised with their priors: Gram inverse."""
+        self.base_gram = self.fit.gram.sum(axis=0) + np.diag(self.fit.prior)
+        return np.linalg.pinv(self.base_gram, hermitian=True) if len(self.base_gram) else np.zeros((0, 0))
+
+    def columns(self, i: int, point: int, effect: Effect, grid: dict[str, float]) -> list[_Column]:
+        family = effect.family
+        if isinstance(family, RateFamily):
+            return self._rate(i, point, effect, grid)
+        if isinstance(family, InputFamily | MemoryFamily):
+            return self._input(i, point, effect, grid)
+        if isinstance(family, SensorFamily | SensorDelayFamily):
+            return self._sensor(i, point, effect, grid)
+        if isinstance(family, ParamFamily):
+            k = self.predictor.data.model.param_names.index(effect.site.target)
+            return [_Column(i, point, "d", self.f_p[..., k], _EMPTY)]
+        return []
+
+    def _linear(self, effect: Effect) -> list[tuple[str, float]]:
+        """Linear quantities and a small amount of each."""
+        return [(q.name, 1e-3) for q in effect.free if not q.grid]
+
+    def _rate(self, i: int, point: int, effect: Effect, grid: dict[str, float]) -> list[_Column]:
+        predictor, dt = self.predictor, self.predictor.data.dt
+        linear = self._linear(effect)
+        names = [q.name for q in effect.free if not q.grid]
+        found = []
+        for name, amount in linear or [("", 1.0)]:
+            values = {**effect.fixed, **dict.fromkeys(names, 0.0), **grid}
+            if name:
+                values[name] = amount
+            before = self._rates_at(effect, values, 0)
+            later = self._rates_at(effect, values, 1)
+            d = 0.5 * dt * ((self.F @ before[..., None])[..., 0] + later)
+            for a, b in predictor.tied():
+                d[..., b] += later[..., a] - before[..., a]
+            found.append(_Column(i, point, name, d / amount, _EMPTY))
+        return found
+
+    def _rates_at(self, effect: Effect, values: dict[str, float], when: int) -> Array:
+        """The added rate at the start (0) or the end (1) of every step; own rates computed once."""
+        data = self.predictor.data
+        x = self.x if when == 0 else self.after
+        t = data.time if when == 0 else data.time + data.dt
+        model = data.model
+        names = model.state_names
+        s = Named("state", names, list(np.moveaxis(x, -1, 0)))
+        a = Named("input", model.input_names, list(np.moveaxis(self.u, -1, 0)))
+        own = self._own(when) if effect.family.needs_own else {}  # type: ignore[attr-defined]
+        total = np.zeros_like(x)
+        rate = effect.family.rate(s, a, own, t, values, effect.site)  # type: ignore[attr-defined]
+        for name, value in rate.items():
+            total[..., names.index(name)] += value
+        return total
+
+    def _own(self, when: int) -> Named:
+        cache = self.__dict__.setdefault("own_rates", {})
+        if when not in cache:
+            data = self.predictor.data
+            x = self.x if when == 0 else self.after
+            ahead = self.after if when == 0 else self.predictor.step(x, self.u, self.p)
+            rate = data.model.difference(ahead, x) / data.dt
+            cache[when] = Named("state", data.model.state_names, list(np.moveaxis(rate, -1, 0)))
+        return cache[when]
+
+    def _input(self, i: int, point: int, effect: Effect, grid: dict[str, float]) -> list[_Column]:
+        data, predictor = self.predictor.data, self.predictor
+        acting = self.fit.hypothesis
+        found = []
+        for name, amount in self._linear(effect) or [("", 1.0)]:
+            values = {**effect.fixed, **grid}
+            if name:
+                values[name] = amount
+            u = transformed(effect, values, data.commands, data)
+            for other, v in zip(acting.effects, acting.values, strict=True):
+                if isinstance(other.family, InputFamily | MemoryFamily):
+                    u = transformed(other, v, u, data)
+            received = data.runs(data.delayed(u))
+            after = predictor.advance(acting, self.x, received, data.time)
+            d = data.model.difference(after, self.after) / amount
+            found.append(_Column(i, point, name, d, _EMPTY))
+        return found
+
+    def _sensor(self, i: int, point: int, effect: Effect, grid: dict[str, float]) -> list[_Column]:
+        data = self.predictor.data
+        k = data.model.state_names.index(effect.site.target)
+        found = []
+        for name, amount in self._linear(effect) or [("", 1.0)]:
+            values = {**effect.fixed, **grid}
+            if name:
+                values[name] = amount
+            r = np.zeros_like(self.fit.track)
+            r[..., k] = -sensor_offset(effect, values, self.fit.track[..., k], data.dt) / amount
+            found.append(_Column(i, point, name, _EMPTY, r))
+        return found
+
+    def filter(
+        self,
+        block: list[_Column],
+        results: dict[tuple[int, int], list[tuple[str, float, Array, Array]]],
+    ) -> None:
+        """Whitens a block of columns and keeps their products with residual, base and each other."""
+        L, B, n = self.white.shape
+        d = np.zeros((L, B, n, len(block)))
+        r = np.zeros((L + 1, B, n, len(block)))
+        for j, column in enumerate(block):
+            if column.d.size:
+                d[..., j] = column.d
+            if column.r.size:
+                r[..., j] = column.r
+        white, _ = kalman.innovations(self.gains, d, r)
+        flat = white.reshape(-1, len(block))
+        against = flat.T @ self.white.reshape(-1)
+        base = self._base_white()
+        cross = flat.T @ base
+        own = flat.T @ flat
+        for j, column in enumerate(block):
+            mates = [
+                k
+                for k, other in enumerate(block)
+                if other.effect == column.effect and other.point == column.point
+            ]
+            entry = (column.name, float(against[j]), cross[j], own[j, mates])
+            results.setdefault((column.effect, column.point), []).append(entry)
+
+    def _base_white(self) -> Array:
+        """Whitened columns of what the fit estimates, (L B n, C)."""
+        if "base_white" not in self.__dict__:
+            from grounded.diagnosis.refine import base_columns
+
+            d, r = base_columns(self.predictor, self.fit)
+            if d.shape[-1]:
+                white, _ = kalman.innovations(self.gains, d, r)
+            else:
+                white = np.zeros((*d.shape[:-1], 0))
+            self.base_white = white.reshape(self.white.size, d.shape[-1])
+            self.base_score = self.base_white.T @ self.white.reshape(-1)
+            self.base_score = self.base_score + self.fit.prior_pull(self.predictor.data)
+        return self.base_white
+
+    def best(
+        self,
+        i: int,
+        effect: Effect,
+        results: dict[tuple[int, int], list[tuple[str, float, Array, Array]]],
+    ) -> Look:
+        """The grid point with the largest gain, its linear values solved."""
+        looks = []
+        for point, grid in enumerate(grid_points(effect)):
+            entries = results.get((i, point), [])
+            if not entries:
+                continue
+            names = [entry[0] for entry in entries]
+            score = np.array([entry[1] for entry in entries])
+            cross = np.array([entry[2] for entry in entries]).reshape(len(entries), -1)
+            gram = np.array([entry[3] for entry in entries])
+            score = score - cross @ self.base @ self.base_score
+            gram = gram - cross @ self.base @ cross.T
+            size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+            if names == [""]:
+                looks.append((-float(score[0]) - 0.5 * float(gram[0, 0]), dict(grid)))
+                continue
+            if not np.isfinite(size).all() or (size < 1e-8).any():
+                looks.append((0.0, {**grid, **dict.fromkeys(names, 0.0)}))
+                continue
+            scaled = gram / np.outer(size, size)
+            value = -np.linalg.lstsq(scaled, score / size, rcond=1e-9)[0] / size
+            gain = -float(value @ score) - 0.5 * float(value @ gram @ value)
+            looks.append((gain, {**grid, **dict(zip(names, value.tolist(), strict=True))}))
+        if not looks:
+            return Look(effect, {}, 0.0)
+        looks.sort(key=lambda look: -look[0])
+        second = looks[1][1] if len(looks) > 1 and looks[1][0] > looks[0][0] - 3 else None
+        return Look(effect, looks[0][1], looks[0][0], second)
+
+
+_EMPTY: Array = np.zeros(0)

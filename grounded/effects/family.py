@@ -1,0 +1,249 @@
+"""What an effect is: a small change of ANY model, with a few quantities to be estimated.
+
+An effect's name is `family:target`. A family says where it acts and writes one equation in plain
+NumPy; the same equation is traced into the adopted model, evaluated on whole trials by the
+diagnosis, and listed in docs/effects.md.
+
+    InputFamily     u_eff = effect(u, t, c)                       what the actuator makes of a command
+    MemoryFamily    u_eff, z+ = advance(u, z, c, dt)              the same, with a memory z
+    RateFamily      ds/dt = model + rate(s, a, own, t, c)         added to the rates of states
+    SensorFamily    y = measure(s, c),  s = recover(y, c)         what is logged of a state
+    ParamFamily     p + c                                         the model's own parameter is wrong
+
+c are the effect's quantities by name. A quantity without a scan grid is absent at zero and the
+equation is (to first order) linear in it; one with a grid is scanned first, then refined. A fixed
+quantity is a constant that the data's scale chose (the width of a smoothed sign), never fitted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from grounded.errors import GroundedError, nearest
+from grounded.frozen import Array
+from grounded.model import Model
+
+Values = Mapping[str, Any]  # by name: numbers, arrays of samples, or traced expressions
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """One number of an effect.
+
+    Args:
+        name: short name, `c`.
+        unit: SI unit.
+        grid: values to scan; empty for a linear coefficient.
+        low, high: bounds that an estimate keeps.
+        fixed: a constant of the effect, not estimated; its value is `start`.
+        start: value at which the effect is absent (or, fixed, the value itself).
+        places: how many independent values the grid looks at, for the price of looking.
+    """
+
+    name: str
+    unit: str = "1"
+    grid: tuple[float, ...] = ()
+    low: float = -np.inf
+    high: float = np.inf
+    fixed: bool = False
+    start: float = 0.0
+    places: float = 1.0
+
+
+@dataclass(frozen=True)
+class Scales:
+    """Typical sizes of the signals: what a grid or a smoothing width is measured in.
+
+    Args:
+        low, high: smallest and largest value of each state and input, by name.
+        quantiles: (21,) quantiles of the absolute values of each signal, by name.
+        dt: control step [s].
+        duration: longest trial [s].
+    """
+
+    low: Mapping[str, float] = field(default_factory=dict)
+    high: Mapping[str, float] = field(default_factory=dict)
+    quantiles: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    dt: float = 0.05
+    duration: float = 10.0
+
+    def peak(self, name: str) -> float:
+        """Largest absolute value, 1 where nothing is known."""
+        value = max(abs(self.low.get(name, -1.0)), abs(self.high.get(name, 1.0)))
+        return value if value > 0 else 1.0
+
+    def spread(self, name: str) -> float:
+        """High minus low, never zero."""
+        value = self.high.get(name, 1.0) - self.low.get(name, -1.0)
+        return value if value > 1e-12 else 1.0
+
+    def fractions(self, name: str, count: int, top: float = 1.0) -> tuple[float, ...]:
+        """`count` thresholds up to `top` times the peak of |signal|, evenly spaced."""
+        return tuple(float(g) for g in np.linspace(0, top * self.peak(name), count + 1)[1:])
+
+
+@dataclass(frozen=True)
+class Site:
+    """Where an effect is built: the model, the targets, the sizes of its signals."""
+
+    model: Model
+    targets: tuple[str, ...]
+    scales: Scales
+
+    @property
+    def target(self) -> str:
+        """The first target, for effects that have one."""
+        return self.targets[0]
+
+    def unit(self, name: str) -> str:
+        """Unit of a state or an input."""
+        return self.model.states.get(name) or self.model.inputs.get(name) or "1"
+
+    def role(self, role: str) -> str | None:
+        """The state that plays a role, or None."""
+        found = self.model.roles.get(role)
+        return found if isinstance(found, str) else (found[0] if found else None)
+
+
+def per(unit: str, by: str = "s") -> str:
+    """unit / by, readable: per("m/s", "s") is "m/s^2"."""
+    if unit == "1":
+        return f"1/{by}"
+    return f"{unit}^2" if unit.endswith(f"/{by}") else f"{unit}/{by}"
+
+
+@dataclass(frozen=True)
+class Family:
+    """A family of effects: what it is called, where it applies, what it estimates.
+
+    Args:
+        name: `dead_zone`.
+        equation: one line of maths for docs and messages.
+        sentence: "the {targets} ...": what it means in the workshop, after "because".
+        targets: all targets of a model to which it can apply, joined by "+".
+        quantities: the numbers to estimate at a site.
+        lookalikes: families that the same data may explain.
+    """
+
+    name: str
+    equation: str
+    sentence: str
+    targets: Callable[[Model], Sequence[str]]
+    quantities: Callable[[Site], tuple[Quantity, ...]]
+    lookalikes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class InputFamily(Family):
+    """effect(u, t, c) -> what the actuator receives of a command u at time t."""
+
+    effect: Callable[[Any, Any, Any], Any] = lambda u, t, c: u
+    timed: bool = False
+
+
+@dataclass(frozen=True)
+class MemoryFamily(Family):
+    """advance(u, z, c, dt) -> (mean input over the step, next memory); z has `depth` entries.
+
+    `depth(values, dt)`: how many memory states the effect needs, all starting at the input that
+    was held before t = 0.
+    """
+
+    advance: Callable[[Any, tuple[Any, ...], Any, Any], tuple[Any, tuple[Any, ...]]] = (
+        lambda u, z, c, dt: (u, z)
+    )
+    depth: Callable[[Mapping[str, float], float], int] = lambda values, dt: 1
+
+
+@dataclass(frozen=True)
+class RateFamily(Family):
+    """rate(s, a, own, t, c, site) -> {state: added rate}; `own` are the model's own rates."""
+
+    rate: Callable[[Any, Any, Any, Any, Any, Site], Values] = lambda s, a, own, t, c, site: {}
+    timed: bool = False
+    needs_own: bool = False
+
+
+@dataclass(frozen=True)
+class SensorFamily(Family):
+    """measure(value, c) -> logged value of the target state; recover is its inverse."""
+
+    measure: Callable[[Any, Any], Any] = lambda value, c: value
+    recover: Callable[[Any, Any], Any] = lambda value, c: value
+
+
+@dataclass(frozen=True)
+class SensorDelayFamily(Family):
+    """The logged value of the target state is `delay` seconds old."""
+
+
+@dataclass(frozen=True)
+class ParamFamily(Family):
+    """The model's own parameter differs from its nominal value."""
+
+
+@dataclass(frozen=True)
+class Effect:
+    """A family at a target: what `family:target` names. Built by `grounded.effects.effect`."""
+
+    family: Family
+    site: Site
+    quantities: tuple[Quantity, ...]
+
+    @property
+    def name(self) -> str:
+        """`family:target`."""
+        return f"{self.family.name}:{'+'.join(self.site.targets)}"
+
+    @property
+    def free(self) -> tuple[Quantity, ...]:
+        """The quantities that are estimated."""
+        return tuple(q for q in self.quantities if not q.fixed)
+
+    @property
+    def fixed(self) -> dict[str, float]:
+        """The constants."""
+        return {q.name: q.start for q in self.quantities if q.fixed}
+
+    @property
+    def places(self) -> float:
+        """How many places the scan looks at (the price of looking is its logarithm)."""
+        return float(np.prod([max(q.places, 1.0) for q in self.free]))
+
+    def complete(self, values: Mapping[str, float]) -> Mapping[str, float]:
+        """All quantities with a value: the given ones, the constants.
+
+        Raises:
+            GroundedError: for a name that is not a quantity, or one that is missing.
+        """
+        names = [q.name for q in self.quantities]
+        for name in values:
+            if name not in names:
+                raise GroundedError(
+                    f"effect '{self.name}' has no quantity '{name}': {nearest(name, names)}"
+                )
+        whole = {**self.fixed, **{name: float(value) for name, value in values.items()}}
+        missing = [name for name in names if name not in whole]
+        if missing:
+            raise GroundedError(f"effect '{self.name}' needs a value for '{missing[0]}'")
+        return MappingProxyType({name: whole[name] for name in names})
+
+
+def scales_of(model: Model, states: Array, inputs: Array, dt: float, duration: float) -> Scales:
+    """Sizes of the signals in recorded data: states (N, n), inputs (N, m)."""
+    low, high, quantiles = {}, {}, {}
+    named = [(model.state_names, states), (model.input_names, inputs)]
+    for names, values in named:
+        for i, name in enumerate(names):
+            column = values[np.isfinite(values[:, i]), i]
+            if not len(column):
+                continue
+            low[name], high[name] = (float(q) for q in np.quantile(column, [0.002, 0.998]))
+            marks = np.quantile(np.abs(column), np.linspace(0, 1, 21))
+            quantiles[name] = tuple(float(q) for q in marks)
+    return Scales(low, high, quantiles, dt, duration)

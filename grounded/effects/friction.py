@@ -1,0 +1,118 @@
+"""What opposes a motion: viscous, Coulomb, quadratic, static.
+
+    v' = model + rate(v)
+
+Viscous and quadratic drag act on any velocity. Coulomb friction's sign is smoothed over a small
+width w (a hundredth of the largest speed): with noise around zero a sharp sign would chatter.
+Stiction holds what is slower than v_s: the model's own rate is cancelled up to c,
+
+    v' = own - exp(-(v / v_s)^2) clip(own + 2 v, -c, c)               (the 2 is 2 per second)
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from grounded.effects import places
+from grounded.effects.family import Quantity, RateFamily, Site, Values, per
+
+
+def _viscous(site: Site) -> tuple[Quantity, ...]:
+    return (Quantity("k", "1/s"),)
+
+
+def _width(site: Site, part: float) -> float:
+    return part * site.scales.peak(site.target)
+
+
+def _coulomb(site: Site) -> tuple[Quantity, ...]:
+    unit = site.unit(site.target)
+    return (
+        Quantity("c", per(unit)),
+        Quantity("width", unit, fixed=True, start=_width(site, 0.01)),
+    )
+
+
+def _quadratic(site: Site) -> tuple[Quantity, ...]:
+    unit = site.unit(site.target)
+    return (Quantity("k", _inverse(unit)),)
+
+
+def _inverse(unit: str) -> str:
+    return {"m/s": "1/m", "rad/s": "1/rad"}.get(unit, f"1/({unit} s)")
+
+
+def _stiction(site: Site) -> tuple[Quantity, ...]:
+    unit, peak = site.unit(site.target), site.scales.peak(site.target)
+    grid = tuple(float(v) for v in np.geomspace(0.05, 4.0, 8) * peak)
+    return (
+        Quantity("c", per(unit), grid, 0.0, np.inf, places=6),
+        Quantity("v_s", unit, fixed=True, start=0.05 * peak),
+    )
+
+
+def _viscous_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
+    return {site.target: -c["k"] * s[site.target]}
+
+
+def _coulomb_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
+    return {site.target: -c["c"] * np.tanh(s[site.target] / c["width"])}
+
+
+def _quadratic_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
+    v = s[site.target]
+    return {site.target: -c["k"] * v * np.abs(v)}
+
+
+def _stiction_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
+    v = s[site.target]
+    slow = v / c["v_s"]
+    drive = own[site.target] + 2.0 * v
+    held = np.minimum(np.maximum(drive, -c["c"]), c["c"])
+    return {site.target: -np.exp(-slow * slow) * held}
+
+
+viscous_friction = RateFamily(
+    name="viscous_friction",
+    equation="v' = model - k v",
+    sentence="{target} is damped by {k}",
+    targets=places.per_second,
+    quantities=_viscous,
+    lookalikes=("quadratic_drag", "coulomb_friction", "input_gain", "parameter"),
+    rate=_viscous_rate,
+)
+
+coulomb_friction = RateFamily(
+    name="coulomb_friction",
+    equation="v' = model - c sign(v)",
+    sentence="{target} is opposed by a dry friction of {c}",
+    targets=places.per_second,
+    quantities=_coulomb,
+    lookalikes=("dead_zone", "viscous_friction", "offset", "stiction"),
+    rate=_coulomb_rate,
+)
+
+quadratic_drag = RateFamily(
+    name="quadratic_drag",
+    equation="v' = model - k v |v|",
+    sentence="{target} is opposed by a drag of {k} times its square",
+    targets=places.per_second,
+    quantities=_quadratic,
+    lookalikes=("viscous_friction", "coulomb_friction", "saturation"),
+    rate=_quadratic_rate,
+)
+
+stiction = RateFamily(
+    name="stiction",
+    equation="v' = own - exp(-(v/v_s)^2) clip(own + 2 v, -c, c)",
+    sentence="{target} sticks until it is driven harder than {c}",
+    targets=places.per_second,
+    quantities=_stiction,
+    lookalikes=("stall", "dead_zone", "coulomb_friction"),
+    rate=_stiction_rate,
+    needs_own=True,
+)
+
+FAMILIES = (viscous_friction, coulomb_friction, quadratic_drag, stiction)

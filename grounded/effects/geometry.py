@@ -1,0 +1,179 @@
+"""How a vehicle moves over the ground: drift, slip, understeer, slope, places that differ.
+
+With the position (x, y), the heading psi and the speed v of the model's roles:
+
+    drift_world   x' += a,                     y' += b                     wind, a conveyor
+    drift_body    x' += a cos psi - b sin psi, y' += a sin psi + b cos psi carpet, misaligned wheels
+    side_slip     the velocity sideways is -k v^2 psi'  (k times the lateral acceleration, times v)
+    understeer    psi' = model / (1 + k v^2)
+    slope         v' += a cos psi + b sin psi                              a floor that tilts
+    patch         s' += c exp(-|q - q0|^2 / (2 radius^2)) at a place q0    a doormat, a puddle
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from grounded.effects import places
+from grounded.effects.family import Quantity, RateFamily, Site, Values, per
+from grounded.model import Model
+
+
+def _two_drifts(site: Site) -> tuple[Quantity, ...]:
+    unit = per(site.unit(site.target))
+    return (Quantity("a", unit), Quantity("b", unit))
+
+
+def _heading(site: Site) -> str:
+    name = places.heading(site.model)
+    assert name is not None
+    return name
+
+
+def _speed(site: Site) -> str:
+    name = places.speed(site.model)
+    assert name is not None
+    return name
+
+
+def _slip(site: Site) -> tuple[Quantity, ...]:
+    return (Quantity("k", "s^2/m"),)
+
+
+def _understeer(site: Site) -> tuple[Quantity, ...]:
+    fastest = site.scales.peak(_speed(site))
+    return (Quantity("k", "s^2/m^2", low=-0.5 / fastest**2, high=20 / fastest**2),)
+
+
+def _patch(site: Site) -> tuple[Quantity, ...]:
+    """Where the vehicle has been, on a grid of 6 x 6 places (or 12 along an axis)."""
+    where = places.position(site.model)
+    count = 6 if len(where) == 2 else 12
+    spreads = [site.scales.spread(name) for name in where]
+    found = [Quantity("c", per(site.unit(site.target)))]
+    for name, spread in zip(where, spreads, strict=True):
+        low = site.scales.low.get(name, -1.0)
+        grid = tuple(float(low + spread * (i + 0.5) / count) for i in range(count))
+        found.append(
+            Quantity(f"{name}0", site.unit(name), grid, low - spread, low + 2 * spread, places=count)
+        )
+    size = float(np.sqrt(np.prod(spreads))) if len(where) == 2 else spreads[0]
+    radii = tuple(size * r for r in (0.08, 0.16))
+    found.append(Quantity("radius", site.unit(where[0]), radii, 0.02 * size, size, places=2))
+    return tuple(found)
+
+
+def _patch_targets(model: Model) -> list[str]:
+    if not places.position(model):
+        return []
+    still = {*places.position(model)}
+    return [n for n in places.dynamic(model) if n not in still] + (
+        [h] if (h := places.heading(model)) else []
+    )
+
+
+def _world_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
+    x, y = site.targets
+    return {x: c["a"] + 0.0 * s[x], y: c["b"] + 0.0 * s[y]}
+
+
+def _body_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
+    x, y = site.targets
+    cos, sin = np.cos(s[_heading(site)]), np.sin(s[_heading(site)])
+    return {x: c["a"] * cos - c["b"] * sin, y: c["a"] * sin + c["b"] * cos}
+
+
+def _slip_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
+    x, y = site.targets
+    psi, v = s[_heading(site)], s[_speed(site)]
+    aside = -c["k"] * v * v * own[_heading(site)]
+    return {x: -aside * np.sin(psi), y: aside * np.cos(psi)}
+
+
+def _understeer_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
+    v = s[_speed(site)]
+    return {site.target: own[site.target] * (1 / (1 + c["k"] * v * v) - 1)}
+
+
+def _slope_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
+    psi = s[_heading(site)]
+    return {site.target: c["a"] * np.cos(psi) + c["b"] * np.sin(psi)}
+
+
+def _patch_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
+    far: Any = 0.0
+    for name in places.position(site.model):
+        away = (s[name] - c[f"{name}0"]) / c["radius"]
+        far = far + away * away
+    return {site.target: c["c"] * np.exp(-0.5 * far)}
+
+
+def _moving(model: Model) -> bool:
+    return bool(places.heading(model) and places.speed(model) and places.plane(model))
+
+
+drift_world = RateFamily(
+    name="drift_world",
+    equation="x' = model + a, y' = model + b",
+    sentence="everything drifts by ({a}, {b}) over the ground",
+    targets=places.plane,
+    quantities=_two_drifts,
+    lookalikes=("offset", "drift_body", "sensor_bias"),
+    rate=_world_rate,
+)
+
+drift_body = RateFamily(
+    name="drift_body",
+    equation="x' = model + a cos(psi) - b sin(psi), y' = model + a sin(psi) + b cos(psi)",
+    sentence="it drifts by {a} ahead and {b} to the left of its heading",
+    targets=places.plane,
+    quantities=_two_drifts,
+    lookalikes=("drift_world", "side_slip", "sensor_bias", "odometry_scale"),
+    rate=_body_rate,
+)
+
+side_slip = RateFamily(
+    name="side_slip",
+    equation="velocity to the left = -k v^2 psi'",
+    sentence="it slides outwards in turns, by {k} of speed times lateral acceleration",
+    targets=lambda model: places.plane(model) if _moving(model) else [],
+    quantities=_slip,
+    lookalikes=("drift_body", "understeer", "sensor_delay"),
+    rate=_slip_rate,
+    needs_own=True,
+)
+
+understeer = RateFamily(
+    name="understeer",
+    equation="psi' = model / (1 + k v^2)",
+    sentence="it understeers: the heading turns less the faster it drives ({k})",
+    targets=lambda model: [h] if _moving(model) and (h := places.heading(model)) else [],
+    quantities=_understeer,
+    lookalikes=("rate_gain", "coupling", "parameter"),
+    rate=_understeer_rate,
+    needs_own=True,
+)
+
+slope = RateFamily(
+    name="slope",
+    equation="v' = model + a cos(psi) + b sin(psi)",
+    sentence="the ground slopes: {a} towards the first axis, {b} towards the second",
+    targets=lambda model: [v] if _moving(model) and (v := places.speed(model)) else [],
+    quantities=_two_drifts,
+    lookalikes=("offset", "patch", "coulomb_friction"),
+    rate=_slope_rate,
+)
+
+patch = RateFamily(
+    name="patch",
+    equation="s' = model + c exp(-|q - q0|^2 / (2 radius^2))",
+    sentence="{target} differs by {c} at one place",
+    targets=_patch_targets,
+    quantities=_patch,
+    lookalikes=("slope", "periodic", "trend"),
+    rate=_patch_rate,
+)
+
+FAMILIES = (drift_world, drift_body, side_slip, understeer, slope, patch)

@@ -1,0 +1,84 @@
+"""Where an effect can apply: the states of a model by what they are.
+
+Roles come from the model (`Model.roles`); where it has none, a position is a state called x and y
+(or north and east), a heading an angle called psi, yaw or heading, a speed one called v or speed. A
+velocity is any state whose unit is per second: friction acts on those. What can't be told is not
+offered.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from grounded.model import Model
+
+POSITIONS = (("x", "y"), ("north", "east"), ("px", "py"), ("pos_x", "pos_y"))
+HEADINGS = ("psi", "yaw", "heading", "theta")
+SPEEDS = ("v", "speed", "velocity", "vx", "u")
+
+
+def role(model: Model, name: str) -> tuple[str, ...]:
+    """States that play a role, () when the model doesn't say."""
+    found = model.roles.get(name, ())
+    return (found,) if isinstance(found, str) else tuple(found)
+
+
+def inputs(model: Model) -> Sequence[str]:
+    """Every input."""
+    return model.input_names
+
+
+def states(model: Model) -> Sequence[str]:
+    """Every state."""
+    return model.state_names
+
+
+def position(model: Model) -> tuple[str, ...]:
+    """The states of a position on the ground (two of them, or one along an axis)."""
+    named = role(model, "position")
+    if named:
+        return named[:2]
+    return next((p for p in POSITIONS if set(p) <= set(model.state_names)), ())
+
+
+def heading(model: Model) -> str | None:
+    """The direction of travel of something that moves on the ground."""
+    named = role(model, "heading")
+    if named:
+        return named[0]
+    return next((h for h in HEADINGS if h in model.angles), None)
+
+
+def speed(model: Model) -> str | None:
+    """The speed along the heading."""
+    named = role(model, "speed")
+    if named:
+        return named[0]
+    return next((s for s in SPEEDS if s in model.state_names), None)
+
+
+def per_second(model: Model) -> list[str]:
+    """States whose unit is per second: velocities, linear or angular."""
+    return [n for n, u in model.states.items() if u.endswith("/s") or u.endswith("/ s")]
+
+
+def plane(model: Model) -> list[str]:
+    """`x+y` for a model that moves in the plane with a heading, else nothing."""
+    where = position(model)
+    if len(where) == 2 and heading(model):
+        return ["+".join(where)]
+    return []
+
+
+def dynamic(model: Model) -> list[str]:
+    """States that are neither a position nor a heading: those that forces and actuators drive."""
+    still = {*position(model), *([heading(model)] if heading(model) else [])}
+    rest = [n for n in model.state_names if n not in still]
+    return rest or list(model.state_names)
+
+
+def pairs(model: Model) -> list[str]:
+    """`v<-delta` for every dynamic target and every other dynamic state as a source."""
+    names = dynamic(model)
+    targets = [n for n in model.state_names if n not in position(model)]
+    return [f"{t}<-{s}" for t in targets for s in names if s != t]

@@ -1,0 +1,132 @@
+"""Rates that the model lacks: constant, proportional, coupled, growing, periodic.
+
+    s' = model + rate
+
+The least specific families: they fit what has no name of its own.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from grounded.effects import places
+from grounded.effects.family import Quantity, RateFamily, Site, Values, per
+
+
+def _constant(site: Site) -> tuple[Quantity, ...]:
+    return (Quantity("c", per(site.unit(site.target))),)
+
+
+def _gain(site: Site) -> tuple[Quantity, ...]:
+    return (Quantity("g", "1", low=-1.5, high=5.0),)
+
+
+def _trend(site: Site) -> tuple[Quantity, ...]:
+    return (Quantity("k", per(per(site.unit(site.target)))),)
+
+
+def coupled(site: Site) -> tuple[str, str]:
+    """The two sides of `v<-delta`: what is driven, and what drives it."""
+    target, _, source = site.target.partition("<-")
+    return target, source
+
+
+def _coupling(site: Site) -> tuple[Quantity, ...]:
+    target, source = coupled(site)
+    return (Quantity("k", f"{per(site.unit(target))} per {site.unit(source)}"),)
+
+
+def _periodic(site: Site) -> tuple[Quantity, ...]:
+    """Frequencies from one period a trial to a fifth of the sampling rate, half a bin apart."""
+    duration, dt = site.scales.duration, site.scales.dt
+    lowest, highest = 1.0 / duration, min(0.2 / dt, 5.0)
+    bins = max((highest - lowest) * duration, 1.0)
+    count = int(min(max(2 * bins, 4), 40))
+    grid = tuple(float(2 * np.pi * f) for f in np.linspace(lowest, highest, count))
+    unit = per(site.unit(site.target))
+    return (
+        Quantity("A", unit),
+        Quantity("B", unit),
+        Quantity("omega", "rad/s", grid, 0.0, 2 * np.pi * 0.45 / dt, places=bins),
+    )
+
+
+def _offset_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
+    return {site.target: c["c"] + 0.0 * s[site.target]}
+
+
+def _gain_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
+    return {site.target: c["g"] * own[site.target]}
+
+
+def _trend_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
+    return {site.target: c["k"] * t + 0.0 * s[site.target]}
+
+
+def _coupling_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
+    target, source = coupled(site)
+    return {target: c["k"] * s[source]}
+
+
+def _periodic_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
+    phase = c["omega"] * t
+    wave = c["A"] * np.sin(phase) + c["B"] * np.cos(phase)
+    return {site.target: wave + 0.0 * s[site.target]}
+
+
+offset = RateFamily(
+    name="offset",
+    equation="s' = model + c",
+    sentence="{target} drifts by {c}",
+    targets=places.states,
+    quantities=_constant,
+    lookalikes=("input_bias", "trend", "drift_world", "sensor_bias", "parameter"),
+    rate=_offset_rate,
+)
+
+rate_gain = RateFamily(
+    name="rate_gain",
+    equation="s' = (1 + g) model",
+    sentence="{target} changes {g} faster than modelled",
+    targets=lambda model: [n for n in model.state_names if n not in places.position(model)],
+    quantities=_gain,
+    lookalikes=("input_gain", "understeer", "parameter", "sensor_scale"),
+    rate=_gain_rate,
+    needs_own=True,
+)
+
+trend = RateFamily(
+    name="trend",
+    equation="s' = model + k t",
+    sentence="{target} drifts more and more, by {k}",
+    targets=places.dynamic,
+    quantities=_trend,
+    lookalikes=("input_fade", "offset", "periodic"),
+    rate=_trend_rate,
+    timed=True,
+)
+
+coupling = RateFamily(
+    name="coupling",
+    equation="s' = model + k r   (s<-r)",
+    sentence="{source} acts on {driven} by {k}",
+    targets=places.pairs,
+    quantities=_coupling,
+    lookalikes=("viscous_friction", "rate_gain", "understeer", "parameter"),
+    rate=_coupling_rate,
+)
+
+periodic = RateFamily(
+    name="periodic",
+    equation="s' = model + A sin(omega t) + B cos(omega t)",
+    sentence="{target} is shaken at {omega}",
+    targets=places.dynamic,
+    quantities=_periodic,
+    lookalikes=("trend", "patch"),
+    rate=_periodic_rate,
+    timed=True,
+)
+
+FAMILIES = (offset, rate_gain, trend, coupling, periodic)

@@ -1,0 +1,127 @@
+"""The library: all families, what of it applies to a model, and the way back from a name.
+
+Third parties add families by the entry point group `grounded.effects` (read once, by the command
+line's options.py); here a library is a plain value.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from grounded.effects import friction, geometry, input, memory, parameter, places, rate, sensor
+from grounded.effects.family import Effect, Family, RateFamily, Scales, Site
+from grounded.errors import GroundedError, nearest
+from grounded.model import Model
+
+BUILT_IN: tuple[Family, ...] = (
+    *input.FAMILIES,
+    *memory.FAMILIES,
+    *rate.FAMILIES,
+    *friction.FAMILIES,
+    *geometry.FAMILIES,
+    *sensor.FAMILIES,
+    *parameter.FAMILIES,
+)
+
+
+@dataclass(frozen=True)
+class Library:
+    """Families by name; `with_families` and `without` give other libraries."""
+
+    families: tuple[Family, ...] = BUILT_IN
+
+    def __post_init__(self) -> None:
+        names = [family.name for family in self.families]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise GroundedError(f"two effect families are called '{twice[0]}': rename one")
+
+    def with_families(self, more: Iterable[Family]) -> Library:
+        """A library that also has these families."""
+        return Library((*self.families, *more))
+
+    def without(self, names: Iterable[str]) -> Library:
+        """A library that lacks these families.
+
+        Raises:
+            GroundedError: for a name that is not in it.
+        """
+        gone = set(names)
+        known = [family.name for family in self.families]
+        for name in gone:
+            if name not in known:
+                raise GroundedError(f"there is no effect family '{name}': {nearest(name, known)}")
+        return Library(tuple(family for family in self.families if family.name not in gone))
+
+    def family(self, name: str) -> Family:
+        """The family of that name.
+
+        Raises:
+            GroundedError: if there is none.
+        """
+        for family in self.families:
+            if family.name == name:
+                return family
+        known = [family.name for family in self.families]
+        raise GroundedError(f"there is no effect family '{name}': {nearest(name, known)}")
+
+    def effect(self, name: str, model: Model, scales: Scales | None = None) -> Effect:
+        """The effect that `family:target` names, at a model.
+
+        Raises:
+            GroundedError: if the family is unknown or does not apply there.
+        """
+        family_name, _, target = name.partition(":")
+        family = self.family(family_name)
+        known = list(family.targets(model))
+        if target not in known:
+            raise GroundedError(
+                f"effect '{name}' does not apply to model '{model.name}': "
+                + nearest(name, [f"{family_name}:{t}" for t in known])
+            )
+        return _build(family, target, model, scales or Scales())
+
+    def candidates(self, model: Model, scales: Scales | None = None) -> tuple[Effect, ...]:
+        """Every effect that can apply to a model, in the library's order."""
+        found = []
+        idle = derived_states(model)
+        for family in self.families:
+            for target in family.targets(model):
+                driven = target.partition("<-")
+                if isinstance(family, RateFamily) and {driven[0], driven[2]} & idle:
+                    continue
+                found.append(_build(family, target, model, scales or Scales()))
+        return tuple(found)
+
+
+def _build(family: Family, target: str, model: Model, scales: Scales) -> Effect:
+    site = Site(model, tuple(target.split("+")), scales)
+    return Effect(family, site, family.quantities(site))
+
+
+def derived_states(model: Model) -> set[str]:
+    """Heading rates that nothing depends on: carried along so that they can be measured.
+
+    Rate effects are not offered for them; one on the heading moves them too (`partner`).
+    """
+    named = places.role(model, "heading_rate")
+    if not named:
+        return set()
+    rng = np.random.default_rng(0)
+    x = rng.uniform(0.2, 1.0, (3, model.n))
+    u = rng.uniform(0.2, 1.0, (3, model.m))
+    f_x, _ = model.system.linearise(x, u, model.values, 0.01)
+    i = model.state_names.index(named[0])
+    others = np.delete(f_x[:, :, i], i, axis=1)
+    return {named[0]} if float(np.abs(others).max()) < 1e-12 else set()
+
+
+def partner(model: Model, target: str) -> str | None:
+    """The derived heading rate that an added heading rate must show up in, or None."""
+    if target != places.heading(model):
+        return None
+    idle = derived_states(model)
+    return next(iter(idle), None)

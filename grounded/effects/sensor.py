@@ -1,0 +1,89 @@
+"""What is logged is not what is: scale of the odometry, bias, scale and delay of a sensor.
+
+    y = measure(s),   so that a model of logged states is   y+ = measure( f( recover(y), u ) )
+
+A bias on a coordinate that nothing depends on (x of a car on a flat floor) can't be known and
+changes nothing.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from grounded.effects import places
+from grounded.effects.family import (
+    Quantity,
+    RateFamily,
+    SensorDelayFamily,
+    SensorFamily,
+    Site,
+    Values,
+)
+
+
+def _scale(site: Site) -> tuple[Quantity, ...]:
+    return (Quantity("k", "1", low=-0.8, high=4.0),)
+
+
+def _bias(site: Site) -> tuple[Quantity, ...]:
+    return (Quantity("b", site.unit(site.target)),)
+
+
+def _delay(site: Site) -> tuple[Quantity, ...]:
+    dt = site.scales.dt
+    longest = min(max(0.3, 3 * dt), site.scales.duration / 4)
+    grid = tuple(float(v) for v in longest * (np.arange(1, 7) / 6) ** 1.5)
+    return (Quantity("d", "s", grid, 0.0, longest, places=4),)
+
+
+def _odometry_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
+    return {name: c["k"] * own[name] for name in site.targets}
+
+
+odometry_scale = RateFamily(
+    name="odometry_scale",
+    equation="x' = (1 + k) model, y' = (1 + k) model",
+    sentence="distances are {k} longer than modelled",
+    targets=lambda model: ["+".join(p)] if (p := places.position(model)) else [],
+    quantities=_scale,
+    lookalikes=("sensor_scale", "rate_gain", "drift_body"),
+    rate=_odometry_rate,
+    needs_own=True,
+)
+
+sensor_bias = SensorFamily(
+    name="sensor_bias",
+    equation="y = s + b",
+    sentence="the log of {target} is off by {b}",
+    targets=lambda model: [n for n in model.state_names if n not in places.position(model)],
+    quantities=_bias,
+    lookalikes=("offset", "input_bias", "drift_body"),
+    measure=lambda value, c: value + c["b"],
+    recover=lambda value, c: value - c["b"],
+)
+
+sensor_scale = SensorFamily(
+    name="sensor_scale",
+    equation="y = (1 + k) s",
+    sentence="the log of {target} is {k} too large",
+    targets=lambda model: [
+        n for n in model.state_names if n not in model.angles and n not in places.position(model)
+    ],
+    quantities=_scale,
+    lookalikes=("odometry_scale", "rate_gain", "input_gain", "parameter"),
+    measure=lambda value, c: (1 + c["k"]) * value,
+    recover=lambda value, c: value / (1 + c["k"]),
+)
+
+sensor_delay = SensorDelayFamily(
+    name="sensor_delay",
+    equation="y(t) = s(t - d)",
+    sentence="the log of {target} is {d} old",
+    targets=places.states,
+    quantities=_delay,
+    lookalikes=("delay", "first_order_lag", "side_slip"),
+)
+
+FAMILIES = (odometry_scale, sensor_bias, sensor_scale, sensor_delay)

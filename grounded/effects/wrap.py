@@ -1,0 +1,275 @@
+"""An effect joins a model: the wrapped model is again a plain model, with more parameters.
+
+One control step of the wrapped model, for commands held over the step:
+
+    u_eff  = effect(u, z, t)                      input and memory families
+    own    = (f(s, u_eff) - s) / dt               the model's own rate
+    s1     = f(s + dt/2 rate(s), u_eff)           half of an added rate before the step ...
+    s+     = s1 + dt/2 rate(s1)                   ... and half after it (Strang): second order in dt
+    y+     = measure(s+),  s = recover(y)         sensor families
+
+It is a `step` model in plain NumPy, so that it is traced and compiled where the original was.
+Memory (a lag's output, a queue, a clock) becomes further states, all of them functions of the
+commands and the measured states: `memory_of` recovers them along a recorded trial.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from grounded.compile.names import Named
+from grounded.effects.family import (
+    Effect,
+    InputFamily,
+    MemoryFamily,
+    ParamFamily,
+    RateFamily,
+    SensorDelayFamily,
+    SensorFamily,
+    Values,
+)
+from grounded.effects.registry import partner
+from grounded.errors import GroundedError
+from grounded.frozen import Array
+from grounded.model import Model, Param
+from grounded.trial import Trial
+
+Step = Callable[[Any, Any, Any, Any], dict[str, Any]]
+
+
+def plain_step(model: Model) -> Step:
+    """The model's step(s, a, p, dt) in the user's own words, integrating a derivative."""
+    if model.step is not None:
+        return lambda s, a, p, dt: dict(model.step(s, a, p, dt))  # type: ignore[misc]
+    derivative, names = model.derivative, model.state_names
+    assert derivative is not None
+
+    def moved(s: Any, rates: Mapping[str, Any], by: Any) -> Named:
+        return Named("state", names, [s[n] + by * rates[n] for n in names])
+
+    def euler(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
+        return dict(moved(s, derivative(s, a, p), dt))
+
+    def rk4(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
+        k1 = derivative(s, a, p)
+        k2 = derivative(moved(s, k1, 0.5 * dt), a, p)
+        k3 = derivative(moved(s, k2, 0.5 * dt), a, p)
+        k4 = derivative(moved(s, k3, dt), a, p)
+        return {n: s[n] + dt / 6 * (k1[n] + 2 * k2[n] + 2 * k3[n] + k4[n]) for n in names}
+
+    return rk4 if model.integrator == "rk4" else euler
+
+
+def wrap(effect: Effect, values: Mapping[str, float], dt: float) -> Model:
+    """A model with the effect in it: parameters `family_target_c`, memory states where needed.
+
+    Args:
+        effect: built for the model that it will change (`Library.effect`).
+        values: the effect's quantities; fixed ones may be left out.
+        dt: control step [s]: how long a queue must be.
+
+    Raises:
+        GroundedError: for a quantity that is unknown or missing.
+    """
+    model, family = effect.site.model, effect.family
+    whole = effect.complete(values)
+    if isinstance(family, ParamFamily):
+        name = effect.site.target
+        return model.with_values({name: model.params[name].value + whole["d"]})
+    added = {param_name(effect, q.name): _param(q, whole[q.name]) for q in effect.quantities}
+    make = {
+        InputFamily: _input_step,
+        MemoryFamily: _memory_step,
+        RateFamily: _rate_step,
+        SensorFamily: _sensor_step,
+        SensorDelayFamily: _sensor_delay_step,
+    }
+    for kind, build in make.items():
+        if isinstance(family, kind):
+            step, memory = build(effect, whole, dt)
+            break
+    else:
+        raise GroundedError(f"effect '{effect.name}': its family can't be adopted")
+    return Model(
+        states={**model.states, **memory},
+        inputs=model.inputs,
+        params={**model.params, **added},
+        angles=model.angles,
+        roles=model.roles,
+        step=step,
+        name=f"{model.name} with {effect.name}",
+    )
+
+
+def param_name(effect: Effect, quantity: str) -> str:
+    """`dead_zone_throttle_c`: the wrapped model's name of an effect's quantity."""
+    target = "_".join(effect.site.targets).replace("<-", "_from_")
+    return f"{effect.family.name}_{target}_{quantity}"
+
+
+def _param(quantity: Any, value: float) -> Param:
+    low = None if not np.isfinite(quantity.low) else min(float(quantity.low), value)
+    high = None if not np.isfinite(quantity.high) else max(float(quantity.high), value)
+    if quantity.fixed:
+        low = high = value
+    return Param(value, quantity.unit, low, high)
+
+
+def _quantities(effect: Effect, p: Any) -> dict[str, Any]:
+    return {q.name: p[param_name(effect, q.name)] for q in effect.quantities}
+
+
+def _own_state(model: Model, s: Any) -> Named:
+    return Named("state", model.state_names, [s[n] for n in model.state_names])
+
+
+def _replaced(model: Model, a: Any, target: Mapping[str, Any]) -> Named:
+    return Named("input", model.input_names, [target.get(n, a[n]) for n in model.input_names])
+
+
+def _clock(effect: Effect) -> str:
+    return f"{effect.family.name}_clock"
+
+
+def _input_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str, str]]:
+    model, family = effect.site.model, effect.family
+    assert isinstance(family, InputFamily)
+    base, clock = plain_step(model), _clock(effect)
+    timed = family.timed
+
+    def step(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
+        c = _quantities(effect, p)
+        t = s[clock] if timed else 0.0
+        u = {n: family.effect(a[n], t, c) for n in effect.site.targets}
+        after = base(_own_state(model, s), _replaced(model, a, u), p, dt)
+        return {**after, clock: s[clock] + dt} if timed else after
+
+    return step, {clock: "s"} if timed else {}
+
+
+def _memory_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str, str]]:
+    model, family = effect.site.model, effect.family
+    assert isinstance(family, MemoryFamily)
+    base, depth = plain_step(model), family.depth(whole, dt)
+    names = {n: [f"{n}_{family.name}_{i + 1}" for i in range(depth)] for n in effect.site.targets}
+
+    def step(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
+        c, u, kept = _quantities(effect, p), {}, {}
+        for n, memory in names.items():
+            u[n], later = family.advance(a[n], tuple(s[z] for z in memory), c, dt)
+            kept.update(zip(memory, later, strict=True))
+        return {**base(_own_state(model, s), _replaced(model, a, u), p, dt), **kept}
+
+    return step, {z: model.inputs[n] for n, memory in names.items() for z in memory}
+
+
+def _rate_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str, str]]:
+    model, family = effect.site.model, effect.family
+    assert isinstance(family, RateFamily)
+    base, clock, timed = plain_step(model), _clock(effect), family.timed
+    tied = {n: k for n in model.state_names if (k := partner(model, n))}
+
+    def step(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
+        c = _quantities(effect, p)
+        t = s[clock] if timed else 0.0
+        state = _own_state(model, s)
+        added, state = _kick(family, effect, base, state, a, p, dt, t, c)
+        after = Named("state", model.state_names, list(_in_order(model, base(state, a, p, dt))))
+        t = t + dt if timed else 0.0
+        later, final = _kick(family, effect, base, after, a, p, dt, t, c)
+        result = dict(final)
+        for n, k in tied.items():
+            if n in added:  # a heading rate shows what was added to the heading
+                result[k] = result[k] + later[n] - added[n]
+        return {**result, clock: t} if timed else result
+
+    return step, {clock: "s"} if timed else {}
+
+
+def _in_order(model: Model, values: Mapping[str, Any]) -> list[Any]:
+    return [values[n] for n in model.state_names]
+
+
+def _kick(
+    family: RateFamily, effect: Effect, base: Step, s: Named, a: Any, p: Any, dt: Any, t: Any, c: Any
+) -> tuple[Values, Named]:
+    """Half a step of the added rate alone: the rate, and the state after it."""
+    own: Any = {}
+    if family.needs_own:
+        ahead = base(s, a, p, dt)
+        own = {n: (ahead[n] - s[n]) / dt for n in s}
+    rate = family.rate(s, a, own, t, c, effect.site)
+    moved = [s[n] + 0.5 * dt * rate[n] if n in rate else s[n] for n in s]
+    return rate, Named("state", tuple(s), moved)
+
+
+def _sensor_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str, str]]:
+    model, family = effect.site.model, effect.family
+    assert isinstance(family, SensorFamily)
+    base = plain_step(model)
+
+    def step(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
+        c = _quantities(effect, p)
+        true = [
+            family.recover(s[n], c) if n in effect.site.targets else s[n] for n in model.state_names
+        ]
+        after = base(Named("state", model.state_names, true), a, p, dt)
+        return {n: family.measure(v, c) if n in effect.site.targets else v for n, v in after.items()}
+
+    return step, {}
+
+
+def _sensor_delay_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str, str]]:
+    """The true value and its past become memory; the state itself is the logged, old value."""
+    model, target = effect.site.model, effect.site.target
+    depth = max(1, int(np.ceil(whole["d"] / dt - 1e-9)))
+    memory = [f"{target}_true", *[f"{target}_true_{i + 1}" for i in range(depth)]]
+    base = plain_step(model)
+
+    def step(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
+        behind = _quantities(effect, p)["d"] / dt
+        true = [s[memory[0]] if n == target else s[n] for n in model.state_names]
+        after = base(Named("state", model.state_names, true), a, p, dt)
+        line = [after[target], *[s[z] for z in memory]]
+        logged: Any = 0.0
+        for i, value in enumerate(line):
+            logged = logged + np.maximum(1 - np.abs(behind - i), 0.0) * value
+        return {**after, target: logged, **dict(zip(memory, line, strict=False))}
+
+    return step, {z: model.states[target] for z in memory}
+
+
+def memory_of(wrapped: Model, base: Model, trial: Trial) -> Array:
+    """The memory states along a recorded trial, (T + 1, wrapped.n - base.n).
+
+    They start at what held before t = 0 (the held input, the first logged value, a clock at zero)
+    and follow the commands and the logged states.
+    """
+    extra = wrapped.state_names[base.n :]
+    now = memory_start(wrapped, base, trial)
+    found = [now]
+    for t in range(trial.steps):
+        x = np.concatenate([trial.states[t], now])[None]
+        after = wrapped.system.step(x, trial.inputs[t][None], wrapped.values, trial.dt)
+        now = after[0, base.n :]
+        found.append(now)
+    return np.array(found).reshape(trial.steps + 1, len(extra))
+
+
+def memory_start(wrapped: Model, base: Model, trial: Trial) -> Array:
+    """The memory states at t = 0, (wrapped.n - base.n,)."""
+    held = np.zeros(base.m) if trial.start_inputs is None else trial.start_inputs
+    start = []
+    for name in wrapped.state_names[base.n :]:
+        inputs = [i for i, n in enumerate(base.input_names) if name.startswith(f"{n}_")]
+        states = [i for i, n in enumerate(base.state_names) if name.startswith(f"{n}_true")]
+        if name.endswith("_clock"):
+            start.append(0.0)
+        elif states:
+            start.append(float(trial.states[0, states[-1]]))
+        else:
+            start.append(float(held[inputs[-1]]) if inputs else 0.0)
+    return np.array(start)
