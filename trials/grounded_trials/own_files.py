@@ -22,13 +22,12 @@ from grounded.frozen import Array
 from grounded_trials.mcap_records import (
     Attachment,
     Channel,
-    DamagedFile,
     End,
     Messages,
     Metadata,
     Schema,
-    read_records,
 )
+from grounded_trials.mcap_walk import DamagedFile, read_records
 from grounded_trials.message_types import Array as ArrayType
 from grounded_trials.message_types import Number, Struct
 from grounded_trials.nodes import BadMessage

@@ -18,7 +18,8 @@ from grounded.errors import GroundedError, nearest
 from grounded_trials.cdr import cdr_messages, ros1_messages
 from grounded_trials.json_messages import json_messages
 from grounded_trials.log_files import log_files, open_log
-from grounded_trials.mcap_records import Channel, Messages, Schema, read_records
+from grounded_trials.mcap_records import Channel, Messages, Schema
+from grounded_trials.mcap_walk import read_records
 from grounded_trials.message_path import MessagePath, parse_path
 from grounded_trials.message_types import Dynamic, Struct, Type
 from grounded_trials.nodes import BadMessage, BadPath, Floats, Ints, Node

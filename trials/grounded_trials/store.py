@@ -19,7 +19,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
 
 from grounded.errors import GroundedError
 
@@ -196,8 +195,6 @@ class Store:
             os.close(descriptor)
 
     def _unwritable(self, error: OSError) -> GroundedError:
-        if error.filename is not None and Path(str(error.filename)).parent != self.folder:
-            return GroundedError(f"{error.filename} can't be read: {error.strerror}")
         return GroundedError(
             f"{self.folder} can't be written: {error.strerror}; nothing was stored, make room or "
             "give yourself the right to write there"
@@ -249,18 +246,16 @@ def _blocks(source: str | Path | bytes) -> Iterator[bytes]:
     if isinstance(source, bytes):
         yield source
         return
-    with Path(source).open("rb") as stream:
-        yield from _read_blocks(stream)
-
-
-def _read_blocks(stream: BinaryIO) -> Iterator[bytes]:
-    while block := stream.read(_BLOCK):
-        yield block
+    try:
+        with Path(source).open("rb") as stream:
+            while block := stream.read(_BLOCK):
+                yield block
+    except OSError as error:
+        raise GroundedError(f"{source} can't be read: {error.strerror}") from None
 
 
 def _hash_file(path: Path) -> str:
     hasher = hashlib.sha256()
-    with path.open("rb") as stream:
-        for block in _read_blocks(stream):
-            hasher.update(block)
+    for block in _blocks(path):
+        hasher.update(block)
     return hasher.hexdigest()
