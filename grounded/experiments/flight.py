@@ -1,0 +1,253 @@
+"""Table 1 and Figure 1: a fixed-wing aircraft learns a figure-8 from a wrong model (section 5.1).
+
+    real system      the aircraft with its 43 true parameters, closed loop, no noise
+    crude model      every parameter times an independent U[0.8, 1.2], one model a run
+    start            trimmed straight flight of the real aircraft, measured before the manoeuvre
+    discarded        models whose first controller is unstable in the real system: the flight leaves
+                     the finite numbers or the target by more than the radius of the turns
+
+The search is the one that `grounded propose` and `ingest` drive, with its default options; the
+optimum is DDP on the true parameters, which the search never sees.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import MutableMapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from grounded.errors import GroundedError
+from grounded.experiments.figure8 import RADIUS, figure8_target, flight_task, perturbed
+from grounded.experiments.jobs import Engine, Job, Progress, run_jobs
+from grounded.experiments.summary import Table, improvement, mean_se
+from grounded.frozen import Array
+from grounded.improve import first_policy, learn, propose
+from grounded.models.aircraft import model as aircraft
+from grounded.rollout import simulate
+from grounded.search import Candidate, Options
+from grounded.task import Task
+from grounded.trial import Trial
+
+ITERATIONS = 5  # Table 1
+PAPER = {
+    "model_based": [-13028.0, 330.0],
+    "learned": [-3000.0, 100.0],
+    "improvement": [0.76, 0.02],
+    "trials": 5,
+    "discarded": 0.2,
+}
+FIGURE_STEP = 5  # Figure 1 is kept at 10 Hz
+
+
+@dataclass(frozen=True)
+class FlightRun:
+    """One approximate model. Utilities: the model's policy, then after each improvement."""
+
+    seed: int
+    discarded: bool
+    utilities: tuple[float, ...]
+    trials: int
+    alphas: tuple[float, ...]  # of every trial; the first is the model's own policy
+    paths: dict[str, list[list[float]]]  # north, east, altitude [m] by "model" and "learned"
+
+    @property
+    def improvement(self) -> float:
+        """Share of the model-based cost that is gone."""
+        return improvement(self.utilities[0], self.utilities[-1])
+
+
+@dataclass(frozen=True)
+class FlightResult:
+    """Table 1, and the paths of Figure 1 for the run whose improvement is the median one."""
+
+    runs: tuple[FlightRun, ...]
+    optimum: float
+    desired: list[list[float]]
+
+    @property
+    def flown(self) -> tuple[FlightRun, ...]:
+        """Runs that count: not discarded."""
+        return tuple(run for run in self.runs if not run.discarded)
+
+    @property
+    def representative(self) -> FlightRun:
+        """The run of Figure 1."""
+        return sorted(self.flown, key=lambda run: run.improvement)[len(self.flown) // 2]
+
+    def summary(self) -> dict[str, Any]:
+        """The figures of Table 1."""
+        first = [run.utilities[0] for run in self.flown]
+        last = [run.utilities[-1] for run in self.flown]
+        mean, se = mean_se([run.improvement for run in self.flown])
+        return {
+            "model_based": mean_se(first),
+            "learned": mean_se(last),
+            "optimum": self.optimum,
+            "worst_gap_to_optimum": max((self.optimum - u) / -self.optimum for u in last),
+            "improvement": {
+                "mean": mean,
+                "se": se,
+                "ratio_of_means": improvement(float(np.mean(first)), float(np.mean(last))),
+            },
+            "trials": mean_se([run.trials for run in self.flown])[0],
+            "trials_an_iteration": float(
+                np.mean([(run.trials - 1) / max(len(run.utilities) - 1, 1) for run in self.flown])
+            ),
+            "discarded": len(self.runs) - len(self.flown),
+        }
+
+    def to_json(self) -> dict[str, Any]:
+        """See CONTRACT.md."""
+        runs = [
+            {
+                "seed": run.seed,
+                "discarded": run.discarded,
+                "utilities": list(run.utilities),
+                "trials": run.trials,
+                "alphas": list(run.alphas),
+                "optimum": self.optimum,
+            }
+            for run in self.runs
+        ]
+        shown = self.representative
+        figure = {"seed": shown.seed, "desired": self.desired, **shown.paths}
+        return {"runs": runs, **self.summary(), "figure": figure, "paper": PAPER}
+
+    def tables(self) -> list[Table]:
+        """Table 1 beside the paper's."""
+        found = self.summary()
+        gain = found["improvement"]
+
+        def pair(value: tuple[float, float]) -> str:
+            return f"{value[0]:,.0f} (±{value[1]:,.0f})"
+
+        rows = (
+            ("utility, model-based", pair(found["model_based"]), "-13,028 (±330)"),
+            (f"utility, {ITERATIONS} iterations", pair(found["learned"]), "-3,000 (±100)"),
+            (
+                "improvement, mean of ratios",
+                f"{gain['mean']:.1%} (±{gain['se']:.1%})",
+                "76 % (±2 %)",
+            ),
+            ("improvement, ratio of means", f"{gain['ratio_of_means']:.1%}", ""),
+            ("optimum with the true parameters", f"{self.optimum:,.0f}", "not given"),
+            ("largest distance to it", f"{found['worst_gap_to_optimum']:.2%}", "not given"),
+            ("trials an iteration", f"{found['trials_an_iteration']:.2f}", "typically 1"),
+            ("discarded", f"{found['discarded']} of {len(self.runs)}", "about 20 %"),
+        )
+        title = f"Table 1: flight simulator, {len(self.flown)} runs, mean (± one standard error)"
+        return [Table(title, ("", "here", "paper"), rows)]
+
+
+def run(
+    count: int = 10,
+    *,
+    first_seed: int = 0,
+    engine: Engine | None = None,
+    finished: MutableMapping[str, dict[str, Any]] | None = None,
+    progress: Progress | None = None,
+    step: str = "damped",
+) -> FlightResult:
+    """Table 1 with `count` runs that were not discarded: seeds first_seed, first_seed + 1 ...
+
+    Args:
+        count: runs that count.
+        first_seed: of the approximate models.
+        engine: where the jobs run.
+        finished: results kept from before, by job.
+        progress: called with jobs done and in all.
+        step: "damped" or "full", as in [search].
+
+    Raises:
+        GroundedError: if more than four of five models are discarded.
+    """
+    found: list[FlightRun] = []
+    seed = first_seed
+    while sum(not r.discarded for r in found) < count:
+        if len(found) >= 5 * count:
+            raise GroundedError(f"{len(found)} models and fewer than {count} flyable ones")
+        missing = count - sum(not r.discarded for r in found)
+        jobs = [Job(one, {"seed": s, "step": step}) for s in range(seed, seed + missing)]
+        seed += missing
+        found += [_read(r) for r in run_jobs(jobs, engine, finished=finished, progress=progress)]
+    path, _, _ = figure8_target()
+    return FlightResult(tuple(found), optimum(), path[::FIGURE_STEP].tolist())
+
+
+def _read(result: dict[str, Any]) -> FlightRun:
+    result = result | {key: tuple(result[key]) for key in ("utilities", "alphas")}
+    return FlightRun(**result)
+
+
+def optimum() -> float:
+    """Utility of DDP on the true parameters."""
+    _, result = first_policy(flight_task(aircraft))
+    return -result.cost
+
+
+def one(seed: int, step: str) -> dict[str, Any]:
+    """A job: one approximate model, five iterations."""
+    truth = flight_task(aircraft)
+    crude = perturbed(aircraft, np.random.default_rng(seed))
+    task = flight_task(crude, started_by=aircraft)
+    options = Options(step="full" if step == "full" else "damped")
+    first = propose(task, [], [], options).candidate
+    if first is None or unstable(truth, flown := real_flight(truth, first)):
+        utility = [] if first is None else [_finite(truth.utility(flown))]
+        return {
+            "seed": seed,
+            "discarded": True,
+            "utilities": utility,
+            "trials": 1,
+            "alphas": [1.0],
+            "paths": {} if first is None else _paths(model=flown),
+        }
+
+    def fly(candidate: Candidate) -> Trial:
+        return real_flight(truth, candidate)
+
+    standing, candidates, trials = learn(task, fly, options, max_iterations=ITERATIONS)
+    assert standing.incumbent is not None
+    best = standing.incumbent.trials[0]
+    return {
+        "seed": seed,
+        "discarded": False,
+        "utilities": standing.utilities,
+        "trials": len(trials),
+        "alphas": [candidate.alpha for candidate in candidates],
+        "paths": _paths(model=trials[0], learned=best),
+    }
+
+
+def real_flight(truth: Task, candidate: Candidate) -> Trial:
+    """What the real aircraft does under a candidate; ends early when it leaves the numbers."""
+    flown = simulate(truth.problem(exact=True), candidate.policy)
+    good = np.isfinite(flown.states).all(axis=1) & (np.abs(flown.states) < 1e6).all(axis=1)
+    T = truth.horizon if good.all() else max(int(np.argmin(good)) - 1, 0)
+    return Trial(
+        states=flown.states[: T + 1],
+        inputs=flown.inputs[:T],
+        dt=truth.dt,
+        state_names=truth.model.state_names,
+        input_names=truth.model.input_names,
+        start_inputs=truth.past,
+    )
+
+
+def unstable(truth: Task, flight: Trial) -> bool:
+    """Whether a flight ended early, or was ever a turn's radius away from the target."""
+    if flight.steps < truth.horizon:
+        return True
+    error: Array = flight.states[:, :3] - truth.target[:, :3]
+    return bool(np.linalg.norm(error, axis=1).max() > RADIUS)
+
+
+def _finite(utility: float) -> float | None:
+    return utility if math.isfinite(utility) else None  # JSON has no infinity
+
+
+def _paths(**flights: Trial) -> dict[str, list[list[float]]]:
+    return {name: t.states[::FIGURE_STEP, :3].tolist() for name, t in flights.items()}

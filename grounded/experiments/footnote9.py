@@ -1,0 +1,142 @@
+"""Footnote 9: a model that is arbitrarily wrong, and one iteration that mends it.
+
+    H = 1,  f(s, a) = a,  R(s) = C exp(-s^2),        model f_hat(s, a) = a + b
+
+The model's optimal action is -b, worth C exp(-b^2) in the real system: for b and C large,
+arbitrarily worse than the optimum C. Its derivatives are exact, epsilon = 0, so Theorem 1 says that the
+algorithm gets there; the paper adds "in a single iteration".
+
+    solved     method A runs to convergence in the biased model. The project's own search does it on
+               -s^2 = log(R / C), which ranks the policies as R does.
+    gradient   method A is one policy-gradient step on R itself, alpha = 1 halved while the real
+               utility does not improve. The gradient 2 C b exp(-b^2) vanishes with b (to zero
+               exactly from b = 28 on): footnote 9 holds for A run to convergence, not for a step.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from grounded.experiments.summary import Table
+from grounded.improve import learn
+from grounded.model import Model, Param
+from grounded.search import Candidate, Options
+from grounded.task import Task
+from grounded.trial import Trial
+from grounded.utility import Reward
+
+OFFSETS = (1.0, 2.0, 3.0, 5.0, 10.0, 30.0)
+CLOSE = 0.99  # share of the optimum that counts as reached
+
+
+@dataclass(frozen=True)
+class Footnote9Row:
+    """One b. Utilities as a share of the optimum C."""
+
+    b: float
+    model_based: float
+    solved: float  # after one iteration
+    solved_trials: int
+    gradient: float  # after `iterations` of policy gradient
+    gradient_trials: int
+
+
+@dataclass(frozen=True)
+class Footnote9Result:
+    """One row for each b."""
+
+    rows: tuple[Footnote9Row, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """Rows by name."""
+        return {"rows": [vars(row) for row in self.rows], "paper": {"iterations": 1}}
+
+    def tables(self) -> list[Table]:
+        """Shares of the optimum by b."""
+        head = ("b", "model-based", "solved, 1 iteration", "trials", "policy gradient", "trials")
+        rows = tuple(
+            (
+                f"{row.b:g}",
+                f"{row.model_based:.3g}",
+                f"{row.solved:.6f}",
+                str(row.solved_trials),
+                f"{row.gradient:.3g}",
+                str(row.gradient_trials),
+            )
+            for row in self.rows
+        )
+        return [Table("Footnote 9: utility as a share of the optimum", head, rows)]
+
+
+def run(offsets: Sequence[float] = OFFSETS, *, iterations: int = 20) -> Footnote9Result:
+    """The model's policy, one iteration of the algorithm, and policy gradient, for each b.
+
+    Args:
+        offsets: values of b.
+        iterations: of the policy gradient, each with up to 30 halvings.
+    """
+    rows = []
+    for b in offsets:
+        solved, solved_trials = _solved(b)
+        gradient, gradient_trials = _gradient(b, iterations)
+        rows.append(
+            Footnote9Row(b, math.exp(-(b**2)), solved, solved_trials, gradient, gradient_trials)
+        )
+    return Footnote9Result(tuple(rows))
+
+
+def _next(s: Any, a: Any, p: Any, dt: float) -> dict[str, Any]:
+    return {"s": a.a + p.b}
+
+
+def footnote9_task(b: float) -> Task:
+    """The approximate MDP with the reward -s^2 on the state after one step."""
+    model = Model(
+        name="footnote 9", states={"s": "1"}, inputs={"a": "1"}, params={"b": Param(b)}, step=_next
+    )
+    zero, one = np.zeros(1), np.ones(1)
+    return Task(
+        model=model,
+        dt=1.0,
+        target=np.zeros((2, 1)),
+        reward=Reward(zero, one, zero, zero),
+        start=zero,
+        past=zero,
+        low=np.full(1, -1e3),
+        high=np.full(1, 1e3),
+        feedback=False,
+    )
+
+
+def _solved(b: float) -> tuple[float, int]:
+    """Share of the optimum after one iteration, and real trials."""
+    task = footnote9_task(b)
+
+    def real(candidate: Candidate) -> Trial:
+        a = candidate.policy.feedforward
+        return Trial(np.vstack([np.zeros((1, 1)), a]), a, 1.0, ("s",), ("a",))
+
+    standing, _, trials = learn(task, real, Options(step="full"), max_iterations=1)
+    return math.exp(standing.utilities[-1]), len(trials)
+
+
+def _gradient(b: float, iterations: int) -> tuple[float, int]:
+    """Policy gradient with the paper's halving, on R / C itself."""
+    a, trials = -b, 1
+    for _ in range(iterations):
+        best = math.exp(-(a**2))
+        slope = -2 * a * best  # exact: the biased model's derivative is the real one
+        for halving in range(31):
+            trials += 1
+            moved = a + 0.5**halving * slope
+            if math.exp(-(moved**2)) > best:
+                a = moved
+                break
+        else:
+            break
+    return math.exp(-(a**2)), trials

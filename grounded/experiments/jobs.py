@@ -1,0 +1,181 @@
+"""Jobs: a study is a list of independent, seeded jobs; how many workers there are changes nothing.
+
+A job is a module-level function called with plain numbers and names, and returns plain JSON values.
+It draws all its randomness from its own seed, so the same seeds give the same results bit for bit
+on one worker or on fifty. The engine is joblib: processes on this machine, or an existing cluster
+through Dask's own joblib backend (extra `grounded[cluster]`); there is no scheduler of ours.
+
+    finished    a mapping from the job's key to its result; jobs found in it are not run again. The
+                caller may keep it on disk: a study that was cut off goes on where it was.
+    lost worker its job is run again (by Dask itself, or here after a process died), not the study.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, MutableMapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from typing import Any
+
+from grounded.errors import GroundedError
+
+Progress = Callable[[int, int], None]  # jobs done, jobs in all
+ROUNDS = 5  # times that jobs of lost workers are handed out again
+
+
+@dataclass(frozen=True)
+class Job:
+    """One call of a module-level function with JSON-like arguments."""
+
+    function: Callable[..., dict[str, Any]]
+    arguments: dict[str, Any]
+
+    @property
+    def key(self) -> str:
+        """What identifies its result: the function's name and its arguments."""
+        return f"{self.function.__module__}.{self.function.__name__}:" + json.dumps(
+            self.arguments, sort_keys=True
+        )
+
+
+@dataclass(frozen=True)
+class Engine:
+    """Where jobs run.
+
+    Args:
+        jobs: processes on this machine; 1 runs them in this one.
+        name: "local", or "dask" for a running cluster.
+        address: the cluster's scheduler, such as "tcp://10.0.0.1:8786".
+    """
+
+    jobs: int = 1
+    name: str = "local"
+    address: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.jobs < 1:
+            raise GroundedError(f"--jobs must be 1 or more, got {self.jobs}")
+        if self.name not in ("local", "dask"):
+            raise GroundedError(f"--engine must be 'local' or 'dask', got '{self.name}'")
+        if (self.name == "dask") != (self.address is not None):
+            raise GroundedError(
+                "--engine dask needs the scheduler's --address (tcp://host:8786), and only it does"
+            )
+
+
+def run_jobs(
+    jobs: Sequence[Job],
+    engine: Engine | None = None,
+    *,
+    finished: MutableMapping[str, dict[str, Any]] | None = None,
+    progress: Progress | None = None,
+) -> list[dict[str, Any]]:
+    """Results in the order of the jobs.
+
+    Args:
+        jobs: what to run.
+        engine: where; None: in this process.
+        finished: results by `Job.key`; read before, filled as jobs end.
+        progress: called with jobs done and jobs in all.
+
+    Raises:
+        GroundedError: if joblib or Dask is missing, or workers keep dying.
+    """
+    engine = engine or Engine()
+    finished = {} if finished is None else finished
+    results = {job.key: finished[job.key] for job in jobs if job.key in finished}
+    waiting = list({job.key: job for job in jobs if job.key not in results}.values())
+    if progress:
+        progress(len(results), len(results) + len(waiting))
+    total = len(results) + len(waiting)
+    for _ in range(ROUNDS):
+        try:
+            for key, result in _results(waiting, engine):
+                finished[key] = results[key] = result
+                if progress:
+                    progress(len(results), total)
+        except _lost() as error:
+            lost = error
+        waiting = [job for job in waiting if job.key not in results]
+        if not waiting:
+            return [results[job.key] for job in jobs]
+    raise GroundedError(
+        f"{len(waiting)} of {total} jobs lost their worker {ROUNDS} times (out of memory?); the "
+        f"finished ones are kept, run the study again with fewer --jobs: {lost}"
+    )
+
+
+def _call(job: Job) -> tuple[str, dict[str, Any]]:
+    # Through JSON and back: a result that was kept on disk is the very same value.
+    return job.key, json.loads(json.dumps(job.function(**job.arguments)))
+
+
+def _results(jobs: Sequence[Job], engine: Engine) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Results as they come, in any order."""
+    if not jobs:
+        return
+    if engine.name == "local" and engine.jobs == 1:
+        yield from map(_call, jobs)
+        return
+    joblib = _import("joblib", "pip install joblib")
+    with _backend(engine, joblib):
+        parallel = joblib.Parallel(
+            n_jobs=-1 if engine.name == "dask" else engine.jobs,
+            return_as="generator_unordered",
+            batch_size=1,
+            pre_dispatch="all" if engine.name == "dask" else "2*n_jobs",
+        )
+        yield from parallel(joblib.delayed(_call)(job) for job in jobs)
+
+
+def _backend(engine: Engine, joblib: Any) -> AbstractContextManager[Any]:
+    if engine.name == "local":
+        # One BLAS thread a worker: results don't depend on how many workers share the machine.
+        config = joblib.parallel_config(backend="loky", inner_max_num_threads=1)
+        return config if config is not None else nullcontext()
+    distributed = _import("distributed", 'pip install "grounded[cluster]"')
+    client = distributed.Client(engine.address)
+    return _Cluster(client, joblib)
+
+
+class _Cluster(AbstractContextManager[None]):
+    """A connection to a running Dask cluster, closed at the end; the cluster stays."""
+
+    def __init__(self, client: Any, joblib: Any) -> None:
+        self.client, self.joblib = client, joblib
+
+    def __enter__(self) -> None:
+        self.config = self.joblib.parallel_config(backend="dask", client=self.client)
+        self.config.__enter__()
+
+    def __exit__(self, *error: object) -> None:
+        self.config.__exit__(*error)
+        self.client.close()
+
+
+def _lost() -> tuple[type[BaseException], ...]:
+    """The errors that say a worker died, not that a job failed."""
+    kinds: list[type[BaseException]] = []
+    try:
+        from joblib.externals.loky.process_executor import TerminatedWorkerError
+
+        kinds.append(TerminatedWorkerError)
+    except ImportError:
+        pass
+    try:
+        from distributed.scheduler import KilledWorker
+
+        kinds.append(KilledWorker)
+    except ImportError:
+        pass
+    return tuple(kinds)
+
+
+def _import(name: str, remedy: str) -> Any:
+    import importlib
+
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise GroundedError(f"this needs the package '{name}': {remedy}") from error
