@@ -1,4 +1,4 @@
-"""Policies: what a robot runs. A sequence of inputs, or linear feedback around one.
+"""Policies: what a robot runs, and the runner that runs it. numpy alone.
 
     u_t = clip( ubar_t + K_t (z_t - zbar_t) ),     z_t = [x_t, inputs already sent]
 
@@ -6,12 +6,24 @@ The past inputs in z (newest first, input by input, see `grounded.compile.proble
 whoever runs the policy: `Runner` keeps them. theta, the paper's policy parameters, are all
 feed-forwards and gains; `theta + alpha d` is `toward(other, alpha)`.
 
-This file needs numpy alone, so that a robot needs nothing else.
+On the robot:
+
+    runner = load("c0003.npz", states=("delta", "v", "x", "y", "psi", "psi_rate"))
+    while not runner.done(t):
+        send(runner.action(t, state))          # array (m,), inside the hard limits
+
+  - the controller for the step NEAREST to t is used (footnote 18), so it may be called at the rate
+    of the state estimate; it remembers the inputs that it sent, which the gains need;
+  - a state that is not finite switches the feedback off for that call: the feed-forward alone is
+    sent, and `blind` counts such calls;
+  - after the horizon it sends the input that was held before the start, never the last one.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -98,3 +110,123 @@ def z_difference(a: Array, b: Array, angles: tuple[bool, ...]) -> Array:
         if angle:
             d[..., i] -= 2 * np.pi * np.rint(d[..., i] / (2 * np.pi))
     return d
+
+
+FORMAT = "grounded-policy-1"
+_NUMBERS = ("feedforward", "low", "high", "past")
+
+
+class Runner:
+    """Executes one run of a policy; make a new one for each run."""
+
+    def __init__(self, policy: Policy) -> None:
+        self.policy = policy
+        self.blind = 0  # calls with a state that was not finite
+        self._H, m = policy.feedforward.shape
+        self._deep = max(policy.depths, default=1)
+        self._sent = np.tile(policy.past, (self._H + self._deep, 1))
+        self._latest = -1
+        columns = [(j, i + 1) for j, d in enumerate(policy.depths) for i in range(d)]
+        self._queue_input = np.array([c[0] for c in columns], dtype=int)
+        self._queue_lag = np.array([c[1] for c in columns], dtype=int)
+        self._angles = np.flatnonzero(policy.angles)
+        self._n = len(policy.state_names)
+        self._z = np.empty(self._n + len(columns))
+
+    def done(self, t: float) -> bool:
+        """Whether t [s] since the start is past the last control step."""
+        return round(t / self.policy.dt) >= self._H
+
+    def action(self, t: float, s: Any) -> Array:
+        """The inputs to send, (m,), for the state s (n,) at t seconds after the start."""
+        policy = self.policy
+        step = max(int(t / policy.dt + 0.5), 0)
+        if step >= self._H:
+            return policy.past
+        base = step + self._deep
+        if step > self._latest + 1:  # calls were missed: the input was held meanwhile
+            self._sent[self._latest + 1 + self._deep : base] = self._sent[self._latest + self._deep]
+        u = policy.feedforward[step]
+        if policy.gain is not None and policy.reference is not None:
+            z = self._z
+            z[: self._n] = s
+            z[self._n :] = self._sent[base - self._queue_lag, self._queue_input]
+            z -= policy.reference[step]
+            for i in self._angles:
+                z[i] -= 2 * np.pi * round(z[i] / (2 * np.pi)) if z[i] == z[i] else 0.0
+            correction = policy.gain[step] @ z
+            if np.isfinite(correction).all():
+                u = u + correction
+            else:
+                self.blind += 1
+        u = np.minimum(np.maximum(u, policy.low), policy.high)
+        self._sent[base] = u
+        self._latest = step
+        return u
+
+
+def to_arrays(policy: Policy, **about: str) -> dict[str, Any]:
+    """A policy as plain arrays and strings for `numpy.savez`; `about` adds what a reader may check."""
+    arrays: dict[str, Any] = {name: getattr(policy, name) for name in _NUMBERS}
+    arrays |= {
+        "format": FORMAT,
+        "dt": policy.dt,
+        "state_names": np.array(policy.state_names),
+        "input_names": np.array(policy.input_names),
+        "z_names": np.array(policy.z_names),
+        "depths": np.array(policy.depths),
+        "angles": np.array(policy.angles),
+    }
+    if policy.gain is not None:
+        arrays |= {"gain": policy.gain, "reference": policy.reference}
+    return arrays | about
+
+
+def load(
+    path: str | Path,
+    *,
+    states: tuple[str, ...] | None = None,
+    inputs: tuple[str, ...] | None = None,
+    task: str | None = None,
+) -> Runner:
+    """A runner from an exported candidate (`grounded export ID --format npz`).
+
+    Args:
+        path: the .npz file; it is data, nothing in it is executed.
+        states: the robot's state names in the order in which it will pass them.
+        inputs: the robot's input names in the order in which it will send them.
+        task: the task hash that the robot is set up for.
+
+    Raises:
+        GroundedError: if the file is no exported candidate, or one for another robot or task.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            data = {name: archive[name] for name in archive.files}
+    except (OSError, ValueError, EOFError, KeyError) as error:
+        raise GroundedError(f"{path} can't be read as an exported candidate (.npz): {error}") from None
+    except Exception as error:  # zipfile and zlib have errors of their own
+        raise GroundedError(f"{path} is damaged: {error}; export it again") from None
+    if str(data.get("format", "")) != FORMAT:
+        raise GroundedError(f"{path} is not a candidate exported by `grounded export --format npz`")
+    policy = Policy(
+        **{name: data[name] for name in _NUMBERS},
+        dt=float(data["dt"]),
+        state_names=tuple(map(str, data["state_names"])),
+        input_names=tuple(map(str, data["input_names"])),
+        depths=tuple(map(int, data["depths"])),
+        angles=tuple(map(bool, data["angles"])),
+        gain=data.get("gain"),
+        reference=data.get("reference"),
+    )
+    wanted = {"states": states, "inputs": inputs}
+    for kind, names in wanted.items():
+        found = policy.state_names if kind == "states" else policy.input_names
+        if names is not None and tuple(names) != found:
+            raise GroundedError(f"{path} is for {kind} {found}; this robot has {tuple(names)}")
+    if task is not None and str(data.get("task", "")) != task:
+        raise GroundedError(f"{path} is for task {data.get('task')}; this robot is set up for {task}")
+    finite = all(np.isfinite(data[k]).all() for k in ("feedforward", "gain", "reference") if k in data)
+    if not finite:
+        raise GroundedError(f"{path} holds numbers that are not finite; export it again")
+    return Runner(policy)

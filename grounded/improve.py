@@ -1,0 +1,263 @@
+"""START HERE: the paper's algorithm as a function of stored trials.
+
+Abbeel, Quigley & Ng, "Using Inaccurate Models in Reinforcement Learning", ICML 2006, section 3.
+The idea: let the REAL system evaluate the policy, and ask the crude model only which way to change
+it. The model is made to replay the last trial exactly, so that its derivatives are taken along the
+true states.
+
+    f_t^(i+1)(s, a) = f_t(s, a) + s_{t+1}^(i) - f_t(s_t^(i), a_t^(i))
+
+| step | paper                                          | here                                    |
+|------|------------------------------------------------|-----------------------------------------|
+| 1, 2 | optimal policy of the crude model              | `first_policy` (`first_guess`, `ddp`)   |
+| 3    | run it, record the trial                       | people, robots: `grounded run`, `ingest`|
+| 4    | add a bias to the ORIGINAL model               | `bias.ground`                           |
+| 5    | direction d from algorithm A in that model     | `direction` (`ddp`, `policy_gradient`)  |
+| 6    | theta + alpha d, line search on the real system| `Policy.toward`, `line_search`          |
+| 7    | none improves: return the current policy       | `search.standing`                       |
+
+`propose` is a pure function: the same candidates and trials give the same next candidate, bit for
+bit. `learn` is the loop for a real system that is a function call.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from grounded import ddp
+from grounded.bias import Grounding, ground
+from grounded.compile import Problem
+from grounded.first_guess import first_guess
+from grounded.frozen import Array
+from grounded.model import Model
+from grounded.policy import Policy
+from grounded.rollout import Rollout, simulate
+from grounded.search import Candidate, Options, Standing, mean_trial, standing
+from grounded.task import Task
+from grounded.trial import Trial
+
+PLANNING = ddp.Options(max_iterations=30, tolerance=1e-6)  # a direction needs no more digits
+CAUTION = 100.0  # factor on the input penalties each time the first policy crashed (FACTS.md 2)
+
+
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """What to run next, or why nothing is: `candidate` is None when the search has ended."""
+
+    standing: Standing
+    candidate: Candidate | None
+    is_new: bool
+    notes: tuple[str, ...] = ()
+
+
+def model_fingerprint(task: Task) -> str:
+    """16 hex digits over the model that plans: its values, latency, smoothing and predictions.
+
+    Predictions at fixed points stand for the code of the dynamics, which has no other identity.
+    """
+    model, problem = task.model, task.problem(exact=True)
+    digest = hashlib.sha256()
+    digest.update(repr((model.state_names, model.input_names, model.param_names)).encode())
+    rng = np.random.default_rng(0)
+    x = task.start + rng.uniform(-0.5, 0.5, (8, model.n))
+    u = np.clip(task.past + rng.uniform(-0.5, 0.5, (8, model.m)), task.low, task.high)
+    with np.errstate(all="ignore"):
+        moved = problem.system.step(x, u, problem.p, problem.dt)
+    for array in (model.values, problem.delay, np.array([task.smoothing]), np.round(moved, 9)):
+        digest.update(np.ascontiguousarray(array + 0.0).tobytes())
+    return digest.hexdigest()[:16]
+
+
+def first_policy(task: Task, caution: int = 0) -> tuple[Policy, ddp.Result]:
+    """Steps 1 and 2: the (locally) optimal policy of the crude model.
+
+    Args:
+        task: the manoeuvre and the crude model.
+        caution: how often a first policy has crashed; each time penalises inputs CAUTION x more.
+    """
+    if caution:
+        reward = replace(
+            task.reward,
+            input=task.reward.input * CAUTION**caution,
+            input_change=np.maximum(task.reward.input_change, 1e-3) * CAUTION**caution,
+        )
+        task = replace(task, reward=reward)
+    guess = first_guess(task)
+    result = ddp.solve(task.problem(), guess.inputs, guess.gain, guess.z[:-1])
+    return task.policy(result.u, result.K, result.z[:-1]), result
+
+
+def direction(task: Task, policy: Policy, grounding: Grounding, options: Options) -> Policy:
+    """Step 5: theta' such that d = theta' - theta improves the policy in the biased model.
+
+    Args:
+        task: the manoeuvre, with the ORIGINAL model.
+        policy: theta, the policy that ran the trial.
+        grounding: the trial as the biased model replays it (step 4).
+        options: which algorithm A.
+    """
+    if options.method == "policy-gradient":
+        return _gradient_direction(task, policy, grounding)
+    problem = task.problem(grounding.bias)
+    if options.step == "damped":
+        problem = damped(problem, grounding.inputs)
+    gains = ddp.damped_step(problem, grounding.z, grounding.inputs, np.zeros(task.model.m)).gains
+    result = ddp.solve(problem, grounding.inputs, gains.K, grounding.z[:-1], PLANNING)
+    return task.policy(result.u, result.K, result.z[:-1])
+
+
+def damped(problem: Problem, inputs: Array) -> Problem:
+    """The problem with a price mu |u_t - inputs_t|^2 on leaving the trial's inputs (H, m).
+
+    The fully converged step goes to the optimum of the biased MODEL, and that need not be uphill in
+    the real system (FACTS.md 2); with mu it turns towards the gradient, which is uphill while the
+    model's derivatives are within 90 degrees (section 3). mu = R + S, the problem's own weights on
+    inputs: the same idea as norm-optimal iterative learning control. Both quadratic penalties on
+    u_t are one: weight R + mu about (R u_target + mu inputs) / (R + mu).
+    """
+    mu = problem.input_weight + problem.change_weight
+    weight = problem.input_weight + mu
+    mixed = problem.input_weight * problem.input_target + mu * inputs
+    safe = np.where(weight > 0, weight, 1.0)
+    return replace(problem, input_weight=weight, input_target=mixed / safe)
+
+
+def _gradient_direction(task: Task, policy: Policy, grounding: Grounding) -> Policy:
+    from grounded.policy_gradient import ascent
+
+    return ascent(task, policy, grounding)
+
+
+def propose(
+    task: Task,
+    candidates: Sequence[Candidate],
+    trials: Sequence[Trial],
+    options: Options,
+    *,
+    refit: Callable[[Model, Sequence[Trial]], Model] | None = None,
+) -> Proposal:
+    """What to run next: the outstanding candidate, a new one, or nothing.
+
+    Args:
+        task: the manoeuvre with the crude model (adopted effects included).
+        candidates: those proposed so far, in order.
+        trials: stored trials, in order.
+        options: the [search] table.
+        refit: with options.refit, gives the model with parameters fitted to all trials.
+    """
+    fingerprint = model_fingerprint(task)
+    now = standing(task, candidates, trials, options, fingerprint)
+    if now.phase == "await-trial":
+        return Proposal(now, now.outstanding, is_new=False)
+    if now.phase != "propose":
+        return Proposal(now, None, is_new=False)
+    assert now.alpha is not None
+    identity = f"c{len(candidates) + 1:04d}"
+    if now.incumbent is None:
+        policy, _ = first_policy(task, now.caution)
+        predicted = simulate(task.problem(exact=True), policy)
+        made = _candidate(identity, policy, predicted, now, fingerprint, task, alpha=1.0)
+        return _checked(task, now, made)
+    planner = task
+    if options.refit and refit is not None:
+        planner = task.with_model(refit(task.model, trials))
+    own = mean_trial(now.incumbent.trials)
+    theta = now.incumbent.candidate.policy
+    target = direction(planner, theta, ground(planner, own), options)
+    real = planner.problem(ground(planner, own, exact=True).bias, exact=True)
+    alpha: float | None = now.alpha
+    while alpha is not None and alpha >= 2.0**-options.max_halvings:
+        policy = theta.toward(target, alpha)
+        made = _candidate(
+            identity, policy, simulate(real, policy), now, fingerprint, task, alpha=alpha
+        )
+        proposal = _checked(task, now, made)
+        if proposal.candidate is not None:
+            return _worth_it(proposal, options)
+        alpha /= 2
+    return proposal
+
+
+def _candidate(
+    identity: str,
+    policy: Policy,
+    predicted: Rollout,
+    now: Standing,
+    fingerprint: str,
+    task: Task,
+    *,
+    alpha: float,
+) -> Candidate:
+    base = now.incumbent
+    return Candidate(
+        id=identity,
+        policy=policy,
+        iteration=0 if base is None else now.iteration + 1,
+        alpha=alpha,
+        base="" if base is None else base.candidate.id,
+        model=fingerprint,
+        predicted_states=predicted.states,
+        predicted_inputs=predicted.inputs,
+        predicted_utility=predicted.utility,
+        caution=now.caution,
+    )
+
+
+def _worth_it(proposal: Proposal, options: Options) -> Proposal:
+    """Ends the search when even the model sees nothing left to gain from a whole step."""
+    now, candidate = proposal.standing, proposal.candidate
+    assert now.incumbent is not None and candidate is not None
+    best = now.incumbent.utility
+    gain = candidate.predicted_utility - best
+    if candidate.alpha < 1.0 or gain > options.tolerance * abs(best):
+        return proposal
+    sentence = (
+        f"the model predicts a gain of {gain:.3g} on {best:.6g}, less than "
+        f"{options.tolerance:g} of it ([search] tolerance): {now.incumbent.candidate.id} is the result"
+    )
+    ended = dataclasses.replace(now, phase="converged", alpha=None, sentence=sentence)
+    return Proposal(ended, None, is_new=False, notes=proposal.notes)
+
+
+def _checked(task: Task, now: Standing, made: Candidate) -> Proposal:
+    """A candidate that is finite, inside the limits and predicted to stay safe; or none."""
+    from grounded.safety import objections
+
+    found = objections(task, made)
+    if not found:
+        return Proposal(now, made, is_new=True)
+    stopped = dataclasses.replace(now, phase="stopped", sentence=found[0])
+    return Proposal(stopped, None, is_new=False, notes=tuple(found))
+
+
+def learn(
+    task: Task,
+    run: Callable[[Candidate], Trial],
+    options: Options,
+    *,
+    max_iterations: int | None = None,
+) -> tuple[Standing, list[Candidate], list[Trial]]:
+    """Steps 1 to 7 for a real system that is a function call: `run` executes a candidate once.
+
+    Args:
+        task: the manoeuvre.
+        run: executes a candidate and returns its trial; its `candidate` field is set here.
+        options: the [search] table.
+        max_iterations: ends after so many accepted improvements.
+    """
+    candidates: list[Candidate] = []
+    trials: list[Trial] = []
+    while True:
+        proposal = propose(task, candidates, trials, options)
+        done = max_iterations is not None and proposal.standing.iteration >= max_iterations
+        if proposal.candidate is None or (done and proposal.is_new):
+            return proposal.standing, candidates, trials
+        if proposal.is_new:
+            candidates.append(proposal.candidate)
+        trial = run(proposal.candidate)
+        trials.append(replace(trial, candidate=proposal.candidate.id))

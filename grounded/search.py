@@ -1,0 +1,209 @@
+"""Where the search stands: a state DERIVED from candidates and stored trials, never kept beside them.
+
+The real system is run by people, so the paper's loop can't be a while loop. Candidates in the order
+in which they were proposed, and the trials that came back, say all there is to know:
+
+    the incumbent    the best candidate so far, pi_theta^(i); its trials measure the next bias
+    outstanding      the candidate that was proposed and has not been run often enough
+    tried            the alphas along the present direction that did not improve (step 6)
+
+Same candidates and trials, same state: nothing depends on the clock or on the process that asks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from grounded.errors import GroundedError
+from grounded.frozen import Array
+from grounded.line_search import next_alpha
+from grounded.policy import Policy
+from grounded.task import Task
+from grounded.trial import Trial
+
+Phase = Literal["propose", "await-trial", "converged", "stopped"]
+MAX_CAUTION = 3  # times the first policy is designed again, ever more gently, after a crash
+
+
+@dataclass(frozen=True)
+class Options:
+    """The [search] table: see CONTRACT.md. `tolerance` ends a search that has nothing to gain."""
+
+    method: Literal["ddp", "policy-gradient"] = "ddp"
+    step: Literal["damped", "full"] = "damped"
+    refit: bool = False
+    max_halvings: int = 6
+    repeats: int = 1
+    max_trials: int = 40
+    tolerance: float = 1e-4  # stop when the model predicts less relative gain than this
+
+    def __post_init__(self) -> None:
+        bounds = {"max_halvings": (0, 30), "repeats": (1, 100), "max_trials": (1, 100_000)}
+        for name, (low, high) in bounds.items():
+            if not low <= getattr(self, name) <= high:
+                raise GroundedError(
+                    f"[search] {name} must be {low} to {high}, got {getattr(self, name)}"
+                )
+        if not 0 <= self.tolerance < 1:
+            raise GroundedError(f"[search] tolerance must be in [0, 1), got {self.tolerance}")
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A policy to run, and how it came about."""
+
+    id: str  # c0001, c0002 ...: the order of proposal
+    policy: Policy
+    iteration: int  # i of theta^(i) that it tries to be; 0 is the model's own policy
+    alpha: float
+    base: str  # the candidate whose trials it was derived from, "" for the model's own
+    model: str  # fingerprint of the model it was planned in
+    predicted_states: Array  # (H + 1, n) in the (biased) model
+    predicted_inputs: Array  # (H, m)
+    predicted_utility: float
+    caution: int = 0  # how often the first policy was redesigned after a crash
+
+
+@dataclass(frozen=True, eq=False)
+class Tried:
+    """A candidate with its trials: mean utility and, for two trials or more, its standard error."""
+
+    candidate: Candidate
+    trials: tuple[Trial, ...]
+    utilities: tuple[float, ...]
+    accepted: bool | None  # None: not decided, trials are missing
+
+    @property
+    def utility(self) -> float:
+        """Mean utility of the trials; nan without a trial, -inf when one of them failed."""
+        return float(np.mean(self.utilities)) if self.utilities else float("nan")
+
+    @property
+    def standard_error(self) -> float:
+        """Of the mean; nan for fewer than two trials."""
+        if len(self.utilities) < 2:
+            return float("nan")
+        return float(np.std(self.utilities, ddof=1) / np.sqrt(len(self.utilities)))
+
+
+@dataclass(frozen=True, eq=False)
+class Standing:
+    """Where the search stands, with the sentence that says it."""
+
+    phase: Phase
+    iteration: int  # accepted improvements so far
+    incumbent: Tried | None
+    outstanding: Candidate | None
+    missing: int  # trials that the outstanding candidate still needs
+    alpha: float | None  # the next step size when a candidate is to be made
+    caution: int
+    history: tuple[Tried, ...]
+    trials: int
+    sentence: str
+
+    @property
+    def utilities(self) -> list[float]:
+        """Utility of the model's policy, then after each accepted improvement."""
+        return [t.utility for t in self.history if t.accepted]
+
+
+def standing(
+    task: Task, candidates: Sequence[Candidate], trials: Sequence[Trial], options: Options, model: str
+) -> Standing:
+    """Steps 6 and 7 over stored trials.
+
+    Args:
+        task: judges the trials.
+        candidates: in order of proposal.
+        trials: in order of storage; those of no known candidate are ignored here.
+        options: the [search] table.
+        model: fingerprint of the task's model now; a direction belongs to one model.
+    """
+    history, incumbent, iteration = _judge(task, candidates, trials, options)
+    total = sum(len(t.trials) for t in history)
+    last = history[-1] if history else None
+
+    def state(phase: Phase, sentence: str, **more: object) -> Standing:
+        fields = dict(outstanding=None, missing=0, alpha=None, caution=0) | more
+        return Standing(
+            phase, iteration, incumbent, history=history, trials=total, sentence=sentence, **fields  # type: ignore[arg-type]
+        )
+
+    if last is not None and last.accepted is None and last.candidate.model == model:
+        missing = options.repeats - len(last.trials)
+        return state(
+            "await-trial",
+            f"{last.candidate.id} is waiting for {missing} trial{'s' * (missing > 1)}",
+            outstanding=last.candidate,
+            missing=missing,
+        )
+    if total >= options.max_trials:
+        return state("stopped", f"all {options.max_trials} trials are used up ([search] max_trials)")
+    if incumbent is None:
+        failed = sum(t.accepted is False for t in history)
+        if failed > MAX_CAUTION:
+            return state(
+                "stopped",
+                f"the first policy crashed {failed} times, designed more gently each time: the "
+                "model is too far off to start from; mend it (fit, diagnose) and propose again",
+            )
+        return state("propose", "the model's own policy comes first", alpha=1.0, caution=failed)
+    own = incumbent.candidate.id
+    losers = [
+        t.candidate.alpha
+        for t in history
+        if t.accepted is False and t.candidate.base == own and t.candidate.model == model
+    ]
+    alpha = next_alpha(losers, options.max_halvings)
+    if alpha is None:
+        return state(
+            "converged",
+            f"no step along the last direction improved on {own} down to alpha = {min(losers):g}: "
+            f"{own} is the result (step 7)",
+        )
+    return state("propose", f"improve on {own} with alpha = {alpha:g}", alpha=alpha)
+
+
+def _judge(
+    task: Task, candidates: Sequence[Candidate], trials: Sequence[Trial], options: Options
+) -> tuple[tuple[Tried, ...], Tried | None, int]:
+    """Every candidate with its trials, accepted or not; the incumbent; iterations done."""
+    history: list[Tried] = []
+    incumbent: Tried | None = None
+    iteration = 0
+    for candidate in candidates:
+        own = tuple(t for t in trials if t.candidate == candidate.id)
+        utilities = tuple(task.utility(t) for t in own)
+        failed = any(u == -np.inf for u in utilities)
+        if len(own) < options.repeats and not failed:
+            history.append(Tried(candidate, own, utilities, None))
+            continue
+        better = incumbent is None or float(np.mean(utilities)) > incumbent.utility
+        accepted = better and not failed
+        tried = Tried(candidate, own, utilities, accepted)
+        history.append(tried)
+        if accepted:
+            iteration += incumbent is not None
+            incumbent = tried
+    return tuple(history), incumbent, iteration
+
+
+def mean_trial(trials: Sequence[Trial]) -> Trial:
+    """The mean of repeated whole trials: states, inputs, the held input; one trial is itself."""
+    if len(trials) == 1:
+        return trials[0]
+    first = trials[0]
+    held = [t.start_inputs for t in trials if t.start_inputs is not None]
+    return Trial(
+        states=np.mean([t.states for t in trials], axis=0),
+        inputs=np.mean([t.inputs for t in trials], axis=0),
+        dt=first.dt,
+        state_names=first.state_names,
+        input_names=first.input_names,
+        candidate=first.candidate,
+        start_inputs=np.mean(held, axis=0) if len(held) == len(trials) else None,
+    )
