@@ -114,7 +114,7 @@ class _Parser:
             raise GroundedError("a message path is empty; write it as /topic.field")
         if len(self.text) > LENGTH_LIMIT:
             raise GroundedError(f"a message path has more than {LENGTH_LIMIT} characters")
-        topic = self.quoted() if self.peek() in "\"'" else self.match(_TOPIC, "a topic")
+        topic = self.name(_TOPIC, "a topic")
         steps: list[Step] = []
         functions: list[Function] = []
         while self.pos < len(self.text):
@@ -130,8 +130,7 @@ class _Parser:
         mark = self.peek()
         if mark == ".":
             self.pos += 1
-            name = self.quoted() if self.peek() in "\"'" else self.match(_NAME, "a field's name")
-            return [Field(name)]
+            return [Field(self.name(_NAME, "a field's name"))]
         if mark == "[":
             return [self.slice()]
         if mark == "{":
@@ -227,10 +226,16 @@ class _Parser:
         if end < 0:
             self.fail(f"the text that begins with {mark} does not end")
         value = self.text[self.pos + 1 : end]
-        if not value:
-            self.fail("a name in quotes is empty")
         self.pos = end + 1
         return value
+
+    def name(self, pattern: re.Pattern[str], what: str) -> str:
+        if self.peek() not in ("'", '"'):
+            return self.match(pattern, what)
+        name = self.quoted()
+        if not name:
+            self.fail("a name in quotes is empty")
+        return name
 
     def peek(self) -> str:
         return self.text[self.pos] if self.pos < len(self.text) else "\0"

@@ -13,11 +13,11 @@ from functools import cached_property
 class Number:
     """A number of a numpy kind without byte order: f8, f4, i1 .. i8, u1 .. u8, b1.
 
-    `zigzag` is protobuf's coding of sint32 and sint64.
+    `coding` is protobuf's of integers: "varint", "zigzag" (sint32, ...) or "fixed" (fixed32, ...).
     """
 
     kind: str
-    zigzag: bool = False
+    coding: str = "varint"
 
     @property
     def size(self) -> int:

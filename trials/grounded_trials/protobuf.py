@@ -93,11 +93,11 @@ class ProtobufNode:
 
     def _read(self, kind: Number, wire: int, at: Ints) -> Floats:
         start = self.start[at]
-        if wire == VARINT and kind.kind[0] != "f":
+        if wire == VARINT and not _is_fixed(kind):
             raw, _ = _varints(self.buffer, start, self.end[at], self.rows[at])
             return _integers(kind, raw)
         size = {FIXED64: 8, FIXED32: 4}.get(wire)
-        if size != kind.size or kind.kind == "b1":
+        if size != kind.size or not _is_fixed(kind):
             raise BadMessage(self.rows[at[0]], "a number is not coded as its schema says")
         return np.asarray(windows(self.buffer, f"<{kind.kind}")[start], dtype=np.float64)
 
@@ -250,10 +250,14 @@ def _varints(buffer: bytes, pos: Ints, limit: Ints, message: Ints) -> tuple[Word
     raise BadMessage(message[active][0], "a number has more than ten bytes")
 
 
+def _is_fixed(kind: Number) -> bool:
+    return kind.kind[0] == "f" or kind.coding == "fixed"
+
+
 def _integers(kind: Number, raw: Words) -> Floats:
     if kind.kind == "b1":
         return np.asarray(raw != 0, dtype=np.float64)
-    if kind.zigzag:
+    if kind.coding == "zigzag":
         raw = (raw >> np.uint64(1)) ^ (np.uint64(0) - (raw & np.uint64(1)))
         return np.asarray(raw.view(np.int64), dtype=np.float64)
     return np.asarray(raw.astype(np.dtype(kind.kind)), dtype=np.float64)  # modulo 2^bits
@@ -266,7 +270,7 @@ def _unpack(
     packed = wire == BYTES
     if not packed.any():
         return owner, start, end, wire
-    size = item.size if item.kind in ("f8", "f4") else 0  # other numbers are varints, mostly
+    size = item.size if _is_fixed(item) else 0
     if size:
         counts = np.where(packed, (end - start) // size, 1)
         ragged = packed & ((end - start) % size != 0)

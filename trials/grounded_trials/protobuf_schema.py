@@ -19,15 +19,15 @@ _NUMBERS = {
     3: Number("i8"),
     4: Number("u8"),
     5: Number("i4"),
-    6: Number("u8"),
-    7: Number("u4"),
+    6: Number("u8", "fixed"),
+    7: Number("u4", "fixed"),
     8: Number("b1"),
     13: Number("u4"),
     14: Number("i4"),
-    15: Number("i4"),
-    16: Number("i8"),
-    17: Number("i4", zigzag=True),
-    18: Number("i8", zigzag=True),
+    15: Number("i4", "fixed"),
+    16: Number("i8", "fixed"),
+    17: Number("i4", "zigzag"),
+    18: Number("i8", "zigzag"),
 }
 STRING, GROUP, MESSAGE, BYTES, REPEATED = 9, 10, 11, 12, 3
 
