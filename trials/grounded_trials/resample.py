@@ -102,6 +102,10 @@ def to_grid(
     names = [*states, *inputs]
     check_clocks({n: series[n] for n in (*names, *span.signals())})
     samples = {n: tidy(n, series[n], unwrap=n in angles) for n in names}
+    how = {n: samples[n].spec.resample or ("linear" if n in states else "hold") for n in names}
+    for name in names:
+        if how[name] == "linear":
+            samples[name].check_linear()
     known, until = _extent(samples, states, inputs, dt)
     origin = min(int(s.t[0]) for s in samples.values())
     start, late = _start(span, series, samples, inputs, known, origin)
@@ -111,9 +115,8 @@ def to_grid(
     middle = start + np.round(dt * 1e9 * (np.arange(count) + 0.5)).astype(np.int64)
     columns, reports = [], []
     for name in names:
-        at, usual = (grid, "linear") if name in states else (middle, "hold")
-        how = samples[name].spec.resample or usual
-        value = samples[name].linear if how == "linear" else samples[name].hold
+        at = grid if name in states else middle
+        value = samples[name].linear if how[name] == "linear" else samples[name].hold
         columns.append(value(at, dt, start))
         reports.append(report_of(samples[name], series[name], columns[-1], at, start))
     held = np.array([samples[n].before(start - round(dt * 0.5e9)) for n in inputs])

@@ -43,17 +43,19 @@ class Samples:
             return self.spec.max_age_s
         return max(GAP_INTERVALS * self.interval, GAP_STEPS * dt)
 
+    def check_linear(self) -> None:
+        """Refuses a single sample, between which and the next nothing can be interpolated."""
+        if len(self.t) < 2:
+            raise _unusable(
+                self.name, self.spec, 'one sample can\'t be interpolated; set resample = "hold"'
+            )
+
     def linear(self, at: Ints, dt: float, origin: int) -> Floats:
         """Values at times [ns], interpolated; half an interval beyond the ends is allowed.
 
         Raises:
             GroundedError: where a time lies in a gap, or outside the samples.
         """
-        if len(self.t) < 2:
-            raise GroundedError(
-                f"'{self.name}' ({self.spec.path}) has {len(self.t)} usable sample; a signal that "
-                'is interpolated needs two or more (or resample = "hold")'
-            )
         i = np.clip(np.searchsorted(self.t, at, "right"), 1, len(self.t) - 1)
         t0, t1 = self.t[i - 1], self.t[i]
         self._refuse_gaps(at, t0, t1, dt, origin)
