@@ -14,6 +14,8 @@ from grounded.compile.names import Named
 from grounded.compile.problem import Problem, history_depths
 from grounded.compile.python import DifferencedSystem
 from grounded.compile.system import Backward, Swarm, System
+from grounded.compile.traced import TracedSystem
+from grounded.compile.tracing import Signature, trace
 
 __all__ = ["Backward", "Named", "Problem", "Swarm", "System", "history_depths", "system_of"]
 
@@ -42,11 +44,21 @@ def system_of(
     Raises:
         GroundedError: if the function can't be a model of these names, naming its file and line.
     """
-    return DifferencedSystem(
-        function,
-        kind=kind,
-        states=states,
-        inputs=inputs,
-        params=params,
-        integrator=integrator,
-    )
+    from grounded.compile import jit
+    from grounded.compile.compiled import CompiledSystem
+
+    signature = Signature(function, kind, tuple(states), tuple(inputs), tuple(params))
+    found = trace(signature, None, 1.0)
+    if isinstance(found, str):
+        return DifferencedSystem(
+            function,
+            kind=kind,
+            states=states,
+            inputs=inputs,
+            params=params,
+            integrator=integrator,
+            note=f"not compiled, {found}",
+        )
+    if not jit.available():
+        return TracedSystem(signature, found, integrator, "not compiled: llvmlite is missing")
+    return CompiledSystem(signature, found, integrator)

@@ -9,10 +9,15 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from types import FrameType
 from typing import Any
 
+import numpy as np
+
 from grounded.errors import GroundedError, nearest
+
+_NOT_THE_USER = (str(Path(__file__).parent), str(Path(np.__file__).parent), "<frozen")
 
 
 class Named(Mapping[str, Any]):
@@ -78,11 +83,11 @@ def where(function: Any) -> str:
 
 
 def raised_at(error: BaseException, function: Any) -> str:
-    """file:line of the deepest frame of `error` that lies in the file that defines `function`."""
-    home = where(function).rpartition(":")[0]
+    """file:line of the deepest frame of `error` in the user's code."""
     trace, found = error.__traceback__, where(function)
     while trace is not None:
-        if trace.tb_frame.f_code.co_filename == home:
-            found = f"{home}:{trace.tb_lineno}"
+        file = trace.tb_frame.f_code.co_filename
+        if not file.startswith(_NOT_THE_USER):
+            found = f"{file}:{trace.tb_lineno}"
         trace = trace.tb_next
     return found

@@ -76,7 +76,7 @@ def sweep(problem: Problem, z: Array, u: Array, f_x: Array, f_u: Array, damping:
         Q_zz = np.diag(q.l_zz[t]) + A.T @ VA
         Q_uu = np.diag(q.l_uu) + B.T @ VB
         Q_uz = q.l_uz + B.T @ VA
-        if not _positive_definite(Q_uu + np.diag(damping)):
+        if not (_positive_definite(Q_uu + np.diag(damping)) and np.isfinite(Q_u).all()):
             return Backward(k, K, d1, d2, t)
         k[t], K[t] = _gains(
             Q_uu + np.diag(damping), Q_u, Q_uz, problem.low - u[t], problem.high - u[t]
@@ -86,7 +86,7 @@ def sweep(problem: Problem, z: Array, u: Array, f_x: Array, f_u: Array, damping:
         V_z = Q_z + K[t].T @ (Q_uu @ k[t] + Q_u) + Q_uz.T @ k[t]
         V = Q_zz + K[t].T @ (Q_uu @ K[t] + Q_uz) + Q_uz.T @ K[t]
         V = 0.5 * (V + V.T)
-    return Backward(k, K, d1, d2, -1)
+    return Backward(k, K, d1, d2, -1 if np.isfinite(K[0]).all() else 0)
 
 
 def _positive_definite(Q: Array) -> bool:

@@ -28,7 +28,7 @@ class Backward:
     """One Riccati sweep: u_t = ubar_t + alpha k_t + K_t (z_t - zbar_t).
 
     The cost is expected to change by alpha d1 + alpha^2 d2 (d1 <= 0 <= d2). `failed_at` is the
-    step whose Q_uu was not positive definite, or -1 when the sweep went through.
+    step whose Q_uu was not positive definite or not finite, -1 when the sweep went through.
     """
 
     k: Array  # (H, m)

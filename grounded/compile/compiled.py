@@ -1,0 +1,237 @@
+"""The fast path: the user's function as machine code.
+
+One module holds the kernels that a search needs (step, rollout, linearise, sweep), another the
+sensitivities that a fit needs, made when they are first asked for. Parameters, bias, targets and
+weights are arguments: one compile serves every trial, every perturbed model, every fit. What can't
+be compiled at all, or would take too long to, is left to the interpreted twin (`traced.py`).
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import struct
+import threading
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from grounded.compile import jit
+from grounded.compile.interpreted import Integrator
+from grounded.compile.llvm_batch import BATCH, linearise_kernel, step_kernel
+from grounded.compile.llvm_box import MAX_INPUTS, box_functions
+from grounded.compile.llvm_riccati import SWEEP, sweep_kernel
+from grounded.compile.llvm_rollout import LANES, ROLLOUT, Layout, rollout_kernel
+from grounded.compile.llvm_step import Dynamics, dynamics_of, jacobian_function, stage_tables
+from grounded.compile.llvm_text import declarations
+from grounded.compile.problem import Array, Problem
+from grounded.compile.queue import queue_of
+from grounded.compile.system import Backward, Swarm
+from grounded.compile.traced import TracedSystem, Variant
+from grounded.compile.tracing import Signature, Trace
+
+FORMAT = 1  # raise when kernels change their words or their meaning
+
+
+class Kernels:
+    """The compiled modules of one trace."""
+
+    def __init__(self, variant: Variant, system: CompiledSystem) -> None:
+        n, m, k = system.n, system.m, system.k
+        kind, integrator = system.kind, system.integrator
+        self.small = dynamics_of(variant, n, m, n + m, kind, integrator)
+        self._wide = (variant, n, m, n + m + k, kind, integrator)
+        graph = variant.trace.graph
+        nodes = [*variant.trace.outputs, *(i for _, _, i in variant.entries)]
+        places = [(r, c) for r, c, _ in variant.entries]
+        self._key = (
+            f"{FORMAT} {jit.writers()} {graph.digest(nodes)} {places} {n} {m} {kind} {integrator}"
+        )
+        self._libraries: dict[Any, jit.Library] = {}
+        self._lock = threading.Lock()
+
+    def search(self, layout: Layout) -> jit.Library:
+        """Step, linearise, rollout and (for few enough inputs) sweep."""
+        return self._library(layout, self.small, layout)
+
+    def any_search(self) -> jit.Library:
+        """A library with step and linearise, whatever its layout."""
+        with self._lock:
+            for key, known in self._libraries.items():
+                if key != "full":
+                    return known
+        d = self.small
+        return self.search(Layout(d.n, (1,) * d.m, (False,) * d.n))
+
+    def full(self) -> tuple[jit.Library, Dynamics]:
+        """Linearise with respect to the parameters as well."""
+        if not hasattr(self, "wide"):
+            self.wide = dynamics_of(*self._wide)
+        return self._library("full", self.wide, None), self.wide
+
+    def _library(self, key: Any, d: Dynamics, layout: Layout | None) -> jit.Library:
+        with self._lock:
+            if key not in self._libraries:
+                names = ["linearise"]
+                if layout is not None:
+                    names += ["step", "rollout"] + ["sweep"] * (layout.m <= MAX_INPUTS)
+                digest = hashlib.sha256(f"{self._key} {key}".encode()).hexdigest()
+                self._libraries[key] = jit.library(digest, lambda: _module(d, layout), names)
+            return self._libraries[key]
+
+
+def _module(d: Dynamics, layout: Layout | None) -> str:
+    """The IR text of a module."""
+    width = jit.lanes()
+    parts = [
+        declarations({width, LANES}),
+        stage_tables(d),
+        d.uniforms.function(),
+        jacobian_function(d, width),
+        linearise_kernel(d, width),
+    ]
+    if layout is not None:
+        parts += [step_kernel(d, width), rollout_kernel(d, layout)]
+        if layout.m <= MAX_INPUTS:
+            parts += [box_functions(layout.m), sweep_kernel(d, layout, width)]
+    return "".join(parts)
+
+
+def call(function: Any, names: Sequence[str], values: Mapping[str, Any]) -> int:
+    """Calls a kernel with its table of words; arrays must be contiguous float64."""
+    table = (ctypes.c_int64 * len(names))(*[_word(values[name]) for name in names])
+    return int(function(ctypes.addressof(table)))
+
+
+def _word(value: Any) -> int:
+    if isinstance(value, np.ndarray):
+        return int(value.__array_interface__["data"][0])
+    if isinstance(value, float):
+        return int(struct.unpack("<q", struct.pack("<d", value))[0])
+    return int(value)
+
+
+def _plain(array: Any) -> Array:
+    return np.ascontiguousarray(array, dtype=np.float64)
+
+
+class CompiledSystem(TracedSystem):
+    """A traced function, compiled."""
+
+    how = "compiled"
+
+    def __init__(self, signature: Signature, first: Trace, integrator: Integrator) -> None:
+        super().__init__(signature, first, integrator, "")
+        self._kernels: dict[int, Kernels] = {}
+
+    def _compiled(self, p: Array, dt: float) -> Kernels:
+        variant = self.variant(p, dt)
+        kernels = self._kernels.get(id(variant))
+        if kernels is None:
+            kernels = self._kernels.setdefault(id(variant), Kernels(variant, self))
+        return kernels
+
+    def step(self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0) -> Array:
+        """See `System.step`."""
+        out = np.empty((len(x), self.n))
+        library = self._compiled(p, dt).any_search()
+        self._batch(library["step"], x, u, p, dt, smoothing, out)
+        return out
+
+    def _derivatives(
+        self, x: Array, u: Array, p: Array, dt: float, smoothing: float, full: bool
+    ) -> Array:
+        kernels = self._compiled(p, dt)
+        library, d = kernels.full() if full else (kernels.any_search(), kernels.small)
+        N, width, places = len(x), jit.lanes(), len(d.places)
+        values = np.empty((-(-N // width), places, width))
+        self._batch(library["linearise"], x, u, p, dt, smoothing, values)
+        J = np.zeros((N, self.n, self.n + self.m + (self.k if full else 0)))
+        rows, columns = np.array(d.places, int).reshape(-1, 2).T
+        J[:, rows, columns] = values.transpose(0, 2, 1).reshape(-1, places)[:N]
+        return J
+
+    def _batch(
+        self, kernel: Any, x: Array, u: Array, p: Array, dt: float, eps: float, out: Array
+    ) -> None:
+        if len(x) == 0:
+            return
+        x, u, p = _plain(x), _plain(u), _plain(p)
+        values = (x, u, p, float(dt), float(eps), len(x), out)
+        call(kernel, BATCH, dict(zip(BATCH, values, strict=True)))
+
+    def rollout(
+        self,
+        problem: Problem,
+        ubar: Array,
+        K: Array | None = None,
+        zbar: Array | None = None,
+        k: Array | None = None,
+        alphas: Array | None = None,
+    ) -> Swarm:
+        """See `System.rollout`."""
+        steps = np.ones(1) if alphas is None else np.asarray(alphas, float)
+        runs, H, nz = len(steps), problem.horizon, problem.nz
+        z, u, cost = np.empty((runs, H + 1, nz)), np.empty((runs, H, self.m)), np.empty(runs)
+        packed = self._packed(problem)
+        lanes = np.empty(LANES)
+        arrays = [None if a is None else _plain(a) for a in (ubar, K, zbar, k)]
+        if arrays[2] is None:
+            arrays[1] = None
+        words = packed | dict(
+            zip(("ubar", "K", "zbar", "k"), [0 if a is None else a for a in arrays], strict=True)
+        )
+        kernel = self._compiled(problem.p, problem.dt).search(self._layout(problem))["rollout"]
+        for at in range(0, runs, LANES):
+            some = min(LANES, runs - at)
+            lanes[:some], lanes[some:] = steps[at : at + some], steps[at]
+            words |= {"alphas": lanes, "runs": some, "z": z[at:], "u": u[at:], "cost": cost[at:]}
+            call(kernel, ROLLOUT, words)
+        return Swarm(z, u, cost)
+
+    def backward(self, problem: Problem, z: Array, u: Array, damping: Array) -> Backward:
+        """See `System.backward`."""
+        if self.m > MAX_INPUTS:
+            return super().backward(problem, z, u, damping)
+        H, nz = problem.horizon, problem.nz
+        k, K, expected = np.zeros((H, self.m)), np.zeros((H, self.m, nz)), np.zeros(2)
+        z, u, damping = _plain(z), _plain(u), _plain(damping)
+        words = self._packed(problem) | {"z_run": z, "u_run": u, "damping": damping}
+        words |= {"k": k, "K": K, "expected": expected}
+        kernel = self._compiled(problem.p, problem.dt).search(self._layout(problem))["sweep"]
+        failed = call(kernel, SWEEP, words)
+        if failed < 0 and not np.isfinite(K[0]).all():
+            failed = 0
+        return Backward(k, K, float(expected[0]), float(expected[1]), failed)
+
+    def _layout(self, problem: Problem) -> Layout:
+        return Layout(self.n, problem.depths, tuple(bool(a) for a in problem.angles))
+
+    def _packed(self, problem: Problem) -> dict[str, Any]:
+        """The words that a problem gives every kernel; its arrays are kept alive beside it."""
+        known = problem.__dict__.get("_packed")
+        if known is None:
+            queue = queue_of(problem)
+            known = {
+                "start": problem.z_start(),
+                "p": problem.p,
+                "bias": problem.bias,
+                "target": problem.target,
+                "weight": problem.state_weight,
+                "input_target": problem.input_target,
+                "R": problem.input_weight,
+                "S": problem.change_weight,
+                "low": problem.low,
+                "high": problem.high,
+                "now": queue.now,
+                "past": queue.past,
+            }
+            known = {name: _plain(array) for name, array in known.items()}
+            known |= {
+                "dt": float(problem.dt),
+                "eps": float(problem.smoothing),
+                "H": problem.horizon,
+            }
+            problem.__dict__["_packed"] = known
+        return known

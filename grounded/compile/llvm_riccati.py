@@ -1,0 +1,337 @@
+"""Kernel: linearise along a trajectory and sweep back, the compiled twin of `sweep.py`.
+
+Rows of the value's Hessian V are vectors. With the Jacobian [A B] sparse and the past inputs a
+shift, the two products of Q = [A B]' V [A B] are the same routine twice,
+
+    M = [A B]' V,   Q = [A B]' M'      row c of [A B]'X = sum over r of [A B](r, c) X(r, :)
+
+with a transposition between, so that only non-zero places cost anything and every operation is a
+whole row. The Jacobian is computed W time steps at once, just before the sweep needs them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from grounded.compile.llvm_batch import Words, gather_rows, start_table
+from grounded.compile.llvm_box import ONE, ZERO, clipped, solved
+from grounded.compile.llvm_rollout import Layout, received, wrap
+from grounded.compile.llvm_step import Dynamics
+from grounded.compile.llvm_text import Writer, number, splat, vector
+
+SWEEP = (
+    *("z_run", "u_run", "p", "dt", "eps", "target", "weight", "input_target", "R", "S"),
+    *("low", "high", "now", "past", "damping", "H", "k", "K", "expected"),
+)
+Row = Callable[[int], str]  # loads (a piece of) row r of a matrix
+
+
+def padded(size: int) -> int:
+    """Rows are multiples of four doubles."""
+    return -(-size // 4) * 4
+
+
+def pieces(size: int, width: int) -> list[tuple[int, int]]:
+    """A padded row as vectors that the machine has: (first entry, W or 4 entries) of each."""
+    wide = size // width * width
+    cut = [(at, width) for at in range(0, wide, width)]
+    return cut + [(at, 4) for at in range(wide, size, 4)]
+
+
+def sweep_kernel(d: Dynamics, layout: Layout, width: int) -> str:
+    """`i64 @sweep(words)`: the step whose Q_uu was not positive definite, or -1."""
+    f = Writer("i64 @sweep(ptr %words)")
+    writer = _Sweep(f, d, layout, width)
+    writer.end()
+    with f.loop(writer.words.integer("H"), down=True) as t:
+        writer.linearise(t)
+        writer.products(t)
+        writer.gains(t)
+        writer.value(t)
+    f.store(f.load(writer.sums, 0), writer.words.pointer("expected"), 0)
+    f.store(f.load(writer.sums, 1), writer.words.pointer("expected"), 1)
+    f.do("ret i64 -1")
+    return f.text()
+
+
+class _Sweep:
+    """The parts of the kernel. P and C are the padded widths of a row over z and over [z, u]."""
+
+    def __init__(self, f: Writer, d: Dynamics, layout: Layout, width: int) -> None:
+        self.f, self.d, self.layout, self.width, self.words = f, d, layout, width, Words(f, SWEEP)
+        n, m, nz = layout.n, layout.m, layout.nz
+        self.P, self.C = padded(nz), padded(nz + m)
+        self.cut = pieces(self.P, width)
+        self.table = start_table(f, self.words, d)
+        self.soa = f.room((nz + m) * width)
+        self.xu, self.following = f.room((n + m) * width), f.room(n * width)
+        self.jac = f.room(len(d.places) * width)
+        self.V, self.v = f.room(self.P * self.P), f.room(self.P)
+        self.M, self.T = f.room(self.C * self.P), f.room(self.P * self.C)
+        self.U = f.room(m * self.C)  # rows of [Q_uz Q_uu]
+        self.g_z, self.g_u = f.room(self.P), f.room(m)
+        self.H, self.L, self.inv = f.room(m * m), f.room(m * m), f.room(m)
+        self.k, self.free, self.low, self.high = (f.room(m) for _ in range(4))
+        self.K, self.F, self.sums = f.room(m * self.P), f.room(m * self.P), f.room(2)
+
+    def _row(self, name: str, t: str, size: int) -> str:
+        return self.f.at(self.words.pointer(name), self.f.integer("mul", t, size))
+
+    def end(self) -> None:
+        """V and v of the last state; zeros in the padding."""
+        f = self.f
+        rooms = ((self.V, self.P * self.P), (self.M, self.C * self.P), (self.v, self.P))
+        for room, size in (*rooms, (self.g_z, self.P)):
+            with f.loop(size // 4) as four:
+                f.store(splat(0.0, 4), room, f.integer("mul", four, 4), 4)
+        f.store(splat(0.0, 2), self.sums, 0, 2)
+        for i, (slope, curvature) in enumerate(self._tracking(self.words.integer("H"))):
+            f.store(slope, self.v, i)
+            f.store(curvature, self.V, i * self.P + i)
+
+    def _tracking(self, t: str) -> list[tuple[str, str]]:
+        """(2 W e, 2 W) of each state at step t."""
+        f, n = self.f, self.layout.n
+        z, target = self._row("z_run", t, self.layout.nz), self._row("target", t, n)
+        weight, out = self._row("weight", t, n), []
+        for i in range(n):
+            e = f.sub(f.load(z, i), f.load(target, i))
+            e = wrap(f, e, 1) if self.layout.angles[i] else e
+            once = f.load(weight, i)
+            twice = f.add(once, once)
+            out.append((f.mul(twice, e), twice))
+        return out
+
+    def linearise(self, t: str) -> None:
+        """The Jacobians of W steps, when t is the last of a block."""
+        f, layout, w = self.f, self.layout, self.width
+        H = self.words.integer("H")
+        last = f.emit(f"icmp eq i64 {t}, {f.integer('sub', H, 1)}")
+        edge = f.emit(f"icmp eq i64 {f.integer('and', t, w - 1)}, {w - 1}")
+        with f.when(f.emit(f"or i1 {last}, {edge}")):
+            first = f.integer("and", t, -w)
+            u_soa = f.at(self.soa, layout.nz * w)
+            z_run, u_run = self.words.pointer("z_run"), self.words.pointer("u_run")
+            gather_rows(f, [(z_run, layout.nz, self.soa), (u_run, layout.m, u_soa)], first, H, w)
+            z = [f.load(self.soa, i * w, w) for i in range(layout.nz)]
+            u = [f.load(u_soa, j * w, w) for j in range(layout.m)]
+            sent = received(f, self.words, layout, z, u, w)
+            for i, value in enumerate([*z[: layout.n], *sent]):
+                f.store(value, self.xu, i * w, w)
+            f.do(
+                f"call void @jacobian(ptr {self.xu}, ptr {self.table}, "
+                f"ptr {self.following}, ptr {self.jac})"
+            )
+
+    def _combined(self, row: Row, size: int, inputs_only: bool = False) -> list[str]:
+        """Rows of [A B]'X, z first and then u, from pieces X(r, :) of `size` doubles."""
+        f, d, layout = self.f, self.d, self.layout
+        sums: dict[int, str] = {}
+        for e, (r, c) in enumerate(d.places):
+            if c < layout.n and inputs_only:
+                continue
+            a, value = self._entry(e, size), row(r)
+            sums[c] = f.fma(a, value, sums[c], size) if c in sums else f.mul(a, value, size)
+        out = [sums.get(c, splat(0.0, size)) for c in range(layout.n)]
+        now, past, D = self.words.pointer("now"), self.words.pointer("past"), layout.nz - layout.n
+        inputs = []
+        for j, depth in enumerate(layout.depths):
+            G = sums.get(layout.n + j, splat(0.0, size))
+            for i in range(depth):
+                weight = f.load_all(past, j * D + layout.slot(j, i) - layout.n, size)
+                value = f.mul(weight, G, size)
+                older = i + 1 < depth
+                out.append(f.add(value, row(layout.slot(j, i + 1)), size) if older else value)
+            inputs.append(f.fma(f.load_all(now, j, size), G, row(layout.slot(j)), size))
+        return inputs if inputs_only else out + inputs
+
+    def _entry(self, e: int, size: int) -> str:
+        """Value e of the Jacobian of this step, in every lane."""
+        if (e, 1) not in self.entries:
+            self.entries[e, 1] = self.f.load(self.now, e * self.width)
+        if (e, size) not in self.entries:
+            self.entries[e, size] = self.f.spread(self.entries[e, 1], size)
+        return self.entries[e, size]
+
+    def _pieces_of(self, base: str, stride: int, at: int, size: int) -> Row:
+        """Loads entries at .. at + size - 1 of a matrix's rows."""
+        return lambda r: self.f.load(base, r * stride + at, size)
+
+    def products(self, t: str) -> None:
+        """Q_zz into V, [Q_uz Q_uu] into U, Q_z into g_z, Q_u into g_u."""
+        f, layout, P, C = self.f, self.layout, self.P, self.C
+        self.now = f.at(self.jac, f.integer("and", t, self.width - 1))
+        self.entries: dict[tuple[int, int], str] = {}
+        for at, size in self.cut:
+            rows = self._combined(self._pieces_of(self.V, P, at, size), size)
+            for c, value in enumerate(rows):
+                f.store(value, self.M, c * P + at, size)
+        slopes = self._combined(lambda r: f.load(self.v, r), 1)
+        self._transpose()
+        for at, size in pieces(C, self.width):
+            beyond = at >= layout.nz  # columns of inputs: only their own rows are wanted
+            rows = self._combined(self._pieces_of(self.T, C, at, size), size, beyond)
+            for c, value in enumerate(rows[: len(rows) - layout.m]):
+                if at + size <= P:
+                    f.store(value, self.V, c * P + at, size)
+                else:
+                    for i in range(P - at):
+                        f.store(f.lane(value, i, size), self.V, c * P + at + i)
+            for j, value in enumerate(rows[len(rows) - layout.m :]):
+                f.store(value, self.U, j * C + at, size)
+        self._add_state_cost(t, slopes)
+        self._add_input_cost(t, slopes)
+
+    def _add_to(self, value: str, base: str, index: int) -> None:
+        self.f.store(self.f.add(self.f.load(base, index), value), base, index)
+
+    def _add_state_cost(self, t: str, slopes: list[str]) -> None:
+        f, layout, P = self.f, self.layout, self.P
+        diagonal = self._tracking(t)
+        before, u = self._row("z_run", t, layout.nz), self._row("u_run", t, layout.m)
+        change = {layout.slot(j): j for j in range(layout.m)}
+        for c in range(layout.nz):
+            slope = slopes[c]
+            if c < layout.n:
+                slope = f.add(slope, diagonal[c][0])
+                self._add_to(diagonal[c][1], self.V, c * P + c)
+            elif c in change:
+                S = f.load(self.words.pointer("S"), change[c])
+                twice = f.add(S, S)
+                step = f.sub(f.load(u, change[c]), f.load(before, c))
+                slope = f.sub(slope, f.mul(twice, step))
+                self._add_to(twice, self.V, c * P + c)
+            f.store(slope, self.g_z, c)
+
+    def _add_input_cost(self, t: str, slopes: list[str]) -> None:
+        f, layout, C = self.f, self.layout, self.C
+        before, u = self._row("z_run", t, layout.nz), self._row("u_run", t, layout.m)
+        target = self._row("input_target", t, layout.m)
+        for j in range(layout.m):
+            S = f.load(self.words.pointer("S"), j)
+            R = f.load(self.words.pointer("R"), j)
+            S, R = f.add(S, S), f.add(R, R)
+            self._add_to(f.neg(S), self.U, j * C + layout.slot(j))
+            self._add_to(f.add(R, S), self.U, j * C + layout.nz + j)
+            value = f.load(u, j)
+            slope = f.fma(R, f.sub(value, f.load(target, j)), slopes[layout.nz + j])
+            slope = f.fma(S, f.sub(value, f.load(before, layout.slot(j))), slope)
+            f.store(slope, self.g_u, j)
+
+    def _transpose(self) -> None:
+        """T = M' in blocks of four by four."""
+        f, P, C = self.f, self.P, self.C
+        kind = vector(4)
+
+        def shuffled(a: str, b: str, *lanes: int) -> str:
+            inside = ", ".join(f"i32 {i}" for i in lanes)
+            return f.emit(f"shufflevector {kind} {a}, {kind} {b}, <4 x i32> <{inside}>")
+
+        for c in range(0, C, 4):
+            for r in range(0, P, 4):
+                a = [f.load(self.M, (c + i) * P + r, 4) for i in range(4)]
+                lo = [shuffled(a[i], a[i + 1], 0, 4, 2, 6) for i in (0, 2)]
+                hi = [shuffled(a[i], a[i + 1], 1, 5, 3, 7) for i in (0, 2)]
+                columns = [
+                    shuffled(lo[0], lo[1], 0, 1, 4, 5),
+                    shuffled(hi[0], hi[1], 0, 1, 4, 5),
+                    shuffled(lo[0], lo[1], 2, 3, 6, 7),
+                    shuffled(hi[0], hi[1], 2, 3, 6, 7),
+                ]
+                for i, column in enumerate(columns):
+                    f.store(column, self.T, (r + i) * C + c, 4)
+
+    def gains(self, t: str) -> None:
+        """Gains k and K of step t inside the limits; the promise d1, d2."""
+        f, layout = self.f, self.layout
+        m, nz = layout.m, layout.nz
+        damping, u = self.words.pointer("damping"), self._row("u_run", t, m)
+        for i in range(m):
+            for j in range(m):
+                q = f.load(self.U, i * self.C + nz + j)
+                q = f.add(q, f.load(damping, i)) if i == j else q
+                f.store(q, self.H, i * m + j)
+            f.store(ONE, self.free, i)
+            f.store(f.neg(f.load(self.g_u, i)), self.k, i)
+            now = f.load(u, i)
+            f.store(f.sub(f.load(self.words.pointer("low"), i), now), self.low, i)
+            f.store(f.sub(f.load(self.words.pointer("high"), i), now), self.high, i)
+        good, infinity = self._factor(), number(float("inf"))
+        for i in range(m):
+            finite = f.compare("olt", f.call("fabs", [f.load(self.g_u, i)]), infinity)
+            good = f.emit(f"and i1 {good}, {finite}")
+        f.return_if(f.emit(f"xor i1 {good}, true"), f"i64 {t}")
+        f.do(f"call void @substitute(ptr {self.L}, ptr {self.inv}, ptr {self.k})")
+        self._limit()
+        self._promise()
+        self._feedback(t)
+
+    def _factor(self) -> str:
+        return self.f.emit(
+            f"call i1 @factor(ptr {self.H}, ptr {self.free}, ptr {self.L}, ptr {self.inv})"
+        )
+
+    def _limit(self) -> None:
+        """The box-limited programme where the unlimited k breaks a limit."""
+        f, broken = self.f, "false"
+        for i in range(self.layout.m):
+            k = f.load(self.k, i)
+            inside = clipped(f, k, f.load(self.low, i), f.load(self.high, i))
+            broken = f.emit(f"or i1 {broken}, {f.compare('une', inside, k)}")
+        with f.when(broken):
+            f.do(
+                f"call void @box(ptr {self.H}, ptr {self.g_u}, ptr {self.low}, ptr {self.high}, "
+                f"ptr {self.k}, ptr {self.free}, ptr {self.L}, ptr {self.inv})"
+            )
+            self._factor()
+
+    def _promise(self) -> None:
+        f, m, nz = self.f, self.layout.m, self.layout.nz
+        k = [f.load(self.k, i) for i in range(m)]
+        d1, d2 = f.load(self.sums, 0), ZERO
+        for i in range(m):
+            d1 = f.fma(k[i], f.load(self.g_u, i), d1)
+            row = f.mul(f.load(self.U, i * self.C + nz), k[0])
+            for j in range(1, m):
+                row = f.fma(f.load(self.U, i * self.C + nz + j), k[j], row)
+            d2 = f.fma(k[i], row, d2)
+        f.store(d1, self.sums, 0)
+        f.store(f.fma(d2, number(0.5), f.load(self.sums, 1)), self.sums, 1)
+
+    def _feedback(self, t: str) -> None:
+        """K = -Q_uu^-1 Q_uz on the free inputs, to memory; F = Q_uz - damping K."""
+        f, m, nz, P = self.f, self.layout.m, self.layout.nz, self.P
+        for at, size in self.cut:
+            Q_uz = [f.load(self.U, j * self.C + at, size) for j in range(m)]
+            sides = [
+                f.mul(f.load_all(self.free, j, size), f.neg(Q, size), size)
+                for j, Q in enumerate(Q_uz)
+            ]
+            for j, row in enumerate(solved(f, sides, self.L, self.inv, size)):
+                damping = f.load_all(self.words.pointer("damping"), j, size)
+                f.store(row, self.K, j * P + at, size)
+                rest = f.sub(Q_uz[j], f.mul(damping, row, size), size)
+                f.store(rest, self.F, j * P + at, size)
+        to_K, to_k = self._row("K", t, m * nz), self._row("k", t, m)
+        for j in range(m):
+            f.store(f.load(self.k, j), to_k, j)
+            for i in range(0, nz - nz % 4, 4):
+                f.store(f.load(self.K, j * P + i, 4), to_K, j * nz + i, 4)
+            for i in range(nz - nz % 4, nz):
+                f.store(f.load(self.K, j * P + i), to_K, j * nz + i)
+
+    def value(self, t: str) -> None:
+        """V = Q_zz + F'K, v = Q_z + F'k."""
+        f, m, P = self.f, self.layout.m, self.P
+        for at, size in self.cut:
+            K = [f.load(self.K, j * P + at, size) for j in range(m)]
+            v = f.load(self.g_z, at, size)
+            for j in range(m):
+                F = f.load(self.F, j * P + at, size)
+                v = f.fma(f.load_all(self.k, j, size), F, v, size)
+            f.store(v, self.v, at, size)
+            for c in range(self.layout.nz):
+                row = f.load(self.V, c * P + at, size)
+                for j in range(m):
+                    row = f.fma(f.load_all(self.F, j * P + c, size), K[j], row, size)
+                f.store(row, self.V, c * P + at, size)

@@ -1,0 +1,192 @@
+"""Writes one control step: the next state, and its sparse Jacobian, of W lanes at once.
+
+The stages of Runge-Kutta are a loop around one copy of the model, so that the code stays small. The
+Jacobian's stages are those of `traced.py`,
+
+    K_i = f_x T_i + [0 f_u f_p],    T_i = I + c_i dt K_{i-1},    A = I + dt sum_i b_i K_i,
+
+kept as the values of a pattern: the places that can be non-zero after any number of stages.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+from grounded.compile.graph import Graph
+from grounded.compile.llvm_graph import DT, Body, Uniforms
+from grounded.compile.llvm_text import Writer, number, splat
+from grounded.compile.traced import STAGES, Variant
+
+Place = tuple[int, int]  # row, column of a Jacobian
+
+
+@dataclass(frozen=True, eq=False)
+class Dynamics:
+    """What the writers know of a model: graph, sizes, integrator, patterns."""
+
+    graph: Graph
+    outputs: tuple[int, ...]
+    entries: dict[Place, int]  # non-zero derivatives of the outputs: node numbers
+    n: int
+    m: int
+    stages: tuple[tuple[float, float], ...]  # empty: the function is the step itself
+
+    @cached_property
+    def uniforms(self) -> Uniforms:
+        """Values that are the same for every sample."""
+        return Uniforms(self.graph, [*self.outputs, *self.entries.values()])
+
+    @cached_property
+    def rates(self) -> dict[Place, tuple[int, ...]]:
+        """The pattern of K: for each place, the s with f_x[r, s] K[s, c] to be summed."""
+        pattern = set(self.entries)
+        while True:
+            reach = {
+                (r, c) for (r, s) in self.entries if s < self.n for (s2, c) in pattern if s2 == s
+            }
+            if reach <= pattern:
+                break
+            pattern |= reach
+        return {
+            (r, c): tuple(s for s in range(self.n) if (r, s) in self.entries and (s, c) in pattern)
+            for (r, c) in sorted(pattern)
+        }
+
+    @cached_property
+    def places(self) -> list[Place]:
+        """The pattern of the step's Jacobian, in the order of its values."""
+        if not self.stages:
+            return sorted(self.entries)
+        return sorted(set(self.rates) | {(i, i) for i in range(self.n)})
+
+
+def dynamics_of(
+    variant: Variant, n: int, m: int, width: int, kind: str, integrator: str
+) -> Dynamics:
+    """The dynamics with derivatives for the first `width` of x, u, p."""
+    entries = {(r, c): i for r, c, i in variant.entries if c < width}
+    stages = STAGES[integrator] if kind == "derivative" else ()
+    return Dynamics(variant.trace.graph, variant.trace.outputs, entries, n, m, stages)
+
+
+class StepWriter:
+    """Writes steps of W lanes into a function."""
+
+    def __init__(self, f: Writer, d: Dynamics, width: int, table: str) -> None:
+        self.f, self.d, self.width, self.table = f, d, width, table
+        self.x = f.room(d.n * width)  # the state at the step's start, SoA: [n][W]
+        self.u = f.room(d.m * width)
+        self.next = f.room(d.n * width)
+        self.k = f.room(d.n * width) if d.stages else ""
+
+    def _body(self, state: Callable[[int], str]) -> Body:
+        f, d, w = self.f, self.d, self.width
+
+        def leaf(letter: str, index: int) -> str:
+            if letter == "d":
+                return f.load_all(self.table, DT, w)
+            return state(index) if letter == "x" else f.load(self.u, index * w, w)
+
+        return Body(f, w, d.graph, leaf, self.table, d.uniforms.slot)
+
+    def step(self) -> None:
+        """From x and u to next."""
+        f, d, w = self.f, self.d, self.width
+        if not d.stages:
+            values = self._body(lambda i: f.load(self.x, i * w, w)).values(d.outputs)
+            for i, value in enumerate(values):
+                f.store(value, self.next, i * w, w)
+            return
+        self._start()
+        with f.loop(len(d.stages)) as stage:
+            self._rates(stage)
+
+    def _start(self) -> None:
+        f, d, w = self.f, self.d, self.width
+        zero = splat(0.0, w)
+        for i in range(d.n):
+            f.store(f.load(self.x, i * w, w), self.next, i * w, w)
+            f.store(zero, self.k, i * w, w)
+
+    def _rates(self, stage: str) -> tuple[Body, str]:
+        """One stage: k = f(x + c dt k), next += b dt k."""
+        f, d, w = self.f, self.d, self.width
+        dt = f.load(self.table, DT)
+        c, b = (f.mul(dt, f.load(name, stage)) for name in ("@stage_c", "@stage_b"))
+        c, b = f.spread(c, w), f.spread(b, w)
+        states = [
+            f.fma(c, f.load(self.k, i * w, w), f.load(self.x, i * w, w), w) for i in range(d.n)
+        ]
+        body = self._body(states.__getitem__)
+        for i, value in enumerate(body.values(d.outputs)):
+            f.store(value, self.k, i * w, w)
+            f.store(f.fma(b, value, f.load(self.next, i * w, w), w), self.next, i * w, w)
+        return body, c
+
+    def jacobian(self, out: str) -> None:
+        """From x and u to next, and the values of the Jacobian's places to out, [places][W]."""
+        f, d, w = self.f, self.d, self.width
+        if not d.stages:
+            self.step()
+            body = self._body(lambda i: f.load(self.x, i * w, w))
+            for e, value in enumerate(body.values([d.entries[p] for p in d.places])):
+                f.store(value, out, e * w, w)
+            return
+        size = len(d.rates)
+        rates = f.room(2 * size * w)  # K of this stage and of the one before, taking turns
+        zero = splat(0.0, w)
+        for e in range(2 * size):
+            f.store(zero, rates, e * w, w)
+        for e, (r, c) in enumerate(d.places):
+            f.store(splat(1.0 if r == c else 0.0, w), out, e * w, w)
+        self._start()
+        with f.loop(len(d.stages)) as stage:
+            body, c_dt = self._rates(stage)
+            self._chain(body, c_dt, stage, rates, out)
+
+    def _chain(self, body: Body, c_dt: str, stage: str, rates: str, out: str) -> None:
+        f, d, w = self.f, self.d, self.width
+        odd = f.integer("and", stage, 1)
+        size = len(d.rates) * w
+        new = f.at(rates, f.integer("mul", odd, size))
+        old = f.at(rates, f.integer("mul", f.integer("xor", odd, 1), size))
+        slot = {at: e * w for e, at in enumerate(d.rates)}
+        place = {at: e for e, at in enumerate(d.places)}
+        b = f.spread(f.mul(f.load(self.table, DT), f.load("@stage_b", stage)), w)
+        scaled = {}
+        chained = len(d.stages) > 1
+        if chained:
+            for (r, s), i in d.entries.items():
+                if s < d.n:
+                    scaled[r, s] = f.mul(c_dt, body.value(i), w)
+        for (r, c), sums in d.rates.items():
+            own = body.value(d.entries[r, c]) if (r, c) in d.entries else ""
+            for s in sums if chained else ():
+                before = f.load(old, slot[s, c], w)
+                own = f.fma(scaled[r, s], before, own, w) if own else f.mul(scaled[r, s], before, w)
+            f.store(own, new, slot[r, c], w)
+            e = place[r, c] * w
+            f.store(f.fma(b, own, f.load(out, e, w), w), out, e, w)
+
+
+def stage_tables(d: Dynamics) -> str:
+    """The stages' c and b as global constants."""
+    if not d.stages:
+        return ""
+    lines = []
+    for name, column in (("stage_c", 0), ("stage_b", 1)):
+        inside = ", ".join(f"double {number(stage[column])}" for stage in d.stages)
+        lines.append(f"@{name} = internal constant [{len(d.stages)} x double] [{inside}]")
+    return "\n".join(lines) + "\n"
+
+
+def jacobian_function(d: Dynamics, width: int) -> str:
+    """`void @jacobian(xu, table, next, out)`: xu is [n + m][W], next [n][W], out [places][W]."""
+    f = Writer("internal void @jacobian(ptr %xu, ptr %table, ptr %next, ptr %out)")
+    writer = StepWriter(f, d, width, "%table")
+    writer.x, writer.u, writer.next = "%xu", f.at("%xu", d.n * width), "%next"
+    writer.jacobian("%out")
+    f.do("ret void")
+    return f.text()
