@@ -1,0 +1,12 @@
+"""Parameters of any model from trials, with intervals: see `grounded.fit.parameters`.
+
+fit                parameters, latencies and thresholds by maximum likelihood
+prediction_error   one step and a second ahead, open loop
+"""
+
+from __future__ import annotations
+
+from grounded.fit.parameters import Estimate, Fit, fit
+from grounded.fit.prediction import PredictionError, prediction_error
+
+__all__ = ["Estimate", "Fit", "PredictionError", "fit", "prediction_error"]

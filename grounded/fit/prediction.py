@@ -1,0 +1,117 @@
+"""How well a model predicts: one step and a second ahead, open loop.
+
+Every window starts from the smoothed state, not from a raw sample: a noisy start would be counted
+as the model's error. The inputs are the recorded ones, delayed as the model says; errors are
+against the samples themselves, so their noise is the floor of both figures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from grounded.estimate import Measurement, Noise, Record, noise_of, of_states
+from grounded.estimate.batch import Batch, batch_of
+from grounded.estimate.filter import model_steps, run
+from grounded.estimate.record import records_of
+from grounded.estimate.smoother import smooth
+from grounded.frozen import Array
+from grounded.model import Model
+from grounded.trial import Trial
+
+STARTS = 4000  # windows at most: more change no figure
+
+
+@dataclass(frozen=True, eq=False)
+class PredictionError:
+    """Root mean square errors per channel; NaN for one never seen at the end of a window."""
+
+    names: tuple[str, ...]
+    one_step: Array  # (ny,)
+    ahead: Array  # (ny,) after `horizon_s`
+    horizon_s: float
+    windows: int  # that reach `horizon_s`; 0: no trial is long enough
+
+
+def prediction_error(
+    model: Model,
+    trials: Sequence[Trial | Record],
+    horizon_s: float = 1.0,
+    *,
+    latency: Array | None = None,
+    measurement: Measurement | None = None,
+    noise: Noise | None = None,
+) -> PredictionError:
+    """One-step and `horizon_s` open-loop prediction error of a model on trials.
+
+    Args:
+        model: n states, m inputs.
+        trials: real trials, or records.
+        horizon_s: how far ahead [s].
+        latency: transport delay of each input [s], (m,); None: zero.
+        measurement: what the records measure; None: the states.
+        noise: of this model on these trials, for the start states; None: estimated.
+
+    Raises:
+        GroundedError: if a trial does not fit the model.
+    """
+    measurement = of_states(model) if measurement is None else measurement
+    delay = np.zeros(model.m) if latency is None else np.asarray(latency, float)
+    records = records_of(model, trials)
+    if noise is None:
+        options = {"latency": delay, "measurement": measurement}
+        noise = noise_of(model, records, **options).noise  # type: ignore[arg-type]
+    batch = batch_of(records, measurement, model.n, delay)
+    filtered = run(batch, measurement, noise, model_steps(model.system, model.values, batch))
+    x = smooth(filtered, batch).x if np.isfinite(filtered.loglik) else filtered.x
+    steps = max(1, round(horizon_s / noise.dt))
+    one, ahead, windows = _windows(model, batch, measurement, x, steps)
+    return PredictionError(measurement.names, one, ahead, horizon_s, windows)
+
+
+def _windows(
+    model: Model, batch: Batch, measurement: Measurement, x: Array, steps: int
+) -> tuple[Array, Array, int]:
+    """Rms after one step and after `steps`, from as many starts as there are."""
+    first, trial = np.nonzero(batch.valid)
+    error = _error(model, batch, measurement, x, first, trial, 1)
+    one = _rms(error)
+    whole = first + steps <= batch.lengths[trial]
+    first, trial = first[whole], trial[whole]
+    if len(first) == 0:
+        return one, np.full(measurement.ny, np.nan), 0
+    every = max(1, len(first) // STARTS)
+    first, trial = first[::every], trial[::every]
+    return one, _rms(_error(model, batch, measurement, x, first, trial, steps)), len(first)
+
+
+def _error(
+    model: Model,
+    batch: Batch,
+    measurement: Measurement,
+    x: Array,
+    first: NDArray[np.int64],
+    trial: NDArray[np.int64],
+    steps: int,
+) -> Array:
+    """Errors (windows, ny) after `steps`; NaN where nothing was seen there."""
+    state = x[first, trial]
+    with np.errstate(all="ignore"):
+        for i in range(steps):
+            u, h = batch.u[first + i, trial], batch.dt[first + i, trial]
+            after = np.empty_like(state)
+            for size in np.unique(np.round(h, 9)):
+                rows = np.abs(h - size) < 1e-9
+                after[rows] = model.system.step(state[rows], u[rows], model.values, float(size))
+            state = after
+        e = measurement.innovation(batch.y[first + steps, trial], measurement.function(state))
+    return np.where(batch.seen[first + steps, trial], e, np.nan)
+
+
+def _rms(error: Array) -> Array:
+    count = np.sum(~np.isnan(error), axis=0)
+    total = np.nansum(error**2, axis=0)
+    return np.asarray(np.where(count > 0, np.sqrt(total / np.maximum(count, 1)), np.nan))

@@ -1,0 +1,140 @@
+"""Unknowns that Gauss and Newton can't move: thresholds, and delays that start far off.
+
+A threshold (the car's stall) changes the likelihood in steps: its slope is zero almost everywhere.
+It is scanned over its bounds, coarse first, then between the neighbours of the best. At each value
+the other unknowns are credited with what their own linear problem promises, so that a delay is
+compared with the best lag beside it, not with the lag of another delay.
+
+The interval of a threshold is the set of values whose log-likelihood lies within DROP of the best:
+3.67 nats, the 95 % point for a threshold (Hansen 2000), more than the 1.92 of a smooth unknown.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from grounded.estimate import Noise
+from grounded.fit.gauss_newton import direction
+from grounded.fit.innovations import Data, Linear, Point, linear, point
+from grounded.frozen import Array
+
+COARSE, FINE, ROUNDS = 21, 7, 4
+DROP = 3.67  # [nats]
+LEVEL = 0.05  # [nats] as good as equal
+QUIET = 1e-2  # information over the whole range below which a slope says nothing
+
+
+def quiet(data: Data, slopes: Linear) -> NDArray[np.bool_]:
+    """Unknowns (k,) on which the innovations do not depend to first order."""
+    information = np.sum(slopes.W**2, axis=0) * data.unknowns.scale**2
+    return np.asarray(information < QUIET)
+
+
+def scan(
+    data: Data, noise: Noise, at: Point, i: int, grid: Array, free: NDArray[np.bool_]
+) -> tuple[Point, Array]:
+    """The best point with unknown i on a grid, and the profile (len(grid),) [nats].
+
+    The other unknowns are moved by one step of theirs if that is better than leaving them.
+
+    Args:
+        data: the records.
+        noise: held fixed.
+        at: where the others are.
+        i: the unknown that is scanned.
+        grid: its values.
+        free: which unknowns may move, (k,); i itself does not.
+    """
+    others = free.copy()
+    others[i] = False
+    profile, best, score = np.full(len(grid), -np.inf), at, at.loglik
+    for g, value in enumerate(grid):
+        theta = at.theta.copy()
+        theta[i] = value
+        here = point(data, noise, theta)
+        profile[g] = here.loglik
+        if not np.isfinite(here.loglik):
+            continue
+        if others.any():
+            delta, promise = direction(data, theta, linear(data, here), others, 1e-3)
+            profile[g] += promise
+        if profile[g] > score:
+            best, score = here, float(profile[g])
+            if others.any():
+                moved = point(data, noise, theta + delta)
+                best = moved if moved.loglik > here.loglik else here
+    return best, profile
+
+
+def coarse_to_fine(
+    data: Data, noise: Noise, at: Point, i: int, free: NDArray[np.bool_], width: float | None = None
+) -> Point:
+    """The best value of unknown i: over its bounds, or within `width` of where it is.
+
+    Stays where it is if nothing is better.
+    """
+    low, high = data.unknowns.low[i], data.unknowns.high[i]
+    if width is not None:
+        low, high = max(low, at.theta[i] - width), min(high, at.theta[i] + width)
+    grid, best = np.linspace(low, high, COARSE), at
+    for _ in range(ROUNDS):
+        best, profile = scan(data, noise, best, i, grid, free)
+        top = np.flatnonzero(profile > profile.max() - LEVEL)
+        step = grid[1] - grid[0]
+        if len(top) > 2:
+            break
+        low, high = max(low, grid[top[0]] - step), min(high, grid[top[-1]] + step)
+        grid = np.linspace(low, high, 2 * FINE + 1)
+    if best.loglik < at.loglik + LEVEL:
+        return at
+    return _centred(data, noise, best, i, grid[top])
+
+
+def _centred(data: Data, noise: Noise, best: Point, i: int, level: Array) -> Point:
+    """The middle of the values that are as good as the best: the likelihood is flat between them.
+
+    An end of the level is where the next sample lies, and nothing says that it is the threshold.
+    """
+    beside = level[np.argsort(np.abs(level - np.median(level)))]
+    for value in beside:
+        theta = best.theta.copy()
+        theta[i] = value
+        there = point(data, noise, theta)
+        if there.loglik > best.loglik - LEVEL:
+            return there
+    return best
+
+
+def likelihood_interval(data: Data, noise: Noise, at: Point, i: int) -> tuple[float, float]:
+    """The values of unknown i around the best whose log-likelihood is within DROP of it.
+
+    A bound of the unknown is returned where the likelihood never falls that far.
+    """
+    ends = []
+    for bound in (data.unknowns.low[i], data.unknowns.high[i]):
+        inside, outside = float(at.theta[i]), float(bound)
+        if _loglik(data, noise, at, i, outside) > at.loglik - DROP:
+            ends.append(outside)
+            continue
+        step = 1e-3 * abs(outside - inside)  # walk out first: the likelihood may rise again
+        while abs(step) < abs(outside - inside):
+            there = inside + np.sign(outside - inside) * step
+            if _loglik(data, noise, at, i, there) < at.loglik - DROP:
+                outside = there
+                break
+            inside, step = there, 2 * step
+        for _ in range(8):
+            middle = 0.5 * (inside + outside)
+            if _loglik(data, noise, at, i, middle) < at.loglik - DROP:
+                outside = middle
+            else:
+                inside = middle
+        ends.append(outside)
+    return ends[0], ends[1]
+
+
+def _loglik(data: Data, noise: Noise, at: Point, i: int, value: float) -> float:
+    theta = at.theta.copy()
+    theta[i] = value
+    return point(data, noise, theta).loglik
