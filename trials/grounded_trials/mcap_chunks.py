@@ -58,3 +58,38 @@ def _lz4(data: bytes, size: int) -> bytes:
     except (RuntimeError, EOFError, ValueError, MemoryError) as error:
         raise BadChunk(f"it can't be decompressed ({error})") from None
     return content
+
+
+def decompress_part(compression: str, data: bytes, limit: int) -> bytes:
+    """What can still be decompressed of a chunk whose end is missing, at most `limit` bytes."""
+    if compression == "zstd":
+        return _zstd_part(data, limit)
+    if compression == "lz4":
+        return _lz4_part(data, limit)
+    return data[:limit] if compression == "" else b""
+
+
+def _zstd_part(data: bytes, limit: int) -> bytes:
+    import zstandard
+
+    parts: list[bytes] = []
+    decoder = zstandard.ZstdDecompressor(max_window_size=2**27)
+    with decoder.stream_reader(data) as reader:
+        try:
+            while sum(map(len, parts)) < limit and (part := reader.read(2**17)):
+                parts.append(part)
+        except zstandard.ZstdError:
+            pass
+    return b"".join(parts)
+
+
+def _lz4_part(data: bytes, limit: int) -> bytes:
+    from lz4.frame import LZ4FrameDecompressor
+
+    decoder, parts = LZ4FrameDecompressor(), []
+    try:
+        for start in range(0, len(data), 2**12):
+            parts.append(decoder.decompress(data[start : start + 2**12], max_length=limit))
+    except (RuntimeError, EOFError, ValueError, MemoryError):
+        pass
+    return b"".join(parts)[:limit]

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from grounded_trials.mcap_chunks import BadChunk
 
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 1, 2, 3, 4, 5, 6
-ATTACHMENT, METADATA, DATA_END = 9, 12, 15
+MESSAGE_INDEX, ATTACHMENT, METADATA, DATA_END = 7, 9, 12, 15
 MESSAGE_HEADER = 22  # channel u16, sequence u32, log time u64, publish time u64
 
 _U16, _U32, _U64 = Struct("<H"), Struct("<I"), Struct("<Q")

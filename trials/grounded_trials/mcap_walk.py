@@ -162,7 +162,7 @@ class _Walk:
     def _run_of_messages(self) -> Messages:
         """All message records that follow each other in the buffer."""
         start = self.pos
-        positions, self.pos = _message_positions(self.buffer, start, len(self.buffer), self.damaged)
+        positions, self.pos = message_positions(self.buffer, start, len(self.buffer), self.damaged)
         return batch(self.buffer, positions)
 
     def _data_record(self, opcode: int, content: bytes, at: int) -> Iterator[Record]:
@@ -237,7 +237,7 @@ def chunk_records(data: bytes) -> Iterator[Record]:
         if length > end - pos - 9:
             raise BadChunk("it ends inside a record")
         if opcode == MESSAGE:
-            more, pos = _message_positions(data, pos, end, bad)
+            more, pos = message_positions(data, pos, end, bad)
             positions.extend(more)
             continue
         if opcode in (SCHEMA, CHANNEL):
@@ -246,10 +246,14 @@ def chunk_records(data: bytes) -> Iterator[Record]:
     yield batch(data, positions)
 
 
-def _message_positions(
+def message_positions(
     buffer: bytes, pos: int, end: int, bad: Callable[[str, int | None], Exception]
 ) -> tuple[list[int], int]:
-    """Starts of the complete message records from `pos` on, and where they stop."""
+    """Starts of the complete message records from `pos` on, and where they stop.
+
+    Raises:
+        Exception: what `bad` makes of a message that is shorter than its header.
+    """
     positions: list[int] = []
     append, unpack = positions.append, _HEAD.unpack_from
     while end - pos >= 9:

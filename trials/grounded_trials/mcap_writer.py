@@ -13,6 +13,7 @@ from typing import IO
 import numpy as np
 
 from grounded.frozen import Array
+from grounded_trials.mcap_records import Attachment, Channel, Header, Messages, Metadata, Schema
 
 LIBRARY = "grounded"
 
@@ -53,6 +54,55 @@ class LogWriter:
     def flush(self) -> None:
         """Hands everything written so far to the operating system."""
         self._writer.flush()  # type: ignore[no-untyped-call]
+
+    def finish(self) -> None:
+        """Ends the file; the stream stays open."""
+        self._writer.finish()  # type: ignore[no-untyped-call]
+        self._stream.flush()
+
+
+class CopyWriter:
+    """Writes records as they were read; ids are given anew."""
+
+    def __init__(self, stream: IO[bytes], header: Header, *, compressed: bool) -> None:
+        from mcap.writer import CompressionType, Writer
+
+        kind = CompressionType.ZSTD if compressed else CompressionType.NONE
+        self._stream = stream
+        self._writer = Writer(stream, compression=kind, enable_data_crcs=True)
+        self._writer.start(profile=header.profile, library=header.library)
+        self._schemas: dict[Schema, int] = {}
+
+    def channel(self, channel: Channel, schema: Schema | None) -> int:
+        """Adds a channel with its schema; returns the id for its messages."""
+        number = 0
+        if schema is not None:
+            if schema not in self._schemas:
+                self._schemas[schema] = self._writer.register_schema(
+                    schema.name, schema.encoding, schema.data
+                )
+            number = self._schemas[schema]
+        return self._writer.register_channel(
+            channel.topic, channel.encoding, number, dict(channel.metadata)
+        )
+
+    def messages(self, batch: Messages, channel: int) -> None:
+        """Adds the messages of a batch, all of one channel."""
+        columns = (batch.starts, batch.ends, batch.log_times, batch.publish_times, batch.sequences)
+        rows = zip(*(column.tolist() for column in columns), strict=True)
+        for start, end, log_time, publish_time, sequence in rows:
+            data = batch.buffer[start:end]
+            self._writer.add_message(channel, log_time, data, publish_time, sequence)
+
+    def metadata(self, record: Metadata) -> None:
+        """Adds a table."""
+        self._writer.add_metadata(record.name, record.data)
+
+    def attachment(self, record: Attachment) -> None:
+        """Adds a file."""
+        self._writer.add_attachment(
+            record.create_time, record.log_time, record.name, record.media_type, record.data
+        )
 
     def finish(self) -> None:
         """Ends the file; the stream stays open."""

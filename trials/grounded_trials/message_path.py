@@ -105,6 +105,16 @@ _OPERATOR = re.compile(r"==|!=|<=|>=|<|>")
 _BLANK = re.compile(r"\s*")
 
 
+def is_name(text: str) -> bool:
+    """Whether a field's name needs no quotes."""
+    return _NAME.fullmatch(text) is not None
+
+
+def is_topic(text: str) -> bool:
+    """Whether a topic's name needs no quotes."""
+    return _TOPIC.fullmatch(text) is not None
+
+
 class _Parser:
     def __init__(self, text: str) -> None:
         self.text, self.pos = text, 0

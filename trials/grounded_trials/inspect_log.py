@@ -1,0 +1,249 @@
+"""What is in an unknown log: topics, types, rates, and every number with its range.
+
+One pass over the file. A topic with very many messages has its ranges from every k-th of them.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from grounded.errors import GroundedError
+from grounded_trials.inspect_fields import number_paths
+from grounded_trials.log_files import log_files, open_log
+from grounded_trials.mcap_records import Channel, Header, Messages, Schema
+from grounded_trials.mcap_walk import DamagedFile, read_records
+from grounded_trials.message_path import is_topic, parse_path
+from grounded_trials.message_types import Dynamic
+from grounded_trials.nodes import BadMessage, BadPath, Floats, Ints
+from grounded_trials.path_walk import Bound, bind, evaluate
+from grounded_trials.protobuf_schema import BadSchema
+from grounded_trials.signals import Decoder, decoder_of
+
+DECODED = 20_000  # messages of a topic whose numbers are looked at
+
+
+@dataclass(frozen=True)
+class FieldReport:
+    """A number in a topic's messages, by its message path."""
+
+    path: str
+    low: float  # smallest and largest finite value; NaN if there is none
+    high: float
+    not_finite: int
+
+
+@dataclass(frozen=True)
+class TopicReport:
+    """A topic: how its messages come, and what is in them."""
+
+    topic: str
+    type: str
+    encoding: str
+    messages: int
+    rate_hz: float  # 1 / median interval of the log times; 0 for fewer than two messages
+    jitter_s: float  # half the width that holds 90 % of the intervals
+    largest_gap_s: float
+    first_s: float  # after the log's first message
+    last_s: float
+    stamped: bool  # messages have a header stamp
+    skew_s: float | None  # median of header stamp minus log time
+    fields: tuple[FieldReport, ...]
+    problem: str = ""  # why its numbers can't be read
+
+
+@dataclass(frozen=True)
+class LogReport:
+    """A log: its files, its length, its topics, and whether it is damaged."""
+
+    files: tuple[Path, ...]
+    library: str  # who wrote it
+    start_ns: int
+    duration_s: float
+    messages: int
+    topics: tuple[TopicReport, ...]
+    damage: str = ""  # where reading it ended early, and why
+
+
+def inspect_log(paths: str | Path | Sequence[str | Path]) -> LogReport:
+    """Looks through a log; damage ends the look, and is reported.
+
+    Args:
+        paths: an MCAP file, several that follow each other, or the folder of a bag.
+
+    Raises:
+        GroundedError: if a file can't be read, or is not MCAP at all.
+    """
+    files = log_files(paths)
+    look = _Look()
+    for path in files:
+        with open_log(path) as stream:
+            look.new_file()
+            try:
+                for record in read_records(stream, str(path)):
+                    look.add(record)
+            except DamagedFile as error:
+                if not look.headers:
+                    raise
+                look.damage = str(error)
+                break
+    return look.report(files)
+
+
+class _Look:
+    """What has been seen so far; topics go on from file to file, channels do not."""
+
+    def __init__(self) -> None:
+        self.headers: list[Header] = []
+        self.topics: dict[str, _Topic] = {}
+        self.damage = ""
+        self.new_file()
+
+    def new_file(self) -> None:
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, _Topic] = {}
+
+    def add(self, record: object) -> None:
+        if isinstance(record, Header):
+            self.headers.append(record)
+        elif isinstance(record, Schema):
+            self.schemas[record.id] = record
+        elif isinstance(record, Channel):
+            known = self.topics.get(record.topic)
+            if known is None:
+                known = _Topic(record, self.schemas.get(record.schema_id))
+                self.topics[record.topic] = known
+            self.channels[record.id] = known
+        elif isinstance(record, Messages):
+            for identity in np.unique(record.channels).tolist():
+                if identity in self.channels:
+                    self.channels[identity].add(record.take(record.channels == identity))
+
+    def report(self, files: tuple[Path, ...]) -> LogReport:
+        times = [t for topic in self.topics.values() for t in topic.log_times]
+        joined = np.concatenate(times) if times else np.zeros(1, dtype=np.int64)
+        start, end = int(joined.min()), int(joined.max())
+        return LogReport(
+            files=files,
+            library=self.headers[0].library if self.headers else "",
+            start_ns=start,
+            duration_s=(end - start) * 1e-9,
+            messages=sum(topic.count for topic in self.topics.values()),
+            topics=tuple(topic.report(start) for topic in self.topics.values()),
+            damage=self.damage,
+        )
+
+
+@dataclass
+class _Range:
+    """The values of one path so far."""
+
+    bound: Bound
+    low: float = np.inf
+    high: float = -np.inf
+    count: int = 0
+    not_finite: int = 0
+
+    def add(self, values: Floats) -> None:
+        finite = values[np.isfinite(values)]
+        self.count += len(values)
+        self.not_finite += len(values) - len(finite)
+        if len(finite):
+            self.low = min(self.low, float(finite.min()))
+            self.high = max(self.high, float(finite.max()))
+
+
+@dataclass
+class _Topic:
+    """One topic so far."""
+
+    channel: Channel
+    schema: Schema | None
+    count: int = 0
+    looked: int = 0
+    problem: str = ""
+    log_times: list[Ints] = field(default_factory=list)
+    skews: list[Ints] = field(default_factory=list)
+    decoder: Decoder | None = None
+    ranges: dict[str, _Range] = field(default_factory=dict)
+
+    def add(self, batch: Messages) -> None:
+        self.count += len(batch)
+        self.log_times.append(batch.log_times)
+        if self.problem or not len(batch):
+            return
+        stride = 1 + self.looked // DECODED
+        chosen = np.zeros(len(batch), dtype=np.bool_)
+        chosen[::stride] = True
+        self.looked += int(chosen.sum())
+        try:
+            self._look(batch.take(chosen))
+        except (BadSchema, BadMessage, BadPath) as error:
+            self.problem = str(error)
+
+    def _look(self, batch: Messages) -> None:
+        if self.decoder is None:
+            self.decoder = decoder_of(self.channel, self.schema)
+            self._find_paths(batch)
+        root = self.decoder.root(batch.buffer, batch.starts, batch.ends)
+        for i, found in enumerate(self.ranges.values()):
+            try:
+                values = evaluate(root, found.bound, stamps=i == 0)
+            except BadPath:  # behind a wstring, or a text in one JSON message
+                continue
+            found.add(values.values)
+            if values.stamps is not None:
+                self.skews.append(values.stamps - batch.log_times[values.rows])
+
+    def _find_paths(self, batch: Messages) -> None:
+        assert self.decoder is not None
+        sample = None
+        if isinstance(self.decoder.type, Dynamic):
+            try:
+                sample = json.loads(batch.buffer[batch.starts[0] : batch.ends[0]])
+            except (ValueError, RecursionError) as error:
+                raise BadMessage(0, f"it is not JSON: {error}") from None
+        topic = self.channel.topic if is_topic(self.channel.topic) else f'"{self.channel.topic}"'
+        for rest in number_paths(self.decoder.type, sample):
+            try:
+                path = parse_path(topic + rest)
+                self.ranges[path.text] = _Range(bind(path, self.decoder.type))
+            except (GroundedError, BadPath):
+                continue
+
+    def report(self, start: int) -> TopicReport:
+        t = np.concatenate(self.log_times) if self.log_times else np.zeros(0, dtype=np.int64)
+        gaps = np.diff(np.sort(t)) * 1e-9
+        low, high = np.percentile(gaps, [5, 95]) if len(gaps) else (0.0, 0.0)
+        median = float(np.median(gaps)) if len(gaps) else 0.0
+        skews = np.concatenate(self.skews) if self.skews else None
+        stamped = any(found.bound.stamp is not None for found in self.ranges.values())
+        return TopicReport(
+            topic=self.channel.topic,
+            type=self.schema.name if self.schema else "",
+            encoding=self.channel.encoding,
+            messages=self.count,
+            rate_hz=1 / median if median > 0 else 0.0,
+            jitter_s=float(high - low) / 2,
+            largest_gap_s=float(gaps.max(initial=0.0)),
+            first_s=float(t.min() - start) * 1e-9 if len(t) else np.nan,
+            last_s=float(t.max() - start) * 1e-9 if len(t) else np.nan,
+            stamped=stamped or bool(skews is not None and len(skews)),
+            skew_s=float(np.median(skews)) * 1e-9 if skews is not None and len(skews) else None,
+            fields=tuple(_field(path, r) for path, r in self.ranges.items() if r.count),
+            problem=self.problem,
+        )
+
+
+def _field(path: str, found: _Range) -> FieldReport:
+    none = found.low > found.high
+    return FieldReport(
+        path=path,
+        low=np.nan if none else found.low,
+        high=np.nan if none else found.high,
+        not_finite=found.not_finite,
+    )

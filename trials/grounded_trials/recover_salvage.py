@@ -1,0 +1,213 @@
+"""Reading a damaged file: every record that can be trusted, and a list of what can not."""
+
+from __future__ import annotations
+
+import zlib
+from collections import Counter
+from collections.abc import Iterator
+from struct import Struct
+from typing import BinaryIO
+
+from grounded_trials.mcap_chunks import BadChunk, decompress, decompress_part
+from grounded_trials.mcap_records import (
+    ATTACHMENT,
+    CHUNK,
+    DATA_END,
+    FOOTER,
+    MESSAGE,
+    MESSAGE_INDEX,
+    METADATA,
+    PARSERS,
+    Fields,
+    Messages,
+    Record,
+    Short,
+    batch,
+)
+from grounded_trials.mcap_walk import (
+    MAGIC,
+    RECORD_LIMIT,
+    chunk_records,
+    message_positions,
+)
+from grounded_trials.recover_search import is_chunk, next_chain, plausible, read_at
+
+_HEAD = Struct("<BQ")
+_NAMES = {1: "the header", 3: "a schema", 4: "a channel", 5: "a message", 6: "a chunk"}
+_NAMES |= {9: "an attachment", 12: "a metadata record"}
+BATCH = 2**22  # [bytes] of messages outside chunks that are handed on together
+
+
+class Salvage:
+    """One pass over a damaged file.
+
+    `losses` are sentences, `lost_messages` counts by channel what the indexes say was in dropped
+    chunks, `unverified` counts messages that no checksum vouches for.
+    """
+
+    def __init__(self, stream: BinaryIO, name: str) -> None:
+        self.stream, self.name = stream, name
+        self.size = stream.seek(0, 2)
+        self.losses: list[str] = []
+        self.lost_messages: Counter[int] = Counter()
+        self.unverified = 0
+        self._crc = 0
+        self._outside = 0  # records outside chunks, which only the data checksum covers
+        self._pending: list[bytes] = []  # messages outside chunks
+
+    def records(self) -> Iterator[Record]:
+        """Yields what can be saved, in file order."""
+        pos = self._first()
+        dropped_chunk = False
+        while pos is not None and pos < self.size - len(MAGIC):
+            end = plausible(self.stream, self.size, pos)
+            if end is None:
+                yield from self._flush()
+                cut = self._is_cut_chunk(pos)
+                after = None if cut else next_chain(self.stream, self.size, pos + 1)
+                if after is None:
+                    yield from self._cut(pos)
+                    return
+                self.losses.append(f"bytes {pos} to {after} can't be read as records")
+                pos = after
+                continue
+            opcode, content = self._read(pos, end)
+            if opcode == MESSAGE:
+                yield from self._message(content)
+            else:
+                yield from self._flush()
+                if opcode == FOOTER:
+                    self._tail(end)
+                    return
+                if opcode == MESSAGE_INDEX and dropped_chunk:
+                    self._count_lost(content)
+                kept = len(self.losses)
+                yield from self._record(opcode, content, pos)
+                dropped_chunk = opcode == MESSAGE_INDEX and dropped_chunk
+                dropped_chunk |= opcode == CHUNK and len(self.losses) > kept
+            pos = end
+        yield from self._flush()
+        self.losses.append("the file has no end: its footer is missing")
+
+    def _first(self) -> int | None:
+        if read_at(self.stream, 0, 8) == MAGIC:
+            self._crc = zlib.crc32(MAGIC)
+            return len(MAGIC)
+        self.losses.append("it does not begin as an MCAP file does")
+        return next_chain(self.stream, self.size, 0)
+
+    def _read(self, pos: int, end: int) -> tuple[int, bytes]:
+        record = read_at(self.stream, pos, end - pos)
+        if record[0] == DATA_END:
+            self._data_end(record)
+        self._crc = zlib.crc32(record, self._crc)
+        return record[0], record[9:]
+
+    def _record(self, opcode: int, content: bytes, pos: int) -> Iterator[Record]:
+        try:
+            if opcode == CHUNK:
+                yield from self._chunk(content)
+            elif opcode in PARSERS:
+                record = PARSERS[opcode](Fields(content))
+                self._outside += opcode in (METADATA, ATTACHMENT)
+                yield record
+        except (BadChunk, Short, UnicodeDecodeError) as error:
+            what = _NAMES.get(opcode, f"a record of type {opcode}")
+            self.losses.append(f"{what} at byte {pos} was dropped: {error}")
+
+    def _chunk(self, content: bytes) -> Iterator[Record]:
+        fields = Fields(content)
+        fields.skip(16)
+        size, crc, compression = fields.u64(), fields.u32(), fields.text()
+        data = decompress(compression, fields.blob(), size, RECORD_LIMIT)
+        if crc and zlib.crc32(data) != crc:
+            raise BadChunk("its checksum does not fit its content")
+        for record in list(chunk_records(data)):
+            if isinstance(record, Messages) and not crc:
+                self._outside += len(record)
+            yield record
+
+    def _message(self, content: bytes) -> Iterator[Record]:
+        self._pending.append(_HEAD.pack(MESSAGE, len(content)) + content)
+        self._outside += 1
+        if len(self._pending) * (len(content) + 9) > BATCH:
+            yield from self._flush()
+
+    def _flush(self) -> Iterator[Record]:
+        if self._pending:
+            data = b"".join(self._pending)
+            self._pending = []
+            yield _messages(data)
+
+    def _data_end(self, record: bytes) -> None:
+        stated = int.from_bytes(record[9:13], "little")
+        if self._outside and not self.losses and stated and stated != self._crc:
+            self.losses.append(
+                "the checksum of the file does not fit; of what lies outside its chunks "
+                f"({self._outside} records) nobody knows which are right"
+            )
+            self.unverified += self._outside
+        elif self._outside and (self.losses or not stated):
+            self.unverified += self._outside
+        self._outside = 0
+
+    def _count_lost(self, content: bytes) -> None:
+        try:
+            fields = Fields(content)
+            channel = fields.u16()
+            self.lost_messages[channel] += fields.u32() // 16
+        except Short:
+            return
+
+    def _is_cut_chunk(self, pos: int) -> bool:
+        """Whether a sound chunk begins here, which the end of the file cuts through."""
+        start = read_at(self.stream, pos, 9 + 64)
+        if len(start) < 49 or start[0] != CHUNK:
+            return False
+        return is_chunk(start[9:], int.from_bytes(start[1:9], "little"))
+
+    def _cut(self, pos: int) -> Iterator[Record]:
+        """The file ends inside the record at `pos`: what of it is whole."""
+        rest = read_at(self.stream, pos, min(self.size - pos, RECORD_LIMIT))
+        saved = 0
+        if len(rest) > 49 and rest[0] == CHUNK:
+            for record in self._cut_chunk(rest[9:]):
+                saved += len(record) if isinstance(record, Messages) else 0
+                yield record
+        self.unverified += saved + self._outside
+        note = f"; {saved} messages before that were saved, unchecked" if saved else ""
+        self.losses.append(f"the file ends inside a record at byte {pos} of {self.size}{note}")
+
+    def _cut_chunk(self, content: bytes) -> Iterator[Record]:
+        try:
+            fields = Fields(content)
+            fields.skip(28)
+            compression = fields.text()
+        except (Short, UnicodeDecodeError):
+            return
+        data = decompress_part(compression, content[fields.pos + 8 :], RECORD_LIMIT)
+        whole = _whole_records(data)
+        try:
+            yield from list(chunk_records(data[:whole]))
+        except (BadChunk, Short, UnicodeDecodeError):
+            return
+
+    def _tail(self, end: int) -> None:
+        if read_at(self.stream, end, 9) != MAGIC:
+            self.losses.append("the file does not end as an MCAP file does")
+
+
+def _messages(data: bytes) -> Messages:
+    positions, _ = message_positions(data, 0, len(data), lambda found, offset: BadChunk(found))
+    return batch(data, positions)
+
+
+def _whole_records(data: bytes) -> int:
+    """Where the last record that is wholly there ends."""
+    pos = 0
+    while len(data) - pos >= 9:
+        _, length = _HEAD.unpack_from(data, pos)
+        if length > len(data) - pos - 9:
+            break
+        pos += 9 + int(length)
+    return pos
