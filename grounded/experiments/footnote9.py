@@ -3,8 +3,8 @@
     H = 1,  f(s, a) = a,  R(s) = C exp(-s^2),        model f_hat(s, a) = a + b
 
 The model's optimal action is -b, worth C exp(-b^2) in the real system: for b and C large,
-arbitrarily worse than the optimum C. Its derivatives are exact, epsilon = 0, so Theorem 1 says that the
-algorithm gets there; the paper adds "in a single iteration".
+arbitrarily worse than the optimum C. Its derivatives are exact, epsilon = 0, so Theorem 1 says
+that the algorithm gets there; the paper adds "in a single iteration".
 
     solved     method A runs to convergence in the biased model. The project's own search does it on
                -s^2 = log(R / C), which ranks the policies as R does.

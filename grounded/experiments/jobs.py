@@ -155,20 +155,18 @@ class _Cluster(AbstractContextManager[None]):
 
 
 def _lost() -> tuple[type[BaseException], ...]:
-    """The errors that say a worker died, not that a job failed."""
+    """The errors that say a worker died, not that a job failed; asked for after an error only."""
+    import importlib
+
     kinds: list[type[BaseException]] = []
-    try:
-        from joblib.externals.loky.process_executor import TerminatedWorkerError
-
-        kinds.append(TerminatedWorkerError)
-    except ImportError:
-        pass
-    try:
-        from distributed.scheduler import KilledWorker
-
-        kinds.append(KilledWorker)
-    except ImportError:
-        pass
+    for module, name in (
+        ("joblib.externals.loky.process_executor", "TerminatedWorkerError"),
+        ("distributed.scheduler", "KilledWorker"),
+    ):
+        try:
+            kinds.append(getattr(importlib.import_module(module), name))
+        except ImportError:
+            continue
     return tuple(kinds)
 
 
