@@ -14,6 +14,7 @@ import numpy as np
 
 from grounded.errors import GroundedError
 from grounded_trials.inspect_fields import number_paths
+from grounded_trials.inspect_twins import Twins, find_twins, kind_of
 from grounded_trials.log_files import log_files, open_log
 from grounded_trials.mcap_records import Channel, Header, Messages, Schema
 from grounded_trials.mcap_walk import DamagedFile, read_records
@@ -24,6 +25,8 @@ from grounded_trials.path_walk import Bound, bind, evaluate
 from grounded_trials.protobuf_schema import BadSchema
 from grounded_trials.signals import Decoder, decoder_of
 
+GAP = 10.0  # intervals; a longer gap is remarked on
+SKEW_S = 0.1  # a header stamp further from the log's clock is remarked on
 DECODED = 20_000  # messages of a topic whose numbers are looked at
 
 
@@ -66,7 +69,13 @@ class LogReport:
     duration_s: float
     messages: int
     topics: tuple[TopicReport, ...]
+    twins: tuple[Twins, ...]  # signals of different topics with one motion
     damage: str = ""  # where reading it ended early, and why
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Sentences about what a person should know before using the log."""
+        return _remarks(self)
 
 
 def inspect_log(paths: str | Path | Sequence[str | Path]) -> LogReport:
@@ -134,8 +143,18 @@ class _Look:
             duration_s=(end - start) * 1e-9,
             messages=sum(topic.count for topic in self.topics.values()),
             topics=tuple(topic.report(start) for topic in self.topics.values()),
+            twins=find_twins(self._samples()),
             damage=self.damage,
         )
+
+    def _samples(self) -> dict[str, tuple[Ints, Floats]]:
+        found = {}
+        for topic in self.topics.values():
+            for path, r in topic.ranges.items():
+                if r.samples:
+                    t, y = (np.concatenate(part) for part in zip(*r.samples, strict=True))
+                    found[path] = (t, y)
+        return found
 
 
 @dataclass
@@ -147,8 +166,11 @@ class _Range:
     high: float = -np.inf
     count: int = 0
     not_finite: int = 0
+    samples: list[tuple[Ints, Floats]] | None = None  # kept where twins may be found
 
-    def add(self, values: Floats) -> None:
+    def add(self, values: Floats, log_times: Ints) -> None:
+        if self.samples is not None:
+            self.samples.append((log_times, values))
         finite = values[np.isfinite(values)]
         self.count += len(values)
         self.not_finite += len(values) - len(finite)
@@ -195,7 +217,7 @@ class _Topic:
                 values = evaluate(root, found.bound, stamps=i == 0)
             except BadPath:  # behind a wstring, or a text in one JSON message
                 continue
-            found.add(values.values)
+            found.add(values.values, batch.log_times[values.rows])
             if values.stamps is not None:
                 self.skews.append(values.stamps - batch.log_times[values.rows])
 
@@ -211,7 +233,9 @@ class _Topic:
         for rest in number_paths(self.decoder.type, sample):
             try:
                 path = parse_path(topic + rest)
-                self.ranges[path.text] = _Range(bind(path, self.decoder.type))
+                found = _Range(bind(path, self.decoder.type))
+                found.samples = [] if kind_of(path.text) else None
+                self.ranges[path.text] = found
             except (GroundedError, BadPath):
                 continue
 
@@ -237,6 +261,34 @@ class _Topic:
             fields=tuple(_field(path, r) for path, r in self.ranges.items() if r.count),
             problem=self.problem,
         )
+
+
+def _remarks(log: LogReport) -> tuple[str, ...]:
+    found = [log.damage] if log.damage else []
+    for topic in log.topics:
+        if topic.problem:
+            found.append(f"{topic.topic} ({topic.type}) can't be read: {topic.problem}")
+        if topic.messages == 0:
+            found.append(f"{topic.topic} has no messages")
+        elif topic.messages == 1:
+            found.append(f"{topic.topic} has a single message, {topic.first_s:.3f} s into the log")
+        elif topic.rate_hz and topic.largest_gap_s > GAP / topic.rate_hz:
+            found.append(f"{topic.topic} has a gap of {topic.largest_gap_s:.3f} s")
+        if topic.skew_s is not None and abs(topic.skew_s) > SKEW_S:
+            found.append(
+                f"{topic.topic} is stamped {topic.skew_s:.3f} s from the log's clock "
+                "(simulation time, or an unset clock?)"
+            )
+        bad = [f.path for f in topic.fields if f.not_finite]
+        if bad:
+            found.append(f"{topic.topic} has values that are no numbers, first in {bad[0]}")
+    for twins in log.twins:
+        if twins.opposite:
+            found.append(
+                f"{twins.first} and {twins.second} show the same motion with OPPOSITE SIGN "
+                f"(correlation {twins.correlation:.3f})"
+            )
+    return tuple(found)
 
 
 def _field(path: str, found: _Range) -> FieldReport:

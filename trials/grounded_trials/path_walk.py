@@ -140,12 +140,23 @@ def evaluate(root: Node, bound: Bound, stamps: bool) -> Values:
     messages, numbered = node.rows, node.numbered(np.arange(len(node.rows)))
     end = walk(numbered, bound.after)
     rows, values = _apply(end, bound.functions)
-    if not stamps or bound.stamp is None:
+    names = _dynamic_stamp(numbered) if isinstance(root.type, Dynamic) else bound.stamp
+    if not stamps or names is None:
         return Values(messages[rows], values, None)
-    place, times = read_stamp(walk(numbered, tuple(Field(name) for name in bound.stamp)))
+    place, times = read_stamp(walk(numbered, tuple(Field(name) for name in names)))
     at = np.searchsorted(place, rows)
     known = np.append(place, -1)[at] == rows
     return Values(messages[rows[known]], values[known], times[at[known]])
+
+
+def _dynamic_stamp(root: Node) -> tuple[str, ...] | None:
+    """Names that lead to the stamp in JSON messages, whose first one tells."""
+    first = root.keep(np.arange(len(root.rows)) == 0)
+    for names in STAMPS:
+        found = walk(first, tuple(Field(name) for name in names)).names()
+        if any(n in found for n in SECONDS) and any(n in found for n in NANOSECONDS):
+            return names
+    return None
 
 
 def walk(node: Node, steps: Sequence[Step]) -> Node:

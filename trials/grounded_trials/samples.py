@@ -15,7 +15,7 @@ from grounded.errors import GroundedError
 from grounded_trials.nodes import Floats, Ints
 from grounded_trials.signals import Series, SignalSpec
 
-GAP_INTERVALS, GAP_STEPS = 5.0, 3.0  # a gap, without max_age_s: this many intervals and steps
+GAP_INTERVALS, GAP_STEPS, GAP_S = 5.0, 3.0, 0.1  # a gap, without max_age_s: more than all these
 JUMP_S = 1.0  # a clock that goes back by more was set, or a simulation was started again
 
 
@@ -41,7 +41,7 @@ class Samples:
         """How far apart two samples may be for what lies between to be believed [s]."""
         if self.spec.max_age_s is not None:
             return self.spec.max_age_s
-        return max(GAP_INTERVALS * self.interval, GAP_STEPS * dt)
+        return max(GAP_INTERVALS * self.interval, GAP_STEPS * dt, GAP_S)
 
     def check_linear(self) -> None:
         """Refuses a single sample, between which and the next nothing can be interpolated."""
