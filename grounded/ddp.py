@@ -99,7 +99,7 @@ def solve(
     state = _State(first.z[0], first.u[0], float(first.cost[0]), 0.0)
     trace: list[Iteration] = []
     if not np.isfinite(state.cost):
-        return _not_finite(problem, state, _first_bad(state.z), trace)
+        return _not_finite(problem, state, _first_bad(problem, state.z), trace)
     while True:
         found = sweep(problem, state.z, state.u, mu=state.mu)
         if not found.ok:
@@ -180,13 +180,15 @@ def _result(status: Status, state: _State, found: Sweep, trace: list[Iteration])
     )
 
 
-def _first_bad(z: Array) -> str:
-    bad = ~np.isfinite(z).all(axis=1)
-    when = int(np.argmax(bad))
+def _first_bad(problem: Problem, z: Array) -> str:
+    system, bad = problem.system, ~np.isfinite(z[:, : problem.system.n])
+    if not bad.any():
+        return "the cost of the first rollout is not finite"
+    when = int(np.argmax(bad.any(axis=1)))
+    name = system.states[int(np.argmax(bad[when]))]
     return (
-        f"the first rollout leaves the finite numbers at step {when}"
-        if bad.any()
-        else ("the cost of the first rollout is not finite")
+        f"the first rollout leaves the finite numbers at step {when}, state '{name}' "
+        f"(the model is at {system.source})"
     )
 
 

@@ -9,15 +9,27 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from grounded.compile.graph import TooLong
 from grounded.compile.interpreted import Integrator, Kind
-from grounded.compile.names import Named
+from grounded.compile.names import Named, where
 from grounded.compile.problem import Problem, history_depths
 from grounded.compile.python import DifferencedSystem
 from grounded.compile.system import Backward, Swarm, System
+from grounded.compile.threads import parallel
 from grounded.compile.traced import TracedSystem
 from grounded.compile.tracing import Signature, trace
 
-__all__ = ["Backward", "Named", "Problem", "Swarm", "System", "history_depths", "system_of"]
+__all__ = [
+    "Backward",
+    "Named",
+    "Problem",
+    "Swarm",
+    "System",
+    "history_depths",
+    "parallel",
+    "system_of",
+]
+MAX_COMPILED = 10_000  # operations of a model and its derivatives, about 4 s of compiling
 
 
 def system_of(
@@ -47,9 +59,7 @@ def system_of(
     from grounded.compile import jit
     from grounded.compile.compiled import CompiledSystem
 
-    signature = Signature(function, kind, tuple(states), tuple(inputs), tuple(params))
-    found = trace(signature, None, 1.0)
-    if isinstance(found, str):
+    def differenced(why: str) -> System:
         return DifferencedSystem(
             function,
             kind=kind,
@@ -57,8 +67,22 @@ def system_of(
             inputs=inputs,
             params=params,
             integrator=integrator,
-            note=f"not compiled, {found}",
+            note=f"not compiled, {why}",
         )
+
+    signature = Signature(function, kind, tuple(states), tuple(inputs), tuple(params))
+    found = trace(signature, None, 1.0)
+    if isinstance(found, str):
+        return differenced(found)
     if not jit.available():
         return TracedSystem(signature, found, integrator, "not compiled: llvmlite is missing")
-    return CompiledSystem(signature, found, integrator)
+    try:
+        system = CompiledSystem(signature, found, integrator)
+    except TooLong as error:
+        return differenced(f"{where(function)}: its derivatives take {error}")
+    if system.operations > MAX_COMPILED:
+        note = (
+            f"not compiled, {where(function)}: {system.operations:,} operations would take too long"
+        )
+        return TracedSystem(signature, found, integrator, note)
+    return system

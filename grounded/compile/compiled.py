@@ -21,7 +21,7 @@ from grounded.compile import jit
 from grounded.compile.interpreted import Integrator
 from grounded.compile.llvm_batch import BATCH, linearise_kernel, step_kernel
 from grounded.compile.llvm_box import MAX_INPUTS, box_functions
-from grounded.compile.llvm_riccati import SWEEP, sweep_kernel
+from grounded.compile.llvm_riccati import SWEEP, sweep_kernel, sweep_tables
 from grounded.compile.llvm_rollout import LANES, ROLLOUT, Layout, rollout_kernel
 from grounded.compile.llvm_step import Dynamics, dynamics_of, jacobian_function, stage_tables
 from grounded.compile.llvm_text import declarations
@@ -41,7 +41,8 @@ class Kernels:
         n, m, k = system.n, system.m, system.k
         kind, integrator = system.kind, system.integrator
         self.small = dynamics_of(variant, n, m, n + m, kind, integrator)
-        self._wide = (variant, n, m, n + m + k, kind, integrator)
+        self._wide = dynamics_of(variant, n, m, n + m + k, kind, integrator)
+        self._k = k
         graph = variant.trace.graph
         nodes = [*variant.trace.outputs, *(i for _, _, i in variant.entries)]
         places = [(r, c) for r, c, _ in variant.entries]
@@ -64,11 +65,9 @@ class Kernels:
         d = self.small
         return self.search(Layout(d.n, (1,) * d.m, (False,) * d.n))
 
-    def full(self) -> tuple[jit.Library, Dynamics]:
+    def full(self) -> jit.Library:
         """Linearise with respect to the parameters as well."""
-        if not hasattr(self, "wide"):
-            self.wide = dynamics_of(*self._wide)
-        return self._library("full", self.wide, None), self.wide
+        return self._library("full", self._wide, None)
 
     def _library(self, key: Any, d: Dynamics, layout: Layout | None) -> jit.Library:
         with self._lock:
@@ -77,24 +76,26 @@ class Kernels:
                 if layout is not None:
                     names += ["step", "rollout"] + ["sweep"] * (layout.m <= MAX_INPUTS)
                 digest = hashlib.sha256(f"{self._key} {key}".encode()).hexdigest()
-                self._libraries[key] = jit.library(digest, lambda: _module(d, layout), names)
+                self._libraries[key] = jit.library(
+                    digest, lambda: _module(d, layout, self._k), names
+                )
             return self._libraries[key]
 
 
-def _module(d: Dynamics, layout: Layout | None) -> str:
-    """The IR text of a module."""
+def _module(d: Dynamics, layout: Layout | None, k: int) -> str:
+    """The IR text of a module: for a search about a layout, or of the sensitivities."""
     width = jit.lanes()
     parts = [
         declarations({width, LANES}),
         stage_tables(d),
         d.uniforms.function(),
         jacobian_function(d, width),
-        linearise_kernel(d, width),
+        linearise_kernel(d, width, 0 if layout is not None else k),
     ]
     if layout is not None:
         parts += [step_kernel(d, width), rollout_kernel(d, layout)]
         if layout.m <= MAX_INPUTS:
-            parts += [box_functions(layout.m), sweep_kernel(d, layout, width)]
+            parts += [sweep_tables(d), box_functions(layout.m), sweep_kernel(d, layout, width)]
     return "".join(parts)
 
 
@@ -125,6 +126,11 @@ class CompiledSystem(TracedSystem):
         super().__init__(signature, first, integrator, "")
         self._kernels: dict[int, Kernels] = {}
 
+    @property
+    def operations(self) -> int:
+        """Operations of the model and its derivatives, 0 while no branch of it is traced."""
+        return max((variant.operations for variant in self._variants), default=0)
+
     def _compiled(self, p: Array, dt: float) -> Kernels:
         variant = self.variant(p, dt)
         kernels = self._kernels.get(id(variant))
@@ -136,30 +142,37 @@ class CompiledSystem(TracedSystem):
         """See `System.step`."""
         out = np.empty((len(x), self.n))
         library = self._compiled(p, dt).any_search()
-        self._batch(library["step"], x, u, p, dt, smoothing, out)
+        self._batch(library["step"], (x, u, p, dt, smoothing), {"out": out})
         return out
 
-    def _derivatives(
-        self, x: Array, u: Array, p: Array, dt: float, smoothing: float, full: bool
-    ) -> Array:
-        kernels = self._compiled(p, dt)
-        library, d = kernels.full() if full else (kernels.any_search(), kernels.small)
-        N, width, places = len(x), jit.lanes(), len(d.places)
-        values = np.empty((-(-N // width), places, width))
-        self._batch(library["linearise"], x, u, p, dt, smoothing, values)
-        J = np.zeros((N, self.n, self.n + self.m + (self.k if full else 0)))
-        rows, columns = np.array(d.places, int).reshape(-1, 2).T
-        J[:, rows, columns] = values.transpose(0, 2, 1).reshape(-1, places)[:N]
-        return J
+    def linearise(
+        self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
+    ) -> tuple[Array, Array]:
+        """See `System.linearise`."""
+        N, n = len(x), self.n
+        f_x, f_u = np.zeros((N, n, n)), np.zeros((N, n, self.m))
+        library = self._compiled(p, dt).any_search()
+        self._batch(library["linearise"], (x, u, p, dt, smoothing), {"f_x": f_x, "f_u": f_u})
+        return f_x, f_u
+
+    def sensitivities(
+        self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
+    ) -> tuple[Array, Array, Array]:
+        """See `System.sensitivities`."""
+        N, n = len(x), self.n
+        f_x, f_u, f_p = np.zeros((N, n, n)), np.zeros((N, n, self.m)), np.zeros((N, n, self.k))
+        out = {"f_x": f_x, "f_u": f_u, "f_p": f_p}
+        self._batch(self._compiled(p, dt).full()["linearise"], (x, u, p, dt, smoothing), out)
+        return f_x, f_u, f_p
 
     def _batch(
-        self, kernel: Any, x: Array, u: Array, p: Array, dt: float, eps: float, out: Array
+        self, kernel: Any, point: tuple[Array, Array, Array, float, float], out: dict[str, Array]
     ) -> None:
+        x, u, p, dt, eps = point
         if len(x) == 0:
             return
-        x, u, p = _plain(x), _plain(u), _plain(p)
-        values = (x, u, p, float(dt), float(eps), len(x), out)
-        call(kernel, BATCH, dict(zip(BATCH, values, strict=True)))
+        words = dict.fromkeys(BATCH, 0) | {"x": _plain(x), "u": _plain(u), "p": _plain(p)}
+        call(kernel, BATCH, words | {"dt": float(dt), "eps": float(eps), "N": len(x)} | out)
 
     def rollout(
         self,

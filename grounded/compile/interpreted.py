@@ -26,6 +26,8 @@ class Interpreted(ABC):
 
     how: str
     note: str
+    source: str
+    states: tuple[str, ...]
 
     def __init__(
         self, kind: Kind, integrator: Integrator, sizes: tuple[int, int, int], note: str = ""

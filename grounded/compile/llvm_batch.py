@@ -1,7 +1,7 @@
 """Kernels over N independent samples, W lanes at a time: the step, and its Jacobian.
 
 A kernel takes one pointer, to a table of 64-bit words: addresses, integers, doubles. The Jacobian
-is left as the values of its places, (ceil(N / W), places, W): whoever wants a matrix scatters them.
+is computed as the values of its places and scattered into matrices that are zero elsewhere.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from grounded.compile.llvm_step import Dynamics, StepWriter
 from grounded.compile.llvm_text import Writer
 
-BATCH = ("x", "u", "p", "dt", "eps", "N", "out")  # words of the kernels here
+BATCH = ("x", "u", "p", "dt", "eps", "N", "out", "f_x", "f_u", "f_p")  # a kernel's words
 
 
 class Words:
@@ -95,23 +95,37 @@ def step_kernel(d: Dynamics, width: int) -> str:
     return f.text()
 
 
-def linearise_kernel(d: Dynamics, width: int) -> str:
-    """`void @linearise(words)`: out (ceil(N / W), places, W)."""
+def linearise_kernel(d: Dynamics, width: int, k: int) -> str:
+    """`void @linearise(words)`: f_x (N, n, n), f_u (N, n, m) and, for k > 0, f_p (N, n, k)."""
     f = Writer("void @linearise(ptr %words)")
     words = Words(f, BATCH)
-    x, u, out, count = (
-        words.pointer("x"),
-        words.pointer("u"),
-        words.pointer("out"),
-        words.integer("N"),
-    )
+    x, u, count = words.pointer("x"), words.pointer("u"), words.integer("N")
     table = start_table(f, words, d)
     xu, following = f.room((d.n + d.m) * width), f.room(d.n * width)
+    values = f.room(len(d.places) * width)
     blocks = f.integer("sdiv", f.integer("add", count, width - 1), width)
     with f.loop(blocks) as block:
         first, inputs = f.integer("mul", block, width), f.at(xu, d.n * width)
         gather_rows(f, [(x, d.n, xu), (u, d.m, inputs)], first, count, width)
-        to = f.at(out, f.integer("mul", block, len(d.places) * width))
-        f.do(f"call void @jacobian(ptr {xu}, ptr {table}, ptr {following}, ptr {to})")
+        f.do(f"call void @jacobian(ptr {xu}, ptr {table}, ptr {following}, ptr {values})")
+        left = f.integer("sub", count, first)
+        full = f.emit(f"icmp sgt i64 {left}, {width}")
+        with f.loop(f.emit(f"select i1 {full}, i64 {width}, i64 {left}")) as lane:
+            _scatter(f, words, d, k, f.integer("add", first, lane), f.at(values, lane), width)
     f.do("ret void")
     return f.text()
+
+
+def _scatter(
+    f: Writer, words: Words, d: Dynamics, k: int, row: str, values: str, width: int
+) -> None:
+    """One sample's values into its matrices."""
+    starts, matrices = [0, d.n, d.n + d.m], [("f_x", d.n), ("f_u", d.m), ("f_p", k)]
+    to = [
+        f.at(words.pointer(name), f.integer("mul", row, d.n * size)) if size else ""
+        for name, size in matrices
+    ]
+    for e, (r, c) in enumerate(d.places):
+        which = sum(c >= start for start in starts) - 1
+        index = r * matrices[which][1] + c - starts[which]
+        f.store(f.load(values, e * width), to[which], index)

@@ -23,14 +23,15 @@ class Uniforms:
     def __init__(self, graph: Graph, outputs: Sequence[int]) -> None:
         self.graph = graph
         live = graph.live(outputs)
-        self.varying: set[int] = set()
-        for i in live:
-            node = graph.nodes[i]
-            if (node.leaf and node.leaf[0] in "xu") or any(a in self.varying for a in node.args):
-                self.varying.add(i)
-        used = {a for i in live if i in self.varying for a in graph.nodes[i].args} | set(outputs)
-        read = [i for i in sorted(used - self.varying) if graph.nodes[i].op != "const"]
+        varying = _reached(graph, live, "xu")
+        read = [i for i in _frontier(graph, live, varying, outputs) if graph.nodes[i].op != "const"]
         self.slot = {i: FIRST + place for place, i in enumerate(read)}
+
+    def held(self, outputs: Sequence[int]) -> list[int]:
+        """Nodes of the inputs alone that outputs use: the same in every stage of a step."""
+        live = self.graph.live(outputs)
+        moving, varying = (_reached(self.graph, live, letters) for letters in ("x", "xu"))
+        return [i for i in _frontier(self.graph, live, moving, outputs) if i in varying]
 
     @property
     def size(self) -> int:
@@ -56,6 +57,24 @@ class Uniforms:
         return f.text()
 
 
+def _reached(graph: Graph, live: Sequence[int], letters: str) -> set[int]:
+    """Nodes that depend on leaves of these letters."""
+    found: set[int] = set()
+    for i in live:
+        node = graph.nodes[i]
+        if (node.leaf and node.leaf[0] in letters) or any(a in found for a in node.args):
+            found.add(i)
+    return found
+
+
+def _frontier(
+    graph: Graph, live: Sequence[int], inside: set[int], outputs: Sequence[int]
+) -> list[int]:
+    """Nodes outside a set that are used by it, or are wanted themselves."""
+    used = {a for i in live if i in inside for a in graph.nodes[i].args} | set(outputs)
+    return sorted(used - inside)
+
+
 class Body:
     """Nodes written once each, in one place of one function."""
 
@@ -67,11 +86,12 @@ class Body:
         leaf: Callable[[str, int], str],
         table: str,
         slots: Mapping[int, int],
+        known: Mapping[int, str] | None = None,
     ) -> None:
         self.f, self.width, self.graph, self.leaf = f, width, graph, leaf
         self.table, self.slots = table, slots
         self.lanes = Lanes(f, width)
-        self._known: dict[int, str] = {}
+        self._known: dict[int, str] = dict(known or {})
         self._settings: dict[int, str] = {}
 
     def values(self, outputs: Sequence[int]) -> list[str]:

@@ -13,17 +13,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from grounded.compile import jit
 from grounded.compile.llvm_batch import Words, gather_rows, start_table
 from grounded.compile.llvm_box import ONE, ZERO, clipped, solved
 from grounded.compile.llvm_rollout import Layout, received, wrap
 from grounded.compile.llvm_step import Dynamics
-from grounded.compile.llvm_text import Writer, number, splat, vector
+from grounded.compile.llvm_text import Writer, integers, number, splat, vector
 
 SWEEP = (
     *("z_run", "u_run", "p", "dt", "eps", "target", "weight", "input_target", "R", "S"),
     *("low", "high", "now", "past", "damping", "H", "k", "K", "expected"),
 )
-Row = Callable[[int], str]  # loads (a piece of) row r of a matrix
+Row = Callable[[int | str], str]  # loads (a piece of) row r of a matrix
+UNROLLED = 400  # entries of the Jacobian whose products are written out; more are a loop
 
 
 def padded(size: int) -> int:
@@ -36,6 +38,24 @@ def pieces(size: int, width: int) -> list[tuple[int, int]]:
     wide = size // width * width
     cut = [(at, width) for at in range(0, wide, width)]
     return cut + [(at, 4) for at in range(wide, size, 4)]
+
+
+def sweep_tables(d: Dynamics) -> str:
+    """For large models: which entries each column of the Jacobian has, at least the zero one."""
+    if len(d.places) <= UNROLLED:
+        return ""
+    first, rows, entries = [0], [], []
+    for c in range(d.n + d.m):
+        column = [(r, e) for e, (r, c2) in enumerate(d.places) if c2 == c] or [(0, len(d.places))]
+        rows += [r for r, _ in column]
+        entries += [e for _, e in column]
+        first.append(len(rows))
+    width = jit.lanes()
+    return (
+        integers("column_first", first)
+        + integers("column_row", rows)
+        + integers("column_entry", [e * width for e in entries])
+    )
 
 
 def sweep_kernel(d: Dynamics, layout: Layout, width: int) -> str:
@@ -65,7 +85,8 @@ class _Sweep:
         self.table = start_table(f, self.words, d)
         self.soa = f.room((nz + m) * width)
         self.xu, self.following = f.room((n + m) * width), f.room(n * width)
-        self.jac = f.room(len(d.places) * width)
+        self.jac = f.room((len(d.places) + 1) * width)  # the last is zero
+        self.sums_room = f.room((n + m) * width)
         self.V, self.v = f.room(self.P * self.P), f.room(self.P)
         self.M, self.T = f.room(self.C * self.P), f.room(self.P * self.C)
         self.U = f.room(m * self.C)  # rows of [Q_uz Q_uu]
@@ -80,6 +101,7 @@ class _Sweep:
     def end(self) -> None:
         """V and v of the last state; zeros in the padding."""
         f = self.f
+        f.store(splat(0.0, self.width), self.jac, len(self.d.places) * self.width, self.width)
         rooms = ((self.V, self.P * self.P), (self.M, self.C * self.P), (self.v, self.P))
         for room, size in (*rooms, (self.g_z, self.P)):
             with f.loop(size // 4) as four:
@@ -125,13 +147,9 @@ class _Sweep:
 
     def _combined(self, row: Row, size: int, inputs_only: bool = False) -> list[str]:
         """Rows of [A B]'X, z first and then u, from pieces X(r, :) of `size` doubles."""
-        f, d, layout = self.f, self.d, self.layout
-        sums: dict[int, str] = {}
-        for e, (r, c) in enumerate(d.places):
-            if c < layout.n and inputs_only:
-                continue
-            a, value = self._entry(e, size), row(r)
-            sums[c] = f.fma(a, value, sums[c], size) if c in sums else f.mul(a, value, size)
+        f, layout = self.f, self.layout
+        large = len(self.d.places) > UNROLLED
+        sums = self._looped_sums(row, size) if large else self._sums(row, size, inputs_only)
         out = [sums.get(c, splat(0.0, size)) for c in range(layout.n)]
         now, past, D = self.words.pointer("now"), self.words.pointer("past"), layout.nz - layout.n
         inputs = []
@@ -145,6 +163,29 @@ class _Sweep:
             inputs.append(f.fma(f.load_all(now, j, size), G, row(layout.slot(j)), size))
         return inputs if inputs_only else out + inputs
 
+    def _sums(self, row: Row, size: int, inputs_only: bool) -> dict[int, str]:
+        """For each column c of the Jacobian, the sum over r of J(r, c) X(r, :)."""
+        f, sums = self.f, dict[int, str]()
+        for e, (r, c) in enumerate(self.d.places):
+            if c < self.layout.n and inputs_only:
+                continue
+            a, value = self._entry(e, size), row(r)
+            sums[c] = f.fma(a, value, sums[c], size) if c in sums else f.mul(a, value, size)
+        return sums
+
+    def _looped_sums(self, row: Row, size: int) -> dict[int, str]:
+        """The same for large models, by tables of indices."""
+        f, count = self.f, self.layout.n + self.layout.m
+        with f.loop(count) as c:
+            first = f.index("@column_first", c)
+            entries = f.integer("sub", f.index("@column_first", f.integer("add", c, 1)), first)
+            with f.fold(entries, size, splat(0.0, size)) as total:
+                q = f.integer("add", first, total.i)
+                a = f.load_all(self.now, f.index("@column_entry", q), size)
+                total.set(f.fma(a, row(f.index("@column_row", q)), total.value, size))
+            f.store(total.result, self.sums_room, f.integer("mul", c, size), size)
+        return {c: f.load(self.sums_room, c * size, size) for c in range(count)}
+
     def _entry(self, e: int, size: int) -> str:
         """Value e of the Jacobian of this step, in every lane."""
         if (e, 1) not in self.entries:
@@ -155,7 +196,14 @@ class _Sweep:
 
     def _pieces_of(self, base: str, stride: int, at: int, size: int) -> Row:
         """Loads entries at .. at + size - 1 of a matrix's rows."""
-        return lambda r: self.f.load(base, r * stride + at, size)
+        f = self.f
+
+        def piece(r: int | str) -> str:
+            if isinstance(r, int):
+                return f.load(base, r * stride + at, size)
+            return f.load(base, f.integer("add", f.integer("mul", r, stride), at), size)
+
+        return piece
 
     def products(self, t: str) -> None:
         """Q_zz into V, [Q_uz Q_uu] into U, Q_z into g_z, Q_u into g_u."""
@@ -227,9 +275,11 @@ class _Sweep:
             inside = ", ".join(f"i32 {i}" for i in lanes)
             return f.emit(f"shufflevector {kind} {a}, {kind} {b}, <4 x i32> <{inside}>")
 
-        for c in range(0, C, 4):
+        with f.loop(C // 4) as block:
+            c = f.integer("mul", block, 4)
+            source, target = f.at(self.M, f.integer("mul", c, P)), f.at(self.T, c)
             for r in range(0, P, 4):
-                a = [f.load(self.M, (c + i) * P + r, 4) for i in range(4)]
+                a = [f.load(source, i * P + r, 4) for i in range(4)]
                 lo = [shuffled(a[i], a[i + 1], 0, 4, 2, 6) for i in (0, 2)]
                 hi = [shuffled(a[i], a[i + 1], 1, 5, 3, 7) for i in (0, 2)]
                 columns = [
@@ -239,7 +289,7 @@ class _Sweep:
                     shuffled(hi[0], hi[1], 2, 3, 6, 7),
                 ]
                 for i, column in enumerate(columns):
-                    f.store(column, self.T, (r + i) * C + c, 4)
+                    f.store(column, target, (r + i) * C, 4)
 
     def gains(self, t: str) -> None:
         """Gains k and K of step t inside the limits; the promise d1, d2."""
@@ -330,8 +380,9 @@ class _Sweep:
                 F = f.load(self.F, j * P + at, size)
                 v = f.fma(f.load_all(self.k, j, size), F, v, size)
             f.store(v, self.v, at, size)
-            for c in range(self.layout.nz):
-                row = f.load(self.V, c * P + at, size)
+            with f.loop(self.layout.nz) as c:
+                place = f.integer("add", f.integer("mul", c, P), at)
+                row, column = f.load(self.V, place, size), f.at(self.F, c)
                 for j in range(m):
-                    row = f.fma(f.load_all(self.F, j * P + c, size), K[j], row, size)
-                f.store(row, self.V, c * P + at, size)
+                    row = f.fma(f.load_all(column, j * P, size), K[j], row, size)
+                f.store(row, self.V, place, size)

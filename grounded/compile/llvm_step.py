@@ -10,16 +10,17 @@ kept as the values of a pattern: the places that can be non-zero after any numbe
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 from grounded.compile.graph import Graph
 from grounded.compile.llvm_graph import DT, Body, Uniforms
-from grounded.compile.llvm_text import Writer, number, splat
+from grounded.compile.llvm_text import Writer, integers, number, splat
 from grounded.compile.traced import STAGES, Variant
 
 Place = tuple[int, int]  # row, column of a Jacobian
+UNROLLED = 2000  # products of the chain rule that are written out; more are a loop over indices
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,17 +43,20 @@ class Dynamics:
     def rates(self) -> dict[Place, tuple[int, ...]]:
         """The pattern of K: for each place, the s with f_x[r, s] K[s, c] to be summed."""
         pattern = set(self.entries)
-        while True:
-            reach = {
-                (r, c) for (r, s) in self.entries if s < self.n for (s2, c) in pattern if s2 == s
-            }
-            if reach <= pattern:
-                break
-            pattern |= reach
+        for _ in self.stages[1:]:
+            rows: dict[int, set[int]] = {}
+            for s, c in pattern:
+                rows.setdefault(s, set()).add(c)
+            pattern |= {(r, c) for r, s in self.entries if s < self.n for c in rows.get(s, ())}
         return {
             (r, c): tuple(s for s in range(self.n) if (r, s) in self.entries and (s, c) in pattern)
             for (r, c) in sorted(pattern)
         }
+
+    @cached_property
+    def products(self) -> int:
+        """Multiplications in a stage of the chain rule."""
+        return sum(len(sums) for sums in self.rates.values()) if len(self.stages) > 1 else 0
 
     @cached_property
     def places(self) -> list[Place]:
@@ -80,6 +84,7 @@ class StepWriter:
         self.u = f.room(d.m * width)
         self.next = f.room(d.n * width)
         self.k = f.room(d.n * width) if d.stages else ""
+        self.held: dict[int, str] = {}  # values of the inputs alone, the same in every stage
 
     def _body(self, state: Callable[[int], str]) -> Body:
         f, d, w = self.f, self.d, self.width
@@ -89,7 +94,7 @@ class StepWriter:
                 return f.load_all(self.table, DT, w)
             return state(index) if letter == "x" else f.load(self.u, index * w, w)
 
-        return Body(f, w, d.graph, leaf, self.table, d.uniforms.slot)
+        return Body(f, w, d.graph, leaf, self.table, d.uniforms.slot, self.held)
 
     def step(self) -> None:
         """From x and u to next."""
@@ -99,12 +104,15 @@ class StepWriter:
             for i, value in enumerate(values):
                 f.store(value, self.next, i * w, w)
             return
-        self._start()
+        self._start(d.outputs)
         with f.loop(len(d.stages)) as stage:
             self._rates(stage)
 
-    def _start(self) -> None:
+    def _start(self, outputs: Sequence[int]) -> None:
         f, d, w = self.f, self.d, self.width
+        held = d.uniforms.held(outputs)
+        self.held = {}
+        self.held = dict(zip(held, self._body(lambda i: "").values(held), strict=True))
         zero = splat(0.0, w)
         for i in range(d.n):
             f.store(f.load(self.x, i * w, w), self.next, i * w, w)
@@ -141,7 +149,7 @@ class StepWriter:
             f.store(zero, rates, e * w, w)
         for e, (r, c) in enumerate(d.places):
             f.store(splat(1.0 if r == c else 0.0, w), out, e * w, w)
-        self._start()
+        self._start([*d.outputs, *d.entries.values()])
         with f.loop(len(d.stages)) as stage:
             body, c_dt = self._rates(stage)
             self._chain(body, c_dt, stage, rates, out)
@@ -155,6 +163,9 @@ class StepWriter:
         slot = {at: e * w for e, at in enumerate(d.rates)}
         place = {at: e for e, at in enumerate(d.places)}
         b = f.spread(f.mul(f.load(self.table, DT), f.load("@stage_b", stage)), w)
+        if d.products > UNROLLED:
+            self._looped_chain(body, (c_dt, b), (old, new), out)
+            return
         scaled = {}
         chained = len(d.stages) > 1
         if chained:
@@ -170,16 +181,59 @@ class StepWriter:
             e = place[r, c] * w
             f.store(f.fma(b, own, f.load(out, e, w), w), out, e, w)
 
+    def _looped_chain(
+        self, body: Body, factors: tuple[str, str], turns: tuple[str, str], out: str
+    ) -> None:
+        """The same sums for large models: small code that runs through tables of indices."""
+        f, d, w = self.f, self.d, self.width
+        (c_dt, b), (old, new) = factors, turns
+        own = f.room((len(d.entries) + 1) * w)  # the last is zero
+        for e, value in enumerate(body.values(list(d.entries.values()))):
+            f.store(value, own, e * w, w)
+        f.store(splat(0.0, w), own, len(d.entries) * w, w)
+        with f.loop(len(d.rates)) as rate:
+            first = f.index("@chain_first", rate)
+            count = f.integer("sub", f.index("@chain_first", f.integer("add", rate, 1)), first)
+            with f.fold(count, w, splat(0.0, w)) as total:
+                q = f.integer("add", first, total.i)
+                left = f.integer("mul", f.index("@chain_left", q), w)
+                right = f.integer("mul", f.index("@chain_right", q), w)
+                total.set(f.fma(f.load(own, left, w), f.load(old, right, w), total.value, w))
+            mine = f.load(own, f.integer("mul", f.index("@chain_own", rate), w), w)
+            value = f.fma(c_dt, total.result, mine, w)
+            f.store(value, new, f.integer("mul", rate, w), w)
+            place = f.integer("mul", f.index("@chain_place", rate), w)
+            f.store(f.fma(b, value, f.load(out, place, w), w), out, place, w)
+
+
+def _chain_tables(d: Dynamics) -> str:
+    """For `_looped_chain`: sums of products by index, at least one a place."""
+    own = {place: e for e, place in enumerate(d.entries)}
+    slot = {place: e for e, place in enumerate(d.rates)}
+    place = {at: e for e, at in enumerate(d.places)}
+    first, left, right = [0], list[int](), list[int]()
+    for (r, c), sums in d.rates.items():
+        left += [own[r, s] for s in sums] or [len(own)]
+        right += [slot[s, c] for s in sums] or [0]
+        first.append(len(left))
+    return (
+        integers("chain_own", [own.get(at, len(own)) for at in d.rates])
+        + integers("chain_place", [place[at] for at in d.rates])
+        + integers("chain_first", first)
+        + integers("chain_left", left)
+        + integers("chain_right", right)
+    )
+
 
 def stage_tables(d: Dynamics) -> str:
-    """The stages' c and b as global constants."""
+    """The stages' c and b as global constants, and the chain's indices where it is a loop."""
     if not d.stages:
         return ""
     lines = []
     for name, column in (("stage_c", 0), ("stage_b", 1)):
         inside = ", ".join(f"double {number(stage[column])}" for stage in d.stages)
-        lines.append(f"@{name} = internal constant [{len(d.stages)} x double] [{inside}]")
-    return "\n".join(lines) + "\n"
+        lines.append(f"@{name} = internal constant [{len(d.stages)} x double] [{inside}]\n")
+    return "".join(lines) + (_chain_tables(d) if d.products > UNROLLED else "")
 
 
 def jacobian_function(d: Dynamics, width: int) -> str:

@@ -34,6 +34,17 @@ def splat(value: float, width: int) -> str:
     return "<" + ", ".join(f"double {number(value)}" for _ in range(width)) + ">"
 
 
+class Fold:
+    """A loop's number of the turn and carried value; afterwards, the result."""
+
+    def __init__(self, i: str, value: str) -> None:
+        self.i, self.value, self.result = i, value, ""
+
+    def set(self, value: str) -> None:
+        """The value that the next turn starts with."""
+        self.result = value
+
+
 class Writer:
     """One function being written."""
 
@@ -76,6 +87,10 @@ class Writer:
         if index == 0:
             return base
         return self.emit(f"getelementptr {kind}, ptr {base}, i64 {index}")
+
+    def index(self, table: str, i: int | str) -> str:
+        """An entry of a table of i64."""
+        return self.emit(f"load i64, ptr {self.at(table, i, 'i64')}, align 8")
 
     def load(self, base: str, index: int | str = 0, width: int = 1) -> str:
         """W doubles from base[index]."""
@@ -180,6 +195,20 @@ class Writer:
         self.do(f"br i1 %more{tag}, label %loop{tag}, label %exit{tag}")
         self.lines.append(f"exit{tag}:")
 
+    @contextmanager
+    def fold(self, count: int | str, width: int, start: str) -> Iterator[Fold]:
+        """A loop that carries W lanes from turn to turn; its body must `set` the next value."""
+        with self.loop(count) as i:
+            carried = Fold(i, self.name())
+            self.lines.append("")
+            line = len(self.lines) - 1
+            yield carried
+        tag = i.removeprefix("%i")
+        self.lines[line] = (
+            f"  {carried.value} = phi {vector(width)} "
+            f"[ {start}, %before{tag} ], [ {carried.result}, %latch{tag} ]"
+        )
+
     def break_if(self, condition: str) -> None:
         """Leaves the innermost loop."""
         self._count += 1
@@ -203,6 +232,12 @@ class Writer:
             self.do(f"ret {result}")
             self._count += 1
             self.lines.append(f"dead{self._count}:")
+
+
+def integers(name: str, values: list[int]) -> str:
+    """A constant table of i64."""
+    inside = ", ".join(f"i64 {value}" for value in values)
+    return f"@{name} = internal constant [{len(values)} x i64] [{inside}]\n"
 
 
 def declarations(widths: set[int]) -> str:

@@ -42,7 +42,7 @@ class DifferencedSystem(Interpreted):
         note: str = "",
     ) -> None:
         super().__init__(kind, integrator, (len(states), len(inputs), len(params)), note)
-        self.function = function
+        self.function, self.source = function, where(function)
         self.states, self.inputs, self.params = tuple(states), tuple(inputs), tuple(params)
         self._batches = True  # until the function fails on arrays
         self._calls = 0

@@ -46,6 +46,8 @@ class System(Protocol):
     k: int  # number of parameters
     how: str  # "compiled", "traced" or "differenced"
     note: str  # why it is not compiled, naming the line; empty when it is
+    source: str  # file:line of the user's function
+    states: tuple[str, ...]  # names, for messages
 
     def step(self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0) -> Array:
         """From x (N, n), u (N, m) to the next x (N, n)."""

@@ -10,8 +10,6 @@ the stages of Runge-Kutta: with k_i = f(x_i), x_i = x + c_i dt k_{i-1}, T_i = d 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from grounded.compile.derivative import jacobian
@@ -50,6 +48,11 @@ class Variant:
         self.small = self._program(n + m)
         self.full = self._program(n + m + k)
 
+    @property
+    def operations(self) -> int:
+        """Nodes of the values and their derivatives."""
+        return len(self.trace.graph.live([*self.trace.outputs, *(i for _, _, i in self.entries)]))
+
     def _program(self, width: int) -> tuple[Program, list[tuple[int, int]]]:
         kept = [(r, c, i) for r, c, i in self.entries if c < width]
         outputs = [*self.trace.outputs, *(i for _, _, i in kept)]
@@ -66,7 +69,8 @@ class TracedSystem(Interpreted):
     ) -> None:
         sizes = (len(signature.states), len(signature.inputs), len(signature.params))
         super().__init__(signature.kind, integrator, sizes, note)
-        self.signature = signature
+        self.signature, self.source = signature, where(signature.function)
+        self.states = signature.states
         self.original = DifferencedSystem(
             signature.function,
             kind=signature.kind,
@@ -75,7 +79,6 @@ class TracedSystem(Interpreted):
             params=signature.params,
             integrator=integrator,
         )
-        self.angles: Sequence[bool] = ()
         self._variants = [Variant(first, sizes)] if not first.guards else []
 
     def variant(self, p: Array, dt: float) -> Variant:
