@@ -40,6 +40,7 @@ from grounded.rollout import Rollout, simulate
 from grounded.search import Candidate, Options, Standing, mean_trial, standing
 from grounded.task import Task
 from grounded.trial import Trial
+from grounded.trust import Step
 
 PLANNING = ddp.Options(max_iterations=30, tolerance=1e-6)  # a direction needs no more digits
 CAUTION = 100.0  # factor on the input penalties each time the first policy crashed (FACTS.md 2)
@@ -92,7 +93,9 @@ def first_policy(task: Task, caution: int = 0) -> tuple[Policy, ddp.Result]:
     return task.policy(result.u, result.K, result.z[:-1]), result
 
 
-def direction(task: Task, policy: Policy, grounding: Grounding, options: Options) -> Policy:
+def direction(
+    task: Task, policy: Policy, grounding: Grounding, options: Options, damping: float = 1.0
+) -> Policy:
     """Step 5: theta' such that d = theta' - theta improves the policy in the biased model.
 
     Args:
@@ -105,13 +108,13 @@ def direction(task: Task, policy: Policy, grounding: Grounding, options: Options
         return _gradient_direction(task, policy, grounding)
     problem = task.problem(grounding.bias)
     if options.step == "damped":
-        problem = damped(problem, grounding.inputs)
+        problem = damped(problem, grounding.inputs, damping)
     gains = ddp.damped_step(problem, grounding.z, grounding.inputs, np.zeros(task.model.m)).gains
     result = ddp.solve(problem, grounding.inputs, gains.K, grounding.z[:-1], PLANNING)
     return task.policy(result.u, result.K, result.z[:-1])
 
 
-def damped(problem: Problem, inputs: Array) -> Problem:
+def damped(problem: Problem, inputs: Array, factor: float = 1.0) -> Problem:
     """The problem with a price mu |u_t - inputs_t|^2 on leaving the trial's inputs (H, m).
 
     The fully converged step goes to the optimum of the biased MODEL, and that need not be uphill in
@@ -120,7 +123,7 @@ def damped(problem: Problem, inputs: Array) -> Problem:
     inputs: the same idea as norm-optimal iterative learning control. Both quadratic penalties on
     u_t are one: weight R + mu about (R u_target + mu inputs) / (R + mu).
     """
-    mu = problem.input_weight + problem.change_weight
+    mu = factor * (problem.input_weight + problem.change_weight)
     weight = problem.input_weight + mu
     mixed = problem.input_weight * problem.input_target + mu * inputs
     safe = np.where(weight > 0, weight, 1.0)
@@ -139,7 +142,8 @@ def propose(
     trials: Sequence[Trial],
     options: Options,
     *,
-    refit: Callable[[Model, Sequence[Trial]], Model] | None = None,
+    identity: str = "",
+    refit: Callable[[Task, Sequence[Trial]], Model] | None = None,
 ) -> Proposal:
     """What to run next: the outstanding candidate, a new one, or nothing.
 
@@ -148,6 +152,7 @@ def propose(
         candidates: those proposed so far, in order.
         trials: stored trials, in order.
         options: the [search] table.
+        identity: the name of a new candidate; by default the next after those of this task.
         refit: with options.refit, gives the model with parameters fitted to all trials.
     """
     fingerprint = model_fingerprint(task)
@@ -156,31 +161,56 @@ def propose(
         return Proposal(now, now.outstanding, is_new=False)
     if now.phase != "propose":
         return Proposal(now, None, is_new=False)
-    assert now.alpha is not None
-    identity = f"c{len(candidates) + 1:04d}"
+    identity = identity or f"c{len(candidates) + 1:04d}"
     if now.incumbent is None:
         policy, _ = first_policy(task, now.caution)
         predicted = simulate(task.problem(exact=True), policy)
-        made = _candidate(identity, policy, predicted, now, fingerprint, task, alpha=1.0)
-        return _checked(task, now, made)
+        return _checked(task, now, _candidate(identity, policy, predicted, now, fingerprint, Step()))
     planner = task
     if options.refit and refit is not None:
-        planner = task.with_model(refit(task.model, trials))
-    own = mean_trial(now.incumbent.trials)
-    theta = now.incumbent.candidate.policy
-    target = direction(planner, theta, ground(planner, own), options)
-    real = planner.problem(ground(planner, own, exact=True).bias, exact=True)
-    alpha: float | None = now.alpha
-    while alpha is not None and alpha >= 2.0**-options.max_halvings:
-        policy = theta.toward(target, alpha)
-        made = _candidate(
-            identity, policy, simulate(real, policy), now, fingerprint, task, alpha=alpha
-        )
-        proposal = _checked(task, now, made)
-        if proposal.candidate is not None:
-            return _worth_it(proposal, options)
-        alpha /= 2
-    return proposal
+        planner = task.with_model(refit(task, trials))
+    return _improvement(planner, now, options, identity, fingerprint)
+
+
+def _improvement(
+    task: Task, now: Standing, options: Options, identity: str, fingerprint: str
+) -> Proposal:
+    """Steps 4 to 6: the first step, from the one that is due on, that the model believes in.
+
+    A step whose predicted run loses is passed over in the model, at no trial's cost: d must satisfy
+    U^(theta + alpha d) >= U^(theta) for some alpha (step 5).
+    """
+    assert now.incumbent is not None
+    own, theta = mean_trial(now.incumbent.trials), now.incumbent.candidate.policy
+    grounding = ground(task, own)
+    real = task.problem(ground(task, own, exact=True).bias, exact=True)
+    already, least = task.utility(own), options.tolerance * abs(task.utility(own))
+    unsafe: Proposal | None = None
+    directions: dict[float, Policy] = {}
+    step = now.step
+    while step is not None:
+        if step.damping not in directions:
+            directions[step.damping] = direction(task, theta, grounding, options, step.damping)
+        policy = theta.toward(directions[step.damping], step.alpha)
+        predicted = simulate(real, policy)
+        gain = predicted.utility - already
+        if gain > least:
+            made = _candidate(identity, policy, predicted, now, fingerprint, step, gain)
+            proposal = _checked(task, now, made)
+            if proposal.candidate is not None:
+                return proposal
+            unsafe = proposal
+        elif abs(gain) <= least:
+            break
+        step = options.next_step(step)
+    if unsafe is not None:
+        return unsafe
+    sentence = (
+        f"the model sees no gain of more than {options.tolerance:g} of {already:.6g} in any step "
+        f"([search] tolerance): {now.incumbent.candidate.id} is the result"
+    )
+    ended = dataclasses.replace(now, phase="converged", step=None, sentence=sentence)
+    return Proposal(ended, None, is_new=False)
 
 
 def _candidate(
@@ -189,16 +219,17 @@ def _candidate(
     predicted: Rollout,
     now: Standing,
     fingerprint: str,
-    task: Task,
-    *,
-    alpha: float,
+    step: Step,
+    gain: float = float("nan"),
 ) -> Candidate:
     base = now.incumbent
     return Candidate(
         id=identity,
         policy=policy,
         iteration=0 if base is None else now.iteration + 1,
-        alpha=alpha,
+        alpha=step.alpha,
+        damping=step.damping,
+        predicted_gain=gain,
         base="" if base is None else base.candidate.id,
         model=fingerprint,
         predicted_states=predicted.states,
@@ -206,22 +237,6 @@ def _candidate(
         predicted_utility=predicted.utility,
         caution=now.caution,
     )
-
-
-def _worth_it(proposal: Proposal, options: Options) -> Proposal:
-    """Ends the search when even the model sees nothing left to gain from a whole step."""
-    now, candidate = proposal.standing, proposal.candidate
-    assert now.incumbent is not None and candidate is not None
-    best = now.incumbent.utility
-    gain = candidate.predicted_utility - best
-    if candidate.alpha < 1.0 or gain > options.tolerance * abs(best):
-        return proposal
-    sentence = (
-        f"the model predicts a gain of {gain:.3g} on {best:.6g}, less than "
-        f"{options.tolerance:g} of it ([search] tolerance): {now.incumbent.candidate.id} is the result"
-    )
-    ended = dataclasses.replace(now, phase="converged", alpha=None, sentence=sentence)
-    return Proposal(ended, None, is_new=False, notes=proposal.notes)
 
 
 def _checked(task: Task, now: Standing, made: Candidate) -> Proposal:

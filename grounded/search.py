@@ -24,6 +24,7 @@ from grounded.line_search import next_alpha
 from grounded.policy import Policy
 from grounded.task import Task
 from grounded.trial import Trial
+from grounded.trust import Step, after_failure, after_success
 
 Phase = Literal["propose", "await-trial", "converged", "stopped"]
 MAX_CAUTION = 3  # times the first policy is designed again, ever more gently, after a crash
@@ -51,6 +52,22 @@ class Options:
         if not 0 <= self.tolerance < 1:
             raise GroundedError(f"[search] tolerance must be in [0, 1), got {self.tolerance}")
 
+    @property
+    def damps(self) -> bool:
+        """Whether steps are damped by `trust`, or only halved as in the paper."""
+        return self.method == "ddp" and self.step == "damped"
+
+    def first_step(self) -> Step:
+        """The first step along a new direction when nothing is known of the model's promises."""
+        return Step(damping=1.0 if self.damps else 0.0)
+
+    def next_step(self, step: Step) -> Step | None:
+        """The step after one that did not improve; None when the search has failed (step 7)."""
+        if self.damps:
+            return after_failure(step, self.max_halvings)
+        alpha = next_alpha([step.alpha], self.max_halvings)
+        return None if alpha is None else Step(step.damping, alpha)
+
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
@@ -65,6 +82,8 @@ class Candidate:
     predicted_states: Array  # (H + 1, n) in the (biased) model
     predicted_inputs: Array  # (H, m)
     predicted_utility: float
+    damping: float = 1.0  # lambda of `trust`
+    predicted_gain: float = float("nan")  # over the mean trial of its base
     caution: int = 0  # how often the first policy was redesigned after a crash
 
 
@@ -99,7 +118,7 @@ class Standing:
     incumbent: Tried | None
     outstanding: Candidate | None
     missing: int  # trials that the outstanding candidate still needs
-    alpha: float | None  # the next step size when a candidate is to be made
+    step: Step | None  # what to try next when a candidate is to be made
     caution: int
     history: tuple[Tried, ...]
     trials: int
@@ -112,7 +131,11 @@ class Standing:
 
 
 def standing(
-    task: Task, candidates: Sequence[Candidate], trials: Sequence[Trial], options: Options, model: str
+    task: Task,
+    candidates: Sequence[Candidate],
+    trials: Sequence[Trial],
+    options: Options,
+    model: str,
 ) -> Standing:
     """Steps 6 and 7 over stored trials.
 
@@ -128,9 +151,15 @@ def standing(
     last = history[-1] if history else None
 
     def state(phase: Phase, sentence: str, **more: object) -> Standing:
-        fields = dict(outstanding=None, missing=0, alpha=None, caution=0) | more
+        fields = dict(outstanding=None, missing=0, step=None, caution=0) | more
         return Standing(
-            phase, iteration, incumbent, history=history, trials=total, sentence=sentence, **fields  # type: ignore[arg-type]
+            phase,
+            iteration,
+            incumbent,
+            history=history,
+            trials=total,
+            sentence=sentence,
+            **fields,  # type: ignore[arg-type]
         )
 
     if last is not None and last.accepted is None and last.candidate.model == model:
@@ -142,7 +171,9 @@ def standing(
             missing=missing,
         )
     if total >= options.max_trials:
-        return state("stopped", f"all {options.max_trials} trials are used up ([search] max_trials)")
+        return state(
+            "stopped", f"all {options.max_trials} trials are used up ([search] max_trials)"
+        )
     if incumbent is None:
         failed = sum(t.accepted is False for t in history)
         if failed > MAX_CAUTION:
@@ -151,21 +182,34 @@ def standing(
                 f"the first policy crashed {failed} times, designed more gently each time: the "
                 "model is too far off to start from; mend it (fit, diagnose) and propose again",
             )
-        return state("propose", "the model's own policy comes first", alpha=1.0, caution=failed)
+        return state("propose", "the model's own policy comes first", step=options.first_step(), caution=failed)
     own = incumbent.candidate.id
-    losers = [
-        t.candidate.alpha
-        for t in history
-        if t.accepted is False and t.candidate.base == own and t.candidate.model == model
-    ]
-    alpha = next_alpha(losers, options.max_halvings)
-    if alpha is None:
+    step = _next_step(history, incumbent, options, model)
+    if step is None:
         return state(
             "converged",
-            f"no step along the last direction improved on {own} down to alpha = {min(losers):g}: "
+            f"no step improved on {own} down to alpha = {2.0**-options.max_halvings:g}: "
             f"{own} is the result (step 7)",
         )
-    return state("propose", f"improve on {own} with alpha = {alpha:g}", alpha=alpha)
+    return state("propose", f"improve on {own} with alpha = {step.alpha:g}", step=step)
+
+
+def _next_step(
+    history: tuple[Tried, ...], incumbent: Tried, options: Options, model: str
+) -> Step | None:
+    """Damping and alpha after what the trials have shown; a direction belongs to one model."""
+    made = incumbent.candidate
+    step = options.first_step()
+    base = next((t for t in history if t.candidate.id == made.base), None)
+    if base is not None and made.model == model and options.damps:
+        real = incumbent.utility - base.utility
+        step = after_success(Step(made.damping, made.alpha), made.predicted_gain, real)
+    losers = [
+        t.candidate
+        for t in history
+        if t.accepted is False and t.candidate.base == made.id and t.candidate.model == model
+    ]
+    return options.next_step(Step(losers[-1].damping, losers[-1].alpha)) if losers else step
 
 
 def _judge(

@@ -1,0 +1,89 @@
+"""grounded ingest: take in what came back from the real system."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from grounded_cli.options import as_json, in_workspace, open_workspace
+from grounded_cli.terminal import number, progress, say, show, show_json, table
+
+if TYPE_CHECKING:
+    from grounded_trials.ingest import Ingested
+
+
+@click.command("ingest")
+@click.argument("files", nargs=-1, required=True, metavar="FILE...")
+@click.option("--candidate", metavar="ID", help="Which candidate was run.")
+@click.option("--data", is_flag=True, help="The log ran no candidate: for fit and diagnose only.")
+@in_workspace
+@as_json
+def command(
+    files: tuple[str, ...], candidate: str | None, data: bool, folder: str | None, json_: bool
+) -> None:
+    """Check, resample and store trials: MCAP files or bag folders.
+
+    A file that was stored before is a success that says which trial it is. Trials of ours are taken
+    as they are; other logs are mapped by the [log] table (`grounded inspect LOG` writes one).
+    """
+    workspace = open_workspace(folder)
+    from grounded_trials.ingest import ingest_log
+
+    done: list[Ingested] = []
+    for name in files:
+        with progress(f"reading {name}"):
+            found = ingest_log(workspace, Path(name), candidate, data=data)
+        done.append(found)
+        if not json_:
+            _tell(name, found)
+    if json_:
+        show_json({"trials": [as_document(one) for one in done]})
+    else:
+        show(f"\nnext: grounded {'propose' if done[-1].candidate else 'fit'}")
+
+
+def as_document(one: Ingested) -> dict[str, Any]:
+    """The fields of CONTRACT.md; a failed run's utility is null and `failed` true."""
+    return {
+        "trial": one.trial,
+        "sha256": one.sha256,
+        "known": one.known,
+        "candidate": one.candidate or None,
+        "utility": one.utility,
+        "failed": one.utility == float("-inf"),
+        "accepted": one.accepted,
+        "warnings": list(one.warnings),
+        "signals": [vars(signal) for signal in one.signals],
+    }
+
+
+def _tell(name: str, one: Ingested) -> None:
+    for warning in one.warnings:
+        say(f"warning: {name}: {warning}")
+    known = "was stored before as" if one.known else "is stored as"
+    if not one.candidate:
+        show(f"{name} {known} {one.trial}: data for fit and diagnose")
+    else:
+        verdict = {
+            True: "an improvement: it is the best so far",
+            False: "no improvement",
+            None: "more trials of it are needed ([search] repeats)",
+        }[one.accepted]
+        show(f"{name} {known} {one.trial}: {one.candidate}, utility {number(one.utility)}, {verdict}")
+    if one.signals:
+        rows = [
+            (
+                s.name,
+                f"{s.rate_hz:.1f}",
+                f"{1e3 * s.jitter_s:.1f}",
+                f"{1e3 * s.largest_gap_s:.0f}",
+                "-" if s.skew_s is None else f"{1e3 * s.skew_s:.1f}",
+                str(s.bridged),
+                f"{s.low:.3g} .. {s.high:.3g}",
+            )
+            for s in one.signals
+        ]
+        header = ("signal", "Hz", "jitter ms", "gap ms", "skew ms", "bridged", "range")
+        show(table(rows, header))

@@ -1,0 +1,120 @@
+"""grounded: the command. Commands are imported when they are called; errors become exit codes.
+
+    0 done      1 failed, with one clear message      2 usage      3 done with loss, saying what
+
+A GroundedError is the user's to mend and is printed as a sentence; any other exception is a mistake
+of ours and keeps its traceback.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from typing import NoReturn
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small; threads only cost start-up
+
+import click
+
+# name -> (module, one line); in the order in which they are used
+COMMANDS = {
+    "init": ("init", "Make a workspace from an example."),
+    "propose": ("propose", "Say what to run next and write its candidate file."),
+    "run": ("run", "Run the candidate on the system of grounded.toml."),
+    "ingest": ("ingest", "Take in what came back: check, resample, store."),
+    "learn": ("learn", "Propose, run and ingest until the search ends."),
+    "status": ("status", "Show where the search stands."),
+    "report": ("report", "Utilities, trajectories and gap: text, page, pictures, recording."),
+    "view": ("view", "Open the recording in Rerun."),
+    "fit": ("fit", "Estimate the model's parameters from all trials."),
+    "diagnose": ("diagnose", "Find where the model is wrong, and which effect makes it so."),
+    "adopt": ("adopt", "Add a diagnosed effect to the model."),
+    "inspect": ("inspect", "Show what is in a log and guess its [log] table."),
+    "recover": ("recover", "Save what can be saved of a damaged log."),
+    "export": ("export", "Write a candidate for other languages: csv, npz, json."),
+    "verify": ("verify", "Check every stored file against its hash."),
+    "demo": ("demo", "A whole example in an empty folder: learn, diagnose, report."),
+    "experiment": ("experiment", "Run the paper's studies again."),
+    "challenge": ("challenge", "Make or score blind cases for the diagnosis."),
+}
+
+
+class LazyGroup(click.Group):
+    """Imports a command's module when it is called, so that `--help` and start-up stay quick."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Names, in the order of use."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
+        """The command of a name, imported now."""
+        if name not in COMMANDS:
+            return None
+        module = importlib.import_module(f"grounded_cli.{COMMANDS[name][0]}")
+        command: click.Command = module.command
+        return command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Adds the nearest name to an unknown command's message."""
+        name = args[0]
+        if name in COMMANDS or name.startswith("-"):
+            return super().resolve_command(ctx, args)
+        from grounded.errors import nearest
+
+        ctx.fail(f"no command '{name}': {nearest(name, COMMANDS)}")
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """The list of commands without importing any."""
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, text) for name, (_, text) in COMMANDS.items()])
+
+
+@click.command(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.option("-C", "folder", default=".", metavar="DIR", help="The workspace (default: here).")
+@click.version_option(package_name="grounded")
+@click.pass_context
+def cli(ctx: click.Context, folder: str) -> None:
+    """Teach a real system a manoeuvre in a few trials, from a crude model.
+
+    Start with `grounded demo car-figure8` in an empty folder, or make a workspace of your own with
+    `grounded init DIR --example car-turn`.
+    """
+    ctx.obj = folder
+
+
+def main() -> NoReturn:
+    """Runs the command line and exits with its code."""
+    try:
+        code = cli.main(standalone_mode=False, prog_name="grounded")
+        sys.stdout.flush()
+    except click.exceptions.Exit as stop:
+        code = stop.exit_code
+    except click.UsageError as error:
+        error.show()
+        code = 2
+    except click.ClickException as error:
+        error.show()
+        code = error.exit_code
+    except (click.Abort, KeyboardInterrupt):
+        click.echo("interrupted; what was stored is safe, run the same command again", err=True)
+        code = 130
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        code = 0
+    except Exception as error:
+        from grounded.errors import GroundedError
+
+        if not isinstance(error, GroundedError):
+            raise
+        from grounded_cli.terminal import style
+
+        click.echo(f"{style('error:', fg='red', bold=True)} {error}", err=True)
+        code = 1
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+if __name__ == "__main__":
+    main()

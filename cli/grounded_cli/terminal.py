@@ -1,0 +1,101 @@
+"""Words on a terminal: colour only where it is wanted, progress on stderr, JSON without NaN."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import click
+
+
+def style(text: str, **how: Any) -> str:
+    """Coloured text, unless NO_COLOR is set or the output is not a terminal."""
+    plain = os.environ.get("NO_COLOR") or not (sys.stdout.isatty() and sys.stderr.isatty())
+    return text if plain else click.style(text, **how)
+
+
+def say(text: str) -> None:
+    """Narration, on stderr."""
+    click.echo(text, err=True)
+
+
+def show(text: str = "") -> None:
+    """Data, on stdout."""
+    click.echo(text)
+
+
+def show_json(document: dict[str, Any]) -> None:
+    """One JSON document on stdout; a number that JSON doesn't have becomes null."""
+    click.echo(json.dumps(_clean(document), indent=1, ensure_ascii=False, allow_nan=False))
+
+
+def _clean(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _clean(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_clean(item) for item in value]
+    if isinstance(value, bool) or value is None or isinstance(value, str):
+        return value
+    if hasattr(value, "tolist"):
+        return _clean(value.tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value if isinstance(value, int) else str(value)
+
+
+@contextmanager
+def progress(text: str) -> Iterator[None]:
+    """Says what is going on while something takes more than a moment; only on a terminal."""
+    live = sys.stderr.isatty()
+    if live:
+        click.echo(f"{text} ...", err=True, nl=False)
+    try:
+        yield
+    finally:
+        if live:
+            click.echo("\r\033[K", err=True, nl=False)
+
+
+def table(rows: Sequence[Sequence[str]], header: Sequence[str]) -> str:
+    """Aligned columns: the first to the left, numbers to the right, two blanks between."""
+    lines = [list(header), *[list(row) for row in rows]]
+    widths = [max(len(line[i]) for line in lines) for i in range(len(header))]
+    out = []
+    for number, line in enumerate(lines):
+        cells = [
+            cell.ljust(width) if i == 0 else cell.rjust(width)
+            for i, (cell, width) in enumerate(zip(line, widths, strict=True))
+        ]
+        text = "  ".join(cells).rstrip()
+        out.append(style(text, bold=True) if number == 0 else text)
+    return "\n".join(out)
+
+
+def number(value: float | None, digits: int = 4) -> str:
+    """A number for a person: significant digits, "failed" for minus infinity, "-" for none."""
+    if value is None or math.isnan(value):
+        return "-"
+    if value == -math.inf:
+        return "failed"
+    if value != 0 and not 1e-3 <= abs(value) < 1e6:
+        return f"{value:.{digits - 1}e}"
+    decimals = max(digits - 1 - math.floor(math.log10(abs(value))) if value else digits - 1, 0)
+    return f"{value:,.{decimals}f}"
+
+
+def sparkline(values: Sequence[float]) -> str:
+    """Utilities as little bars, worst to best; a failed run is a cross."""
+    known = [v for v in values if math.isfinite(v)]
+    if not known:
+        return "x" * len(values)
+    low, high = min(known), max(known)
+    bars = "▁▂▃▄▅▆▇█"
+    span = (high - low) or 1.0
+    return "".join(
+        bars[round((v - low) / span * 7)] if math.isfinite(v) else "x" for v in values
+    )

@@ -1,0 +1,83 @@
+"""The [log] table of grounded.toml: how a foreign log maps to the model's states and inputs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal, cast
+
+from grounded_trials.foreign import LogMapping
+from grounded_trials.resample import Crossing, Span
+from grounded_trials.signals import Clock, SignalSpec
+from grounded_trials.toml_table import Table
+
+CLOCKS = ("header", "log", "publish")
+
+
+def log_mapping(table: Table, states: Sequence[str], inputs: Sequence[str]) -> LogMapping | None:
+    """The mapping, or None when there is no [log] table.
+
+    Raises:
+        GroundedError: for an unknown key or name, or a value of the wrong kind.
+    """
+    if not table.names():
+        return None
+    clock = table.choice("clock", CLOCKS, "header")
+    signals = {}
+    for kind, names in (("state", states), ("input", inputs)):
+        group = table.sub(kind)
+        signals[kind] = {name: _signal(group.sub(name), clock) for name in names if group.has(name)}
+        group.finish(names)
+    span = _span(table.sub("span"))
+    table.finish()
+    return LogMapping(states=signals["state"], inputs=signals["input"], span=span)
+
+
+def _signal(table: Table, clock: str) -> SignalSpec:
+    age: float | None = table.take("max_age_s", float, -1.0)
+    how = table.choice("resample", ("linear", "hold", ""), "")
+    spec = SignalSpec(
+        path=table.take("path", str),
+        clock=cast(Clock, table.choice("clock", CLOCKS, clock)),
+        unwrap=table.take("unwrap", bool, False),
+        scale=table.take("scale", float, 1.0),
+        offset=table.take("offset", float, 0.0),
+        delay_s=table.take("delay_s", float, 0.0),
+        max_age_s=None if age == -1.0 else age,
+        resample=cast('Literal["linear", "hold"] | None', how or None),
+    )
+    table.finish()
+    if spec.max_age_s is not None and spec.max_age_s <= 0:
+        raise table.error("max_age_s", f"must be positive, found {spec.max_age_s:g}")
+    return spec
+
+
+def _span(table: Table) -> Span:
+    start = _end(table, "start")
+    end = _end(table, "end")
+    table.finish()
+    if end == "first-input":
+        raise table.error("end", "must be a time in seconds or { path = ..., above = ... }")
+    return Span(start="first-input" if start is None else start, end=cast("Any", end))
+
+
+def _end(table: Table, key: str) -> Any:
+    """None, "first-input", a time, or a crossing."""
+    value = table.peek(key)
+    if value is None:
+        table.has(key)
+        return None
+    if isinstance(value, str):
+        return table.choice(key, ("first-input",), "first-input")
+    if not isinstance(value, dict):
+        return table.take(key, float)
+    crossing = table.sub(key)
+    found = Crossing(
+        path=crossing.take("path", str),
+        above=crossing.take("above", float) if crossing.has("above") else None,
+        below=crossing.take("below", float) if crossing.has("below") else None,
+        clock=cast(Clock, crossing.choice("clock", CLOCKS, "log")),
+    )
+    crossing.finish()
+    if (found.above is None) == (found.below is None):
+        raise table.error(key, "needs exactly one of above = ... and below = ...")
+    return found

@@ -1,0 +1,86 @@
+"""The user's model.py: the one thing in a workspace that is executed, because it is their own code.
+
+An exception inside it is a mistake of theirs and becomes a sentence with file and line.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import sys
+import traceback
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from grounded.errors import GroundedError, nearest
+from grounded.model import Model
+
+
+def load_module(folder: Path, file: str = "", module: str = "") -> ModuleType:
+    """The module of a model, from a file in the workspace or by its import name.
+
+    Raises:
+        GroundedError: if it isn't there, lies outside the workspace, or fails while it runs.
+    """
+    if module:
+        try:
+            return importlib.import_module(module)
+        except ModuleNotFoundError as error:
+            raise GroundedError(
+                f"[model] module = '{module}' can't be imported: {error}; install its package in "
+                "this environment or give file = 'model.py'"
+            ) from None
+        except Exception as error:
+            raise GroundedError(_where(error, module)) from None
+    path = (folder / file).resolve()
+    if not path.is_relative_to(folder.resolve()):
+        raise GroundedError(f"'{file}' lies outside the workspace {folder}; copy it inside")
+    if not path.is_file():
+        raise GroundedError(f"{path} does not exist; grounded.toml asks for '{file}'")
+    spec = importlib.util.spec_from_file_location(f"grounded_workspace_{path.stem}", path)
+    assert spec is not None and spec.loader is not None
+    found = importlib.util.module_from_spec(spec)
+    sys.path.insert(0, str(folder))
+    try:
+        spec.loader.exec_module(found)
+    except GroundedError as error:
+        raise GroundedError(f"{path}: {error}") from None
+    except (Exception, SystemExit) as error:
+        raise GroundedError(_where(error, str(path))) from None
+    finally:
+        sys.path.remove(str(folder))
+    return found
+
+
+def model_in(module: ModuleType) -> Model:
+    """The `model` that a module holds.
+
+    Raises:
+        GroundedError: if there is none, or it is something else.
+    """
+    found: Any = getattr(module, "model", None)
+    if isinstance(found, Model):
+        return found
+    name = module.__file__ or module.__name__
+    if found is None:
+        names = [key for key, value in vars(module).items() if isinstance(value, Model)]
+        hint = f"; rename '{names[0]}' to 'model'" if names else "; see the README for an example"
+        raise GroundedError(f"{name} does not define `model = Model(...)`{hint}")
+    raise GroundedError(f"{name}: `model` must be a grounded.Model, found {type(found).__name__}")
+
+
+def _where(error: BaseException, name: str) -> str:
+    """The user's own line that failed, and why."""
+    if isinstance(error, SyntaxError):
+        return f"{error.filename} line {error.lineno}: {error.msg}"
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if Path(f.filename).name in name]
+    line = f" line {frames[-1].lineno}" if frames else ""
+    return f"{name}{line}: {type(error).__name__}: {error}"
+
+
+def check_names(names: dict[str, Any] | Any, valid: list[str], what: str) -> None:
+    """Complains about the first name that is not valid."""
+    for name in names:
+        if name not in valid:
+            raise GroundedError(f"{what} '{name}' is not in the model: {nearest(name, valid)}")

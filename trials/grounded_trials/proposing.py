@@ -1,0 +1,71 @@
+"""propose in a workspace: the method's answer, with the candidate's file written."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from grounded_trials.workspace import Workspace
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from grounded.improve import Proposal
+    from grounded.model import Model
+    from grounded.search import Standing
+    from grounded.task import Task
+    from grounded.trial import Trial
+
+
+@dataclass(frozen=True, eq=False)
+class Proposed:
+    """What `propose` answers, and where the candidate's file is (None: the search has ended)."""
+
+    proposal: Proposal
+    file: Path | None
+
+
+def propose_in(workspace: Workspace) -> Proposed:
+    """The next candidate of a workspace; the outstanding one again while its trial is missing."""
+    from grounded.improve import propose
+
+    proposal = propose(
+        workspace.task,
+        workspace.search_candidates(),
+        workspace.task_trials(),
+        workspace.config.search,
+        identity=workspace.next_id(),
+        refit=refitted,
+    )
+    if proposal.candidate is None:
+        return Proposed(proposal, None)
+    path = workspace.candidate_path(proposal.candidate.id)
+    if proposal.is_new or not path.is_file():
+        workspace.save_candidate(proposal.candidate, workspace.task)
+    return Proposed(proposal, path)
+
+
+def standing_in(workspace: Workspace) -> Standing:
+    """Where the search of a workspace stands; nothing is planned."""
+    from grounded.improve import model_fingerprint
+    from grounded.search import standing
+
+    task = workspace.task
+    return standing(
+        task,
+        workspace.search_candidates(),
+        workspace.task_trials(),
+        workspace.config.search,
+        model_fingerprint(task),
+    )
+
+
+def refitted(task: Task, trials: Sequence[Trial]) -> Model:
+    """The task's model with parameters fitted to all trials ([search] refit)."""
+    from grounded.fit import fit
+
+    usable = [t for t in trials if t.finite_steps == t.steps and t.steps > 2]
+    found = fit(task, usable)
+    values = {name: p.value for name, p in found.params.items() if p.identified}
+    return task.model.with_values({n: v for n, v in values.items() if n in task.model.params})

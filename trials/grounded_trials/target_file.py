@@ -1,0 +1,113 @@
+"""target.csv: what the states are to do, a row a control step; a state without a column is free."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+
+from grounded.errors import GroundedError, nearest
+from grounded.frozen import Array
+
+ROW_LIMIT = 200_002
+
+
+def read_target(path: Path) -> tuple[list[str], Array]:
+    """The columns' names (first `t`) and the values, (rows, columns).
+
+    Raises:
+        GroundedError: naming the line and column that is not a number.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            reader = csv.reader(stream)
+            names = [name.strip() for name in next(reader, [])]
+            rows = []
+            for line, row in enumerate(reader, start=2):
+                if not any(cell.strip() for cell in row):
+                    continue
+                if len(rows) > ROW_LIMIT:
+                    raise GroundedError(f"{path.name} has more than {ROW_LIMIT} rows")
+                rows.append(_numbers(path, line, names, row))
+    except FileNotFoundError:
+        raise GroundedError(f"{path} does not exist; [task] target asks for it") from None
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise GroundedError(f"{path} can't be read as CSV: {error}") from None
+    if not names or names[0] != "t":
+        found = names[0] if names else "nothing"
+        raise GroundedError(f"{path.name}: the first column must be 't', found '{found}'")
+    return names, np.array(rows, dtype=float).reshape(len(rows), len(names))
+
+
+def _numbers(path: Path, line: int, names: list[str], row: list[str]) -> list[float]:
+    if len(row) != len(names):
+        raise GroundedError(
+            f"{path.name} line {line}: {len(row)} values for {len(names)} columns ({', '.join(names)})"
+        )
+    values = []
+    for name, cell in zip(names, row, strict=True):
+        try:
+            value = float(cell)
+        except ValueError:
+            raise GroundedError(
+                f"{path.name} line {line}: '{cell}' in column '{name}' is not a number"
+            ) from None
+        if not np.isfinite(value):
+            raise GroundedError(
+                f"{path.name} line {line}: {cell.strip()} in column '{name}'; every tracked value "
+                "must be finite, leave out the column of a state that is free"
+            )
+        values.append(value)
+    return values
+
+
+def target_arrays(
+    path: Path, states: list[str], inputs: list[str], dt: float, horizon: int
+) -> tuple[Array, Array | None]:
+    """The target (H + 1, n), NaN in free columns, and the inputs' target (H, m) if there is one.
+
+    Raises:
+        GroundedError: for an unknown column, too few rows, or times off the control grid.
+    """
+    names, values = read_target(path)
+    for name in names[1:]:
+        if name not in states and name not in inputs:
+            raise GroundedError(
+                f"{path.name}: column '{name}' is neither a state nor an input of the model: "
+                + nearest(name, [*states, *inputs])
+            )
+    if len(values) < horizon + 1:
+        raise GroundedError(
+            f"{path.name} has {len(values)} rows, a horizon of {horizon} steps needs {horizon + 1}: "
+            f"add rows or set [task] horizon = {max(len(values) - 1, 0)}"
+        )
+    t = values[: horizon + 1, 0]
+    off = np.abs(t - t[0] - dt * np.arange(horizon + 1))
+    if off.max() > 0.01 * dt:
+        i = int(np.argmax(off > 0.01 * dt))
+        raise GroundedError(
+            f"{path.name} line {i + 2}: t = {t[i]:g} s, expected {t[0] + i * dt:g} s: rows must be "
+            f"[task] dt = {dt:g} s apart"
+        )
+    target = np.full((horizon + 1, len(states)), np.nan)
+    given = {name: values[: horizon + 1, names.index(name)] for name in names[1:]}
+    for i, name in enumerate(states):
+        if name in given:
+            target[:, i] = given[name]
+    if not any(name in given for name in inputs):
+        return target, None
+    columns = [given.get(name, np.zeros(horizon + 1))[:horizon] for name in inputs]
+    return target, np.stack(columns, axis=1)
+
+
+def write_target(path: Path, dt: float, columns: dict[str, Array]) -> None:
+    """Writes a target; `columns` are states in the order of the file, (H + 1,) each."""
+    from grounded_trials.store import write_atomically
+
+    H = len(next(iter(columns.values())))
+    lines = [",".join(["t", *columns])]
+    for i in range(H):
+        row = [f"{i * dt:.10g}", *(f"{values[i]:.9g}" for values in columns.values())]
+        lines.append(",".join(row))
+    write_atomically(path, ("\n".join(lines) + "\n").encode())

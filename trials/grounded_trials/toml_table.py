@@ -1,0 +1,128 @@
+"""A TOML table that is taken apart key by key, so that what is left over is a mistake of the user's.
+
+Every complaint names the file, the key with its table, what was found, and what would be right.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from grounded.errors import GroundedError, nearest
+
+_WORDS = {str: "a text", bool: "true or false", float: "a number", int: "a whole number"}
+_REQUIRED = object()
+
+
+class Table:
+    """One table of a TOML file; `where` is its dotted name, "" for the whole file."""
+
+    def __init__(self, values: Mapping[str, Any], file: Path, where: str = "") -> None:
+        self._values = dict(values)
+        self._known: set[str] = set()
+        self.file, self.where = file, where
+
+    def error(self, key: str, text: str) -> GroundedError:
+        """A complaint about one key."""
+        name = f"[{self.where}] {key}" if self.where else key
+        return GroundedError(f"{self.file.name}: {name}: {text}")
+
+    def has(self, key: str) -> bool:
+        """Whether the key is there."""
+        self._known.add(key)
+        return key in self._values
+
+    def peek(self, key: str) -> Any:
+        """The value of a key as it stands, None when it is not there."""
+        return self._values.get(key)
+
+    def take(self, key: str, kind: type, default: Any = _REQUIRED) -> Any:
+        """The value of a key, checked to be of a kind; a whole number does for a number."""
+        self._known.add(key)
+        if key not in self._values:
+            if default is _REQUIRED:
+                raise self.error(key, f"is missing; it must be {_WORDS.get(kind, kind.__name__)}")
+            return default
+        value = self._values.pop(key)
+        return self._checked(key, value, kind)
+
+    def _checked(self, key: str, value: Any, kind: type) -> Any:
+        fits = isinstance(value, kind) and not (isinstance(value, bool) and kind is not bool)
+        if kind is float and isinstance(value, int) and not isinstance(value, bool):
+            return float(value)
+        if not fits:
+            raise self.error(key, f"must be {_WORDS.get(kind, kind.__name__)}, found {value!r}")
+        if kind is float and not math.isfinite(value):
+            raise self.error(key, f"must be a finite number, found {value}")
+        return value
+
+    def choice(self, key: str, options: Iterable[str], default: str) -> str:
+        """A text that is one of the options."""
+        value: str = self.take(key, str, default)
+        names = list(options)
+        if value not in names:
+            raise self.error(key, f"'{value}' is not one of the choices: {nearest(value, names)}")
+        return value
+
+    def sub(self, key: str) -> Table:
+        """The table under a key, empty when it is not there."""
+        self._known.add(key)
+        value = self._values.pop(key, {})
+        if not isinstance(value, dict):
+            raise self.error(key, f"must be a table, found {value!r}")
+        return Table(value, self.file, f"{self.where}.{key}" if self.where else key)
+
+    def numbers(self, key: str, names: Iterable[str]) -> dict[str, float]:
+        """A table name -> number under a key, whose names must be among `names`."""
+        table, valid = self.sub(key), list(names)
+        found = {name: table.take(name, float) for name in valid if table.has(name)}
+        table.finish(valid)
+        return found
+
+    def pairs(self, names: Iterable[str]) -> dict[str, tuple[float, float]]:
+        """This table as name -> [low, high]."""
+        valid, found = list(names), {}
+        for name in valid:
+            if self.has(name):
+                value = self.take(name, list)
+                if len(value) != 2:
+                    raise self.error(name, f"must be [low, high], found {value!r}")
+                low, high = (self._checked(name, v, float) for v in value)
+                found[name] = (low, high)
+        self.finish(valid)
+        return found
+
+    def names(self) -> list[str]:
+        """The keys that were not taken yet."""
+        return list(self._values)
+
+    def finish(self, valid: Iterable[str] | None = None) -> None:
+        """Complains about a key that nobody took."""
+        for key in self._values:
+            known = self._known if valid is None else valid
+            raise self.error(key, f"is not known here: {nearest(key, sorted(known))}")
+
+
+def read_toml(path: Path) -> Table:
+    """A TOML file as a table.
+
+    Raises:
+        GroundedError: if it isn't there, can't be read, or isn't TOML (with line and column).
+    """
+    import tomllib
+
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise GroundedError(
+            f"{path} does not exist: this is not a workspace; make one with "
+            "'grounded init DIR --example car-turn' or name one with -C DIR"
+        ) from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise GroundedError(f"{path} can't be read: {error}") from None
+    try:
+        return Table(tomllib.loads(text), path)
+    except tomllib.TOMLDecodeError as error:
+        raise GroundedError(f"{path.name} is not valid TOML: {error}") from None
