@@ -1,4 +1,4 @@
-"""Logs of other writers to signals: foxglove SDK, rosbags, split bags; and every way it can fail."""
+"""Logs of other writers to signals: foxglove SDK, rosbags, split bags; and all that can fail."""
 
 from __future__ import annotations
 

@@ -36,6 +36,7 @@ def candidate_bytes(
         "dt": repr(float(policy.dt)),
         "states": json.dumps(with_units(policy.state_names, state_units)),
         "inputs": json.dumps(with_units(policy.input_names, input_units)),
+        "steps": str(policy.horizon),
         "policy": json.dumps(_policy_table(policy)),
     }
     stream = io.BytesIO()
@@ -113,7 +114,7 @@ def read_candidate(
     nz = n + sum(depths)
     lists = own.lists("/policy", {"feedforward": m, "gain": m * nz, "reference": nz})
     feedforward, gain, reference = lists
-    H = len(feedforward)
+    H, steps = len(feedforward), own.integer("steps")
     if gain.size == 0 and reference.size == 0:
         feedback: tuple[Array | None, Array | None] = (None, None)
     else:
@@ -132,13 +133,14 @@ def read_candidate(
         reference=feedback[1],
     )
     _refuse_unfinite(policy, own.name)
-    x, _ = own.doubles("/predicted_state", states)
-    u, _ = own.doubles("/predicted_input", inputs)
-    if len(x) != H + 1 or len(u) != H:
+    x, u = own.doubles("/predicted_state", states), own.doubles("/predicted_input", inputs)
+    if (len(x), H, len(u)) != (steps + 1, steps, steps):
         raise GroundedError(
-            f"{own.name}: a policy of {H} steps needs {H + 1} predicted states and {H} inputs, "
-            f"found {len(x)} and {len(u)}"
+            f"{own.name}: a policy of {steps} steps needs {steps} messages of it, {steps + 1} "
+            f"predicted states and {steps} inputs; found {H}, {len(x)} and {len(u)}"
         )
+    for topic in ("/policy", "/predicted_state", "/predicted_input"):
+        own.check_grid(topic, 0, policy.dt)
     return policy, x, u, own.meta
 
 

@@ -10,6 +10,8 @@ the metadata record `grounded`, a table of strings:
     states, inputs    JSON objects, name -> unit, in array order
     candidate         (trial) the candidate that was run, "" for none
     start_inputs      (trial) JSON list, the inputs held before t = 0, or null
+    start_ns          (trial) the stamp of t = 0 [ns]; a trial without its beginning is refused
+    steps             (candidate) H; one without its end is refused
     policy            (candidate) JSON object: low, high (null: no limit), past, depths, angles, z
 
 and whatever the writer adds. A trial carries the candidate's file as attachment `policy`.

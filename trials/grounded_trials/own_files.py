@@ -30,7 +30,7 @@ from grounded_trials.mcap_records import (
 from grounded_trials.mcap_walk import DamagedFile, read_records
 from grounded_trials.message_types import Array as ArrayType
 from grounded_trials.message_types import Number, Struct
-from grounded_trials.nodes import BadMessage
+from grounded_trials.nodes import BadMessage, Ints
 from grounded_trials.protobuf import protobuf_messages, uniform_doubles
 from grounded_trials.protobuf_schema import BadSchema, parse_descriptor_set
 
@@ -39,7 +39,17 @@ STEP_LIMIT = 2_000_000  # messages of a channel
 NAME_LIMIT = 1000  # states, or inputs
 
 TRIAL, CANDIDATE = "grounded trial 1", "grounded candidate 1"
-RESERVED = ("format", "dt", "states", "inputs", "candidate", "start_inputs", "policy")
+RESERVED = (
+    "format",
+    "dt",
+    "states",
+    "inputs",
+    "candidate",
+    "start_inputs",
+    "start_ns",
+    "policy",
+    "steps",
+)
 
 Meta = Mapping[str, str]
 Units = Mapping[str, str]
@@ -100,8 +110,8 @@ class OwnFile:
                 return np.array(numbers, dtype=np.float64)
         raise GroundedError(f"{self.name}: its metadata '{what}' must be a list of {size} numbers")
 
-    def doubles(self, topic: str, names: list[str]) -> tuple[Array, Array]:
-        """Values (N, len(names)) of a topic's messages and their times (N,) [s after the first]."""
+    def doubles(self, topic: str, names: list[str]) -> Array:
+        """The numbers of a topic's messages, (N, len(names))."""
         type, batches = self._topic(topic)
         for name in names:
             field = type.by_name.get(name)
@@ -109,9 +119,19 @@ class OwnFile:
                 raise GroundedError(f"{self.name}: {topic} has no number '{name}'")
         numbers = [type.by_name[name].number for name in names]
         blocks = [self._doubles(type, names, numbers, batch) for batch in batches]
-        values = np.concatenate(blocks) if blocks else np.zeros((0, len(names)))
-        times = np.concatenate([b.publish_times for b in batches] or [np.zeros(0, np.int64)])
-        return values, times * 1e-9 if not len(times) else (times - times[0]) * 1e-9
+        return np.concatenate(blocks) if blocks else np.zeros((0, len(names)))
+
+    def times(self, topic: str) -> Ints:
+        """When a topic's messages were sampled (N,) [ns]."""
+        _, batches = self._topic(topic)
+        return np.concatenate([b.publish_times for b in batches] or [np.zeros(0, np.int64)])
+
+    def integer(self, key: str) -> int:
+        """An integer of the table that is not negative."""
+        text = self.entry(key)
+        if not (text.isascii() and text.isdigit() and len(text) < 20):
+            raise GroundedError(f"{self.name}: its metadata '{key}' is '{text}', not an integer")
+        return int(text)
 
     def _doubles(
         self, type: Struct, names: list[str], numbers: list[int], batch: Messages
@@ -175,22 +195,17 @@ class OwnFile:
             raise GroundedError(f"{self.name}: it has no channel {topic}")
         return self.types[topic], self.messages.get(topic, [])
 
-    def check_grid(self, t_states: Array, t_inputs: Array, dt: float) -> None:
-        """Refuses samples that do not lie within half a step of the grid k dt."""
-        if len(t_inputs) != len(t_states) - 1:
+    def check_grid(self, topic: str, start_ns: int, dt: float) -> None:
+        """Refuses a topic whose samples do not lie within half a step of start + k dt."""
+        times = (self.times(topic) - start_ns) * 1e-9
+        off = np.abs(times - dt * np.arange(len(times))) > 0.5 * dt
+        if off.any():
+            k = int(np.argmax(off))
             raise GroundedError(
-                f"{self.name}: {len(t_states)} states need {len(t_states) - 1} inputs, "
-                f"found {len(t_inputs)}"
+                f"{self.name}: {topic} sample {k} is stamped {times[k]:.4f} s, its place on the "
+                f"grid of {dt} s is {k * dt:.4f} s: samples are missing, or came late. Map the log "
+                "with a [log] table, which resamples"
             )
-        for topic, times in (("/state", t_states), ("/input", t_inputs)):
-            late = np.abs(times - dt * np.arange(len(times))) > 0.5 * dt
-            if late.any():
-                k = int(np.argmax(late))
-                raise GroundedError(
-                    f"{self.name}: {topic} sample {k} is stamped {times[k]:.4f} s, its place on "
-                    f"the grid of {dt} s is {k * dt:.4f} s; map the log with a [log] table, which "
-                    "resamples"
-                )
 
 
 def read_own(source: str | Path | bytes, name: str, kind: str) -> OwnFile:

@@ -12,11 +12,12 @@ behind is a temporary file, which the next one removes.
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import os
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -134,15 +135,15 @@ class Store:
             GroundedError: if the source can't be read or the folder not be written.
         """
         with self._locked():
-            self._sweep()
             temporary = self.folder / f".{self.prefix}-{os.getpid()}.tmp"
             try:
+                self._sweep()
                 digest = _copy(source, temporary)
                 return self._place(temporary, digest, suffix)
             except OSError as error:
                 raise self._unwritable(error) from None
             finally:
-                temporary.unlink(missing_ok=True)
+                _remove(temporary)
 
     def verify(self) -> tuple[Damaged, ...]:
         """Reads every file; returns those that changed, and names that do not belong here.
@@ -162,7 +163,7 @@ class Store:
         entries = self.list()
         for entry in entries:
             if entry.digest == digest[:DIGITS]:
-                if _hash_file(entry.path) == digest:
+                if hash_file(entry.path) == digest:
                     return Added(digest, entry.path, known=True)
                 entry.path.replace(entry.path.with_name(entry.path.name + ".damaged"))
                 temporary.rename(entry.path)
@@ -181,23 +182,25 @@ class Store:
 
     @contextmanager
     def _locked(self) -> Iterator[None]:
-        import fcntl
-
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             descriptor = os.open(self.folder / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
         except OSError as error:
             raise self._unwritable(error) from None
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX)
+            except OSError as error:
+                raise self._unwritable(error) from None
             yield
         finally:
-            os.close(descriptor)
+            with suppress(OSError):  # nothing was written through it
+                os.close(descriptor)
 
     def _unwritable(self, error: OSError) -> GroundedError:
         return GroundedError(
-            f"{self.folder} can't be written: {error.strerror}; nothing was stored, make room or "
-            "give yourself the right to write there"
+            f"{self.folder} can't be written: {error.strerror}; the file is not stored. Make room, "
+            "or give yourself the right to write there, and add it again"
         )
 
 
@@ -214,9 +217,15 @@ def write_atomically(path: Path, data: bytes) -> None:
             temporary.replace(path)
             sync_folder(path.parent)
         finally:
-            temporary.unlink(missing_ok=True)
+            _remove(temporary)
     except OSError as error:
         raise GroundedError(f"{path} can't be written: {error.strerror}") from None
+
+
+def _remove(path: Path) -> None:
+    """Removes a temporary file; one that can't be removed now is swept by the next process."""
+    with suppress(OSError):
+        path.unlink(missing_ok=True)
 
 
 def sync_folder(folder: Path) -> None:
@@ -254,7 +263,12 @@ def _blocks(source: str | Path | bytes) -> Iterator[bytes]:
         raise GroundedError(f"{source} can't be read: {error.strerror}") from None
 
 
-def _hash_file(path: Path) -> str:
+def hash_file(path: Path) -> str:
+    """The SHA-256 of a file, read piece by piece.
+
+    Raises:
+        GroundedError: if it can't be read.
+    """
     hasher = hashlib.sha256()
     for block in _blocks(path):
         hasher.update(block)

@@ -59,6 +59,7 @@ class TrialWriter:
             "inputs": json.dumps(dict(inputs)),
             "candidate": candidate,
             "start_inputs": json.dumps(held),
+            "start_ns": str(int(start_ns)),
         }
         table = with_meta(table, meta)
         self._n, self._m, self._start_ns = len(states), len(inputs), start_ns
@@ -186,15 +187,17 @@ def read_trial(
     own = read_own(source, name, TRIAL)
     states, inputs = own.names("states"), own.names("inputs")
     dt = own.number("dt")
-    x, t_x = own.doubles("/state", states)
-    u, t_u = own.doubles("/input", inputs)
+    x, u = own.doubles("/state", states), own.doubles("/input", inputs)
     if len(x) == 0:
         raise GroundedError(
             f"{own.name}: the trial has no states; it ended before its first sample"
         )
     if len(u) == len(x):  # stopped between the last input and the state that it would have led to
-        u, t_u = u[:-1], t_u[:-1]
-    own.check_grid(t_x, t_u, dt)
+        u = u[:-1]
+    if len(u) != len(x) - 1:
+        raise GroundedError(f"{own.name}: {len(x)} states need {len(x) - 1} inputs, found {len(u)}")
+    for topic in ("/state", "/input"):
+        own.check_grid(topic, own.integer("start_ns"), dt)
     held = own.json("start_inputs", list, optional=True)
     trial = Trial(
         states=x,
