@@ -14,6 +14,7 @@ from grounded.compile.problem import Array
 MAX_ITERATIONS = 50
 STOP = 1e-11  # on the free gradient, relative to |g|
 ARMIJO = 0.1
+ROUNDING = 1e-13  # of the value: a smaller rise is none
 
 
 def solve(H: Array, b: Array) -> Array:
@@ -58,9 +59,11 @@ def _projected_search(
 ) -> Array:
     """Moves k along the projected path clip(k + beta newton), halving beta until J falls enough."""
     value, gradient, beta = g @ k + 0.5 * k @ H @ k, g + H @ k, 1.0
+    slack = ROUNDING * abs(value)
     for _ in range(40):
         trial = np.clip(k + beta * newton, low, high)
-        if g @ trial + 0.5 * trial @ H @ trial - value <= ARMIJO * gradient @ (trial - k):
+        change = g @ trial + 0.5 * trial @ H @ trial - value
+        if change <= ARMIJO * gradient @ (trial - k) + slack:
             return np.asarray(trial)
         beta *= 0.5
     return k

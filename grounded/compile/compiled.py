@@ -21,7 +21,8 @@ from grounded.compile import jit
 from grounded.compile.interpreted import Integrator
 from grounded.compile.llvm_batch import BATCH, linearise_kernel, step_kernel
 from grounded.compile.llvm_box import MAX_INPUTS, box_functions
-from grounded.compile.llvm_riccati import SWEEP, sweep_kernel, sweep_tables
+from grounded.compile.llvm_product import sweep_tables
+from grounded.compile.llvm_riccati import SWEEP, sweep_kernel
 from grounded.compile.llvm_rollout import LANES, ROLLOUT, Layout, rollout_kernel
 from grounded.compile.llvm_step import Dynamics, dynamics_of, jacobian_function, stage_tables
 from grounded.compile.llvm_text import declarations

@@ -7,7 +7,7 @@ and `free`, 1 for an input that no bound holds back, else 0.
 
 from __future__ import annotations
 
-from grounded.compile.box_qp import ARMIJO, MAX_ITERATIONS, STOP
+from grounded.compile.box_qp import ARMIJO, MAX_ITERATIONS, ROUNDING, STOP
 from grounded.compile.llvm_text import Writer, number
 
 MAX_INPUTS = 8
@@ -139,7 +139,7 @@ class _Box:
         f.store(ONE, self.beta)
         for i in range(m):
             f.store(f.load("%k", i), self.trial, i)
-        moved = f.room(1)
+        moved, slack = f.room(1), f.mul(f.call("fabs", [value]), number(ROUNDING))
         f.store(ZERO, moved)
         with f.loop(40):
             beta, promised = f.load(self.beta), ZERO
@@ -151,7 +151,8 @@ class _Box:
             now = f.emit(
                 f"call double @value(ptr %H, ptr %g, ptr {self.trial}, ptr {self.scratch})"
             )
-            enough = f.compare("ole", f.sub(now, value), f.mul(promised, number(ARMIJO)))
+            allowed = f.fma(promised, number(ARMIJO), slack)
+            enough = f.compare("ole", f.sub(now, value), allowed)
             f.store(f.select(enough, ONE, ZERO), moved)
             f.store(f.mul(beta, number(0.5)), self.beta)
             f.break_if(enough)

@@ -5,57 +5,22 @@ shift, the two products of Q = [A B]' V [A B] are the same routine twice,
 
     M = [A B]' V,   Q = [A B]' M'      row c of [A B]'X = sum over r of [A B](r, c) X(r, :)
 
-with a transposition between, so that only non-zero places cost anything and every operation is a
-whole row. The Jacobian is computed W time steps at once, just before the sweep needs them.
+with a transposition between (`llvm_product.py`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
-from grounded.compile import jit
-from grounded.compile.llvm_batch import Words, gather_rows, start_table
+from grounded.compile.llvm_batch import Words
 from grounded.compile.llvm_box import ONE, ZERO, clipped, solved
-from grounded.compile.llvm_rollout import Layout, received, wrap
+from grounded.compile.llvm_product import Linearised, padded, pieces, pieces_of, transpose
+from grounded.compile.llvm_rollout import Layout, wrap
 from grounded.compile.llvm_step import Dynamics
-from grounded.compile.llvm_text import Writer, integers, number, splat, vector
+from grounded.compile.llvm_text import Writer, number, splat
 
 SWEEP = (
     *("z_run", "u_run", "p", "dt", "eps", "target", "weight", "input_target", "R", "S"),
     *("low", "high", "now", "past", "damping", "H", "k", "K", "expected"),
 )
-Row = Callable[[int | str], str]  # loads (a piece of) row r of a matrix
-UNROLLED = 400  # entries of the Jacobian whose products are written out; more are a loop
-
-
-def padded(size: int) -> int:
-    """Rows are multiples of four doubles."""
-    return -(-size // 4) * 4
-
-
-def pieces(size: int, width: int) -> list[tuple[int, int]]:
-    """A padded row as vectors that the machine has: (first entry, W or 4 entries) of each."""
-    wide = size // width * width
-    cut = [(at, width) for at in range(0, wide, width)]
-    return cut + [(at, 4) for at in range(wide, size, 4)]
-
-
-def sweep_tables(d: Dynamics) -> str:
-    """For large models: which entries each column of the Jacobian has, at least the zero one."""
-    if len(d.places) <= UNROLLED:
-        return ""
-    first, rows, entries = [0], [], []
-    for c in range(d.n + d.m):
-        column = [(r, e) for e, (r, c2) in enumerate(d.places) if c2 == c] or [(0, len(d.places))]
-        rows += [r for r, _ in column]
-        entries += [e for _, e in column]
-        first.append(len(rows))
-    width = jit.lanes()
-    return (
-        integers("column_first", first)
-        + integers("column_row", rows)
-        + integers("column_entry", [e * width for e in entries])
-    )
 
 
 def sweep_kernel(d: Dynamics, layout: Layout, width: int) -> str:
@@ -64,7 +29,7 @@ def sweep_kernel(d: Dynamics, layout: Layout, width: int) -> str:
     writer = _Sweep(f, d, layout, width)
     writer.end()
     with f.loop(writer.words.integer("H"), down=True) as t:
-        writer.linearise(t)
+        writer.along.linearise(t)
         writer.products(t)
         writer.gains(t)
         writer.value(t)
@@ -78,15 +43,11 @@ class _Sweep:
     """The parts of the kernel. P and C are the padded widths of a row over z and over [z, u]."""
 
     def __init__(self, f: Writer, d: Dynamics, layout: Layout, width: int) -> None:
-        self.f, self.d, self.layout, self.width, self.words = f, d, layout, width, Words(f, SWEEP)
-        n, m, nz = layout.n, layout.m, layout.nz
+        self.f, self.layout, self.width, self.words = f, layout, width, Words(f, SWEEP)
+        m, nz = layout.m, layout.nz
         self.P, self.C = padded(nz), padded(nz + m)
         self.cut = pieces(self.P, width)
-        self.table = start_table(f, self.words, d)
-        self.soa = f.room((nz + m) * width)
-        self.xu, self.following = f.room((n + m) * width), f.room(n * width)
-        self.jac = f.room((len(d.places) + 1) * width)  # the last is zero
-        self.sums_room = f.room((n + m) * width)
+        self.along = Linearised(f, d, layout, width, self.words)
         self.V, self.v = f.room(self.P * self.P), f.room(self.P)
         self.M, self.T = f.room(self.C * self.P), f.room(self.P * self.C)
         self.U = f.room(m * self.C)  # rows of [Q_uz Q_uu]
@@ -101,7 +62,6 @@ class _Sweep:
     def end(self) -> None:
         """V and v of the last state; zeros in the padding."""
         f = self.f
-        f.store(splat(0.0, self.width), self.jac, len(self.d.places) * self.width, self.width)
         rooms = ((self.V, self.P * self.P), (self.M, self.C * self.P), (self.v, self.P))
         for room, size in (*rooms, (self.g_z, self.P)):
             with f.loop(size // 4) as four:
@@ -124,101 +84,19 @@ class _Sweep:
             out.append((f.mul(twice, e), twice))
         return out
 
-    def linearise(self, t: str) -> None:
-        """The Jacobians of W steps, when t is the last of a block."""
-        f, layout, w = self.f, self.layout, self.width
-        H = self.words.integer("H")
-        last = f.emit(f"icmp eq i64 {t}, {f.integer('sub', H, 1)}")
-        edge = f.emit(f"icmp eq i64 {f.integer('and', t, w - 1)}, {w - 1}")
-        with f.when(f.emit(f"or i1 {last}, {edge}")):
-            first = f.integer("and", t, -w)
-            u_soa = f.at(self.soa, layout.nz * w)
-            z_run, u_run = self.words.pointer("z_run"), self.words.pointer("u_run")
-            gather_rows(f, [(z_run, layout.nz, self.soa), (u_run, layout.m, u_soa)], first, H, w)
-            z = [f.load(self.soa, i * w, w) for i in range(layout.nz)]
-            u = [f.load(u_soa, j * w, w) for j in range(layout.m)]
-            sent = received(f, self.words, layout, z, u, w)
-            for i, value in enumerate([*z[: layout.n], *sent]):
-                f.store(value, self.xu, i * w, w)
-            f.do(
-                f"call void @jacobian(ptr {self.xu}, ptr {self.table}, "
-                f"ptr {self.following}, ptr {self.jac})"
-            )
-
-    def _combined(self, row: Row, size: int, inputs_only: bool = False) -> list[str]:
-        """Rows of [A B]'X, z first and then u, from pieces X(r, :) of `size` doubles."""
-        f, layout = self.f, self.layout
-        large = len(self.d.places) > UNROLLED
-        sums = self._looped_sums(row, size) if large else self._sums(row, size, inputs_only)
-        out = [sums.get(c, splat(0.0, size)) for c in range(layout.n)]
-        now, past, D = self.words.pointer("now"), self.words.pointer("past"), layout.nz - layout.n
-        inputs = []
-        for j, depth in enumerate(layout.depths):
-            G = sums.get(layout.n + j, splat(0.0, size))
-            for i in range(depth):
-                weight = f.load_all(past, j * D + layout.slot(j, i) - layout.n, size)
-                value = f.mul(weight, G, size)
-                older = i + 1 < depth
-                out.append(f.add(value, row(layout.slot(j, i + 1)), size) if older else value)
-            inputs.append(f.fma(f.load_all(now, j, size), G, row(layout.slot(j)), size))
-        return inputs if inputs_only else out + inputs
-
-    def _sums(self, row: Row, size: int, inputs_only: bool) -> dict[int, str]:
-        """For each column c of the Jacobian, the sum over r of J(r, c) X(r, :)."""
-        f, sums = self.f, dict[int, str]()
-        for e, (r, c) in enumerate(self.d.places):
-            if c < self.layout.n and inputs_only:
-                continue
-            a, value = self._entry(e, size), row(r)
-            sums[c] = f.fma(a, value, sums[c], size) if c in sums else f.mul(a, value, size)
-        return sums
-
-    def _looped_sums(self, row: Row, size: int) -> dict[int, str]:
-        """The same for large models, by tables of indices."""
-        f, count = self.f, self.layout.n + self.layout.m
-        with f.loop(count) as c:
-            first = f.index("@column_first", c)
-            entries = f.integer("sub", f.index("@column_first", f.integer("add", c, 1)), first)
-            with f.fold(entries, size, splat(0.0, size)) as total:
-                q = f.integer("add", first, total.i)
-                a = f.load_all(self.now, f.index("@column_entry", q), size)
-                total.set(f.fma(a, row(f.index("@column_row", q)), total.value, size))
-            f.store(total.result, self.sums_room, f.integer("mul", c, size), size)
-        return {c: f.load(self.sums_room, c * size, size) for c in range(count)}
-
-    def _entry(self, e: int, size: int) -> str:
-        """Value e of the Jacobian of this step, in every lane."""
-        if (e, 1) not in self.entries:
-            self.entries[e, 1] = self.f.load(self.now, e * self.width)
-        if (e, size) not in self.entries:
-            self.entries[e, size] = self.f.spread(self.entries[e, 1], size)
-        return self.entries[e, size]
-
-    def _pieces_of(self, base: str, stride: int, at: int, size: int) -> Row:
-        """Loads entries at .. at + size - 1 of a matrix's rows."""
-        f = self.f
-
-        def piece(r: int | str) -> str:
-            if isinstance(r, int):
-                return f.load(base, r * stride + at, size)
-            return f.load(base, f.integer("add", f.integer("mul", r, stride), at), size)
-
-        return piece
-
     def products(self, t: str) -> None:
         """Q_zz into V, [Q_uz Q_uu] into U, Q_z into g_z, Q_u into g_u."""
         f, layout, P, C = self.f, self.layout, self.P, self.C
-        self.now = f.at(self.jac, f.integer("and", t, self.width - 1))
-        self.entries: dict[tuple[int, int], str] = {}
+        self.along.select(t)
         for at, size in self.cut:
-            rows = self._combined(self._pieces_of(self.V, P, at, size), size)
+            rows = self.along.rows(pieces_of(f, self.V, P, at, size), size)
             for c, value in enumerate(rows):
                 f.store(value, self.M, c * P + at, size)
-        slopes = self._combined(lambda r: f.load(self.v, r), 1)
-        self._transpose()
+        slopes = self.along.rows(lambda r: f.load(self.v, r), 1)
+        transpose(f, self.M, self.T, P, C)
         for at, size in pieces(C, self.width):
             beyond = at >= layout.nz  # columns of inputs: only their own rows are wanted
-            rows = self._combined(self._pieces_of(self.T, C, at, size), size, beyond)
+            rows = self.along.rows(pieces_of(f, self.T, C, at, size), size, beyond)
             for c, value in enumerate(rows[: len(rows) - layout.m]):
                 if at + size <= P:
                     f.store(value, self.V, c * P + at, size)
@@ -265,31 +143,6 @@ class _Sweep:
             slope = f.fma(R, f.sub(value, f.load(target, j)), slopes[layout.nz + j])
             slope = f.fma(S, f.sub(value, f.load(before, layout.slot(j))), slope)
             f.store(slope, self.g_u, j)
-
-    def _transpose(self) -> None:
-        """T = M' in blocks of four by four."""
-        f, P, C = self.f, self.P, self.C
-        kind = vector(4)
-
-        def shuffled(a: str, b: str, *lanes: int) -> str:
-            inside = ", ".join(f"i32 {i}" for i in lanes)
-            return f.emit(f"shufflevector {kind} {a}, {kind} {b}, <4 x i32> <{inside}>")
-
-        with f.loop(C // 4) as block:
-            c = f.integer("mul", block, 4)
-            source, target = f.at(self.M, f.integer("mul", c, P)), f.at(self.T, c)
-            for r in range(0, P, 4):
-                a = [f.load(source, i * P + r, 4) for i in range(4)]
-                lo = [shuffled(a[i], a[i + 1], 0, 4, 2, 6) for i in (0, 2)]
-                hi = [shuffled(a[i], a[i + 1], 1, 5, 3, 7) for i in (0, 2)]
-                columns = [
-                    shuffled(lo[0], lo[1], 0, 1, 4, 5),
-                    shuffled(hi[0], hi[1], 0, 1, 4, 5),
-                    shuffled(lo[0], lo[1], 2, 3, 6, 7),
-                    shuffled(hi[0], hi[1], 2, 3, 6, 7),
-                ]
-                for i, column in enumerate(columns):
-                    f.store(column, target, (r + i) * C, 4)
 
     def gains(self, t: str) -> None:
         """Gains k and K of step t inside the limits; the promise d1, d2."""

@@ -197,10 +197,10 @@ def wrong_value(name: str, value: Any, function: Any) -> GroundedError:
         array = np.asarray(None)
     if array.dtype.kind == "c":
         found = f"a complex number ({value})"
-    elif array.dtype.kind == "O":
-        found = f"{type(value).__name__} ({value!r})"
     elif array.size != 1:
         found = f"an array of shape {array.shape}"
+    elif array.dtype.kind == "O":
+        found = f"{type(value).__name__} ({value!r})"
     else:
         found = f"{value!r}"
     return GroundedError(

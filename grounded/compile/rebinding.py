@@ -16,7 +16,9 @@ from functools import partial, reduce
 from types import CellType, CodeType, FunctionType, MethodType, ModuleType, SimpleNamespace
 from typing import Any
 
-from grounded.compile.expression import FUNCTIONS, Expression, any_traced, maximum, minimum
+from grounded.compile.expression import Expression, any_traced
+from grounded.compile.functions import TRACED as FUNCTIONS
+from grounded.compile.functions import maximum, minimum
 
 LEFT_ALONE = frozenset(sys.stdlib_module_names - {"__main__"}) | {"numpy", "scipy", "llvmlite"}
 

@@ -1,0 +1,176 @@
+"""Writes products with the Jacobian [A B] of z along a trajectory, for the sweep.
+
+Rows c of [A B]'X are sums of rows of X: over the non-zero places (r, c) of the model's Jacobian for
+a state, the same with the delay's weights and a shifted row for a past input. So only what is not
+zero costs anything, and every operation is on whole rows. The model's Jacobian is computed for W
+steps at once, just before the sweep needs them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from grounded.compile import jit
+from grounded.compile.llvm_batch import Words, gather_rows, start_table
+from grounded.compile.llvm_rollout import Layout, received
+from grounded.compile.llvm_step import Dynamics
+from grounded.compile.llvm_text import Writer, integers, splat, vector
+
+Row = Callable[[int | str], str]  # loads (a piece of) row r of a matrix
+UNROLLED = 400  # entries of the Jacobian whose products are written out; more are a loop
+
+
+def padded(size: int) -> int:
+    """Rows are multiples of four doubles."""
+    return -(-size // 4) * 4
+
+
+def pieces(size: int, width: int) -> list[tuple[int, int]]:
+    """A padded row as vectors that the machine has: (first entry, W or 4 entries) of each."""
+    wide = size // width * width
+    cut = [(at, width) for at in range(0, wide, width)]
+    return cut + [(at, 4) for at in range(wide, size, 4)]
+
+
+def pieces_of(f: Writer, base: str, stride: int, at: int, size: int) -> Row:
+    """Loads entries at .. at + size - 1 of a matrix's rows."""
+
+    def piece(r: int | str) -> str:
+        if isinstance(r, int):
+            return f.load(base, r * stride + at, size)
+        return f.load(base, f.integer("add", f.integer("mul", r, stride), at), size)
+
+    return piece
+
+
+def transpose(f: Writer, M: str, T: str, P: int, C: int) -> None:
+    """T (P, C) = M' of M (C, P), in blocks of four by four."""
+    kind = vector(4)
+
+    def shuffled(a: str, b: str, *lanes: int) -> str:
+        inside = ", ".join(f"i32 {i}" for i in lanes)
+        return f.emit(f"shufflevector {kind} {a}, {kind} {b}, <4 x i32> <{inside}>")
+
+    with f.loop(C // 4) as block:
+        c = f.integer("mul", block, 4)
+        source, target = f.at(M, f.integer("mul", c, P)), f.at(T, c)
+        for r in range(0, P, 4):
+            a = [f.load(source, i * P + r, 4) for i in range(4)]
+            lo = [shuffled(a[i], a[i + 1], 0, 4, 2, 6) for i in (0, 2)]
+            hi = [shuffled(a[i], a[i + 1], 1, 5, 3, 7) for i in (0, 2)]
+            columns = [
+                shuffled(lo[0], lo[1], 0, 1, 4, 5),
+                shuffled(hi[0], hi[1], 0, 1, 4, 5),
+                shuffled(lo[0], lo[1], 2, 3, 6, 7),
+                shuffled(hi[0], hi[1], 2, 3, 6, 7),
+            ]
+            for i, column in enumerate(columns):
+                f.store(column, target, (r + i) * C, 4)
+
+
+class Linearised:
+    """The Jacobian along a trajectory, W steps of it at a time."""
+
+    def __init__(self, f: Writer, d: Dynamics, layout: Layout, width: int, words: Words) -> None:
+        self.f, self.d, self.layout, self.width, self.words = f, d, layout, width, words
+        n, m, nz = layout.n, layout.m, layout.nz
+        self.table = start_table(f, words, d)
+        self.soa = f.room((nz + m) * width)  # [z, u] of W steps
+        self.xu, self.following = f.room((n + m) * width), f.room(n * width)
+        self.jac = f.room((len(d.places) + 1) * width)  # the last is zero
+        self.sums_room = f.room((n + m) * width)
+        self.now, self.entries = "", dict[tuple[int, int], str]()
+        f.store(splat(0.0, width), self.jac, len(d.places) * width, width)
+
+    def linearise(self, t: str) -> None:
+        """The Jacobians of W steps, when t is the last of a block."""
+        f, layout, w = self.f, self.layout, self.width
+        H = self.words.integer("H")
+        last = f.emit(f"icmp eq i64 {t}, {f.integer('sub', H, 1)}")
+        edge = f.emit(f"icmp eq i64 {f.integer('and', t, w - 1)}, {w - 1}")
+        with f.when(f.emit(f"or i1 {last}, {edge}")):
+            first = f.integer("and", t, -w)
+            u_soa = f.at(self.soa, layout.nz * w)
+            z_run, u_run = self.words.pointer("z_run"), self.words.pointer("u_run")
+            gather_rows(f, [(z_run, layout.nz, self.soa), (u_run, layout.m, u_soa)], first, H, w)
+            z = [f.load(self.soa, i * w, w) for i in range(layout.nz)]
+            u = [f.load(u_soa, j * w, w) for j in range(layout.m)]
+            sent = received(f, self.words, layout, z, u, w)
+            for i, value in enumerate([*z[: layout.n], *sent]):
+                f.store(value, self.xu, i * w, w)
+            f.do(
+                f"call void @jacobian(ptr {self.xu}, ptr {self.table}, "
+                f"ptr {self.following}, ptr {self.jac})"
+            )
+
+    def select(self, t: str) -> None:
+        """From here on `rows` means those of step t."""
+        self.now = self.f.at(self.jac, self.f.integer("and", t, self.width - 1))
+        self.entries.clear()
+
+    def rows(self, row: Row, size: int, inputs_only: bool = False) -> list[str]:
+        """Rows of [A B]'X, z first and then u, from pieces X(r, :) of `size` doubles."""
+        f, layout = self.f, self.layout
+        large = len(self.d.places) > UNROLLED
+        sums = self._looped_sums(row, size) if large else self._sums(row, size, inputs_only)
+        out = [sums.get(c, splat(0.0, size)) for c in range(layout.n)]
+        now, past, D = self.words.pointer("now"), self.words.pointer("past"), layout.nz - layout.n
+        inputs = []
+        for j, depth in enumerate(layout.depths):
+            G = sums.get(layout.n + j, splat(0.0, size))
+            for i in range(depth):
+                weight = f.load_all(past, j * D + layout.slot(j, i) - layout.n, size)
+                value = f.mul(weight, G, size)
+                older = i + 1 < depth
+                out.append(f.add(value, row(layout.slot(j, i + 1)), size) if older else value)
+            inputs.append(f.fma(f.load_all(now, j, size), G, row(layout.slot(j)), size))
+        return inputs if inputs_only else out + inputs
+
+    def _sums(self, row: Row, size: int, inputs_only: bool) -> dict[int, str]:
+        """For each column c of the Jacobian, the sum over r of J(r, c) X(r, :)."""
+        f, sums = self.f, dict[int, str]()
+        for e, (r, c) in enumerate(self.d.places):
+            if c < self.layout.n and inputs_only:
+                continue
+            a, value = self._entry(e, size), row(r)
+            sums[c] = f.fma(a, value, sums[c], size) if c in sums else f.mul(a, value, size)
+        return sums
+
+    def _looped_sums(self, row: Row, size: int) -> dict[int, str]:
+        """The same for large models, by tables of indices."""
+        f, count = self.f, self.layout.n + self.layout.m
+        with f.loop(count) as c:
+            first = f.index("@column_first", c)
+            entries = f.integer("sub", f.index("@column_first", f.integer("add", c, 1)), first)
+            with f.fold(entries, size, splat(0.0, size)) as total:
+                q = f.integer("add", first, total.i)
+                a = f.load_all(self.now, f.index("@column_entry", q), size)
+                total.set(f.fma(a, row(f.index("@column_row", q)), total.value, size))
+            f.store(total.result, self.sums_room, f.integer("mul", c, size), size)
+        return {c: f.load(self.sums_room, c * size, size) for c in range(count)}
+
+    def _entry(self, e: int, size: int) -> str:
+        """Value e of the Jacobian of this step, in every lane."""
+        if (e, 1) not in self.entries:
+            self.entries[e, 1] = self.f.load(self.now, e * self.width)
+        if (e, size) not in self.entries:
+            self.entries[e, size] = self.f.spread(self.entries[e, 1], size)
+        return self.entries[e, size]
+
+
+def sweep_tables(d: Dynamics) -> str:
+    """For large models: which entries each column of the Jacobian has, at least the zero one."""
+    if len(d.places) <= UNROLLED:
+        return ""
+    first, rows, entries = [0], [], []
+    for c in range(d.n + d.m):
+        column = [(r, e) for e, (r, c2) in enumerate(d.places) if c2 == c] or [(0, len(d.places))]
+        rows += [r for r, _ in column]
+        entries += [e for _, e in column]
+        first.append(len(rows))
+    width = jit.lanes()
+    return (
+        integers("column_first", first)
+        + integers("column_row", rows)
+        + integers("column_entry", [e * width for e in entries])
+    )
