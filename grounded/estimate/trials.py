@@ -93,7 +93,7 @@ def noise_of(
     """Process and measurement noise of a model on trials, by maximum likelihood.
 
     What the model gets wrong counts as process noise here: fit the model first, or take it as a
-    measure of the model. Of more than 20,000 samples a draw of whole trials is used (`rng`).
+    measure of the model. Of more than 8,000 samples a draw of whole trials is used (`rng`).
     Arguments as `filter_trials`.
 
     Raises:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from grounded.errors import GroundedError
 from grounded.estimate import Measurement, Noise, Record, cut, of_states
 from grounded.estimate.batch import batch_of
-from grounded.estimate.likelihood import ENOUGH, enough, first_noise, maximum_likelihood
+from grounded.estimate.likelihood import enough, first_noise, maximum_likelihood
 from grounded.estimate.record import part, records_of
 from grounded.fit.gauss_newton import Climb, climb
 from grounded.fit.innovations import Data, Point, linear, point
@@ -35,6 +35,7 @@ from grounded.task import Task
 from grounded.trial import Trial
 
 ROUNDS = 8  # of parameters, thresholds, noise
+STIRRED = 0.5  # [nats] a climb that gains less leaves thresholds and noise where they are
 REVIVE = 0.2  # of the rough noise: where each search for the noise begins at least
 LONG = 400  # steps; longer records are cut, so that the filter runs over the pieces at once
 
@@ -114,7 +115,7 @@ def fit(
     if max(r.steps for r in records) < 3:
         raise GroundedError("a fit needs a trial of at least 3 steps")
     rng = np.random.default_rng(0) if rng is None else rng
-    train, test = _held_out(records, hold_out, horizon_s)
+    train, test = _held_out(records, hold_out, horizon_s, measurement)
     first = _search(_data(model, train, measurement, unknowns), unknowns.start, None, rng)
     before = after = None
     if test and np.isfinite(first.climb.at.loglik):
@@ -142,9 +143,10 @@ def _data(
     model: Model, records: Sequence[Record], measurement: Measurement, unknowns: Unknowns
 ) -> Data:
     pieces: list[Record] = []
+    direct = all(i >= 0 for i in measurement.states)  # else a piece would not know its start
     for record in records:
         span = float(record.times[-1] - record.times[0])
-        many = -(-record.steps // LONG)
+        many = -(-record.steps // LONG) if direct else 1
         pieces += [record] if many <= 1 else cut(record, span / many)
     return Data(model.system, tuple(pieces), measurement, unknowns)
 
@@ -167,20 +169,20 @@ def _search(data: Data, theta: Array, noise: Noise | None, rng: np.random.Genera
         before = at.loglik
         slopes = linear(data, at)
         still = quiet(data, slopes) | thresholds
-        found = climb(data, noise, at, ~still)
-        at = found.at
-        for i in np.flatnonzero(still & np.isfinite(data.unknowns.scale)):
-            width = None if new and round_ == 0 else 0.1 * data.unknowns.scale[i]
-            moved = coarse_to_fine(data, noise, at, int(i), ~still, width)
-            thresholds[i] |= moved is not at
-            at = moved
+        at = climb(data, noise, at, ~still).at
+        if round_ == 0 or at.loglik - before > STIRRED:
+            for i in np.flatnonzero(still & np.isfinite(data.unknowns.scale)):
+                width = None if new and round_ == 0 else 0.1 * data.unknowns.scale[i]
+                moved = coarse_to_fine(data, noise, at, int(i), ~still, width)
+                thresholds[i] |= moved is not at
+                at = moved
+        if at.loglik - before < STIRRED and round_ > 0:
+            status = "converged"
+            break
         later = _noise(data, at.theta, noise, rng)
         there = point(data, later, at.theta)
         if there.loglik > at.loglik:
             at, noise = there, later
-        if at.loglik - before < ENOUGH:
-            status = "converged"
-            break
     found = Climb(at, linear(data, at), 0, status)
     return _Found(data, found, noise, start_noise, loglik_start, thresholds, status)
 
@@ -222,12 +224,17 @@ def _delays(data: Data, noise: Noise, at: Point) -> Point:
 
 
 def _held_out(
-    records: Sequence[Record], share: float, horizon_s: float
+    records: Sequence[Record], share: float, horizon_s: float, measurement: Measurement
 ) -> tuple[list[Record], list[Record]]:
-    """The first and the last part of every record; whole records where they are short."""
+    """The first and the last part of every record.
+
+    Whole records where they are short, or where the state in their middle is not measured.
+    """
     train, test = [], []
+    if any(i < 0 for i in measurement.states):
+        horizon_s = np.inf
     long = [r for r in records if share * (r.times[-1] - r.times[0]) > 1.5 * horizon_s]
-    if len(long) * 2 >= len(records):
+    if share > 0 and len(long) * 2 >= len(records):
         for record in records:
             edge = round((1 - share) * record.steps)
             train.append(part(record, 0, edge) if record in long else record)
