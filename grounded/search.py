@@ -40,7 +40,7 @@ class Options:
     max_halvings: int = 6
     repeats: int = 1
     max_trials: int = 40
-    tolerance: float = 1e-4  # stop when the model predicts less relative gain than this
+    tolerance: float = 1e-3  # stop when the model predicts less relative gain than this
 
     def __post_init__(self) -> None:
         bounds = {"max_halvings": (0, 30), "repeats": (1, 100), "max_trials": (1, 100_000)}

@@ -9,6 +9,7 @@ finds the first.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -124,7 +125,7 @@ def _own(workspace: Workspace, path: Path, candidate: str | None, data: bool) ->
     if data:
         if not trial.candidate:
             return _Read(trial, content)
-        about = {k: v for k, v in meta.items() if k in ("system", "source", "source_sha256")}
+        about = {k: v for k, v in meta.items() if k in ("system", "source", "source_sha256", "estimated")}
         about |= {"kind": "data", "ran": trial.candidate}
         trial = replace(trial, candidate="")
         return _Read(trial, _encode(workspace, trial, about, None))
@@ -179,11 +180,11 @@ def _foreign(workspace: Workspace, path: Path, candidate: str | None, data: bool
             f"`grounded inspect {path}` prints one"
         )
     chosen = "" if data else candidate or _outstanding(workspace, path)
-    from grounded_trials.unmeasured import read_with_estimates
+    estimated: tuple[str, ...] = ()
+    if workspace.config.estimate.names():
+        from grounded_trials.unmeasured import read_with_estimates
 
-    estimate = workspace.config.estimate
-    if estimate.names():
-        found = read_with_estimates(workspace, files, mapping, estimate, data=data)
+        found, estimated = read_with_estimates(workspace, files, mapping, data=data)
     else:
         missing = [s for s in model.state_names if s not in mapping.states]
         missing += [i for i in model.input_names if i not in mapping.inputs]
@@ -210,14 +211,23 @@ def _foreign(workspace: Workspace, path: Path, candidate: str | None, data: bool
         candidate=chosen,
         start_inputs=found.start_inputs,
     )
-    digest = hashlib.sha256()
-    for file in files:
-        digest.update(read_file(file, 2**40))
-    about = _about(workspace, chosen) | {"source": path.name, "source_sha256": digest.hexdigest()}
+    about = _about(workspace, chosen) | {"source": path.name, "source_sha256": _hashed(files)}
+    if estimated:
+        about["estimated"] = ",".join(estimated)
     if chosen:
         _check_candidate(workspace, path, chosen, "", None)
     encoded = _encode(workspace, trial, about, chosen, found.start_ns)
     return _Read(trial, encoded, found.warnings, found.reports)
+
+
+def _hashed(files: Sequence[Path]) -> str:
+    """SHA-256 over a log's files, or over their hashes when there are several."""
+    hashes = []
+    for file in files:
+        with file.open("rb") as stream:
+            hashes.append(hashlib.file_digest(stream, "sha256").hexdigest())
+    joined = "".join(hashes).encode()
+    return hashes[0] if len(hashes) == 1 else hashlib.sha256(joined).hexdigest()
 
 
 def _outstanding(workspace: Workspace, path: Path) -> str:

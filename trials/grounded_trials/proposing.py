@@ -66,6 +66,4 @@ def refitted(task: Task, trials: Sequence[Trial]) -> Model:
     from grounded.fit import fit
 
     usable = [t for t in trials if t.finite_steps == t.steps and t.steps > 2]
-    found = fit(task, usable)
-    values = {name: p.value for name, p in found.params.items() if p.identified}
-    return task.model.with_values({n: v for n, v in values.items() if n in task.model.params})
+    return fit(task, usable).model

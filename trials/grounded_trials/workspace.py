@@ -181,6 +181,11 @@ class Workspace:
             trial, meta, _ = read_trial(self.store.read(stored), stored.path.name)
             yield StoredTrial(stored, bridge(replace(trial, id=stored.id)).trial, meta)
 
+    def estimated_states(self) -> tuple[str, ...]:
+        """States that some stored trial did not measure: its smoother's, not evidence of their own."""
+        found = {n for t in self.trials() for n in t.meta.get("estimated", "").split(",") if n}
+        return tuple(name for name in self.base_model.state_names if name in found)
+
     def task_trials(self) -> list[Trial]:
         """The trials whose states and inputs are this model's and whose dt is this task's."""
         names = (self.base_model.state_names, self.base_model.input_names)

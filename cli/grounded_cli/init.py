@@ -1,0 +1,45 @@
+"""grounded init: a workspace from an example."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from grounded_cli.options import as_json
+from grounded_cli.terminal import show, show_json
+
+
+@click.command("init")
+@click.argument("folder", metavar="DIR", required=False)
+@click.option("--example", "name", metavar="NAME", help="Which example (see --list).")
+@click.option("--list", "list_", is_flag=True, help="List the examples.")
+@as_json
+def command(folder: str | None, name: str | None, list_: bool, json_: bool) -> None:
+    """Make a workspace in DIR: grounded.toml, model.py, target.csv, trials/, candidates/.
+
+    real.py stands in for your robot; replace [system] in grounded.toml when you have one.
+    """
+    from grounded_trials.examples import EXAMPLES, write_example
+
+    if list_:
+        if json_:
+            show_json({"examples": {key: value.text for key, value in EXAMPLES.items()}})
+        else:
+            show("\n".join(f"{key:15} {value.text}" for key, value in EXAMPLES.items()))
+        return
+    if folder is None or name is None:
+        raise click.UsageError("give a folder and an example: grounded init DIR --example car-turn")
+    write_example(Path(folder), name)
+    if json_:
+        show_json({"workspace": folder, "example": name})
+        return
+    files = [
+        ("grounded.toml", "the task: target, reward, limits, search"),
+        ("model.py", "the crude model, plain NumPy"),
+        ("target.csv", "what the states are to do"),
+        ("real.py", "a simulated real system, in place of your robot"),
+    ]
+    show(f"{folder} is a workspace for {name}:")
+    show("\n".join(f"  {a:14} {b}" for a, b in files))
+    show(f"\nnext: cd {folder} && grounded propose")
