@@ -107,11 +107,15 @@ def call(function: Any, names: Sequence[str], values: Mapping[str, Any]) -> int:
 
 
 def _word(value: Any) -> int:
+    if type(value) is int:
+        return value
     if isinstance(value, np.ndarray):
-        return int(value.__array_interface__["data"][0])
-    if isinstance(value, float):
-        return int(struct.unpack("<q", struct.pack("<d", value))[0])
-    return int(value)
+        return int(value.ctypes.data) if value.size == 0 else _address(value)
+    return int(struct.unpack("<q", struct.pack("<d", value))[0])
+
+
+def _address(array: Array) -> int:
+    return int(array.__array_interface__["data"][0])
 
 
 def _plain(array: Any) -> Array:
@@ -223,11 +227,11 @@ class CompiledSystem(TracedSystem):
         return Layout(self.n, problem.depths, tuple(bool(a) for a in problem.angles))
 
     def _packed(self, problem: Problem) -> dict[str, Any]:
-        """The words that a problem gives every kernel; its arrays are kept alive beside it."""
+        """The words that a problem gives every kernel; its arrays are kept alive beside them."""
         known = problem.__dict__.get("_packed")
         if known is None:
             queue = queue_of(problem)
-            known = {
+            arrays = {
                 "start": problem.z_start(),
                 "p": problem.p,
                 "bias": problem.bias,
@@ -241,11 +245,10 @@ class CompiledSystem(TracedSystem):
                 "now": queue.now,
                 "past": queue.past,
             }
-            known = {name: _plain(array) for name, array in known.items()}
-            known |= {
-                "dt": float(problem.dt),
-                "eps": float(problem.smoothing),
-                "H": problem.horizon,
-            }
+            kept = {name: _plain(array) for name, array in arrays.items()}
+            settings = {"dt": problem.dt, "eps": problem.smoothing}
+            words: dict[str, Any] = {name: _word(array) for name, array in kept.items()}
+            words |= {name: _word(float(value)) for name, value in settings.items()}
+            known = words | {"H": problem.horizon, "kept": kept}
             problem.__dict__["_packed"] = known
         return known

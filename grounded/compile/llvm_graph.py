@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from grounded.compile.graph import Graph
 from grounded.compile.llvm_math import Lanes
 from grounded.compile.llvm_text import Writer
+from grounded.compile.operations import SATURATED
 
 EPS, INVERSE, DT, FIRST = 0, 1, 2, 3  # slots of the table: eps, 1/eps or 0, dt, then nodes
 
@@ -163,12 +164,12 @@ class Body:
         f, w, one, zero = self.f, self.width, self.const(1.0), self.const(0.0)
         exact = self.pick("ogt", left, r, one, zero)
         d = f.mul(f.sub(left, r, w), self.setting(INVERSE), w)
-        e = self.lanes.exp(f.neg(d, w))
-        soft = f.div(one, f.add(one, e, w), w)
-        soft = self.pick(
-            "olt", d, self.const(-40.0), zero, self.pick("ogt", d, self.const(40.0), one, soft)
-        )
-        return self.sharp(exact, soft)
+        limit, below = self.const(SATURATED), self.const(-SATURATED)
+        near = self.pick("ogt", d, limit, limit, self.pick("olt", d, below, below, d))
+        soft = f.div(one, f.add(one, self.lanes.exp_within(f.neg(near, w)), w), w)
+        soft = self.pick("olt", d, below, zero, soft)
+        soft = self.pick("uno", d, d, exact, soft)
+        return self.pick("oeq", self.setting(EPS), zero, exact, soft)
 
     def equal(self, left: str, r: str) -> str:
         """1 where equal."""

@@ -139,18 +139,21 @@ class Lanes:
         low = f.compare("olt", x, self.const(-708.0), w)
         high = f.compare("ogt", x, self.const(709.78), w)
         inside = f.select(low, self.const(0.0), f.select(high, self.const(0.0), x, w), w)
-        shifted = self._rounding(inside, 1 / math.log(2))
+        scaled = f.select(high, self.const(math.inf), self.exp_within(inside), w)
+        return f.select(low, self.const(0.0), scaled, w)
+
+    def exp_within(self, x: str) -> str:
+        """e^x for x in [-708, 709.78]."""
+        f, w = self.f, self.width
+        shifted = self._rounding(x, 1 / math.log(2))
         n = f.emit(f"fsub {vector(w)} {shifted}, {self.const(MAGIC)}")
-        r = f.sub(
-            f.sub(inside, f.mul(n, self.const(LN2[0]), w), w), f.mul(n, self.const(LN2[1]), w), w
-        )
+        r = f.sub(x, f.mul(n, self.const(LN2[0]), w), w)
+        r = f.sub(r, f.mul(n, self.const(LN2[1]), w), w)
         tail = f.fma(f.mul(r, r, w), self.polynomial(r, EXP), r, w)
         mantissa = f.add(tail, self.const(1.0), w)
         exponent = self._bitwise("shl", self._bits(shifted), 52)
         kind = "i64" if w == 1 else f"<{w} x i64>"
-        scaled = self._from_bits(f.emit(f"add {kind} {self._bits(mantissa)}, {exponent}"))
-        scaled = f.select(high, self.const(math.inf), scaled, w)
-        return f.select(low, self.const(0.0), scaled, w)
+        return self._from_bits(f.emit(f"add {kind} {self._bits(mantissa)}, {exponent}"))
 
     def tanh(self, x: str) -> str:
         """(1 - e) / (1 + e) with e = exp(-2 |x|), and x's sign."""
