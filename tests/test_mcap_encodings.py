@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from grounded_trials.cdr import cdr_messages, ros1_messages
+from grounded_trials.idl_schema import parse_idl
 from grounded_trials.json_messages import json_messages
 from grounded_trials.message_path import parse_path
 from grounded_trials.message_types import Array, Dynamic, Number, Struct, Text, Type
@@ -192,6 +193,98 @@ def test_nested_counts_do_not_overflow() -> None:
     type = parse_ros(text, "x/msg/M", ros1=False)
     with pytest.raises(BadPath, match="larger than"):
         found([b"\0\1\0\0" + bytes(100)], type, lambda b, s, e: cdr_messages(b, type, s, e), "/t.d")
+
+
+IDL = """
+// generated from rosidl
+#include "geometry_msgs/msg/Vector3.idl"
+module robot { module msg {
+  const unsigned long SIZE = 3;
+  typedef double triple[SIZE];
+  typedef sequence<triple, 4> triples;
+  enum Gear { REVERSE, NEUTRAL, FORWARD };
+  module State_Constants { const string<9> NAME = "a;b"; };
+  struct Empty { uint8 structure_needs_at_least_one_member; };
+  @verbatim (language="comment", text= "a (long) text" "in parts")
+  struct State : robot::msg::Base {
+    @key @unit(value="m/s")
+    double speed;
+    octet flags, more[2][2];
+    Gear gear;
+    Empty none;
+    unsigned long long count; long long offset; unsigned short u; short s;
+    string<22> name;
+    sequence<Vector3> points;
+    triples rows;
+    boolean ok; /* the
+    last */
+  };
+  struct Base { long first; };
+}; };
+================================================================================
+IDL: robot/msg/Vector3
+module robot { module msg { struct Vector3 { double x; double y; float z; }; }; };
+"""
+
+
+def test_idl_definitions_are_the_same_types_as_ros_ones() -> None:
+    typesys = pytest.importorskip("rosbags.typesys")
+    texts = {
+        "x/msg/T0": "int32 first\nfloat64 speed\nuint8 flags\nuint8[4] more\nuint32 gear\n"
+        "E none\nuint64 count\nint64 offset\nuint16 u\nint16 s\nstring name\nV[] points\n"
+        "R[] rows\nbool ok\n",
+        "x/msg/E": "",
+        "x/msg/R": "float64[3] v\n",
+        "x/msg/V": "float64 x\nfloat64 y\nfloat32 z\n",
+    }
+    store = typesys.get_typestore(typesys.Stores.EMPTY)
+    types = {}
+    for name, text in texts.items():
+        types.update(typesys.get_types_from_msg(text, name))
+    store.register(types)
+    ros = parse_ros(concatenated(texts), "x/msg/T0", ros1=False)
+    rng = random.Random(0)
+    make = lambda n, f: store.types[n.replace("x/", "x/msg/")](**f)  # noqa: E731
+    objects = [random_value(ros, rng, make) for _ in range(20)]
+    messages = [bytes(store.serialize_cdr(o, "x/msg/T0")) for o in objects]
+    idl = parse_idl(IDL, "robot/msg/State")
+    for path in ("first", "speed", "gear", "count", "offset", "u", "s", "ok", "points[:].z"):
+        wanted = found(messages, ros, partial(decode, cdr_messages, ros), f"/t.{path}")
+        mine = found(messages, idl, partial(decode, cdr_messages, idl), f"/t.{path}")
+        assert mine == wanted and any(wanted), path
+    for of_ros, of_idl in (("rows[:].v[2]", "rows[:][2]"), ("more[2]", "more[1][0]")):
+        wanted = found(messages, ros, partial(decode, cdr_messages, ros), f"/t.{of_ros}")
+        mine = found(messages, idl, partial(decode, cdr_messages, idl), f"/t.{of_idl}")
+        assert mine == wanted and any(wanted), of_idl
+
+
+def test_idl_definitions_that_can_not_be_read() -> None:
+    for bad, says in (
+        ("module a { union U switch(long) { case 1: long x; }; };", "union"),
+        ("struct M { Missing a; };", "uses 'Missing'"),
+        ("struct M { M a; };", "contains itself"),
+        ("struct M { @optional double a; };", "not plain CDR"),
+        ("struct M { double a[999999999]; };", "999999999 items"),
+        ("struct M { long double a; };", "long"),
+        ("struct N { long a; };", "no struct 'M'"),
+        ("struct M {", "damaged"),
+        ("what", "where a definition should be"),
+    ):
+        with pytest.raises(BadSchema, match=says):
+            parse_idl(bad, "M")
+
+
+@pytest.mark.parametrize("seed", range(200))
+def test_any_damaged_idl_is_told(seed: int) -> None:
+    rng = random.Random(seed)
+    text = list(IDL)
+    for _ in range(rng.randint(1, 5)):
+        at = rng.randrange(len(text))
+        text[at : at + rng.randint(0, 20)] = rng.choice(["", "{", "}", ";", "@a(", '"', "[", "<"])
+    try:
+        parse_idl("".join(text), "robot/msg/State")
+    except BadSchema as error:
+        assert str(error)
 
 
 def test_ros_definitions_that_are_none() -> None:

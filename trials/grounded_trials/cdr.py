@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from grounded_trials.mcap_records import windows
 from grounded_trials.message_types import Array, Field, Number, Struct, Text, Type
 from grounded_trials.nodes import (
+    ROW_LIMIT,
     BadMessage,
     BadPath,
     Bools,
@@ -28,8 +29,8 @@ from grounded_trials.nodes import (
 )
 
 ITEM_LIMIT = 100_000  # items of a list whose sizes differ: they are stepped over one by one
+ZSTD = b"\x28\xb5\x2f\xfd"  # a message that rosbag2 compressed by itself
 SIZE_LIMIT = 2**40  # [bytes] of a type; positions must not overflow
-ROW_LIMIT = 50_000_000  # values that one path may find in one batch of messages
 
 
 @dataclass(frozen=True)
@@ -292,6 +293,11 @@ def cdr_messages(buffer: bytes, type: Struct, start: Ints, end: Ints) -> CdrNode
         other = kinds != kinds[0]
         if other.any():
             raise BadMessage(int(np.argmax(other)), "its variant of CDR is not that of the others")
+        if buffer[start[0] : start[0] + 4] == ZSTD:
+            raise BadMessage(
+                0,
+                "it is compressed by itself; use `ros2 bag convert` with compression_mode none",
+            )
         if int(kinds[0]) not in _KINDS or octets[start].any():
             raise BadMessage(
                 0, f"its variant of CDR, {int(kinds[0])}, can't be read (plain CDR can)"

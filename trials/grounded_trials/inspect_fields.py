@@ -12,6 +12,7 @@ from grounded_trials.path_walk import is_time
 FIELD_LIMIT = 200  # paths of one topic
 ITEM_LIMIT = 12  # items of a list that are named one by one
 DEPTH_LIMIT = 12
+VISIT_LIMIT = 20_000  # parts of a type that are looked at; a hostile one has no end
 QUATERNION = ("x", "y", "z", "w")
 
 
@@ -23,7 +24,8 @@ def number_paths(type: Type, sample: Any = None) -> list[str]:
         sample: one parsed message, where only it tells the type (JSON).
     """
     found: list[str] = []
-    walk = _of_value(sample, 0) if isinstance(type, Dynamic) else _of_type(type, 0)
+    patience = iter(range(VISIT_LIMIT))
+    walk = _of_value(sample, 0) if isinstance(type, Dynamic) else _of_type(type, 0, patience)
     for path in walk:
         found.append(path)
         if len(found) >= FIELD_LIMIT:
@@ -31,8 +33,8 @@ def number_paths(type: Type, sample: Any = None) -> list[str]:
     return found
 
 
-def _of_type(type: Type, depth: int) -> Iterator[str]:
-    if depth > DEPTH_LIMIT:
+def _of_type(type: Type, depth: int, patience: Iterator[int]) -> Iterator[str]:
+    if depth > DEPTH_LIMIT or next(patience, None) is None:
         return
     if isinstance(type, Number):
         yield ""
@@ -40,13 +42,13 @@ def _of_type(type: Type, depth: int) -> Iterator[str]:
         count = ITEM_LIMIT if type.count is None else type.count
         if count <= ITEM_LIMIT:
             for i in range(count if isinstance(type.item, Number) else 1):
-                for rest in _of_type(type.item, depth + 1):
+                for rest in _of_type(type.item, depth + 1, patience):
                     yield f"[{i}]{rest}"
     elif isinstance(type, Struct) and not is_time(type):
         if tuple(type.by_name) == QUATERNION:
             yield from (f".@rpy.{angle}" for angle in ("roll", "pitch", "yaw"))
         for field in type.fields:
-            for rest in _of_type(field.type, depth + 1):
+            for rest in _of_type(field.type, depth + 1, patience):
                 yield f".{_spell(field.name)}{rest}"
 
 

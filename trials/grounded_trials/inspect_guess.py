@@ -112,7 +112,7 @@ def _score(name: str, topic: TopicReport, field: FieldReport, *, is_input: bool)
     words = set(_WORD.findall(path))
     commanded = any(word in words for word in _COMMANDED)
     best += (0.5 if is_input else -2.0) * commanded
-    best -= 3.0 if not np.isfinite(field.low) else 0.0
+    best -= 3.0 if field.low is None else 0.0
     best -= 1.0 if field.low == field.high else 0.0
     best -= 1.0 if topic.messages < 3 else 0.0
     best -= 2.0 if field.not_finite > 0.1 * topic.messages else 0.0
@@ -194,7 +194,7 @@ def _table(kind: str, guess: Guess, clock: str) -> list[str]:
         return [f"# {head}  # {what}"]
     lines = [head if guess.sure else f"{head}  # unsure{others}"]
     lines.append(f"path = {_quote(guess.path)}")
-    if guess.field is not None and np.isfinite(guess.field.low):
+    if guess.field is not None and guess.field.low is not None:
         lines[-1] += f"  # {guess.field.low:.4g} to {guess.field.high:.4g} in this log"
     if guess.clock != clock:
         lines.append(f'clock = "{guess.clock}"')

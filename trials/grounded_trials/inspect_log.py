@@ -35,8 +35,8 @@ class FieldReport:
     """A number in a topic's messages, by its message path."""
 
     path: str
-    low: float  # smallest and largest finite value; NaN if there is none
-    high: float
+    low: float | None  # smallest and largest finite value; None if there is none
+    high: float | None
     not_finite: int
 
 
@@ -51,8 +51,8 @@ class TopicReport:
     rate_hz: float  # 1 / median interval of the log times; 0 for fewer than two messages
     jitter_s: float  # half the width that holds 90 % of the intervals
     largest_gap_s: float
-    first_s: float  # after the log's first message
-    last_s: float
+    first_s: float | None  # after the log's first message; None without messages
+    last_s: float | None
     stamped: bool  # messages have a header stamp
     skew_s: float | None  # median of header stamp minus log time
     fields: tuple[FieldReport, ...]
@@ -254,8 +254,8 @@ class _Topic:
             rate_hz=1 / median if median > 0 else 0.0,
             jitter_s=float(high - low) / 2,
             largest_gap_s=float(gaps.max(initial=0.0)),
-            first_s=float(t.min() - start) * 1e-9 if len(t) else np.nan,
-            last_s=float(t.max() - start) * 1e-9 if len(t) else np.nan,
+            first_s=float(t.min() - start) * 1e-9 if len(t) else None,
+            last_s=float(t.max() - start) * 1e-9 if len(t) else None,
             stamped=stamped or bool(skews is not None and len(skews)),
             skew_s=float(np.median(skews)) * 1e-9 if skews is not None and len(skews) else None,
             fields=tuple(_field(path, r) for path, r in self.ranges.items() if r.count),
@@ -295,7 +295,7 @@ def _field(path: str, found: _Range) -> FieldReport:
     none = found.low > found.high
     return FieldReport(
         path=path,
-        low=np.nan if none else found.low,
-        high=np.nan if none else found.high,
+        low=None if none else found.low,
+        high=None if none else found.high,
         not_finite=found.not_finite,
     )

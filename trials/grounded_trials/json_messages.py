@@ -16,6 +16,7 @@ import numpy as np
 from grounded_trials.message_types import Dynamic
 from grounded_trials.nodes import BadMessage, BadPath, Bools, Floats, Ints, choose_items
 
+MESSAGE_LIMIT = 16 * 2**20  # [bytes]; parsed, JSON takes many times its size
 _DYNAMIC = Dynamic()
 
 
@@ -82,6 +83,8 @@ def json_messages(buffer: bytes, start: Ints, end: Ints) -> JsonNode:
     """
     objects = []
     for i, (a, b) in enumerate(zip(start.tolist(), end.tolist(), strict=True)):
+        if b - a > MESSAGE_LIMIT:
+            raise BadMessage(i, f"it has {b - a} bytes of JSON, the limit is {MESSAGE_LIMIT}")
         try:
             objects.append(json.loads(buffer[a:b]))
         except (ValueError, RecursionError) as error:

@@ -52,8 +52,17 @@ def _bag(folder: Path) -> list[Path]:
             )
         return [folder / name for name in names]
     if not inside:
-        raise GroundedError(f"{folder} holds no *.mcap file")
+        raise GroundedError(f"{folder} holds no *.mcap file{_advice(folder)}")
     return sorted(inside, key=lambda path: _natural(path.name))
+
+
+def _advice(folder: Path) -> str:
+    kinds = {path.suffix for path in folder.iterdir()}
+    if ".db3" in kinds:
+        return "; turn its .db3 into MCAP with `ros2 bag convert` or `mcap convert`"
+    if ".zstd" in kinds:
+        return "; decompress its files first, with `zstd -d`"
+    return ""
 
 
 def _natural(name: str) -> list[tuple[int, str]]:

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from grounded_trials.message_types import Type
 
+ROW_LIMIT = 10_000_000  # values that one path may find in one batch of messages
+
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]

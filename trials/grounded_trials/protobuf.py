@@ -15,10 +15,19 @@ from numpy.typing import NDArray
 
 from grounded_trials.mcap_records import windows
 from grounded_trials.message_types import Array, Number, Struct, Type
-from grounded_trials.nodes import BadMessage, Bools, Floats, Ints, choose_items, texts_equal
+from grounded_trials.nodes import (
+    ROW_LIMIT,
+    BadMessage,
+    Bools,
+    Floats,
+    Ints,
+    choose_items,
+    texts_equal,
+)
 
 VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5
 Words = NDArray[np.uint64]
+PACKED_LIMIT = 2**27  # [bytes] of the lists of integers in one batch of messages
 MOST_FIELDS = 200_000  # in one message; a hostile one would take minutes
 
 
@@ -277,9 +286,14 @@ def _unpack(
         if ragged.any():
             raise BadMessage(node.rows[owner[ragged][0]], "a packed list ends inside a number")
     else:
-        stops = np.flatnonzero(np.frombuffer(node.buffer, np.uint8) < 0x80) + 1
+        low, high = int(start[packed].min()), int(end[packed].max())
+        if high - low > PACKED_LIMIT:
+            raise BadMessage(int(node.rows[0]), f"lists of more than {PACKED_LIMIT} bytes")
+        stops = np.flatnonzero(np.frombuffer(node.buffer[low:high], np.uint8) < 0x80) + 1 + low
         first = np.searchsorted(stops, start, "right")
         counts = np.where(packed, np.searchsorted(stops, end, "right") - first, 1)
+    if int(counts.sum()) > ROW_LIMIT:
+        raise BadMessage(int(node.rows[0]), f"lists of more than {ROW_LIMIT} numbers")
     which = np.repeat(np.arange(len(owner)), counts)
     index = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)
     inside = packed[which]

@@ -16,6 +16,7 @@ import numpy as np
 
 from grounded.errors import GroundedError, nearest
 from grounded_trials.cdr import cdr_messages, ros1_messages
+from grounded_trials.idl_schema import parse_idl
 from grounded_trials.json_messages import json_messages
 from grounded_trials.log_files import log_files, open_log
 from grounded_trials.mcap_records import Channel, Messages, Schema
@@ -200,8 +201,11 @@ def struct_of(schema: Schema) -> Struct:
     if schema.encoding in ("ros1msg", "ros2msg"):
         text = schema.data.decode("utf-8", "replace")
         return parse_ros(text, schema.name, ros1=schema.encoding == "ros1msg")
+    if schema.encoding in ("ros2idl", "omgidl"):
+        return parse_idl(schema.data.decode("utf-8", "replace"), schema.name)
     raise BadSchema(
-        f"the schema's language '{schema.encoding}' can't be read (ros1msg, ros2msg, protobuf can)"
+        f"the schema's language '{schema.encoding}' can't be read; ros1msg, ros2msg, ros2idl, "
+        "omgidl and protobuf can"
     )
 
 
