@@ -6,7 +6,7 @@ to be found. At each step by itself, with f the model over one control step,
     f(x_t, u_t)_i = x_{t+1, i}   for prescribed states,    f(x_t, u_t)_i = x_{t, i}   for free ones:
 
 free states hold still while the prescribed ones move (a quasi-steady turn: steering angle, bank,
-surfaces). Levenberg-Marquardt on all steps at once, inputs inside their limits. It starts from
+surfaces). Levenberg-Marquardt on many steps at once, inputs inside their limits. It starts from
 several inputs, because a stalled motor has no slope to follow; then every step tries again with one
 input set back, and tries the solutions of its neighbours, because a manoeuvre is continuous and a
 bad local minimum seldom is.
@@ -14,7 +14,7 @@ bad local minimum seldom is.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,27 +27,53 @@ STARTS = (0.0, 0.35, 0.7, -0.35)  # fractions of the way from the held input to 
 ITERATIONS, MORE = 30, 12  # of Levenberg-Marquardt: from the starts, from a solution nearby
 ROUNDS = 3
 FREE_WEIGHT = 0.3  # what is prescribed goes first where both can't be had
+KNOTS = 250  # steps that are solved from scratch; those between start from their neighbours
+EXACT = 1e-12  # of the mean squared rate: a trim this good is not tried again
+
+
+@dataclass(frozen=True, eq=False)
+class _Steps:
+    """Some steps of the run: prescribed states now and next (N, n), and what counts as solved."""
+
+    problem: Problem
+    known: NDArray[np.bool_]
+    now: Array
+    next: Array
+    solved: float
+
+    def some(self, chosen: NDArray[np.bool_]) -> _Steps:
+        return replace(self, now=self.now[chosen], next=self.next[chosen])
+
+    def residual(self, x: Array, u: Array) -> Array:
+        problem = self.problem
+        with np.errstate(all="ignore"):
+            moved = problem.system.step(x, u, problem.p, problem.dt, problem.smoothing)
+        weight = np.where(self.known, 1.0, FREE_WEIGHT)
+        return np.asarray((moved - np.where(self.known, self.next, x)) / problem.dt * weight)
 
 
 @dataclass(frozen=True, eq=False)
 class _Trim:
-    x: Array  # (H, n)
-    u: Array  # (H, m)
-    r: Array  # (H, n) residuals as rates, weighted
+    x: Array  # (N, n)
+    u: Array  # (N, m)
+    r: Array  # (N, n) residuals as rates, weighted
 
     @property
     def error(self) -> Array:
-        square = (self.r**2).sum(axis=1)
+        square = np.einsum("ti,ti->t", self.r, self.r)
         return np.where(np.isfinite(square), square, np.inf)
 
-    def take(self, other: _Trim) -> _Trim:
-        """Step by step the one with the smaller error."""
-        better = (other.error < self.error)[:, None]
-        return _Trim(
-            np.where(better, other.x, self.x),
-            np.where(better, other.u, self.u),
-            np.where(better, other.r, self.r),
-        )
+    def some(self, chosen: NDArray[np.bool_]) -> _Trim:
+        return _Trim(self.x[chosen], self.u[chosen], self.r[chosen])
+
+    def take(self, other: _Trim, chosen: NDArray[np.bool_]) -> _Trim:
+        """The chosen steps from `other` where its error is smaller."""
+        rows = np.flatnonzero(chosen)
+        better = other.error < self.error[rows]
+        x, u, r = self.x.copy(), self.u.copy(), self.r.copy()
+        rows, source = rows[better], np.flatnonzero(better)
+        x[rows], u[rows], r[rows] = other.x[source], other.u[source], other.r[source]
+        return _Trim(x, u, r)
 
 
 def trim(task: Task, x: Array, known: NDArray[np.bool_]) -> tuple[Array, Array]:
@@ -61,23 +87,48 @@ def trim(task: Task, x: Array, known: NDArray[np.bool_]) -> tuple[Array, Array]:
     Returns:
         x (H, n) with the free columns filled in, u (H, m).
     """
-    problem = task.problem()
-    held = np.tile(np.clip(task.past, task.low, task.high), (task.horizon, 1))
-    best = _solve(problem, x, known, x[:-1], held, ITERATIONS)
+    H = task.horizon
+    rate = np.diff(x, axis=0)[:, known] / task.dt
+    solved = EXACT * (float(np.mean(rate**2)) + 1e-12)
+    steps = _Steps(task.problem(), known, x[:-1], x[1:], solved)
+    knots = np.unique(np.linspace(0, H - 1, min(H, KNOTS)).round().astype(int))
+    chosen = np.zeros(H, dtype=bool)
+    chosen[knots] = True
+    coarse = _from_scratch(task, steps.some(chosen))
+    if len(knots) == H:
+        return coarse.x, coarse.u
+    at = np.arange(H)
+    state = np.column_stack([np.interp(at, knots, column) for column in coarse.x.T])
+    state[:, known] = x[:-1][:, known]
+    u = np.column_stack([np.interp(at, knots, column) for column in coarse.u.T])
+    fine = _solve(steps, state, u, MORE)
+    return fine.x, fine.u
+
+
+def _from_scratch(task: Task, steps: _Steps) -> _Trim:
+    """From several inputs, then with one input set back, then from the neighbours' solutions."""
+    held = np.tile(np.clip(task.past, task.low, task.high), (len(steps.now), 1))
+    best = _solve(steps, steps.now, held, ITERATIONS)
     for part in STARTS[1:]:
-        u = _toward_limit(task, held, part)
-        best = best.take(_solve(problem, x, known, x[:-1], u, ITERATIONS))
+        best = _again(steps, best, steps.now, _toward_limit(task, held, part), ITERATIONS)
     for j in range(task.model.m):
         for part in STARTS:
             u = best.u.copy()
             u[:, j] = _toward_limit(task, held, part)[:, j]
-            best = best.take(_solve(problem, x, known, best.x, u, MORE))
+            best = _again(steps, best, best.x, u, MORE)
     for _ in range(ROUNDS):
         for shift in (1, -1):
-            state = np.where(known, x[:-1], np.roll(best.x, shift, axis=0))
-            u = np.roll(best.u, shift, axis=0)
-            best = best.take(_solve(problem, x, known, state, u, MORE))
-    return best.x, best.u
+            x = np.where(steps.known, steps.now, np.roll(best.x, shift, axis=0))
+            best = _again(steps, best, x, np.roll(best.u, shift, axis=0), MORE)
+    return best
+
+
+def _again(steps: _Steps, best: _Trim, x: Array, u: Array, iterations: int) -> _Trim:
+    """Tries other starts for the steps that are not solved yet."""
+    open_ = best.error > steps.solved
+    if not open_.any():
+        return best
+    return best.take(_solve(steps.some(open_), x[open_], u[open_], iterations), open_)
 
 
 def _toward_limit(task: Task, held: Array, part: float) -> Array:
@@ -86,46 +137,41 @@ def _toward_limit(task: Task, held: Array, part: float) -> Array:
     return np.where(np.isfinite(limit), held + abs(part) * (limit - held), held)
 
 
-def _residual(problem: Problem, x: Array, known: NDArray[np.bool_], s: Array, u: Array) -> Array:
-    with np.errstate(all="ignore"):
-        moved = problem.system.step(s, u, problem.p, problem.dt, problem.smoothing)
-    weight = np.where(known, 1.0, FREE_WEIGHT)
-    return np.asarray((moved - np.where(known, x[1:], s)) / problem.dt * weight)
-
-
-def _solve(
-    problem: Problem, x: Array, known: NDArray[np.bool_], s: Array, u: Array, iterations: int
-) -> _Trim:
-    """Levenberg-Marquardt from states s and inputs u, every step with its own damping."""
-    now = _Trim(s.copy(), u.copy(), _residual(problem, x, known, s, u))
+def _solve(steps: _Steps, x: Array, u: Array, iterations: int) -> _Trim:
+    """Levenberg-Marquardt from states x and inputs u, every step with its own damping."""
+    now = _Trim(x.copy(), u.copy(), steps.residual(x, u))
     damping = np.full(len(u), 1e-3)
-    free = np.flatnonzero(~known)
+    free = np.flatnonzero(~steps.known)
+    problem = steps.problem
     for _ in range(iterations):
-        move = _move(problem, known, free, now, damping)
-        s, u = now.x.copy(), now.u + move[:, len(free) :]
+        active = now.error > steps.solved
+        if not active.any():
+            break
+        part = now.some(active)
+        move = _move(steps, free, part, damping[active])
+        s, v = part.x.copy(), part.u + move[:, len(free) :]
         s[:, free] += move[:, : len(free)]
-        np.clip(u, problem.low, problem.high, out=u)
-        new = _Trim(s, u, _residual(problem, x, known, s, u))
-        better = new.error < now.error
-        now = now.take(new)
-        damping = np.clip(np.where(better, damping / 5, damping * 5), 1e-9, 1e6)
+        np.clip(v, problem.low, problem.high, out=v)
+        new = _Trim(s, v, steps.some(active).residual(s, v))
+        better = new.error < part.error
+        now = now.take(new, active)
+        factor = np.where(better, 0.2, 5.0)
+        damping[active] = np.clip(damping[active] * factor, 1e-9, 1e6)
     return now
 
 
-def _move(
-    problem: Problem, known: NDArray[np.bool_], free: NDArray[np.intp], now: _Trim, damping: Array
-) -> Array:
-    """The Levenberg-Marquardt step in [free states, inputs], (H, len(free) + m)."""
-    n = len(known)
+def _move(steps: _Steps, free: NDArray[np.intp], now: _Trim, damping: Array) -> Array:
+    """The Levenberg-Marquardt step in [free states, inputs], (N, len(free) + m)."""
+    problem, n = steps.problem, len(steps.known)
     f_x, f_u = problem.system.linearise(now.x, now.u, problem.p, problem.dt, problem.smoothing)
     J = np.concatenate([f_x[:, :, free] - np.eye(n)[:, free], f_u], axis=2)
-    J *= np.where(known, 1.0, FREE_WEIGHT)[:, None] / problem.dt
+    J *= np.where(steps.known, 1.0, FREE_WEIGHT)[:, None] / problem.dt
     usable = np.isfinite(J).all(axis=(1, 2)) & np.isfinite(now.r).all(axis=1)
     J[~usable] = 0.0
     r = np.where(usable[:, None], now.r, 0.0)
-    normal = np.einsum("tij,tik->tjk", J, J)
-    diagonal = np.einsum("tjj->tj", normal) + 1e-9
+    normal = J.swapaxes(1, 2) @ J
     index = np.arange(J.shape[2])
+    diagonal = normal[:, index, index] + 1e-9
     normal[:, index, index] += damping[:, None] * diagonal + 1e-9
-    gradient = np.einsum("tij,ti->tj", J, r)
+    gradient = (r[:, None, :] @ J)[:, 0]
     return np.asarray(-np.linalg.solve(normal, gradient[..., None])[..., 0])

@@ -1,0 +1,94 @@
+"""grounded demo: a whole example in an empty folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from grounded_cli.learn import learn_in
+from grounded_cli.options import as_json
+from grounded_cli.status import summary
+from grounded_cli.terminal import number, progress, say, show, show_json
+
+if TYPE_CHECKING:
+    from grounded_trials.workspace import Workspace
+
+
+@click.command("demo")
+@click.argument("name", metavar="NAME", default="car-figure8")
+@click.option("--dir", "folder", metavar="DIR", help="Default: demo-NAME in the current folder.")
+@as_json
+def command(name: str, folder: str | None, json_: bool) -> None:
+    """Learn an example's manoeuvre on its simulated real system, diagnose the gap, report.
+
+    `grounded init --list` lists the examples. The optimum is found afterwards with the TRUE model,
+    which the search never sees.
+    """
+    from grounded.errors import GroundedError
+    from grounded_trials.examples import example, write_example
+    from grounded_trials.workspace import Workspace
+
+    example(name)
+    target = Path(folder or f"demo-{name}")
+    if target.exists() and any(target.iterdir()):
+        raise GroundedError(f"{target} is not empty: name another folder with --dir, or remove it")
+    write_example(target, name)
+    workspace = Workspace(target)
+    say(f"workspace {target}: {name}, a crude model and a simulated real system\n")
+    standing = learn_in(workspace)
+    optimum = _optimum(workspace)
+    verdict = _diagnosis(workspace)
+    paths = _report(workspace)
+    document = {
+        "workspace": str(target),
+        "utilities": standing.utilities,
+        "trials": standing.trials,
+        "phase": standing.phase,
+        "optimum": optimum,
+        "verdict": verdict,
+        "paths": paths,
+    }
+    if json_:
+        show_json(document)
+        return
+    say("")
+    show(summary(standing))
+    _tell(document)
+
+
+def _tell(document: dict[str, Any]) -> None:
+    utilities = document["utilities"]
+    improvement = 1 - utilities[-1] / utilities[0]
+    show(
+        f"\nutility    {number(utilities[0])} by the model's own policy, {number(utilities[-1])} after "
+        f"{document['trials']} trials: {100 * improvement:.1f} % better"
+    )
+    show(f"optimum    {number(document['optimum'])}, planned with the true model (never shown to the search)")
+    if document["verdict"]:
+        show(f"gap        {document['verdict']['sentence']}")
+    for kind, path in document["paths"].items():
+        show(f"{kind:10} {path}")
+    show(f"\nnext: grounded -C {document['workspace']} view")
+
+
+def _optimum(workspace: Workspace) -> float | None:
+    from grounded_trials.optimum import optimum
+
+    with progress("finding the optimum with the true model"):
+        return optimum(workspace)
+
+
+def _diagnosis(workspace: Workspace) -> dict[str, Any] | None:
+    from grounded_trials.diagnosing import diagnose_in
+
+    with progress("diagnosing the gap"):
+        return dict(diagnose_in(workspace)["verdict"])
+
+
+def _report(workspace: Workspace) -> dict[str, str]:
+    from grounded_cli.report import write_all
+
+    with progress("writing the report"):
+        return write_all(workspace)
