@@ -40,10 +40,12 @@ class DifferencedSystem(Interpreted):
         params: Sequence[str],
         integrator: Integrator = "rk4",
         note: str = "",
+        returns: Sequence[str] = (),
     ) -> None:
         super().__init__(kind, integrator, (len(states), len(inputs), len(params)), note)
         self.function, self.source = function, where(function)
         self.states, self.inputs, self.params = tuple(states), tuple(inputs), tuple(params)
+        self.outputs = tuple(returns) or self.states  # names of what the function returns
         self._batches = True  # until the function fails on arrays
         self._calls = 0
 
@@ -56,7 +58,7 @@ class DifferencedSystem(Interpreted):
                 return result
             self._batches = False
         return np.array([self._single(a, b, p, dt) for a, b in zip(x, u, strict=True)]).reshape(
-            len(x), self.n
+            len(x), len(self.outputs)
         )
 
     def check(self, x: Array, u: Array, p: Array, dt: float) -> None:
@@ -106,8 +108,8 @@ class DifferencedSystem(Interpreted):
         self._calls += 1
         try:
             values = self._call([*x.T], [*u.T], p, dt)
-            result = np.empty(x.shape)
-            for i, name in enumerate(self.states):
+            result = np.empty((len(x), len(self.outputs)))
+            for i, name in enumerate(self.outputs):
                 result[:, i] = np.broadcast_to(np.asarray(values[name], float), len(x))
         except Exception:  # whatever it is, the call on one sample tells the user
             return None
@@ -122,20 +124,20 @@ class DifferencedSystem(Interpreted):
     def _single(self, x: Array, u: Array, p: Array, dt: float) -> Array:
         """The function on one sample; NaN where it leaves the finite numbers."""
         if not (np.isfinite(x).all() and np.isfinite(u).all()):
-            return np.full(self.n, np.nan)
+            return np.full(len(self.outputs), np.nan)
         try:
             values = self._call(x.tolist(), u.tolist(), p, dt)
         except ArithmeticError:
-            return np.full(self.n, np.nan)
+            return np.full(len(self.outputs), np.nan)
         except ValueError as error:
             if "math domain error" in str(error) or "nonnegative input" in str(error):
-                return np.full(self.n, np.nan)
+                return np.full(len(self.outputs), np.nan)
             raise self._failure(error) from error
         except GroundedError:
             raise
         except Exception as error:
             raise self._failure(error) from error
-        return np.array([self._number(name, values[name]) for name in self.states])
+        return np.array([self._number(name, values[name]) for name in self.outputs])
 
     def _call(self, x: Sequence[Any], u: Sequence[Any], p: Array, dt: float) -> Mapping[str, Any]:
         s = Named("state", self.states, x)
@@ -146,7 +148,7 @@ class DifferencedSystem(Interpreted):
                 values = self.function(s, a, parameters, dt)
             else:
                 values = self.function(s, a, parameters)
-        check_names(values, self.states, self.function)
+        check_names(values, self.outputs, self.function)
         return values
 
     def _number(self, name: str, value: Any) -> float:

@@ -10,6 +10,9 @@ the stages of Runge-Kutta: with k_i = f(x_i), x_i = x + c_i dt k_{i-1}, T_i = d 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 
 from grounded.compile.derivative import jacobian
@@ -159,12 +162,13 @@ class TracedSystem(Interpreted):
         width: int,
     ) -> Array:
         if self.kind == "step":
-            return _values(program, x, u, p, dt, smoothing, width)[1]
+            return values_and_jacobian(program, leaves_of(x, u, p, dt), smoothing, len(x), width)[1]
         identity = np.eye(self.n, width)
         k, K = np.zeros_like(x), np.zeros((len(x), self.n, width))
         total = np.zeros_like(K)
         for c, b in STAGES[self.integrator]:
-            k, K_own = _values(program, x + c * dt * k, u, p, dt, smoothing, width)
+            leaves = leaves_of(x + c * dt * k, u, p, dt)
+            k, K_own = values_and_jacobian(program, leaves, smoothing, len(x), width)
             T = identity + c * dt * K
             K = K_own[:, :, : self.n] @ T
             K[:, :, self.n :] += K_own[:, :, self.n :]
@@ -172,20 +176,18 @@ class TracedSystem(Interpreted):
         return np.asarray(identity + dt * total)
 
 
-def _values(
+def values_and_jacobian(
     program: tuple[Program, list[tuple[int, int]]],
-    x: Array,
-    u: Array,
-    p: Array,
-    dt: float,
+    leaves: Mapping[tuple[str, int], Any],
     smoothing: float,
+    N: int,
     width: int,
 ) -> tuple[Array, Array]:
-    """The function (N, n) and its Jacobian (N, n, width) at N samples."""
+    """The r outputs (N, r) and their Jacobian (N, r, width) at N samples."""
     run, places = program
-    values = run(leaves_of(x, u, p, dt), smoothing)
-    n = x.shape[1]
-    J = np.zeros((len(x), n, width))
-    for (r, c), value in zip(places, values[n:], strict=True):
+    found = run(leaves, smoothing)
+    values = found[: len(found) - len(places)]
+    J = np.zeros((N, len(values), width))
+    for (r, c), value in zip(places, found[len(values) :], strict=True):
         J[:, r, c] = value
-    return np.stack([np.broadcast_to(v, len(x)) for v in values[:n]], axis=1), J
+    return np.stack([np.broadcast_to(v, N) for v in values], axis=1), J

@@ -31,6 +31,12 @@ class Signature:
     states: tuple[str, ...]
     inputs: tuple[str, ...]
     params: tuple[str, ...]
+    returns: tuple[str, ...] = ()  # names of what it returns; empty: the states
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the returned values, in array order."""
+        return self.returns or self.states
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,8 +87,8 @@ def trace(signature: Signature, p: Array | None, dt: float, limit: int = MAX_NOD
         return f"{raised_at(error, signature.function)}: {error}"
     except Exception as error:  # the plain call will tell whether this is the user's mistake
         return f"{raised_at(error, signature.function)}: {type(error).__name__}: {error}"
-    check_names(values, signature.states, signature.function)
-    outputs = tuple(_output(graph, name, values[name], signature) for name in signature.states)
+    check_names(values, signature.outputs, signature.function)
+    outputs = tuple(_output(graph, name, values[name], signature) for name in signature.outputs)
     return Trace(graph, outputs, tuple(guards))
 
 
