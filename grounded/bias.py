@@ -29,7 +29,9 @@ class Grounding:
     inputs: Array
 
 
-def effective_inputs(z: Array, inputs: Array, delay: Array, depths: tuple[int, ...], n: int) -> Array:
+def effective_inputs(
+    z: Array, inputs: Array, delay: Array, depths: tuple[int, ...], n: int
+) -> Array:
     """What the actuators receive, (T, m): commands after their transport delay (in steps)."""
     received = np.empty_like(inputs)
     first = n

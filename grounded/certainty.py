@@ -1,8 +1,8 @@
 """How sure an improvement is, given that the real system never does the same thing twice.
 
-Two candidates with means m_a, m_b of k_a, k_b trials differ for certain where the difference exceeds
-its standard error; Welch's t-test gives the probability. Single trials say nothing about noise:
-then the scatter of any candidate that WAS repeated stands in for it.
+Two candidates with means m_a, m_b of k_a, k_b trials differ for certain where the difference
+exceeds its standard error; Welch's t-test gives the probability. Single trials say nothing about
+noise: then the scatter of any candidate that WAS repeated stands in for it.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ def last_improvement(history: Sequence[Tried]) -> str:
     noise, freedom = utility_noise(history)
     if not freedom:
         return (
-            f"the last gain is {gain:.3g}; every candidate was run once, so the noise of a trial is "
-            "unknown: run one again, or set [search] repeats = 3"
+            f"the last gain is {gain:.3g}; every candidate was run once, so the noise of a "
+            "trial is unknown: run one again, or set [search] repeats = 3"
         )
     error = noise * math.sqrt(1 / len(before.utilities) + 1 / len(after.utilities))
     if error == 0:

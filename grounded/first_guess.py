@@ -21,6 +21,7 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from grounded.bias import effective_inputs
 from grounded.frozen import Array
@@ -69,10 +70,10 @@ def filled_target(task: Task) -> tuple[Array, Array]:
     return np.vstack([trimmed, last]), u
 
 
-def _read_off_path(task: Task) -> tuple[Array, Array]:
+def _read_off_path(task: Task) -> tuple[Array, NDArray[np.bool_]]:
     """Target states where given, heading and speed from the path, the start state elsewhere."""
     model = task.model
-    given = np.isfinite(task.target).all(axis=0)
+    given: NDArray[np.bool_] = np.asarray(np.isfinite(task.target).all(axis=0))
     x = np.where(given, task.target, task.start)
     names = list(model.state_names)
     position = model.roles.get("position", ())

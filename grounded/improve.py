@@ -103,6 +103,7 @@ def direction(
         policy: theta, the policy that ran the trial.
         grounding: the trial as the biased model replays it (step 4).
         options: which algorithm A.
+        damping: lambda of `trust`, the share of mu that leaving the trial's inputs costs.
     """
     if options.method == "policy-gradient":
         return _gradient_direction(task, policy, grounding)
@@ -165,7 +166,9 @@ def propose(
     if now.incumbent is None:
         policy, _ = first_policy(task, now.caution)
         predicted = simulate(task.problem(exact=True), policy)
-        return _checked(task, now, _candidate(identity, policy, predicted, now, fingerprint, Step()))
+        return _checked(
+            task, now, _candidate(identity, policy, predicted, now, fingerprint, Step())
+        )
     planner = task
     if options.refit and refit is not None:
         planner = task.with_model(refit(task, trials))

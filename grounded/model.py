@@ -54,7 +54,7 @@ class Model:
         inputs: name -> unit.
         params: name -> Param.
         angles: states whose differences wrap to [-pi, pi].
-        roles: optional meaning of states (position, heading, speed, ...), used by effects, pictures.
+        roles: optional meaning of states (position, heading, speed ...), for effects and pictures.
         derivative: ds/dt, integrated over a control step by `integrator` under a zero-order hold.
         step: the next state itself, any Python callable; instead of `derivative`.
         integrator: "rk4" (one step of Runge-Kutta a control step) or "euler".
@@ -81,7 +81,8 @@ class Model:
         object.__setattr__(self, "angles", tuple(self.angles))
         if (self.derivative is None) == (self.step is None):
             raise GroundedError(
-                f"model '{self.name}' needs exactly one of derivative= (ds/dt) and step= (next state)"
+                f"model '{self.name}' needs exactly one of derivative= (ds/dt) and "
+                "step= (next state)"
             )
         if self.integrator not in ("rk4", "euler"):
             raise GroundedError(f"integrator must be 'rk4' or 'euler', got '{self.integrator}'")
@@ -136,7 +137,8 @@ class Model:
     @cached_property
     def values(self) -> Array:
         """Parameter values (k,)."""
-        return readonly([param.value for param in self.params.values()])
+        values: Array = readonly([param.value for param in self.params.values()])
+        return values
 
     @cached_property
     def angle_mask(self) -> Any:
@@ -159,8 +161,8 @@ class Model:
         )
 
     def difference(self, a: Array, b: Array) -> Array:
-        """a - b for arrays (..., n) of states; angles wrapped to [-pi, pi]."""
-        d = np.asarray(a, float) - np.asarray(b, float)
+        """A - b for arrays (..., n) of states; angles wrapped to [-pi, pi]."""
+        d: Array = np.asarray(a, float) - np.asarray(b, float)
         mask = self.angle_mask
         d[..., mask] -= 2 * np.pi * np.rint(d[..., mask] / (2 * np.pi))
         return d

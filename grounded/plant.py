@@ -17,7 +17,6 @@ from grounded.errors import GroundedError, nearest
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.policy import Policy, Runner
-
 from grounded.trial import Trial
 
 

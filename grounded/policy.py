@@ -90,7 +90,7 @@ class Policy:
         return replace(self, feedforward=moved, reference=reference)
 
     def toward(self, other: Policy, alpha: float) -> Policy:
-        """theta + alpha d with d = theta' - theta (footnote 11): alpha = 1 is `other` itself."""
+        """Theta + alpha d with d = theta' - theta (footnote 11): alpha = 1 is `other` itself."""
         if alpha == 1.0:
             return other
         if other.reference is None or other.gain is None:
@@ -104,8 +104,8 @@ class Policy:
 
 
 def z_difference(a: Array, b: Array, angles: tuple[bool, ...]) -> Array:
-    """a - b for augmented states (..., nz), angles wrapped."""
-    d = np.asarray(a, float) - np.asarray(b, float)
+    """A - b for augmented states (..., nz), angles wrapped."""
+    d: Array = np.asarray(a, float) - np.asarray(b, float)
     for i, angle in enumerate(angles):
         if angle:
             d[..., i] -= 2 * np.pi * np.rint(d[..., i] / (2 * np.pi))
@@ -122,7 +122,7 @@ class Runner:
     def __init__(self, policy: Policy) -> None:
         self.policy = policy
         self.blind = 0  # calls with a state that was not finite
-        self._H, m = policy.feedforward.shape
+        self._H = policy.horizon
         self._deep = max(policy.depths, default=1)
         self._sent = np.tile(policy.past, (self._H + self._deep, 1))
         self._latest = -1
@@ -146,7 +146,7 @@ class Runner:
         base = step + self._deep
         if step > self._latest + 1:  # calls were missed: the input was held meanwhile
             self._sent[self._latest + 1 + self._deep : base] = self._sent[self._latest + self._deep]
-        u = policy.feedforward[step]
+        u: Array = policy.feedforward[step]
         if policy.gain is not None and policy.reference is not None:
             z = self._z
             z[: self._n] = s
@@ -166,7 +166,7 @@ class Runner:
 
 
 def to_arrays(policy: Policy, **about: str) -> dict[str, Any]:
-    """A policy as plain arrays and strings for `numpy.savez`; `about` adds what a reader may check."""
+    """A policy as arrays and strings for `numpy.savez`; `about` adds what a reader may check."""
     arrays: dict[str, Any] = {name: getattr(policy, name) for name in _NUMBERS}
     arrays |= {
         "format": FORMAT,
@@ -204,7 +204,9 @@ def load(
         with np.load(path, allow_pickle=False) as archive:
             data = {name: archive[name] for name in archive.files}
     except (OSError, ValueError, EOFError, KeyError) as error:
-        raise GroundedError(f"{path} can't be read as an exported candidate (.npz): {error}") from None
+        raise GroundedError(
+            f"{path} can't be read as an exported candidate (.npz): {error}"
+        ) from None
     except Exception as error:  # zipfile and zlib have errors of their own
         raise GroundedError(f"{path} is damaged: {error}; export it again") from None
     if str(data.get("format", "")) != FORMAT:
@@ -225,8 +227,12 @@ def load(
         if names is not None and tuple(names) != found:
             raise GroundedError(f"{path} is for {kind} {found}; this robot has {tuple(names)}")
     if task is not None and str(data.get("task", "")) != task:
-        raise GroundedError(f"{path} is for task {data.get('task')}; this robot is set up for {task}")
-    finite = all(np.isfinite(data[k]).all() for k in ("feedforward", "gain", "reference") if k in data)
+        raise GroundedError(
+            f"{path} is for task {data.get('task')}; this robot is set up for {task}"
+        )
+    finite = all(
+        np.isfinite(data[k]).all() for k in ("feedforward", "gain", "reference") if k in data
+    )
     if not finite:
         raise GroundedError(f"{path} holds numbers that are not finite; export it again")
     return Runner(policy)

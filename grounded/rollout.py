@@ -51,5 +51,7 @@ def augmented(problem: Problem, states: Array, inputs: Array, past: Array) -> Ar
     for j, depth in enumerate(problem.depths):
         sent = np.concatenate([np.full(depth, past[j]), inputs[:, j]])
         T = len(inputs)
-        columns.append(np.stack([sent[depth - 1 - i : depth + T - i] for i in range(depth)], axis=1))
+        columns.append(
+            np.stack([sent[depth - 1 - i : depth + T - i] for i in range(depth)], axis=1)
+        )
     return np.hstack(columns)

@@ -1,4 +1,4 @@
-"""Where the search stands: a state DERIVED from candidates and stored trials, never kept beside them.
+"""Where the search stands: DERIVED from candidates and stored trials, never kept beside them.
 
 The real system is run by people, so the paper's loop can't be a while loop. Candidates in the order
 in which they were proposed, and the trials that came back, say all there is to know:
@@ -151,7 +151,7 @@ def standing(
     last = history[-1] if history else None
 
     def state(phase: Phase, sentence: str, **more: object) -> Standing:
-        fields = dict(outstanding=None, missing=0, step=None, caution=0) | more
+        fields = {"outstanding": None, "missing": 0, "step": None, "caution": 0} | more
         return Standing(
             phase,
             iteration,
@@ -182,7 +182,12 @@ def standing(
                 f"the first policy crashed {failed} times, designed more gently each time: the "
                 "model is too far off to start from; mend it (fit, diagnose) and propose again",
             )
-        return state("propose", "the model's own policy comes first", step=options.first_step(), caution=failed)
+        return state(
+            "propose",
+            "the model's own policy comes first",
+            step=options.first_step(),
+            caution=failed,
+        )
     own = incumbent.candidate.id
     step = _next_step(history, incumbent, options, model)
     if step is None:

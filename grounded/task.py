@@ -103,8 +103,9 @@ class Task:
             bad = ~np.isfinite(self.target[:, i])
             if weighted[i] and bad.any():
                 raise GroundedError(
-                    f"[reward] weighs state '{name}', but the target has no value for it at step "
-                    f"{int(np.argmax(bad))}: add the column '{name}' to the target or drop the weight"
+                    f"[reward] weighs state '{name}', but the target has no value for it at "
+                    f"step {int(np.argmax(bad))}: add the column '{name}' to the target or drop "
+                    "the weight"
                 )
         if not np.isfinite(self.start).all():
             raise GroundedError(f"task: the start state must be finite, got {self.start.tolist()}")
@@ -116,8 +117,10 @@ class Task:
 
     @cached_property
     def hash(self) -> str:
-        """16 hex digits over all that the utility of a real trial depends on; not the model's
-        parameters, which may change while the task stays."""
+        """16 hex digits over all that the utility of a real trial depends on.
+
+        Not the model's parameters, which may change while the task stays.
+        """
         digest = hashlib.sha256()
         digest.update(repr((self.model.state_names, self.model.input_names)).encode())
         digest.update(repr((float(self.dt), self.feedback)).encode())

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from grounded.errors import GroundedError
 from grounded.frozen import Array, readonly
@@ -33,7 +34,9 @@ class Trial:
         states, inputs = readonly(self.states), readonly(self.inputs)
         n, m = len(self.state_names), len(self.input_names)
         if states.ndim != 2 or states.shape[1] != n:
-            raise GroundedError(f"a trial of {n} states needs an array (T+1, {n}), got {states.shape}")
+            raise GroundedError(
+                f"a trial of {n} states needs an array (T+1, {n}), got {states.shape}"
+            )
         if inputs.shape != (len(states) - 1, m):
             raise GroundedError(
                 f"a trial of {len(states)} states and {m} inputs needs inputs of shape "
@@ -52,6 +55,6 @@ class Trial:
     @property
     def finite_steps(self) -> int:
         """Steps before the first state or input that is not a finite number."""
-        bad = ~np.isfinite(self.states).all(axis=1)
+        bad: NDArray[np.bool_] = np.asarray(~np.isfinite(self.states).all(axis=1))
         bad[:-1] |= ~np.isfinite(self.inputs).all(axis=1)
         return int(np.argmax(bad)) - 1 if bad.any() else self.steps

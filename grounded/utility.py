@@ -35,7 +35,8 @@ class Reward:
             weights = readonly(getattr(self, name))
             if not np.isfinite(weights).all() or (weights < 0).any():
                 raise GroundedError(
-                    f"[reward] {name}: weights must be finite and not negative, got {weights.tolist()}"
+                    f"[reward] {name}: weights must be finite and not negative, got "
+                    f"{weights.tolist()}"
                 )
             object.__setattr__(self, name, weights)
 

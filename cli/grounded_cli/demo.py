@@ -26,9 +26,10 @@ def command(name: str, folder: str | None, json_: bool) -> None:
     `grounded init --list` lists the examples. The optimum is found afterwards with the TRUE model,
     which the search never sees.
     """
-    from grounded.errors import GroundedError
     from grounded_trials.examples import example, write_example
     from grounded_trials.workspace import Workspace
+
+    from grounded.errors import GroundedError
 
     example(name)
     target = Path(folder or f"demo-{name}")
@@ -62,10 +63,14 @@ def _tell(document: dict[str, Any]) -> None:
     utilities = document["utilities"]
     improvement = 1 - utilities[-1] / utilities[0]
     show(
-        f"\nutility    {number(utilities[0])} by the model's own policy, {number(utilities[-1])} after "
-        f"{document['trials']} trials: {100 * improvement:.1f} % better"
+        f"\nutility    {number(utilities[0])} by the model's own policy, "
+        f"{number(utilities[-1])} after {document['trials']} trials: "
+        f"{100 * improvement:.1f} % better"
     )
-    show(f"optimum    {number(document['optimum'])}, planned with the true model (never shown to the search)")
+    show(
+        f"optimum    {number(document['optimum'])}, planned with the true model "
+        "(never shown to the search)"
+    )
     if document["verdict"]:
         show(f"gap        {document['verdict']['sentence']}")
     for kind, path in document["paths"].items():

@@ -71,7 +71,9 @@ def _tell(name: str, one: Ingested) -> None:
             False: "no improvement",
             None: "more trials of it are needed ([search] repeats)",
         }[one.accepted]
-        show(f"{name} {known} {one.trial}: {one.candidate}, utility {number(one.utility)}, {verdict}")
+        show(
+            f"{name} {known} {one.trial}: {one.candidate}, utility {number(one.utility)}, {verdict}"
+        )
     if one.signals:
         rows = [
             (

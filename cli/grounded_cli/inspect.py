@@ -54,8 +54,9 @@ def command(log: str, folder: str | None, json_: bool) -> None:
 
 
 def _mapping(report: LogReport, folder: str | None) -> str:
-    from grounded.errors import GroundedError
     from grounded_trials.inspect_guess import guess_mapping, is_simulated, mapping_toml
+
+    from grounded.errors import GroundedError
 
     try:
         model = open_workspace(folder).base_model
@@ -72,9 +73,7 @@ def _document(report: LogReport, mapping: str) -> dict[str, Any]:
         "library": report.library,
         "duration_s": report.duration_s,
         "messages": report.messages,
-        "topics": [
-            vars(t) | {"fields": [vars(f) for f in t.fields]} for t in report.topics
-        ],
+        "topics": [vars(t) | {"fields": [vars(f) for f in t.fields]} for t in report.topics],
         "remarks": list(report.remarks),
         "damage": report.damage,
         "log_table": mapping,

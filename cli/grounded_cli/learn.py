@@ -12,8 +12,9 @@ from grounded_cli.status import as_document, summary
 from grounded_cli.terminal import number, progress, say, show, show_json
 
 if TYPE_CHECKING:
-    from grounded.search import Standing
     from grounded_trials.workspace import Workspace
+
+    from grounded.search import Standing
 
 
 @click.command("learn")
@@ -21,14 +22,18 @@ if TYPE_CHECKING:
 @in_workspace
 @as_json
 def command(trials: int | None, folder: str | None, json_: bool) -> None:
-    """Propose, run and ingest until the search ends; stopped at any moment, it goes on from there."""
+    """Propose, run and ingest until the search ends; stopped at any moment, it can go on."""
     workspace = open_workspace(folder)
     standing = learn_in(workspace, trials)
     if json_:
         show_json(as_document(standing))
         return
     show(summary(standing))
-    show("\nnext: grounded report --html" if standing.phase != "propose" else "\nnext: grounded learn")
+    show(
+        "\nnext: grounded report --html"
+        if standing.phase != "propose"
+        else "\nnext: grounded learn"
+    )
 
 
 def learn_in(workspace: Workspace, trials: int | None = None) -> Standing:

@@ -72,13 +72,17 @@ def _tell(workspace: Workspace, proposed: Proposed) -> None:
     best = standing.incumbent
     waiting = "" if proposed.proposal.is_new else " (proposed before, its trial is missing)"
     show(f"Run {candidate.id}{waiting}: {proposed.file}")
-    what = "the model's own policy" if not candidate.base else (
-        f"iteration {candidate.iteration}, alpha = {candidate.alpha:g} from {candidate.base}"
+    what = (
+        "the model's own policy"
+        if not candidate.base
+        else (f"iteration {candidate.iteration}, alpha = {candidate.alpha:g} from {candidate.base}")
     )
     if candidate.caution:
         what += f", designed more gently after {candidate.caution} crash(es)"
     show(f"  what       {what}, {task.horizon * task.dt:g} s")
-    show(f"  predicted  utility {number(candidate.predicted_utility)}", )
+    show(
+        f"  predicted  utility {number(candidate.predicted_utility)}",
+    )
     if best is not None:
         show(f"  so far     best {best.candidate.id} with {number(best.utility)}")
     show(f"  trust      {_trust(workspace, proposed)}")
@@ -102,9 +106,8 @@ def _trust(workspace: Workspace, proposed: Proposed) -> str:
     if not pairs:
         return "unknown: the crude model was never compared with the real system"
     predicted, real = pairs[-1]
-    return (
-        f"the last prediction was {number(predicted)}, the real run gave {number(real)}"
-        + (f" ({len(pairs)} candidates so far)" if len(pairs) > 1 else "")
+    return f"the last prediction was {number(predicted)}, the real run gave {number(real)}" + (
+        f" ({len(pairs)} candidates so far)" if len(pairs) > 1 else ""
     )
 
 

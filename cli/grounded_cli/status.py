@@ -27,7 +27,8 @@ def command(folder: str | None, json_: bool) -> None:
         show_json(as_document(standing))
         return
     show(summary(standing))
-    show(f"\nnext: {next_command(standing, bool(workspace.config.system.command or workspace.config.system.model))}")
+    system = workspace.config.system
+    show(f"\nnext: {next_command(standing, bool(system.command or system.model))}")
 
 
 def as_document(standing: Standing) -> dict[str, Any]:
@@ -92,7 +93,11 @@ def summary(standing: Standing) -> str:
         gain = (best.utility - first) / abs(first) if first else 0.0
         lines.append(
             f"best       {best.candidate.id}, utility {number(best.utility)}"
-            + (f", {100 * gain:.1f} % better than the model's own policy" if standing.iteration else "")
+            + (
+                f", {100 * gain:.1f} % better than the model's own policy"
+                if standing.iteration
+                else ""
+            )
         )
     if sure := certainty(standing):
         lines.append(f"certainty  {sure}")

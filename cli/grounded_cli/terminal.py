@@ -96,6 +96,4 @@ def sparkline(values: Sequence[float]) -> str:
     low, high = min(known), max(known)
     bars = "▁▂▃▄▅▆▇█"
     span = (high - low) or 1.0
-    return "".join(
-        bars[round((v - low) / span * 7)] if math.isfinite(v) else "x" for v in values
-    )
+    return "".join(bars[round((v - low) / span * 7)] if math.isfinite(v) else "x" for v in values)

@@ -43,8 +43,7 @@ def _path(name: str) -> tuple[_Profile, float]:
 
 
 def target(name: str, wheelbase: float = 0.15) -> Array:
-    """States to follow, (H + 1, 6), in the order of `grounded.models.car`; delta and psi_rate are
-    filled in too."""
+    """States to follow, (H + 1, 6), in the order of `grounded.models.car`, none left free."""
     profile, duration = _path(name)
     H = round(duration / DT)
     ends = np.cumsum([length for length, _, _ in profile])

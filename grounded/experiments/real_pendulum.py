@@ -1,4 +1,4 @@
-"""A simulated REAL pendulum: heavier than the model thinks, with Coulomb friction in its bearing."""
+"""A simulated REAL pendulum: heavier than the model thinks, with dry friction in its bearing."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """A torque-driven pendulum: the smallest example.
 
-    theta'' = (torque - b theta') / (m l^2) - (g / l) sin(theta),      theta = 0 hangs down
+theta'' = (torque - b theta') / (m l^2) - (g / l) sin(theta),      theta = 0 hangs down
 """
 
 from __future__ import annotations

@@ -138,13 +138,13 @@ def _search(table: Table) -> Options:
     defaults = Options()
     method = table.choice("method", ("ddp", "policy-gradient"), defaults.method)
     step = table.choice("step", ("damped", "full"), defaults.step)
-    options = dict(
-        refit=table.take("refit", bool, defaults.refit),
-        max_halvings=table.take("max_halvings", int, defaults.max_halvings),
-        repeats=table.take("repeats", int, defaults.repeats),
-        max_trials=table.take("max_trials", int, defaults.max_trials),
-        tolerance=table.take("tolerance", float, defaults.tolerance),
-    )
+    options = {
+        "refit": table.take("refit", bool, defaults.refit),
+        "max_halvings": table.take("max_halvings", int, defaults.max_halvings),
+        "repeats": table.take("repeats", int, defaults.repeats),
+        "max_trials": table.take("max_trials", int, defaults.max_trials),
+        "tolerance": table.take("tolerance", float, defaults.tolerance),
+    }
     table.finish()
     try:
         return Options(method=method, step=step, **options)  # type: ignore[arg-type]

@@ -28,7 +28,7 @@ class Example:
     optimum: str = ""  # import name of `optimum() -> float`, for the demo
 
 
-_REAL_CAR = '''"""The simulated REAL car: stands in for your robot. Nothing in here is known to the search."""
+_REAL_CAR = '''"""The simulated REAL car, in place of your robot. The search never sees it."""
 
 from grounded.experiments.real_car import LATENCY, real_car
 
@@ -36,7 +36,7 @@ model = real_car()
 latency = LATENCY  # [s]; the crude model's task assumes 0.1
 '''
 
-_REAL_AIRCRAFT = '''"""The simulated REAL aircraft: parameters that the crude model does not have."""
+_REAL_AIRCRAFT = '''"""The simulated REAL aircraft: other parameters than the crude model's."""
 
 import numpy as np
 
@@ -47,7 +47,7 @@ model = perturbed(aircraft.model, np.random.default_rng(4))
 substeps = 1
 '''
 
-_REAL_PENDULUM = '''"""The simulated REAL pendulum: heavier, and with dry friction in its bearing."""
+_REAL_PENDULUM = '''"""The simulated REAL pendulum: heavier, with dry friction in its bearing."""
 
 from grounded.experiments.real_pendulum import model
 '''
@@ -79,7 +79,9 @@ def _pendulum() -> Task:
 
 _CAR = "grounded.models.car"
 EXAMPLES: Mapping[str, Example] = {
-    "car-turn": Example("RC car, open loop: a quarter turn from standstill", _car("turn"), _CAR, _REAL_CAR),
+    "car-turn": Example(
+        "RC car, open loop: a quarter turn from standstill", _car("turn"), _CAR, _REAL_CAR
+    ),
     "car-circle": Example(
         "RC car, closed loop: 1.4 m/s on a 1 m circle", _car("circle"), _CAR, _REAL_CAR
     ),
@@ -177,14 +179,15 @@ def toml_of(task: Task, name: str) -> str:
         "",
         "[model]",
         'file = "model.py"             # the crude model, plain NumPy',
-        f"smoothing = {_number(task.smoothing)}              # width over which planning blends np.where, abs ...",
+        f"smoothing = {_number(task.smoothing)}              # width over which planning blends "
+        "np.where, abs ...",
         "",
         "[task]",
         f"dt = {_number(task.dt)}                     # [s] control interval",
         f"horizon = {task.horizon}                 # steps",
         'target = "target.csv"         # states without a column are free',
         f"start = {_table(start)}",
-        f"feedback = {'true' if task.feedback else 'false'}               # false: an open-loop sequence of inputs",
+        f"feedback = {'true' if task.feedback else 'false'}               # false: open loop",
         f"latency = {_table(latency)}",
         "",
         "[reward]                      # quadratic weights; utility = -sum",
@@ -200,7 +203,7 @@ def toml_of(task: Task, name: str) -> str:
         "max_trials = 40",
         "",
         "[system]                      # how `grounded run` reaches the real system",
-        'model = "real.py"             # simulated; your robot: command = "python drive.py {candidate} {trial}"',
+        'model = "real.py"             # yours: command = "python drive.py {candidate} {trial}"',
         "seed = 0",
         "",
     ]

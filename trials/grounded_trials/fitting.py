@@ -56,8 +56,8 @@ def fit_trials(workspace: Workspace, names: Sequence[str] | None, *, latency: bo
 def apply_fit(workspace: Workspace, found: Fit) -> None:
     """Writes all fitted values (and a fitted latency) to grounded.toml.
 
-    Those that the data do not identify by themselves go too: the others were fitted beside them, and
-    only together do they predict what was measured.
+    Those that the data do not identify by themselves go too: the others were fitted beside them,
+    and only together do they predict what was measured.
     """
     base = workspace.base_model
     values = {

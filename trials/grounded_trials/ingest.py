@@ -67,7 +67,7 @@ def ingest_log(
     kind = "" if path.is_dir() else kind_of(path)
     if kind == CANDIDATE:
         raise GroundedError(
-            f"{path} is a candidate, the policy to run, not the trial that came back from running it"
+            f"{path} is a candidate, the policy to run, not the trial that came back from it"
         )
     if candidate is not None and data:
         raise GroundedError("--data is for a log that ran no candidate; drop it or --candidate")
@@ -125,7 +125,9 @@ def _own(workspace: Workspace, path: Path, candidate: str | None, data: bool) ->
     if data:
         if not trial.candidate:
             return _Read(trial, content)
-        about = {k: v for k, v in meta.items() if k in ("system", "source", "source_sha256", "estimated")}
+        about = {
+            k: v for k, v in meta.items() if k in ("system", "source", "source_sha256", "estimated")
+        }
         about |= {"kind": "data", "ran": trial.candidate}
         trial = replace(trial, candidate="")
         return _Read(trial, _encode(workspace, trial, about, None))
@@ -151,8 +153,8 @@ def _check_candidate(
     """The candidate must be one of this workspace and task, the policy the one in its file."""
     if candidate not in workspace.candidate_ids():
         raise GroundedError(
-            f"{path} ran {candidate}, which this workspace never proposed; take it in with --data to "
-            "use it for fitting and diagnosis"
+            f"{path} ran {candidate}, which this workspace never proposed; take it in with --data "
+            "to use it for fitting and diagnosis"
         )
     own = workspace.task.hash
     _, meta = workspace.candidate(candidate)

@@ -68,7 +68,10 @@ def _next_run(folder: Path, identity: str) -> Path:
 
 def _call(workspace: Workspace, command: str, identity: str, path: Path) -> None:
     """The user's command, its output passed on to stderr."""
-    words = {"candidate": str(workspace.candidate_path(identity).resolve()), "trial": str(path.resolve())}
+    words = {
+        "candidate": str(workspace.candidate_path(identity).resolve()),
+        "trial": str(path.resolve()),
+    }
     for name in words:
         if "{" + name + "}" not in command:
             raise GroundedError(f"[system] command must contain {{{name}}}, found: {command}")
@@ -83,9 +86,7 @@ def _call(workspace: Workspace, command: str, identity: str, path: Path) -> None
             f"[system] command ended with exit code {done.returncode}: {shlex.join(parts)}{hint}"
         )
     if not path.exists():
-        raise GroundedError(
-            f"[system] command ended well but wrote no trial to {{trial}} = {path}"
-        )
+        raise GroundedError(f"[system] command ended well but wrote no trial to {{trial}} = {path}")
 
 
 def _simulate(workspace: Workspace, identity: str, path: Path) -> None:

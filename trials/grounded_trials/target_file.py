@@ -23,7 +23,7 @@ def read_target(path: Path) -> tuple[list[str], Array]:
         with path.open(newline="", encoding="utf-8-sig") as stream:
             reader = csv.reader(stream)
             names = [name.strip() for name in next(reader, [])]
-            rows = []
+            rows: list[list[float]] = []
             for line, row in enumerate(reader, start=2):
                 if not any(cell.strip() for cell in row):
                     continue
@@ -43,7 +43,8 @@ def read_target(path: Path) -> tuple[list[str], Array]:
 def _numbers(path: Path, line: int, names: list[str], row: list[str]) -> list[float]:
     if len(row) != len(names):
         raise GroundedError(
-            f"{path.name} line {line}: {len(row)} values for {len(names)} columns ({', '.join(names)})"
+            f"{path.name} line {line}: {len(row)} values for {len(names)} columns "
+            f"({', '.join(names)})"
         )
     values = []
     for name, cell in zip(names, row, strict=True):
@@ -79,8 +80,8 @@ def target_arrays(
             )
     if len(values) < horizon + 1:
         raise GroundedError(
-            f"{path.name} has {len(values)} rows, a horizon of {horizon} steps needs {horizon + 1}: "
-            f"add rows or set [task] horizon = {max(len(values) - 1, 0)}"
+            f"{path.name} has {len(values)} rows, a horizon of {horizon} steps needs "
+            f"{horizon + 1}: add rows or set [task] horizon = {max(len(values) - 1, 0)}"
         )
     t = values[: horizon + 1, 0]
     off = np.abs(t - t[0] - dt * np.arange(horizon + 1))

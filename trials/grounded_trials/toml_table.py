@@ -1,4 +1,4 @@
-"""A TOML table that is taken apart key by key, so that what is left over is a mistake of the user's.
+"""A TOML table that is taken apart key by key: what is left over is a mistake of the user's.
 
 Every complaint names the file, the key with its table, what was found, and what would be right.
 """

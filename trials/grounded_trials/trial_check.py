@@ -28,15 +28,15 @@ def warnings_about(workspace: Workspace, trial: Trial) -> tuple[str, ...]:
     if whole.finite_steps < whole.steps:
         i = int(np.argmax(~np.isfinite(whole.states[whole.finite_steps + 1 :]).all(axis=0)))
         found.append(
-            f"'{whole.state_names[i]}' is not a finite number from {(whole.finite_steps + 1) * trial.dt:.2f}"
-            " s on: the trial counts as ended there"
+            f"'{whole.state_names[i]}' is not a finite number from "
+            f"{(whole.finite_steps + 1) * trial.dt:.2f} s on: the trial counts as ended there"
         )
     if not trial.candidate:
         return tuple(found)
     if whole.steps < task.horizon:
         found.append(
-            f"the run ended after {whole.steps} of {task.horizon} steps ({whole.steps * trial.dt:.2f}"
-            " s): a failed candidate; its data stay usable for fit and diagnose"
+            f"the run ended after {whole.steps} of {task.horizon} steps "
+            f"({whole.steps * trial.dt:.2f} s): a failed candidate; its data stay usable for fit and diagnose"
         )
     found += _start(task, whole)
     found += _inputs(task, whole)

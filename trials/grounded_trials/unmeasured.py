@@ -4,8 +4,9 @@
     measured = { x = 0.002, y = 0.002, psi = 0.005 }   # standard deviation of each measured state
     process = { v = 0.05 }                             # optional, a control step; else estimated
 
-The measured states of [log] are filtered forth and back through the crude model, whose process noise
-is estimated from the same log by maximum likelihood. Measured states stay as they were measured.
+The measured states of [log] are filtered forth and back through the crude model, whose process
+noise is estimated from the same log by maximum likelihood. Measured states stay as they
+were measured.
 """
 
 from __future__ import annotations
@@ -95,7 +96,7 @@ def _smoothed(
 
     model, task = workspace.base_model, workspace.base_task
     dt = task.dt
-    times = dt * np.arange(len(found.states))
+    times = np.arange(len(found.states), dtype=np.float64) * dt
     record = Record(
         times=times,
         measured=found.states,
@@ -114,8 +115,8 @@ def _smoothed(
     smooth = smooth_trials(model, [record], noise, **options)[0]  # type: ignore[arg-type]
     if not np.isfinite(smooth.states).all():
         raise GroundedError(
-            f"the smoother finds no finite states for this log ({smooth.status}): the crude model is "
-            "too far off to tell what was not measured; check its units and the [log] mapping"
+            f"the smoother finds no finite states for this log ({smooth.status}): the crude model "
+            "is too far off to tell what was not measured; check its units and the [log] mapping"
         )
     states = np.array(smooth.states)
     for column, name in enumerate(measured):

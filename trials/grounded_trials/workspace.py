@@ -182,7 +182,7 @@ class Workspace:
             yield StoredTrial(stored, bridge(replace(trial, id=stored.id)).trial, meta)
 
     def estimated_states(self) -> tuple[str, ...]:
-        """States that some stored trial did not measure: its smoother's, not evidence of their own."""
+        """States that some stored trial did not measure: the smoother's, no evidence."""
         found = {n for t in self.trials() for n in t.meta.get("estimated", "").split(",") if n}
         return tuple(name for name in self.base_model.state_names if name in found)
 
