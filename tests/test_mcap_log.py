@@ -187,3 +187,88 @@ def test_reading_needs_no_mcap_and_no_protobuf() -> None:
     )
     source = trial_bytes(a_trial(), {})
     subprocess.run([sys.executable, "-c", code], input=source, check=True)
+
+
+def with_metadata(source: bytes, key: str, value: str | None) -> bytes:
+    """The same file, sound in itself, with one entry changed: a stranger's, or a mistake."""
+    from grounded_trials.mcap_records import (
+        Attachment,
+        Channel,
+        Header,
+        Messages,
+        Metadata,
+        Schema,
+    )
+    from grounded_trials.mcap_walk import read_records
+    from grounded_trials.mcap_writer import CopyWriter
+
+    stream = io.BytesIO()
+    copy = CopyWriter(stream, Header("", "grounded"), compressed=False)
+    schemas: dict[int, Schema] = {}
+    numbers: dict[int, int] = {}
+    for r in read_records(io.BytesIO(source), "file"):
+        if isinstance(r, Metadata):
+            table = {k: v for k, v in r.data.items() if k != key}
+            copy.metadata(Metadata(r.name, table if value is None else {**table, key: value}))
+        elif isinstance(r, Attachment):
+            copy.attachment(r)
+        elif isinstance(r, Schema):
+            schemas[r.id] = r
+        elif isinstance(r, Channel):
+            numbers[r.id] = copy.channel(r, schemas[r.schema_id])
+        elif isinstance(r, Messages):
+            for identity in np.unique(r.channels).tolist():
+                copy.messages(r.take(r.channels == identity), numbers[identity])
+    copy.finish()
+    return stream.getvalue()
+
+
+NASTY = ["", "x", "-1", "0", "1e999", "nan", "inf", "null", "[]", "{}", "[[[1]]]", "[1e999, 2]"]
+NASTY += ['{"a": 1}', "[" * 10_000, '["a", "b"]', "[NaN, NaN]", "9" * 30, "\u0663", "-0.0", "0.05"]
+NASTY += ['{"v": "m/s", "x": "m", "psi": 3}', '{"depths": [1e300, -1], "low": 3}']
+
+
+@pytest.mark.parametrize("value", [None, *NASTY])
+def test_a_strangers_metadata_is_read_or_refused_with_a_message(value: str | None) -> None:
+    trial = trial_bytes(a_trial(4), {})
+    candidate = candidate_bytes(a_policy(), np.zeros((21, 3)), np.zeros((20, 2)), {})
+    for key in ("dt", "states", "inputs", "candidate", "start_inputs", "start_ns"):
+        try:
+            found, _, _ = read_trial(with_metadata(trial, key, value))
+        except GroundedError as error:
+            assert len(str(error)) < 500
+        else:
+            assert found.steps == 4 and found.dt > 0
+    table = json.loads(read_candidate(candidate)[3]["policy"])
+    for key in ("dt", "states", "inputs", "steps", "policy", *table):
+        changed = value
+        if key in table:
+            try:
+                inner = {**table, key: json.loads(value or "null")}
+            except (ValueError, RecursionError):
+                continue
+            key, changed = "policy", json.dumps(inner)
+        try:
+            policy, _, _, _ = read_candidate(with_metadata(candidate, key, changed))
+        except GroundedError as error:
+            assert len(str(error)) < 500
+        else:
+            assert policy.horizon == 20 and np.isfinite(policy.feedforward).all()
+
+
+def test_a_file_without_its_checksum_is_refused() -> None:
+    from mcap.writer import Writer
+
+    stream = io.BytesIO()
+    writer = Writer(stream)
+    writer.start()
+    writer.add_metadata("grounded", {"format": "grounded trial 1"})
+    writer.finish()
+    with pytest.raises(GroundedError, match="checksum is missing"):
+        read_trial(stream.getvalue())
+
+
+def test_a_candidate_that_lost_its_end_is_refused() -> None:
+    candidate = candidate_bytes(a_policy(), np.zeros((21, 3)), np.zeros((20, 2)), {})
+    with pytest.raises(GroundedError, match="a policy of 21 steps needs 21 messages"):
+        read_candidate(with_metadata(candidate, "steps", "21"))

@@ -12,8 +12,10 @@ import numpy as np
 from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.policy import Policy
-from grounded_trials.own_files import CANDIDATE, Meta, Target, Units, read_own
+from grounded_trials.own_files import CANDIDATE, Meta, OwnFile, Target, Units, read_own
 from grounded_trials.own_files_write import deliver, rows, with_meta, with_units
+
+DEPTH_LIMIT = 10_000  # past values of one input
 
 
 def candidate_bytes(
@@ -110,7 +112,7 @@ def read_candidate(
     states, inputs = own.names("states"), own.names("inputs")
     table = own.json("policy", dict)
     n, m = len(states), len(inputs)
-    depths = tuple(int(d) for d in own.floats(table.get("depths"), "policy.depths", m))
+    depths = _depths(own, own.floats(table.get("depths"), "policy.depths", m))
     nz = n + sum(depths)
     lists = own.lists("/policy", {"feedforward": m, "gain": m * nz, "reference": nz})
     feedforward, gain, reference = lists
@@ -150,6 +152,14 @@ z = the measured states, then for each input its depths[j] last sent values, new
 Differences of states marked in `angles` are wrapped to [-pi, pi]. Names, units, limits: see the
 metadata record `grounded`.
 """
+
+
+def _depths(own: OwnFile, depths: Array) -> tuple[int, ...]:
+    if not all(d.is_integer() and 0 <= d <= DEPTH_LIMIT for d in depths.tolist()):
+        raise GroundedError(
+            f"{own.name}: its metadata 'policy.depths' must be integers from 0 to {DEPTH_LIMIT}"
+        )
+    return tuple(int(d) for d in depths)
 
 
 def _policy_table(policy: Policy) -> dict[str, Any]:

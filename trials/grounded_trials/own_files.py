@@ -82,7 +82,7 @@ class OwnFile:
             value = math.nan
         if not (math.isfinite(value) and value > 0):
             raise GroundedError(
-                f"{self.name}: its metadata '{key}' is '{text}', not a positive number"
+                f"{self.name}: its metadata '{key}' is '{text[:40]}', not a positive number"
             )
         return value
 
@@ -130,7 +130,9 @@ class OwnFile:
         """An integer of the table that is not negative."""
         text = self.entry(key)
         if not (text.isascii() and text.isdigit() and len(text) < 20):
-            raise GroundedError(f"{self.name}: its metadata '{key}' is '{text}', not an integer")
+            raise GroundedError(
+                f"{self.name}: its metadata '{key}' is '{text[:40]}', not an integer"
+            )
         return int(text)
 
     def _doubles(
@@ -152,7 +154,10 @@ class OwnFile:
 
     def names(self, key: str) -> list[str]:
         """The names of a JSON object of the table, in order."""
-        return list(self.json(key, dict))
+        table = self.json(key, dict)
+        if not table or not all(isinstance(unit, str) for unit in table.values()):
+            raise GroundedError(f"{self.name}: its metadata '{key}' must give each name a unit")
+        return list(table)
 
     def lists(self, topic: str, sizes: dict[str, int]) -> list[Array]:
         """Lists of a topic's messages, (N, size) each; (0, size) where no message has any."""

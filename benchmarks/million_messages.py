@@ -1,0 +1,108 @@
+"""A million nav_msgs/Odometry messages to arrays: CPU seconds, against decoders one by one.
+
+Run by hand: python benchmarks/million_messages.py [COUNT]. Peers are optional (rosbags,
+mcap-ros2-support); they read a twentieth of the messages and are scaled up.
+"""
+
+from __future__ import annotations
+
+import struct
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from grounded_trials.signals import SignalSpec, read_signals
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+
+PARTS = {
+    "": "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/PoseWithCovariance pose\n"
+    "geometry_msgs/TwistWithCovariance twist\n",
+    "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id\n",
+    "builtin_interfaces/Time": "int32 sec\nuint32 nanosec\n",
+    "geometry_msgs/PoseWithCovariance": "geometry_msgs/Pose pose\nfloat64[36] covariance\n",
+    "geometry_msgs/Pose": "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation\n",
+    "geometry_msgs/Point": "float64 x\nfloat64 y\nfloat64 z\n",
+    "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w\n",
+    "geometry_msgs/TwistWithCovariance": "geometry_msgs/Twist twist\nfloat64[36] covariance\n",
+    "geometry_msgs/Twist": "geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular\n",
+    "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z\n",
+}
+DEFINITION = ("=" * 80 + "\n").join(
+    (f"MSG: {name}\n" if name else "") + text for name, text in PARTS.items()
+)
+PATHS = {
+    "x": "/odom.pose.pose.position.x",
+    "y": "/odom.pose.pose.position.y",
+    "yaw": "/odom.pose.pose.orientation.@rpy.yaw",
+    "v": "/odom.twist.twist.linear.x",
+}
+
+
+def write(path: Path, count: int, *, chunked: bool) -> None:
+    """An Odometry message a millisecond, with a stamp and two frame names."""
+    rest = struct.pack("<85d", *range(85))
+    kind = CompressionType.ZSTD if chunked else CompressionType.NONE
+    with path.open("wb") as stream:
+        writer = Writer(stream, compression=kind, use_chunking=chunked)
+        writer.start("ros2")
+        schema = writer.register_schema("nav_msgs/msg/Odometry", "ros2msg", DEFINITION.encode())
+        channel = writer.register_channel("/odom", "cdr", schema)
+        for i in range(count):
+            stamp = struct.pack("<II", i // 1000, i % 1000 * 10**6)
+            names = struct.pack("<I5s3xI10s6x", 5, b"odom", 10, b"base_link")
+            writer.add_message(channel, i * 10**6, b"\0\1\0\0" + stamp + names + rest, i * 10**6)
+        writer.finish()
+
+
+def cpu(run: Callable[[], None]) -> float:
+    """CPU seconds of one run."""
+    start = time.process_time()
+    run()
+    return time.process_time() - start
+
+
+def one_by_one(path: Path) -> None:
+    """The decoder of the mcap project."""
+    from mcap_ros2.decoder import DecoderFactory
+
+    with path.open("rb") as stream:
+        for m in make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
+            _ = m.decoded_message.pose.pose.position.x
+
+
+def with_rosbags(path: Path) -> None:
+    """The rosbags package."""
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    with path.open("rb") as stream:
+        for _, _, message in make_reader(stream).iter_messages():
+            _ = store.deserialize_cdr(message.data, "nav_msgs/msg/Odometry").pose.pose.position.x
+
+
+def main() -> None:
+    """Prints a line a reader."""
+    count = int(sys.argv[1]) if len(sys.argv) > 1 else 1_000_000
+    with tempfile.TemporaryDirectory() as folder:
+        for chunked in (True, False):
+            path = Path(folder, "log.mcap")
+            write(path, count, chunked=chunked)
+            specs = {name: SignalSpec(text) for name, text in PATHS.items()}
+            took = cpu(lambda path=path, specs=specs: read_signals(path, specs))  # type: ignore[misc]
+            size = path.stat().st_size / 1e6
+            how = "zstd chunks" if chunked else "no chunks"
+            print(f"{count} messages, {how}, {size:.0f} MB: 4 signals in {took:.2f} s")
+        write(path, count // 20, chunked=True)
+        for name, run in (("mcap-ros2-support", one_by_one), ("rosbags", with_rosbags)):
+            try:
+                took = 20 * cpu(lambda run=run, path=path: run(path))  # type: ignore[misc]
+            except ImportError:
+                continue
+            print(f"{name}, one by one: {took:.1f} s (scaled)")
+
+
+if __name__ == "__main__":
+    main()
