@@ -19,8 +19,11 @@ from grounded.estimate import (
     smooth_trials,
 )
 from grounded.estimate.batch import batch_of
-from grounded.estimate.filter import fixed_steps, model_steps, run, sensitivity
+from grounded.estimate.filter import run, sensitivity
 from grounded.estimate.likelihood import _slope
+from grounded.estimate.recursion import recursion
+from grounded.estimate.smoother import smooth
+from grounded.estimate.steps import ModelSteps, fixed_steps
 from grounded.estimate.tracker import nearest_step
 from grounded.model import Model, Param
 from grounded.models.car import model as car
@@ -103,7 +106,7 @@ def test_a_linear_model_is_filtered_and_smoothed_exactly():
 def test_sensitivities_of_the_innovations_match_differences():
     _, trials = simulated(car, np.random.default_rng(1), CAR_NOISE, B=2, T=40)
     batch, measurement = batched(car, trials)
-    base = run(batch, measurement, CAR_NOISE, model_steps(car.system, car.values, batch))
+    base = run(batch, measurement, CAR_NOISE, ModelSteps(car.system, car.values, batch))
     F = np.stack(
         [car.system.sensitivities(base.x[t], batch.u[t], car.values, DT)[2] for t in range(40)]
     )
@@ -142,19 +145,49 @@ def test_slopes_by_the_variances_match_differences():
     lost[5:8, 0], lost[3] = np.nan, np.nan
     gappy = Trial(lost, trials[1].inputs, DT, SPRING.state_names, SPRING.input_names)
     batch, measurement = batched(SPRING, [trials[0], gappy, short])
-    base = run(batch, measurement, SPRING_NOISE, model_steps(SPRING.system, SPRING.values, batch))
+    base = run(batch, measurement, SPRING_NOISE, ModelSteps(SPRING.system, SPRING.values, batch))
 
     def at(theta):
         std = np.exp(theta / 2)
-        return run(batch, measurement, Noise(std[:2], std[2:], DT), fixed_steps(base))
+        noise = Noise(std[:2], std[2:], DT)
+        return noise, recursion(batch, measurement, noise, fixed_steps(base))
 
     theta = 2 * np.log(np.concatenate([SPRING_NOISE.process, SPRING_NOISE.measurement]))
-    slope = _slope(at(theta), batch, theta, DT)
+    noise, here = at(theta)
+    slope = _slope(here, batch, noise)
     for i in range(4):
         step = 1e-4 * np.eye(4)[i]
         assert slope[i] == pytest.approx(
-            (at(theta + step).loglik - at(theta - step).loglik) / 2e-4, rel=1e-5
+            (at(theta + step)[1].loglik - at(theta - step)[1].loglik) / 2e-4, rel=1e-5
         )
+
+
+@pytest.mark.parametrize("width", [1, 3, 9])
+def test_the_compiled_pass_is_the_recursion(width):
+    rng = np.random.default_rng(20)
+    _, trials = simulated(car, rng, CAR_NOISE, B=width, T=60, latency=0.1)
+    lost = trials[0].states.copy()
+    lost[20:25, 2:], lost[30, :2] = np.nan, np.nan
+    names = (car.state_names, car.input_names)
+    trials[0] = Trial(lost, trials[0].inputs, DT, *names)
+    trials[-1] = Trial(trials[-1].states[:41], trials[-1].inputs[:40], DT, *names)
+    batch, measurement = batched(car, trials, np.array([0.1, 0.07]))
+    steps = ModelSteps(car.system, car.values, batch)
+    plain = recursion(batch, measurement, CAR_NOISE, steps.at)
+    near = Noise(1.2 * CAR_NOISE.process, 0.9 * CAR_NOISE.measurement, DT)
+    fast = run(batch, measurement, CAR_NOISE, steps, recursion(batch, measurement, near, steps.at))
+    assert fast.done is not None
+    assert fast.loglik == pytest.approx(plain.loglik, abs=1e-3)
+    for name in ("x", "x_prior", "P_prior", "e", "A", "f", "P", "K", "C", "eps"):
+        a, b = getattr(fast, name), getattr(plain, name)
+        assert np.allclose(a, b, atol=1e-3 * np.abs(b).max()), name
+    one, two = smooth(fast, batch), smooth(plain, batch)
+    for name in ("x", "P", "process_slope", "measurement_slope", "start_slope"):
+        a, b = getattr(one, name), getattr(two, name)
+        assert np.allclose(a, b, atol=2e-3 * np.abs(b).max()), name
+    assert np.allclose(
+        _slope(fast, batch, CAR_NOISE), _slope(plain, batch, CAR_NOISE), rtol=1e-2, atol=0.1
+    )
 
 
 def test_padding_and_lost_samples_change_nothing_of_the_others():

@@ -14,8 +14,12 @@ recursion, driven by f_theta (and h_theta):
     D_{t+1} = A ((I-KH) D_t - K h_theta) + f_theta,      d eps_t / d theta = -C (H D_t + h_theta)
 
 so that a fit, and each candidate of the diagnosis, is a least-squares problem in eps
-(`sensitivity`). The linearisation may also be a fixed one, which makes the filter exact for the
-model f_t + A_t (x - track_t): the noise is estimated that way.
+(`sensitivity`).
+
+A pass is either the recursion itself (`recursion.py`) or its fixed point: the model is evaluated
+along a whole track in one call, a compiled linear filter runs about that track, and the filtered
+states are the next track. Sweep s is exact for the first s steps, and in practice everywhere after
+two or three, because a track of a neighbouring fit is at hand.
 
 Notation as above; arrays are time first, (T + 1, B, ...): see `grounded.estimate.batch`.
 Source: Särkkä, Bayesian Filtering and Smoothing (2013), ch. 5; Ljung, System Identification, ch. 7.
@@ -23,113 +27,96 @@ Source: Särkkä, Bayesian Filtering and Smoothing (2013), ch. 5; Ljung, System 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cached_property
-
 import numpy as np
 
-from grounded.compile import System
+from grounded.estimate import lanes
 from grounded.estimate.batch import Batch
+from grounded.estimate.filtered import Filtered
 from grounded.estimate.measurement import Measurement
 from grounded.estimate.noise import Noise
+from grounded.estimate.recursion import recursion
+from grounded.estimate.steps import ModelSteps
 from grounded.frozen import Array
 
-Advance = Callable[[int, Array], tuple[Array, Array]]  # t, x (B, n) -> f (B, n), A (B, n, n)
+SWEEPS = 8
+CLOSE = 1e-3  # standard deviations: a sweep that moves the track less is the last
 
 
-@dataclass(frozen=True, eq=False)
-class Filtered:
-    """Everything one pass leaves behind; `loglik` is minus infinity when it did not get through."""
+def run(
+    batch: Batch,
+    measurement: Measurement,
+    noise: Noise,
+    steps: ModelSteps,
+    about: Filtered | None = None,
+) -> Filtered:
+    """One pass over a batch. Never raises for numbers that run away: see `Filtered.status`.
 
-    x: Array  # (T + 1, B, n) filtered
-    P: Array  # (T + 1, B, n, n)
-    x_prior: Array  # predicted
-    P_prior: Array
-    e: Array  # (T + 1, B, ny) innovations, zero where not seen
-    C: Array  # (T + 1, B, ny, ny) whitening, lower triangular; identity rows where not seen
-    H: Array  # (T + 1, B, ny, n), zero rows where not seen
-    K: Array  # (T + 1, B, n, ny)
-    A: Array  # (T, B, n, n)
-    f: Array  # (T, B, n) what the model predicted from x
-    loglik: float
-    status: str = "filtered"
-
-    @cached_property
-    def eps(self) -> Array:
-        """Whitened innovations (T + 1, B, ny), zero where not seen."""
-        return np.asarray((self.C @ self.e[..., None])[..., 0])
-
-    @cached_property
-    def kept(self) -> Array:
-        """I - K H, what an update keeps of the prediction, (T + 1, B, n, n)."""
-        return np.asarray(np.eye(self.x.shape[-1]) - self.K @ self.H)
-
-
-def model_steps(system: System, p: Array, batch: Batch, smoothing: float = 0.0) -> Advance:
-    """The model itself, linearised at the filtered state: the extended Kalman filter."""
-    sizes = batch.steps_of
-
-    def advance(t: int, x: Array) -> tuple[Array, Array]:
-        u = batch.u[t]
-        if len(sizes) == 1:
-            h = sizes[0][0]
-            return system.step(x, u, p, h, smoothing), system.linearise(x, u, p, h, smoothing)[0]
-        f, A = x.copy(), np.tile(np.eye(x.shape[1]), (len(x), 1, 1))
-        for h, mask in sizes:
-            rows = np.flatnonzero(mask[t]) if mask is not None else np.arange(len(x))
-            if len(rows):
-                f[rows] = system.step(x[rows], u[rows], p, h, smoothing)
-                A[rows] = system.linearise(x[rows], u[rows], p, h, smoothing)[0]
-        return f, A
-
-    return advance
+    Args:
+        batch: the records.
+        measurement: ny channels.
+        noise: of process and measurements.
+        steps: the model.
+        about: a pass with nearly the same model and noise, where sweeps begin.
+    """
+    (T, B), n = batch.dt.shape, batch.start.shape[1]
+    if lanes.usable(T, n, measurement.ny):
+        if about is not None and about.x.shape == (T + 1, B, n):
+            track, xbar = about.x[:-1], about.x_prior
+        elif measurement.states == tuple(range(n)) and batch.seen[1:].all():
+            track, xbar = np.concatenate([batch.start[None], batch.y[1:-1]]), batch.y.copy()
+            xbar[0] = batch.start
+        else:
+            return recursion(batch, measurement, noise, steps.at)
+        found = _sweeps(batch, measurement, noise, steps, track, xbar)
+        if found is not None:
+            return found
+    return recursion(batch, measurement, noise, steps.at)
 
 
-def fixed_steps(filtered: Filtered) -> Advance:
-    """The linearisation of an earlier pass, f_t + A_t (x - x_t)."""
-
-    def advance(t: int, x: Array) -> tuple[Array, Array]:
-        A = filtered.A[t]
-        return filtered.f[t] + (A @ (x - filtered.x[t])[..., None])[..., 0], A
-
-    return advance
-
-
-def run(batch: Batch, measurement: Measurement, noise: Noise, advance: Advance) -> Filtered:
-    """One pass over a batch. Never raises for numbers that run away: see `Filtered.status`."""
-    T, B, n, ny = len(batch.dt), len(batch.lengths), batch.start.shape[1], measurement.ny
-    R = noise.measurement**2
-    Q = noise.process**2 / noise.dt
-    out = _room(T, B, n, ny)
-    x, P = batch.start, _start_covariance(batch, R)
-    scale, eye = batch.dt[..., None, None] * np.diag(Q), np.eye(n)
-    whole = bool(batch.valid.all())
+def _sweeps(
+    batch: Batch,
+    measurement: Measurement,
+    noise: Noise,
+    steps: ModelSteps,
+    track: Array,
+    xbar: Array,
+) -> Filtered | None:
+    """The fixed point, from a track (T, B, n) and predictions (T + 1, B, n); None: not found."""
+    B, n = track.shape[1:]
     with np.errstate(all="ignore"):
-        for t in range(T + 1):
-            out["x_prior"][t], out["P_prior"][t] = x, P
-            e, H, Rt = _seen(batch, measurement, R, t, x)
-            try:
-                C = np.linalg.inv(np.linalg.cholesky(H @ P @ H.transpose(0, 2, 1) + Rt))
-            except np.linalg.LinAlgError:
-                return _failed(out, t)
-            K = P @ H.transpose(0, 2, 1) @ C.transpose(0, 2, 1) @ C
-            kept = eye - K @ H
-            x = x + (K @ e[..., None])[..., 0]
-            P = kept @ P @ kept.transpose(0, 2, 1) + K @ Rt @ K.transpose(0, 2, 1)
-            for name, value in (("x", x), ("P", P), ("e", e), ("C", C), ("H", H), ("K", K)):
-                out[name][t] = value
-            if t == T:
-                break
-            f, A = advance(t, x)
-            if not whole:
-                f = np.where(batch.valid[t, :, None], f, x)
-                A = np.where(batch.valid[t, :, None, None], A, eye)
-            if not (np.isfinite(f).all() and np.isfinite(A).all()):
-                return _failed(out, t + 1)
-            out["f"][t], out["A"][t] = f, A
-            x, P = f, A @ P @ A.transpose(0, 2, 1) + scale[t]
-    return _filtered(out, _loglik(batch, out), "filtered")
+        for _ in range(SWEEPS):
+            f, A = steps.along(track)
+            H, e0 = _seen(batch, measurement, xbar)
+            if not all(np.isfinite(array).all() for array in (f, A, H, e0)):
+                return None
+            lin = lanes.linearised(batch, A, f, track, H, e0, xbar)
+            done = lanes.forward(lin, noise)
+            if not np.isfinite(done.loglik):
+                return None
+            x = lanes.unpack(done.out["x"], B, n)
+            x_prior = lanes.unpack(done.out["x_prior"], B, n)
+            P = lanes.unpack(done.out["P_prior"], B, n, n)
+            std = np.sqrt(np.abs(np.diagonal(P, axis1=-2, axis2=-1))) + 1e-12
+            moved = max(
+                float(np.max(np.abs(x[:-1] - track) / std[:-1])),
+                float(np.max(np.abs(x_prior - xbar) / std)),
+            )
+            if moved < CLOSE:
+                # f and e are those at the end of the sweep, to first order
+                f = f + (A @ (x[:-1] - track)[..., None])[..., 0]
+                e = e0 - (H @ (x_prior - xbar)[..., None])[..., 0]
+                R = np.where(batch.seen, noise.measurement**2, 1.0)
+                return Filtered(x, x_prior, P, e, H, R, A, f, done.loglik, "filtered", done)
+            track, xbar = x[:-1], x_prior
+    return None
+
+
+def _seen(batch: Batch, measurement: Measurement, x: Array) -> tuple[Array, Array]:
+    """H (T + 1, B, ny, n) and y - h(x) (T + 1, B, ny) along a track, zero where not seen."""
+    flat = x.reshape(-1, x.shape[-1])
+    e = measurement.innovation(batch.y, measurement.function(flat).reshape(batch.y.shape))
+    H = measurement.jacobian(flat).reshape(*batch.y.shape, x.shape[-1])
+    return H * batch.seen[..., None], np.where(batch.seen, e, 0.0)
 
 
 def sensitivity(filtered: Filtered, f_theta: Array, h_theta: Array | None = None) -> Array:
@@ -154,59 +141,3 @@ def sensitivity(filtered: Filtered, f_theta: Array, h_theta: Array | None = None
         D[t + 1] += drive[t]
     seen = filtered.H @ D
     return np.asarray(-filtered.C @ (seen if h_theta is None else seen + h_theta))
-
-
-def _start_covariance(batch: Batch, R: Array) -> Array:
-    channel = batch.start_channel
-    var = batch.start_var + np.where(channel >= 0, R[np.maximum(channel, 0)], 0.0)
-    return var[..., None] * np.eye(var.shape[1])
-
-
-def _seen(
-    batch: Batch, measurement: Measurement, R: Array, t: int, x: Array
-) -> tuple[Array, Array, Array]:
-    """Innovation (B, ny), H (B, ny, n) and R (B, ny, ny); a channel not seen says nothing."""
-    e = measurement.innovation(batch.y[t], measurement.function(x))
-    H = measurement.jacobian(x)
-    if t and batch.whole:
-        return e, H, np.broadcast_to(np.diag(R), (len(x), len(R), len(R)))
-    seen = batch.seen[t]
-    variance = np.where(seen, R, 1.0)
-    return np.where(seen, e, 0.0), H * seen[..., None], variance[..., None] * np.eye(len(R))
-
-
-def _room(T: int, B: int, n: int, ny: int) -> dict[str, Array]:
-    tails = {"x": (n,), "P": (n, n), "x_prior": (n,), "P_prior": (n, n), "e": (ny,)}
-    tails |= {"C": (ny, ny), "H": (ny, n), "K": (n, ny)}
-    room = {name: np.zeros((T + 1, B, *tail)) for name, tail in tails.items()}
-    return room | {"A": np.zeros((T, B, n, n)), "f": np.zeros((T, B, n))}
-
-
-def _loglik(batch: Batch, out: dict[str, Array]) -> float:
-    eps = (out["C"] @ out["e"][..., None])[..., 0]
-    log_det = np.log(np.diagonal(out["C"], axis1=-2, axis2=-1))  # of S^-1/2; zero where not seen
-    value = -0.5 * np.sum(eps**2) + np.sum(log_det[batch.seen])
-    value -= 0.5 * np.log(2 * np.pi) * batch.count
-    return float(value) if np.isfinite(value) else -np.inf
-
-
-def _failed(out: dict[str, Array], t: int) -> Filtered:
-    return _filtered(out, -np.inf, f"the filter left the finite numbers at step {t}")
-
-
-def _filtered(out: dict[str, Array], loglik: float, status: str) -> Filtered:
-    # Spelt out, so that the type checker sees each field.
-    return Filtered(
-        x=out["x"],
-        P=out["P"],
-        x_prior=out["x_prior"],
-        P_prior=out["P_prior"],
-        e=out["e"],
-        C=out["C"],
-        H=out["H"],
-        K=out["K"],
-        A=out["A"],
-        f=out["f"],
-        loglik=loglik,
-        status=status,
-    )

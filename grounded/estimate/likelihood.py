@@ -17,12 +17,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from grounded.compile import System
+from grounded.estimate import lanes
 from grounded.estimate.batch import Batch, batch_of
-from grounded.estimate.filter import Advance, Filtered, fixed_steps, model_steps, run
+from grounded.estimate.filter import run
+from grounded.estimate.filtered import Filtered
 from grounded.estimate.measurement import Measurement
 from grounded.estimate.noise import Noise
 from grounded.estimate.record import Record
+from grounded.estimate.recursion import recursion
 from grounded.estimate.smoother import smooth
+from grounded.estimate.steps import ModelSteps, fixed_steps
 from grounded.frozen import Array
 
 FLOOR = 1e-4  # of the visible scatter: below it a std is zero
@@ -62,8 +66,8 @@ def maximum_likelihood(
         start: where to begin, see `first_noise`.
         rounds: how often to linearise anew at most.
     """
-    advance = model_steps(system, p, batch)
-    noise, best = _expectation(batch, measurement, start, advance, FIRST_STEPS)
+    steps = ModelSteps(system, p, batch)
+    noise, best = _expectation(batch, measurement, start, steps, FIRST_STEPS)
     seen = np.zeros(len(start.process) + measurement.ny, dtype=bool)
     status = "converged"
     for round_ in range(rounds):
@@ -71,7 +75,7 @@ def maximum_likelihood(
             status = best.status
             break
         trial, seen = _climb(batch, measurement, noise, best, start)
-        after = run(batch, measurement, trial, advance)
+        after = run(batch, measurement, trial, steps, best)
         gain = after.loglik - best.loglik
         if gain > 0:
             noise, best = trial, after
@@ -86,27 +90,27 @@ def maximum_likelihood(
 
 
 def _expectation(
-    batch: Batch, measurement: Measurement, noise: Noise, advance: Advance, steps: int
+    batch: Batch, measurement: Measurement, noise: Noise, steps: ModelSteps, rounds: int
 ) -> tuple[Noise, Filtered]:
     """Expectation-maximisation: each variance becomes what the smoother expects of it.
 
     Slow near the end, but sure-footed far from it, where it also mends the track.
     """
-    best = run(batch, measurement, noise, advance)
+    best = run(batch, measurement, noise, steps)
     steps_seen = max(int(batch.valid.sum()), 1)
     samples = np.maximum(batch.seen.sum(axis=(0, 1)), 1)
-    for _ in range(steps):
+    for _ in range(rounds):
         if not np.isfinite(best.loglik):
             break
         n = len(noise.process)
         variance = np.concatenate([noise.process, noise.measurement]) ** 2
-        slope = _slope(best, batch, 2 * np.log(np.sqrt(variance)), noise.dt)
+        slope = _slope(best, batch, noise)
         # E[w^2] = q + 2 q (slope by log q) / count
         share = np.concatenate([np.full(n, steps_seen), samples])
         factor = np.clip(1 + 2 * slope / share, 1e-2, 1e2)
         std = np.sqrt(variance * factor)
         trial = Noise(std[:n], std[n:], noise.dt)
-        after = run(batch, measurement, trial, advance)
+        after = run(batch, measurement, trial, steps, best)
         if not after.loglik > best.loglik:
             break
         noise, best = trial, after
@@ -155,14 +159,21 @@ def _climb(
     from scipy.optimize import minimize
 
     n, dt = len(noise.process), noise.dt
-    advance = fixed_steps(about)
 
     def cost(theta: Array) -> tuple[float, Array]:
         std = np.exp(0.5 * theta)
-        filtered = run(batch, measurement, Noise(std[:n], std[n:], dt), advance)
-        if not np.isfinite(filtered.loglik):
+        there = Noise(std[:n], std[n:], dt)
+        if about.done is not None:
+            done = lanes.forward(about.done.linearised, there)
+            loglik = done.loglik
+            slope = lanes.variance_slopes(done, there) if np.isfinite(loglik) else None
+        else:
+            filtered = recursion(batch, measurement, there, fixed_steps(about))
+            loglik = filtered.loglik
+            slope = _slope(filtered, batch, there) if np.isfinite(loglik) else None
+        if slope is None:
             return 1e12, np.zeros_like(theta)
-        return -filtered.loglik / batch.count, -_slope(filtered, batch, theta, dt) / batch.count
+        return -loglik / batch.count, -slope / batch.count
 
     visible = np.concatenate([start.process, start.measurement])
     theta = 2 * np.log(np.concatenate([noise.process, noise.measurement]))
@@ -174,14 +185,16 @@ def _climb(
     return Noise(std[:n], std[n:], dt), found > low + 2.0
 
 
-def _slope(filtered: Filtered, batch: Batch, theta: Array, dt: float) -> Array:
+def _slope(filtered: Filtered, batch: Batch, noise: Noise) -> Array:
     """Slope of the log-likelihood by the log variances, (n + ny,)."""
+    if filtered.done is not None:
+        return lanes.variance_slopes(filtered.done, noise)
     back = smooth(filtered, batch)
-    by_q = np.sum(back.process_slope * batch.dt[..., None] / dt, axis=(0, 1))
+    by_q = np.sum(back.process_slope * batch.dt[..., None] / noise.dt, axis=(0, 1))
     by_r = np.sum(back.measurement_slope, axis=(0, 1))
     for c in range(len(by_r)):
         by_r[c] += back.start_slope[batch.start_channel == c].sum()
-    return np.concatenate([by_q, by_r]) * np.exp(theta)
+    return np.concatenate([by_q * noise.process**2, by_r * noise.measurement**2])
 
 
 def _spread(values: Array) -> float:

@@ -19,7 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from grounded.estimate.batch import Batch
-from grounded.estimate.filter import Filtered
+from grounded.estimate.filtered import Filtered
+from grounded.estimate.lanes import backward, unpack
 from grounded.frozen import Array
 
 
@@ -36,10 +37,30 @@ class Smoothed:
 
 def smooth(filtered: Filtered, batch: Batch) -> Smoothed:
     """One pass backwards over a filter pass that got through."""
+    B, n = filtered.x.shape[1:]
+    if filtered.done is not None:
+        back = backward(filtered.done)
+        r, N = unpack(back["ry"], B, n), unpack(back["Ny"], B, n, n)
+        by_r = unpack(back["r_slope"], B, filtered.R.shape[-1])
+    else:
+        r, N, by_r = _adjoints(filtered)
+    P = filtered.P_prior
+    slope = 0.5 * (r**2 - np.diagonal(N, axis1=-2, axis2=-1))
+    return Smoothed(
+        x=filtered.x_prior + (P @ r[..., None])[..., 0],
+        P=P - P @ N @ P,
+        process_slope=np.where(batch.valid[..., None], slope[1:], 0.0),
+        measurement_slope=np.where(batch.seen, by_r, 0.0),
+        start_slope=slope[0],
+    )
+
+
+def _adjoints(filtered: Filtered) -> tuple[Array, Array, Array]:
+    """r^- (T + 1, B, n), N^- (T + 1, B, n, n) and the slopes by R (T + 1, B, ny)."""
     T, (B, n) = len(filtered.A), filtered.x.shape[1:]
-    weight = filtered.C.transpose(0, 1, 3, 2) @ filtered.C  # S^-1, identity where not seen
-    drive = (filtered.C.transpose(0, 1, 3, 2) @ filtered.eps[..., None])[..., 0]  # S^-1 e
-    Ht = filtered.H.transpose(0, 1, 3, 2)
+    weight = filtered.C.swapaxes(-1, -2) @ filtered.C  # S^-1, identity where not seen
+    drive = (filtered.C.swapaxes(-1, -2) @ filtered.eps[..., None])[..., 0]  # S^-1 e
+    Ht = filtered.H.swapaxes(-1, -2)
     source, source_N = (Ht @ drive[..., None])[..., 0], Ht @ weight @ filtered.H
     r, N = np.zeros((T + 1, B, n)), np.zeros((T + 1, B, n, n))  # r^-, N^-
     after, after_N = np.zeros((T + 1, B, n)), np.zeros((T + 1, B, n, n))  # r_t, N_t
@@ -52,17 +73,7 @@ def smooth(filtered: Filtered, batch: Batch) -> Smoothed:
         kt = kept[t].transpose(0, 2, 1)
         r[t] = source[t] + (kt @ after[t][..., None])[..., 0]
         N[t] = source_N[t] + kt @ after_N[t] @ kept[t]
-    P = filtered.P_prior
-    Kt = filtered.K.transpose(0, 1, 3, 2)
+    Kt = filtered.K.swapaxes(-1, -2)
     z = drive - (Kt @ after[..., None])[..., 0]
     spread = weight + Kt @ after_N @ filtered.K
-    slope = 0.5 * (r**2 - np.diagonal(N, axis1=-2, axis2=-1))
-    return Smoothed(
-        x=filtered.x_prior + (P @ r[..., None])[..., 0],
-        P=P - P @ N @ P,
-        process_slope=np.where(batch.valid[..., None], slope[1:], 0.0),
-        measurement_slope=np.where(
-            batch.seen, 0.5 * (z**2 - np.diagonal(spread, axis1=-2, axis2=-1)), 0.0
-        ),
-        start_slope=slope[0],
-    )
+    return r, N, 0.5 * (z**2 - np.diagonal(spread, axis1=-2, axis2=-1))

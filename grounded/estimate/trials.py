@@ -9,12 +9,14 @@ import numpy as np
 
 from grounded.errors import GroundedError
 from grounded.estimate.batch import Batch, batch_of
-from grounded.estimate.filter import Filtered, model_steps, run
+from grounded.estimate.filter import run
+from grounded.estimate.filtered import Filtered
 from grounded.estimate.likelihood import NoiseEstimate, noise_of_records
 from grounded.estimate.measurement import Measurement, of_states
 from grounded.estimate.noise import Noise
 from grounded.estimate.record import Record, records_of
 from grounded.estimate.smoother import smooth
+from grounded.estimate.steps import ModelSteps
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.trial import Trial
@@ -123,8 +125,8 @@ def _passed(
     records = records_of(model, trials)
     delay = np.zeros(model.m) if latency is None else np.asarray(latency, float)
     batch = batch_of(records, measurement, model.n, delay)
-    advance = model_steps(model.system, model.values, batch)
-    return records, batch, run(batch, measurement, noise, advance), measurement
+    steps = ModelSteps(model.system, model.values, batch)
+    return records, batch, run(batch, measurement, noise, steps), measurement
 
 
 def _estimates(

@@ -68,7 +68,7 @@ def _step(
         delta, promise = direction(data, at.theta, slopes, free, damping)
         if promise < ENOUGH:
             return at, slopes, damping, "converged"
-        there = point(data, noise, data.unknowns.clipped(at.theta + delta))
+        there = point(data, noise, data.unknowns.clipped(at.theta + delta), at)
         if there.loglik > at.loglik:
             gain = there.loglik - at.loglik
             later = linear(data, there)

@@ -18,7 +18,9 @@ from numpy.typing import NDArray
 from grounded.compile import System
 from grounded.estimate import Measurement, Noise, Record
 from grounded.estimate.batch import Batch, batch_of
-from grounded.estimate.filter import Filtered, model_steps, run, sensitivity
+from grounded.estimate.filter import run, sensitivity
+from grounded.estimate.filtered import Filtered
+from grounded.estimate.steps import ModelSteps
 from grounded.fit.unknowns import Unknowns
 from grounded.frozen import Array
 
@@ -61,12 +63,13 @@ class Linear:
     block: NDArray[np.int64]  # (rows,) the piece of time that a row belongs to
 
 
-def point(data: Data, noise: Noise, theta: Array) -> Point:
-    """One pass of the filter at theta."""
+def point(data: Data, noise: Noise, theta: Array, near: Point | None = None) -> Point:
+    """One pass of the filter at theta; `near`: a point not far from it, which saves time."""
     batch = data.batch(theta)
     p = data.unknowns.unpack(theta)[0]
-    advance = model_steps(data.system, p, batch)
-    return Point(theta, batch, run(batch, data.measurement, noise, advance))
+    steps = ModelSteps(data.system, p, batch)
+    about = None if near is None else near.filtered
+    return Point(theta, batch, run(batch, data.measurement, noise, steps, about))
 
 
 def linear(data: Data, at: Point, blocks: int = 60) -> Linear:

@@ -180,7 +180,7 @@ def _search(data: Data, theta: Array, noise: Noise | None, rng: np.random.Genera
             status = "converged"
             break
         later = _noise(data, at.theta, noise, rng)
-        there = point(data, later, at.theta)
+        there = point(data, later, at.theta, at)
         if there.loglik > at.loglik:
             at, noise = there, later
     found = Climb(at, linear(data, at), 0, status)

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from grounded.estimate import Measurement, Noise, Record, noise_of, of_states
 from grounded.estimate.batch import Batch, batch_of
-from grounded.estimate.filter import model_steps, run
+from grounded.estimate.filter import run
 from grounded.estimate.record import records_of
 from grounded.estimate.smoother import smooth
+from grounded.estimate.steps import ModelSteps
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.trial import Trial
@@ -65,7 +66,7 @@ def prediction_error(
         options = {"latency": delay, "measurement": measurement}
         noise = noise_of(model, records, **options).noise  # type: ignore[arg-type]
     batch = batch_of(records, measurement, model.n, delay)
-    filtered = run(batch, measurement, noise, model_steps(model.system, model.values, batch))
+    filtered = run(batch, measurement, noise, ModelSteps(model.system, model.values, batch))
     x = smooth(filtered, batch).x if np.isfinite(filtered.loglik) else filtered.x
     steps = max(1, round(horizon_s / noise.dt))
     one, ahead, windows = _windows(model, batch, measurement, x, steps)

@@ -52,7 +52,7 @@ def scan(
     for g, value in enumerate(grid):
         theta = at.theta.copy()
         theta[i] = value
-        here = point(data, noise, theta)
+        here = point(data, noise, theta, at)
         profile[g] = here.loglik
         if not np.isfinite(here.loglik):
             continue
@@ -62,7 +62,7 @@ def scan(
         if profile[g] > score:
             best, score = here, float(profile[g])
             if others.any():
-                moved = point(data, noise, theta + delta)
+                moved = point(data, noise, theta + delta, here)
                 best = moved if moved.loglik > here.loglik else here
     return best, profile
 
@@ -100,7 +100,7 @@ def _centred(data: Data, noise: Noise, best: Point, i: int, level: Array) -> Poi
     for value in beside:
         theta = best.theta.copy()
         theta[i] = value
-        there = point(data, noise, theta)
+        there = point(data, noise, theta, best)
         if there.loglik > best.loglik - LEVEL:
             return there
     return best
@@ -137,4 +137,4 @@ def likelihood_interval(data: Data, noise: Noise, at: Point, i: int) -> tuple[fl
 def _loglik(data: Data, noise: Noise, at: Point, i: int, value: float) -> float:
     theta = at.theta.copy()
     theta[i] = value
-    return point(data, noise, theta).loglik
+    return point(data, noise, theta, at).loglik
