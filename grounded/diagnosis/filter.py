@@ -14,6 +14,9 @@ candidate becomes a small least-squares problem.
 `smoother` runs back (de Jong 1989; Koopman & Shephard 1992): with u_t and r_t its adjoints and D_t,
 N_t their covariances, d loglik / d R = (u u' - D) / 2 and d loglik / d Q = (r r' - N) / 2.
 
+Where a state is only carried along (a heading rate that is a function of steering and speed), what
+disturbs those disturbs it too: the noises enter through G_t (n, n), c + w -> G (c + w).
+
 Arrays are time-major: L steps, B runs, N states of the filter (n, or 2 n with coloured noise), C
 columns. A missing measurement is a False in `seen`.
 """
@@ -38,22 +41,28 @@ class Gains:
     whiten: Array  # W with W S W' = 1
     logdet: Array  # (L, B) log det S over what was seen
     seen: Array  # (L + 1, B, n) 1.0 or 0.0
+    G: Array | None = None  # (L, B, n, n) how noise enters; None: as it is
 
 
-def transition(F: Array, phi: float | None) -> Array:
-    """A of the filter: F alone, or [[F, 1], [0, phi]] beside coloured noise."""
+def transition(F: Array, phi: float | None, G: Array | None = None) -> Array:
+    """A of the filter: F alone, or [[F, G], [0, phi]] beside coloured noise."""
     if phi is None:
         return F
     L, B, n, _ = F.shape
     A = np.zeros((L, B, 2 * n, 2 * n))
     A[:, :, :n, :n] = F
     i = np.arange(n)
-    A[:, :, i, n + i] = 1.0
+    if G is None:
+        A[:, :, i, n + i] = 1.0
+    else:
+        A[:, :, :n, n:] = G
     A[:, :, n + i, n + i] = phi
     return A
 
 
-def gains(A: Array, Q: Array, R: Array, seen: Array, start: Array) -> Gains:
+def gains(
+    A: Array, Q: Array, R: Array, seen: Array, start: Array, G: Array | None = None
+) -> Gains:
     """The covariance recursion.
 
     Args:
@@ -62,6 +71,7 @@ def gains(A: Array, Q: Array, R: Array, seen: Array, start: Array) -> Gains:
         R: variances (L + 1, B, n), or broadcastable.
         seen: (L + 1, B, n), 1.0 where a measurement is there.
         start: (B, N - n) variance of the coloured noise at t = 0.
+        G: (L, B, n, n) how the noise enters, None for the identity.
 
     Raises:
         numpy.linalg.LinAlgError: when a covariance is not finite.
@@ -77,7 +87,11 @@ def gains(A: Array, Q: Array, R: Array, seen: Array, start: Array) -> Gains:
     whole = bool(seen.all())
     for t in range(L):
         P = A[t] @ P @ A[t].swapaxes(1, 2)
-        P[:, k, k] += Q[t]
+        if G is None:
+            P[:, k, k] += Q[t]
+        else:
+            P[:, :n, :n] += (G[t] * Q[t][:, None, :n]) @ G[t].swapaxes(1, 2)
+            P[:, k[n:], k[n:]] += Q[t][:, n:]
         S, PH = P[:, :n, :n].copy(), P[:, :, :n]
         if whole:
             S[:, i, i] += R[t + 1]
@@ -93,7 +107,7 @@ def gains(A: Array, Q: Array, R: Array, seen: Array, start: Array) -> Gains:
         P = P - half @ half.swapaxes(1, 2)
         whiten[t] = W
         logdet[t] = 2 * np.log(chol[:, i, i]).sum(axis=1)
-    return Gains(A, K, whiten, logdet, seen)
+    return Gains(A, K, whiten, logdet, seen, G)
 
 
 def innovations(g: Gains, d: Array, r: Array, *, track: bool = False) -> tuple[Array, Array | None]:
@@ -160,6 +174,10 @@ def smoother(g: Gains, white: Array) -> Adjoint:
         Nr[:, :n, :] -= NK.swapaxes(1, 2)
         Nr[:, :n, :n] += Dt * seen[:, :, None] * seen[:, None, :]
         r[t], Nd[t] = q, np.einsum("bii->bi", Nr)
+        if g.G is not None:
+            Gt = g.G[t].swapaxes(1, 2)
+            r[t, :, :n] = (Gt @ q[:, :n, None])[:, :, 0]
+            Nd[t, :, :n] = np.einsum("bij,bij->bi", Gt @ Nr[:, :n, :n], Gt)
         At = g.A[t].swapaxes(1, 2)
         q = (At @ q[:, :, None])[:, :, 0]
         Nq = At @ Nr @ g.A[t]

@@ -5,12 +5,13 @@ which real noise differs from the textbook's, allowed before an effect is claime
 
     coloured   beside w, a disturbance c_{t+1} = phi c_t + eta with phi = exp(-dt / tau): a gust, a
                carpet, a swaying antenna (variance C of c, a channel)
-    heavy      v and w are Student-t of 4 degrees of freedom: each is normal with a precision lambda
-               drawn from Gamma(dof / 2, dof / 2). Variational Bayes gives each its own weight
-               E[lambda] = (dof + 1) / (dof + E[v^2] / R); outliers count for little.
+    heavy      v and w are Student-t of 4 degrees of freedom: each is normal with its own precision,
+               whose expectation weighs it, (dof + 1) / (dof + E[v^2] / R). The weights are found for
+               one fit (`cleaned`) and then belong to the data: every hypothesis is judged with the
+               same ones, so that outliers count for little and favour nobody.
 
-Variances climb the likelihood by scoring, each channel by itself: with the smoother's adjoint r and
-its covariance N, d loglik / d log q = q sum(r^2 - N) / 2 and the information is about sum((q N)^2) / 2.
+Variances climb the likelihood by scoring: with the smoother's adjoint r and its covariance N,
+d loglik / d log q = q sum(r^2 - N) / 2; the information is that of a channel by itself (`climbed`).
 """
 
 from __future__ import annotations
@@ -28,10 +29,9 @@ DOF = 4.0
 
 @dataclass(frozen=True)
 class Structure:
-    """Which noise is allowed: tau [s] of a coloured part or None, heavy tails or not."""
+    """Which noise is allowed beside white: tau [s] of a coloured part, or None."""
 
     tau: float | None = None
-    heavy: bool = False
 
     def phi(self, dt: float) -> float | None:
         """The coloured part's correlation over a step."""
@@ -39,7 +39,7 @@ class Structure:
 
     def numbers(self, n: int) -> int:
         """How many more numbers than plain white noise it estimates."""
-        return (0 if self.tau is None else n + 1) + (1 if self.heavy else 0)
+        return 0 if self.tau is None else n + 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +53,7 @@ class Noise:
     floor: Array  # (n,) log variance below which nothing is resolved
     weight_w: Array | float = 1.0
     weight_v: Array | float = 1.0
+    last: Array | None = None  # the steps that were taken last, (2 or 3, n)
 
     def process(self, dt: float) -> Array | float:
         """Q for the filter: (L, B, N) or (N,)."""
@@ -77,14 +78,13 @@ class Noise:
         return np.tile(np.exp(self.log_c), (runs, 1))
 
     def allowing(self, structure: Structure) -> Noise:
-        """The same noise, free to be coloured or heavy-tailed: where its fit starts."""
+        """The same noise, free to be coloured (or not): where its fit starts."""
         return replace(
             self,
             structure=structure,
             log_q=self.log_q - (0.7 if structure.tau is not None else 0.0),
             log_c=np.maximum(self.log_q - 1.5, self.floor),
-            weight_w=1.0,
-            weight_v=1.0,
+            last=None,
         )
 
 
@@ -112,69 +112,82 @@ def first_guess(residual: Array, seen: Array, scale: Array) -> Noise:
     )
 
 
-def climbed(noise: Noise, adjoint: Adjoint, dt: float, boldness: float = 1.0) -> Noise:
-    """One scoring step up the likelihood; `boldness` scales it."""
-    n = len(noise.log_q)
-    q_t, r_t = np.exp(noise.log_q) / noise.weight_w, np.exp(noise.log_r) / noise.weight_v
+def climbed(
+    noise: Noise, adjoint: Adjoint, memory: Array, dt: float, boldness: float = 1.0
+) -> Noise:
+    """One scoring step up the likelihood, all variances of a channel together.
 
-    def step(log: Array, variance: Array, score: Array, cover: Array) -> Array:
-        count = score.shape[0] * score.shape[1]
-        slope = (variance * (score**2 - cover)).sum(axis=(0, 1))
-        info = ((variance * cover) ** 2).sum(axis=(0, 1)) + 1e-3 * count
-        moved = log + np.clip(boldness * slope / info, -1.0, 1.0)
-        return np.maximum(moved, noise.floor)
+    The slope is exact. The information is that of a channel by itself with x_{t+1} = m x_t + w: its
+    measured differences have the spectrum f = q + r |1 - m e^{i omega}|^2 + coloured part, and the
+    information of log a and log b, two parts of f, is T/2 mean_omega((a / f) (b / f)).
 
-    log_q = step(noise.log_q, q_t, adjoint.r[..., :n], adjoint.N[..., :n])
-    log_r = step(noise.log_r, r_t, adjoint.u, adjoint.D)
-    log_c, phi = noise.log_c, noise.structure.phi(dt)
+    Args:
+        noise: as it is.
+        adjoint: what the smoother says of every disturbance.
+        memory: m of each channel (n,), the mean diagonal of the Jacobian.
+        dt: [s].
+        boldness: scales the step.
+    """
+    n, count = len(noise.log_q), adjoint.u.shape[0] * adjoint.u.shape[1]
+    phi = noise.structure.phi(dt)
+    logs = [noise.log_q, noise.log_r] + ([noise.log_c] if phi is not None else [])
+    scores = [(adjoint.r[..., :n], adjoint.N[..., :n]), (adjoint.u, adjoint.D)]
+    variances = [np.exp(noise.log_q) / noise.weight_w, np.exp(noise.log_r) / noise.weight_v]
+    omega = np.linspace(0.02, np.pi, 40)[:, None]
+    parts = [
+        np.broadcast_to(np.exp(noise.log_q), (40, n)),
+        np.exp(noise.log_r) * (1 - 2 * memory * np.cos(omega) + memory**2),
+    ]
     if phi is not None:
         eta = np.exp(noise.log_c) * (1 - phi**2)
-        log_c = step(noise.log_c, eta, adjoint.r[..., n:], adjoint.N[..., n:])
-    return replace(noise, log_q=log_q, log_r=log_r, log_c=log_c)
-
-
-def reweighted(noise: Noise, adjoint: Adjoint) -> Noise:
-    """Heavy tails: each disturbance's own weight, from what the smoother thinks of it."""
-    if not noise.structure.heavy:
-        return noise
-    n = len(noise.log_q)
-    w2 = _moment(np.exp(noise.log_q) / noise.weight_w, adjoint.r[..., :n], adjoint.N[..., :n])
-    v2 = _moment(np.exp(noise.log_r) / noise.weight_v, adjoint.u, adjoint.D)
+        scores.append((adjoint.r[..., n:], adjoint.N[..., n:]))
+        variances.append(eta)
+        parts.append(eta / (1 - 2 * phi * np.cos(omega) + phi**2))
+    whole = np.sum(parts, axis=0)
+    share = np.stack([part / whole for part in parts])  # (2 or 3, 40, n)
+    info = 0.5 * count * np.einsum("afn,bfn->nab", share, share) / len(omega)
+    slope = np.stack(
+        [0.5 * (v * (s**2 - c)).sum(axis=(0, 1)) for v, (s, c) in zip(variances, scores, strict=True)]
+    )
+    info += 1e-3 * count * np.eye(len(logs))
+    step = np.linalg.solve(info, slope.T[:, :, None])[:, :, 0].T
+    step = np.clip(boldness * step, -1.5, 1.5)
+    if noise.last is not None and noise.last.shape == step.shape:
+        # a variance on its way to zero shrinks by a constant factor: Aitken's extrapolation
+        ratio = step / np.where(noise.last == 0, 1.0, noise.last)
+        steady = (ratio > 0.3) & (ratio < 1.2) & (noise.last != 0)
+        step = np.where(steady, step / np.maximum(1 - ratio, 0.2), step)
+        step = np.clip(step, -2.0, 2.0)
+    moved = np.maximum(np.stack(logs) + step, noise.floor)
     return replace(
         noise,
-        weight_w=(DOF + 1) / (DOF + w2 / np.exp(noise.log_q)),
-        weight_v=(DOF + 1) / (DOF + v2 / np.exp(noise.log_r)),
+        log_q=moved[0],
+        log_r=moved[1],
+        log_c=moved[2] if phi is not None else noise.log_c,
+        last=moved - np.stack(logs),
+    )
+
+
+def cleaned(noise: Noise, adjoint: Adjoint) -> Noise:
+    """One round of outlier weights: scales by what the weighted disturbances are, then new weights."""
+    n = len(noise.log_q)
+    q_t, r_t = np.exp(noise.log_q) / noise.weight_w, np.exp(noise.log_r) / noise.weight_v
+    w2 = _moment(q_t, adjoint.r[..., :n], adjoint.N[..., :n])
+    v2 = _moment(r_t, adjoint.u, adjoint.D)
+    log_q = np.log((noise.weight_w * w2).mean(axis=(0, 1)) + 1e-300)
+    log_r = np.log((noise.weight_v * v2).mean(axis=(0, 1)) + 1e-300)
+    log_q = np.maximum(noise.log_q + np.clip(log_q - noise.log_q, -1.0, 0.5), noise.floor)
+    log_r = np.maximum(noise.log_r + np.clip(log_r - noise.log_r, -1.0, 0.5), noise.floor)
+    return replace(
+        noise,
+        log_q=log_q,
+        log_r=log_r,
+        weight_w=(DOF + 1) / (DOF + w2 / np.exp(log_q)),
+        weight_v=(DOF + 1) / (DOF + v2 / np.exp(log_r)),
+        last=None,
     )
 
 
 def _moment(variance: Array, score: Array, cover: Array) -> Array:
     """E[w^2] given the data."""
     return np.maximum((variance * score) ** 2 + variance - variance**2 * cover, 0.0)
-
-
-def tail_bound(noise: Noise, seen: Array) -> float:
-    """What the weights add to the variational bound of the log-likelihood.
-
-    sum over disturbances of (E[log lambda] - log E[lambda]) / 2 - KL(q(lambda) | Gamma(dof/2, dof/2)),
-    with q(lambda) = Gamma(a, a / E[lambda]), a = (dof + 1) / 2.
-    """
-    if not noise.structure.heavy or isinstance(noise.weight_w, float):
-        return 0.0
-    a, a0 = (DOF + 1) / 2, DOF / 2
-    psi = digamma(a)
-    total = 0.0
-    for weight in (noise.weight_w, noise.weight_v):
-        b = a / np.asarray(weight)
-        kl = (a - a0) * psi - math.lgamma(a) + math.lgamma(a0)
-        kl = kl + a0 * (np.log(b) - math.log(a0)) + a * (a0 - b) / b
-        total += float(((0.5 * (psi - math.log(a)) - kl) * seen[1:]).sum())
-    return total
-
-
-def digamma(x: float) -> float:
-    """psi(x) for x > 0, by recurrence and its asymptotic series (Abramowitz & Stegun 6.3.18)."""
-    value = 0.0
-    while x < 8:
-        value -= 1 / x
-        x += 1
-    return value + math.log(x) - 1 / (2 * x) - 1 / (12 * x**2) + 1 / (120 * x**4) - 1 / (252 * x**6)

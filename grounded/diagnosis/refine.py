@@ -22,7 +22,7 @@ import numpy as np
 from grounded.diagnosis import filter as kalman
 from grounded.diagnosis.data import Data
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor, param_scale
-from grounded.diagnosis.noise import Noise, climbed, reweighted, tail_bound
+from grounded.diagnosis.noise import Noise, cleaned, climbed
 from grounded.frozen import Array
 
 MOST_NUMBERS = 1.2e7  # of one (L, B, N, N) array
@@ -39,7 +39,7 @@ class Fit:
     hypothesis: Hypothesis
     noise: Noise
     track: Array  # (L + 1, B, n)
-    loglik: float  # of the data, with the tails' bound
+    loglik: float  # of the data
     evidence: float  # log p(y | h): the shifts integrated out
     gram: Array
     score: Array
@@ -139,13 +139,15 @@ def _iterate(predictor: Predictor, works: list[_Work], fixed_noise: bool) -> Non
     d = np.concatenate([_padded(part[1], width) for part in parts], axis=1)
     r = np.concatenate([_padded(part[2], width) for part in parts], axis=1)
     F = np.concatenate([part[0] for part in parts], axis=1)
+    carried = [noise_entry(predictor, work.h, work.track) for work in works]
+    G = np.concatenate(carried, axis=1) if carried[0] is not None else None  # type: ignore[arg-type]
     phi = works[0].noise.structure.phi(data.dt)
     Q = np.concatenate([_spread(w.noise.process(data.dt), (L, B)) for w in works], axis=1)
     R = np.concatenate([_spread(w.noise.measurement(L), (L + 1, B)) for w in works], axis=1)
     start = np.concatenate([w.noise.start(B) for w in works])
     seen = np.tile(data.seen, (1, len(works), 1))
     try:
-        g = kalman.gains(kalman.transition(F, phi), Q, R, seen, start)
+        g = kalman.gains(kalman.transition(F, phi, G), Q, R, seen, start, G)
     except np.linalg.LinAlgError:
         for work in works:
             work.still = 2
@@ -161,6 +163,7 @@ def _iterate(predictor: Predictor, works: list[_Work], fixed_noise: bool) -> Non
         own = slice(i * B, (i + 1) * B)
         adjoint = kalman.Adjoint(back.u[:, own], back.D[:, own], back.r[:, own], back.N[:, own])
         columns = parts[i][1].shape[-1]
+        memory = np.einsum("tbii->i", parts[i][0]) / (L * B)
         _update(
             predictor,
             work,
@@ -168,8 +171,39 @@ def _iterate(predictor: Predictor, works: list[_Work], fixed_noise: bool) -> Non
             g.logdet[:, own],
             filtered[:, own, :, :columns],
             adjoint,
-            fixed_noise,
+            None if fixed_noise else memory,
         )
+
+
+def clean(predictor: Predictor, fit: Fit, rounds: int = 8) -> Fit:
+    """The same hypothesis with outliers weighed down, its noise fitted to the rest."""
+    data = predictor.data
+    L, B = data.time.shape
+    work = _Work(fit.hypothesis, fit.noise, fit.track)
+    for _ in range(rounds):
+        if not np.isfinite(work.track).all():
+            return fit
+        F, d, r = _linearised(predictor, work)
+        G = noise_entry(predictor, work.h, work.track)
+        try:
+            g = kalman.gains(
+                kalman.transition(F, work.noise.structure.phi(data.dt), G),
+                work.noise.process(data.dt),
+                work.noise.measurement(L),
+                data.seen,
+                work.noise.start(B),
+                G,
+            )
+        except np.linalg.LinAlgError:
+            return fit
+        white, filtered = kalman.innovations(g, d[..., :1], r[..., :1], track=True)
+        assert filtered is not None
+        work.noise = cleaned(work.noise, kalman.smoother(g, white[..., 0]))
+        work.track = work.track + filtered[..., 0]
+        if not all(np.isfinite(a).all() for a in (work.track, work.noise.log_q, work.noise.log_r)):
+            return fit
+    found = refine(predictor, [(work.h, work.noise, work.track)], iterations=4)
+    return found[0] if found else fit
 
 
 def _spread(values: Array | float, shape: tuple[int, int]) -> Array:
@@ -190,7 +224,8 @@ def _linearised(predictor: Predictor, work: _Work) -> tuple[Array, Array, Array]
     x = track[:-1]
     u = predictor.inputs(h)
     after = predictor.advance(h, x, u, data.time)
-    offset = predictor.offset(h, track)
+    ahead = np.concatenate([track[:1], after])  # predicted: a measurement must not explain itself
+    offset = predictor.offset(h, ahead)
     columns_d = [model.difference(after, track[1:])]
     columns_r = [model.difference(data.y - track, np.asarray(offset))]
     theta = h.theta
@@ -204,7 +239,7 @@ def _linearised(predictor: Predictor, work: _Work) -> tuple[Array, Array, Array]
             model.difference(predictor.advance(other, x, predictor.inputs(other), data.time), after)
             / moved
         )
-        shifted = predictor.offset(other, track)
+        shifted = predictor.offset(other, ahead)
         columns_r.append((np.zeros_like(track) + offset - shifted) / moved)
     d, r = np.stack(columns_d, axis=-1), np.stack(columns_r, axis=-1)
     flat = (np.ascontiguousarray(x.reshape(-1, model.n)), np.ascontiguousarray(u.reshape(-1, model.m)))
@@ -218,6 +253,26 @@ def _linearised(predictor: Predictor, work: _Work) -> tuple[Array, Array, Array]
     else:
         f_x, _ = model.system.linearise(*flat, p, data.dt)
     return f_x.reshape(L, B, model.n, model.n), d, r
+
+
+def noise_entry(predictor: Predictor, h: Hypothesis, track: Array) -> Array | None:
+    """G of the filter (L, B, n, n): a carried heading rate moves with what it is a function of."""
+    tied = predictor.tied()
+    if not tied:
+        return None
+    data = predictor.data
+    model, (L, B) = data.model, data.time.shape
+    x = np.ascontiguousarray(track[1:].reshape(-1, model.n))
+    u = np.ascontiguousarray(predictor.inputs(h).reshape(-1, model.m))
+    short = 1e-3 * data.dt
+    f_x, _ = model.system.linearise(x, u, predictor.params(h), short)
+    G = np.zeros((L * B, model.n, model.n))
+    G[:, np.arange(model.n), np.arange(model.n)] = 1.0
+    for heading, rate in tied:
+        slope = f_x[:, heading, :] / short
+        slope[:, [heading, rate]] = 0.0
+        G[:, rate, :] += slope
+    return G.reshape(L, B, model.n, model.n)
 
 
 def base_columns(predictor: Predictor, fit: Fit) -> tuple[Array, Array]:
@@ -260,7 +315,7 @@ def _update(
     logdet: Array,
     filtered: Array,
     adjoint: kalman.Adjoint,
-    fixed_noise: bool,
+    memory: Array | None,
 ) -> None:
     """Scores the point where the work stands, keeps it if it is the best, and moves on."""
     data, h = predictor.data, work.h
@@ -297,8 +352,8 @@ def _update(
         work.track = work.track + filtered[..., 0] + filtered[..., 1:] @ delta
     else:
         work.track = work.track + filtered[..., 0]
-    if not fixed_noise:
-        work.noise = climbed(reweighted(work.noise, adjoint), adjoint, data.dt, work.boldness)
+    if memory is not None:
+        work.noise = climbed(work.noise, adjoint, memory, data.dt, work.boldness)
 
 
 def _limited(h: Hypothesis, delta: Array) -> Array:
@@ -333,7 +388,6 @@ def _scored(
     run_logdet = logdet.sum(axis=0)
     count = data.seen[1:].sum()
     loglik = -0.5 * float(rss.sum() + run_logdet.sum() + count * np.log(2 * np.pi))
-    loglik += tail_bound(work.noise, data.seen)
     evidence, k = loglik, len(h.theta)
     if C > k:
         precision = shift_precision(h, C - k)

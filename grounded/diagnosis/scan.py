@@ -23,7 +23,7 @@ import numpy as np
 from grounded.compile import Named
 from grounded.diagnosis import filter as kalman
 from grounded.diagnosis.hypothesis import Predictor, sensor_offset, transformed
-from grounded.diagnosis.refine import Fit
+from grounded.diagnosis.refine import Fit, base_columns, noise_entry
 from grounded.effects import (
     Effect,
     InputFamily,
@@ -96,6 +96,7 @@ class _Context:
         self.u = predictor.inputs(h)
         self.p = predictor.params(h)
         self.after = predictor.advance(h, self.x, self.u, data.time)
+        self.ahead = np.concatenate([fit.track[:1], self.after])
         flat = (
             np.ascontiguousarray(self.x.reshape(-1, model.n)),
             np.ascontiguousarray(self.u.reshape(-1, model.m)),
@@ -106,12 +107,14 @@ class _Context:
         self.f_p = f_p.reshape(L, B, model.n, -1)
         noise = fit.noise
         phi = noise.structure.phi(data.dt)
+        G = noise_entry(predictor, h, fit.track)
         self.gains = kalman.gains(
-            kalman.transition(self.F, phi),
+            kalman.transition(self.F, phi, G),
             noise.process(data.dt),
             noise.measurement(L),
             data.seen,
             noise.start(B),
+            G,
         )
         self.white = fit.white
         self.base = self._base()
@@ -208,7 +211,7 @@ class _Context:
             if name:
                 values[name] = amount
             r = np.zeros_like(self.fit.track)
-            r[..., k] = -sensor_offset(effect, values, self.fit.track[..., k], data.dt) / amount
+            r[..., k] = -sensor_offset(effect, values, self.ahead[..., k], data.dt) / amount
             found.append(_Column(i, point, name, _EMPTY, r))
         return found
 
@@ -244,8 +247,6 @@ class _Context:
     def _base_white(self) -> Array:
         """Whitened columns of what the fit estimates, (L B n, C)."""
         if "base_white" not in self.__dict__:
-            from grounded.diagnosis.refine import base_columns
-
             d, r = base_columns(self.predictor, self.fit)
             if d.shape[-1]:
                 white, _ = kalman.innovations(self.gains, d, r)

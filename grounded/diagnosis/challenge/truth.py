@@ -1,0 +1,220 @@
+"""A simulated real system for the blind challenge, written apart from the diagnosis.
+
+The diagnosis predicts with one step of the crude model, Strang splitting and a linear filter. The
+truth is integrated at several times the control rate with the added rates inside the derivative,
+actuators advanced at that fine rate, noise of its own kinds, and a controller that sees the noisy
+log. What they share is the equation of an effect, no numerics.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from grounded.compile import Named
+from grounded.effects import (
+    Effect,
+    InputFamily,
+    MemoryFamily,
+    RateFamily,
+    SensorDelayFamily,
+    SensorFamily,
+)
+from grounded.effects.registry import partner
+from grounded.frozen import Array
+from grounded.model import Model
+from grounded.trial import Trial
+
+FINE = 6  # integration steps a control step
+
+# What is outside the library acts on received inputs: f(u (m,), state of its own, t, dt) -> u
+Actuator = Callable[[Array, dict[str, Any], float, float], Array]
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """Noise of the real system, by state: process in unit/sqrt(s), measurement in unit.
+
+    kind: "white", "coloured" (correlated over `tau`), "heavy" (Student-t of 3, 1 % outliers).
+    """
+
+    process: Mapping[str, float]
+    measurement: Mapping[str, float]
+    kind: str = "white"
+    tau: float = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """The real system: a model with its true parameters, effects in it, disturbances, withheld parts."""
+
+    model: Model
+    effects: tuple[tuple[Effect, Mapping[str, float]], ...] = ()
+    disturbance: Disturbance = field(default_factory=lambda: Disturbance({}, {}))
+    actuators: tuple[Actuator, ...] = ()
+    rates: tuple[Callable[[Any, Any, float, Mapping[str, Any]], Mapping[str, float]], ...] = ()
+    latency: tuple[float, ...] = ()
+
+    def run(
+        self,
+        rng: np.random.Generator,
+        controller: Callable[[int, Array], Array],
+        start: Array,
+        held: Array,
+        steps: int,
+        dt: float,
+    ) -> Trial:
+        """One real trial: controller(t, logged state) -> command."""
+        return _Run(self, rng, start, held, dt).trial(controller, steps)
+
+
+class _Run:
+    """The state of one run of the truth."""
+
+    def __init__(
+        self, truth: Truth, rng: np.random.Generator, start: Array, held: Array, dt: float
+    ) -> None:
+        self.truth, self.rng, self.dt, self.fine = truth, rng, dt, dt / FINE
+        self.x, self.held = np.array(start, float), np.array(held, float)
+        model = truth.model
+        self.names = model.state_names
+        self.p = Named("parameter", model.param_names, list(model.values))
+        self.memory: dict[str, Any] = {}
+        self.own_state: dict[str, Any] = {"rng": rng}
+        latency = truth.latency or (0.0,) * model.m
+        self.queues = [[held[j]] * round(latency[j] / self.fine) for j in range(model.m)]
+        self.gust = np.zeros(model.n)
+        self.past: list[Array] = []
+        self.last, self.tied = self.held, list[tuple[int, int]]()
+
+    def trial(self, controller: Callable[[int, Array], Array], steps: int) -> Trial:
+        model = self.truth.model
+        self.tied = [
+            (self.names.index(n), self.names.index(k))
+            for n in self.names
+            if (k := partner(model, n))
+        ]
+        self.past = [self.x.copy()]
+        logged, inputs = [self.measure()], []
+        for t in range(steps):
+            u = np.asarray(controller(t, logged[-1]), float)
+            for k in range(FINE):
+                self.advance(u, t * self.dt + k * self.fine)
+                self.past.append(self.x.copy())
+            self.disturb()
+            self.tie(u, (t + 1) * self.dt)
+            self.past[-1] = self.x.copy()
+            logged.append(self.measure())
+            inputs.append(u)
+        return Trial(
+            np.array(logged),
+            np.array(inputs),
+            self.dt,
+            model.state_names,
+            model.input_names,
+            start_inputs=self.held,
+        )
+
+    def received(self, u: Array, t: float) -> Array:
+        """What the actuators deliver over a fine step."""
+        model, out = self.truth.model, u.copy()
+        for index, (effect, values) in enumerate(self.truth.effects):
+            family = effect.family
+            for target in effect.site.targets:
+                if not isinstance(family, InputFamily | MemoryFamily):
+                    continue
+                j = model.input_names.index(target)
+                if isinstance(family, InputFamily):
+                    out[j] = family.effect(out[j], t, values)
+                else:
+                    key = f"{index}{target}"
+                    depth = family.depth(values, self.fine)
+                    z = self.memory.get(key, tuple([self.held[j]] * depth))
+                    out[j], self.memory[key] = family.advance(out[j], z, values, self.fine)
+        for actuator in self.truth.actuators:
+            out = actuator(out, self.own_state, t, self.fine)
+        for j, queue in enumerate(self.queues):
+            queue.append(out[j])
+            out[j] = queue.pop(0)
+        return out
+
+    def rates(self, x: Array, u: Array, t: float) -> Array:
+        """ds/dt of the real system, effects inside."""
+        model = self.truth.model
+        s, a = Named("state", self.names, list(x)), Named("input", model.input_names, list(u))
+        assert model.derivative is not None
+        own = dict(model.derivative(s, a, self.p))
+        total = {n: float(own[n]) for n in self.names}
+        for effect, values in self.truth.effects:
+            if isinstance(effect.family, RateFamily):
+                added = effect.family.rate(s, a, own, t, values, effect.site)
+                for n, value in added.items():
+                    total[n] += float(value)
+        for extra in self.truth.rates:
+            for n, value in extra(s, a, t, own).items():
+                total[n] += float(value)
+        return np.array([total[n] for n in self.names])
+
+    def advance(self, u: Array, t: float) -> None:
+        """One fine step by the midpoint rule."""
+        received = self.last = self.received(u, t)
+        half = self.x + 0.5 * self.fine * self.rates(self.x, received, t)
+        self.x = self.x + self.fine * self.rates(half, received, t + 0.5 * self.fine)
+
+    def tie(self, u: Array, t: float) -> None:
+        """A heading rate that the model only carries along is, in truth, the heading's rate."""
+        if self.tied:
+            rates = self.rates(self.x, self.last, t)
+            for heading, rate in self.tied:
+                self.x[rate] = rates[heading]
+
+    def disturb(self) -> None:
+        """Process noise over a control step."""
+        noise, dt = self.truth.disturbance, self.dt
+        scale = np.array([noise.process.get(n, 0.0) for n in self.names])
+        if noise.kind == "coloured":  # the same spectrum at low frequencies as the white noise
+            phi = np.exp(-dt / noise.tau)
+            kick = self.rng.standard_normal(len(scale)) * np.sqrt(1 - phi**2)
+            self.gust = phi * self.gust + kick
+            self.x = self.x + self.gust * scale * dt / np.sqrt(2 * noise.tau)
+            return
+        w = self._draw(len(scale))
+        self.x = self.x + scale * np.sqrt(dt) * w
+
+    def _draw(self, count: int) -> Array:
+        if self.truth.disturbance.kind == "heavy":
+            return self.rng.standard_t(3, count) / np.sqrt(3.0)
+        return self.rng.standard_normal(count)
+
+    def measure(self) -> Array:
+        """The log of this moment."""
+        model, noise = self.truth.model, self.truth.disturbance
+        y = self.x.copy()
+        for effect, values in self.truth.effects:
+            i = self.names.index(effect.site.target) if effect.site.target in self.names else -1
+            if isinstance(effect.family, SensorFamily):
+                y[i] = effect.family.measure(y[i], values)
+            elif isinstance(effect.family, SensorDelayFamily):
+                y[i] += self._old(i, values["d"]) - self.x[i]
+        scale = np.array([noise.measurement.get(n, 0.0) for n in self.names])
+        v = self._draw(len(scale))
+        if noise.kind == "heavy":
+            hit = self.rng.random(len(scale)) < 0.01
+            v = v + hit * self.rng.choice([-1, 1], len(scale)) * self.rng.uniform(5, 10, len(scale))
+        return np.asarray(y + scale * v)
+
+    def _old(self, i: int, delay: float) -> float:
+        """State i as it was `delay` seconds ago; before t = 0 it stood still."""
+        back = delay / self.fine
+        k, part = int(back), back - int(back)
+        last = len(self.past) - 1
+        new, old = self.past[max(last - k, 0)][i], self.past[max(last - k - 1, 0)][i]
+        return float((1 - part) * new + part * old)
+
+
+def no_effects(effects: Sequence[Any]) -> bool:
+    """Whether a truth has none of the library's effects."""
+    return not effects
