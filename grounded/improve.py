@@ -35,9 +35,11 @@ from grounded.compile import Problem
 from grounded.first_guess import first_guess
 from grounded.frozen import Array
 from grounded.model import Model
+from grounded.planner import Planner
 from grounded.policy import Policy
-from grounded.rollout import Rollout, simulate
-from grounded.search import Candidate, Options, Standing, mean_trial, standing
+from grounded.rollout import simulate
+from grounded.safety import objections
+from grounded.search import Candidate, Options, Standing, Tried, mean_trial, standing
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded.trust import Step
@@ -144,113 +146,107 @@ def propose(
     options: Options,
     *,
     identity: str = "",
+    planner: Planner | None = None,
     refit: Callable[[Task, Sequence[Trial]], Model] | None = None,
 ) -> Proposal:
     """What to run next: the outstanding candidate, a new one, or nothing.
 
     Args:
-        task: the manoeuvre with the crude model (adopted effects included).
+        task: the manoeuvre; it judges the trials.
         candidates: those proposed so far, in order.
         trials: stored trials, in order.
         options: the [search] table.
         identity: the name of a new candidate; by default the next after those of this task.
+        planner: plans with adopted effects; None: with the task's own model.
         refit: with options.refit, gives the model with parameters fitted to all trials.
     """
-    fingerprint = model_fingerprint(task)
+    planner = planner or Planner(task, task)
+    fingerprint = model_fingerprint(planner.plan)
     now = standing(task, candidates, trials, options, fingerprint)
     if now.phase == "await-trial":
         return Proposal(now, now.outstanding, is_new=False)
     if now.phase != "propose":
         return Proposal(now, None, is_new=False)
-    identity = identity or f"c{len(candidates) + 1:04d}"
+    if options.refit and refit is not None and now.incumbent is not None:
+        planner = planner.with_model(refit(planner.plan, trials))
+    make = _Maker(planner, now, identity or f"c{len(candidates) + 1:04d}", fingerprint)
     if now.incumbent is None:
-        policy, _ = first_policy(task, now.caution)
-        predicted = simulate(task.problem(exact=True), policy)
-        return _checked(
-            task, now, _candidate(identity, policy, predicted, now, fingerprint, Step())
-        )
-    planner = task
-    if options.refit and refit is not None:
-        planner = task.with_model(refit(task, trials))
-    return _improvement(planner, now, options, identity, fingerprint)
+        policy, _ = first_policy(planner.plan, now.caution)
+        return make.checked(make.candidate(policy, planner.plan.problem(exact=True), Step()))
+    return _improvement(make, now.incumbent, options)
 
 
-def _improvement(
-    task: Task, now: Standing, options: Options, identity: str, fingerprint: str
-) -> Proposal:
+def _improvement(make: _Maker, incumbent: Tried, options: Options) -> Proposal:
     """Steps 4 to 6: the first step, from the one that is due on, that the model believes in.
 
     A step whose predicted run loses is passed over in the model, at no trial's cost: d must satisfy
     U^(theta + alpha d) >= U^(theta) for some alpha (step 5).
     """
-    assert now.incumbent is not None
-    own, theta = mean_trial(now.incumbent.trials), now.incumbent.candidate.policy
-    grounding = ground(task, own)
-    real = task.problem(ground(task, own, exact=True).bias, exact=True)
-    already, least = task.utility(own), options.tolerance * abs(task.utility(own))
+    planner, plan = make.planner, make.planner.plan
+    own = planner.lift(mean_trial(incumbent.trials))
+    grounding = ground(plan, own)
+    real = plan.problem(ground(plan, own, exact=True).bias, exact=True)
+    already, least = incumbent.utility, options.tolerance * abs(incumbent.utility)
+    theta = planner.widened(incumbent.candidate.policy)
     unsafe: Proposal | None = None
     directions: dict[float, Policy] = {}
-    step = now.step
+    step = make.now.step
     while step is not None:
         if step.damping not in directions:
-            directions[step.damping] = direction(task, theta, grounding, options, step.damping)
-        policy = theta.toward(directions[step.damping], step.alpha)
-        predicted = simulate(real, policy)
-        gain = predicted.utility - already
-        if gain > least:
-            made = _candidate(identity, policy, predicted, now, fingerprint, step, gain)
-            proposal = _checked(task, now, made)
+            directions[step.damping] = direction(plan, theta, grounding, options, step.damping)
+        made = make.candidate(theta.toward(directions[step.damping], step.alpha), real, step)
+        if made.predicted_gain > least:
+            proposal = make.checked(made)
             if proposal.candidate is not None:
                 return proposal
             unsafe = proposal
-        elif abs(gain) <= least:
+        elif abs(made.predicted_gain) <= least:
             break
         step = options.next_step(step)
     if unsafe is not None:
         return unsafe
     sentence = (
         f"the model sees no gain of more than {options.tolerance:g} of {already:.6g} in any step "
-        f"([search] tolerance): {now.incumbent.candidate.id} is the result"
+        f"([search] tolerance): {incumbent.candidate.id} is the result"
     )
-    ended = dataclasses.replace(now, phase="converged", step=None, sentence=sentence)
+    ended = dataclasses.replace(make.now, phase="converged", step=None, sentence=sentence)
     return Proposal(ended, None, is_new=False)
 
 
-def _candidate(
-    identity: str,
-    policy: Policy,
-    predicted: Rollout,
-    now: Standing,
-    fingerprint: str,
-    step: Step,
-    gain: float = float("nan"),
-) -> Candidate:
-    base = now.incumbent
-    return Candidate(
-        id=identity,
-        policy=policy,
-        iteration=0 if base is None else now.iteration + 1,
-        alpha=step.alpha,
-        damping=step.damping,
-        predicted_gain=gain,
-        base="" if base is None else base.candidate.id,
-        model=fingerprint,
-        predicted_states=predicted.states,
-        predicted_inputs=predicted.inputs,
-        predicted_utility=predicted.utility,
-        caution=now.caution,
-    )
+@dataclass(frozen=True, eq=False)
+class _Maker:
+    """Makes candidates of a policy: what a robot can run of it, and its predicted run."""
 
+    planner: Planner
+    now: Standing
+    identity: str
+    fingerprint: str
 
-def _checked(task: Task, now: Standing, made: Candidate) -> Proposal:
-    """A candidate that is finite, inside the limits and predicted to stay safe; or none."""
-    from grounded.safety import objections
+    def candidate(self, policy: Policy, problem: Problem, step: Step) -> Candidate:
+        base, policy = self.now.incumbent, self.planner.narrowed(policy)
+        predicted = simulate(problem, self.planner.widened(policy))
+        return Candidate(
+            id=self.identity,
+            policy=policy,
+            iteration=0 if base is None else self.now.iteration + 1,
+            alpha=step.alpha,
+            damping=step.damping,
+            predicted_gain=predicted.utility - base.utility if base else float("nan"),
+            base="" if base is None else base.candidate.id,
+            model=self.fingerprint,
+            predicted_states=predicted.states[:, : self.planner.task.model.n],
+            predicted_inputs=predicted.inputs,
+            predicted_utility=predicted.utility,
+            caution=self.now.caution,
+        )
 
-    found = objections(task, made)
-    if not found:
-        return Proposal(now, made, is_new=True)
-    stopped = dataclasses.replace(now, phase="stopped", sentence=found[0])
-    return Proposal(stopped, None, is_new=False, notes=tuple(found))
+    def checked(self, made: Candidate) -> Proposal:
+        """A candidate that is finite, inside the limits and predicted to stay safe; or none."""
+        found = objections(self.planner.task, made)
+        if not found:
+            return Proposal(self.now, made, is_new=True)
+        stopped = dataclasses.replace(self.now, phase="stopped", sentence=found[0])
+        return Proposal(stopped, None, is_new=False, notes=tuple(found))
 
 
 def learn(

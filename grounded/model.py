@@ -161,7 +161,7 @@ class Model:
         )
 
     def difference(self, a: Array, b: Array) -> Array:
-        """A - b for arrays (..., n) of states; angles wrapped to [-pi, pi]."""
+        """The difference a - b of arrays (..., n) of states; angles wrapped to [-pi, pi]."""
         d: Array = np.asarray(a, float) - np.asarray(b, float)
         mask = self.angle_mask
         d[..., mask] -= 2 * np.pi * np.rint(d[..., mask] / (2 * np.pi))

@@ -55,8 +55,20 @@ class Policy:
         for name in ("feedforward", "low", "high", "past", "gain", "reference"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, readonly(getattr(self, name)))
+        if self.feedforward.ndim != 2 or len(self.feedforward) == 0:
+            raise GroundedError(
+                f"a feed-forward must have shape (H, m), found {self.feedforward.shape}"
+            )
         H, m = self.feedforward.shape
-        nz = len(self.state_names) + sum(self.depths)
+        n, nz = len(self.state_names), len(self.state_names) + sum(self.depths)
+        sizes = (len(self.input_names), *self.low.shape, *self.high.shape, *self.past.shape)
+        if sizes != (m,) * 4 or len(self.depths) != m or len(self.angles) != n:
+            raise GroundedError(
+                f"a policy of {n} states and {m} inputs: its names, limits, held input, depths and "
+                "angles don't have these sizes"
+            )
+        if not (np.isfinite(self.dt) and self.dt > 0 and min(self.depths) >= 1):
+            raise GroundedError("a policy's dt must be positive and its depths at least 1")
         if (self.gain is None) != (self.reference is None):
             raise GroundedError("a feedback policy needs both a gain and a reference")
         if self.gain is not None and self.reference is not None:
@@ -81,6 +93,30 @@ class Policy:
         ]
         return (*self.state_names, *past)
 
+    def laid_out(
+        self, state_names: tuple[str, ...], angles: tuple[bool, ...], depths: tuple[int, ...]
+    ) -> Policy:
+        """The same policy over another z: columns go by name, new ones have no gain, others go.
+
+        Args:
+            state_names: states of the new z, in order.
+            angles: which of them wrap.
+            depths: past inputs of the new z, for each input.
+        """
+        layout = replace(
+            self, state_names=state_names, angles=angles, depths=depths, gain=None, reference=None
+        )
+        if self.gain is None or self.reference is None:
+            return layout
+        mine, names = self.z_names, layout.z_names
+        gain = np.zeros((*self.feedforward.shape, len(names)))
+        reference = np.zeros((self.horizon, len(names)))
+        for column, name in enumerate(names):
+            if name in mine:
+                gain[:, :, column] = self.gain[:, :, mine.index(name)]
+                reference[:, column] = self.reference[:, mine.index(name)]
+        return replace(layout, gain=gain, reference=reference)
+
     def about(self, reference: Array) -> Policy:
         """The same policy, written about another reference (H, nz)."""
         if self.gain is None or self.reference is None:
@@ -93,6 +129,9 @@ class Policy:
         """Theta + alpha d with d = theta' - theta (footnote 11): alpha = 1 is `other` itself."""
         if alpha == 1.0:
             return other
+        if self.z_names != other.z_names:
+            start = self.laid_out(other.state_names, other.angles, other.depths)
+            return start.toward(other, alpha)
         if other.reference is None or other.gain is None:
             mixed = (1 - alpha) * self.feedforward + alpha * other.feedforward
             return replace(other, feedforward=mixed)
@@ -104,7 +143,7 @@ class Policy:
 
 
 def z_difference(a: Array, b: Array, angles: tuple[bool, ...]) -> Array:
-    """A - b for augmented states (..., nz), angles wrapped."""
+    """The difference a - b of augmented states (..., nz), angles wrapped."""
     d: Array = np.asarray(a, float) - np.asarray(b, float)
     for i, angle in enumerate(angles):
         if angle:
@@ -135,14 +174,14 @@ class Runner:
 
     def done(self, t: float) -> bool:
         """Whether t [s] since the start is past the last control step."""
-        return round(t / self.policy.dt) >= self._H
+        return int(t / self.policy.dt + 0.5) >= self._H
 
     def action(self, t: float, s: Any) -> Array:
         """The inputs to send, (m,), for the state s (n,) at t seconds after the start."""
         policy = self.policy
         step = max(int(t / policy.dt + 0.5), 0)
         if step >= self._H:
-            return policy.past
+            return np.array(policy.past)
         base = step + self._deep
         if step > self._latest + 1:  # calls were missed: the input was held meanwhile
             self._sent[self._latest + 1 + self._deep : base] = self._sent[self._latest + self._deep]
@@ -152,10 +191,13 @@ class Runner:
             z[: self._n] = s
             z[self._n :] = self._sent[base - self._queue_lag, self._queue_input]
             z -= policy.reference[step]
-            for i in self._angles:
-                z[i] -= 2 * np.pi * round(z[i] / (2 * np.pi)) if z[i] == z[i] else 0.0
-            correction = policy.gain[step] @ z
-            if np.isfinite(correction).all():
+            seen = bool(np.isfinite(z).all())
+            if seen:
+                for i in self._angles:
+                    z[i] -= 2 * np.pi * round(z[i] / (2 * np.pi))
+                correction = policy.gain[step] @ z
+                seen = bool(np.isfinite(correction).all())
+            if seen:
                 u = u + correction
             else:
                 self.blind += 1
@@ -200,27 +242,24 @@ def load(
     Raises:
         GroundedError: if the file is no exported candidate, or one for another robot or task.
     """
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            data = {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, EOFError, KeyError) as error:
-        raise GroundedError(
-            f"{path} can't be read as an exported candidate (.npz): {error}"
-        ) from None
-    except Exception as error:  # zipfile and zlib have errors of their own
-        raise GroundedError(f"{path} is damaged: {error}; export it again") from None
+    data = _archive(path)
     if str(data.get("format", "")) != FORMAT:
         raise GroundedError(f"{path} is not a candidate exported by `grounded export --format npz`")
-    policy = Policy(
-        **{name: data[name] for name in _NUMBERS},
-        dt=float(data["dt"]),
-        state_names=tuple(map(str, data["state_names"])),
-        input_names=tuple(map(str, data["input_names"])),
-        depths=tuple(map(int, data["depths"])),
-        angles=tuple(map(bool, data["angles"])),
-        gain=data.get("gain"),
-        reference=data.get("reference"),
-    )
+    try:
+        policy = Policy(
+            **{name: data[name] for name in _NUMBERS},
+            dt=float(data["dt"]),
+            state_names=tuple(map(str, data["state_names"])),
+            input_names=tuple(map(str, data["input_names"])),
+            depths=tuple(map(int, data["depths"])),
+            angles=tuple(map(bool, data["angles"])),
+            gain=data.get("gain"),
+            reference=data.get("reference"),
+        )
+    except KeyError as error:
+        raise GroundedError(f"{path} lacks {error}; export it again") from None
+    except (TypeError, ValueError, GroundedError) as error:
+        raise GroundedError(f"{path} is garbled: {error}; export it again") from None
     wanted = {"states": states, "inputs": inputs}
     for kind, names in wanted.items():
         found = policy.state_names if kind == "states" else policy.input_names
@@ -230,9 +269,28 @@ def load(
         raise GroundedError(
             f"{path} is for task {data.get('task')}; this robot is set up for {task}"
         )
-    finite = all(
-        np.isfinite(data[k]).all() for k in ("feedforward", "gain", "reference") if k in data
-    )
-    if not finite:
-        raise GroundedError(f"{path} holds numbers that are not finite; export it again")
+    parts = ("feedforward", "gain", "reference", "past")
+    finite = all(np.isfinite(data[part]).all() for part in parts if part in data)
+    if not (finite and (policy.low <= policy.high).all()):  # NaN is not below anything
+        raise GroundedError(
+            f"{path} holds numbers that are not finite, or limits that exclude each other; "
+            "export it again"
+        )
     return Runner(policy)
+
+
+def _archive(path: str | Path) -> dict[str, Any]:
+    """The arrays of an .npz file; nothing in it is executed."""
+    from io import BytesIO
+
+    try:
+        content = Path(path).read_bytes()
+    except OSError as error:
+        raise GroundedError(f"{path} can't be read: {error.strerror}") from None
+    try:
+        with np.load(BytesIO(content), allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except Exception as error:  # numpy, zipfile and zlib each have errors of their own
+        raise GroundedError(
+            f"{path} is damaged, or no exported candidate (.npz): {error}; export it again"
+        ) from None

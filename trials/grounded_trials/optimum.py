@@ -26,7 +26,7 @@ def optimum(workspace: Workspace) -> float | None:
     """
     if not workspace.config.system.model:
         return None
-    task, plant = workspace.base_task, replace(simulated_plant(workspace), noise=Noise())
+    task, plant = workspace.task, replace(simulated_plant(workspace), noise=Noise())
     model = plant.model
     if (model.state_names, model.input_names) != (task.model.state_names, task.model.input_names):
         return None

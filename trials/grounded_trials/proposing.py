@@ -36,6 +36,7 @@ def propose_in(workspace: Workspace) -> Proposed:
         workspace.task_trials(),
         workspace.config.search,
         identity=workspace.next_id(),
+        planner=workspace.planner,
         refit=refitted,
     )
     if proposal.candidate is None:
@@ -57,7 +58,7 @@ def standing_in(workspace: Workspace) -> Standing:
         workspace.search_candidates(),
         workspace.task_trials(),
         workspace.config.search,
-        model_fingerprint(task),
+        model_fingerprint(workspace.planner.plan),
     )
 
 

@@ -36,7 +36,8 @@ def warnings_about(workspace: Workspace, trial: Trial) -> tuple[str, ...]:
     if whole.steps < task.horizon:
         found.append(
             f"the run ended after {whole.steps} of {task.horizon} steps "
-            f"({whole.steps * trial.dt:.2f} s): a failed candidate; its data stay usable for fit and diagnose"
+            f"({whole.steps * trial.dt:.2f} s): a failed candidate; its data stay usable for "
+            "fit and diagnose"
         )
     found += _start(task, whole)
     found += _inputs(task, whole)

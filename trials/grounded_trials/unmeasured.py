@@ -94,7 +94,7 @@ def _smoothed(
     """All states (T + 1, n): the smoother's, with the measured ones as they were measured."""
     from grounded.estimate import Noise, Record, noise_of, of_states, smooth_trials
 
-    model, task = workspace.base_model, workspace.base_task
+    model, task = workspace.base_model, workspace.task
     dt = task.dt
     times = np.arange(len(found.states), dtype=np.float64) * dt
     record = Record(

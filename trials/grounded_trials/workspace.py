@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from grounded.bridge import bridge
 from grounded.errors import GroundedError, nearest
@@ -25,6 +26,9 @@ from grounded_trials.mcap_log import candidate_bytes, read_candidate, read_trial
 from grounded_trials.model_file import check_names, load_module, model_in
 from grounded_trials.store import Store, Stored, write_atomically
 from grounded_trials.task_file import build_task
+
+if TYPE_CHECKING:
+    from grounded.planner import Planner
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,18 +71,20 @@ class Workspace:
         return model.with_values(table.params)
 
     @cached_property
-    def base_task(self) -> Task:
-        """The task with the crude model, without adopted effects."""
+    def task(self) -> Task:
+        """The task with the crude model: it judges trials."""
         return build_task(self.config, self.base_model, self.folder)
 
     @cached_property
-    def task(self) -> Task:
-        """The task with all effects that were adopted."""
-        if not self.config.model.effects:
-            return self.base_task
-        from grounded_trials.adopted import with_effects
+    def planner(self) -> Planner:
+        """The task as the search plans it, with all effects that were adopted."""
+        from grounded.planner import Planner
 
-        return with_effects(self.base_task, self.config.model.effects)
+        if not self.config.model.effects:
+            return Planner(self.task, self.task)
+        from grounded_trials.adopted import planner_with
+
+        return planner_with(self.task, self.config.model.effects)
 
     def candidate_path(self, identity: str) -> Path:
         """candidates/c0001.mcap and so on."""

@@ -1,0 +1,54 @@
+"""grounded view: the recording in the Rerun viewer."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import click
+
+from grounded_cli.options import in_workspace, open_workspace
+from grounded_cli.terminal import progress, say
+
+
+@click.command("view")
+@in_workspace
+def command(folder: str | None) -> None:
+    """Open the recording in the Rerun viewer: paths, states, inputs, bias, trial by trial.
+
+    The file reports/recording.rrd is written first. Without a screen, copy it to a computer that
+    has one (`pip install rerun-sdk`) and open it there: rerun recording.rrd
+    """
+    workspace = open_workspace(folder)
+    from grounded_trials.reporting import save_recording
+
+    with progress("writing the recording"):
+        path = save_recording(workspace)
+    _open(path)
+
+
+def _open(path: Path) -> None:
+    """Starts the viewer and leaves it running.
+
+    Raises:
+        GroundedError: if there is none, or it ends at once.
+    """
+    from grounded.errors import GroundedError
+
+    beside = Path(sys.executable).with_name("rerun")
+    program = str(beside) if beside.exists() else shutil.which("rerun")
+    if program is None:
+        raise GroundedError(f"the viewer is missing: pip install rerun-sdk, then: rerun {path}")
+    viewer = subprocess.Popen([program, str(path)], stdout=2, start_new_session=True)
+    try:
+        code = viewer.wait(timeout=2.0)
+    except subprocess.TimeoutExpired:
+        say(f"{path} is open in the viewer")
+        return
+    if code != 0:
+        raise GroundedError(
+            f"the viewer can't be opened here (no screen?): copy {path} to a computer with a screen "
+            "and open it there with: rerun recording.rrd"
+        )
