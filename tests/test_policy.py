@@ -1,0 +1,374 @@
+"""theta + alpha d, and the runner that a robot runs: numpy alone."""
+
+import os
+import pickle
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_tasks import other, rover_task
+
+from grounded.errors import GroundedError
+from grounded.plant import Plant
+from grounded.policy import Policy, Runner, load, to_arrays, z_difference
+
+STATES, INPUTS = ("x", "psi"), ("speed", "turn")
+
+
+def policy(H=10, seed=0, feedback=True, depths=(1, 2), **changes):
+    rng = np.random.default_rng(seed)
+    nz = 2 + sum(depths)
+    fields = {
+        "feedforward": rng.normal(size=(H, 2)),
+        "low": np.full(2, -50.0),
+        "high": np.full(2, 50.0),
+        "dt": 0.1,
+        "state_names": STATES,
+        "input_names": INPUTS,
+        "depths": depths,
+        "angles": (False, True),
+        "past": np.array([0.5, -0.5]),
+        "gain": rng.normal(size=(H, 2, nz)) if feedback else None,
+        "reference": rng.normal(size=(H, nz)) if feedback else None,
+    }
+    return Policy(**fields | changes)
+
+
+def law(p, t, z):
+    """u = ubar + K (z - zbar), with the angle's difference wrapped, written out."""
+    u = p.feedforward[t].copy()
+    for i in range(len(u)):
+        for j in range(len(z)):
+            d = z[j] - p.reference[t, j]
+            if j == 1:
+                d = np.arctan2(np.sin(d), np.cos(d))
+            u[i] += p.gain[t, i, j] * d
+    return u
+
+
+def test_alpha_0_is_theta_alpha_1_is_the_other_and_a_half_is_between():
+    a, b = policy(seed=1), policy(seed=2)
+    z = np.random.default_rng(3).normal(size=(20, 10, 5)) * 0.1
+    assert a.toward(b, 1.0) is b
+    for alpha in (0.0, 0.5, 0.125):
+        mixed = a.toward(b, alpha)
+        for sample in z:
+            for t in range(10):
+                near = b.reference[t] + sample[t]
+                # differences of angles to both references stay within (-pi, pi) here
+                expected = (1 - alpha) * law(a, t, near) + alpha * law(b, t, near)
+                np.testing.assert_allclose(law(mixed, t, near), expected, atol=1e-12)
+        np.testing.assert_array_equal(mixed.reference, b.reference)
+        np.testing.assert_allclose(mixed.gain, (1 - alpha) * a.gain + alpha * b.gain, atol=1e-15)
+
+
+def test_alpha_is_linear_in_theta_when_references_agree():
+    a = policy(seed=1)
+    b = replace(policy(seed=2), reference=a.reference)
+    for alpha in (0.0, 0.25, 0.5):
+        mixed = a.toward(b, alpha)
+        np.testing.assert_allclose(
+            mixed.feedforward, a.feedforward + alpha * (b.feedforward - a.feedforward), atol=1e-15
+        )
+        np.testing.assert_allclose(mixed.gain, a.gain + alpha * (b.gain - a.gain), atol=1e-15)
+
+
+def test_open_loop_policies_mix_their_inputs():
+    a, b = policy(seed=1, feedback=False), policy(seed=2, feedback=False)
+    half = a.toward(b, 0.5)
+    np.testing.assert_allclose(half.feedforward, 0.5 * (a.feedforward + b.feedforward))
+    assert half.gain is None
+
+
+def test_a_policy_about_another_reference_is_the_same_policy():
+    a = policy(seed=1)
+    moved = a.about(a.reference + np.random.default_rng(0).normal(size=a.reference.shape) * 0.3)
+    for t in range(10):
+        z = a.reference[t] + 0.1
+        np.testing.assert_allclose(law(moved, t, z), law(a, t, z), atol=1e-12)
+
+
+def test_references_a_full_turn_apart_are_the_same_reference():
+    a = policy(seed=1)
+    b = replace(a, reference=a.reference + 2 * np.pi * np.array([0, 1, 0, 0, 0]))
+    half = a.toward(b, 0.5)
+    np.testing.assert_allclose(half.feedforward, a.feedforward, atol=1e-12)
+
+
+def test_differences_wrap_only_where_they_are_angles():
+    d = z_difference(np.array([7.0, 7.0, 7.0]), np.zeros(3), (False, True))
+    np.testing.assert_allclose(d, [7.0, 7.0 - 2 * np.pi, 7.0])
+
+
+def test_mismatched_sizes_are_refused():
+    with pytest.raises(GroundedError, match="both a gain and a reference"):
+        policy(reference=None)
+    with pytest.raises(GroundedError, match=r"must have shapes \(\(10, 2, 5\), \(10, 5\)\)"):
+        policy(gain=np.zeros((10, 2, 4)))
+
+
+# the runner
+
+
+def test_the_runner_is_the_law_with_the_queue_of_past_inputs():
+    p, rng = policy(), np.random.default_rng(5)
+    run, sent = Runner(p), [p.past, p.past]
+    for t in range(10):
+        s = rng.normal(size=2)
+        z = np.array([*s, sent[-1][0], sent[-1][1], sent[-2][1]])
+        expected = np.clip(law(p, t, z), p.low, p.high)
+        found = run.action(t * p.dt, s)
+        np.testing.assert_allclose(found, expected, atol=1e-12)
+        sent.append(found)
+
+
+def test_clipped_inputs_are_what_is_remembered():
+    p = policy(low=np.array([-0.1, -0.1]), high=np.array([0.1, 0.1]))
+    run, s = Runner(p), np.array([100.0, 1.0])
+    first = run.action(0.0, s)
+    assert np.abs(first).max() <= 0.1
+    z = np.array([*s, first[0], first[1], p.past[1]])
+    np.testing.assert_allclose(run.action(0.1, s), np.clip(law(p, 1, z), -0.1, 0.1), atol=1e-12)
+
+
+def test_the_controller_of_the_nearest_step_is_used():
+    p = policy(feedback=False)
+    for t, step in ((0.0, 0), (0.049, 0), (0.051, 1), (0.149, 1), (0.26, 3), (0.949, 9)):
+        np.testing.assert_array_equal(Runner(p).action(t, np.zeros(2)), p.feedforward[step])
+    np.testing.assert_array_equal(Runner(p).action(-0.3, np.zeros(2)), p.feedforward[0])
+
+
+def test_called_at_the_rate_of_the_camera_it_sends_one_controller_a_step():
+    """Footnote 18: states come at 30 Hz, controllers are for 20 Hz; the last command of a step
+    counts as the one that was sent."""
+    p = policy()
+    run = Runner(p)
+    for _ in range(3):
+        last = run.action(0.1, np.array([0.1, 0.2]))
+    z = np.array([0.3, 0.1, last[0], last[1], p.past[1]])
+    np.testing.assert_allclose(run.action(0.2, z[:2]), law(p, 2, z), atol=1e-12)
+
+
+def test_missed_calls_held_the_last_input():
+    p = policy()
+    run, s = Runner(p), np.zeros(2)
+    sent = run.action(0.1, s)
+    z = np.array([0.0, 0.0, sent[0], sent[1], sent[1]])  # steps 2 .. 4 held what was sent at 1
+    np.testing.assert_allclose(run.action(0.5, s), law(p, 5, z), atol=1e-12)
+
+
+def test_a_late_first_call_held_the_past():
+    p = policy()
+    z = np.array([0.0, 0.0, p.past[0], p.past[1], p.past[1]])
+    np.testing.assert_allclose(Runner(p).action(0.4, np.zeros(2)), law(p, 4, z), atol=1e-12)
+
+
+def test_an_unfinite_state_switches_the_feedback_off_for_that_call():
+    p = policy()
+    run = Runner(p)
+    np.testing.assert_array_equal(run.action(0.0, [np.nan, 0.0]), p.feedforward[0])
+    np.testing.assert_array_equal(run.action(0.1, [0.0, np.nan]), p.feedforward[1])
+    assert run.blind == 2
+    u1 = p.feedforward[1]
+    z = np.array([0.0, 0.0, u1[0], u1[1], p.feedforward[0][1]])
+    np.testing.assert_allclose(run.action(0.2, np.zeros(2)), law(p, 2, z), atol=1e-12)
+    assert run.blind == 2
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("bad", [np.inf, -np.inf])
+@pytest.mark.parametrize("where", [0, 1])
+def test_an_infinite_state_is_blind_too(bad, where):
+    p = policy()
+    run, s = Runner(p), np.zeros(2)
+    s[where] = bad
+    np.testing.assert_array_equal(run.action(0.0, s), p.feedforward[0])
+    assert run.blind == 1
+
+
+def test_a_turn_more_changes_nothing():
+    p = policy()
+    a, b = Runner(p), Runner(p)
+    for t in range(10):
+        s = np.array([0.1, 0.4])
+        one, other_ = a.action(t * 0.1, s), b.action(t * 0.1, s + np.array([0, 6 * np.pi]))
+        np.testing.assert_allclose(one, other_, atol=1e-9)
+
+
+def test_after_the_horizon_the_held_input_is_sent():
+    p = policy()
+    run = Runner(p)
+    assert not run.done(0.9) and run.done(1.0)
+    for t in (0.96, 1.0, 5.0, 1e9):
+        np.testing.assert_array_equal(run.action(t, np.zeros(2)), p.past)
+
+
+@pytest.mark.parametrize("t", [0.949, 0.951, 0.95, 1.05, 0.05, 0.15])
+def test_done_agrees_with_action(t):
+    """A loop `while not done(t)` never asks for a step that the policy doesn't have."""
+    p = policy(feedback=False)
+    run = Runner(p)
+    over = np.array_equal(run.action(t, np.zeros(2)), p.past)
+    assert run.done(t) == over
+
+
+def test_an_action_can_be_kept_and_changed_by_the_caller():
+    """A driver may scale what it got; the policy and what is remembered are not touched."""
+    p = policy()
+    a, b = Runner(p), Runner(p)
+    s = np.zeros(2)
+    first = np.array(a.action(0.0, s))
+    got = b.action(0.0, s)
+    got *= 0.0
+    np.testing.assert_array_equal(a.action(0.1, s), b.action(0.1, s))
+    assert np.abs(first).max() > 0
+    after = b.action(9.0, s)
+    after *= 0.5
+    np.testing.assert_array_equal(b.action(9.0, s), p.past)
+
+
+def test_the_plant_runs_the_runner():
+    task = rover_task()
+    made = task.policy(np.full((60, 2), 0.3), np.zeros((60, 2, 5)), np.zeros((60, 5)))
+    trial = Plant(other(task.model)).run(made, {}, np.random.default_rng(0))
+    assert trial.steps == 60 and (trial.inputs == 0.3).all()
+
+
+def test_a_call_is_quick():
+    """Below 20 us on a quiet machine (benchmarks); here the best of several, with room."""
+    p = policy(H=200, depths=(2, 2))
+    s, best = np.array([0.1, 0.2]), np.inf
+    for _ in range(7):
+        run, start = Runner(p), time.perf_counter()
+        for t in range(200):
+            run.action(t * 0.1, s)
+        best = min(best, (time.perf_counter() - start) / 200)
+    assert best < 60e-6
+
+
+# load
+
+
+def saved(folder, p, **about):
+    path = folder / "c.npz"
+    np.savez(path, **to_arrays(p, task="feed", **about))
+    return path
+
+
+@pytest.mark.parametrize("feedback", [True, False])
+def test_a_saved_policy_is_the_same_policy(tmp_path, feedback):
+    p = policy(feedback=feedback)
+    a, b = Runner(p), load(saved(tmp_path, p), states=STATES, inputs=INPUTS, task="feed")
+    for t in range(12):
+        s = np.array([0.1 * t, -0.2])
+        np.testing.assert_array_equal(a.action(t * 0.1, s), b.action(t * 0.1, s))
+    assert b.policy.z_names == ("x", "psi", "speed[t-1]", "turn[t-1]", "turn[t-2]")
+
+
+@pytest.mark.parametrize(
+    ("asked", "match"),
+    [
+        ({"states": ("psi", "x")}, r"is for states \('x', 'psi'\); this robot has \('psi', 'x'\)"),
+        ({"inputs": ("speed",)}, "this robot has"),
+        ({"task": "beef"}, "is for task feed; this robot is set up for beef"),
+    ],
+)
+def test_another_robot_or_task_is_refused(tmp_path, asked, match):
+    with pytest.raises(GroundedError, match=match):
+        load(saved(tmp_path, policy()), **asked)
+
+
+def test_a_file_that_is_not_there_or_not_ours(tmp_path):
+    with pytest.raises(GroundedError, match="can't be read"):
+        load(tmp_path / "nowhere.npz")
+    (tmp_path / "a.npz").write_bytes(b"")
+    (tmp_path / "b.npz").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(100))
+    np.savez(tmp_path / "c.npz", a=np.zeros(3))
+    np.save(tmp_path / "d.npy", np.zeros(3))
+    for name in ("a.npz", "b.npz", "c.npz", "d.npy"):
+        with pytest.raises(GroundedError, match=name):
+            load(tmp_path / name)
+
+
+def test_nothing_in_a_file_is_executed(tmp_path):
+    class Bomb:
+        def __reduce__(self):
+            return (os.mkdir, (str(tmp_path / "boom"),))
+
+    np.savez(tmp_path / "a.npz", **to_arrays(policy()) | {"low": np.array([Bomb()], dtype=object)})
+    (tmp_path / "b.npz").write_bytes(pickle.dumps(Bomb()))
+    for name in ("a.npz", "b.npz"):
+        with pytest.raises(GroundedError):
+            load(tmp_path / name)
+    assert not (tmp_path / "boom").exists()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"feedforward": np.full((10, 2), np.nan)},
+        {"low": np.array([np.nan, 0.0])},
+        {"past": np.array([np.nan, 0.0])},
+        {"high": np.zeros(3)},
+        {"past": np.zeros(3)},
+        {"dt": np.array([0.1, 0.2])},
+        {"dt": 0.0},
+        {"dt": np.nan},
+        {"dt": "soon"},
+        {"depths": np.array([1])},
+        {"depths": np.array([0, -1])},
+        {"depths": np.array(["a", "b"])},
+        {"angles": np.array([True])},
+        {"feedforward": np.zeros(10)},
+        {"feedforward": np.array([["a", "b"]])},
+        {"feedforward": np.zeros((0, 2))},
+        {"state_names": np.array("x")},
+        {"gain": np.zeros((10, 2, 4))},
+        {"reference": None},
+        {"low": None},
+        {"format": "grounded-policy-2"},
+        {"low": np.array([60.0, 60.0])},
+    ],
+    ids=str,
+)
+def test_garbage_inside_is_one_sentence(tmp_path, change):
+    arrays = to_arrays(policy()) | change
+    path = tmp_path / "c.npz"
+    np.savez(path, **{k: v for k, v in arrays.items() if v is not None})
+    with pytest.raises(GroundedError, match=r"c\.npz"):
+        load(path)
+
+
+def test_cut_and_flipped_files_are_refused_or_whole(tmp_path):
+    good = saved(tmp_path, policy()).read_bytes()
+    reference, path = policy(), tmp_path / "bad.npz"
+    rng = np.random.default_rng(0)
+    for _ in range(60):
+        data = bytearray(good)
+        if rng.random() < 0.5:
+            data = data[: rng.integers(len(data))]
+        else:
+            data[rng.integers(len(data))] ^= 1 << rng.integers(8)
+        path.write_bytes(bytes(data))
+        try:
+            run = load(path)
+        except GroundedError:
+            continue
+        np.testing.assert_array_equal(run.policy.feedforward, reference.feedforward)
+        np.testing.assert_array_equal(run.policy.gain, reference.gain)
+
+
+def test_the_robot_needs_numpy_alone(tmp_path):
+    """Importing the runner brings in neither the compiler nor scipy nor the log library."""
+    path = saved(tmp_path, policy())
+    code = (
+        "import sys; from grounded.policy import load; import numpy as np\n"
+        f"run = load({str(path)!r})\nprint(run.action(0.0, np.zeros(2)).tolist())\n"
+        "bad = {'llvmlite', 'scipy', 'mcap', 'click', 'rerun', 'google'} & set(sys.modules)\n"
+        "assert not bad, bad\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
