@@ -270,6 +270,27 @@ def test_every_number_of_every_ros2_fixture_against_the_other_decoder() -> None:
 
 
 @needs_data
+def test_a_transform_is_picked_by_its_frame_and_stamped_by_its_own_header() -> None:
+    support = pytest.importorskip("mcap_ros2.decoder")
+    from mcap.reader import make_reader
+
+    path = data("mcap_format_fixtures", "evo", "nav2_turtlebot_SIM.mcap")
+    wanted = []
+    with path.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[support.DecoderFactory()])
+        for m in reader.iter_decoded_messages(topics=["/tf"], log_time_order=False):
+            for transform in m.decoded_message.transforms:
+                if transform.child_frame_id == "right_wheel":
+                    stamp = transform.header.stamp
+                    time = stamp.sec * 10**9 + stamp.nanosec
+                    wanted.append((time, transform.transform.rotation.y))
+    frames = '/tf.transforms[:]{child_frame_id=="right_wheel"}'
+    found = read_signals(path, {"x": SignalSpec(frames + ".transform.rotation.y")})["x"]
+    assert len(wanted) > 1000 and found.messages > len(wanted)
+    assert list(zip(found.t.tolist(), found.values.tolist(), strict=True)) == wanted
+
+
+@needs_data
 def test_dart_span_and_delay() -> None:
     path = data("dart_small_car", "dart_4_sept_random_driving_slow_ros2.mcap")
     mapping = LogMapping(

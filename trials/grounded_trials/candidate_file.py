@@ -28,7 +28,7 @@ def candidate_bytes(
     input_units: Units | None = None,
 ) -> bytes:
     """A candidate as the bytes of a file; equal arguments give equal bytes."""
-    from grounded_trials.mcap_writer import LogWriter, encode_doubles, encode_lists
+    from grounded_trials.mcap_writer import DoublesEncoder, LogWriter, encode_lists
 
     _refuse_unfinite(policy)
     states = rows(predicted_states, policy.horizon + 1, len(policy.state_names))
@@ -48,7 +48,7 @@ def candidate_bytes(
     topic = log.channel("/policy", "Policy", ["feedforward", "gain", "reference"], repeated=True)
     state = log.channel("/predicted_state", "State", policy.state_names)
     input = log.channel("/predicted_input", "Input", policy.input_names)
-    lines, columns = encode_doubles(states), encode_doubles(inputs)
+    encode_x, encode_u = DoublesEncoder(states.shape[1]), DoublesEncoder(inputs.shape[1])
     none = np.zeros(0)
     for k in range(policy.horizon + 1):
         time = round(k * policy.dt * 1e9)
@@ -56,8 +56,8 @@ def candidate_bytes(
             gain = none if policy.gain is None else policy.gain[k].ravel()
             reference = none if policy.reference is None else policy.reference[k]
             log.message(topic, time, encode_lists([policy.feedforward[k], gain, reference]))
-            log.message(input, time, columns[k])
-        log.message(state, time, lines[k])
+            log.message(input, time, encode_u(inputs[k]))
+        log.message(state, time, encode_x(states[k]))
     log.finish()
     return stream.getvalue()
 

@@ -202,11 +202,11 @@ class _Parser:
             item, rest = self.type(written[2:], scope, depth)
             return Array(item), rest[3:] if rest[0] == "," else rest[1:]
         for words in (3, 2, 1):
-            kind = _NUMBERS.get(" ".join(written[:words]))
-            if kind:
+            number = _NUMBERS.get(" ".join(written[:words]))
+            if number:
                 if written[words : words + 1] == ["double"]:
                     break
-                return Number(kind), written[words:]
+                return Number(number), written[words:]
         if first in _REFUSED or first in ("long", "wchar"):
             raise BadSchema(f"its IDL definition uses {first}, which can't be read")
         name = self.find(first, scope)

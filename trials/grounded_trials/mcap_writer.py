@@ -125,20 +125,22 @@ def file_descriptor_set(message: str, names: Sequence[str], *, repeated: bool = 
     return bytes(files.SerializeToString(deterministic=True))
 
 
-def encode_doubles(values: Array) -> list[bytes]:
-    """Protobuf messages of doubles numbered from 1; values (N, k) -> N messages.
+class DoublesEncoder:
+    """Protobuf messages of `count` doubles, numbered from 1.
 
     Zeros are written too, so that every message has the same length and -0.0 survives.
     """
-    tags = [_varint(number << 3 | 1) for number in range(1, values.shape[1] + 1)]
-    form = struct.Struct("<" + "".join(f"{len(tag)}sd" for tag in tags))
-    messages = []
-    for row in values.tolist():
-        parts: list[bytes | float] = []
-        for tag, value in zip(tags, row, strict=True):
-            parts += (tag, value)
-        messages.append(form.pack(*parts))
-    return messages
+
+    def __init__(self, count: int) -> None:
+        tags = [_varint(number << 3 | 1) for number in range(1, count + 1)]
+        self._form = struct.Struct("<" + "".join(f"{len(tag)}sd" for tag in tags))
+        self._parts: list[bytes | float] = [0.0] * (2 * count)
+        self._parts[::2] = tags
+
+    def __call__(self, values: Array) -> bytes:
+        """The message of these values (count,)."""
+        self._parts[1::2] = values.tolist()
+        return self._form.pack(*self._parts)
 
 
 def encode_lists(lists: Sequence[Array]) -> bytes:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import IO
@@ -14,7 +16,7 @@ from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.trial import Trial
 from grounded_trials.own_files import TRIAL, Meta, Target, Units, read_own
-from grounded_trials.own_files_write import deliver, rows, with_meta, with_units
+from grounded_trials.own_files_write import deliver, with_meta, with_units
 
 FLUSH_NS = 10**9  # at most this much trial time is lost when the robot's battery is
 
@@ -49,7 +51,7 @@ class TrialWriter:
         start_inputs: Array | None = None,
         start_ns: int = 0,
     ) -> None:
-        from grounded_trials.mcap_writer import LogWriter
+        from grounded_trials.mcap_writer import DoublesEncoder, LogWriter
 
         held = None if start_inputs is None else np.asarray(start_inputs, float).tolist()
         table = {
@@ -63,9 +65,11 @@ class TrialWriter:
         }
         table = with_meta(table, meta)
         self._n, self._m, self._start_ns = len(states), len(inputs), start_ns
-        self._owned = not hasattr(target, "write")
-        self._stream = _create(Path(str(target))) if self._owned else target
-        self._log = LogWriter(self._stream)  # type: ignore[arg-type]
+        self._owned = isinstance(target, str | Path)
+        self._stream = _create(Path(target)) if isinstance(target, str | Path) else target
+        self._closed = False
+        self._encode_state, self._encode_input = DoublesEncoder(self._n), DoublesEncoder(self._m)
+        self._log = LogWriter(self._stream)
         self._log.metadata("grounded", table)
         if policy is None:
             self._log.attachment("about", "text/plain", b"A trial; no policy was run.")
@@ -80,28 +84,41 @@ class TrialWriter:
         """Adds the state (n,) at t seconds after the start, and the input (m,) sent then.
 
         The last state of a trial has no input.
-        """
-        from grounded_trials.mcap_writer import encode_doubles
 
+        Raises:
+            GroundedError: if the shapes do not fit, or the file can't be written.
+        """
         time = self._start_ns + round(t * 1e9)
-        self._log.message(
-            self._state, time, encode_doubles(rows(np.atleast_2d(state), 1, self._n))[0]
-        )
-        if input is not None:
-            self._log.message(
-                self._input, time, encode_doubles(rows(np.atleast_2d(input), 1, self._m))[0]
-            )
-        if time - self._flushed >= FLUSH_NS:
-            self._log.flush()
-            self._flushed = time
+        with self._writing():
+            self._log.message(self._state, time, self._encode_state(_row(state, self._n)))
+            if input is not None:
+                self._log.message(self._input, time, self._encode_input(_row(input, self._m)))
+            if time - self._flushed >= FLUSH_NS:
+                self._log.flush()
+                self._flushed = time
 
     def close(self) -> None:
-        """Ends the file; a second call does nothing."""
-        if self._log is not None:
-            self._log.finish()
-            self._log = None  # type: ignore[assignment]
-            if self._owned:
-                self._stream.close()  # type: ignore[union-attr]
+        """Ends the file; a second call does nothing.
+
+        Raises:
+            GroundedError: if it can't be written, as on a full disk.
+        """
+        if not self._closed:
+            self._closed = True
+            with self._writing():
+                self._log.finish()
+                if self._owned:
+                    self._stream.close()
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise GroundedError(
+                f"the trial can't be written: {error.strerror}; what is in the file already can be "
+                "saved with `grounded recover`"
+            ) from None
 
     def __enter__(self) -> TrialWriter:
         return self
@@ -210,6 +227,13 @@ def read_trial(
         start_inputs=None if held is None else own.floats(held, "start_inputs", len(inputs)),
     )
     return trial, own.meta, own.attachments.get("policy")
+
+
+def _row(values: Array, size: int) -> Array:
+    row = np.asarray(values, dtype=np.float64)
+    if row.shape != (size,):
+        raise GroundedError(f"expected {size} numbers, got an array of shape {row.shape}")
+    return row
 
 
 def _create(path: Path) -> IO[bytes]:
