@@ -38,7 +38,7 @@ from grounded.estimate.recursion import recursion
 from grounded.estimate.steps import ModelSteps
 from grounded.frozen import Array
 
-SWEEPS = 8
+SWEEPS = 20
 CLOSE = 1e-3  # standard deviations: a sweep that moves the track less is the last
 
 

@@ -12,7 +12,7 @@ second ahead (`prediction`), then joins the rest for the final values and their 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -116,7 +116,7 @@ def fit(
         raise GroundedError("a fit needs a trial of at least 3 steps")
     rng = np.random.default_rng(0) if rng is None else rng
     train, test = _held_out(records, hold_out, horizon_s, measurement)
-    first = _search(_data(model, train, measurement, unknowns), unknowns.start, None, rng)
+    first = _first(_data(model, train, measurement, unknowns), rng)
     before = after = None
     if test and np.isfinite(first.climb.at.loglik):
         before, after = _judged(model, test, measurement, unknowns, first, horizon_s)
@@ -151,6 +151,18 @@ def _data(
     return Data(model.system, tuple(pieces), measurement, unknowns)
 
 
+def _first(data: Data, rng: np.random.Generator) -> _Found:
+    """From the start values; much data are searched on a draw of them first."""
+    draw = enough(data.records, rng)
+    if 2 * sum(r.steps for r in draw) > sum(r.steps for r in data.records):
+        return _search(data, data.unknowns.start, None, rng)
+    rough = _search(replace(data, records=tuple(draw)), data.unknowns.start, None, rng)
+    if not np.isfinite(rough.climb.at.loglik):
+        return rough
+    found = _search(data, rough.climb.at.theta, rough.noise, rng)
+    return replace(found, start_noise=rough.start_noise, loglik_start=np.nan)
+
+
 def _search(data: Data, theta: Array, noise: Noise | None, rng: np.random.Generator) -> _Found:
     """Parameters, thresholds and noise in turn until the likelihood stops rising."""
     new = noise is None
@@ -172,7 +184,7 @@ def _search(data: Data, theta: Array, noise: Noise | None, rng: np.random.Genera
         at = climb(data, noise, at, ~still).at
         if round_ == 0 or at.loglik - before > STIRRED:
             for i in np.flatnonzero(still & np.isfinite(data.unknowns.scale)):
-                width = None if new and round_ == 0 else 0.1 * data.unknowns.scale[i]
+                width = None if new and round_ == 0 else 0.05 * data.unknowns.scale[i]
                 moved = coarse_to_fine(data, noise, at, int(i), ~still, width)
                 thresholds[i] |= moved is not at
                 at = moved
@@ -298,18 +310,19 @@ def _report(
 
 
 def _estimates(unknowns: Unknowns, found: _Found) -> tuple[dict[str, Estimate], Spread]:
-    at = found.climb.at
+    at, scanned = found.climb.at, np.zeros(unknowns.k, dtype=bool)
     if not np.isfinite(at.loglik):
         k = unknowns.k
         wide = Spread(np.full(k, np.inf), np.zeros((k, k)), ())
     else:
-        smooth = ~quiet(found.data, found.climb.slopes) & ~found.thresholds
+        scanned = quiet(found.data, found.climb.slopes) | found.thresholds
+        smooth, scanned = ~scanned, scanned & np.isfinite(unknowns.scale)
         wide = spread(found.climb.slopes, smooth)
     params: dict[str, Estimate] = {}
     for i, name in enumerate(unknowns.names):
         value, std = float(at.theta[i]), float(wide.std[i])
         low, high = value - 1.96 * std, value + 1.96 * std
-        if found.thresholds[i]:
+        if scanned[i]:
             low, high = likelihood_interval(found.data, found.noise, at, i)
             std = (high - low) / (2 * 1.96)
         range_ = unknowns.high[i] - unknowns.low[i]

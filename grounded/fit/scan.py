@@ -19,7 +19,7 @@ from grounded.fit.gauss_newton import direction
 from grounded.fit.innovations import Data, Linear, Point, linear, point
 from grounded.frozen import Array
 
-COARSE, FINE, ROUNDS = 21, 7, 4
+COARSE, FINE, ROUNDS = 21, 5, 4
 DROP = 3.67  # [nats]
 LEVEL = 0.05  # [nats] as good as equal
 QUIET = 1e-2  # information over the whole range below which a slope says nothing
@@ -32,7 +32,12 @@ def quiet(data: Data, slopes: Linear) -> NDArray[np.bool_]:
 
 
 def scan(
-    data: Data, noise: Noise, at: Point, i: int, grid: Array, free: NDArray[np.bool_]
+    data: Data,
+    noise: Noise,
+    at: Point,
+    i: int,
+    grid: Array,
+    free: NDArray[np.bool_] | None,
 ) -> tuple[Point, Array]:
     """The best point with unknown i on a grid, and the profile (len(grid),) [nats].
 
@@ -44,9 +49,9 @@ def scan(
         at: where the others are.
         i: the unknown that is scanned.
         grid: its values.
-        free: which unknowns may move, (k,); i itself does not.
+        free: which others may move, (k,); None: none.
     """
-    others = free.copy()
+    others = np.zeros(data.unknowns.k, dtype=bool) if free is None else free.copy()
     others[i] = False
     profile, best, score = np.full(len(grid), -np.inf), at, at.loglik
     for g, value in enumerate(grid):
@@ -78,8 +83,9 @@ def coarse_to_fine(
     if width is not None:
         low, high = max(low, at.theta[i] - width), min(high, at.theta[i] + width)
     grid, best = np.linspace(low, high, COARSE), at
-    for _ in range(ROUNDS):
-        best, profile = scan(data, noise, best, i, grid, free)
+    for round_ in range(ROUNDS):
+        others = free if round_ == 0 else None  # later steps are too small to matter to them
+        best, profile = scan(data, noise, best, i, grid, others)
         top = np.flatnonzero(profile > profile.max() - LEVEL)
         step = grid[1] - grid[0]
         if len(top) > 2:
