@@ -108,6 +108,8 @@ def test_dart_from_an_unknown_bag_to_arrays() -> None:
     assert "# [log.state.v]  # nothing in the log fits" in text
     log = tomllib.loads(text)["log"]
     assert log["clock"] == "header" and log["state"]["psi"]["unwrap"] is True
+    measured = tomllib.loads(text)["estimate"]["measured"]
+    assert set(measured) == {"x", "y", "psi"} and 1e-4 < measured["x"] < 5e-3
     specs = {
         kind: {n: SignalSpec(**{"clock": log["clock"], **s}) for n, s in log[kind].items()}
         for kind in ("state", "input")

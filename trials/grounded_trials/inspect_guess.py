@@ -18,6 +18,7 @@ from grounded_trials.inspect_log import FieldReport, LogReport, TopicReport
 
 SURE = 1.5  # how much better than the next topic's best a guess must be
 LEAST = 2.0  # below this score nothing is proposed
+DRIFT = 2e-4  # of a signal's range: the least deviation that is proposed for it
 SIMULATED_S = 1.0  # header stamps this far from the log's clock are not its time
 
 _YAW = ("@rpy.yaw", "yaw", "heading", "theta", "psi")
@@ -183,6 +184,7 @@ def mapping_toml(
     for kind, guesses in (("state", states), ("input", inputs)):
         for guess in guesses:
             lines += ["", *_table(kind, guess, clock)]
+    lines += _estimate(states)
     return "\n".join(lines) + "\n"
 
 
@@ -201,6 +203,27 @@ def _table(kind: str, guess: Guess, clock: str) -> list[str]:
     if guess.is_angle and guess.path.endswith("yaw"):
         lines.append("unwrap = true")
     return lines
+
+
+def _estimate(states: Sequence[Guess]) -> list[str]:
+    """An [estimate] table for the states that nothing in the log gives."""
+    missing = [guess.name for guess in states if not guess.path]
+    known = [guess for guess in states if guess.path and guess.field is not None]
+    if not missing or not known:
+        return []
+    deviations = ", ".join(f"{guess.name} = {_deviation(guess):.1g}" for guess in known)
+    return [
+        "",
+        f"[estimate]  # the smoother finds {', '.join(missing)}",
+        f"measured = {{ {deviations} }}  # standard deviations; check them",
+    ]
+
+
+def _deviation(guess: Guess) -> float:
+    """Its noise in this log; not less than a small part of its range, since sensors drift too."""
+    assert guess.field is not None
+    low, high = guess.field.low or 0.0, guess.field.high or 0.0
+    return max(guess.field.noise, DRIFT * (high - low), 1e-6)
 
 
 def _quote(path: str) -> str:

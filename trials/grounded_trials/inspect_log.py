@@ -27,6 +27,7 @@ from grounded_trials.signals import Decoder, decoder_of
 
 GAP = 10.0  # intervals; a longer gap is remarked on
 SKEW_S = 0.1  # a header stamp further from the log's clock is remarked on
+NOISE_SAMPLES = 10  # in a batch, to tell a signal's noise
 DECODED = 20_000  # messages of a topic whose numbers are looked at
 
 
@@ -38,6 +39,7 @@ class FieldReport:
     low: float | None  # smallest and largest finite value; None if there is none
     high: float | None
     not_finite: int
+    noise: float = 0.0  # standard deviation of what changes from sample to sample
 
 
 @dataclass(frozen=True)
@@ -167,6 +169,7 @@ class _Range:
     count: int = 0
     not_finite: int = 0
     samples: list[tuple[Ints, Floats]] | None = None  # kept where twins may be found
+    noises: list[float] = field(default_factory=list)
 
     def add(self, values: Floats, log_times: Ints) -> None:
         if self.samples is not None:
@@ -174,6 +177,8 @@ class _Range:
         finite = values[np.isfinite(values)]
         self.count += len(values)
         self.not_finite += len(values) - len(finite)
+        if len(finite) >= NOISE_SAMPLES:
+            self.noises.append(_noise(finite))
         if len(finite):
             self.low = min(self.low, float(finite.min()))
             self.high = max(self.high, float(finite.max()))
@@ -298,4 +303,10 @@ def _field(path: str, found: _Range) -> FieldReport:
         low=None if none else found.low,
         high=None if none else found.high,
         not_finite=found.not_finite,
+        noise=float(np.median(found.noises)) if found.noises else 0.0,
     )
+
+
+def _noise(values: Floats) -> float:
+    """Deviation of white noise on a smooth signal, from its second differences; outliers aside."""
+    return float(np.median(np.abs(np.diff(values, 2))) / (0.6745 * np.sqrt(6)))
