@@ -42,7 +42,7 @@ def command(html: bool, png: bool, rrd: bool, folder: str | None, json_: bool) -
     else:
         show(report_text(findings, table, sparkline))
     if findings.lost:
-        for one in findings.lost:
+        for one in findings.lost if paths or json_ else ():
             say(f"left out: {one.file}: {one.reason}")
         click.get_current_context().exit(3)
 

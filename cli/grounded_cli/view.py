@@ -49,6 +49,6 @@ def _open(path: Path) -> None:
         return
     if code != 0:
         raise GroundedError(
-            f"the viewer can't be opened here (no screen?): copy {path} to a computer with a screen "
-            "and open it there with: rerun recording.rrd"
+            f"the viewer can't be opened here (no screen?): copy {path} to a computer with a "
+            "screen and open it there with: rerun recording.rrd"
         )

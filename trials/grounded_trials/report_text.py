@@ -1,0 +1,201 @@
+"""The report for a terminal: 80 columns, aligned numbers, the next command as its last line."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from textwrap import wrap
+
+import numpy as np
+
+from grounded.search import Tried
+from grounded_trials.diagnosis_file import Diagnosis
+from grounded_trials.findings import (
+    Findings,
+    prediction_error,
+    rms,
+    selection,
+    tracking_error,
+)
+
+WIDTH = 80
+ROWS = 12  # candidates in the table; the others are counted
+ITERATIONS = 5  # of the bias
+EFFECTS = 5
+
+Table = Callable[[Sequence[Sequence[str]], Sequence[str]], str]
+
+
+def report_text(findings: Findings, table: Table, bars: Callable[[Sequence[float]], str]) -> str:
+    """The whole report.
+
+    Args:
+        findings: what is shown.
+        table: aligns rows under a header.
+        bars: a sparkline of utilities.
+    """
+    parts = [_head(findings), _utilities(findings, table, bars)]
+    if findings.best is not None:
+        parts += [_trajectories(findings, table), _biases(findings, table)]
+    parts.append(_diagnosis(findings.diagnosis, table))
+    if findings.lost:
+        lines = ["left out of this report"]
+        for one in findings.lost:
+            lines += _wrapped(f"{one.file}: {one.reason}", "  ")
+        parts.append("\n".join(lines))
+    parts.append(f"next: {findings.next_command}")
+    return "\n\n".join(parts)
+
+
+def _head(findings: Findings) -> str:
+    task = findings.task
+    runs = len(findings.runs)
+    text = (
+        f"{findings.name}: {task.model.name}, {task.horizon} steps of {task.dt:g} s "
+        f"({task.horizon * task.dt:g} s), {'closed loop' if task.feedback else 'open loop'}; "
+        f"{runs} trial{'' if runs == 1 else 's'}"
+    )
+    if findings.effects:
+        text += "; adopted: " + ", ".join(findings.effects)
+    return "\n".join(wrap(text, WIDTH))
+
+
+def _utilities(findings: Findings, table: Table, bars: Callable[[Sequence[float]], str]) -> str:
+    history = findings.history
+    if not history:
+        return "utility\n  no candidate was proposed yet"
+    shown, left = _rows(history)
+    rows = [_candidate(t, t is history[-1]) for t in shown]
+    header = ("candidate", "iter.", "alpha", "predicted", "real", "+-", "trials", "")
+    lines = ["utility", table(rows, header)]
+    if left:
+        lines.append(f"  ({left} more that did not improve, or between: grounded status)")
+    spark = bars(spaced([t.utility for t in history if t.utilities][-WIDTH // 2 :]))
+    lines.append(f"\n  {spark}  by candidate, higher is better")
+    first, best = findings.first, findings.best
+    if first is not None and best is not None:
+        text = f"model's policy {figure(first.utility)}, "
+        text += f"best {best.candidate.id} {figure(best.utility)}"
+        if math.isfinite(first.utility) and first.utility < 0:
+            text += f", {100 * (1 - best.utility / first.utility):.1f} % better"
+        if findings.optimum is not None:
+            text += f", optimum {figure(findings.optimum)}"
+        lines += _wrapped(text, "  ")
+    lines += _wrapped(f"{findings.standing.phase}: {findings.standing.sentence}", "  ")
+    return "\n".join(lines)
+
+
+def spaced(utilities: Sequence[float]) -> list[float]:
+    """Utilities for bars: by their logarithm where the worst would flatten all the others."""
+    known = [u for u in utilities if math.isfinite(u)]
+    if not known or max(known) >= 0 or min(known) > 5 * max(known):
+        return list(utilities)
+    return [-math.log(-u) if math.isfinite(u) else u for u in utilities]
+
+
+def _rows(history: Sequence[Tried]) -> tuple[list[Tried], int]:
+    """At most ROWS candidates: the first, then improvements, then the latest ones."""
+    if len(history) <= ROWS:
+        return list(history), 0
+    keep = {0, len(history) - 1}
+    accepted = [k for k, t in enumerate(history) if t.accepted]
+    if len(accepted) > ROWS - 2:
+        index = np.unique(np.rint(np.linspace(0, len(accepted) - 1, ROWS - 2)).astype(int))
+        accepted = [accepted[i] for i in index]
+    keep |= set(accepted)
+    for k in range(len(history) - 1, -1, -1):
+        if len(keep) < ROWS:
+            keep.add(k)
+    return [history[k] for k in sorted(keep)], len(history) - len(keep)
+
+
+def _candidate(tried: Tried, last: bool) -> tuple[str, ...]:
+    verdict = {True: "better", False: "no better", None: "waiting" if last else "no trial"}[
+        tried.accepted
+    ]
+    if tried.accepted and not tried.candidate.base:
+        verdict = "first"
+    error = tried.standard_error
+    return (
+        tried.candidate.id,
+        str(tried.candidate.iteration),
+        f"{tried.candidate.alpha:g}",
+        figure(tried.candidate.predicted_utility),
+        figure(tried.utility),
+        figure(error, 2),
+        str(len(tried.trials)),
+        verdict,
+    )
+
+
+def _trajectories(findings: Findings, table: Table) -> str:
+    """Distance to the target, and what the model had promised, rms over the run."""
+    task, first, best = findings.task, findings.first, findings.best
+    assert best is not None
+    runs = [run for run in (first, best) if run is not None]
+    if first is not None and first.candidate is best.candidate:
+        runs = [best]
+    columns = [rms(tracking_error(task, run.trial)) for run in runs]
+    columns += [rms(prediction_error(task, run)) for run in runs]
+    rows = [
+        (name, unit, *(figure(float(c[i]), 3) for c in columns))
+        for i, (name, unit) in enumerate(task.model.states.items())
+    ]
+    ids = [run.candidate.id for run in runs]
+    header = ("state", "unit", *(f"{i} off" for i in ids), *(f"{i} gap" for i in ids))
+    note = "  off: from the desired path; gap: from what the model predicted for that run"
+    return "trajectories, rms over the run\n" + table(rows, header) + "\n" + note
+
+
+def _biases(findings: Findings, table: Table) -> str:
+    task = findings.task
+    runs = selection(findings.improvements, ITERATIONS)
+    if not runs:
+        return "bias\n  no whole trial yet"
+    columns = [rms(run.residual) / task.dt for run in runs]
+    rows = [
+        (name, f"{unit} per s", *(figure(float(c[i]), 3) for c in columns))
+        for i, (name, unit) in enumerate(task.model.states.items())
+    ]
+    header = ("state", "unit", *(f"iter. {run.candidate.iteration}" for run in runs))
+    return "bias: what the crude model lacks, rms over the run\n" + table(rows, header)
+
+
+def _diagnosis(diagnosis: Diagnosis | None, table: Table) -> str:
+    if diagnosis is None:
+        return "gap to the model\n  not diagnosed yet: grounded diagnose"
+    lines = ["gap to the model", *_wrapped(diagnosis.sentence or diagnosis.kind, "  ")]
+    gap = diagnosis.gap
+    if gap is not None:
+        lines.append(
+            f"  {gap.horizon_s:g} s ahead: {figure(gap.before, 3)} before, {figure(gap.after, 3)} "
+            f"after, floor {figure(gap.floor, 3)} ({gap.unit})"
+        )
+    if diagnosis.ranking:
+        rows = [
+            (
+                r.effect[:30],
+                figure(r.evidence, 3),
+                figure(r.gap_after, 3),
+                " ".join(f"{v.name} = {v.value:.3g} +- {v.std:.1g}" for v in r.params)[:34],
+            )
+            for r in diagnosis.ranking[:EFFECTS]
+        ]
+        lines.append(table(rows, ("effect", "nats", "gap after", "")))
+    return "\n".join(lines)
+
+
+def _wrapped(text: str, indent: str) -> list[str]:
+    return wrap(text, WIDTH, initial_indent=indent, subsequent_indent=indent + "  ")
+
+
+def figure(value: float | None, digits: int = 4) -> str:
+    """A number for a person: `digits` significant ones; "failed" for minus infinity, "-": none."""
+    if value is None or math.isnan(value):
+        return "-"
+    if value == -math.inf:
+        return "failed"
+    if value != 0 and not 1e-3 <= abs(value) < 1e6:
+        return f"{value:.{digits - 1}e}"
+    decimals = max(digits - 1 - math.floor(math.log10(abs(value))) if value else digits - 1, 0)
+    return f"{value:,.{decimals}f}"
