@@ -66,8 +66,9 @@ def _tell(name: str, one: Ingested) -> None:
     if not one.candidate:
         show(f"{name} {known} {one.trial}: data for fit and diagnose")
     else:
+        better = "the best so far" if one.base else "the first: what the search improves on"
         verdict = {
-            True: "an improvement: it is the best so far",
+            True: better,
             False: "no improvement",
             None: "more trials of it are needed ([search] repeats)",
         }[one.accepted]

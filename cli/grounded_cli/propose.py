@@ -7,11 +7,14 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from grounded_cli.options import as_json, in_workspace, open_workspace
-from grounded_cli.terminal import number, progress, say, show, show_json
+from grounded_cli.terminal import field, number, progress, say, show, show_json
 
 if TYPE_CHECKING:
     from grounded_trials.proposing import Proposed
     from grounded_trials.workspace import Workspace
+
+    from grounded.search import Candidate, Standing
+    from grounded.task import Task
 
 
 @click.command("propose")
@@ -65,52 +68,64 @@ def _tell(workspace: Workspace, proposed: Proposed) -> None:
     standing, candidate = proposed.proposal.standing, proposed.proposal.candidate
     for note in proposed.proposal.notes:
         say(f"note: {note}")
+    if note := workspace.planner.plan.model.system.note:
+        say(f"note: the model is not compiled: {note}")
     if candidate is None:
-        show(f"Nothing to run: {standing.sentence}.")
+        show(field("end", f"nothing to run: {standing.sentence}"))
         return
-    task = workspace.task
-    best = standing.incumbent
     waiting = "" if proposed.proposal.is_new else " (proposed before, its trial is missing)"
     show(f"Run {candidate.id}{waiting}: {proposed.file}")
-    what = (
-        "the model's own policy"
-        if not candidate.base
-        else (f"iteration {candidate.iteration}, alpha = {candidate.alpha:g} from {candidate.base}")
-    )
-    if candidate.caution:
-        what += f", designed more gently after {candidate.caution} crash(es)"
-    show(f"  what       {what}, {task.horizon * task.dt:g} s")
-    show(
-        f"  predicted  utility {number(candidate.predicted_utility)}",
-    )
-    if best is not None:
-        show(f"  so far     best {best.candidate.id} with {number(best.utility)}")
-    show(f"  trust      {_trust(workspace, proposed)}")
-    reach = candidate.predicted_states
-    for name in _position(task.model.roles):
-        i = task.model.state_names.index(name)
-        unit = task.model.states[name]
-        show(f"  {name:10} from {reach[:, i].min():.2f} to {reach[:, i].max():.2f} {unit}")
+    show(field("what", _what(candidate, workspace.task), "  "))
+    show(field("predicted", f"utility {number(candidate.predicted_utility)}", "  "))
+    if standing.incumbent is not None:
+        best = standing.incumbent
+        show(field("so far", f"{number(best.utility)} by {best.candidate.id}", "  "))
+    show(field("trust", _trust(standing), "  "))
+    for name, text in _extent(candidate, workspace.task):
+        show(field(name, text, "  "))
     system = workspace.config.system
     follow = "grounded run" if system.command or system.model else "grounded ingest TRIAL.mcap"
     show(f"\nnext: {follow}")
 
 
-def _trust(workspace: Workspace, proposed: Proposed) -> str:
-    """How well predictions came true so far."""
+def _what(candidate: Candidate, task: Task) -> str:
+    """Where a candidate comes from."""
+    seconds = f"{task.horizon * task.dt:g} s"
+    if not candidate.base:
+        gently = f", designed more gently after {candidate.caution} crashes" * bool(
+            candidate.caution
+        )
+        return f"the model's own policy{gently}, {seconds}"
+    return f"iteration {candidate.iteration}: alpha = {candidate.alpha:g} from {candidate.base}, {seconds}"
+
+
+def _extent(candidate: Candidate, task: Task) -> list[tuple[str, str]]:
+    """Where the predicted run goes, and how much of the inputs it uses."""
+    model, rows = task.model, []
+    position = model.roles.get("position", ())
+    for name in (position,) if isinstance(position, str) else position:
+        if name in model.states:
+            values = candidate.predicted_states[:, model.state_names.index(name)]
+            rows.append((name, f"{_span(values)} {model.states[name]}"))
+    for i, name in enumerate(model.input_names):
+        low, high = float(task.low[i]), float(task.high[i])
+        limits = f", limits {low:g} to {high:g}" * (high < float("inf"))
+        rows.append((name, f"{_span(candidate.predicted_inputs[:, i])}{limits}"))
+    return rows
+
+
+def _span(values: Any) -> str:
+    return f"{values.min() + 0.0:.2f} to {values.max() + 0.0:.2f}".replace("-0.00", "0.00")
+
+
+def _trust(standing: Standing) -> str:
+    """How the last prediction came true."""
     pairs = [
         (tried.candidate.predicted_utility, tried.utility)
-        for tried in proposed.proposal.standing.history
+        for tried in standing.history
         if tried.utilities
     ]
     if not pairs:
         return "unknown: the crude model was never compared with the real system"
     predicted, real = pairs[-1]
-    return f"the last prediction was {number(predicted)}, the real run gave {number(real)}" + (
-        f" ({len(pairs)} candidates so far)" if len(pairs) > 1 else ""
-    )
-
-
-def _position(roles: Any) -> list[str]:
-    position = roles.get("position", ())
-    return [position] if isinstance(position, str) else list(position)
+    return f"the last prediction was {number(predicted)}, the real run gave {number(real)}"

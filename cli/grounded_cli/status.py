@@ -7,22 +7,22 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from grounded_cli.options import as_json, in_workspace, open_workspace
-from grounded_cli.terminal import number, progress, show, show_json, sparkline, table
+from grounded_cli.terminal import field, number, progress, show, show_json, sparkline, table
 
 if TYPE_CHECKING:
-    from grounded.search import Standing
+    from grounded.search import Standing, Tried
 
 
 @click.command("status")
 @in_workspace
 @as_json
 def command(folder: str | None, json_: bool) -> None:
-    """Show where the search stands: derived from the stored trials, nothing is planned."""
+    """Show where the search stands: derived from the stored trials, nothing is written."""
     workspace = open_workspace(folder)
     from grounded_trials.proposing import standing_in
 
     with progress("reading trials"):
-        standing = standing_in(workspace)
+        standing = standing_in(workspace, ahead=True)
     if json_:
         show_json(as_document(standing))
         return
@@ -64,45 +64,37 @@ def as_document(standing: Standing) -> dict[str, Any]:
 def summary(standing: Standing) -> str:
     """The history as a table, with a line of bars and how sure the last improvement is."""
     lines = []
-    rows = []
-    for t in standing.history:
-        error = t.standard_error
-        verdict = {True: "better", False: "no better", None: "waiting"}[t.accepted]
-        if not t.candidate.base and t.accepted:
-            verdict = "first"
-        rows.append(
-            (
-                t.candidate.id,
-                str(t.candidate.iteration),
-                f"{t.candidate.alpha:g}",
-                number(t.candidate.predicted_utility),
-                number(t.utility),
-                "-" if error != error else f"{error:.2g}",
-                str(len(t.trials)),
-                verdict,
-            )
-        )
-    if rows:
+    if standing.history:
         header = ("candidate", "iteration", "alpha", "predicted", "utility", "+-", "trials", "")
-        lines.append(table(rows, header))
+        lines.append(table([_row(t) for t in standing.history], header))
         bars = sparkline([t.utility for t in standing.history if t.utilities])
-        lines.append(f"\nutility    {bars}")
+        lines.append("\n" + field("utility", bars))
     if standing.incumbent is not None:
-        best = standing.incumbent
-        first = standing.utilities[0]
-        gain = (best.utility - first) / abs(first) if first else 0.0
-        lines.append(
-            f"best       {best.candidate.id}, utility {number(best.utility)}"
-            + (
-                f", {100 * gain:.1f} % better than the model's own policy"
-                if standing.iteration
-                else ""
-            )
-        )
+        best, first = standing.incumbent, standing.utilities[0]
+        gain = 100 * (best.utility - first) / abs(first) if first else 0.0
+        better = f", {gain:.1f} % better than the model's own policy" * bool(standing.iteration)
+        lines.append(field("best", f"{best.candidate.id}, utility {number(best.utility)}{better}"))
     if sure := certainty(standing):
-        lines.append(f"certainty  {sure}")
-    lines.append(f"phase      {standing.phase}: {standing.sentence}")
+        lines.append(field("certainty", sure))
+    lines.append(field("phase", f"{standing.phase}: {standing.sentence}"))
     return "\n".join(lines)
+
+
+def _row(tried: Tried) -> tuple[str, ...]:
+    error = tried.standard_error
+    verdict = {True: "better", False: "no better", None: "waiting"}[tried.accepted]
+    if not tried.candidate.base and tried.accepted:
+        verdict = "first"
+    return (
+        tried.candidate.id,
+        str(tried.candidate.iteration),
+        f"{tried.candidate.alpha:g}",
+        number(tried.candidate.predicted_utility),
+        number(tried.utility),
+        "-" if error != error else f"{error:.2g}",
+        str(len(tried.trials)),
+        verdict,
+    )
 
 
 def certainty(standing: Standing) -> str:

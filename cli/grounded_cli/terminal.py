@@ -6,6 +6,7 @@ import json
 import math
 import os
 import sys
+import textwrap
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -46,6 +47,14 @@ def _clean(value: Any) -> Any:
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return value if isinstance(value, int) else str(value)
+
+
+def field(label: str, text: str, indent: str = "") -> str:
+    """A label and its text, wrapped to 80 columns under itself."""
+    head = f"{indent}{label:<11}"
+    return textwrap.fill(
+        text, 80, initial_indent=head, subsequent_indent=" " * len(head), break_on_hyphens=False
+    )
 
 
 @contextmanager

@@ -97,7 +97,8 @@ def _csv(policy: Policy, units: dict[str, str], about: dict[str, str]) -> bytes:
     for name, low, high, held in zip(
         policy.input_names, policy.low, policy.high, policy.past, strict=True
     ):
-        stream.write(f"# {name}: limits [{low!r}, {high!r}], held before the start {held!r}\n")
+        span = f"[{float(low)!r}, {float(high)!r}]"
+        stream.write(f"# {name}: limits {span}, held before the start {float(held)!r}\n")
     columns = [policy.feedforward]
     header = ["t", *(f"feedforward.{name}" for name in policy.input_names)]
     if policy.gain is not None and policy.reference is not None:

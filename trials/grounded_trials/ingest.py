@@ -40,6 +40,7 @@ class Ingested:
     accepted: bool | None  # None: data, or more trials of the candidate are needed
     warnings: tuple[str, ...]
     signals: tuple[SignalReport, ...]  # for a foreign log
+    base: str = ""  # the candidate that this one was to improve on, "" for the model's own policy
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +87,7 @@ def ingest_log(
         accepted=tried.accepted if tried else None,
         warnings=warnings,
         signals=read.signals,
+        base=tried.candidate.base if tried else "",
     )
 
 

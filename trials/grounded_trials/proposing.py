@@ -47,19 +47,24 @@ def propose_in(workspace: Workspace) -> Proposed:
     return Proposed(proposal, path)
 
 
-def standing_in(workspace: Workspace) -> Standing:
-    """Where the search of a workspace stands; nothing is planned."""
-    from grounded.improve import model_fingerprint
+def standing_in(workspace: Workspace, *, ahead: bool = False) -> Standing:
+    """Where the search of a workspace stands.
+
+    Args:
+        workspace: whose trials and candidates say it.
+        ahead: plan the next candidate too, without writing it: only that tells a search that has
+            nothing left to gain from one that goes on.
+    """
+    from grounded.improve import model_fingerprint, propose
     from grounded.search import standing
 
-    task = workspace.task
-    return standing(
-        task,
-        workspace.search_candidates(),
-        workspace.task_trials(),
-        workspace.config.search,
-        model_fingerprint(workspace.planner.plan),
-    )
+    candidates, trials = workspace.search_candidates(), workspace.task_trials()
+    task, options, planner = workspace.task, workspace.config.search, workspace.planner
+    now = standing(task, candidates, trials, options, model_fingerprint(planner.plan))
+    if ahead and now.phase == "propose" and now.incumbent is not None:
+        options_ = {"planner": planner, "refit": refitted}
+        return propose(task, candidates, trials, options, **options_).standing  # type: ignore[arg-type]
+    return now
 
 
 def refitted(task: Task, trials: Sequence[Trial]) -> Model:
