@@ -91,12 +91,12 @@ def _tell(workspace: Workspace, proposed: Proposed) -> None:
 def _what(candidate: Candidate, task: Task) -> str:
     """Where a candidate comes from."""
     seconds = f"{task.horizon * task.dt:g} s"
-    if not candidate.base:
-        gently = f", designed more gently after {candidate.caution} crashes" * bool(
-            candidate.caution
-        )
-        return f"the model's own policy{gently}, {seconds}"
-    return f"iteration {candidate.iteration}: alpha = {candidate.alpha:g} from {candidate.base}, {seconds}"
+    if candidate.base:
+        step = f"alpha = {candidate.alpha:g} from {candidate.base}"
+        return f"iteration {candidate.iteration}: {step}, {seconds}"
+    crashes = candidate.caution
+    gently = f", designed more gently after {crashes} crashes" * bool(crashes)
+    return f"the model's own policy{gently}, {seconds}"
 
 
 def _extent(candidate: Candidate, task: Task) -> list[tuple[str, str]]:
