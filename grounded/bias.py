@@ -51,13 +51,14 @@ def ground(task: Task, trial: Trial, *, exact: bool = False) -> Grounding:
 
     Args:
         task: gives the original model, with its latency.
-        trial: a whole trial, T = H, finite.
+        trial: a whole trial, finite for H steps; what follows is not used.
         exact: measure the bias of the exact model, not of the smoothed planning model.
 
     Raises:
         GroundedError: if the trial is short or not finite: its bias is not known to the end.
     """
-    if trial.steps != task.horizon or trial.finite_steps < trial.steps:
+    trial = trial.until(task.horizon)
+    if trial.steps < task.horizon or trial.finite_steps < trial.steps:
         raise GroundedError(
             f"a bias needs a whole trial of {task.horizon} steps; this one is finite for "
             f"{trial.finite_steps}"

@@ -58,6 +58,8 @@ class Plant:
         model, H = self.model, policy.horizon
         columns = [self._index(name, model.state_names) for name in policy.state_names]
         order = [self._index(name, model.input_names) for name in policy.input_names]
+        for name in self.latency:
+            self._index(name, model.input_names)
         x = np.array([start.get(name, 0.0) for name in model.state_names], dtype=float)
         x += self._std(self.noise.start) * rng.standard_normal(model.n)
         process, error = self._std(self.noise.process), self._std(self.noise.measurement)

@@ -225,7 +225,7 @@ def _judge(
     incumbent: Tried | None = None
     iteration = 0
     for candidate in candidates:
-        own = tuple(t for t in trials if t.candidate == candidate.id)
+        own = tuple(t.until(task.horizon) for t in trials if t.candidate == candidate.id)
         utilities = tuple(task.utility(t) for t in own)
         failed = any(u == -np.inf for u in utilities)
         if len(own) < options.repeats and not failed:

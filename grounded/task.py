@@ -65,9 +65,11 @@ class Task:
     def __post_init__(self) -> None:
         n, m = self.model.n, self.model.m
         H = len(self.target) - 1
+        if not 1 <= H <= MAX_HORIZON:
+            raise GroundedError(f"task: the horizon must be 1 to {MAX_HORIZON} steps, got {H}")
         defaults = {
             "latency": np.zeros(m),
-            "input_target": np.zeros((max(H, 0), m)),
+            "input_target": np.zeros((H, m)),
             "safety_low": np.full(n, -np.inf),
             "safety_high": np.full(n, np.inf),
         }
@@ -79,14 +81,21 @@ class Task:
             if value.shape != shape:
                 raise GroundedError(f"task: {name} must have shape {shape}, got {value.shape}")
             object.__setattr__(self, name, value)
-        self._check_values(H)
+        self._check_values()
 
-    def _check_values(self, H: int) -> None:
-        if not 1 <= H <= MAX_HORIZON:
-            raise GroundedError(f"task: the horizon must be 1 to {MAX_HORIZON} steps, got {H}")
+    def _check_values(self) -> None:
         if not (np.isfinite(self.dt) and self.dt > 0):
             raise GroundedError(f"task: dt must be a positive number of seconds, got {self.dt}")
+        if not (np.isfinite(self.smoothing) and self.smoothing >= 0):
+            raise GroundedError(f"[model] smoothing must not be negative, got {self.smoothing}")
         assert self.latency is not None
+        assert self.safety_low is not None and self.safety_high is not None
+        for i, name in enumerate(self.model.state_names):
+            if not self.safety_low[i] < self.safety_high[i]:
+                raise GroundedError(
+                    f"[safety] {name}: the lower bound {self.safety_low[i]:g} must be below the "
+                    f"upper bound {self.safety_high[i]:g}"
+                )
         for i, name in enumerate(self.model.input_names):
             if not self.low[i] < self.high[i]:
                 raise GroundedError(
@@ -109,6 +118,10 @@ class Task:
                 )
         if not np.isfinite(self.start).all():
             raise GroundedError(f"task: the start state must be finite, got {self.start.tolist()}")
+        if not np.isfinite(self.past).all():
+            raise GroundedError(
+                f"task: the input held before the start must be finite, got {self.past.tolist()}"
+            )
 
     @property
     def horizon(self) -> int:
@@ -177,7 +190,11 @@ class Task:
         )
 
     def rewards(self, trial: Trial) -> Array:
-        """The reward of every step of a trial, (T + 1,); NaN where the trial is not finite."""
+        """The reward of every step of a trial, (T + 1,); NaN where the trial is not finite.
+
+        What a log holds after the horizon is not judged.
+        """
+        trial = trial.until(self.horizon)
         T = trial.steps
         assert self.input_target is not None
         error = self.model.difference(trial.states, self.target[: T + 1])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,7 +54,14 @@ class Trial:
 
     @property
     def finite_steps(self) -> int:
-        """Steps before the first state or input that is not a finite number."""
-        bad: NDArray[np.bool_] = np.asarray(~np.isfinite(self.states).all(axis=1))
-        bad[:-1] |= ~np.isfinite(self.inputs).all(axis=1)
-        return int(np.argmax(bad)) - 1 if bad.any() else self.steps
+        """Steps whose states and inputs are all finite numbers; -1 if the first state isn't."""
+        states = ~np.isfinite(self.states).all(axis=1)
+        inputs = ~np.isfinite(self.inputs).all(axis=1)
+        known = int(np.argmax(states)) - 1 if states.any() else self.steps
+        return min(known, int(np.argmax(inputs))) if inputs.any() else known
+
+    def until(self, steps: int) -> Trial:
+        """The trial up to so many steps; a log may go on after the horizon."""
+        if steps >= self.steps:
+            return self
+        return replace(self, states=self.states[: steps + 1], inputs=self.inputs[:steps])

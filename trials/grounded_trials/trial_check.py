@@ -26,10 +26,10 @@ def warnings_about(workspace: Workspace, trial: Trial) -> tuple[str, ...]:
         )
     whole = filled.trial
     if whole.finite_steps < whole.steps:
-        i = int(np.argmax(~np.isfinite(whole.states[whole.finite_steps + 1 :]).all(axis=0)))
+        name, step = _first_bad(whole)
         found.append(
-            f"'{whole.state_names[i]}' is not a finite number from "
-            f"{(whole.finite_steps + 1) * trial.dt:.2f} s on: the trial counts as ended there"
+            f"'{name}' is not a finite number at {step * trial.dt:.2f} s: the trial counts as ended "
+            "there"
         )
     if not trial.candidate:
         return tuple(found)
@@ -39,6 +39,12 @@ def warnings_about(workspace: Workspace, trial: Trial) -> tuple[str, ...]:
             f"({whole.steps * trial.dt:.2f} s): a failed candidate; its data stay usable for "
             "fit and diagnose"
         )
+    if whole.steps > task.horizon:
+        found.append(
+            f"the log goes on for {whole.steps - task.horizon} steps after the horizon of "
+            f"{task.horizon}: they are not judged"
+        )
+    whole = whole.until(task.horizon)
     found += _start(task, whole)
     found += _inputs(task, whole)
     candidate, _ = workspace.candidate(trial.candidate)
@@ -46,7 +52,21 @@ def warnings_about(workspace: Workspace, trial: Trial) -> tuple[str, ...]:
     return tuple(found)
 
 
+def _first_bad(trial: Trial) -> tuple[str, int]:
+    """The first state or input that is not a finite number, and its step."""
+    places = [
+        (int(step), name)
+        for values, names in ((trial.states, trial.state_names), (trial.inputs, trial.input_names))
+        for column, name in zip(values.T, names, strict=True)
+        for step in np.flatnonzero(~np.isfinite(column))[:1]
+    ]
+    step, name = min(places, key=lambda place: place[0])
+    return name, step
+
+
 def _start(task: Task, trial: Trial) -> list[str]:
+    if trial.finite_steps < 0:
+        return []
     off = task.model.difference(trial.states[0], task.start)
     usual = np.ptp(trial.states[: trial.finite_steps + 1], axis=0)
     found = []

@@ -1,0 +1,61 @@
+"""Trial: arrays that fit each other, read-only, and finite up to a known step."""
+
+import numpy as np
+import pytest
+
+from grounded.errors import GroundedError
+from grounded.frozen import readonly
+from grounded.trial import Trial
+
+
+def trial(T=5, **changes):
+    fields = {
+        "states": np.arange(2.0 * (T + 1)).reshape(T + 1, 2),
+        "inputs": np.zeros((T, 1)),
+        "dt": 0.1,
+        "state_names": ("x", "v"),
+        "input_names": ("u",),
+    }
+    return Trial(**fields | changes)
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"states": np.zeros((6, 3))}, r"\(T\+1, 2\), got \(6, 3\)"),
+        ({"states": np.zeros(6)}, "got"),
+        ({"inputs": np.zeros((6, 1))}, r"inputs of shape \(5, 1\), got \(6, 1\)"),
+        ({"inputs": np.zeros((5, 2))}, "got"),
+    ],
+)
+def test_arrays_must_fit(change, match):
+    with pytest.raises(GroundedError, match=match):
+        trial(**change)
+
+
+def test_a_trial_is_a_copy_that_stays():
+    states = np.zeros((6, 2))
+    made = trial(states=states)
+    states[:] = 7.0
+    assert made.states.max() == 0.0
+    with pytest.raises(ValueError, match="read-only"):
+        made.states[0, 0] = 1.0
+    assert readonly(made.states) is made.states
+
+
+@pytest.mark.parametrize("T", [0, 1, 5])
+def test_steps(T):
+    made = trial(T)
+    assert made.steps == T and made.finite_steps == T
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_finite_steps_end_before_the_first_bad_number(bad):
+    for k in range(6):
+        states = np.zeros((6, 2))
+        states[k, 1] = bad
+        assert trial(states=states).finite_steps == k - 1  # s_{k-1} is the last state known
+    for k in range(5):
+        inputs = np.zeros((5, 1))
+        inputs[k] = bad
+        assert trial(inputs=inputs).finite_steps == k  # s_k is known, and what led to it
