@@ -61,13 +61,13 @@ def run(
     (T, B), n = batch.dt.shape, batch.start.shape[1]
     if lanes.usable(T, n, measurement.ny):
         if about is not None and about.x.shape == (T + 1, B, n):
-            track, xbar = about.x[:-1], about.x_prior
+            start = about.x[:-1], about.std[:-1], about.x_prior
         elif measurement.states == tuple(range(n)) and batch.seen[1:].all():
-            track, xbar = np.concatenate([batch.start[None], batch.y[1:-1]]), batch.y.copy()
-            xbar[0] = batch.start
+            x = np.concatenate([batch.start[None], batch.y[1:]])
+            start = x[:-1], np.broadcast_to(noise.measurement, x[:-1].shape), x
         else:
             return recursion(batch, measurement, noise, steps.at)
-        found = _sweeps(batch, measurement, noise, steps, track, xbar)
+        found = _sweeps(batch, measurement, noise, steps, *start)
         if found is not None:
             return found
     return recursion(batch, measurement, noise, steps.at)
@@ -79,13 +79,17 @@ def _sweeps(
     noise: Noise,
     steps: ModelSteps,
     track: Array,
+    std: Array,
     xbar: Array,
 ) -> Filtered | None:
-    """The fixed point, from a track (T, B, n) and predictions (T + 1, B, n); None: not found."""
+    """The fixed point, from a track and its std (T, B, n) and predictions (T + 1, B, n).
+
+    None if it is not found.
+    """
     B, n = track.shape[1:]
     with np.errstate(all="ignore"):
         for _ in range(SWEEPS):
-            f, A = steps.along(track)
+            f, A = steps.along(track, std)
             H, e0 = _seen(batch, measurement, xbar)
             if not all(np.isfinite(array).all() for array in (f, A, H, e0)):
                 return None
@@ -96,18 +100,20 @@ def _sweeps(
             x = lanes.unpack(done.out["x"], B, n)
             x_prior = lanes.unpack(done.out["x_prior"], B, n)
             P = lanes.unpack(done.out["P_prior"], B, n, n)
-            std = np.sqrt(np.abs(np.diagonal(P, axis1=-2, axis2=-1))) + 1e-12
+            wide = np.sqrt(np.abs(np.diagonal(P, axis1=-2, axis2=-1))) + 1e-12
+            after = lanes.unpack(lanes.posterior_std(done), B, n)
             moved = max(
-                float(np.max(np.abs(x[:-1] - track) / std[:-1])),
-                float(np.max(np.abs(x_prior - xbar) / std)),
+                float(np.max(np.abs(x[:-1] - track) / wide[:-1])),
+                float(np.max(np.abs(x_prior - xbar) / wide)),
+                float(np.max(np.abs(after[:-1] - std) / wide[:-1])) if steps.wide else 0.0,
             )
             if moved < CLOSE:
                 # f and e are those at the end of the sweep, to first order
                 f = f + (A @ (x[:-1] - track)[..., None])[..., 0]
                 e = e0 - (H @ (x_prior - xbar)[..., None])[..., 0]
                 R = np.where(batch.seen, noise.measurement**2, 1.0)
-                return Filtered(x, x_prior, P, e, H, R, A, f, done.loglik, "filtered", done)
-            track, xbar = x[:-1], x_prior
+                return Filtered(x, after, x_prior, P, e, H, R, A, f, done.loglik, "filtered", done)
+            track, std, xbar = x[:-1], after[:-1], x_prior
     return None
 
 

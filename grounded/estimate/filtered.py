@@ -16,6 +16,7 @@ class Filtered:
     """Arrays time first; `loglik` is minus infinity when the pass did not get through."""
 
     x: Array  # (T + 1, B, n) filtered
+    std: Array  # (T + 1, B, n) of x
     x_prior: Array  # (T + 1, B, n) predicted
     P_prior: Array  # (T + 1, B, n, n)
     e: Array  # (T + 1, B, ny) innovations, zero where not seen

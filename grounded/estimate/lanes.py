@@ -124,6 +124,16 @@ def forward(lin: Linearised, noise: Noise) -> Pass:
     return Pass(lin, out, r, total if np.isfinite(total) else -np.inf)
 
 
+def posterior_std(done: Pass) -> Array:
+    """Standard deviations of the filtered states (G, T + 1, n, W)."""
+    _, _, n, ny, _ = done.linearised.sizes
+    variance = done.out["P_prior"][:, :, :: n + 1].copy()
+    for c in range(ny):
+        gain = done.out["g"][:, :, c * n : (c + 1) * n]
+        variance -= gain**2 * done.out["s"][:, :, c : c + 1]
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
+
 def backward(done: Pass) -> dict[str, Array]:
     """The smoother: `ry` (G, T+1, n, W), `Ny` (G, T+1, n n, W), `r_slope` (G, T+1, ny, W)."""
     from grounded.compile.compiled import call

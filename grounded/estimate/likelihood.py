@@ -55,6 +55,7 @@ def maximum_likelihood(
     start: Noise,
     *,
     rounds: int = ROUNDS,
+    wide: bool = False,
 ) -> NoiseEstimate:
     """Climbs from `start` to the most likely noise.
 
@@ -65,8 +66,9 @@ def maximum_likelihood(
         measurement: ny channels.
         start: where to begin, see `first_noise`.
         rounds: how often to linearise anew at most.
+        wide: see `grounded.estimate.steps`.
     """
-    steps = ModelSteps(system, p, batch)
+    steps = ModelSteps(system, p, batch, wide)
     noise, best = _expectation(batch, measurement, start, steps, FIRST_STEPS)
     seen = np.zeros(len(start.process) + measurement.ny, dtype=bool)
     status = "converged"

@@ -40,12 +40,12 @@ def recursion(batch: Batch, measurement: Measurement, noise: Noise, advance: Adv
             kept = eye - K @ H
             x = x + (K @ e[..., None])[..., 0]
             P = kept @ P @ kept.transpose(0, 2, 1) + K @ Rt @ K.transpose(0, 2, 1)
-            out["x"][t] = x
+            out["x"][t], out["std"][t] = x, np.sqrt(np.diagonal(P, axis1=-2, axis2=-1))
             log_det = np.log(np.diagonal(C, axis1=-2, axis2=-1))[seen]
             loglik += float(log_det.sum() - 0.5 * np.sum((C @ e[..., None]) ** 2))
             if t == T:
                 break
-            f, A = advance(t, x)
+            f, A = advance(t, x, out["std"][t])
             if not (np.isfinite(f).all() and np.isfinite(A).all()):
                 return _failed(out, t + 1)
             out["f"][t], out["A"][t] = f, A
@@ -58,6 +58,7 @@ def made(out: dict[str, Array], loglik: float, status: str) -> Filtered:
     """A pass from its arrays (spelt out, so that the type checker sees each field)."""
     return Filtered(
         x=out["x"],
+        std=out["std"],
         x_prior=out["x_prior"],
         P_prior=out["P_prior"],
         e=out["e"],
@@ -71,7 +72,7 @@ def made(out: dict[str, Array], loglik: float, status: str) -> Filtered:
 
 
 def _room(T: int, B: int, n: int, ny: int) -> dict[str, Array]:
-    tails = {"x": (n,), "x_prior": (n,), "P_prior": (n, n), "e": (ny,), "H": (ny, n)}
+    tails = {"x": (n,), "std": (n,), "x_prior": (n,), "P_prior": (n, n), "e": (ny,), "H": (ny, n)}
     room = {name: np.zeros((T + 1, B, *tail)) for name, tail in tails.items()}
     return room | {"A": np.zeros((T, B, n, n)), "f": np.zeros((T, B, n))}
 

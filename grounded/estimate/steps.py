@@ -1,8 +1,20 @@
-"""The model as a filter sees it: the next state and its slopes, at one time or along a track."""
+"""The model as a filter sees it: the next state and its slopes, at one time or along a track.
+
+Two ways to linearise about a state known to within sigma:
+
+    narrow   f(x), f_x(x): the extended Kalman filter
+    wide     differences over h sigma_i on either side of each state,
+             f(x) + 1/2 sum_i (f_i+ + f_i- - 2 f) / h^2,       A_i = (f_i+ - f_i-) / (2 h sigma_i)
+
+The wide one sees what lies within reach: where a model has a kink (friction at rest, brakes that
+are faster than the motor), the mean of f is not f of the mean, and a filter that does not know it
+pulls the parameters off. h = sqrt(pi/2) makes the mean right for a kink and for a parabola alike.
+Source: Noergaard, Poulsen & Ravn, Automatica 36 (2000), with another h.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +24,10 @@ from grounded.estimate.batch import Batch
 from grounded.estimate.filtered import Filtered
 from grounded.frozen import Array
 
-Advance = Callable[[int, Array], tuple[Array, Array]]  # t, x (B, n) -> f (B, n), A (B, n, n)
+# t, x (B, n) and its standard deviation (B, n) -> f (B, n), A (B, n, n)
+Advance = Callable[[int, Array, Array], tuple[Array, Array]]
+REACH = float(np.sqrt(np.pi / 2))  # h
+LEAST = 1e-6  # of max(1, |x|): no difference is taken over less
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,45 +38,67 @@ class ModelSteps:
         system: the dynamics.
         p: parameter values (k,).
         batch: gives inputs and step sizes.
-        smoothing: width of the smoothed indicator terms; 0: exact.
+        wide: differences over the uncertainty instead of derivatives.
     """
 
     system: System
     p: Array
     batch: Batch
-    smoothing: float = 0.0
+    wide: bool = False
 
-    def at(self, t: int, x: Array) -> tuple[Array, Array]:
-        """From x (B, n) at time t: f (B, n), A (B, n, n)."""
-        f, A = self._rows(x[None], slice(t, t + 1))
+    def at(self, t: int, x: Array, std: Array) -> tuple[Array, Array]:
+        """From x (B, n), known to within std, at time t: f (B, n), A (B, n, n)."""
+        f, A = self._rows(x[None], std[None], slice(t, t + 1))
         return f[0], A[0]
 
-    def along(self, x: Array) -> tuple[Array, Array]:
-        """From a track x (T, B, n): f (T, B, n), A (T, B, n, n)."""
-        return self._rows(x, slice(None))
+    def along(self, x: Array, std: Array) -> tuple[Array, Array]:
+        """From a track x (T, B, n) and its std: f (T, B, n), A (T, B, n, n)."""
+        return self._rows(x, std, slice(None))
 
-    def _rows(self, x: Array, times: slice) -> tuple[Array, Array]:
+    def _rows(self, x: Array, std: Array, times: slice) -> tuple[Array, Array]:
         batch, n = self.batch, x.shape[-1]
         valid, u = batch.valid[times], batch.u[times]
         if len(batch.steps_of) == 1 and valid.all():
-            f, A = self._call(x.reshape(-1, n), u.reshape(-1, u.shape[-1]), batch.steps_of[0][0])
+            flat = (x.reshape(-1, n), std.reshape(-1, n), u.reshape(-1, u.shape[-1]))
+            f, A = self._call(*flat, batch.steps_of[0][0])
             return f.reshape(x.shape), A.reshape(*x.shape, n)
         f, A = x.copy(), np.tile(np.eye(n), (*x.shape[:-1], 1, 1))
         for h, mask in batch.steps_of:
             rows = valid if mask is None else valid & mask[times]
             if rows.any():
-                f[rows], A[rows] = self._call(x[rows], u[rows], h)
+                f[rows], A[rows] = self._call(x[rows], std[rows], u[rows], h)
         return f, A
 
-    def _call(self, x: Array, u: Array, h: float) -> tuple[Array, Array]:
-        f = self.system.step(x, u, self.p, h, self.smoothing)
-        return f, self.system.linearise(x, u, self.p, h, self.smoothing)[0]
+    def _call(self, x: Array, std: Array, u: Array, h: float) -> tuple[Array, Array]:
+        f = self.system.step(x, u, self.p, h)
+        if not self.wide:
+            return f, self.system.linearise(x, u, self.p, h)[0]
+        mean, A = f.copy(), np.empty((*x.shape, x.shape[1]))
+        for i, (up, down, reach) in enumerate(self._pairs(x, std, u, h)):
+            A[..., i] = (up - down) / (2 * reach[:, None])
+            mean += (up + down - 2 * f) / (2 * REACH**2)
+        return mean, A
+
+    def _pairs(
+        self, x: Array, std: Array, u: Array, h: float
+    ) -> Iterator[tuple[Array, Array, Array]]:
+        """For each state: f a reach above and below it, and the reach (N,)."""
+        reach = np.maximum(REACH * std, LEAST * np.maximum(1.0, np.abs(x)))
+        for i in range(x.shape[1]):
+            up, down = x.copy(), x.copy()
+            up[:, i] += reach[:, i]
+            down[:, i] -= reach[:, i]
+            yield (
+                self.system.step(up, u, self.p, h),
+                self.system.step(down, u, self.p, h),
+                reach[:, i],
+            )
 
 
 def fixed_steps(filtered: Filtered) -> Advance:
     """The linearisation of an earlier pass, f_t + A_t (x - x_t)."""
 
-    def advance(t: int, x: Array) -> tuple[Array, Array]:
+    def advance(t: int, x: Array, std: Array) -> tuple[Array, Array]:
         A = filtered.A[t]
         return filtered.f[t] + (A @ (x - filtered.x[t])[..., None])[..., 0], A
 

@@ -67,7 +67,7 @@ def point(data: Data, noise: Noise, theta: Array, near: Point | None = None) -> 
     """One pass of the filter at theta; `near`: a point not far from it, which saves time."""
     batch = data.batch(theta)
     p = data.unknowns.unpack(theta)[0]
-    steps = ModelSteps(data.system, p, batch)
+    steps = ModelSteps(data.system, p, batch, wide=True)
     about = None if near is None else near.filtered
     return Point(theta, batch, run(batch, data.measurement, noise, steps, about))
 

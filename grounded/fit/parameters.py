@@ -221,7 +221,7 @@ def _noise(data: Data, theta: Array, noise: Noise | None, rng: np.random.Generat
             np.maximum(noise.measurement, REVIVE * rough.measurement),
             noise.dt,
         )
-    found = maximum_likelihood(data.system, p, batch, data.measurement, noise, rounds=2)
+    found = maximum_likelihood(data.system, p, batch, data.measurement, noise, rounds=2, wide=True)
     return found.noise
 
 
