@@ -1,8 +1,8 @@
-"""Functions of m inputs: Cholesky of the free ones, and the box-limited quadratic programme.
+"""Functions of m inputs: a factor of the free ones, and the box-limited quadratic programme.
 
 The compiled twin of `box_qp.py`; the same steps in the same order. Everything is written out for m
-inputs, in small arrays: H [m][m], the factor L [m][m] with the inverses of its diagonal in `inv`,
-and `free`, 1 for an input that no bound holds back, else 0.
+inputs, in small arrays: H [m][m] = L D L', 1/D in `inv`, and `free`, 1 for an input that no bound
+holds back, else 0.
 """
 
 from __future__ import annotations
@@ -20,37 +20,37 @@ def box_functions(m: int) -> str:
 
 
 def _factor(m: int) -> str:
-    """`i1 @factor(H, free, L, inv)`: whether H is positive definite, clamped inputs left out."""
+    """`i1 @factor(H, free, L, inv)`: whether H is positive definite, clamped inputs left out.
+
+    H = L D L' without square roots: L has ones on its diagonal, inv holds 1/D.
+    """
     f = Writer("internal i1 @factor(ptr %H, ptr %free, ptr %L, ptr %inv)")
     free = [f.load("%free", i) for i in range(m)]
-    L: dict[tuple[int, int], str] = {}
-    inverse = []
+    L, LD = dict[tuple[int, int], str](), dict[tuple[int, int], str]()
     for j in range(m):
+        inverse = ""
         for i in range(j, m):
             value = f.mul(f.mul(f.load("%H", i * m + j), free[i]), free[j])
             if i == j:
                 value = f.add(value, f.sub(ONE, free[i]))
             for s in range(j):
-                value = f.sub(value, f.mul(L[i, s], L[j, s]))
+                value = f.sub(value, f.mul(LD[i, s], L[j, s]))
             if i == j:
                 good = f.compare("ogt", value, ZERO)
                 finite = f.compare("olt", value, number(float("inf")))
                 both = f.emit(f"and i1 {good}, {finite}")
                 f.return_if(f.emit(f"xor i1 {both}, true"), "i1 false")
-                L[i, j] = f.call("sqrt", [value])
-                inverse.append(f.div(ONE, L[i, j]))
+                inverse = f.div(ONE, value)
+                f.store(inverse, "%inv", j)
             else:
-                L[i, j] = f.mul(value, inverse[j])
-    for (i, j), value in L.items():
-        f.store(value, "%L", i * m + j)
-    for i, value in enumerate(inverse):
-        f.store(value, "%inv", i)
+                LD[i, j], L[i, j] = value, f.mul(value, inverse)
+                f.store(L[i, j], "%L", i * m + j)
     f.do("ret i1 true")
     return f.text()
 
 
 def _substitute(m: int) -> str:
-    """`void @substitute(L, inv, b)`: b becomes the solution of L L' x = b."""
+    """`void @substitute(L, inv, b)`: b becomes the solution of L D L' x = b."""
     f = Writer("internal void @substitute(ptr %L, ptr %inv, ptr %b)")
     b = [f.load("%b", i) for i in range(m)]
     for i, value in enumerate(solved(f, b, "%L", "%inv", 1)):
@@ -60,17 +60,15 @@ def _substitute(m: int) -> str:
 
 
 def solved(f: Writer, rows: list[str], L: str, inverse: str, width: int) -> list[str]:
-    """Rows of the solution X of L L' X = rows, each W wide."""
+    """Rows of the solution X of L D L' X = rows, each W wide."""
     m, x = len(rows), list(rows)
-    inv = [f.load_all(inverse, i, width) for i in range(m)]
     for i in range(m):
         for j in range(i):
             x[i] = f.sub(x[i], f.mul(f.load_all(L, i * m + j, width), x[j], width), width)
-        x[i] = f.mul(x[i], inv[i], width)
+    x = [f.mul(x[i], f.load_all(inverse, i, width), width) for i in range(m)]
     for i in reversed(range(m)):
         for j in range(i + 1, m):
             x[i] = f.sub(x[i], f.mul(f.load_all(L, j * m + i, width), x[j], width), width)
-        x[i] = f.mul(x[i], inv[i], width)
     return x
 
 

@@ -1,8 +1,8 @@
 """Elementary functions on lanes: sine, cosine, exponential, arctangent without leaving the vector.
 
 The C library knows one number at a time; a robot's model is half trigonometry. Reduction to a small
-interval in three pieces of pi/2 (Cody, Waite 1980), then the polynomials of fdlibm (Sun, 1993) for
-sine, cosine, exponential, and the rational function of Cephes (Moshier, 1989) for the arctangent.
+interval in three pieces of pi/2 (Cody, Waite 1980), then a polynomial: fdlibm's for sine and cosine
+(Sun, 1993), Taylor's for the exponential, one of our own for the arctangent.
 Good to about one unit in the last place while |x| < 1e6, which unwrapped angles are. The rest goes
 to the C library lane by lane.
 """
@@ -33,20 +33,34 @@ HALF_PI = (1.57079632673412561417e00, 6.07710050630396597660e-11, 2.022266248795
 EXP = tuple(1.0 / math.factorial(i) for i in range(2, 14))
 LN2 = (6.93147180369123816490e-01, 1.90821492927058770002e-10)
 MAGIC = 6755399441055744.0  # 1.5 2^52: adding it rounds, and leaves the integer in the low bits
-ATAN_P = (
-    -8.750608600031904122785e-01,
-    -1.615753718733365076637e01,
-    -7.500855792314704667340e01,
-    -1.228866684490136173410e02,
-    -6.485021904942025371773e01,
+ATAN = (  # (atan(x) / x - 1) / x^2 in x^2, interpolated at Chebyshev's points up to tan(pi / 8)
+    -0.3333333333333333,
+    0.19999999999995519,
+    -0.14285714284666234,
+    0.11111111015231484,
+    -0.09090904577092156,
+    0.07692183166364956,
+    -0.06664511096795875,
+    0.05858145823777143,
+    -0.05085433387030355,
+    0.039231181543784695,
+    -0.019176298874366237,
 )
-ATAN_Q = (
-    1.0,
-    2.485846490142306297962e01,
-    1.650270098316988542046e02,
-    4.328810604912902668951e02,
-    4.853903996359136964868e02,
-    1.945506571482613964425e02,
+
+ASIN = (  # (asin(x) / x - 1) / x^2 in x^2, likewise up to x = 1/2
+    0.16666666666666669,
+    0.07499999999998433,
+    0.04464285714635544,
+    0.03038194413853449,
+    0.022372172941915732,
+    0.017352392727934783,
+    0.013971212851918104,
+    0.011479178733064088,
+    0.010322805051652312,
+    0.005457549375313392,
+    0.01740075682113532,
+    -0.014851686572448643,
+    0.028757709154150685,
 )
 
 
@@ -170,41 +184,42 @@ class Lanes:
         ax, ay = f.call("fabs", [x], w), f.call("fabs", [y], w)
         steep = f.compare("ogt", ay, ax, w)
         small, large = f.select(steep, ax, ay, w), f.select(steep, ay, ax, w)
-        both_zero = f.compare("oeq", large, zero, w)
-        ratio = f.div(small, f.select(both_zero, self.const(1.0), large, w), w)
-        angle = self._atan_unit(ratio)
+        angle = self._first_octant(small, large)
         angle = f.select(steep, f.sub(self.const(math.pi / 2), angle, w), angle, w)
         left = self._is_set(self._bitwise("lshr", self._bits(x), 63))
         angle = f.select(left, f.sub(self.const(math.pi), angle, w), angle, w)
         signed = self._bitwise("and", self._bits(y), -(1 << 63))
         return self._from_bits(self._exclusive(self._bits(angle), signed))
 
-    def _atan_unit(self, t: str) -> str:
-        """The arctangent of 0 <= t <= 1: about 0 or about 1."""
-        f, w = self.f, self.width
-        far = f.compare("ogt", t, self.const(0.66), w)
-        one = self.const(1.0)
-        moved = f.div(f.sub(t, one, w), f.add(t, one, w), w)
-        x = f.select(far, moved, t, w)
-        z = f.mul(x, x, w)
-        p = self.polynomial(z, ATAN_P[::-1])
-        q = self.polynomial(z, ATAN_Q[::-1])
-        angle = f.fma(f.mul(x, z, w), f.div(p, q, w), x, w)
-        return f.select(far, f.add(angle, self.const(math.pi / 4), w), angle, w)
+    def _first_octant(self, y: str, x: str) -> str:
+        """The angle of (x, y) for 0 <= y <= x: about 0, or about pi/4, with one division."""
+        f, w, zero = self.f, self.width, self.const(0.0)
+        far = f.compare("ogt", y, f.mul(x, self.const(math.tan(math.pi / 8)), w), w)
+        above = f.select(far, f.sub(y, x, w), y, w)
+        below = f.select(far, f.add(y, x, w), x, w)
+        below = f.select(f.compare("oeq", x, zero, w), self.const(1.0), below, w)
+        t = f.div(above, below, w)
+        z = f.mul(t, t, w)
+        angle = f.fma(f.mul(t, z, w), self.polynomial(z, ATAN), t, w)
+        return f.add(angle, f.select(far, self.const(math.pi / 4), zero, w), w)
 
     def asin(self, x: str) -> str:
-        """The arcsine, NaN outside [-1, 1]."""
+        """The arcsine, NaN outside [-1, 1]: beyond 1/2, pi/2 - 2 asin(sqrt((1 - |x|) / 2))."""
         f, w = self.f, self.width
-        one = self.const(1.0)
-        rest = f.mul(f.sub(one, x, w), f.add(one, x, w), w)
-        return self.atan2(x, f.call("sqrt", [rest], w))
+        size, half = f.call("fabs", [x], w), self.const(0.5)
+        large = f.compare("ogt", size, half, w)
+        rest = f.fma(size, self.const(-0.5), half, w)
+        z = f.select(large, rest, f.mul(x, x, w), w)
+        base = f.select(large, f.call("sqrt", [rest], w), size, w)
+        angle = f.fma(f.mul(z, self.polynomial(z, ASIN), w), base, base, w)
+        folded = f.fma(angle, self.const(-2.0), self.const(math.pi / 2), w)
+        angle = f.select(large, folded, angle, w)
+        sign = self._bitwise("and", self._bits(x), -(1 << 63))
+        return self._from_bits(self._exclusive(self._bits(angle), sign))
 
     def acos(self, x: str) -> str:
         """The arccosine, NaN outside [-1, 1]."""
-        f, w = self.f, self.width
-        one = self.const(1.0)
-        rest = f.mul(f.sub(one, x, w), f.add(one, x, w), w)
-        return self.atan2(f.call("sqrt", [rest], w), x)
+        return self.f.sub(self.const(math.pi / 2), self.asin(x), self.width)
 
     def library(self, name: str, *args: str) -> str:
         """A function of the C library, lane by lane."""

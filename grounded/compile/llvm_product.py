@@ -79,7 +79,7 @@ class Linearised:
         self.xu, self.following = f.room((n + m) * width), f.room(n * width)
         self.jac = f.room((len(d.places) + 1) * width)  # the last is zero
         self.sums_room = f.room((n + m) * width)
-        self.now, self.entries = "", dict[tuple[int, int], str]()
+        self.now = ""
         f.store(splat(0.0, width), self.jac, len(d.places) * width, width)
 
     def linearise(self, t: str) -> None:
@@ -106,7 +106,6 @@ class Linearised:
     def select(self, t: str) -> None:
         """From here on `rows` means those of step t."""
         self.now = self.f.at(self.jac, self.f.integer("and", t, self.width - 1))
-        self.entries.clear()
 
     def rows(self, row: Row, size: int, inputs_only: bool = False) -> list[str]:
         """Rows of [A B]'X, z first and then u, from pieces X(r, :) of `size` doubles."""
@@ -150,12 +149,11 @@ class Linearised:
         return {c: f.load(self.sums_room, c * size, size) for c in range(count)}
 
     def _entry(self, e: int, size: int) -> str:
-        """Value e of the Jacobian of this step, in every lane."""
-        if (e, 1) not in self.entries:
-            self.entries[e, 1] = self.f.load(self.now, e * self.width)
-        if (e, size) not in self.entries:
-            self.entries[e, size] = self.f.spread(self.entries[e, 1], size)
-        return self.entries[e, size]
+        """Value e of the Jacobian of this step, in every lane: read again each time it is used,
+
+        because a multiplication can take it from memory for nothing and registers are few.
+        """
+        return self.f.load_all(self.now, e * self.width, size)
 
 
 def sweep_tables(d: Dynamics) -> str:
