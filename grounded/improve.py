@@ -183,18 +183,23 @@ def _improvement(make: _Maker, incumbent: Tried, options: Options) -> Proposal:
     U^(theta + alpha d) >= U^(theta) for some alpha (step 5).
     """
     planner, plan = make.planner, make.planner.plan
-    own = planner.lift(mean_trial(incumbent.trials))
+    own = planner.lift(mean_trial(incumbent.trials, planner.task.model.angle_mask))
     grounding = ground(plan, own)
     real = plan.problem(ground(plan, own, exact=True).bias, exact=True)
-    already, least = incumbent.utility, options.tolerance * abs(incumbent.utility)
     theta = planner.widened(incumbent.candidate.policy)
+    # Where a trial started off s_0, its utility is no measure for runs that start there: theta's own
+    # run in the grounded model is. It replays the trial when the start was s_0.
+    already = simulate(real, theta).utility
+    already = already if np.isfinite(already) else incumbent.utility
+    least = options.tolerance * abs(already)
     unsafe: Proposal | None = None
     directions: dict[float, Policy] = {}
     step = make.now.step
     while step is not None:
         if step.damping not in directions:
             directions[step.damping] = direction(plan, theta, grounding, options, step.damping)
-        made = make.candidate(theta.toward(directions[step.damping], step.alpha), real, step)
+        policy = theta.toward(directions[step.damping], step.alpha)
+        made = make.candidate(policy, real, step, already)
         if made.predicted_gain > least:
             proposal = make.checked(made)
             if proposal.candidate is not None:
@@ -222,7 +227,9 @@ class _Maker:
     identity: str
     fingerprint: str
 
-    def candidate(self, policy: Policy, problem: Problem, step: Step) -> Candidate:
+    def candidate(
+        self, policy: Policy, problem: Problem, step: Step, already: float = float("nan")
+    ) -> Candidate:
         base, policy = self.now.incumbent, self.planner.narrowed(policy)
         predicted = simulate(problem, self.planner.widened(policy))
         return Candidate(
@@ -231,7 +238,7 @@ class _Maker:
             iteration=0 if base is None else self.now.iteration + 1,
             alpha=step.alpha,
             damping=step.damping,
-            predicted_gain=predicted.utility - base.utility if base else float("nan"),
+            predicted_gain=predicted.utility - already,
             base="" if base is None else base.candidate.id,
             model=self.fingerprint,
             predicted_states=predicted.states[:, : self.planner.task.model.n],

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from grounded.errors import GroundedError
 from grounded.frozen import Array
@@ -241,14 +242,20 @@ def _judge(
     return tuple(history), incumbent, iteration
 
 
-def mean_trial(trials: Sequence[Trial]) -> Trial:
-    """The mean of repeated whole trials: states, inputs, the held input; one trial is itself."""
+def mean_trial(trials: Sequence[Trial], angles: NDArray[np.bool_] | None = None) -> Trial:
+    """The mean of repeated whole trials: states, inputs, the held input; one trial is itself.
+
+    Angles (n,) are taken near the first trial's: one log may be a full turn off another.
+    """
     if len(trials) == 1:
         return trials[0]
     first = trials[0]
+    off = np.array([t.states - first.states for t in trials])
+    if angles is not None:
+        off[..., angles] -= 2 * np.pi * np.rint(off[..., angles] / (2 * np.pi))
     held = [t.start_inputs for t in trials if t.start_inputs is not None]
     return Trial(
-        states=np.mean([t.states for t in trials], axis=0),
+        states=first.states + off.mean(axis=0),
         inputs=np.mean([t.inputs for t in trials], axis=0),
         dt=first.dt,
         state_names=first.state_names,

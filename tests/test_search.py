@@ -1,0 +1,322 @@
+"""Where the search stands: a pure function of candidates and stored trials."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_tasks import cart_task, drive, other, rover_task
+
+from grounded.errors import GroundedError
+from grounded.improve import learn, model_fingerprint, propose
+from grounded.plant import Noise, Plant
+from grounded.search import MAX_CAUTION, Options, mean_trial, standing
+from grounded.trial import Trial
+from grounded.trust import Step
+
+TASK = cart_task()
+PLANT = Plant(other(TASK.model, 1.6), latency={"force": 0.02})
+
+
+def bad(trial, value=30.0):
+    """The same run with a state that is far off: a trial that improves nothing."""
+    states = np.array(trial.states)
+    states[1:, 0] += value
+    return replace(trial, states=states)
+
+
+class Story:
+    """A search whose trials are made to order."""
+
+    def __init__(self, task=TASK, plant=PLANT, **options):
+        self.task, self.plant, self.options = task, plant, Options(**options)
+        self.candidates, self.trials = [], []
+
+    def propose(self):
+        proposal = propose(self.task, self.candidates, self.trials, self.options)
+        if proposal.is_new:
+            self.candidates.append(proposal.candidate)
+        return proposal
+
+    def add(self, how=lambda trial: trial):
+        proposal = self.propose()
+        assert proposal.candidate is not None, proposal.standing.sentence
+        trial = drive(self.task, self.plant, proposal.candidate, seed=len(self.trials))
+        self.trials.append(how(trial))
+        return self
+
+    @property
+    def now(self):
+        fingerprint = model_fingerprint(self.task)
+        return standing(self.task, self.candidates, self.trials, self.options, fingerprint)
+
+
+def test_an_empty_search_proposes_the_models_own_policy():
+    now = Story().now
+    assert (now.phase, now.iteration, now.incumbent, now.utilities) == ("propose", 0, None, [])
+    assert now.sentence == "the model's own policy comes first"
+
+
+def test_a_candidate_without_a_trial_is_named_again():
+    story = Story()
+    first, again = story.propose(), story.propose()
+    assert first.is_new and not again.is_new and again.candidate is first.candidate
+    assert story.now.phase == "await-trial" and story.now.missing == 1
+    assert story.now.sentence == "c0001 is waiting for 1 trial"
+
+
+def test_an_improvement_is_accepted_and_the_next_starts_from_it():
+    story = Story().add().add()
+    now = story.now
+    assert now.iteration == 1 and now.incumbent.candidate.id == "c0002"
+    assert now.utilities == [story.task.utility(t) for t in story.trials]
+    third = story.propose().candidate
+    assert (third.id, third.iteration, third.base) == ("c0003", 2, "c0002")
+
+
+@pytest.mark.parametrize(
+    ("options", "steps"),
+    [
+        ({"max_halvings": 2}, [(1.0, 1.0), (1.0, 0.5), (1.0, 0.25)]),
+        ({"step": "full", "max_halvings": 3}, [(0.0, a) for a in (1.0, 0.5, 0.25, 0.125)]),
+        ({"method": "policy-gradient", "max_halvings": 0}, [(0.0, 1.0)]),
+    ],
+    ids=["damped", "full", "gradient"],
+)
+def test_trials_that_do_not_improve_halve_alpha_then_end_the_search(options, steps):
+    if options.get("method") == "policy-gradient":
+        pytest.importorskip("grounded.policy_gradient")
+    story = Story(**options, tolerance=0.0).add()
+    for _ in steps:
+        story.add(bad)
+    made = [(c.damping, c.alpha) for c in story.candidates[1:]]
+    assert made == steps and all(c.base == "c0001" for c in story.candidates[1:])
+    last = story.propose()
+    assert last.candidate is None and last.standing.phase == "converged"
+    assert last.standing.sentence == (
+        f"no step improved on c0001 down to alpha = {steps[-1][1]:g}: c0001 is the result (step 7)"
+    )
+
+
+def test_an_equal_utility_is_no_improvement():
+    story = Story().add()
+    same = story.trials[0]
+    story.propose()
+    story.trials.append(replace(same, candidate="c0002"))
+    assert story.now.history[-1].accepted is False and story.now.iteration == 0
+
+
+def test_repeats_are_averaged_and_all_are_needed():
+    noisy = Plant(PLANT.model, noise=Noise(process={"v": 0.02}))
+    story = Story(plant=noisy, repeats=3)
+    for missing in (3, 2, 1):
+        story.propose()
+        assert story.now.missing == missing and story.now.phase == "await-trial"
+        assert f"{missing} trial" in story.now.sentence
+        story.add()
+    story.add().add().add()
+    tried = story.now.history[0]
+    assert len(tried.trials) == 3 and tried.accepted is True
+    each = [story.task.utility(t) for t in tried.trials]
+    assert tried.utility == pytest.approx(np.mean(each)) and len(set(each)) == 3
+    assert tried.standard_error == pytest.approx(np.std(each, ddof=1) / np.sqrt(3))
+    mean = mean_trial(tried.trials, TASK.model.angle_mask)
+    np.testing.assert_allclose(mean.states, np.mean([t.states for t in tried.trials], axis=0))
+    np.testing.assert_allclose(mean.inputs, np.mean([t.inputs for t in tried.trials], axis=0))
+
+
+def test_a_candidate_run_more_often_is_averaged_too():
+    story = Story().add()
+    story.trials.append(bad(story.trials[0], 1.0))
+    each = [story.task.utility(t) for t in story.trials]
+    assert story.now.incumbent.utility == pytest.approx(np.mean(each))
+    assert story.now.trials == 2
+
+
+# what goes wrong on a robot
+
+
+def cut(trial, T=20):
+    return replace(trial, states=trial.states[: T + 1], inputs=trial.inputs[:T])
+
+
+def with_nan(trial):
+    states = np.array(trial.states)
+    states[25:] = np.nan
+    return replace(trial, states=states)
+
+
+def nothing(trial):
+    return replace(trial, states=trial.states[:1], inputs=trial.inputs[:0])
+
+
+FAILURES = {"short": cut, "nan": with_nan, "nothing": nothing}
+
+
+@pytest.mark.parametrize("how", FAILURES.values(), ids=FAILURES)
+def test_a_crashed_candidate_is_one_that_failed(how):
+    story = Story().add().add(how)
+    assert story.now.history[-1].accepted is False
+    assert story.now.incumbent.candidate.id == "c0001"
+    story.add()  # a more cautious step from the same base
+    assert story.candidates[-1].alpha == 0.5 and story.candidates[-1].base == "c0001"
+    assert story.now.iteration == 1
+
+
+@pytest.mark.parametrize("how", FAILURES.values(), ids=FAILURES)
+def test_a_crash_of_the_first_policy_makes_a_gentler_one(how):
+    story = Story()
+    efforts = []
+    for k in range(MAX_CAUTION + 1):
+        story.add(how)
+        made = story.candidates[-1]
+        assert made.caution == k and made.base == "" and made.iteration == 0
+        efforts.append(float(np.abs(np.diff(made.predicted_inputs, axis=0)).sum()))
+    assert efforts == sorted(efforts, reverse=True) and efforts[1] < 0.7 * efforts[0]
+    last = story.propose()
+    assert last.candidate is None and last.standing.phase == "stopped"
+    assert last.standing.sentence.startswith("the first policy crashed 4 times")
+
+
+def test_after_a_gentler_first_policy_the_search_goes_on():
+    story = Story().add(cut).add().add()
+    assert story.now.iteration == 1 and story.now.incumbent.candidate.id == "c0003"
+
+
+def test_with_repeats_a_single_crash_fails_the_candidate():
+    story = Story(repeats=3).add().add().add().add(cut)
+    assert story.now.history[-1].accepted is False and story.now.history[-1].utility == -np.inf
+    assert story.propose().is_new
+
+
+def test_a_trial_longer_than_the_horizon_counts_up_to_it():
+    def longer(trial):
+        states = np.vstack([trial.states, trial.states[-1:]])
+        return replace(trial, states=states, inputs=np.vstack([trial.inputs, trial.inputs[-1:]]))
+
+    plain, story = Story().add().add(), Story().add(longer).add(longer)
+    assert story.now.utilities == plain.now.utilities
+    a, b = plain.propose().candidate, story.propose().candidate
+    np.testing.assert_array_equal(a.policy.feedforward, b.policy.feedforward)
+
+
+@pytest.mark.parametrize(("off", "repeats", "least"), [(0.02, 3, -0.9), (0.3, 1, -1.35)])
+def test_a_start_away_from_s0_does_not_stop_the_search(off, repeats, least):
+    """The robot is put down a little (or far) off. Without: from -1.349 to -0.881."""
+    rng = np.random.default_rng(0)
+
+    def run(candidate):
+        start = {"x": off * rng.standard_normal(), "v": 0.0}
+        return PLANT.run(candidate.policy, start, rng)
+
+    now, candidates, trials = learn(TASK, run, Options(max_trials=12 * repeats, repeats=repeats))
+    assert now.iteration >= 1 and len(candidates) >= 3
+    assert TASK.utility(drive(TASK, PLANT, now.incumbent.candidate)) > least
+    if repeats == 3:  # scatter is no gain to look for: the search ends before trials run out
+        assert now.phase == "converged" and len(trials) <= 30
+
+
+def test_max_trials_ends_the_search():
+    story = Story(max_trials=3).add().add().add()
+    last = story.propose()
+    assert last.candidate is None and last.standing.phase == "stopped"
+    assert last.standing.sentence == "all 3 trials are used up ([search] max_trials)"
+
+
+def test_the_last_trials_of_a_repeated_candidate_may_pass_the_limit():
+    story = Story(max_trials=4, repeats=3)
+    for _ in range(6):
+        story.add()
+    assert story.propose().standing.phase == "stopped" and story.now.trials == 6
+
+
+def test_a_search_with_nothing_to_gain_ends_before_a_trial_is_spent():
+    story = Story(plant=Plant(TASK.model), tolerance=0.01).add()
+    last = story.propose()
+    assert last.candidate is None and last.standing.phase == "converged"
+    assert "the model sees no gain of more than 0.01 of" in last.standing.sentence
+    assert last.standing.sentence.endswith("c0001 is the result")
+
+
+def test_another_model_starts_again_at_alpha_1_from_the_best_policy():
+    story = Story(max_halvings=2).add().add(bad).add(bad)
+    assert story.candidates[-1].alpha == 0.5
+    story.task = story.task.with_model(other(TASK.model, 1.3))  # fitted, say
+    made = story.propose().candidate
+    assert (made.alpha, made.base, made.id) == (1.0, "c0001", "c0004")
+    assert story.now.outstanding is made
+
+
+def test_an_outstanding_candidate_of_another_model_is_made_again():
+    story = Story().add()
+    story.propose()
+    story.task = story.task.with_model(other(TASK.model, 1.3))
+    assert story.now.phase == "propose"
+    made = story.propose()
+    assert made.is_new and made.candidate.id == "c0003" and made.candidate.base == "c0001"
+
+
+def test_trials_of_no_candidate_are_ignored():
+    story = Story().add()
+    before = story.now
+    story.trials += [
+        replace(story.trials[0], candidate=""),
+        replace(story.trials[0], candidate="x"),
+    ]
+    assert story.now.utilities == before.utilities and story.now.trials == 1
+
+
+def test_the_order_of_stored_trials_decides_nothing():
+    noisy = Plant(PLANT.model, noise=Noise(process={"v": 0.02}))
+    story = Story(plant=noisy, repeats=2)
+    for _ in range(6):
+        story.add()
+    made = story.propose().candidate
+    turned = propose(story.task, story.candidates[:3], list(reversed(story.trials)), story.options)
+    assert turned.standing.utilities == pytest.approx(story.now.utilities)
+    np.testing.assert_allclose(
+        turned.candidate.policy.feedforward, made.policy.feedforward, atol=1e-9
+    )
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"max_halvings": -1},
+        {"max_halvings": 31},
+        {"repeats": 0},
+        {"max_trials": 0},
+        {"tolerance": 1.0},
+        {"tolerance": -0.1},
+        {"tolerance": float("nan")},
+    ],
+    ids=str,
+)
+def test_options_out_of_range_are_refused(change):
+    with pytest.raises(GroundedError, match=next(iter(change))):
+        Options(**change)
+
+
+def test_first_steps():
+    assert Options().first_step() == Step(1.0, 1.0)
+    assert Options(step="full").first_step() == Step(0.0, 1.0)
+    assert not Options(method="policy-gradient").damps
+
+
+def test_the_mean_of_one_trial_is_itself_and_held_inputs_are_averaged():
+    a = Trial(np.zeros((3, 2)), np.zeros((2, 1)), 0.05, ("x", "v"), ("force",), start_inputs=[1.0])
+    none = TASK.model.angle_mask
+    assert mean_trial([a], none) is a
+    b = replace(a, start_inputs=np.array([3.0]))
+    np.testing.assert_array_equal(mean_trial([a, b], none).start_inputs, [2.0])
+    assert mean_trial([a, replace(a, start_inputs=None)], none).start_inputs is None
+
+
+def test_headings_that_wrap_between_repeats_do_not_spoil_the_mean():
+    """One log unwrapped, the other a full turn off: their mean is the run, not half a turn off."""
+    task = rover_task()
+    policy = task.policy(np.full((60, 2), 0.5), None, None)
+    one = Plant(task.model).run(policy, {}, np.random.default_rng(0))
+    states = np.array(one.states)
+    states[:, 2] += 2 * np.pi
+    mean = mean_trial([one, replace(one, states=states)], task.model.angle_mask)
+    assert np.abs(task.model.difference(mean.states, one.states)).max() < 1e-9
