@@ -56,8 +56,8 @@ def bench(manoeuvre: str, kind: str, seed: int) -> Bench:
     """One case: a manoeuvre ("turn", "circle", "figure8"), a kind of error, a seed."""
     rng = np.random.default_rng([seed, 3])
     if kind == "parametric":
-        factors = rng.uniform(1 - SPREAD, 1 + SPREAD, len(car.values))
-        model = car.with_values(dict(zip(car.param_names, car.values * factors, strict=True)))
+        wrong = car.values * rng.uniform(1 - SPREAD, 1 + SPREAD, len(car.values))
+        model = car.with_values(dict(zip(car.param_names, wrong, strict=True)))
         latency = dict.fromkeys(car.input_names, MODELLED)
     else:
         signs = rng.choice([-1.0, 1.0], len(CALIBRATION))

@@ -85,6 +85,7 @@ def update(task: Task, model: Lifted, policy: Policy, trial: Trial) -> Policy:
 
 def gradient_of(task: Task, policy: Policy) -> tuple[float, Array]:
     """Utility and its gradient (H, m) by the feed-forward when `task.model` is the real system."""
+    policy = deepened(policy, task.problem().depths)
     run = simulate(task.problem(exact=True), policy)
     names = (task.model.state_names, task.model.input_names)
     trial = Trial(run.states, run.inputs, task.dt, *names, start_inputs=task.past)
@@ -92,6 +93,22 @@ def gradient_of(task: Task, policy: Policy) -> tuple[float, Array]:
     responses = lifted_along(task, z, run.inputs, policy.gain)
     gradient, _ = _quadratic(task, responses, trial, curved=False)
     return run.utility, -2 * gradient.reshape(task.horizon, -1)
+
+
+def deepened(policy: Policy, depths: tuple[int, ...]) -> Policy:
+    """The same policy for a system with longer queues of past inputs; it ignores the new ones."""
+    if policy.gain is None or policy.reference is None or policy.depths == depths:
+        return replace(policy, depths=depths)
+    n = len(policy.state_names)
+    ends = n + np.cumsum(policy.depths)
+    missing = [new - old for new, old in zip(depths, policy.depths, strict=True)]
+    where = np.repeat(ends, missing)
+    return replace(
+        policy,
+        gain=np.insert(policy.gain, where, 0.0, axis=2),
+        reference=np.insert(policy.reference, where, 0.0, axis=1),
+        depths=depths,
+    )
 
 
 def _quadratic(task: Task, model: Lifted, trial: Trial, curved: bool = True) -> tuple[Array, Array]:
