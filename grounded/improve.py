@@ -38,7 +38,7 @@ from grounded.model import Model
 from grounded.planner import Planner
 from grounded.policy import Policy
 from grounded.rollout import simulate
-from grounded.safety import objections
+from grounded.safety import objections, spread
 from grounded.search import Candidate, Options, Standing, Tried, mean_trial, standing
 from grounded.task import Task
 from grounded.trial import Trial
@@ -249,7 +249,8 @@ class _Maker:
 
     def checked(self, made: Candidate) -> Proposal:
         """A candidate that is finite, inside the limits and predicted to stay safe; or none."""
-        found = objections(self.planner.task, made)
+        task = self.planner.task
+        found = objections(task, made, spread(task, self.now.history))
         if not found:
             return Proposal(self.now, made, is_new=True)
         stopped = dataclasses.replace(self.now, phase="stopped", sentence=found[0])

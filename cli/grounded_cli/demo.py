@@ -26,10 +26,9 @@ def command(name: str, folder: str | None, json_: bool) -> None:
     `grounded init --list` lists the examples. The optimum is found afterwards with the TRUE model,
     which the search never sees.
     """
+    from grounded.errors import GroundedError
     from grounded_trials.examples import example, write_example
     from grounded_trials.workspace import Workspace
-
-    from grounded.errors import GroundedError
 
     example(name)
     target = Path(folder or f"demo-{name}")

@@ -54,9 +54,8 @@ def command(log: str, folder: str | None, json_: bool) -> None:
 
 
 def _mapping(report: LogReport, folder: str | None) -> str:
-    from grounded_trials.inspect_guess import guess_mapping, is_simulated, mapping_toml
-
     from grounded.errors import GroundedError
+    from grounded_trials.inspect_guess import guess_mapping, is_simulated, mapping_toml
 
     try:
         model = open_workspace(folder).base_model

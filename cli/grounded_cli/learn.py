@@ -12,9 +12,8 @@ from grounded_cli.status import as_document, summary
 from grounded_cli.terminal import number, progress, say, show, show_json
 
 if TYPE_CHECKING:
-    from grounded_trials.workspace import Workspace
-
     from grounded.search import Standing
+    from grounded_trials.workspace import Workspace
 
 
 @click.command("learn")

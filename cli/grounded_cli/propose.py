@@ -10,11 +10,10 @@ from grounded_cli.options import as_json, in_workspace, open_workspace
 from grounded_cli.terminal import field, number, progress, say, show, show_json
 
 if TYPE_CHECKING:
-    from grounded_trials.proposing import Proposed
-    from grounded_trials.workspace import Workspace
-
     from grounded.search import Candidate, Standing
     from grounded.task import Task
+    from grounded_trials.proposing import Proposed
+    from grounded_trials.workspace import Workspace
 
 
 @click.command("propose")

@@ -19,10 +19,9 @@ def command(candidate: str | None, folder: str | None, json_: bool) -> None:
     averaged).
     """
     workspace = open_workspace(folder)
+    from grounded.errors import GroundedError
     from grounded_trials.proposing import standing_in
     from grounded_trials.running import run_candidate
-
-    from grounded.errors import GroundedError
 
     if candidate is None:
         standing = standing_in(workspace)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import sys
 import textwrap
 from collections.abc import Iterator, Sequence
@@ -22,12 +23,22 @@ def style(text: str, **how: Any) -> str:
 
 def say(text: str) -> None:
     """Narration, on stderr."""
-    click.echo(text, err=True)
+    click.echo(harmless(text), err=True)
 
 
 def show(text: str = "") -> None:
     """Data, on stdout."""
-    click.echo(text)
+    click.echo(harmless(text))
+
+
+def harmless(text: str) -> str:
+    """Text that can colour a terminal and nothing else: names come from strangers' files."""
+    parts = re.split(r"(\x1b\[[0-9;]*m)", text)
+    shown = [
+        part if i % 2 else "".join(c if c.isprintable() or c in "\n\t" else "?" for c in part)
+        for i, part in enumerate(parts)
+    ]
+    return "".join(shown)
 
 
 def show_json(document: dict[str, Any]) -> None:
