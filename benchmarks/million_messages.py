@@ -13,9 +13,10 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from grounded_trials.signals import SignalSpec, read_signals
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
+
+from grounded_trials.signals import SignalSpec, read_signals
 
 PARTS = {
     "": "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/PoseWithCovariance pose\n"

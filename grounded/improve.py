@@ -187,8 +187,8 @@ def _improvement(make: _Maker, incumbent: Tried, options: Options) -> Proposal:
     grounding = ground(plan, own)
     real = plan.problem(ground(plan, own, exact=True).bias, exact=True)
     theta = planner.widened(incumbent.candidate.policy)
-    # Where a trial started off s_0, its utility is no measure for runs that start there: theta's own
-    # run in the grounded model is. It replays the trial when the start was s_0.
+    # Where a trial started off s_0, its utility is no measure for runs that start there: theta's
+    # own run in the grounded model is. It replays the trial when the start was s_0.
     already = simulate(real, theta).utility
     already = already if np.isfinite(already) else incumbent.utility
     least = options.tolerance * abs(already)

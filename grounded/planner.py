@@ -1,8 +1,8 @@
 """Planner: the task as the search plans it, beside the task as the robot's trials judge it.
 
 They differ once effects are adopted: a lag, a backlash or a rate limit gives the model memory
-states that no sensor of the robot knows. Trials are LIFTED to the planning model (the memory follows
-from the commands), policies are NARROWED to what the robot measures (gains on memory are dropped;
+states that no sensor of the robot knows. Trials are LIFTED to the planning model (the memory
+follows from the commands), policies are NARROWED to what the robot measures (gains on memory are dropped;
 their part of the feed-forward stays), and the predicted run is the narrowed policy's.
 """
 

@@ -1,8 +1,8 @@
 """What must hold before a candidate is handed to a robot.
 
 Finite numbers, inputs inside the hard limits, gains within reason, and a PREDICTED run that stays
-inside [safety], widened by the spread that real runs have shown so far. Each objection is a sentence
-that says which limit, where and when.
+inside [safety], widened by the spread that real runs have shown so far. Each objection is a
+sentence that says which limit, where and when.
 """
 
 from __future__ import annotations
@@ -87,6 +87,6 @@ def _outside(task: Task, candidate: Candidate, stray: Array, i: int) -> str:
     around = f" +- {stray[t]:.3f}" * bool(stray[t])
     return (
         f"{candidate.id} (alpha = {candidate.alpha:g}) is predicted to take {name} to "
-        f"{value[t]:.3f}{around} {task.model.states[name]} at t = {t * task.dt:.2f} s, outside [safety] "
-        f"{name} = [{task.safety_low[i]:g}, {task.safety_high[i]:g}]"
+        f"{value[t]:.3f}{around} {task.model.states[name]} at t = {t * task.dt:.2f} s, outside "
+        f"[safety] {name} = [{task.safety_low[i]:g}, {task.safety_high[i]:g}]"
     )

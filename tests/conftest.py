@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+
 from grounded_trials.workspace import Workspace
 from shared_data import DATA
 

@@ -21,13 +21,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from grounded_trials.mcap_log import candidate_bytes, read_candidate, read_trial, trial_bytes
-from grounded_trials.recover import recover_log
-from grounded_trials.store import Store
 
 from grounded.errors import GroundedError
 from grounded.policy import Policy
 from grounded.trial import Trial
+from grounded_trials.mcap_log import candidate_bytes, read_candidate, read_trial, trial_bytes
+from grounded_trials.recover import recover_log
+from grounded_trials.store import Store
 
 MEMORY = "/dev/shm" if Path("/dev/shm").is_dir() else None  # where syncing costs nothing
 

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_tasks import black_box, cart_task, drive, other, rover_task
 
 from grounded.bias import effective_inputs, ground, residuals
 from grounded.errors import GroundedError
@@ -19,6 +18,7 @@ from grounded.policy import Policy
 from grounded.rollout import augmented, simulate
 from grounded.search import Options
 from grounded.trial import Trial
+from small_tasks import black_box, cart_task, drive, other, rover_task
 
 
 def run_of(task, model, seed=0, substeps=1, latency=None):

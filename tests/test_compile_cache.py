@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from problems import system
 
 from grounded.compile import cache, jit
+from problems import system
 
 
 @pytest.fixture

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from problems import SPECS, system
 
 from grounded.compile import system_of
 from grounded.compile.python import RELATIVE_STEP
 from grounded.compile.traced import TracedSystem
 from grounded.compile.tracing import Signature, trace
+from problems import SPECS, system
 
 UNARY = {
     "sin": np.sin,

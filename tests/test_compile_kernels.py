@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from problems import SPECS, problem
 
 from grounded.compile import Problem, jit, parallel, system_of
 from grounded.compile.graph import TooLong
@@ -12,6 +11,7 @@ from grounded.compile.llvm_box import MAX_INPUTS
 from grounded.compile.traced import TracedSystem
 from grounded.compile.tracing import Signature, trace
 from grounded.ddp import solve
+from problems import SPECS, problem
 
 TIGHT = {"rtol": 1e-10, "atol": 1e-10}
 

@@ -5,11 +5,11 @@ from functools import partial
 
 import numpy as np
 import pytest
-from problems import SPECS, system
 
 from grounded.compile import Named
 from grounded.compile.python import DifferencedSystem
 from grounded.errors import GroundedError
+from problems import SPECS, system
 
 
 def make(function, states=("x", "v"), inputs=("f",), params=("m",), kind="derivative", **more):

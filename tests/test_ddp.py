@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from problems import linear_least_squares, problem
 
 from grounded.ddp import Options, damped_step, natural_damping, solve
 from grounded.errors import GroundedError
+from problems import linear_least_squares, problem
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.5, 2.0])

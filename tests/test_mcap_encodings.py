@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+
 from grounded_trials.cdr import cdr_messages, ros1_messages
 from grounded_trials.idl_schema import parse_idl
 from grounded_trials.json_messages import json_messages

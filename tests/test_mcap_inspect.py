@@ -8,6 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.writer import Writer
+
+from grounded.errors import GroundedError
 from grounded_trials.foreign import LogMapping, read_log
 from grounded_trials.inspect_fields import number_paths
 from grounded_trials.inspect_guess import Guess, guess_mapping, is_simulated, mapping_toml
@@ -16,10 +19,7 @@ from grounded_trials.inspect_twins import find_twins
 from grounded_trials.message_types import Dynamic
 from grounded_trials.ros_schema import parse_ros
 from grounded_trials.signals import SignalSpec
-from mcap.writer import Writer
 from shared_data import data, files, needs_data
-
-from grounded.errors import GroundedError
 
 
 @needs_data

@@ -9,6 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+
+from grounded.errors import GroundedError
+from grounded.policy import Policy
+from grounded.trial import Trial
 from grounded_trials.mcap_log import (
     TrialWriter,
     candidate_bytes,
@@ -18,12 +24,6 @@ from grounded_trials.mcap_log import (
     write_candidate,
     write_trial,
 )
-from mcap.reader import make_reader
-from mcap_protobuf.decoder import DecoderFactory
-
-from grounded.errors import GroundedError
-from grounded.policy import Policy
-from grounded.trial import Trial
 
 
 def a_trial(steps: int = 40, seed: int = 0) -> Trial:

@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mcap.writer import CompressionType, IndexType, Writer
+
+from grounded.errors import GroundedError
 from grounded_trials.foreign import LogMapping, read_log
 from grounded_trials.log_files import log_files
 from grounded_trials.resample import Crossing, Span
 from grounded_trials.signals import SignalSpec, read_signals
-from mcap.writer import CompressionType, IndexType, Writer
 from shared_data import data, files, needs_data
-
-from grounded.errors import GroundedError
 
 EPOCH = 1_700_000_000_000_000_000
 
@@ -241,9 +241,10 @@ def test_wrong_encodings_and_damage_in_real_files() -> None:
 @needs_data
 def test_every_number_of_every_ros2_fixture_against_the_other_decoder() -> None:
     support = pytest.importorskip("mcap_ros2.decoder")
+    from mcap.reader import make_reader
+
     from grounded_trials.inspect_log import inspect_log
     from grounded_trials.message_path import parse_path
-    from mcap.reader import make_reader
     from path_reference import follow
 
     compared = 0

@@ -11,6 +11,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mcap.stream_reader import StreamReader
+from mcap.writer import CompressionType, Writer
+
+from grounded.errors import GroundedError
 from grounded_trials.mcap_chunks import BadChunk, decompress
 from grounded_trials.mcap_records import (
     Attachment,
@@ -22,11 +26,7 @@ from grounded_trials.mcap_records import (
     Schema,
 )
 from grounded_trials.mcap_walk import MAGIC, DamagedFile, read_records
-from mcap.stream_reader import StreamReader
-from mcap.writer import CompressionType, Writer
 from shared_data import data, files, needs_data
-
-from grounded.errors import GroundedError
 
 
 def plain(source: bytes) -> list[Any]:

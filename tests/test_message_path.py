@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from grounded.errors import GroundedError
 from grounded_trials.message_path import (
     BINARY,
     UNARY,
@@ -13,10 +17,6 @@ from grounded_trials.message_path import (
     Slice,
     parse_path,
 )
-from hypothesis import given
-from hypothesis import strategies as st
-
-from grounded.errors import GroundedError
 
 
 @pytest.mark.parametrize(

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from small_tasks import black_box, cart, cart_dynamics, rover
 
 from grounded.errors import GroundedError, nearest
 from grounded.model import Model, Param
+from small_tasks import black_box, cart, cart_dynamics, rover
 
 
 def model(**changes):

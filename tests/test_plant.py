@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from small_tasks import cart, cart_task, other, rover, rover_task
 
 from grounded.errors import GroundedError
 from grounded.model import Model
 from grounded.plant import Noise, Plant
+from small_tasks import cart, cart_task, other, rover, rover_task
 
 
 def step_policy(task, at=10, value=1.0):

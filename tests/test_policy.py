@@ -9,11 +9,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_tasks import other, rover_task
 
 from grounded.errors import GroundedError
 from grounded.plant import Plant
 from grounded.policy import Policy, Runner, load, to_arrays, z_difference
+from small_tasks import other, rover_task
 
 STATES, INPUTS = ("x", "psi"), ("speed", "turn")
 

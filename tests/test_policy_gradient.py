@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from problems import SPECS, problem
 
 from grounded.bias import ground
 from grounded.compile.parametric import ParametricPolicy
@@ -21,6 +20,7 @@ from grounded.rollout import simulate
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded.utility import Reward
+from problems import SPECS, problem
 
 CASES = [(name, delay) for name in sorted(SPECS) for delay in (0.0, 1.4)]
 

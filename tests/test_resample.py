@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from grounded_trials.resample import END, START, Crossing, Span, to_grid
-from grounded_trials.signals import Series, SignalSpec
 from hypothesis import given
 from hypothesis import strategies as st
 
 from grounded.errors import GroundedError
+from grounded_trials.resample import END, START, Crossing, Span, to_grid
+from grounded_trials.signals import Series, SignalSpec
 
 EPOCH = 1_700_000_000_000_000_000
 

@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from problems import linear_least_squares, problem
 
 from grounded.compile.box_qp import box_qp
 from grounded.compile.cost import trajectory_cost
 from grounded.riccati import sweep
+from problems import linear_least_squares, problem
 
 DELAYS = [0.0, 0.4, 1.0, 2.3]
 

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from small_tasks import cart_task, rover, rover_task
 
 from grounded.plant import Plant
 from grounded.policy import Runner
 from grounded.rollout import augmented, simulate
+from small_tasks import cart_task, rover, rover_task
 
 
 def feedback_policy(task, seed=0):

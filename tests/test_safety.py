@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_tasks import cart_task
 
 from grounded.improve import propose
 from grounded.safety import MAX_GAIN, objections
 from grounded.search import Options
+from small_tasks import cart_task
 
 
 @pytest.fixture(scope="module")

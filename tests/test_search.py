@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_tasks import cart_task, drive, other, rover_task
 
 from grounded.errors import GroundedError
 from grounded.improve import learn, model_fingerprint, propose
@@ -12,6 +11,7 @@ from grounded.plant import Noise, Plant
 from grounded.search import MAX_CAUTION, Options, mean_trial, standing
 from grounded.trial import Trial
 from grounded.trust import Step
+from small_tasks import cart_task, drive, other, rover_task
 
 TASK = cart_task()
 PLANT = Plant(other(TASK.model, 1.6), latency={"force": 0.02})

@@ -8,9 +8,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from grounded_trials.store import Store, write_atomically
 
 from grounded.errors import GroundedError
+from grounded_trials.store import Store, write_atomically
 
 
 def test_the_same_content_is_kept_once(tmp_path: Path) -> None:

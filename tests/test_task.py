@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_tasks import cart, cart_task, other, rover_task
 
 from grounded.errors import GroundedError
 from grounded.utility import Reward
+from small_tasks import cart, cart_task, other, rover_task
 
 REWARD = Reward(np.array([10.0, 0.0]), np.zeros(2), np.array([0.01]), np.array([0.01]))
 

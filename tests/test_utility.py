@@ -5,13 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_tasks import cart_task, rover_task
 
 from grounded.bias import ground
 from grounded.errors import GroundedError
 from grounded.rollout import simulate
 from grounded.trial import Trial
 from grounded.utility import Reward, step_rewards
+from small_tasks import cart_task, rover_task
 
 
 def by_hand(task, trial):

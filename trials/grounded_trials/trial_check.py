@@ -28,8 +28,8 @@ def warnings_about(workspace: Workspace, trial: Trial) -> tuple[str, ...]:
     if whole.finite_steps < whole.steps:
         name, step = _first_bad(whole)
         found.append(
-            f"'{name}' is not a finite number at {step * trial.dt:.2f} s: the trial counts as ended "
-            "there"
+            f"'{name}' is not a finite number at {step * trial.dt:.2f} s: the trial counts as "
+            "ended there"
         )
     if not trial.candidate:
         return tuple(found)
