@@ -89,11 +89,11 @@ def _sweeps(
     B, n = track.shape[1:]
     with np.errstate(all="ignore"):
         for _ in range(SWEEPS):
-            f, A = steps.along(track, std)
+            f, A, more = steps.along(track, std)
             H, e0 = _seen(batch, measurement, xbar)
             if not all(np.isfinite(array).all() for array in (f, A, H, e0)):
                 return None
-            lin = lanes.linearised(batch, A, f, track, H, e0, xbar)
+            lin = lanes.linearised(batch, A, f, more, track, H, e0, xbar)
             done = lanes.forward(lin, noise)
             if not np.isfinite(done.loglik):
                 return None
@@ -112,7 +112,9 @@ def _sweeps(
                 f = f + (A @ (x[:-1] - track)[..., None])[..., 0]
                 e = e0 - (H @ (x_prior - xbar)[..., None])[..., 0]
                 R = np.where(batch.seen, noise.measurement**2, 1.0)
-                return Filtered(x, after, x_prior, P, e, H, R, A, f, done.loglik, "filtered", done)
+                return Filtered(
+                    x, after, x_prior, P, e, H, R, A, f, more, done.loglik, "filtered", done
+                )
             track, std, xbar = x[:-1], after[:-1], x_prior
     return None
 

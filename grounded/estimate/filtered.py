@@ -24,6 +24,7 @@ class Filtered:
     R: Array  # (T + 1, B, ny) variance of the measurements, 1 where not seen
     A: Array  # (T, B, n, n)
     f: Array  # (T, B, n) what the model predicted from x
+    more: Array  # (T, B, n) variance added to the process noise, see `steps`
     loglik: float
     status: str = "filtered"
     done: Pass | None = field(default=None, repr=False)  # the same in lanes, if it was compiled

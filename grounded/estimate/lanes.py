@@ -72,7 +72,7 @@ class Pass:
 
 
 def linearised(
-    batch: Batch, A: Array, f: Array, track: Array, H: Array, e0: Array, xbar: Array
+    batch: Batch, A: Array, f: Array, more: Array, track: Array, H: Array, e0: Array, xbar: Array
 ) -> Linearised:
     """Packs a linearisation along a track.
 
@@ -80,6 +80,7 @@ def linearised(
         batch: the records.
         A: (T, B, n, n), likewise f and track (T, B, n).
         f: what the model predicts from the track.
+        more: variance added to the process noise (T, B, n).
         track: filtered states about which A holds.
         H: (T + 1, B, ny, n), rows of channels that were not seen are zero.
         e0: y - h(xbar), (T + 1, B, ny), zero where not seen.
@@ -88,7 +89,7 @@ def linearised(
     from grounded.compile import jit
 
     width, B = jit.lanes(), len(batch.lengths)
-    given = {"A": A, "f": f, "track": track, "H": H, "e0": e0, "xbar": xbar}
+    given = {"A": A, "f": f, "more": more, "track": track, "H": H, "e0": e0, "xbar": xbar}
     arrays = {name: pack(value, width) for name, value in given.items()}
     arrays["x0"] = pack(batch.start[None], width)[:, 0]
     dt = np.where(batch.valid, batch.dt, 0.0)[..., None]
@@ -111,7 +112,7 @@ def forward(lin: Linearised, noise: Noise) -> Pass:
     G, T, n, ny, width = lin.sizes
     R = noise.measurement**2
     r = np.where(lin.seen, R[:, None], 1.0)
-    q = lin.dt * (noise.process**2 / noise.dt)[:, None]
+    q = lin.dt * (noise.process**2 / noise.dt)[:, None] + lin.arrays["more"]
     channel = lin.start_channel
     P0 = lin.start_var + np.where(channel >= 0, R[np.maximum(channel, 0)], 0.0)
     shapes = {"x": n, "x_prior": n, "P_prior": n * n, "e": ny, "s": ny, "g": ny * n}

@@ -45,11 +45,11 @@ def recursion(batch: Batch, measurement: Measurement, noise: Noise, advance: Adv
             loglik += float(log_det.sum() - 0.5 * np.sum((C @ e[..., None]) ** 2))
             if t == T:
                 break
-            f, A = advance(t, x, out["std"][t])
+            f, A, more = advance(t, x, out["std"][t])
             if not (np.isfinite(f).all() and np.isfinite(A).all()):
                 return _failed(out, t + 1)
-            out["f"][t], out["A"][t] = f, A
-            x, P = f, A @ P @ A.transpose(0, 2, 1) + scale[t]
+            out["f"][t], out["A"][t], out["more"][t] = f, A, more
+            x, P = f, A @ P @ A.transpose(0, 2, 1) + scale[t] + more[..., None] * eye
     loglik -= 0.5 * np.log(2 * np.pi) * batch.count
     return made(out, loglik if np.isfinite(loglik) else -np.inf, "filtered")
 
@@ -66,6 +66,7 @@ def made(out: dict[str, Array], loglik: float, status: str) -> Filtered:
         R=out["R"],
         A=out["A"],
         f=out["f"],
+        more=out["more"],
         loglik=loglik,
         status=status,
     )
@@ -74,7 +75,11 @@ def made(out: dict[str, Array], loglik: float, status: str) -> Filtered:
 def _room(T: int, B: int, n: int, ny: int) -> dict[str, Array]:
     tails = {"x": (n,), "std": (n,), "x_prior": (n,), "P_prior": (n, n), "e": (ny,), "H": (ny, n)}
     room = {name: np.zeros((T + 1, B, *tail)) for name, tail in tails.items()}
-    return room | {"A": np.zeros((T, B, n, n)), "f": np.zeros((T, B, n))}
+    return room | {
+        "A": np.zeros((T, B, n, n)),
+        "f": np.zeros((T, B, n)),
+        "more": np.zeros((T, B, n)),
+    }
 
 
 def _start_covariance(batch: Batch, R: Array) -> Array:

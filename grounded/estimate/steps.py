@@ -3,12 +3,14 @@
 Two ways to linearise about a state known to within sigma:
 
     narrow   f(x), f_x(x): the extended Kalman filter
-    wide     differences over h sigma_i on either side of each state,
-             f(x) + 1/2 sum_i (f_i+ + f_i- - 2 f) / h^2,       A_i = (f_i+ - f_i-) / (2 h sigma_i)
+    wide     differences over h sigma_i on either side of each state, c_i = f_i+ + f_i- - 2 f:
+             f(x) + sum_i c_i / (2 h^2),         A_i = (f_i+ - f_i-) / (2 h sigma_i);
+             what a straight line misses is process noise: sum_i c_i^2 (h^2 - 1) / (4 h^4)
 
 The wide one sees what lies within reach: where a model has a kink (friction at rest, brakes that
 are faster than the motor), the mean of f is not f of the mean, and a filter that does not know it
-pulls the parameters off. h = sqrt(pi/2) makes the mean right for a kink and for a parabola alike.
+pulls the parameters off. h = sqrt(pi/2) makes the mean right for a kink and for a parabola alike,
+and the variance for a kink.
 Source: Noergaard, Poulsen & Ravn, Automatica 36 (2000), with another h.
 """
 
@@ -24,9 +26,10 @@ from grounded.estimate.batch import Batch
 from grounded.estimate.filtered import Filtered
 from grounded.frozen import Array
 
-# t, x (B, n) and its standard deviation (B, n) -> f (B, n), A (B, n, n)
-Advance = Callable[[int, Array, Array], tuple[Array, Array]]
+# t, x (B, n) and its standard deviation (B, n) -> f (B, n), A (B, n, n), added variance (B, n)
+Advance = Callable[[int, Array, Array], tuple[Array, Array, Array]]
 REACH = float(np.sqrt(np.pi / 2))  # h
+MISSED = (REACH**2 - 1) / (4 * REACH**4)
 LEAST = 1e-6  # of max(1, |x|): no difference is taken over less
 
 
@@ -46,38 +49,40 @@ class ModelSteps:
     batch: Batch
     wide: bool = False
 
-    def at(self, t: int, x: Array, std: Array) -> tuple[Array, Array]:
-        """From x (B, n), known to within std, at time t: f (B, n), A (B, n, n)."""
-        f, A = self._rows(x[None], std[None], slice(t, t + 1))
-        return f[0], A[0]
+    def at(self, t: int, x: Array, std: Array) -> tuple[Array, Array, Array]:
+        """From x (B, n), known to within std, at time t: f, A and added variance (B, n)."""
+        f, A, more = self._rows(x[None], std[None], slice(t, t + 1))
+        return f[0], A[0], more[0]
 
-    def along(self, x: Array, std: Array) -> tuple[Array, Array]:
-        """From a track x (T, B, n) and its std: f (T, B, n), A (T, B, n, n)."""
+    def along(self, x: Array, std: Array) -> tuple[Array, Array, Array]:
+        """From a track x (T, B, n) and its std: f, A (T, B, n, n), added variance (T, B, n)."""
         return self._rows(x, std, slice(None))
 
-    def _rows(self, x: Array, std: Array, times: slice) -> tuple[Array, Array]:
+    def _rows(self, x: Array, std: Array, times: slice) -> tuple[Array, Array, Array]:
         batch, n = self.batch, x.shape[-1]
         valid, u = batch.valid[times], batch.u[times]
         if len(batch.steps_of) == 1 and valid.all():
             flat = (x.reshape(-1, n), std.reshape(-1, n), u.reshape(-1, u.shape[-1]))
-            f, A = self._call(*flat, batch.steps_of[0][0])
-            return f.reshape(x.shape), A.reshape(*x.shape, n)
-        f, A = x.copy(), np.tile(np.eye(n), (*x.shape[:-1], 1, 1))
+            f, A, more = self._call(*flat, batch.steps_of[0][0])
+            return f.reshape(x.shape), A.reshape(*x.shape, n), more.reshape(x.shape)
+        f, A, more = x.copy(), np.tile(np.eye(n), (*x.shape[:-1], 1, 1)), np.zeros_like(x)
         for h, mask in batch.steps_of:
             rows = valid if mask is None else valid & mask[times]
             if rows.any():
-                f[rows], A[rows] = self._call(x[rows], std[rows], u[rows], h)
-        return f, A
+                f[rows], A[rows], more[rows] = self._call(x[rows], std[rows], u[rows], h)
+        return f, A, more
 
-    def _call(self, x: Array, std: Array, u: Array, h: float) -> tuple[Array, Array]:
+    def _call(self, x: Array, std: Array, u: Array, h: float) -> tuple[Array, Array, Array]:
         f = self.system.step(x, u, self.p, h)
         if not self.wide:
-            return f, self.system.linearise(x, u, self.p, h)[0]
-        mean, A = f.copy(), np.empty((*x.shape, x.shape[1]))
+            return f, self.system.linearise(x, u, self.p, h)[0], np.zeros_like(x)
+        mean, A, more = f.copy(), np.empty((*x.shape, x.shape[1])), np.zeros_like(x)
         for i, (up, down, reach) in enumerate(self._pairs(x, std, u, h)):
             A[..., i] = (up - down) / (2 * reach[:, None])
-            mean += (up + down - 2 * f) / (2 * REACH**2)
-        return mean, A
+            curve = up + down - 2 * f
+            mean += curve / (2 * REACH**2)
+            more += MISSED * curve**2
+        return mean, A, more
 
     def _pairs(
         self, x: Array, std: Array, u: Array, h: float
@@ -98,8 +103,9 @@ class ModelSteps:
 def fixed_steps(filtered: Filtered) -> Advance:
     """The linearisation of an earlier pass, f_t + A_t (x - x_t)."""
 
-    def advance(t: int, x: Array, std: Array) -> tuple[Array, Array]:
+    def advance(t: int, x: Array, std: Array) -> tuple[Array, Array, Array]:
         A = filtered.A[t]
-        return filtered.f[t] + (A @ (x - filtered.x[t])[..., None])[..., 0], A
+        moved = (A @ (x - filtered.x[t])[..., None])[..., 0]
+        return filtered.f[t] + moved, A, filtered.more[t]
 
     return advance
