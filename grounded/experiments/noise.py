@@ -1,0 +1,195 @@
+"""The line search when trials scatter: what a comparison of single trials costs, and what helps.
+
+Six rules at four levels of scatter, as multiples of the simulated car's own (`real_car.SCATTER`).
+Judged is the TRUE utility, the mean of fresh runs, of each policy that a rule accepts:
+
+    false      accepted steps that made the policy truly worse
+    closed     share of the gap between the model's policy and the optimum that the final one closes
+    flattered  utility that the winner's own trials claim, minus its true utility, by the gap
+
+A rule runs a candidate `repeats` times and averages states, inputs and utilities; the bias is that
+of the mean. "incumbent again" runs the best policy once more beside every candidate, so that a
+lucky winner loses its luck.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, MutableMapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from grounded.experiments.bench import bench, optimum
+from grounded.experiments.jobs import Engine, Job, Progress, run_jobs
+from grounded.experiments.scatter import scaled, true_utility
+from grounded.experiments.summary import Table
+from grounded.improve import propose
+from grounded.policy import Policy
+from grounded.search import Candidate, Options
+from grounded.task import Task
+from grounded.trial import Trial
+
+LEVELS = (0.5, 1.0, 2.0, 3.0)
+MANOEUVRES = ("turn", "figure8")
+BUDGET = 40  # trials
+FRESH = 30  # runs that judge a policy
+
+
+@dataclass(frozen=True)
+class Rule:
+    """How trials decide."""
+
+    name: str
+    repeats: int
+    max_halvings: int
+    again: bool = False  # the incumbent is run again beside every candidate
+
+
+RULES = (
+    Rule("single trials, alpha to 1/64", 1, 6),
+    Rule("single trials, alpha to 1/8", 1, 3),
+    Rule("single trials, incumbent again", 1, 3, again=True),
+    Rule("2 trials, alpha to 1/8", 2, 3),
+    Rule("3 trials, alpha to 1/64", 3, 6),
+    Rule("3 trials, alpha to 1/8", 3, 3),
+)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One rule on one case."""
+
+    rule: str
+    manoeuvre: str
+    level: float
+    seed: int
+    accepted: int  # steps
+    false: int
+    closed: float
+    flattered: float
+    trials: int
+
+
+@dataclass(frozen=True)
+class NoiseResult:
+    """All outcomes, in the order of manoeuvre, level, rule, seed."""
+
+    outcomes: tuple[Outcome, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """Outcomes by name, and the rule that follows from them."""
+        return {"outcomes": [vars(o) for o in self.outcomes], "recommended": self.recommended}
+
+    @property
+    def recommended(self) -> str:
+        """The rule whose median share closed, averaged over all cases, is the largest."""
+        return max((rule.name for rule in RULES), key=lambda name: self._score(name))
+
+    def _score(self, rule: str) -> float:
+        cases = dict.fromkeys((o.manoeuvre, o.level) for o in self.outcomes)
+        own = [self._of(rule, *case) for case in cases]
+        return float(np.mean([np.median([o.closed for o in some]) for some in own if some]))
+
+    def _of(self, rule: str, manoeuvre: str, level: float) -> list[Outcome]:
+        wanted = (rule, manoeuvre, level)
+        return [o for o in self.outcomes if (o.rule, o.manoeuvre, o.level) == wanted]
+
+    def tables(self) -> list[Table]:
+        """By manoeuvre and level: false acceptances, share closed, how much the winner flatters."""
+        cases = dict.fromkeys((o.manoeuvre, o.level) for o in self.outcomes)
+        return [self._table(manoeuvre, level) for manoeuvre, level in cases]
+
+    def _table(self, manoeuvre: str, level: float) -> Table:
+        rows = []
+        for rule in dict.fromkeys(o.rule for o in self.outcomes):
+            own = self._of(rule, manoeuvre, level)
+            if not own:
+                continue
+            steps, false = sum(o.accepted for o in own), sum(o.false for o in own)
+            closed = [o.closed for o in own]
+            rows.append(
+                (
+                    rule,
+                    f"{false} of {steps}",
+                    f"{np.median(closed):.1%}",
+                    f"{min(closed):.1%}",
+                    f"{np.median([o.flattered for o in own]):.1%}",
+                    f"{np.median([o.trials for o in own]):g}",
+                )
+            )
+        head = ("rule", "false acceptances", "gap closed", "worst", "flattered by", "trials")
+        return Table(f"{manoeuvre}, scatter x{level:g}", head, tuple(rows))
+
+
+def run(
+    seeds: Sequence[int] = range(8),
+    *,
+    manoeuvres: Sequence[str] = MANOEUVRES,
+    levels: Sequence[float] = LEVELS,
+    rules: Sequence[Rule] = RULES,
+    engine: Engine | None = None,
+    finished: MutableMapping[str, dict[str, Any]] | None = None,
+    progress: Progress | None = None,
+) -> NoiseResult:
+    """Every rule on every case; a job is one of them."""
+    jobs = [
+        Job(one, {"rule": vars(rule), "manoeuvre": manoeuvre, "level": level, "seed": seed})
+        for manoeuvre in manoeuvres
+        for level in levels
+        for rule in rules
+        for seed in seeds
+    ]
+    found = run_jobs(jobs, engine, finished=finished, progress=progress)
+    return NoiseResult(tuple(Outcome(**result) for result in found))
+
+
+def one(rule: dict[str, Any], manoeuvre: str, level: float, seed: int) -> dict[str, Any]:
+    """A job: one rule, one case."""
+    how = Rule(**rule)
+    case = bench(manoeuvre, "noise", seed)
+    best, _ = optimum(case)
+    case = replace(case, plant=scaled(case.plant, level))
+
+    def truly(policy: Policy) -> float:
+        return true_utility(case.task, case.plant, policy, FRESH, seed)
+
+    accepted, claimed, trials = _search(how, case.real, case.task)
+    utilities = [truly(policy) for policy in accepted]
+    gap = truly(best) - utilities[0]
+    return {
+        "rule": how.name,
+        "manoeuvre": manoeuvre,
+        "level": level,
+        "seed": seed,
+        "accepted": len(accepted) - 1,
+        "false": int((np.diff(utilities) < 0).sum()),
+        "closed": (utilities[-1] - utilities[0]) / gap,
+        "flattered": (claimed - utilities[-1]) / gap,
+        "trials": trials,
+    }
+
+
+def _search(
+    rule: Rule, real: Callable[[Policy, int], Trial], task: Task
+) -> tuple[list[Policy], float, int]:
+    """The policies accepted in turn, the utility that the last one's trials claim, trials run."""
+    options = Options(max_trials=BUDGET, repeats=rule.repeats, max_halvings=rule.max_halvings)
+    candidates: list[Candidate] = []
+    trials: list[Trial] = []
+    accepted: list[Policy] = []
+    while True:
+        proposal = propose(task, candidates, trials, options)
+        best = proposal.standing.incumbent
+        if best is not None and (not accepted or accepted[-1] is not best.candidate.policy):
+            accepted.append(best.candidate.policy)
+        if proposal.candidate is None or len(trials) >= BUDGET:
+            assert best is not None
+            return accepted, best.utility, len(trials)
+        if proposal.is_new:
+            candidates.append(proposal.candidate)
+            if rule.again and best is not None:
+                again = real(best.candidate.policy, len(trials))
+                trials.append(replace(again, candidate=best.candidate.id))
+        trial = real(proposal.candidate.policy, len(trials))
+        trials.append(replace(trial, candidate=proposal.candidate.id))
