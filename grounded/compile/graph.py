@@ -43,6 +43,7 @@ class Graph:
         self.limit = limit
         self.conditions: set[int] = set()  # nodes that are weights in [0, 1]
         self.oracle: Callable[[int], bool] | None = None  # answers an `if` while tracing
+        self.varying: set[int] = set()  # nodes that depend on a state or an input
         self._known: dict[Node | tuple[str, str], int] = {}
 
     def const(self, value: float) -> int:
@@ -69,6 +70,8 @@ class Graph:
             return known
         if len(self.nodes) >= self.limit:
             raise TooLong(f"more than {self.limit:,} operations")
+        if (node.leaf and node.leaf[0] in "xu") or any(a in self.varying for a in node.args):
+            self.varying.add(len(self.nodes))
         self.nodes.append(node)
         self._known[key] = len(self.nodes) - 1
         return len(self.nodes) - 1
@@ -170,7 +173,11 @@ def _mul(g: Graph, args: tuple[int, ...], v: list[float | None]) -> int | None:
 def _div(g: Graph, args: tuple[int, ...], v: list[float | None]) -> int | None:
     if v[1] == 1.0:
         return args[0]
-    return g.const(0.0) if v[0] == 0.0 and v[1] is None else None
+    if v[0] == 0.0 and v[1] is None:
+        return g.const(0.0)
+    if args[0] in g.varying and args[1] not in g.varying:  # one division a call, not one a sample
+        return g.node("mul", args[0], g.node("div", g.const(1.0), args[1]))
+    return None
 
 
 def _neg(g: Graph, args: tuple[int, ...], v: list[float | None]) -> int | None:

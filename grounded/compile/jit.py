@@ -40,7 +40,7 @@ def _machine() -> Any:
 
     name, features, _ = _host()
     return llvm.Target.from_default_triple().create_target_machine(
-        cpu=name, features=features, opt=OPTIMISATION, codemodel="jitdefault", jit=True
+        cpu=name, features=features, opt=OPTIMISATION, reloc="pic", codemodel="small", jit=True
     )
 
 

@@ -113,10 +113,8 @@ class Lanes:
         return self.f.emit(f"icmp ne <{self.width} x i64> {bit}, zeroinitializer")
 
     def _rounding(self, x: str, scale: float) -> str:
-        """MAGIC + the integer nearest to scale x; not fused, so that MAGIC can be taken off."""
-        kind = vector(self.width)
-        scaled = self.f.emit(f"fmul {kind} {x}, {self.const(scale)}")
-        return self.f.emit(f"fadd {kind} {scaled}, {self.const(MAGIC)}")
+        """MAGIC + the integer nearest to scale x; taking MAGIC off leaves the integer."""
+        return self.f.fma(x, self.const(scale), self.const(MAGIC), self.width)
 
     def sincos(self, x: str) -> tuple[str, str]:
         """Sine and cosine, one reduction for both."""
@@ -163,8 +161,8 @@ class Lanes:
         n = f.emit(f"fsub {vector(w)} {shifted}, {self.const(MAGIC)}")
         r = f.sub(x, f.mul(n, self.const(LN2[0]), w), w)
         r = f.sub(r, f.mul(n, self.const(LN2[1]), w), w)
-        tail = f.fma(f.mul(r, r, w), self.polynomial(r, EXP), r, w)
-        mantissa = f.add(tail, self.const(1.0), w)
+        start = f.add(r, self.const(1.0), w)
+        mantissa = f.fma(f.mul(r, r, w), self.polynomial(r, EXP), start, w)
         exponent = self._bitwise("shl", self._bits(shifted), 52)
         kind = "i64" if w == 1 else f"<{w} x i64>"
         return self._from_bits(f.emit(f"add {kind} {self._bits(mantissa)}, {exponent}"))
@@ -180,28 +178,45 @@ class Lanes:
     def atan2(self, y: str, x: str) -> str:
         """The angle of (x, y) in (-pi, pi]."""
         f, w = self.f, self.width
-        zero = self.const(0.0)
         ax, ay = f.call("fabs", [x], w), f.call("fabs", [y], w)
         steep = f.compare("ogt", ay, ax, w)
-        small, large = f.select(steep, ax, ay, w), f.select(steep, ay, ax, w)
-        angle = self._first_octant(small, large)
-        angle = f.select(steep, f.sub(self.const(math.pi / 2), angle, w), angle, w)
         left = self._is_set(self._bitwise("lshr", self._bits(x), 63))
-        angle = f.select(left, f.sub(self.const(math.pi), angle, w), angle, w)
+        far = self._both(self._beyond_eighth(ay, ax), self._beyond_eighth(ax, ay))
+        small, large = f.select(steep, ax, ay, w), f.select(steep, ay, ax, w)
+        core = self._small_angle(small, large, far)
+        base, turn = self._octant(far, steep, left)
+        angle = f.fma(turn, core, base, w)
         signed = self._bitwise("and", self._bits(y), -(1 << 63))
         return self._from_bits(self._exclusive(self._bits(angle), signed))
 
-    def _first_octant(self, y: str, x: str) -> str:
-        """The angle of (x, y) for 0 <= y <= x: about 0, or about pi/4, with one division."""
+    def _both(self, a: str, b: str) -> str:
+        bits = "i1" if self.width == 1 else f"<{self.width} x i1>"
+        return self.f.emit(f"and {bits} {a}, {b}")
+
+    def _beyond_eighth(self, y: str, x: str) -> str:
+        """Whether y / x is above tan(pi / 8)."""
+        f, w = self.f, self.width
+        return f.compare("ogt", y, f.mul(x, self.const(math.tan(math.pi / 8)), w), w)
+
+    def _small_angle(self, y: str, x: str, far: str) -> str:
+        """The angle of (x, y) for 0 <= y <= x, less pi/4 if it is far from 0; one division."""
         f, w, zero = self.f, self.width, self.const(0.0)
-        far = f.compare("ogt", y, f.mul(x, self.const(math.tan(math.pi / 8)), w), w)
-        above = f.select(far, f.sub(y, x, w), y, w)
-        below = f.select(far, f.add(y, x, w), x, w)
-        below = f.select(f.compare("oeq", x, zero, w), self.const(1.0), below, w)
-        t = f.div(above, below, w)
+        below = f.select(f.compare("oeq", x, zero, w), self.const(1.0), x, w)
+        below = f.select(far, f.add(y, x, w), below, w)
+        t = f.div(f.select(far, f.sub(y, x, w), y, w), below, w)
         z = f.mul(t, t, w)
-        angle = f.fma(f.mul(t, z, w), self.polynomial(z, ATAN), t, w)
-        return f.add(angle, f.select(far, self.const(math.pi / 4), zero, w), w)
+        return f.fma(f.mul(t, z, w), self.polynomial(z, ATAN), t, w)
+
+    def _octant(self, far: str, steep: str, left: str) -> tuple[str, str]:
+        """(base, turn): the whole angle is base + turn * small angle."""
+        f, w = self.f, self.width
+        zero, half, whole = (self.const(v * math.pi) for v in (0.0, 0.5, 1.0))
+        base = f.select(far, self.const(math.pi / 4), zero, w)
+        base = f.select(steep, f.sub(half, base, w), base, w)
+        base = f.select(left, f.sub(whole, base, w), base, w)
+        one, back = self.const(1.0), self.const(-1.0)
+        flipped = f.select(steep, f.select(left, one, back, w), f.select(left, back, one, w), w)
+        return base, flipped
 
     def asin(self, x: str) -> str:
         """The arcsine, NaN outside [-1, 1]: beyond 1/2, pi/2 - 2 asin(sqrt((1 - |x|) / 2))."""

@@ -107,52 +107,56 @@ class Linearised:
         """From here on `rows` means those of step t."""
         self.now = self.f.at(self.jac, self.f.integer("and", t, self.width - 1))
 
-    def rows(self, row: Row, size: int, inputs_only: bool = False) -> list[str]:
-        """Rows of [A B]'X, z first and then u, from pieces X(r, :) of `size` doubles."""
+    def inputs(self, row: Row, size: int) -> tuple[list[str], list[str]]:
+        """Rows of f_u'X, one an input, and of B'X, from pieces X(r, :) of `size` doubles."""
+        f, layout, now = self.f, self.layout, self.words.pointer("now")
+        G = self._sums(row, size, range(layout.n, layout.n + layout.m))
+        return G, [
+            f.fma(f.load_all(now, j, size), G[j], row(layout.slot(j)), size)
+            for j in range(layout.m)
+        ]
+
+    def states(self, row: Row, size: int, G: list[str]) -> list[str]:
+        """Rows of A'X, given those of f_u'X."""
         f, layout = self.f, self.layout
-        large = len(self.d.places) > UNROLLED
-        sums = self._looped_sums(row, size) if large else self._sums(row, size, inputs_only)
-        out = [sums.get(c, splat(0.0, size)) for c in range(layout.n)]
-        now, past, D = self.words.pointer("now"), self.words.pointer("past"), layout.nz - layout.n
-        inputs = []
+        out = self._sums(row, size, range(layout.n))
+        past, D = self.words.pointer("past"), layout.nz - layout.n
         for j, depth in enumerate(layout.depths):
-            G = sums.get(layout.n + j, splat(0.0, size))
             for i in range(depth):
                 weight = f.load_all(past, j * D + layout.slot(j, i) - layout.n, size)
-                value = f.mul(weight, G, size)
+                value = f.mul(weight, G[j], size)
                 older = i + 1 < depth
                 out.append(f.add(value, row(layout.slot(j, i + 1)), size) if older else value)
-            inputs.append(f.fma(f.load_all(now, j, size), G, row(layout.slot(j)), size))
-        return inputs if inputs_only else out + inputs
+        return out
 
-    def _sums(self, row: Row, size: int, inputs_only: bool) -> dict[int, str]:
-        """For each column c of the Jacobian, the sum over r of J(r, c) X(r, :)."""
+    def _sums(self, row: Row, size: int, columns: range) -> list[str]:
+        """For each column c of the model's Jacobian, the sum over r of J(r, c) X(r, :)."""
+        if len(self.d.places) > UNROLLED:
+            return self._looped_sums(row, size, columns)
         f, sums = self.f, dict[int, str]()
         for e, (r, c) in enumerate(self.d.places):
-            if c < self.layout.n and inputs_only:
-                continue
-            a, value = self._entry(e, size), row(r)
-            sums[c] = f.fma(a, value, sums[c], size) if c in sums else f.mul(a, value, size)
-        return sums
+            if c in columns:
+                a, value = self._entry(e, size), row(r)
+                sums[c] = f.fma(a, value, sums[c], size) if c in sums else f.mul(a, value, size)
+        return [sums.get(c, splat(0.0, size)) for c in columns]
 
-    def _looped_sums(self, row: Row, size: int) -> dict[int, str]:
+    def _looped_sums(self, row: Row, size: int, columns: range) -> list[str]:
         """The same for large models, by tables of indices."""
-        f, count = self.f, self.layout.n + self.layout.m
-        with f.loop(count) as c:
+        f, count = self.f, len(columns)
+        with f.loop(count) as i:
+            c = f.integer("add", i, columns.start)
             first = f.index("@column_first", c)
             entries = f.integer("sub", f.index("@column_first", f.integer("add", c, 1)), first)
             with f.fold(entries, size, splat(0.0, size)) as total:
                 q = f.integer("add", first, total.i)
                 a = f.load_all(self.now, f.index("@column_entry", q), size)
                 total.set(f.fma(a, row(f.index("@column_row", q)), total.value, size))
-            f.store(total.result, self.sums_room, f.integer("mul", c, size), size)
-        return {c: f.load(self.sums_room, c * size, size) for c in range(count)}
+            f.store(total.result, self.sums_room, f.integer("mul", i, size), size)
+        return [f.load(self.sums_room, i * size, size) for i in range(count)]
 
     def _entry(self, e: int, size: int) -> str:
-        """Value e of the Jacobian of this step, in every lane: read again each time it is used,
-
-        because a multiplication can take it from memory for nothing and registers are few.
-        """
+        """Value e of the Jacobian of this step, in every lane."""
+        # Read again at each use: a multiplication takes it from memory for nothing.
         return self.f.load_all(self.now, e * self.width, size)
 
 

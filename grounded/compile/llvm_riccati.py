@@ -30,8 +30,11 @@ def sweep_kernel(d: Dynamics, layout: Layout, width: int) -> str:
     writer.end()
     with f.loop(writer.words.integer("H"), down=True) as t:
         writer.along.linearise(t)
-        writer.products(t)
+        writer.along.select(t)
+        slopes = writer.product()
+        writer.input_rows(t, slopes)
         writer.gains(t)
+        writer.state_rows(t, slopes)
         writer.value(t)
     f.store(f.load(writer.sums, 0), writer.words.pointer("expected"), 0)
     f.store(f.load(writer.sums, 1), writer.words.pointer("expected"), 1)
@@ -50,7 +53,7 @@ class _Sweep:
         self.along = Linearised(f, d, layout, width, self.words)
         self.V, self.v = f.room(self.P * self.P), f.room(self.P)
         self.M, self.T = f.room(self.C * self.P), f.room(self.P * self.C)
-        self.U = f.room(m * self.C)  # rows of [Q_uz Q_uu]
+        self.U, self.G = f.room(m * self.C), f.room(m * self.C)  # rows of [Q_uz Q_uu], f_u'T
         self.g_z, self.g_u = f.room(self.P), f.room(m)
         self.H, self.L, self.inv = f.room(m * m), f.room(m * m), f.room(m)
         self.k, self.free, self.low, self.high = (f.room(m) for _ in range(4))
@@ -84,29 +87,38 @@ class _Sweep:
             out.append((f.mul(twice, e), twice))
         return out
 
-    def products(self, t: str) -> None:
-        """Q_zz into V, [Q_uz Q_uu] into U, Q_z into g_z, Q_u into g_u."""
-        f, layout, P, C = self.f, self.layout, self.P, self.C
-        self.along.select(t)
+    def product(self) -> list[str]:
+        """V [A B], transposed into T; returns the products with v, z first and then u."""
+        f, P = self.f, self.P
         for at, size in self.cut:
-            rows = self.along.rows(pieces_of(f, self.V, P, at, size), size)
-            for c, value in enumerate(rows):
+            row = pieces_of(f, self.V, P, at, size)
+            G, inputs = self.along.inputs(row, size)
+            for c, value in enumerate([*self.along.states(row, size, G), *inputs]):
                 f.store(value, self.M, c * P + at, size)
-        slopes = self.along.rows(lambda r: f.load(self.v, r), 1)
-        transpose(f, self.M, self.T, P, C)
+        G, inputs = self.along.inputs(lambda r: f.load(self.v, r), 1)
+        slopes = self.along.states(lambda r: f.load(self.v, r), 1, G) + inputs
+        transpose(f, self.M, self.T, P, self.C)
+        return slopes
+
+    def input_rows(self, t: str, slopes: list[str]) -> None:
+        """[Q_uz Q_uu] into U, Q_u into g_u: first, so that their factor is under way early."""
+        f, C = self.f, self.C
         for at, size in pieces(C, self.width):
-            beyond = at >= layout.nz  # columns of inputs: only their own rows are wanted
-            rows = self.along.rows(pieces_of(f, self.T, C, at, size), size, beyond)
-            for c, value in enumerate(rows[: len(rows) - layout.m]):
-                if at + size <= P:
-                    f.store(value, self.V, c * P + at, size)
-                else:
-                    for i in range(P - at):
-                        f.store(f.lane(value, i, size), self.V, c * P + at + i)
-            for j, value in enumerate(rows[len(rows) - layout.m :]):
+            G, rows = self.along.inputs(pieces_of(f, self.T, C, at, size), size)
+            for j, value in enumerate(rows):
+                f.store(G[j], self.G, j * C + at, size)
                 f.store(value, self.U, j * C + at, size)
-        self._add_state_cost(t, slopes)
         self._add_input_cost(t, slopes)
+
+    def state_rows(self, t: str, slopes: list[str]) -> None:
+        """Q_zz into V, Q_z into g_z."""
+        f, P, C = self.f, self.P, self.C
+        for at, size in self.cut:
+            G = [f.load(self.G, j * C + at, size) for j in range(self.layout.m)]
+            row = pieces_of(f, self.T, C, at, size)
+            for c, value in enumerate(self.along.states(row, size, G)):
+                f.store(value, self.V, c * P + at, size)
+        self._add_state_cost(t, slopes)
 
     def _add_to(self, value: str, base: str, index: int) -> None:
         self.f.store(self.f.add(self.f.load(base, index), value), base, index)

@@ -87,6 +87,7 @@ class _Rollout:
         self.f, self.layout, self.words = f, layout, Words(f, ROLLOUT)
         self.step = StepWriter(f, d, LANES, start_table(f, self.words, d))
         self.z, self.u = f.room(layout.nz * LANES), f.room(layout.m * LANES)
+        self.step.x = self.z  # the state comes first in z
         self.cost, self.alpha = f.room(LANES), f.load(self.words.pointer("alphas"), 0, LANES)
         start = self.words.pointer("start")
         for i in range(layout.nz):
@@ -142,11 +143,12 @@ class _Rollout:
             e = f.sub(f.load(self.z, i * LANES, LANES), f.load_all(zbar, i, LANES), LANES)
             dz.append(wrap(f, e, LANES) if i < layout.n and layout.angles[i] else e)
         for j in range(layout.m):
-            sums = [f.load(self.u, j * LANES, LANES), splat(0.0, LANES)]  # two chains, half as long
+            sums = [f.load(self.u, j * LANES, LANES), *[splat(0.0, LANES)] * 3]  # short chains
             for i, e in enumerate(dz):
                 gain = f.load_all(K, j * layout.nz + i, LANES)
-                sums[i % 2] = f.fma(gain, e, sums[i % 2], LANES)
-            f.store(f.add(sums[0], sums[1], LANES), self.u, j * LANES, LANES)
+                sums[i % 4] = f.fma(gain, e, sums[i % 4], LANES)
+            pair = [f.add(sums[i], sums[i + 2], LANES) for i in (0, 1)]
+            f.store(f.add(pair[0], pair[1], LANES), self.u, j * LANES, LANES)
 
     def _clip(self, t: str) -> None:
         f, layout, terms = self.f, self.layout, []
@@ -188,8 +190,6 @@ class _Rollout:
         z, u = self._all(self.z, layout.nz), self._all(self.u, layout.m)
         for j, value in enumerate(received(f, self.words, layout, z, u, LANES)):
             f.store(value, step.u, j * LANES, LANES)
-        for i in range(layout.n):
-            f.store(z[i], step.x, i * LANES, LANES)
         for j, depth in enumerate(layout.depths):
             for i in range(depth):
                 f.store(

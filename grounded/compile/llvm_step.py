@@ -107,6 +107,7 @@ class StepWriter:
         self._start(d.outputs)
         with f.loop(len(d.stages)) as stage:
             self._rates(stage)
+        self._finish()
 
     def _start(self, outputs: Sequence[int]) -> None:
         f, d, w = self.f, self.d, self.width
@@ -115,11 +116,17 @@ class StepWriter:
         self.held = dict(zip(held, self._body(lambda i: "").values(held), strict=True))
         zero = splat(0.0, w)
         for i in range(d.n):
-            f.store(f.load(self.x, i * w, w), self.next, i * w, w)
+            f.store(zero, self.next, i * w, w)
             f.store(zero, self.k, i * w, w)
 
+    def _finish(self) -> None:
+        f, w = self.f, self.width
+        for i in range(self.d.n):
+            x = f.add(f.load(self.x, i * w, w), f.load(self.next, i * w, w), w)
+            f.store(x, self.next, i * w, w)
+
     def _rates(self, stage: str) -> tuple[Body, str]:
-        """One stage: k = f(x + c dt k), next += b dt k."""
+        """One stage: k = f(x + c dt k), next += b dt k; next starts at zero."""
         f, d, w = self.f, self.d, self.width
         dt = f.load(self.table, DT)
         c, b = (f.mul(dt, f.load(name, stage)) for name in ("@stage_c", "@stage_b"))
@@ -153,6 +160,7 @@ class StepWriter:
         with f.loop(len(d.stages)) as stage:
             body, c_dt = self._rates(stage)
             self._chain(body, c_dt, stage, rates, out)
+        self._finish()
 
     def _chain(self, body: Body, c_dt: str, stage: str, rates: str, out: str) -> None:
         f, d, w = self.f, self.d, self.width
@@ -166,20 +174,28 @@ class StepWriter:
         if d.products > UNROLLED:
             self._looped_chain(body, (c_dt, b), (old, new), out)
             return
-        scaled = {}
-        chained = len(d.stages) > 1
-        if chained:
-            for (r, s), i in d.entries.items():
-                if s < d.n:
-                    scaled[r, s] = f.mul(c_dt, body.value(i), w)
-        for (r, c), sums in d.rates.items():
-            own = body.value(d.entries[r, c]) if (r, c) in d.entries else ""
-            for s in sums if chained else ():
-                before = f.load(old, slot[s, c], w)
-                own = f.fma(scaled[r, s], before, own, w) if own else f.mul(scaled[r, s], before, w)
-            f.store(own, new, slot[r, c], w)
-            e = place[r, c] * w
-            f.store(f.fma(b, own, f.load(out, e, w), w), out, e, w)
+        own = {at: body.value(i) for at, i in d.entries.items()}
+        zero = splat(0.0, w)
+
+        def add(at: Place, value: str) -> None:
+            f.store(value, new, slot[at], w)
+            e = place[at] * w
+            f.store(f.fma(b, value, f.load(out, e, w), w), out, e, w)
+
+        with f.when(f.emit(f"icmp eq i64 {stage}, 0")):  # nothing to chain with yet
+            for at in d.rates:
+                add(at, own.get(at, zero))
+        if len(d.stages) == 1:
+            return
+        with f.when(f.emit(f"icmp ne i64 {stage}, 0")):
+            scaled = {at: f.mul(c_dt, v, w) for at, v in own.items() if at[1] < d.n}
+            for (r, c), sums in d.rates.items():
+                value = own.get((r, c), "")
+                for s in sums:
+                    before = f.load(old, slot[s, c], w)
+                    known = scaled[r, s]
+                    value = f.fma(known, before, value, w) if value else f.mul(known, before, w)
+                add((r, c), value)
 
     def _looped_chain(
         self, body: Body, factors: tuple[str, str], turns: tuple[str, str], out: str
