@@ -23,9 +23,10 @@ def nearest(name: str, valid: Iterable[str]) -> str:
     from difflib import get_close_matches
 
     names = list(valid)
-    close = get_close_matches(name, names, n=1, cutoff=0.6)
+    lower = {known.lower(): known for known in reversed(names)}
+    close = get_close_matches(name.lower(), lower, n=1, cutoff=0.6)
     if close:
-        return f"did you mean '{close[0]}'?"
+        return f"did you mean '{lower[close[0]]}'?"
     if not names:
         return "none is defined"
     return "valid names: " + ", ".join(names)

@@ -7,7 +7,7 @@ in `workspace`, once the model is loaded. CONTRACT.md lists every key.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -74,6 +74,7 @@ def read_config(folder: Path) -> Config:
         GroundedError: naming the key, what was found and what would be right.
     """
     table = read_toml(folder / FILE)
+    table.expect(*(field.name for field in fields(Config) if field.name != "file"))
     config = Config(
         file=folder / FILE,
         model=_model(table.sub("model")),
@@ -86,11 +87,11 @@ def read_config(folder: Path) -> Config:
         log=table.sub("log"),
         estimate=table.sub("estimate"),
     )
-    table.finish()
     return config
 
 
 def _model(table: Table) -> ModelTable:
+    table.expect(*(field.name for field in fields(ModelTable)))
     params = table.sub("params")
     effects = table.take("effects", list, [])
     for effect in effects:
@@ -106,7 +107,6 @@ def _model(table: Table) -> ModelTable:
         effects=tuple(effects),
         smoothing=table.take("smoothing", float, 0.05),
     )
-    table.finish()
     if bool(found.file) == bool(found.module):
         raise table.error(
             "file", 'give exactly one of file = "model.py" and module = "package.name"'
@@ -117,6 +117,7 @@ def _model(table: Table) -> ModelTable:
 
 
 def _task(table: Table) -> TaskTable:
+    table.expect(*(field.name for field in fields(TaskTable)))
     start, latency = table.sub("start"), table.sub("latency")
     found = TaskTable(
         dt=table.take("dt", float),
@@ -126,7 +127,6 @@ def _task(table: Table) -> TaskTable:
         feedback=table.take("feedback", bool, True),
         latency={name: latency.take(name, float) for name in latency.names()},
     )
-    table.finish()
     if found.dt <= 0:
         raise table.error("dt", f"must be a positive number of seconds, found {found.dt:g}")
     if found.horizon < 1:
@@ -158,6 +158,9 @@ def _system(table: Table) -> SystemTable:
     for kind in ("start", "process", "measurement"):
         inner = noise.sub(kind)
         kinds[kind] = {name: inner.take(name, float) for name in inner.names()}
+        for name, std in kinds[kind].items():
+            if std < 0:
+                raise inner.error(name, f"must not be negative, found {std:g}")
     noise.finish()
     found = SystemTable(
         command=table.take("command", str, ""),
@@ -168,4 +171,6 @@ def _system(table: Table) -> SystemTable:
     table.finish()
     if found.command and found.model:
         raise table.error("command", "give command or model, not both")
+    if found.seed < 0:
+        raise table.error("seed", f"must not be negative, found {found.seed}")
     return found

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Literal, cast
 
+from grounded.errors import GroundedError
 from grounded_trials.foreign import LogMapping
+from grounded_trials.message_path import parse_path
 from grounded_trials.resample import Crossing, Span
 from grounded_trials.signals import Clock, SignalSpec
 from grounded_trials.toml_table import Table
@@ -33,22 +35,34 @@ def log_mapping(table: Table, states: Sequence[str], inputs: Sequence[str]) -> L
 
 
 def _signal(table: Table, clock: str) -> SignalSpec:
-    age: float | None = table.take("max_age_s", float, -1.0)
+    age = table.take("max_age_s", float) if table.has("max_age_s") else None
     how = table.choice("resample", ("linear", "hold", ""), "")
     spec = SignalSpec(
-        path=table.take("path", str),
+        path=_path(table),
         clock=cast(Clock, table.choice("clock", CLOCKS, clock)),
         unwrap=table.take("unwrap", bool, False),
         scale=table.take("scale", float, 1.0),
         offset=table.take("offset", float, 0.0),
         delay_s=table.take("delay_s", float, 0.0),
-        max_age_s=None if age == -1.0 else age,
+        max_age_s=age,
         resample=cast('Literal["linear", "hold"] | None', how or None),
     )
     table.finish()
     if spec.max_age_s is not None and spec.max_age_s <= 0:
         raise table.error("max_age_s", f"must be positive, found {spec.max_age_s:g}")
+    if spec.scale == 0:
+        raise table.error("scale", "must not be 0: the signal would say nothing")
     return spec
+
+
+def _path(table: Table) -> str:
+    """The message path under `path`, known to be one."""
+    path: str = table.take("path", str)
+    try:
+        parse_path(path)
+    except GroundedError as error:
+        raise table.error("path", str(error)) from None
+    return path
 
 
 def _span(table: Table) -> Span:
@@ -72,7 +86,7 @@ def _end(table: Table, key: str) -> Any:
         return table.take(key, float)
     crossing = table.sub(key)
     found = Crossing(
-        path=crossing.take("path", str),
+        path=_path(crossing),
         above=crossing.take("above", float) if crossing.has("above") else None,
         below=crossing.take("below", float) if crossing.has("below") else None,
         clock=cast(Clock, crossing.choice("clock", CLOCKS, "log")),

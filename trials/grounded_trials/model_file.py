@@ -17,7 +17,9 @@ from grounded.errors import GroundedError, nearest
 from grounded.model import Model
 
 
-def load_module(folder: Path, file: str = "", module: str = "") -> ModuleType:
+def load_module(
+    folder: Path, file: str = "", module: str = "", key: str = "[model] file"
+) -> ModuleType:
     """The module of a model, from a file in the workspace or by its import name.
 
     Raises:
@@ -35,12 +37,15 @@ def load_module(folder: Path, file: str = "", module: str = "") -> ModuleType:
             raise GroundedError(_where(error, module)) from None
     path = (folder / file).resolve()
     if not path.is_relative_to(folder.resolve()):
-        raise GroundedError(f"'{file}' lies outside the workspace {folder}; copy it inside")
+        raise GroundedError(
+            f"grounded.toml: {key} = '{file}' lies outside the workspace {folder}; copy it inside"
+        )
     if not path.is_file():
-        raise GroundedError(f"{path} does not exist; grounded.toml asks for '{file}'")
+        raise GroundedError(f"grounded.toml: {key} = '{file}': {path} does not exist")
     spec = importlib.util.spec_from_file_location(f"grounded_workspace_{path.stem}", path)
     assert spec is not None and spec.loader is not None
     found = importlib.util.module_from_spec(spec)
+    before = set(sys.modules)
     sys.path.insert(0, str(folder))
     try:
         spec.loader.exec_module(found)
@@ -50,7 +55,16 @@ def load_module(folder: Path, file: str = "", module: str = "") -> ModuleType:
         raise GroundedError(_where(error, str(path))) from None
     finally:
         sys.path.remove(str(folder))
+        _forget_neighbours(folder, before)
     return found
+
+
+def _forget_neighbours(folder: Path, before: set[str]) -> None:
+    """Modules that the file imported from its own folder: another workspace has its own `model`."""
+    for name in set(sys.modules) - before:
+        origin = getattr(sys.modules[name], "__file__", None)
+        if origin and Path(origin).resolve().is_relative_to(folder.resolve()):
+            del sys.modules[name]
 
 
 def model_in(module: ModuleType) -> Model:

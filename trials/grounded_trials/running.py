@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from grounded.errors import GroundedError
+from grounded.errors import GroundedError, nearest
 from grounded.plant import Noise, Plant
 from grounded_trials.mcap_log import write_trial
 from grounded_trials.model_file import load_module, model_in
@@ -48,11 +48,19 @@ def simulated_plant(workspace: Workspace) -> Plant:
         GroundedError: if its file holds no model.
     """
     system = workspace.config.system
-    module = load_module(workspace.folder, file=system.model)
+    module = load_module(workspace.folder, file=system.model, key="[system] model")
+    model = model_in(module)
+    for kind, values in system.noise.items():
+        for name in values:
+            if name not in model.states:
+                raise GroundedError(
+                    f"grounded.toml: [system.noise.{kind}] {name}: {system.model} has no such "
+                    "state: " + nearest(name, model.states)
+                )
     noise = Noise(**{kind: dict(values) for kind, values in system.noise.items()})
     latency = getattr(module, "latency", {})
     return Plant(
-        model=model_in(module),
+        model=model,
         latency=dict(latency),
         noise=noise,
         substeps=int(getattr(module, "substeps", 5)),

@@ -32,6 +32,8 @@ def read_target(path: Path) -> tuple[list[str], Array]:
                 rows.append(_numbers(path, line, names, row))
     except FileNotFoundError:
         raise GroundedError(f"{path} does not exist; [task] target asks for it") from None
+    except IsADirectoryError:
+        raise GroundedError(f"{path} is a folder; [task] target must name a CSV file") from None
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise GroundedError(f"{path} can't be read as CSV: {error}") from None
     if not names or names[0] != "t":

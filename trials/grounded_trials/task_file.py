@@ -22,10 +22,18 @@ def build_task(config: Config, model: Model, folder: Path) -> Task:
     Raises:
         GroundedError: for a name that is not in the model, or sizes that do not fit.
     """
+    try:
+        return _build(config, model, folder)
+    except GroundedError as error:
+        named = str(error).startswith((config.file.name, str(folder), config.task.target))
+        raise GroundedError(f"{'' if named else config.file.name + ': '}{error}") from None
+
+
+def _build(config: Config, model: Model, folder: Path) -> Task:
     states, inputs = list(model.state_names), list(model.input_names)
     table = config.task
-    check_names(table.start, [*states, *inputs], "grounded.toml: [task] start: state")
-    check_names(table.latency, inputs, "grounded.toml: [task] latency: input")
+    check_names(table.start, [*states, *inputs], "[task] start: state")
+    check_names(table.latency, inputs, "[task] latency: input")
     path = (folder / table.target).resolve()
     if not path.is_relative_to(folder.resolve()):
         raise GroundedError(f"[task] target = '{table.target}' lies outside the workspace")
@@ -71,7 +79,7 @@ def _reward(config: Config, states: list[str], inputs: list[str]) -> Reward:
     table.finish()
     if not any(w.any() for w in (weights["state"], weights["terminal"])):
         raise GroundedError(
-            "grounded.toml: [reward] weighs no state: there is nothing to follow; add for example "
+            "[reward] weighs no state: there is nothing to follow; add for example "
             f"state = {{ {states[0]} = 1.0 }}"
         )
     return Reward(**weights)

@@ -29,6 +29,12 @@ class Table:
         name = f"[{self.where}] {key}" if self.where else key
         return GroundedError(f"{self.file.name}: {name}: {text}")
 
+    def expect(self, *names: str) -> None:
+        """Complains about a key that is none of these, before a missing one is complained about."""
+        for key in self._values:
+            if key not in names:
+                raise self.error(key, f"is not known here: {nearest(key, names)}")
+
     def has(self, key: str) -> bool:
         """Whether the key is there."""
         self._known.add(key)
@@ -51,6 +57,8 @@ class Table:
     def _checked(self, key: str, value: Any, kind: type) -> Any:
         fits = isinstance(value, kind) and not (isinstance(value, bool) and kind is not bool)
         if kind is float and isinstance(value, int) and not isinstance(value, bool):
+            if abs(value) > 10**300:
+                raise self.error(key, "must be a finite number, found one of over 300 digits")
             return float(value)
         if not fits:
             raise self.error(key, f"must be {_WORDS.get(kind, kind.__name__)}, found {value!r}")
