@@ -28,7 +28,7 @@ from grounded_trials.recording_words import summary
 from grounded_trials.scene import Scene, scene_of
 
 ITERATIONS = 4  # of the bias, in one plot
-FINE = 1000  # steps; the bias of longer trials is averaged over a few steps, or files get large
+FINE = 600  # steps; the bias of longer trials is averaged over a few steps, or files get large
 
 
 def write_recording(findings: Findings, path: Path) -> None:

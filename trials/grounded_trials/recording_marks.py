@@ -37,6 +37,7 @@ SERIES = [
     (213, 94, 0),
 ]
 FRAMES = 600  # poses of a body in an animation
+VERTICES = 1000  # of a path in space
 
 
 def line(
@@ -75,6 +76,9 @@ def path(stream: Any, at: str, points: Array, colour: str, width: float) -> None
     import rerun as rr
 
     points = points[np.isfinite(points).all(axis=1)]
+    if not len(points):
+        return
+    points = points[np.unique(np.linspace(0, len(points) - 1, VERTICES).astype(int))]
     strip = rr.LineStrips3D([points], colors=COLOURS[colour], radii=rr.Radius.ui_points(width))
     stream.log(at, strip, static=True)
 

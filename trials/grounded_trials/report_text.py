@@ -17,6 +17,7 @@ from grounded_trials.findings import (
     selection,
     tracking_error,
 )
+from grounded_trials.words import figure
 
 WIDTH = 80
 ROWS = 12  # candidates in the table; the others are counted
@@ -187,15 +188,3 @@ def _diagnosis(diagnosis: Diagnosis | None, table: Table) -> str:
 
 def _wrapped(text: str, indent: str) -> list[str]:
     return wrap(text, WIDTH, initial_indent=indent, subsequent_indent=indent + "  ")
-
-
-def figure(value: float | None, digits: int = 4) -> str:
-    """A number for a person: `digits` significant ones; "failed" for minus infinity, "-": none."""
-    if value is None or math.isnan(value):
-        return "-"
-    if value == -math.inf:
-        return "failed"
-    if value != 0 and not 1e-3 <= abs(value) < 1e6:
-        return f"{value:.{digits - 1}e}"
-    decimals = max(digits - 1 - math.floor(math.log10(abs(value))) if value else digits - 1, 0)
-    return f"{value:,.{decimals}f}"

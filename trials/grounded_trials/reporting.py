@@ -7,6 +7,7 @@ from pathlib import Path
 from grounded.errors import GroundedError
 from grounded_trials.findings import Findings
 from grounded_trials.gathering import gather
+from grounded_trials.store import write_atomically
 from grounded_trials.workspace import Workspace
 
 RECORDING, PAGE = "recording.rrd", "report.html"
@@ -21,15 +22,37 @@ def save_recording(workspace: Workspace, findings: Findings | None = None) -> Pa
     return path
 
 
+def save_page(workspace: Workspace, findings: Findings | None = None) -> Path:
+    """reports/report.html."""
+    from grounded_trials.page import page
+
+    path = _place(workspace) / PAGE
+    write_atomically(path, page(findings or gather(workspace)).encode())
+    return path
+
+
+def save_pictures(workspace: Workspace, findings: Findings | None = None) -> list[Path]:
+    """reports/utility.png, paths.png and so on: the figures of the page."""
+    from grounded_trials.figures_all import all_figures
+    from grounded_trials.figures_png import png
+
+    paths = []
+    for figure in all_figures(findings or gather(workspace)):
+        path = _place(workspace) / f"{figure.name}.png"
+        write_atomically(path, png(figure))
+        paths.append(path)
+    return paths
+
+
 def save(
     workspace: Workspace, findings: Findings, *, html: bool, png: bool, rrd: bool
 ) -> list[Path]:
     """Writes what was asked for; returns the files."""
     paths = []
     if html:
-        raise GroundedError("the page is not written yet")
+        paths.append(save_page(workspace, findings))
     if png:
-        raise GroundedError("pictures are not written yet")
+        paths += save_pictures(workspace, findings)
     if rrd:
         paths.append(save_recording(workspace, findings))
     return paths

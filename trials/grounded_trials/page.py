@@ -1,0 +1,176 @@
+"""report.html: one page with everything, that needs no network and runs no script but its own.
+
+What a name or a file says is text, never markup: it is escaped, and a content security policy
+allows only the one script whose hash the page states.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import math
+from html import escape
+from importlib.resources import files
+
+from grounded_trials.diagnosis_file import Diagnosis
+from grounded_trials.figures_gap import gap_figure
+from grounded_trials.figures_runs import (
+    bias_figure,
+    error_figure,
+    input_figure,
+    path_figure,
+    state_figure,
+)
+from grounded_trials.figures_search import search_figure
+from grounded_trials.findings import Findings
+from grounded_trials.page_parts import command, figure_block, role_styles
+from grounded_trials.page_tables import (
+    candidate_table,
+    channel_table,
+    effect_table,
+    error_table,
+    parameter_table,
+)
+from grounded_trials.words import figure
+
+
+def page(findings: Findings) -> str:
+    """The whole document."""
+    package = files("grounded_trials")
+    script = package.joinpath("page.js").read_text(encoding="utf-8")
+    style = package.joinpath("page.css").read_text(encoding="utf-8") + role_styles()
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    policy = (
+        "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'; "
+        f"script-src 'sha256-{digest}'"
+    )
+    sections = [(title, body) for title, body in _sections(findings) if body]
+    links = "".join(
+        f'<a href="#s{number}">{escape(title)}</a>' for number, (title, _) in enumerate(sections)
+    )
+    bodies = "".join(
+        f'<section id="s{number}"><h2>{escape(title)}</h2>{body}</section>'
+        for number, (title, body) in enumerate(sections)
+    )
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{escape(findings.name)} – grounded</title><style>{style}</style></head>"
+        f"<body><main>{_head(findings)}<nav>{links}</nav>{bodies}</main>"
+        f'<div id="tip" role="status"></div><script>{script}</script></body></html>\n'
+    )
+
+
+def _sections(findings: Findings) -> list[tuple[str, str]]:
+    """Titles and bodies, in reading order; an empty body is left out."""
+    return [
+        ("Utility", _utility(findings)),
+        ("Paths", figure_block(path_figure(findings), "two")),
+        ("States", figure_block(state_figure(findings))),
+        ("Tracking error", figure_block(error_figure(findings)) + error_table(findings)),
+        ("Inputs", figure_block(input_figure(findings))),
+        ("Bias", figure_block(bias_figure(findings))),
+        ("Gap", _gap(findings.diagnosis)),
+        ("Task and model", _task(findings)),
+        ("What to run next", _next(findings)),
+    ]
+
+
+def _head(findings: Findings) -> str:
+    task = findings.task
+    about = (
+        f"{task.model.name}: {task.horizon} steps of {task.dt:g} s ({task.horizon * task.dt:g} s), "
+        f"{'closed loop' if task.feedback else 'open loop'}; {findings.method}"
+    )
+    diagnosis = findings.diagnosis
+    verdict = f'<p class="verdict">{escape(diagnosis.sentence)}</p>' if diagnosis else ""
+    return (
+        f'<h1>{escape(findings.name)}</h1><p class="soft">{escape(about)}</p>'
+        f"{_lost(findings)}{_tiles(findings)}{verdict}"
+    )
+
+
+def _tiles(findings: Findings) -> str:
+    first, best = findings.first, findings.best
+    tiles = []
+    if best is not None:
+        tiles.append((figure(best.utility), f"best utility, {best.candidate.id}"))
+    if first is not None:
+        tiles.append((figure(first.utility), "the model’s own policy"))
+    if findings.optimum is not None:
+        tiles.append((figure(findings.optimum), "optimum of the real system"))
+    if first is not None and best is not None and -math.inf < first.utility < 0:
+        gain = 100 * (1 - best.utility / first.utility)
+        tiles.append((f"{gain:.1f} %", "of the first policy’s loss is gone"))
+    iterations = findings.standing.iteration
+    tiles.append((str(findings.standing.trials), f"trials, {iterations} improvements"))
+    tiles.append((findings.standing.phase, "phase of the search"))
+    inside = "".join(
+        f'<div class="tile"><b>{escape(a)}</b><span>{escape(b)}</span></div>' for a, b in tiles
+    )
+    return f'<div class="tiles">{inside}</div>'
+
+
+def _lost(findings: Findings) -> str:
+    if not findings.lost:
+        return ""
+    items = "".join(
+        f"<li><b>{escape(one.file)}</b>: {escape(one.reason)}</li>" for one in findings.lost
+    )
+    return (
+        '<div class="lost" id="lost"><b>This report is not complete.</b> Left out: '
+        f"<ul>{items}</ul></div>"
+    )
+
+
+def _utility(findings: Findings) -> str:
+    if not findings.history:
+        return "<p>No candidate was proposed yet.</p>"
+    from grounded.certainty import last_improvement
+
+    sure = last_improvement(findings.history)
+    sentence = f"<p>{escape(sure[:1].upper() + sure[1:])}.</p>" if sure else ""
+    opened = " open" if len(findings.history) <= 12 else ""
+    return (
+        f"{figure_block(search_figure(findings))}{sentence}"
+        f"<details{opened}><summary>All candidates</summary>{candidate_table(findings)}</details>"
+    )
+
+
+def _gap(diagnosis: Diagnosis | None) -> str:
+    if diagnosis is None:
+        return (
+            "<p>Not diagnosed yet. This says where the model is wrong, and which effect makes it "
+            f"so: {command('grounded diagnose', 'c-diagnose')}</p>"
+        )
+    parts = [f'<p class="verdict">{escape(diagnosis.sentence or diagnosis.kind)}</p>']
+    parts.append(figure_block(gap_figure(diagnosis)))
+    if diagnosis.ranking:
+        parts.append(f"<h3>Effects that were weighed</h3>{effect_table(diagnosis)}")
+    for group in diagnosis.indistinguishable:
+        parts.append(f"<p>These data can’t tell apart: {escape(', '.join(group))}.</p>")
+    gap = diagnosis.gap
+    if gap is not None:
+        held = "on trials that were held out" if gap.held_out else "on the trials that were fitted"
+        parts.append(f'<p class="soft">Gap: {escape(gap.unit)}, {held}.</p>')
+    return "".join(parts)
+
+
+def _task(findings: Findings) -> str:
+    adopted = ", ".join(findings.effects) or "none"
+    words = (
+        f"Adopted effects: {adopted}. Other stored trials (data, earlier tasks): {findings.others}."
+    )
+    return (
+        f"<p>{escape(words)}</p>{channel_table(findings)}"
+        f"<details><summary>Parameters of the model</summary>{parameter_table(findings)}</details>"
+    )
+
+
+def _next(findings: Findings) -> str:
+    parts = [f"<p>{escape(findings.standing.phase)}: {escape(findings.standing.sentence)}.</p>"]
+    if findings.diagnosis is not None and findings.diagnosis.next_trial:
+        parts.append(f"<p>To learn more: {escape(findings.diagnosis.next_trial)}</p>")
+    parts.append(f"<p>{command(findings.next_command, 'c-next')}</p>")
+    return "".join(parts)

@@ -1,0 +1,139 @@
+"""The page's tables: trials, errors, effects, parameters, states and inputs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from grounded_trials.diagnosis_file import Diagnosis, Ranked, Value
+from grounded_trials.findings import Findings, Run, prediction_error, rms, tracking_error
+from grounded_trials.page_parts import table
+from grounded_trials.words import figure
+
+INTERVAL = 1.96  # standard deviations of a 95 % interval
+
+
+def candidate_table(findings: Findings) -> str:
+    """Every candidate with its trials."""
+    verdicts = {True: "accepted", False: "not accepted", None: "not decided"}
+    rows: list[tuple[str, ...]] = []
+    strong, best = -1, findings.standing.incumbent
+    for tried in findings.history:
+        c = tried.candidate
+        if best is not None and c is best.candidate:
+            strong = len(rows)
+        rows.append(
+            (
+                c.id,
+                str(c.iteration),
+                f"{c.alpha:g}",
+                f"{c.damping:.2g}",
+                figure(c.predicted_utility),
+                figure(tried.utility),
+                figure(tried.standard_error, 2),
+                verdicts[tried.accepted],
+                " ".join(t.id for t in tried.trials) or "none",
+            )
+        )
+    header = (
+        "candidate",
+        "iteration",
+        "alpha",
+        "damping",
+        "predicted utility",
+        "real utility",
+        "std. error",
+        "verdict ",
+        "trials ",
+    )
+    return table("candidates", header, rows, strong)
+
+
+def error_table(findings: Findings) -> str:
+    """Rms by state: off the target, off the prediction, and the bias."""
+    task, best = findings.task, findings.best
+    if best is None:
+        return ""
+    runs = [r for r in (findings.first, best) if r is not None]
+    if len(runs) == 2 and runs[0].candidate is runs[1].candidate:
+        runs = runs[1:]
+    measures: list[tuple[str, Callable[[Run], np.ndarray]]] = [
+        ("off target", lambda run: rms(tracking_error(task, run.trial))),
+        ("off prediction", lambda run: rms(prediction_error(task, run))),
+        ("bias per s", lambda run: rms(run.residual) / task.dt),
+    ]
+    columns = [(f"{what}, {run.candidate.id}", get(run)) for what, get in measures for run in runs]
+    rows = [
+        (name, unit, *(figure(float(values[i]), 3) for _, values in columns))
+        for i, (name, unit) in enumerate(task.model.states.items())
+    ]
+    return table("errors", ("state", "unit", *(name for name, _ in columns)), rows)
+
+
+def effect_table(diagnosis: Diagnosis) -> str:
+    """The ranked effects with their parameters and 95 % intervals."""
+    rows = [
+        (
+            r.effect,
+            figure(r.evidence, 3),
+            figure(r.gap_after, 3),
+            f"{100 * r.shrinkage:.0f} %" if math.isfinite(r.shrinkage) else "-",
+            _params(r),
+        )
+        for r in diagnosis.ranking
+    ]
+    header = ("effect", "evidence [nats]", "gap after", "gap closed", "parameters, 95 % ")
+    strong = next((i for i, r in enumerate(diagnosis.ranking) if r.effect in diagnosis.effects), -1)
+    return table("effects", header, rows, strong)
+
+
+def _params(ranked: Ranked) -> str:
+    return "; ".join(map(_value, ranked.params)) or "-"
+
+
+def _value(v: Value) -> str:
+    half = INTERVAL * v.std
+    if not math.isfinite(half):
+        return f"{v.name} = {figure(v.value)} {v.unit}"
+    interval = f"{figure(v.value - half, 3)} to {figure(v.value + half, 3)}"
+    return f"{v.name} = {figure(v.value)} ({interval}) {v.unit}"
+
+
+def parameter_table(findings: Findings) -> str:
+    """The crude model's parameters."""
+    rows = []
+    for name, param in findings.task.model.params.items():
+        nominal = findings.nominal.get(name)
+        changed = "" if nominal is None or nominal == param.value else figure(nominal)
+        limits = (
+            "free" if param.low is None and param.high is None else _range(param.low, param.high)
+        )
+        rows.append((name, figure(param.value), param.unit, changed or "-", limits))
+    if not rows:
+        return "<p>The model has no parameters.</p>"
+    return table("parameters", ("parameter", "value", "unit", "in model.py", "bounds"), rows)
+
+
+def channel_table(findings: Findings) -> str:
+    """States and inputs with units, weights, limits and latency."""
+    task, rows = findings.task, []
+    reward = task.reward
+    assert task.latency is not None
+    for i, (name, unit) in enumerate(task.model.states.items()):
+        weight = f"{reward.state[i]:g}" + (
+            f", terminal {reward.terminal[i]:g}" if reward.terminal[i] else ""
+        )
+        rows.append((name, "state", unit, weight, "-", "-"))
+    for j, (name, unit) in enumerate(task.model.inputs.items()):
+        weight = f"{reward.input[j]:g}, change {reward.input_change[j]:g}"
+        delay = f"{task.latency[j]:g} s" if task.latency[j] else "-"
+        rows.append((name, "input", unit, weight, _range(task.low[j], task.high[j]), delay))
+    return table("channels", ("name", "kind", "unit", "weight", "limits", "latency"), rows)
+
+
+def _range(low: float | None, high: float | None) -> str:
+    a = "−∞" if low is None or not math.isfinite(low) else f"{low:g}"
+    b = "∞" if high is None or not math.isfinite(high) else f"{high:g}"
+    return f"{a} to {b}"
