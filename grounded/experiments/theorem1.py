@@ -1,0 +1,223 @@
+"""Theorem 1: how near a stationary point the algorithm ends with a model wrong by epsilon.
+
+A pendulum with a torque, H = 40 steps, deterministic; the model's dynamics are the true ones plus a
+smooth error whose derivatives by states and inputs are at most epsilon (of the rates; of a step,
+that times dt, which K takes up),
+
+    f_hat = f + epsilon e(s, a),      |de/ds|, |de/da| <= 1.
+
+Method A is policy gradient on the inputs, the line search is exact (eta = 0), and the search runs
+until the real utility can't be improved along the model's gradient. Then the theorem says
+
+    |grad U - grad U^| <= K epsilon       (Eqn 7: slope 1 in a log-log plot)
+    |grad U|^2         <= 2 K^2 epsilon^2 (Eqn 6: slope 2)
+
+K is measured: the largest |grad U - grad U^| / epsilon along the way. (Two slips of the paper:
+Eqn 1 omits the policy in h_t, and what Eqn 12 guarantees a successful search is
+K^2 epsilon^2 / (2 M).)
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import MutableMapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from grounded.bias import ground
+from grounded.compile import Problem
+from grounded.experiments.jobs import Engine, Job, Progress, run_jobs
+from grounded.experiments.summary import Table, mean_se, slope
+from grounded.frozen import Array
+from grounded.model import Model, Param
+from grounded.policy_gradient import gradient
+from grounded.task import Task
+from grounded.trial import Trial
+from grounded.utility import Reward
+
+EPSILONS = (0.003, 0.01, 0.03, 0.1, 0.3)
+H, DT = 40, 0.1
+ITERATIONS = 3000
+GOLDEN = (math.sqrt(5) - 1) / 2
+
+
+@dataclass(frozen=True)
+class Theorem1Row:
+    """One search: gradient error at the start, the squared gradient at its end, K of its way."""
+
+    epsilon: float
+    seed: int
+    error: float  # |grad U - grad U^| at the first policy
+    squared: float  # |grad U|^2 where the line search ended
+    K: float
+    iterations: int
+
+    @property
+    def ratio(self) -> float:
+        """|grad U|^2 over the bound 2 K^2 epsilon^2."""
+        return self.squared / (2 * (self.K * self.epsilon) ** 2)
+
+
+@dataclass(frozen=True)
+class Theorem1Result:
+    """All searches."""
+
+    rows: tuple[Theorem1Row, ...]
+
+    def slopes(self) -> dict[str, tuple[float, float]]:
+        """Slopes of the gradient error and of the squared gradient over epsilon: mean, error.
+
+        One slope a seed, because each shape of the model's error has a K of its own.
+        """
+        found: dict[str, list[float]] = {"gradient_error": [], "squared_gradient": []}
+        for seed in dict.fromkeys(row.seed for row in self.rows):
+            own = [row for row in self.rows if row.seed == seed]
+            x = [row.epsilon for row in own]
+            found["gradient_error"].append(slope(x, [row.error for row in own])[0])
+            found["squared_gradient"].append(slope(x, [row.squared for row in own])[0])
+        return {name: mean_se(values) for name, values in found.items()}
+
+    def to_json(self) -> dict[str, Any]:
+        """Rows and slopes by name."""
+        slopes = {k: {"slope": v[0], "se": v[1]} for k, v in self.slopes().items()}
+        worst = max(row.ratio for row in self.rows)
+        paper = {"gradient_error": 1, "squared_gradient": 2}
+        return {
+            "rows": [vars(row) for row in self.rows],
+            "slopes": slopes,
+            "largest_ratio_to_bound": worst,
+            "paper": paper,
+        }
+
+    def tables(self) -> list[Table]:
+        """Medians by epsilon, and the slopes beside the theorem's."""
+        rows = []
+        for epsilon in dict.fromkeys(row.epsilon for row in self.rows):
+            own = [row for row in self.rows if row.epsilon == epsilon]
+            rows.append(
+                (
+                    f"{epsilon:g}",
+                    f"{np.median([row.error for row in own]):.3g}",
+                    f"{np.median([row.squared for row in own]):.3g}",
+                    f"{max(row.ratio for row in own):.3f}",
+                )
+            )
+        head = (
+            "epsilon",
+            "|grad U - grad U^|",
+            "|grad U|^2 at the end",
+            "of 2 K^2 epsilon^2, at most",
+        )
+        found = self.slopes()
+        slopes = tuple(
+            (name, f"{found[key][0]:.3f} (±{found[key][1]:.3f})", paper)
+            for name, key, paper in (
+                ("gradient error over epsilon", "gradient_error", "1"),
+                ("squared gradient over epsilon", "squared_gradient", "2"),
+            )
+        )
+        title = f"Theorem 1: medians of {len(self.rows) // max(len(rows), 1)} seeds"
+        return [
+            Table(title, head, tuple(rows)),
+            Table("Slopes (± one standard error)", ("", "here", "theorem"), slopes),
+        ]
+
+
+def run(
+    seeds: Sequence[int] = range(8),
+    *,
+    epsilons: Sequence[float] = EPSILONS,
+    engine: Engine | None = None,
+    finished: MutableMapping[str, dict[str, Any]] | None = None,
+    progress: Progress | None = None,
+) -> Theorem1Result:
+    """A search for each epsilon and seed; the seed draws the shape of the model's error."""
+    jobs = [Job(one, {"epsilon": float(e), "seed": seed}) for e in epsilons for seed in seeds]
+    found = run_jobs(jobs, engine, finished=finished, progress=progress)
+    return Theorem1Result(tuple(Theorem1Row(**result) for result in found))
+
+
+def _dynamics(s: Any, a: Any, p: Any) -> dict[str, Any]:
+    # the errors' derivatives: |cos| times weights whose squares add up to one, so at most epsilon
+    wrong = p.eps * np.sin(p.w1 * s.angle + p.w2 * s.rate + p.w3 * a.torque + p.phase)
+    return {"angle": s.rate, "rate": a.torque - np.sin(s.angle) - 0.2 * s.rate + wrong}
+
+
+def theorem1_task(epsilon: float, seed: int) -> Task:
+    """Swing a pendulum to one radian and hold it, with a model that is wrong by epsilon."""
+    rng = np.random.default_rng([seed, 5])
+    weights = rng.normal(size=3)
+    weights /= np.linalg.norm(weights)
+    names = dict(zip(("w1", "w2", "w3"), map(float, weights), strict=True))
+    phase = float(rng.uniform(-np.pi, np.pi))
+    params = {name: Param(value) for name, value in (names | {"phase": phase}).items()}
+    model = Model(
+        name="theorem 1",
+        states={"angle": "rad", "rate": "rad/s"},
+        inputs={"torque": "1/s^2"},
+        params={"eps": Param(epsilon), **params},
+        derivative=_dynamics,
+    )
+    zero, one_ = np.zeros(1), np.ones(1)
+    return Task(
+        model=model,
+        dt=DT,
+        target=np.tile([1.0, 0.0], (H + 1, 1)),
+        reward=Reward(np.array([1.0, 0.1]), np.zeros(2), 0.1 * one_, zero),
+        start=np.zeros(2),
+        past=zero,
+        low=np.full(1, -1e6),
+        high=np.full(1, 1e6),
+        feedback=False,
+        smoothing=0.0,
+    )
+
+
+def one(epsilon: float, seed: int) -> dict[str, Any]:
+    """A job: one search to its end."""
+    task = theorem1_task(epsilon, seed)
+    truth = task.with_model(task.model.with_values({"eps": 0.0}))
+    real = truth.problem(exact=True)
+    u, first, K, iterations = np.zeros((H, 1)), 0.0, 0.0, 0
+    while True:
+        swarm = real.system.rollout(real, u)
+        z = swarm.z[0]
+        own = gradient(real, z, u).inputs
+        trial = Trial(z[:, :2], u, DT, task.model.state_names, task.model.input_names)
+        guess = gradient(task.problem(ground(task, trial).bias), z, u).inputs
+        error = float(np.linalg.norm(own - guess))
+        first, K = first or error, max(K, error / epsilon)
+        better = _line_search(real, u, -guess, float(swarm.cost[0]))
+        if better is None or iterations >= ITERATIONS:
+            squared = float((own**2).sum())
+            return {
+                "epsilon": epsilon,
+                "seed": seed,
+                "error": first,
+                "squared": squared,
+                "K": K,
+                "iterations": iterations,
+            }
+        u, iterations = better, iterations + 1
+
+
+def _line_search(real: Problem, u: Array, direction: Array, cost: float) -> Array | None:
+    """The best point along a direction in the real system; None when none is better (eta = 0)."""
+
+    def costs(at: Array) -> Array:
+        return real.system.rollout(real, u, k=direction, alphas=at).cost
+
+    alphas = np.array([2.0**-i for i in range(-3, 40)])
+    found = costs(alphas)
+    best = int(np.argmin(found))
+    if not found[best] < cost:
+        return None
+    low, high = alphas[best] / 2, alphas[best] * 2
+    for _ in range(40):
+        a, b = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
+        ca, cb = costs(np.array([a, b]))
+        low, high = (low, b) if ca < cb else (a, high)
+    last = np.array([alphas[best], 0.5 * (low + high)])
+    return u + float(last[np.argmin(costs(last))]) * direction
