@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 @click.command("demo")
-@click.argument("name", metavar="NAME", default="car-figure8")
+@click.argument("name", metavar="[NAME]", default="car-figure8")
 @click.option("--dir", "folder", metavar="DIR", help="Default: demo-NAME in the current folder.")
 @as_json
 def command(name: str, folder: str | None, json_: bool) -> None:

@@ -12,7 +12,13 @@ from grounded_cli.terminal import show, show_json
 
 @click.command("export")
 @click.argument("candidate", metavar="ID")
-@click.option("--format", "form", type=click.Choice(["csv", "npz", "json"]), default="json")
+@click.option(
+    "--format",
+    "form",
+    type=click.Choice(["csv", "npz", "json"]),
+    default="json",
+    help="Default: json. npz is what `grounded.policy.load` reads.",
+)
 @click.option("-o", "--output", metavar="FILE", help="Default: ID.FORMAT in the current folder.")
 @in_workspace
 @as_json
