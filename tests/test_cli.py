@@ -3,17 +3,20 @@
 import csv
 import importlib.util
 import json
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from cli import grounded, process
+from cli import COMMAND, grounded, process
 from grounded.policy import load
 from grounded_cli.main import COMMANDS
 from grounded_trials.examples import EXAMPLES
-from workspaces import make
+from workspaces import CONFIG, REAL, make
 
 HERE = [n for n, (m, _) in COMMANDS.items() if importlib.util.find_spec(f"grounded_cli.{m}")]
 
@@ -56,12 +59,6 @@ def test_the_list_of_commands_is_in_the_order_of_use():
 
 def test_help_needs_no_numpy():
     """`grounded --help` is quick: it imports no command and no array library."""
-    from cli import COMMAND
-
-    code = "import sys\n" + COMMAND[-1].replace("main()", "").rstrip("; ")
-    import subprocess
-    import sys
-
     code = (
         "import sys, atexit\nsys.argv = ['grounded', '--help']\n"
         "from grounded_cli.main import main\n"
@@ -327,11 +324,6 @@ def test_narration_is_not_data(w):
 
 
 def test_a_closed_pipe_is_no_traceback(w):
-    import os
-    import subprocess
-
-    from cli import COMMAND
-
     command = " ".join(f"'{c}'" for c in COMMAND)
     done = subprocess.run(
         ["bash", "-c", f"{command} -C '{w}' status --json | true"],
@@ -344,8 +336,6 @@ def test_a_closed_pipe_is_no_traceback(w):
 
 
 def test_repeats_and_a_failed_run_in_words(tmp_path):
-    from workspaces import CONFIG, REAL
-
     noisy = (
         CONFIG.replace("[search]", "[search]\nrepeats = 3") + "noise = { process = { v = 0.02 } }\n"
     )
