@@ -16,7 +16,7 @@ from functools import cached_property
 
 from grounded.compile.graph import Graph
 from grounded.compile.llvm_graph import DT, Body, Uniforms
-from grounded.compile.llvm_text import Writer, integers, number, splat
+from grounded.compile.llvm_text import Writer, doubles, integers, number, splat
 from grounded.compile.traced import STAGES, Variant
 
 Place = tuple[int, int]  # row, column of a Jacobian
@@ -63,7 +63,8 @@ class Dynamics:
         """The pattern of the step's Jacobian, in the order of its values."""
         if not self.stages:
             return sorted(self.entries)
-        return sorted(set(self.rates) | {(i, i) for i in range(self.n)})
+        diagonal = ((i, i) for i in range(self.n))
+        return [*self.rates, *(at for at in diagonal if at not in self.rates)]
 
 
 def dynamics_of(
@@ -149,60 +150,66 @@ class StepWriter:
             for e, value in enumerate(body.values([d.entries[p] for p in d.places])):
                 f.store(value, out, e * w, w)
             return
-        size = len(d.rates)
-        rates = f.room(2 * size * w)  # K of this stage and of the one before, taking turns
-        zero = splat(0.0, w)
-        for e in range(2 * size):
-            f.store(zero, rates, e * w, w)
-        for e, (r, c) in enumerate(d.places):
-            f.store(splat(1.0 if r == c else 0.0, w), out, e * w, w)
+        rates = f.room((len(d.stages) + 1) * len(d.rates) * w)  # K of each stage, after zeros
         self._start([*d.outputs, *d.entries.values()])
+        if d.products > UNROLLED:
+            with f.loop(len(d.rates)) as rate:
+                f.store(splat(0.0, w), rates, f.integer("mul", rate, w), w)
         with f.loop(len(d.stages)) as stage:
             body, c_dt = self._rates(stage)
-            self._chain(body, c_dt, stage, rates, out)
+            old = f.at(rates, f.integer("mul", stage, len(d.rates) * w))
+            new = f.at(old, len(d.rates) * w)
+            if d.products > UNROLLED:
+                self._looped_chain(body, c_dt, old, new)
+            else:
+                self._chain(body, c_dt, stage, old, new)
         self._finish()
+        self._sum_of_stages(rates, out)
 
-    def _chain(self, body: Body, c_dt: str, stage: str, rates: str, out: str) -> None:
+    def _sum_of_stages(self, rates: str, out: str) -> None:
+        """A = I + dt sum of b_i K_i."""
         f, d, w = self.f, self.d, self.width
-        odd = f.integer("and", stage, 1)
-        size = len(d.rates) * w
-        new = f.at(rates, f.integer("mul", odd, size))
-        old = f.at(rates, f.integer("mul", f.integer("xor", odd, 1), size))
-        slot = {at: e * w for e, at in enumerate(d.rates)}
-        place = {at: e for e, at in enumerate(d.places)}
-        b = f.spread(f.mul(f.load(self.table, DT), f.load("@stage_b", stage)), w)
-        if d.products > UNROLLED:
-            self._looped_chain(body, (c_dt, b), (old, new), out)
-            return
+        dt = f.load(self.table, DT)
+        weights = [f.spread(f.mul(dt, number(b)), w) for _, b in d.stages]
+        with f.loop(len(d.rates)) as rate:
+            total, at = f.load_all("@chain_diagonal", rate, w), f.integer("mul", rate, w)
+            for i, b in enumerate(weights):
+                K = f.load(f.at(rates, (i + 1) * len(d.rates) * w), at, w)
+                total = f.fma(b, K, total, w)
+            f.store(total, out, at, w)
+        for e in range(len(d.rates), len(d.places)):
+            f.store(splat(1.0, w), out, e * w, w)
+
+    def _chain(self, body: Body, c_dt: str, stage: str, old: str, new: str) -> None:
+        """K = f_x T + own into new."""
+        f, d, w = self.f, self.d, self.width
         own = {at: body.value(i) for at, i in d.entries.items()}
-        zero = splat(0.0, w)
-
-        def add(at: Place, value: str) -> None:
-            f.store(value, new, slot[at], w)
-            e = place[at] * w
-            f.store(f.fma(b, value, f.load(out, e, w), w), out, e, w)
-
+        slot = {at: e * w for e, at in enumerate(d.rates)}
         with f.when(f.emit(f"icmp eq i64 {stage}, 0")):  # nothing to chain with yet
             for at in d.rates:
-                add(at, own.get(at, zero))
+                f.store(own.get(at, splat(0.0, w)), new, slot[at], w)
         if len(d.stages) == 1:
             return
         with f.when(f.emit(f"icmp ne i64 {stage}, 0")):
             scaled = {at: f.mul(c_dt, v, w) for at, v in own.items() if at[1] < d.n}
-            for (r, c), sums in d.rates.items():
-                value = own.get((r, c), "")
-                for s in sums:
-                    before = f.load(old, slot[s, c], w)
-                    known = scaled[r, s]
-                    value = f.fma(known, before, value, w) if value else f.mul(known, before, w)
-                add((r, c), value)
+            for block in _blocks(d):
+                values = {at: own[at] for at in block if at in own}
+                for s in range(d.n):
+                    before: dict[int, str] = {}
+                    for r, c in block:
+                        if s not in d.rates[r, c]:
+                            continue
+                        if c not in before:
+                            before[c] = f.load(old, slot[s, c], w)
+                        known, last = scaled[r, s], values.get((r, c))
+                        term = (known, before[c])
+                        values[r, c] = f.fma(*term, last, w) if last else f.mul(*term, w)
+                for at, value in values.items():
+                    f.store(value, new, slot[at], w)
 
-    def _looped_chain(
-        self, body: Body, factors: tuple[str, str], turns: tuple[str, str], out: str
-    ) -> None:
+    def _looped_chain(self, body: Body, c_dt: str, old: str, new: str) -> None:
         """The same sums for large models: small code that runs through tables of indices."""
         f, d, w = self.f, self.d, self.width
-        (c_dt, b), (old, new) = factors, turns
         own = f.room((len(d.entries) + 1) * w)  # the last is zero
         for e, value in enumerate(body.values(list(d.entries.values()))):
             f.store(value, own, e * w, w)
@@ -218,15 +225,20 @@ class StepWriter:
             mine = f.load(own, f.integer("mul", f.index("@chain_own", rate), w), w)
             value = f.fma(c_dt, total.result, mine, w)
             f.store(value, new, f.integer("mul", rate, w), w)
-            place = f.integer("mul", f.index("@chain_place", rate), w)
-            f.store(f.fma(b, value, f.load(out, place, w), w), out, place, w)
+
+
+def _blocks(d: Dynamics) -> list[list[Place]]:
+    """Places in blocks of two rows and four columns, which share what they read."""
+    blocks: dict[Place, list[Place]] = {}
+    for r, c in d.rates:
+        blocks.setdefault((r // 2, c // 4), []).append((r, c))
+    return list(blocks.values())
 
 
 def _chain_tables(d: Dynamics) -> str:
     """For `_looped_chain`: sums of products by index, at least one a place."""
     own = {place: e for e, place in enumerate(d.entries)}
     slot = {place: e for e, place in enumerate(d.rates)}
-    place = {at: e for e, at in enumerate(d.places)}
     first, left, right = [0], list[int](), list[int]()
     for (r, c), sums in d.rates.items():
         left += [own[r, s] for s in sums] or [len(own)]
@@ -234,7 +246,6 @@ def _chain_tables(d: Dynamics) -> str:
         first.append(len(left))
     return (
         integers("chain_own", [own.get(at, len(own)) for at in d.rates])
-        + integers("chain_place", [place[at] for at in d.rates])
         + integers("chain_first", first)
         + integers("chain_left", left)
         + integers("chain_right", right)
@@ -245,11 +256,10 @@ def stage_tables(d: Dynamics) -> str:
     """The stages' c and b as global constants, and the chain's indices where it is a loop."""
     if not d.stages:
         return ""
-    lines = []
-    for name, column in (("stage_c", 0), ("stage_b", 1)):
-        inside = ", ".join(f"double {number(stage[column])}" for stage in d.stages)
-        lines.append(f"@{name} = internal constant [{len(d.stages)} x double] [{inside}]\n")
-    return "".join(lines) + (_chain_tables(d) if d.products > UNROLLED else "")
+    columns = {"stage_c": [c for c, _ in d.stages], "stage_b": [b for _, b in d.stages]}
+    columns["chain_diagonal"] = [float(r == c) for r, c in d.rates]
+    tables = "".join(doubles(name, values) for name, values in columns.items())
+    return tables + (_chain_tables(d) if d.products > UNROLLED else "")
 
 
 def jacobian_function(d: Dynamics, width: int) -> str:

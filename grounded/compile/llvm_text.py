@@ -240,6 +240,12 @@ def integers(name: str, values: list[int]) -> str:
     return f"@{name} = internal constant [{len(values)} x i64] [{inside}]\n"
 
 
+def doubles(name: str, values: list[float]) -> str:
+    """A constant table of doubles."""
+    inside = ", ".join(f"double {number(value)}" for value in values)
+    return f"@{name} = internal constant [{len(values)} x double] [{inside}]\n"
+
+
 def declarations(widths: set[int]) -> str:
     """The intrinsics and C functions that kernels may call."""
     lines = []
