@@ -21,6 +21,7 @@ from typing import Any
 from grounded.errors import GroundedError
 
 Progress = Callable[[int, int], None]  # jobs done, jobs in all
+CONNECT_S = 10.0  # for a cluster's scheduler to answer
 ROUNDS = 5  # times that jobs of lost workers are handed out again
 
 
@@ -135,7 +136,12 @@ def _backend(engine: Engine, joblib: Any) -> AbstractContextManager[Any]:
         config = joblib.parallel_config(backend="loky", inner_max_num_threads=1)
         return config if config is not None else nullcontext()
     distributed = _import("distributed", 'pip install "grounded[cluster]"')
-    client = distributed.Client(engine.address)
+    try:
+        client = distributed.Client(engine.address, timeout=CONNECT_S)
+    except OSError as error:
+        raise GroundedError(
+            f"no Dask scheduler answers at {engine.address}: is it running? ({error})"
+        ) from error
     return _Cluster(client, joblib)
 
 

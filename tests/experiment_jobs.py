@@ -1,0 +1,30 @@
+"""Jobs for tests: module-level, importable by workers."""
+
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+
+
+def draw(seed, sleep=0.0):
+    time.sleep(sleep)
+    rng = np.random.default_rng(seed)
+    a = rng.normal(size=(60, 60))
+    return {"seed": seed, "value": float(np.linalg.inv(a)[0, 0]), "nothing": None}
+
+
+def dies_once(seed, marker):
+    path = Path(marker)
+    if seed == 3 and not path.exists():
+        path.touch()
+        os._exit(1)
+    return {"seed": seed}
+
+
+def dies_always(seed):
+    os._exit(1)
+
+
+def fails(seed):
+    raise ValueError("this is a mistake, not a lost worker")
