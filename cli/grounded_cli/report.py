@@ -11,6 +11,7 @@ from grounded_cli.terminal import progress, say, show, show_json, sparkline, tab
 
 if TYPE_CHECKING:
     from grounded_trials.findings import Findings
+    from grounded_trials.workspace import Workspace
 
 
 @click.command("report")
@@ -45,6 +46,15 @@ def command(html: bool, png: bool, rrd: bool, folder: str | None, json_: bool) -
         for one in findings.lost if paths or json_ else ():
             say(f"left out: {one.file}: {one.reason}")
         click.get_current_context().exit(3)
+
+
+def write_all(workspace: Workspace) -> dict[str, str]:
+    """The page and the recording; their files by kind."""
+    from grounded_trials.gathering import gather
+    from grounded_trials.reporting import save
+
+    paths = save(workspace, gather(workspace), html=True, png=False, rrd=True)
+    return {path.suffix[1:]: str(path) for path in paths}
 
 
 def as_document(findings: Findings, paths: list[Any]) -> dict[str, Any]:

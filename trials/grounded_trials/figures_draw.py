@@ -129,8 +129,10 @@ class _Plot:
             ends = np.array([[left, at], [left + width, at]])
             shapes += [Stroke(ends, "grid"), Words(left - 6, at + 4, text, "end", "faint")]
         for value, text in self.x.ticks(7):
-            if self.panel.whole and (value < 1 or value != round(value)):
-                continue
+            if self.panel.whole:
+                if value < 1 or value != round(value):
+                    continue
+                text = f"{value:.0f}"
             at = float(self._points(np.array([value]), np.array([self.y.high]))[0, 0])
             ends = np.array([[at, top], [at, top + height]])
             shapes += [Stroke(ends, "grid"), Words(at, top + height + 15, text, "middle", "faint")]

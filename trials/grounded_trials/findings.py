@@ -48,7 +48,7 @@ class Findings:
     """A workspace as a report shows it; `lost` says what could not be shown."""
 
     name: str
-    task: Task  # the crude model, adopted effects included
+    task: Task  # with the crude model, which judges and is measured; effects are named beside it
     nominal: Mapping[str, float]  # parameters as model.py has them, before [model] params
     effects: tuple[str, ...]  # adopted
     method: str  # the [search] table in a few words
@@ -99,7 +99,7 @@ class Findings:
             return None
         if len(runs) == 1 or len({r.trial.steps for r in runs}) > 1:
             return runs[0]
-        trial = mean_trial([r.trial for r in runs])
+        trial = mean_trial([r.trial for r in runs], self.task.model.angle_mask)
         explained = [r.explained for r in runs if r.explained is not None]
         return Run(
             trial,

@@ -10,6 +10,7 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from grounded.bridge import bridge
 from grounded.certainty import utility_noise
 from grounded.errors import GroundedError
 from grounded.frozen import Array
+from grounded.planner import Planner
 from grounded.search import Candidate, Standing, standing
 from grounded.task import Task
 from grounded.trial import Trial
@@ -39,6 +41,7 @@ def gather(workspace: Workspace) -> Findings:
     own = [t for t in trials if _fits(task, t) and t.candidate in {c.id for c in candidates}]
     now = _settled(workspace, candidates, own, _standing(workspace, candidates, own))
     diagnosis = _diagnosis(workspace, lost)
+    explaining = _explaining(workspace, diagnosis, lost)
     return Findings(
         name=workspace.folder.resolve().name,
         task=task,
@@ -46,7 +49,7 @@ def gather(workspace: Workspace) -> Findings:
         effects=tuple(str(e["name"]) for e in workspace.config.model.effects),
         method=_method(workspace),
         standing=now,
-        runs=tuple(_runs(task, now, own, lost)),
+        runs=tuple(_runs(task, now, own, explaining, lost)),
         others=len(trials) - len(own),
         lost=tuple(lost),
         diagnosis=diagnosis,
@@ -111,8 +114,8 @@ def _fits(task: Task, trial: Trial) -> bool:
 def _standing(workspace: Workspace, candidates: list[Candidate], trials: list[Trial]) -> Standing:
     from grounded.improve import model_fingerprint
 
-    task = workspace.task
-    return standing(task, candidates, trials, workspace.config.search, model_fingerprint(task))
+    task, options = workspace.task, workspace.config.search
+    return standing(task, candidates, trials, options, model_fingerprint(workspace.planner.plan))
 
 
 def _settled(
@@ -125,12 +128,37 @@ def _settled(
     if now.phase != "propose" or now.incumbent is None or options.refit:
         return now
     try:
-        return propose(workspace.task, candidates, trials, options).standing
+        planner = workspace.planner
+        return propose(workspace.task, candidates, trials, options, planner=planner).standing
     except GroundedError:
         return now
 
 
-def _runs(task: Task, now: Standing, trials: list[Trial], lost: list[Lost]) -> list[Run]:
+def _explaining(
+    workspace: Workspace, diagnosis: Diagnosis | None, lost: list[Lost]
+) -> Planner | None:
+    """The crude model with the adopted effects, or else with those that the diagnosis names."""
+    effects: list[dict[str, Any]] = [dict(effect) for effect in workspace.config.model.effects]
+    if not effects and diagnosis is not None:
+        ranked = {r.effect: r for r in diagnosis.ranking}
+        for name in diagnosis.effects:
+            if name in ranked:
+                values = {v.name: v.value for v in ranked[name].params}
+                effects.append({"name": name, **values})
+    if not effects:
+        return None
+    from grounded_trials.adopted import planner_with
+
+    try:
+        return planner_with(workspace.task, effects)
+    except GroundedError as error:
+        lost.append(Lost("the bias that the effects leave", str(error)))
+        return None
+
+
+def _runs(
+    task: Task, now: Standing, trials: list[Trial], explaining: Planner | None, lost: list[Lost]
+) -> list[Run]:
     by_id = {tried.candidate.id: tried for tried in now.history}
     runs = []
     for trial in trials:
@@ -139,18 +167,20 @@ def _runs(task: Task, now: Standing, trials: list[Trial], lost: list[Lost]) -> l
             reason = f"it has {trial.steps} steps, the task has {task.horizon}: not drawn"
             lost.append(Lost(trial.id, reason))
             continue
-        residual = _residual(task, trial)
-        runs.append(Run(trial, tried.candidate, tried.accepted, task.utility(trial), residual))
+        residual = _residual(Planner(task, task), trial)
+        explained = None if explaining is None else _residual(explaining, trial)
+        utility = task.utility(trial)
+        runs.append(Run(trial, tried.candidate, tried.accepted, utility, residual, explained))
     return runs
 
 
-def _residual(task: Task, trial: Trial) -> Array:
-    """The crude model's one-step residuals, (T, n), NaN after the last finite step."""
-    whole = trial.finite_steps
-    residual = np.full((trial.steps, task.model.n), np.nan)
+def _residual(planner: Planner, trial: Trial) -> Array:
+    """One-step residuals of the planning model, (T, n), NaN after the last finite step."""
+    whole, n = trial.finite_steps, planner.task.model.n
+    residual = np.full((trial.steps, n), np.nan)
     if whole > 0:
         part = replace(trial, states=trial.states[: whole + 1], inputs=trial.inputs[:whole])
-        residual[:whole] = residuals(task, part)
+        residual[:whole] = residuals(planner.plan, planner.lift(part))[:, :n]
     return residual
 
 

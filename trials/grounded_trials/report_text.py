@@ -9,7 +9,7 @@ from textwrap import wrap
 import numpy as np
 
 from grounded.search import Tried
-from grounded_trials.diagnosis_file import Diagnosis
+from grounded_trials.diagnosis_file import Diagnosis, Value
 from grounded_trials.findings import (
     Findings,
     prediction_error,
@@ -178,12 +178,17 @@ def _diagnosis(diagnosis: Diagnosis | None, table: Table) -> str:
                 r.effect[:30],
                 figure(r.evidence, 3),
                 figure(r.gap_after, 3),
-                " ".join(f"{v.name} = {v.value:.3g} +- {v.std:.1g}" for v in r.params)[:34],
+                ", ".join(map(_value, r.params))[:34].ljust(34),
             )
             for r in diagnosis.ranking[:EFFECTS]
         ]
-        lines.append(table(rows, ("effect", "nats", "gap after", "")))
+        lines.append(table(rows, ("effect", "nats", "gap after", "parameters".ljust(34))))
     return "\n".join(lines)
+
+
+def _value(value: Value) -> str:
+    spread = f" +- {value.std:.1g}" if math.isfinite(value.std) else ""
+    return f"{value.name} = {value.value:.3g}{spread}"
 
 
 def _wrapped(text: str, indent: str) -> list[str]:
