@@ -34,7 +34,7 @@ CLAIM = 3.0  # nats from which an effect is claimed
 SURE = 6.0  # nats from which it is sure
 SPREADS = (0.03, 0.1)  # prior relative errors of the model's parameters when they are calibrated
 PARAM_PRIOR = 0.2  # prior relative error of one parameter that is blamed
-SHORTLIST = 8
+SHORTLIST = 14  # effects that are refined of a scan, and half as many parameters
 TAUS = (0.05, 0.1, 0.3)  # [s] of coloured noise
 
 
@@ -124,19 +124,39 @@ class Search:
         noise = first_guess(residual, data.seen, scale)
         (plain,) = self.refined([(h, noise, track)], iterations=20)
         self.structures(plain)
-        self.calibrated(self.best_null())
+        self.calibrated(plain)
+        if self.best_null() is not plain:
+            self.calibrated(self.best_null())
         return self.best_null()
+
+    def fair(self, best: Fit) -> None:
+        """The model alone, starting from the noise and the shifts that the best hypothesis has.
+
+        What is compared with must have climbed as high as it can, or a better noise passes for an
+        effect.
+        """
+        h = best.hypothesis
+        bare = Hypothesis(shift=h.shift, spread=h.spread)
+        starts = [(bare, best.noise, best.track)]
+        if best.noise.structure.tau is None:
+            starts += [
+                (bare, best.noise.allowing(Structure(tau), self.data.dt), best.track)
+                for tau in TAUS
+                if tau > 0.7 * self.data.dt
+            ]
+            self.refined(starts[1:], iterations=8)
+        self.refined(starts[:1], iterations=10)
 
     def structures(self, fit: Fit) -> list[Fit]:
         """A hypothesis with coloured noise of several correlation times (if it had none)."""
         if fit.noise.structure.tau is not None:
             return []
         starts = [
-            (fit.hypothesis, fit.noise.allowing(Structure(tau)), fit.track)
+            (fit.hypothesis, fit.noise.allowing(Structure(tau), self.data.dt), fit.track)
             for tau in TAUS
             if tau > 0.7 * self.data.dt
         ]
-        return self.refined(starts, iterations=6)
+        return self.refined(starts, iterations=8)
 
     def calibrated(self, fit: Fit) -> list[Fit]:
         """The same hypothesis with the model's parameters free to move a little, or a little more."""
@@ -148,7 +168,7 @@ class Search:
                 (replace(fit.hypothesis, spread=spread, shift=shift), fit.noise, fit.track)
                 for spread in SPREADS
             ],
-            iterations=6,
+            iterations=9,
         )
 
     def best_null(self) -> Fit:
@@ -192,7 +212,9 @@ class Search:
         worth = [(look.gain - self.price(look.effect, look.values), look) for look in looks]
         worth = [(w, look) for w, look in worth if np.isfinite(w) and look.values]
         worth.sort(key=lambda pair: -pair[0])
-        return [look for _, look in worth[:count]]
+        params = [look for _, look in worth if isinstance(look.effect.family, ParamFamily)]
+        others = [look for _, look in worth if not isinstance(look.effect.family, ParamFamily)]
+        return others[:count] + params[: count // 2]
 
     def extended(self, fit: Fit, count: int = SHORTLIST, iterations: int = 7) -> list[Fit]:
         """The fit with each shortlisted effect added, refined."""
@@ -279,6 +301,7 @@ def _explore(search: Search) -> Fit:
         best = again
         if same:
             break
+    search.fair(best)
     return max([best, search.best_null()], key=search.score)
 
 
@@ -311,7 +334,7 @@ def _grow(search: Search, best: Fit, most: int) -> None:
     while size < most:
         for start in search.of_size(size)[: 3 if size == 1 else 1]:
             if search.score(start) > search.score(best) - 25:
-                search.extended(start, 6)
+                search.extended(start, 8)
         larger = search.of_size(size + 1)
         if not larger or search.score(larger[0]) < search.score(best) + CLAIM:
             return

@@ -156,9 +156,21 @@ class Predictor:
         after = self.step(x + 0.5 * dt * before, u, p)
         later = self.added_rate(rates, after, u, p, t + dt)
         result = after + 0.5 * dt * later
-        for i, j in self.tied():
-            result[..., j] += later[..., i] - before[..., i]
+        for i, j in self.tied():  # a carried heading rate is the heading's rate, effects and all
+            rise = self.instant(result, u, p, i) - self.instant(x, u, p, i)
+            result[..., j] = x[..., j] + rise + later[..., i] - before[..., i]
         return result
+
+    def instant(self, x: Array, u: Array, p: Array, i: int) -> Array:
+        """The model's own rate of state i at x, by a very short step."""
+        model, short = self.data.model, 1e-3 * self.data.dt
+        flat = model.system.step(
+            np.ascontiguousarray(x.reshape(-1, model.n)),
+            np.ascontiguousarray(u.reshape(-1, model.m)),
+            p,
+            short,
+        )
+        return (flat[:, i].reshape(x.shape[:-1]) - x[..., i]) / short
 
     def tied(self) -> list[tuple[int, int]]:
         """(heading, heading rate) where the rate is only carried along."""
@@ -187,7 +199,7 @@ class Predictor:
         return total
 
     def offset(self, h: Hypothesis, track: Array) -> Array | float:
-        """y - x under a hypothesis along a track (L + 1, B, n); 0.0 where nothing is measured wrong."""
+        """Y - x under a hypothesis along a track (L + 1, B, n); 0.0 where nothing is measured wrong."""
         sensors = [
             (e, v)
             for e, v in zip(h.effects, h.values, strict=True)

@@ -38,8 +38,12 @@ class Structure:
         return None if self.tau is None else math.exp(-dt / self.tau)
 
     def numbers(self, n: int) -> int:
-        """How many more numbers than plain white noise it estimates."""
-        return 0 if self.tau is None else n + 1
+        """How many more numbers than plain white noise it estimates, in effect.
+
+        A correlation time and one variance: in most channels the coloured part is nil and costs
+        nothing. Charging all n + 1 would make a claim cheaper than coloured noise.
+        """
+        return 0 if self.tau is None else 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,15 +81,14 @@ class Noise:
             return np.zeros((runs, 0))
         return np.tile(np.exp(self.log_c), (runs, 1))
 
-    def allowing(self, structure: Structure) -> Noise:
+    def allowing(self, structure: Structure, dt: float) -> Noise:
         """The same noise, free to be coloured (or not): where its fit starts."""
-        return replace(
-            self,
-            structure=structure,
-            log_q=self.log_q - (0.7 if structure.tau is not None else 0.0),
-            log_c=np.maximum(self.log_q - 1.5, self.floor),
-            last=None,
-        )
+        if structure.tau is None:
+            return replace(self, structure=structure, last=None)
+        # a tenth of the low-frequency power: the sum of c over time has about 2 tau / dt times its own
+        share = math.log(0.1 * dt / (2 * structure.tau))
+        log_c = np.maximum(self.log_q + share, self.floor)
+        return replace(self, structure=structure, log_c=log_c, last=None)
 
 
 def first_guess(residual: Array, seen: Array, scale: Array) -> Noise:

@@ -389,7 +389,7 @@ def _scored(
     count = data.seen[1:].sum()
     loglik = -0.5 * float(rss.sum() + run_logdet.sum() + count * np.log(2 * np.pi))
     evidence, k = loglik, len(h.theta)
-    if C > k:
+    if k < C:
         precision = shift_precision(h, C - k)
         which = calibrated(data)
         shift = 0.0 if h.shift is None else h.shift[which] / param_scale(data.model)[which]

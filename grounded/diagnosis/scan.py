@@ -107,7 +107,7 @@ class _Context:
         self.f_p = f_p.reshape(L, B, model.n, -1)
         noise = fit.noise
         phi = noise.structure.phi(data.dt)
-        G = noise_entry(predictor, h, fit.track)
+        self.G = G = noise_entry(predictor, h, fit.track)
         self.gains = kalman.gains(
             kalman.transition(self.F, phi, G),
             noise.process(data.dt),
@@ -154,7 +154,10 @@ class _Context:
             later = self._rates_at(effect, values, 1)
             d = 0.5 * dt * ((self.F @ before[..., None])[..., 0] + later)
             for a, b in predictor.tied():
-                d[..., b] += later[..., a] - before[..., a]
+                assert self.G is not None
+                slope = self.G[..., b, :].copy()
+                slope[..., b] = 0.0
+                d[..., b] = (slope * d).sum(axis=-1) + later[..., a] - before[..., a]
             found.append(_Column(i, point, name, d / amount, _EMPTY))
         return found
 

@@ -111,7 +111,7 @@ class Site:
 
 
 def per(unit: str, by: str = "s") -> str:
-    """unit / by, readable: per("m/s", "s") is "m/s^2"."""
+    """Unit / by, readable: per("m/s", "s") is "m/s^2"."""
     if unit == "1":
         return f"1/{by}"
     return f"{unit}^2" if unit.endswith(f"/{by}") else f"{unit}/{by}"

@@ -1,6 +1,6 @@
 """The model is right in form: one of its own parameters differs from its nominal value.
 
-    p = nominal + d
+p = nominal + d
 """
 
 from __future__ import annotations

@@ -181,8 +181,12 @@ def _rate_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str
         t = t + dt if timed else 0.0
         later, final = _kick(family, effect, base, after, a, p, dt, t, c)
         result = dict(final)
-        for n, k in tied.items():
-            if n in added:  # a heading rate shows what was added to the heading
+        for n, k in tied.items():  # a carried heading rate is the heading's rate, effects and all
+            if model.derivative is not None:
+                start = _own_state(model, s)
+                rise = model.derivative(final, a, p)[n] - model.derivative(start, a, p)[n]
+                result[k] = s[k] + rise + later.get(n, 0.0) - added.get(n, 0.0)
+            elif n in added:
                 result[k] = result[k] + later[n] - added[n]
         return {**result, clock: t} if timed else result
 
@@ -239,7 +243,7 @@ def _sensor_delay_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, 
             logged = logged + np.maximum(1 - np.abs(behind - i), 0.0) * value
         return {**after, target: logged, **dict(zip(memory, line, strict=False))}
 
-    return step, {z: model.states[target] for z in memory}
+    return step, dict.fromkeys(memory, model.states[target])
 
 
 def memory_of(wrapped: Model, base: Model, trial: Trial) -> Array:

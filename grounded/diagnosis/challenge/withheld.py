@@ -1,14 +1,14 @@
 """Effects that are NOT in the library: what the diagnosis must meet without a name for it.
 
-    resonance     the actuator rings: u_eff'' = w^2 (u - u_eff) - 2 zeta w u_eff'
-    asymmetric    a different gain for positive and negative commands
-    dropouts      commands get lost for 0.1 to 0.4 s; the last one is held
-    fault         from half of the trial on an actuator gives less
-    expo          an exponential stick curve: u_eff = (1 - e) u + e u^3 / peak^2
-    crosstalk     one input leaks, squared, into another
-    quantised     commands arrive in coarse steps
-    gusts         pushes of half a second at random times
-    hysteresis    drag that depends on whether the speed rises or falls
+resonance     the actuator rings: u_eff'' = w^2 (u - u_eff) - 2 zeta w u_eff'
+asymmetric    a different gain for positive and negative commands
+dropouts      commands get lost for 0.1 to 0.4 s; the last one is held
+fault         from half of the trial on an actuator gives less
+expo          an exponential stick curve: u_eff = (1 - e) u + e u^3 / peak^2
+crosstalk     one input leaks, squared, into another
+quantised     commands arrive in coarse steps
+gusts         pushes of half a second at random times
+hysteresis    drag that depends on whether the speed rises or falls
 """
 
 from __future__ import annotations
