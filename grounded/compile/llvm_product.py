@@ -14,7 +14,7 @@ from grounded.compile import jit
 from grounded.compile.llvm_batch import Words, gather_rows, start_table
 from grounded.compile.llvm_rollout import Layout, received
 from grounded.compile.llvm_step import Dynamics
-from grounded.compile.llvm_text import Writer, integers, splat, vector
+from grounded.compile.llvm_text import Writer, integers, number, splat, vector
 
 Row = Callable[[int | str], str]  # loads (a piece of) row r of a matrix
 UNROLLED = 400  # entries of the Jacobian whose products are written out; more are a loop
@@ -43,29 +43,67 @@ def pieces_of(f: Writer, base: str, stride: int, at: int, size: int) -> Row:
     return piece
 
 
-def transpose(f: Writer, M: str, T: str, P: int, C: int) -> None:
-    """T (P, C) = M' of M (C, P), in blocks of four by four."""
+def transpose(f: Writer, M: str, T: str, P: int, C: int, width: int) -> None:
+    """T (P, C) = M' of M (C, P), stored in the pieces that T is read in.
+
+    A store that a later load only partly covers would have to reach the cache first.
+    """
+    if C // width:
+        with f.loop(C // width) as block:
+            c = f.integer("mul", block, width)
+            _transpose_rows(f, f.at(M, f.integer("mul", c, P)), f.at(T, c), (P, C), width)
+    for tail in range(C // width * width, C, 4):
+        _transpose_rows(f, f.at(M, tail * P), f.at(T, tail), (P, C), 4)
+
+
+def _transpose_rows(f: Writer, source: str, target: str, size: tuple[int, int], count: int) -> None:
+    """`count` rows of M to as many columns of T, in blocks of four by four."""
+    P, C = size
+    for r in range(0, P, 4):
+        columns = _transpose_block(f, [f.load(source, i * P + r, 4) for i in range(4)])
+        for four in range(4, count, 4):
+            more = _transpose_block(f, [f.load(source, (four + i) * P + r, 4) for i in range(4)])
+            columns = [_beside(f, a, b) for a, b in zip(columns, more, strict=True)]
+        for i, column in enumerate(columns):
+            f.store(column, target, (r + i) * C, count)
+
+
+def _transpose_block(f: Writer, a: list[str]) -> list[str]:
+    """Columns of four rows of four."""
     kind = vector(4)
 
     def shuffled(a: str, b: str, *lanes: int) -> str:
         inside = ", ".join(f"i32 {i}" for i in lanes)
         return f.emit(f"shufflevector {kind} {a}, {kind} {b}, <4 x i32> <{inside}>")
 
-    with f.loop(C // 4) as block:
-        c = f.integer("mul", block, 4)
-        source, target = f.at(M, f.integer("mul", c, P)), f.at(T, c)
-        for r in range(0, P, 4):
-            a = [f.load(source, i * P + r, 4) for i in range(4)]
-            lo = [shuffled(a[i], a[i + 1], 0, 4, 2, 6) for i in (0, 2)]
-            hi = [shuffled(a[i], a[i + 1], 1, 5, 3, 7) for i in (0, 2)]
-            columns = [
-                shuffled(lo[0], lo[1], 0, 1, 4, 5),
-                shuffled(hi[0], hi[1], 0, 1, 4, 5),
-                shuffled(lo[0], lo[1], 2, 3, 6, 7),
-                shuffled(hi[0], hi[1], 2, 3, 6, 7),
-            ]
-            for i, column in enumerate(columns):
-                f.store(column, target, (r + i) * C, 4)
+    lo = [shuffled(a[i], a[i + 1], 0, 4, 2, 6) for i in (0, 2)]
+    hi = [shuffled(a[i], a[i + 1], 1, 5, 3, 7) for i in (0, 2)]
+    return [
+        shuffled(lo[0], lo[1], 0, 1, 4, 5),
+        shuffled(hi[0], hi[1], 0, 1, 4, 5),
+        shuffled(lo[0], lo[1], 2, 3, 6, 7),
+        shuffled(hi[0], hi[1], 2, 3, 6, 7),
+    ]
+
+
+def _beside(f: Writer, a: str, b: str) -> str:
+    """Two vectors of four as one of eight."""
+    kind, lanes = vector(4), ", ".join(f"i32 {i}" for i in range(8))
+    return f.emit(f"shufflevector {kind} {a}, {kind} {b}, <8 x i32> <{lanes}>")
+
+
+def placed(f: Writer, value: str, lane: int, row: str, size: int) -> str:
+    """A row with `value` added in one lane."""
+    unit = ", ".join(f"double {number(float(i == lane))}" for i in range(size))
+    return f.fma(f.spread(value, size), f"<{unit}>", row, size)
+
+
+def row_of(f: Writer, values: list[str], size: int) -> str:
+    """Numbers as a vector, zeros after them."""
+    row = "zeroinitializer"
+    for i, value in enumerate(values):
+        row = f.emit(f"insertelement {vector(size)} {row}, double {value}, i64 {i}")
+    return row
 
 
 class Linearised:

@@ -12,7 +12,15 @@ from __future__ import annotations
 
 from grounded.compile.llvm_batch import Words
 from grounded.compile.llvm_box import ONE, ZERO, clipped, solved
-from grounded.compile.llvm_product import Linearised, padded, pieces, pieces_of, transpose
+from grounded.compile.llvm_product import (
+    Linearised,
+    padded,
+    pieces,
+    pieces_of,
+    placed,
+    row_of,
+    transpose,
+)
 from grounded.compile.llvm_rollout import Layout, wrap
 from grounded.compile.llvm_step import Dynamics
 from grounded.compile.llvm_text import Writer, number, splat
@@ -97,64 +105,62 @@ class _Sweep:
                 f.store(value, self.M, c * P + at, size)
         G, inputs = self.along.inputs(lambda r: f.load(self.v, r), 1)
         slopes = self.along.states(lambda r: f.load(self.v, r), 1, G) + inputs
-        transpose(f, self.M, self.T, P, self.C)
+        transpose(f, self.M, self.T, P, self.C, self.width)
         return slopes
 
     def input_rows(self, t: str, slopes: list[str]) -> None:
         """[Q_uz Q_uu] into U, Q_u into g_u: first, so that their factor is under way early."""
-        f, C = self.f, self.C
+        f, layout, C = self.f, self.layout, self.C
+        doubled = []
+        for j in range(layout.m):
+            S, R = (f.load(self.words.pointer(name), j) for name in ("S", "R"))
+            doubled.append((f.add(S, S), f.add(R, R)))
         for at, size in pieces(C, self.width):
             G, rows = self.along.inputs(pieces_of(f, self.T, C, at, size), size)
-            for j, value in enumerate(rows):
+            for j, row in enumerate(rows):
+                S, R = doubled[j]
+                for place, value in ((layout.slot(j), f.neg(S)), (layout.nz + j, f.add(R, S))):
+                    if at <= place < at + size:
+                        row = placed(f, value, place - at, row, size)
                 f.store(G[j], self.G, j * C + at, size)
-                f.store(value, self.U, j * C + at, size)
-        self._add_input_cost(t, slopes)
-
-    def state_rows(self, t: str, slopes: list[str]) -> None:
-        """Q_zz into V, Q_z into g_z."""
-        f, P, C = self.f, self.P, self.C
-        for at, size in self.cut:
-            G = [f.load(self.G, j * C + at, size) for j in range(self.layout.m)]
-            row = pieces_of(f, self.T, C, at, size)
-            for c, value in enumerate(self.along.states(row, size, G)):
-                f.store(value, self.V, c * P + at, size)
-        self._add_state_cost(t, slopes)
-
-    def _add_to(self, value: str, base: str, index: int) -> None:
-        self.f.store(self.f.add(self.f.load(base, index), value), base, index)
-
-    def _add_state_cost(self, t: str, slopes: list[str]) -> None:
-        f, layout, P = self.f, self.layout, self.P
-        diagonal = self._tracking(t)
-        before, u = self._row("z_run", t, layout.nz), self._row("u_run", t, layout.m)
-        change = {layout.slot(j): j for j in range(layout.m)}
-        for c in range(layout.nz):
-            slope = slopes[c]
-            if c < layout.n:
-                slope = f.add(slope, diagonal[c][0])
-                self._add_to(diagonal[c][1], self.V, c * P + c)
-            elif c in change:
-                S = f.load(self.words.pointer("S"), change[c])
-                twice = f.add(S, S)
-                step = f.sub(f.load(u, change[c]), f.load(before, c))
-                slope = f.sub(slope, f.mul(twice, step))
-                self._add_to(twice, self.V, c * P + c)
-            f.store(slope, self.g_z, c)
-
-    def _add_input_cost(self, t: str, slopes: list[str]) -> None:
-        f, layout, C = self.f, self.layout, self.C
+                f.store(row, self.U, j * C + at, size)
         before, u = self._row("z_run", t, layout.nz), self._row("u_run", t, layout.m)
         target = self._row("input_target", t, layout.m)
-        for j in range(layout.m):
-            S = f.load(self.words.pointer("S"), j)
-            R = f.load(self.words.pointer("R"), j)
-            S, R = f.add(S, S), f.add(R, R)
-            self._add_to(f.neg(S), self.U, j * C + layout.slot(j))
-            self._add_to(f.add(R, S), self.U, j * C + layout.nz + j)
+        for j, (S, R) in enumerate(doubled):
             value = f.load(u, j)
             slope = f.fma(R, f.sub(value, f.load(target, j)), slopes[layout.nz + j])
             slope = f.fma(S, f.sub(value, f.load(before, layout.slot(j))), slope)
             f.store(slope, self.g_u, j)
+
+    def state_rows(self, t: str, slopes: list[str]) -> None:
+        """Q_zz into V, Q_z into g_z."""
+        f, P, C = self.f, self.P, self.C
+        cost = self._state_cost(t)
+        for at, size in self.cut:
+            G = [f.load(self.G, j * C + at, size) for j in range(self.layout.m)]
+            rows = self.along.states(pieces_of(f, self.T, C, at, size), size, G)
+            for c, row in enumerate(rows):
+                own = cost[c]
+                if own and at <= c < at + size:
+                    row = placed(f, own[1], c - at, row, size)
+                f.store(row, self.V, c * P + at, size)
+            slope = []
+            for c in range(at, min(at + size, len(cost))):
+                own = cost[c]
+                slope.append(f.add(slopes[c], own[0]) if own else slopes[c])
+            f.store(row_of(f, slope, size), self.g_z, at, size)
+
+    def _state_cost(self, t: str) -> list[tuple[str, str] | None]:
+        """(l_z, l_zz) for each entry of z, None where it has no cost."""
+        f, layout = self.f, self.layout
+        before, u = self._row("z_run", t, layout.nz), self._row("u_run", t, layout.m)
+        cost: list[tuple[str, str] | None] = [*self._tracking(t)]
+        for j, depth in enumerate(layout.depths):
+            S = f.load(self.words.pointer("S"), j)
+            twice = f.add(S, S)
+            step = f.sub(f.load(before, layout.slot(j)), f.load(u, j))
+            cost += [(f.mul(twice, step), twice), *[None] * (depth - 1)]
+        return cost
 
     def gains(self, t: str) -> None:
         """Gains k and K of step t inside the limits; the promise d1, d2."""
