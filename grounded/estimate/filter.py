@@ -27,6 +27,8 @@ Source: Särkkä, Bayesian Filtering and Smoothing (2013), ch. 5; Ljung, System 
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from grounded.estimate import lanes
@@ -39,7 +41,9 @@ from grounded.estimate.steps import ModelSteps
 from grounded.frozen import Array
 
 SWEEPS = 20
-CLOSE = 1e-3  # standard deviations: a sweep that moves the track less is the last
+CLOSE = 1e-2  # standard deviations: a sweep that moves the track less is the last,
+STILL = 1e-3  # [nats] or the likelihood; at a kink a track may flip for ever,
+ENOUGH = 0.05  # [nats] and then this is enough after SWEEPS
 
 
 def run(
@@ -66,7 +70,10 @@ def run(
             x = np.concatenate([batch.start[None], batch.y[1:]])
             start = x[:-1], np.broadcast_to(noise.measurement, x[:-1].shape), x
         else:
-            return recursion(batch, measurement, noise, steps.at)
+            first = recursion(batch, measurement, noise, replace(steps, wide=False).at)
+            if not steps.wide or not np.isfinite(first.loglik):
+                return first
+            start = first.x[:-1], first.std[:-1], first.x_prior
         found = _sweeps(batch, measurement, noise, steps, *start)
         if found is not None:
             return found
@@ -86,9 +93,9 @@ def _sweeps(
 
     None if it is not found.
     """
-    B, n = track.shape[1:]
+    (B, n), last = track.shape[1:], -np.inf
     with np.errstate(all="ignore"):
-        for _ in range(SWEEPS):
+        for sweep in range(SWEEPS):
             f, A, more = steps.along(track, std)
             H, e0 = _seen(batch, measurement, xbar)
             if not all(np.isfinite(array).all() for array in (f, A, H, e0)):
@@ -107,7 +114,8 @@ def _sweeps(
                 float(np.max(np.abs(x_prior - xbar) / wide)),
                 float(np.max(np.abs(after[:-1] - std) / wide[:-1])) if steps.wide else 0.0,
             )
-            if moved < CLOSE:
+            settled = abs(done.loglik - last) < (STILL if sweep < SWEEPS - 1 else ENOUGH)
+            if moved < CLOSE or settled:
                 # f and e are those at the end of the sweep, to first order
                 f = f + (A @ (x[:-1] - track)[..., None])[..., 0]
                 e = e0 - (H @ (x_prior - xbar)[..., None])[..., 0]
@@ -115,7 +123,7 @@ def _sweeps(
                 return Filtered(
                     x, after, x_prior, P, e, H, R, A, f, more, done.loglik, "filtered", done
                 )
-            track, std, xbar = x[:-1], after[:-1], x_prior
+            track, std, xbar, last = x[:-1], after[:-1], x_prior, done.loglik
     return None
 
 
