@@ -5,6 +5,7 @@ An exception inside it is a mistake of theirs and becomes a sentence with file a
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import importlib.util
 import sys
@@ -48,7 +49,8 @@ def load_module(
     before = set(sys.modules)
     sys.path.insert(0, str(folder))
     try:
-        spec.loader.exec_module(found)
+        with contextlib.redirect_stdout(sys.stderr):  # what a model prints is no data of ours
+            spec.loader.exec_module(found)
     except GroundedError as error:
         raise GroundedError(f"{path}: {error}") from None
     except (Exception, SystemExit) as error:
@@ -87,7 +89,8 @@ def model_in(module: ModuleType) -> Model:
 def _where(error: BaseException, name: str) -> str:
     """The user's own line that failed, and why."""
     if isinstance(error, SyntaxError):
-        return f"{error.filename} line {error.lineno}: {error.msg}"
+        line = f" line {error.lineno}" if error.lineno else ""
+        return f"{error.filename or name}{line}: {error.msg}"
     frames = [f for f in traceback.extract_tb(error.__traceback__) if Path(f.filename).name in name]
     line = f" line {frames[-1].lineno}" if frames else ""
     return f"{name}{line}: {type(error).__name__}: {error}"

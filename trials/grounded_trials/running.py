@@ -83,7 +83,14 @@ def _call(workspace: Workspace, command: str, identity: str, path: Path) -> None
     for name in words:
         if "{" + name + "}" not in command:
             raise GroundedError(f"[system] command must contain {{{name}}}, found: {command}")
-    parts = [part.format(**words) for part in shlex.split(command)]
+    try:
+        parts = shlex.split(command)
+    except ValueError as error:
+        raise GroundedError(
+            f"[system] command can't be split into words ({error}): {command}"
+        ) from None
+    for name, text in words.items():
+        parts = [part.replace("{" + name + "}", text) for part in parts]
     try:
         done = subprocess.run(parts, cwd=workspace.folder, stdout=2, check=False)
     except OSError as error:

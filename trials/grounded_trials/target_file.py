@@ -23,6 +23,7 @@ def read_target(path: Path) -> tuple[list[str], Array]:
         with path.open(newline="", encoding="utf-8-sig") as stream:
             reader = csv.reader(stream)
             names = [name.strip() for name in next(reader, [])]
+            _check_header(path, names)
             rows: list[list[float]] = []
             for line, row in enumerate(reader, start=2):
                 if not any(cell.strip() for cell in row):
@@ -36,10 +37,19 @@ def read_target(path: Path) -> tuple[list[str], Array]:
         raise GroundedError(f"{path} is a folder; [task] target must name a CSV file") from None
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise GroundedError(f"{path} can't be read as CSV: {error}") from None
+    return names, np.array(rows, dtype=float).reshape(len(rows), len(names))
+
+
+def _check_header(path: Path, names: list[str]) -> None:
     if not names or names[0] != "t":
         found = names[0] if names else "nothing"
-        raise GroundedError(f"{path.name}: the first column must be 't', found '{found}'")
-    return names, np.array(rows, dtype=float).reshape(len(rows), len(names))
+        raise GroundedError(
+            f"{path.name}: the first column must be 't', found '{found}'; columns are separated by "
+            "commas"
+        )
+    twice = [name for name in names if names.count(name) > 1]
+    if twice:
+        raise GroundedError(f"{path.name}: the column '{twice[0]}' is there twice")
 
 
 def _numbers(path: Path, line: int, names: list[str], row: list[str]) -> list[float]:

@@ -80,6 +80,8 @@ def _start(task: Task, trial: Trial) -> list[str]:
 
 
 def _inputs(task: Task, trial: Trial) -> list[str]:
+    if not trial.steps:
+        return []
     excess = np.maximum(task.low - trial.inputs, trial.inputs - task.high).max(axis=0)
     return [
         f"the log has {name} up to {excess[i]:.3g} outside its [limits]: log the COMMANDS, after "

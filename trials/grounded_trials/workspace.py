@@ -9,6 +9,7 @@ one that got lost is taken from the trial that ran it, which carries it as an at
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -29,6 +30,9 @@ from grounded_trials.task_file import build_task
 
 if TYPE_CHECKING:
     from grounded.planner import Planner
+
+
+_ID = re.compile(r"c\d{4,}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,9 +96,9 @@ class Workspace:
 
     def candidate_ids(self) -> list[str]:
         """Every candidate that was ever proposed, whether its file is there or only its trial."""
-        ids = {path.stem for path in (self.folder / "candidates").glob("c[0-9]*.mcap")}
-        ids |= {t.trial.candidate for t in self.trials() if t.trial.candidate}
-        return sorted(ids)
+        ids = {path.stem for path in (self.folder / "candidates").glob("c*.mcap") if path.is_file()}
+        ids |= {t.trial.candidate for t in self.trials()}
+        return sorted(filter(_ID.fullmatch, ids), key=lambda name: int(name[1:]))
 
     def save_candidate(self, candidate: Candidate, task: Task, kind: str = "search") -> Path:
         """Writes candidates/cNNNN.mcap, complete or not at all."""
