@@ -9,7 +9,7 @@ import numpy as np
 
 from grounded.search import Tried
 from grounded_trials.figures import Band, Curve, Dot, Figure, Key, Panel, Rule
-from grounded_trials.findings import Findings
+from grounded_trials.findings import Findings, standard_error
 from grounded_trials.words import figure
 
 STEEP = 8.0  # worst over best utility from which on the axis is logarithmic
@@ -91,7 +91,7 @@ def _dots(findings: Findings, tried: Tried, at: int) -> list[Dot]:
         f"{candidate.id}, iteration {candidate.iteration}, α = {candidate.alpha:g}\n"
         f"utility {real}, predicted {figure(candidate.predicted_utility)}\n{verdict}"
     )
-    error = tried.standard_error
+    error = standard_error(tried)
     if math.isfinite(error):
         note += f", ± {figure(error, 2)} over {len(tried.trials)} trials"
     if not math.isfinite(tried.utility):

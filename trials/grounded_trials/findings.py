@@ -111,6 +111,11 @@ class Findings:
         )
 
 
+def standard_error(tried: Tried) -> float:
+    """Of a candidate's mean utility; NaN for fewer than two trials, or when one of them failed."""
+    return tried.standard_error if np.isfinite(tried.utility) else float("nan")
+
+
 def tracked(task: Task) -> list[int]:
     """States with a target."""
     return [i for i in range(task.model.n) if np.isfinite(task.target[:, i]).all()]

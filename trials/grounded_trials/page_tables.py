@@ -8,7 +8,14 @@ from collections.abc import Callable
 import numpy as np
 
 from grounded_trials.diagnosis_file import Diagnosis, Ranked, Value
-from grounded_trials.findings import Findings, Run, prediction_error, rms, tracking_error
+from grounded_trials.findings import (
+    Findings,
+    Run,
+    prediction_error,
+    rms,
+    standard_error,
+    tracking_error,
+)
 from grounded_trials.page_parts import table
 from grounded_trials.words import figure
 
@@ -32,7 +39,7 @@ def candidate_table(findings: Findings) -> str:
                 f"{c.damping:.2g}",
                 figure(c.predicted_utility),
                 figure(tried.utility),
-                figure(tried.standard_error, 2),
+                figure(standard_error(tried), 2),
                 verdicts[tried.accepted],
                 " ".join(t.id for t in tried.trials) or "none",
             )

@@ -15,6 +15,7 @@ from grounded_trials.findings import (
     prediction_error,
     rms,
     selection,
+    standard_error,
     tracking_error,
 )
 from grounded_trials.words import figure
@@ -116,7 +117,7 @@ def _candidate(tried: Tried, last: bool) -> tuple[str, ...]:
     ]
     if tried.accepted and not tried.candidate.base:
         verdict = "first"
-    error = tried.standard_error
+    error = standard_error(tried)
     return (
         tried.candidate.id,
         str(tried.candidate.iteration),

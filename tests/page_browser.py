@@ -1,0 +1,129 @@
+"""A real browser for tests: headless Chromium, driven over ChromeDriver's plain HTTP."""
+
+from __future__ import annotations
+
+import base64
+import json
+import shutil
+import socket
+import subprocess
+import tempfile
+import time
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+FLAGS = [
+    "--headless=new",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--hide-scrollbars",
+]
+
+
+def missing() -> str:
+    """Why there is no browser here, or ""."""
+    for program in ("chromium", "chromedriver"):
+        if shutil.which(program) is None:
+            return f"{program} is not installed (apt-get install chromium chromium-driver)"
+    return ""
+
+
+class Browser:
+    """One page in one window."""
+
+    def __init__(self, base: str, session: str) -> None:
+        self._at = f"{base}/session/{session}"
+
+    def open(self, path: Path) -> None:
+        _call("POST", f"{self._at}/url", {"url": path.resolve().as_uri()})
+
+    def resize(self, width: int, height: int) -> None:
+        """The size of the page itself, whatever the window's smallest size is."""
+        metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+        self.devtools("Emulation.setDeviceMetricsOverride", metrics)
+
+    def dark(self, on: bool = True) -> None:
+        value = {"name": "prefers-color-scheme", "value": "dark" if on else "light"}
+        self.devtools("Emulation.setEmulatedMedia", {"features": [value]})
+
+    def devtools(self, command: str, params: dict[str, Any]) -> Any:
+        body = {"cmd": command, "params": params}
+        return _call("POST", f"{self._at}/goog/cdp/execute", body)
+
+    def run(self, script: str, *args: Any) -> Any:
+        """The value of a function's body in the page."""
+        return _call("POST", f"{self._at}/execute/sync", {"script": script, "args": list(args)})
+
+    def point(self, selector: str, x: float, y: float) -> None:
+        """Moves the mouse to a fraction of an element's width and height."""
+        place = self.run(
+            "const e = document.querySelector(arguments[0]); e.scrollIntoView({block: 'center'});"
+            "const b = e.getBoundingClientRect(); return [b.left, b.top, b.width, b.height];",
+            selector,
+        )
+        at = [round(place[0] + x * place[2]), round(place[1] + y * place[3])]
+        move = {"type": "pointerMove", "duration": 0, "x": at[0], "y": at[1], "origin": "viewport"}
+        mouse = {"type": "pointer", "id": "mouse", "parameters": {"pointerType": "mouse"}}
+        _call("POST", f"{self._at}/actions", {"actions": [{**mouse, "actions": [move]}]})
+
+    def errors(self) -> list[str]:
+        """What the console has logged as an error or a warning."""
+        lines = _call("POST", f"{self._at}/se/log", {"type": "browser"})
+        return [line["message"] for line in lines if line["level"] in ("SEVERE", "WARNING")]
+
+    def picture(self) -> bytes:
+        found = self.devtools("Page.captureScreenshot", {"captureBeyondViewport": True})
+        return base64.b64decode(found["data"])
+
+
+@contextmanager
+def browser() -> Iterator[Browser]:
+    """A browser with an empty profile, ended afterwards."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    base = f"http://127.0.0.1:{port}"
+    quiet = subprocess.DEVNULL
+    driver = subprocess.Popen(["chromedriver", f"--port={port}"], stdout=quiet, stderr=quiet)
+    session = ""
+    try:
+        _wait(base)
+        with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
+            options = {"args": [*FLAGS, f"--user-data-dir={profile}"]}
+            wanted = {"goog:chromeOptions": options, "goog:loggingPrefs": {"browser": "ALL"}}
+            made = _call("POST", f"{base}/session", {"capabilities": {"alwaysMatch": wanted}})
+            session = made["sessionId"]
+            try:
+                yield Browser(base, session)
+            finally:
+                _call("DELETE", f"{base}/session/{session}")
+    finally:
+        driver.terminate()
+        driver.wait(timeout=20)
+
+
+def _wait(base: str) -> None:
+    for _ in range(200):
+        try:
+            if _call("GET", f"{base}/status")["ready"]:
+                return
+        except OSError:
+            time.sleep(0.05)
+    raise RuntimeError("chromedriver did not start")
+
+
+def _call(method: str, url: str, body: dict[str, Any] | None = None) -> Any:
+    data = None if body is None else json.dumps(body).encode()
+    headers = {"Content-Type": "application/json"}
+    request = urllib.request.Request(url, data=data, headers=headers, method=method)
+    opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+    with opener.open(request, timeout=60) as answer:
+        return json.loads(answer.read())["value"]
