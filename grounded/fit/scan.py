@@ -21,6 +21,7 @@ from grounded.frozen import Array
 
 COARSE, FINE, ROUNDS = 21, 5, 4
 DROP = 3.67  # [nats]
+GRID = 10  # points between a value that is as good and one that is not
 LEVEL = 0.05  # [nats] as good as equal
 QUIET = 1e-2  # information over the whole range below which a slope says nothing
 
@@ -115,29 +116,38 @@ def _centred(data: Data, noise: Noise, best: Point, i: int, level: Array) -> Poi
 def likelihood_interval(data: Data, noise: Noise, at: Point, i: int) -> tuple[float, float]:
     """The values of unknown i around the best whose log-likelihood is within DROP of it.
 
-    A bound of the unknown is returned where the likelihood never falls that far.
+    The likelihood of a threshold is rough: the outermost such value counts, sought as far as it has
+    fallen for good. A bound of the unknown is returned where it never falls that far.
     """
-    ends = []
-    for bound in (data.unknowns.low[i], data.unknowns.high[i]):
-        inside, outside = float(at.theta[i]), float(bound)
-        if _loglik(data, noise, at, i, outside) > at.loglik - DROP:
-            ends.append(outside)
-            continue
-        step = 1e-3 * abs(outside - inside)  # walk out first: the likelihood may rise again
-        while abs(step) < abs(outside - inside):
-            there = inside + np.sign(outside - inside) * step
-            if _loglik(data, noise, at, i, there) < at.loglik - DROP:
-                outside = there
-                break
-            inside, step = there, 2 * step
-        for _ in range(8):
-            middle = 0.5 * (inside + outside)
-            if _loglik(data, noise, at, i, middle) < at.loglik - DROP:
-                outside = middle
-            else:
-                inside = middle
-        ends.append(outside)
-    return ends[0], ends[1]
+    low, high = data.unknowns.low[i], data.unknowns.high[i]
+    return _end(data, noise, at, i, float(low)), _end(data, noise, at, i, float(high))
+
+
+def _end(data: Data, noise: Noise, at: Point, i: int, bound: float) -> float:
+    best = float(at.theta[i])
+    span = abs(bound - best)
+    if span == 0 or _loglik(data, noise, at, i, bound) > at.loglik - DROP:
+        return bound
+    sign, step, good = np.sign(bound - best), 1e-3 * span, 0.0
+    while step < span:
+        fallen = at.loglik - _loglik(data, noise, at, i, best + sign * step)
+        good = step if fallen < DROP else good
+        if fallen > 3 * DROP:
+            break
+        step *= 2
+    far = min(step, span)
+    grid = np.linspace(good, far, GRID + 1)[1:-1]
+    inside = [g for g in grid if _loglik(data, noise, at, i, best + sign * g) > at.loglik - DROP]
+    width = (far - good) / GRID
+    good = max([good, *inside])
+    outside = min(far, good + width)
+    for _ in range(3):
+        middle = 0.5 * (good + outside)
+        if _loglik(data, noise, at, i, best + sign * middle) > at.loglik - DROP:
+            good = middle
+        else:
+            outside = middle
+    return float(best + sign * outside)
 
 
 def _loglik(data: Data, noise: Noise, at: Point, i: int, value: float) -> float:
