@@ -15,10 +15,9 @@ and drop what another explains better.
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -28,34 +27,13 @@ from grounded.diagnosis.noise import Structure, first_guess
 from grounded.diagnosis.refine import Fit, clean, refine
 from grounded.diagnosis.scan import Look, scan
 from grounded.effects import Effect, ParamFamily
-from grounded.frozen import Array
 
-CLAIM = 3.0  # nats from which an effect is claimed
-SURE = 6.0  # nats from which it is sure
+CLAIM = 5.0  # nats from which an effect is claimed
+TIE = 3.0  # nats within which two explanations are not told apart
 SPREADS = (0.03, 0.1)  # prior relative errors of the model's parameters when they are calibrated
 PARAM_PRIOR = 0.2  # prior relative error of one parameter that is blamed
 SHORTLIST = 14  # effects that are refined of a scan, and half as many parameters
 TAUS = (0.05, 0.1, 0.3)  # [s] of coloured noise
-
-
-@dataclass(frozen=True, eq=False)
-class Attribution:
-    """The result of a search.
-
-    `best` and `null` are the most likely hypotheses with and without effects, each under the noise
-    structure that it prefers; `singles` are all refined hypotheses of one effect, best first, and
-    `scores` gives every fit's evidence over `null`'s.
-    """
-
-    null: Fit
-    plain: Fit  # without effects, under the noise structure of `best`
-    best: Fit
-    singles: tuple[Fit, ...]
-    evidence: dict[str, float]  # name of a single effect -> evidence beside the rest of `best`
-    looks: tuple[Look, ...]
-    candidates: tuple[Effect, ...]
-    gain: float  # evidence of `best` over `null`
-    parts: dict[str, float] = field(default_factory=dict)  # name -> evidence lost without it
 
 
 class Search:
@@ -330,8 +308,8 @@ def _bare(fit: Fit, h: Hypothesis) -> Fit:
 
 def _grow(search: Search, best: Fit, most: int) -> None:
     """Second and further effects: add, then swap each for what goes better with the others."""
-    size = 1
-    while size < most:
+    size = len(best.hypothesis.effects)
+    while 1 <= size < most:
         for start in search.of_size(size)[: 3 if size == 1 else 1]:
             if search.score(start) > search.score(best) - 25:
                 search.extended(start, 8)
@@ -339,23 +317,7 @@ def _grow(search: Search, best: Fit, most: int) -> None:
         if not larger or search.score(larger[0]) < search.score(best) + CLAIM:
             return
         best = larger[0]
+        for name in best.hypothesis.names:  # what goes better with the others?
+            search.extended(_bare(best, best.hypothesis.minus(name)), 6)
+        best = search.of_size(size + 1)[0]
         size += 1
-
-
-def leave_one_out(fit: Fit, trial_of: Array) -> tuple[Array, Array]:
-    """Values without each trial (S, C), and that trial's rss under them (S,): one Newton step each."""
-    trials = np.unique(trial_of)
-    C = fit.gram.shape[-1]
-    prior = np.diag(fit.prior)
-    total = fit.gram.sum(axis=0)
-    shifts, rss = np.zeros((len(trials), C)), np.zeros(len(trials))
-    for i, trial in enumerate(trials):
-        own = trial_of == trial
-        G, s = fit.gram[own].sum(axis=0), fit.score[own].sum(axis=0)
-        if C:
-            shifts[i] = np.linalg.lstsq(total - G + prior, s, rcond=1e-10)[0]
-        rss[i] = fit.rss[own].sum() + 2 * s @ shifts[i] + shifts[i] @ G @ shifts[i]
-    return shifts, rss
-
-
-_ = itertools

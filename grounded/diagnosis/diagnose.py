@@ -1,0 +1,403 @@
+"""START HERE: the sim-to-real gap, diagnosed. Trials and a crude model in, a verdict out.
+
+    limits       what can't be known from these data
+    attribution  which effects, by evidence                      (effects/, scan, refine, noise)
+    leftover     what no effect explains
+    gap          where the gap lies: channels, times, regions
+    shrinkage    how far it shrinks on trials that were left out
+    excitation   what to run next, where two explanations tie
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from grounded.diagnosis.attribution import CLAIM, TIE, Search, attribute
+from grounded.diagnosis.data import Data, prepare
+from grounded.diagnosis.gap import by_region, by_time, explained, horizon, normalised
+from grounded.diagnosis.hypothesis import Hypothesis, param_scale
+from grounded.diagnosis.intervals import standard_deviations
+from grounded.diagnosis.leftover import Leftover, leftovers
+from grounded.diagnosis.limits import Limits, knowable, limits
+from grounded.diagnosis.refine import Fit, calibrated
+from grounded.diagnosis.report import (
+    Diagnosis,
+    Estimate,
+    Kind,
+    Ranked,
+    Remainder,
+    meaning,
+    number,
+)
+from grounded.diagnosis.shrinkage import gaps_of, held_out, shrinkage, whole_runs
+from grounded.effects import Effect, Library, ParamFamily, SensorDelayFamily, SensorFamily
+from grounded.model import Model
+from grounded.task import Task
+from grounded.trial import Trial
+
+RANKED = 12  # explanations that are listed
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to diagnose.
+
+    Args:
+        library: the families that may be blamed.
+        max_effects: at most so many at once.
+        horizon: how far ahead predictions are judged [s].
+    """
+
+    library: Library = Library()
+    max_effects: int = 3
+    horizon: float = 1.0
+
+
+def diagnose(
+    subject: Task | Model,
+    trials: Sequence[Trial],
+    options: Options | None = None,
+    *,
+    progress: Callable[[str], None] | None = None,
+) -> Diagnosis:
+    """Where the gap between a model and real trials lies, which effect makes it, how far it shrinks.
+
+    Args:
+        subject: the task (its latency counts as modelled) or the bare model.
+        trials: real runs on one time grid, whatever policy they ran.
+        options: library, number of effects, horizon.
+        progress: called with a word at every stage, for a display.
+
+    Raises:
+        GroundedError: for trials that don't fit the model, or with nothing in them.
+    """
+    options, tick = options or Options(), progress or (lambda word: None)
+    model = subject.model if isinstance(subject, Task) else subject
+    latency = subject.latency if isinstance(subject, Task) else None
+    past = subject.past if isinstance(subject, Task) else None
+    data = prepare(model, trials, latency, past)
+    known = limits(data)
+    tick("candidates")
+    candidates = knowable(data, options.library.candidates(model, data.scales), ())
+    search, best = attribute(data, candidates, max_effects=options.max_effects, tick=tick)
+    tick("leftover")
+    left = leftovers(search.predictor, best)
+    return _Writer(search, best, left, known, options, tick).diagnosis()
+
+
+class _Writer:
+    """Turns a search into a Diagnosis."""
+
+    def __init__(
+        self,
+        search: Search,
+        best: Fit,
+        left: list[Leftover],
+        known: Limits,
+        options: Options,
+        tick: Callable[[str], None],
+    ) -> None:
+        self.search, self.best, self.left, self.known = search, best, left, known
+        self.options, self.tick = options, tick
+        self.predictor, self.data = search.predictor, search.data
+        self.null = search.best_null()
+        self.names = best.hypothesis.names
+        self.base = search.score(self.null)
+
+    def diagnosis(self) -> Diagnosis:
+        data, predictor = self.data, self.predictor
+        self.tick("gap")
+        where = horizon(predictor, self.best, self.options.horizon)
+        track = self.track()
+        shrunk = shrinkage(predictor, self.best, track, where)
+        gain = explained(predictor, Hypothesis(), self.best)
+        if self.left:
+            i = data.model.state_names.index(self.left[0].channel)
+            gain = gain.copy()
+            gain[..., i] += self.left[0].improvement
+        ranking = self.ranking(track, where, shrunk.gap_before)
+        groups = self.groups()
+        remainder = tuple(self.remainder(left) for left in self.left)
+        kind, sentence = self.verdict(shrunk.gap_before, shrunk.gap_after, ranking, groups, remainder)
+        named = () if kind in ("none",) or self.known.no_cause else self.names
+        return Diagnosis(
+            kind=kind,
+            effects=named,
+            sentence=sentence,
+            channels=tuple(self.channels(gain, shrunk.before, where.spread)),
+            times=tuple(by_time(gain.sum(axis=-1), data)),
+            regions=tuple(by_region(gain.sum(axis=-1), predictor, self.best)),
+            ranking=ranking,
+            indistinguishable=groups,
+            gap={
+                "horizon_s": where.steps * data.dt,
+                "unit": "noise-normalised rms",
+                "before": shrunk.gap_before,
+                "after": shrunk.gap_after,
+                "floor": 1.0,
+                "held_out": data.count > 1,
+                "channels": self.by_channel(shrunk.before, shrunk.after, where.spread),
+            },
+            leftover=remainder,
+            next_trial=self.next_trial(groups),
+            unknowable=self.known.sentences,
+            noise=self.noise(),
+            whole_run=self.whole_run(track),
+            parameters=self.parameters(),
+            trials=data.count,
+            steps=data.steps,
+            candidates=len(self.search.candidates),
+        )
+
+    def track(self) -> Any:
+        """Filtered states that predictions start from: of the best hypothesis, in what is logged."""
+        sensors = [
+            e for e in self.best.hypothesis.effects
+            if isinstance(e.family, SensorFamily | SensorDelayFamily)
+        ]
+        return self.null.track if sensors else self.best.track
+
+    def ranking(self, track: Any, where: Any, before: float) -> tuple[Ranked, ...]:
+        """The claimed effects first (by what would be lost without each), then what lost."""
+        search, rows = self.search, []
+        parts = self.parts()
+        after = normalised(held_out(self.predictor, self.best, track, where), where)
+        for name in sorted(self.names, key=lambda n: -parts[n]):
+            rows.append(self._row(self.best, name, parts[name], after, before, claimed=True))
+        singles = [f for f in search.of_size(1) if f.hypothesis.names[0] not in self.names]
+        singles = singles[: max(RANKED - len(rows), 3)]
+        gaps = gaps_of(self.predictor, singles, track, where)
+        for fit, gap in zip(singles, gaps, strict=True):
+            name = fit.hypothesis.names[0]
+            evidence = search.score(fit) - self.base
+            rows.append(self._row(fit, name, evidence, gap, before, claimed=False))
+        return tuple(rows)
+
+    def parts(self) -> dict[str, float]:
+        """What the evidence loses without each claimed effect."""
+        search, found = self.search, {}
+        whole = search.score(self.best)
+        for name in self.names:
+            rest = tuple(sorted(n for n in self.names if n != name))
+            fits = [f for f in search.of_size(len(rest)) if tuple(sorted(f.hypothesis.names)) == rest]
+            found[name] = whole - max([search.score(f) for f in fits] or [self.base])
+        return found
+
+    def _row(
+        self, fit: Fit, name: str, evidence: float, gap: float, before: float, *, claimed: bool
+    ) -> Ranked:
+        index = fit.hypothesis.names.index(name)
+        effect = fit.hypothesis.effects[index]
+        return Ranked(
+            effect=name,
+            params=self.estimates(fit)[index],
+            fixed=effect.fixed,
+            evidence=evidence,
+            gap_after=gap,
+            shrinkage=1 - gap / before if before > 0 else 0.0,
+            claimed=claimed,
+        )
+
+    def estimates(self, fit: Fit) -> list[dict[str, Estimate]]:
+        """Values with intervals, effect by effect."""
+        stds, halves = standard_deviations(fit, self.data.trial_of)
+        found, at = [], 0
+        for effect, values in zip(fit.hypothesis.effects, fit.hypothesis.values, strict=True):
+            some = {}
+            for q in effect.free:
+                v, s, w = float(values[q.name]), float(stds[at]), float(halves[at])
+                some[q.name] = Estimate(v, s, v - w, v + w, q.unit)
+                at += 1
+            found.append(some)
+        return found
+
+    def groups(self) -> tuple[tuple[str, ...], ...]:
+        """For each claimed effect, what could stand in its place within a few nats (three in all)."""
+        found = []
+        whole = self.search.score(self.best)
+        for name in self.names:
+            rest = set(self.names) - {name}
+            rivals = [
+                f for f in self.search.of_size(len(self.names))
+                if rest <= set(f.hypothesis.names) and name not in f.hypothesis.names
+            ]
+            close = [f for f in rivals if whole - self.search.score(f) < TIE]
+            others = [next(n for n in f.hypothesis.names if n not in rest) for f in close[:2]]
+            if others:
+                found.append((name, *others))
+        return tuple(found)
+
+    def remainder(self, left: Leftover) -> Remainder:
+        """A leftover with the region where it acts."""
+        size = left.correction**2 * self.data.valid.T
+        regions = by_region(size, self.predictor, self.best, 1)
+        return Remainder(
+            left.channel, left.size, left.unit, left.gain, regions[0] if regions else None
+        )
+
+    def verdict(
+        self,
+        before: float,
+        after: float,
+        ranking: tuple[Ranked, ...],
+        groups: tuple[tuple[str, ...], ...],
+        remainder: tuple[Remainder, ...],
+    ) -> tuple[Kind, str]:
+        left = "; ".join(r.sentence() for r in remainder[:2])
+        if self.known.no_cause:
+            return "unknown", f"No cause is named: {self.known.sentences[0]}."
+        if not self.names and not remainder:
+            if self.null.hypothesis.spread > 0:
+                return self._calibration(before)
+            return "none", (
+                f"The model explains the data down to the noise (predictions {number(before)} times "
+                "what noise alone makes)."
+            )
+        if not self.names:
+            return "unknown", f"A gap remains that no known effect explains: {left}."
+        row = {r.effect: r for r in ranking}
+        effects = {e.name: e for e in self.best.hypothesis.effects}
+        because = "; ".join(meaning(effects[n], row[n].params) for n in sorted(
+            self.names, key=lambda n: -row[n].evidence))
+        sentence = (
+            f"{because[:1].upper()}{because[1:]}. Held-out predictions improve from {number(before)} "
+            f"to {number(after)} times the noise."
+        )
+        for group in groups:
+            sentence += f" The data can't tell {' from '.join(group)}."
+        if remainder:
+            sentence += f" Something is left that no known effect explains: {left}."
+        return ("effect" if len(self.names) == 1 else "several"), sentence
+
+    def _calibration(self, before: float) -> tuple[Kind, str]:
+        """The model's form is right, its numbers are not."""
+        shift = self.null.hypothesis.shift
+        assert shift is not None
+        model = self.data.model
+        relative = shift / np.where(model.values == 0, 1.0, np.abs(model.values))
+        worst = np.argsort(-np.abs(relative))[:3]
+        listed = ", ".join(f"{model.param_names[i]} by {relative[i]:+.1%}" for i in worst)
+        return "several", (
+            f"The model's form explains the data; several of its parameters are off, most of all "
+            f"{listed}: run `grounded fit`."
+        )
+
+    def channels(self, gain: Any, error: Any, spread: Any) -> list[dict[str, Any]]:
+        """Each state's part of the gap."""
+        data = self.data
+        excess = np.maximum(gain.sum(axis=(0, 1)), 0.0)
+        share = excess / max(float(excess.sum()), 1e-12)
+        rms = np.sqrt(np.nanmean(error**2, axis=0))
+        rows = [
+            {
+                "name": name,
+                "share": float(share[i]),
+                "rms": float(rms[i]),
+                "unit": data.model.states[name],
+                "noise": float(np.sqrt((spread[:, i] ** 2).mean())),
+            }
+            for i, name in enumerate(data.model.state_names)
+        ]
+        return sorted(rows, key=lambda row: -float(row["share"]))
+
+    def by_channel(self, before: Any, after: Any, spread: Any) -> dict[str, Any]:
+        """The gap of each state, noise-normalised."""
+        found = {}
+        for i, name in enumerate(self.data.model.state_names):
+            b, a = (
+                float(np.sqrt(np.nanmean((e[:, i] / spread[:, i]) ** 2))) for e in (before, after)
+            )
+            found[name] = {"before": b, "after": a}
+        return found
+
+    def parameters(self) -> dict[str, Estimate]:
+        """Values of the model's parameters where they were calibrated beside the effects."""
+        h, model = self.best.hypothesis, self.data.model
+        if h.spread == 0 or h.shift is None:
+            return {}
+        stds, halves = standard_deviations(self.best, self.data.trial_of)
+        scale, k = param_scale(model), len(h.theta)
+        found = {}
+        for at, index in enumerate(calibrated(self.data)):
+            value = float(model.values[index] + h.shift[index])
+            std, half = (float(a[k + at] * scale[index]) for a in (stds, halves))
+            name = model.param_names[index]
+            found[name] = Estimate(value, std, value - half, value + half, model.params[name].unit)
+        return found
+
+    def noise(self) -> dict[str, Any]:
+        """The noise as it was estimated."""
+        noise, names = self.best.noise, self.data.model.state_names
+        q, r = np.exp(0.5 * noise.log_q), np.exp(0.5 * noise.log_r)
+        return {
+            "process": {n: float(v) for n, v in zip(names, q, strict=True)},
+            "measurement": {n: float(v) for n, v in zip(names, r, strict=True)},
+            "correlation_s": noise.structure.tau,
+            "outliers": not isinstance(noise.weight_v, float),
+        }
+
+    def whole_run(self, track: Any) -> dict[str, Any]:
+        """Errors of predictions from the first state to the end of each run."""
+        names = self.data.model.state_names
+        before = whole_runs(self.predictor, Hypothesis(), track)
+        after = whole_runs(self.predictor, self.best.hypothesis, track)
+        return {
+            n: {"before": float(b), "after": float(a), "unit": self.data.model.states[n]}
+            for n, b, a in zip(names, before, after, strict=True)
+        }
+
+    def next_trial(self, groups: tuple[tuple[str, ...], ...]) -> str:
+        """A sentence; `excitation.probe` makes the trial itself."""
+        if self.known.no_cause:
+            return "Run two or more trials in which every input changes."
+        if groups:
+            return (
+                f"Run a probe that tells {' from '.join(groups[0])}: "
+                + " ".join(distinguishing(groups[0]))
+            )
+        if not self.names and self.left:
+            return (
+                f"Repeat a trial twice with the same inputs to see whether the leftover in "
+                f"{self.left[0].channel} repeats."
+            )
+        return "Nothing is tied: go on with the search, or adopt the effect first."
+
+
+HINTS = {
+    "dead_zone": "sweep it slowly through zero and hold small commands",
+    "stall": "sweep it slowly through zero and hold small commands",
+    "stiction": "start and stop often, from small commands",
+    "coulomb_friction": "coast down from different speeds",
+    "viscous_friction": "hold several speeds, slow and fast",
+    "quadratic_drag": "hold several speeds, slow and fast",
+    "delay": "step the input sharply, by different amounts",
+    "first_order_lag": "step the input sharply, by different amounts",
+    "rate_limit": "step the input by small and large amounts",
+    "input_bias": "use commands of both signs and of different size",
+    "input_gain": "use small and large commands",
+    "input_fade": "repeat the same manoeuvre early and late in one trial",
+    "understeer": "drive the same curve slowly and fast",
+    "rate_gain": "drive the same curve slowly and fast",
+    "sensor_bias": "start from different headings and reverse direction",
+    "patch": "cross the same places at other speeds and directions",
+    "slope": "drive the same way in several headings",
+}
+
+
+def distinguishing(group: Sequence[str]) -> list[str]:
+    """What to do in a trial that tells a group apart, in words."""
+    found = []
+    for name in group:
+        family, _, target = name.partition(":")
+        hint = HINTS.get(family)
+        text = f"{hint} ({target})." if hint else ""
+        if text and text not in found:
+            found.append(text)
+    return found or ["excite every input over its whole range."]
+
+
+__all__ = ["CLAIM", "Diagnosis", "Effect", "Options", "ParamFamily", "diagnose"]

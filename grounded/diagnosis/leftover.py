@@ -1,0 +1,190 @@
+"""What no effect explains: is there a gap left, in which channel, where, how large?
+
+A flexible reference model is given the chance to predict what the best hypothesis leaves: for each
+channel a correction of its rate, linear in features that no engineer would name,
+
+    bins and powers of every input, what was commanded up to 0.3 s ago, products of inputs with each
+    other, with dynamic states and with parts of the trial, bins of time, direction of motion.
+
+Its columns are whitened by the filter of the best hypothesis and solved by ridge regression on all
+trials but one; what counts is the likelihood gained on the trial left out. Noise, however coloured
+or heavy, gains nothing there. A correction that does gain is a leftover: stated with its channel, its
+size and the region where it acts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from grounded.diagnosis import filter as kalman
+from grounded.diagnosis.hypothesis import Predictor
+from grounded.diagnosis.refine import Fit, noise_entry
+from grounded.effects import places
+from grounded.frozen import Array
+
+CLAIM = 5.0  # nats gained on held-out trials from which a leftover is stated
+PENALTIES = (3.0, 30.0)  # ridge: prior variances of the whitened columns' weights, relative
+LAGS = (1, 2, 4, 7)  # steps
+RHO_LAGS = 10
+
+
+@dataclass(frozen=True, eq=False)
+class Leftover:
+    """What remains in one channel: gain [nats] on held-out trials, size [unit/s] rms of the rate."""
+
+    channel: str
+    gain: float
+    size: float
+    unit: str
+    correction: Array  # (L, B) the rate that the flexible model adds
+    improvement: Array  # (L, B) held-out gain of each step [nats]
+
+
+def leftovers(predictor: Predictor, fit: Fit) -> list[Leftover]:
+    """The channels in which a flexible model predicts held-out trials better, most first."""
+    data = predictor.data
+    if data.count < 2:
+        return []
+    features = flexible(predictor, fit)
+    found = []
+    for i, name in enumerate(data.model.state_names):
+        gain, step_gain, weights = _channel(predictor, fit, features, i)
+        if gain > CLAIM:
+            correction = features @ weights
+            size = float(np.sqrt((correction**2 * data.valid.T).sum() / data.valid.sum()))
+            unit = data.model.states[name]
+            found.append(Leftover(name, gain, size, f"{unit}/s", correction, step_gain))
+    return sorted(found, key=lambda left: -left.gain)
+
+
+def flexible(predictor: Predictor, fit: Fit) -> Array:
+    """Features of every step, (L, B, K), each of unit size."""
+    data, h = predictor.data, fit.hypothesis
+    model = data.model
+    x, u = fit.track[:-1], predictor.inputs(h)
+    names = [n for n in places.dynamic(model) if n in model.state_names]
+    states = [_scaled(x[..., model.state_names.index(n)]) for n in names][:6]
+    inputs = [_scaled(u[..., j]) for j in range(model.m)]
+    lagged = [_scaled(np.abs(_late(u[..., j], k)) * np.sign(_late(u[..., j], k)))
+              for j in range(model.m) for k in LAGS]
+    clock = data.time / max(float(data.time.max()), data.dt)
+    columns: list[Array] = [np.ones_like(clock)]
+    for value in inputs:
+        columns += [value, value**2, value**3, np.maximum(value, 0), np.abs(value)]
+        columns += _bins(value, 10)
+        columns += [value * (clock > part) for part in (0.33, 0.5, 0.67)]
+    columns += lagged
+    columns += [s for s in states] + [s**2 for s in states] + [s**3 for s in states]
+    columns += [a * b for k, a in enumerate(inputs) for b in inputs[k + 1 :]]
+    columns += [a**2 * np.sign(b) for a in inputs for b in inputs if a is not b]
+    columns += [a * b for a in inputs for b in states]
+    columns += [np.tanh(3 * _scaled(_rate(s))) for s in states]
+    columns += _bins(clock, 16)
+    stacked = np.stack(columns, axis=-1)
+    size = np.sqrt((stacked**2).mean(axis=(0, 1)))
+    return np.asarray(stacked / np.where(size > 1e-9, size, 1.0))
+
+
+def _scaled(value: Array) -> Array:
+    """Zero mean, unit spread, clipped to three."""
+    spread = float(value.std())
+    return np.clip((value - value.mean()) / (spread if spread > 1e-12 else 1.0), -3, 3)
+
+
+def _late(value: Array, steps: int) -> Array:
+    return np.concatenate([np.repeat(value[:1], steps, axis=0), value[:-steps]])[: len(value)]
+
+
+def _rate(value: Array) -> Array:
+    """Backward difference: what is known at the time."""
+    return np.concatenate([np.zeros_like(value[:1]), np.diff(value, axis=0)])
+
+
+def _bins(value: Array, count: int) -> list[Array]:
+    """1 inside each of `count` bins of equal width."""
+    edges = np.linspace(float(value.min()), float(value.max()) + 1e-9, count + 1)
+    pairs = zip(edges[:-1], edges[1:], strict=True)
+    inside = [((value >= a) & (value < b)).astype(float) for a, b in pairs]
+    return [column for column in inside if column.mean() > 0.01]
+
+
+def _channel(
+    predictor: Predictor, fit: Fit, features: Array, i: int
+) -> tuple[float, Array, Array]:
+    """Held-out gain of correcting one channel's rate: total, by step (L, B); weights on all trials."""
+    data = predictor.data
+    gains = filter_of(predictor, fit)
+    L, B, K = features.shape
+    n = data.model.n
+    d = np.zeros((L, B, n, K))
+    d[:, :, i, :] = features * data.dt
+    white, _ = kalman.innovations(gains, d, np.zeros((L + 1, 1, 1, 1)))
+    trials = np.unique(data.trial_of)
+    grams, scores = [], []
+    for trial in trials:
+        own = data.trial_of == trial
+        W = white[:, own].reshape(-1, K)
+        grams.append(W.T @ W)
+        scores.append(W.T @ fit.white[:, own].reshape(-1))
+    G, s = np.sum(grams, axis=0), np.sum(scores, axis=0)
+    scale = np.sqrt(np.maximum(np.diag(G), 1e-300))
+    best: tuple[float, Array, Array] = (-np.inf, np.zeros((L, B)), np.zeros(K))
+    for spread in PENALTIES:
+        prior = np.diag(scale**2) / spread  # the columns' own size: a weight explains `spread` nats
+        total, by_step = 0.0, np.zeros((L, B))
+        for trial, Gt, st in zip(trials, grams, scores, strict=True):
+            weights = -np.linalg.solve(G - Gt + prior + 1e-12 * np.eye(K), s - st)
+            own = data.trial_of == trial
+            change = white[:, own] @ weights
+            residual = fit.white[:, own]
+            gained = 0.5 * (residual**2 - (residual + change) ** 2).sum(axis=-1)
+            by_step[:, own] = gained
+            total += float(gained.sum())
+        if total > best[0]:
+            best = (total, by_step, -np.linalg.solve(G + prior + 1e-12 * np.eye(K), s))
+    return best
+
+
+def filter_of(predictor: Predictor, fit: Fit) -> kalman.Gains:
+    """The gains of a fit's filter."""
+    data = predictor.data
+    L, B = data.time.shape
+    n = data.model.n
+    flat_x = np.ascontiguousarray(fit.track[:-1].reshape(-1, n))
+    flat_u = np.ascontiguousarray(predictor.inputs(fit.hypothesis).reshape(-1, data.model.m))
+    F, _ = data.model.system.linearise(flat_x, flat_u, predictor.params(fit.hypothesis), data.dt)
+    G = noise_entry(predictor, fit.hypothesis, fit.track)
+    A = kalman.transition(F.reshape(L, B, n, n), fit.noise.structure.phi(data.dt), G)
+    noise = fit.noise
+    return kalman.gains(
+        A, noise.process(data.dt), noise.measurement(L), data.seen, noise.start(B), G
+    )
+
+
+def whiteness(fit: Fit, seen: Array) -> dict[str, float]:
+    """Ljung-Box of each channel's whitened innovations over 10 lags: p-values by index."""
+    found = {}
+    L, _, n = fit.white.shape
+    lags = min(RHO_LAGS, L // 4)
+    for i in range(n):
+        e = fit.white[..., i] * seen[1:, :, i]
+        count, power = float(seen[1:, :, i].sum()), float((e**2).sum())
+        q = 0.0
+        for k in range(1, lags + 1):
+            rho = float((e[k:] * e[:-k]).sum()) / max(power, 1e-300)
+            q += rho**2 / max(count - k, 1.0)
+        q *= count * (count + 2)
+        found[str(i)] = chi2_tail(q, lags)
+    return found
+
+
+def chi2_tail(q: float, dof: int) -> float:
+    """P(chi2_dof > q), by Wilson and Hilferty's cube root."""
+    from math import erfc, sqrt
+
+    if dof <= 0 or q <= 0:
+        return 1.0
+    z = ((q / dof) ** (1 / 3) - (1 - 2 / (9 * dof))) / sqrt(2 / (9 * dof))
+    return 0.5 * erfc(z / sqrt(2))

@@ -1,0 +1,92 @@
+"""What the data cannot tell, said before anything is claimed.
+
+A state that never moved, an input that never changed, a single trial, a handful of steps: an effect
+there may exist and can't be known, so it is not offered and the reader is told.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from grounded.diagnosis.data import Data
+from grounded.diagnosis.refine import Fit
+from grounded.effects import Effect, InputFamily, MemoryFamily, RateFamily, SensorFamily
+
+FEW_STEPS = 30
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What can't be known: sentences, and whether they forbid to name a cause."""
+
+    sentences: tuple[str, ...]
+    no_cause: bool
+
+
+def limits(data: Data) -> Limits:
+    """What the trials are too few or too quiet for."""
+    found, no_cause = [], False
+    if data.count < 2:
+        found.append(
+            "one trial: nothing can be confirmed on another, so no cause is named; run a second one"
+        )
+        no_cause = True
+    if data.steps < FEW_STEPS:
+        found.append(
+            f"{data.steps} steps in all are too few to tell an effect from noise; record "
+            f"{FEW_STEPS} or more"
+        )
+        no_cause = True
+    still = constant_inputs(data)
+    for name in still:
+        found.append(f"input {name} never changed: nothing can be said of its actuator")
+    if len(still) == data.model.m:
+        no_cause = True
+    if data.skipped:
+        found.append(f"{data.skipped} stretches of the trials were left out, to bound memory")
+    empty = [n for i, n in enumerate(data.model.state_names) if not data.seen[..., i].any()]
+    for name in empty:
+        found.append(f"state {name} was never measured")
+    return Limits(tuple(found), no_cause)
+
+
+def constant_inputs(data: Data) -> list[str]:
+    """Inputs that took one value in every trial."""
+    names = data.model.input_names
+    return [
+        name
+        for j, name in enumerate(names)
+        if float(np.ptp(np.concatenate([data.commands[i, :T, j] for i, T in enumerate(data.lengths)])))
+        <= 1e-9 * max(data.scales.peak(name), 1e-12)
+    ]
+
+
+def quiet_states(data: Data, fit: Fit) -> list[str]:
+    """States whose filtered track moved less than their measurement noise."""
+    noise = np.exp(0.5 * fit.noise.log_r)
+    moved = fit.track.reshape(-1, data.model.n).std(axis=0)
+    return [n for n, m, v in zip(data.model.state_names, moved, noise, strict=True) if m < 2 * v]
+
+
+def knowable(data: Data, effects: Sequence[Effect], quiet: Sequence[str]) -> tuple[Effect, ...]:
+    """The effects that these data could show at all."""
+    still = set(constant_inputs(data))
+    dull = set(quiet)
+    dead = {n for i, n in enumerate(data.model.state_names) if not data.seen[..., i].any()}
+    kept = []
+    for effect in effects:
+        targets = {part for t in effect.site.targets for part in t.split("<-")}
+        family = effect.family
+        if isinstance(family, InputFamily | MemoryFamily) and targets & still:
+            continue
+        proportional = family.name not in ("offset", "trend", "periodic", "patch", "slope")
+        proportional = proportional and family.name not in ("drift_world", "drift_body")
+        if isinstance(family, RateFamily) and proportional and targets & dull:
+            continue
+        if isinstance(family, SensorFamily) and targets & dead:
+            continue
+        kept.append(effect)
+    return tuple(kept)
