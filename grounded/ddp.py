@@ -152,7 +152,7 @@ def _search(
     """The first alpha that keeps its promise, or a higher regularisation."""
     gains, alphas = found.gains, np.float64(0.5) ** np.arange(options.halvings + 1)
     predicted = gains.d1 + gains.d2
-    for some in (alphas[:4], alphas[4:]):
+    for some in (alphas[:1], alphas[1:5], alphas[5:]):  # the first is nearly always enough
         swarm = problem.system.rollout(problem, state.u, gains.K, state.z, gains.k, some)
         enough = swarm.cost - state.cost <= options.accept * (some * gains.d1 + some**2 * gains.d2)
         if enough.any():

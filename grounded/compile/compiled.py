@@ -213,13 +213,15 @@ class CompiledSystem(TracedSystem):
         if self.m > MAX_INPUTS:
             return super().backward(problem, z, u, damping)
         H, nz = problem.horizon, problem.nz
-        k, K, expected = np.zeros((H, self.m)), np.zeros((H, self.m, nz)), np.zeros(2)
+        k, K, expected = np.empty((H, self.m)), np.empty((H, self.m, nz)), np.zeros(2)
         z, u, damping = _plain(z), _plain(u), _plain(damping)
         words = self._packed(problem) | {"z_run": z, "u_run": u, "damping": damping}
         words |= {"k": k, "K": K, "expected": expected}
         kernel = self._compiled(problem.p, problem.dt).search(self._layout(problem))["sweep"]
         failed = call(kernel, SWEEP, words)
-        if failed < 0 and not np.isfinite(K[0]).all():
+        if failed >= 0:
+            k[: failed + 1], K[: failed + 1] = 0.0, 0.0
+        elif not np.isfinite(K[0]).all():
             failed = 0
         return Backward(k, K, float(expected[0]), float(expected[1]), failed)
 

@@ -219,7 +219,7 @@ class Lanes:
         return base, flipped
 
     def asin(self, x: str) -> str:
-        """The arcsine, NaN outside [-1, 1]: beyond 1/2, pi/2 - 2 asin(sqrt((1 - |x|) / 2))."""
+        """The arcsine, NaN outside [-1, 1]; beyond 1/2 by the root of half of what is left to 1."""
         f, w = self.f, self.width
         size, half = f.call("fabs", [x], w), self.const(0.5)
         large = f.compare("ogt", size, half, w)

@@ -1,0 +1,84 @@
+"""The benchmark's two problems, as grounded sees them and as files for its peers.
+
+    car       n = 6 + 2 previous inputs, m = 2, H = 200: 10 s on a circle at 20 Hz
+    aircraft  n = 12 + 4, m = 4, H = 3000: the 60 s figure-8 of section 5.1 at 50 Hz
+
+No limits on the inputs (plain DDP peers have none). Everybody starts from the same rollout.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from models import CAR_INPUTS, CAR_PARAMS, CAR_STATES, car
+
+from grounded import Model, Param
+from grounded.compile import Problem
+from grounded.experiments.car_tasks import car_task
+from grounded.experiments.figure8 import flight_task
+from grounded.first_guess import first_guess
+from grounded.models.aircraft import model as aircraft_model
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A problem and the trajectory that every solver starts from."""
+
+    name: str
+    problem: Problem
+    u: np.ndarray
+    z: np.ndarray
+
+    def save(self, folder: Path) -> Path:
+        """The case as arrays, for the peers."""
+        p = self.problem
+        path = folder / f"{self.name}.npz"
+        np.savez(
+            path, name=self.name, p=p.p, dt=p.dt, start=p.start, past=p.past, target=p.target,
+            weight=p.state_weight, R=p.input_weight, S=p.change_weight, u=self.u, z=self.z,
+        )  # fmt: skip
+        return path
+
+
+def smooth_car() -> Model:
+    """The car without indicator terms."""
+
+    def rate(s, a, p):
+        x = [s[name] for name in CAR_STATES]
+        values = car(x, [a.steering, a.throttle], [p[name] for name in CAR_PARAMS], np)
+        return dict(zip(CAR_STATES, values, strict=True))
+
+    return Model(
+        name="smooth car",
+        states=dict.fromkeys(CAR_STATES, "1"),
+        inputs=dict.fromkeys(CAR_INPUTS, "1"),
+        params={name: Param(value) for name, value in CAR_PARAMS.items()},
+        angles=("psi",),
+        roles={"position": ("x", "y"), "heading": "psi", "speed": "v"},
+        derivative=rate,
+    )
+
+
+def cases(names=("car", "aircraft")) -> list[Case]:
+    """Both problems with their starts."""
+    found = []
+    for name in names:
+        if name == "car":
+            task = car_task("circle", smooth_car())
+            task = dataclasses.replace(task, latency=np.zeros(2))
+        else:
+            task = flight_task(aircraft_model)
+        free = np.full(task.model.m, np.inf)
+        problem = dataclasses.replace(task.problem(), low=-free, high=free)
+        target = np.nan_to_num(problem.target)
+        problem = dataclasses.replace(problem, target=target, smoothing=0.0)
+        if name == "car":  # the inputs of the steady circle, open loop: about 0.5 m off at the end
+            run = problem.system.rollout(problem, np.tile([0.32, 0.55], (problem.horizon, 1)))
+        else:
+            guess = first_guess(task)
+            run = problem.system.rollout(problem, guess.inputs, guess.gain, guess.z[:-1])
+        found.append(Case(name, problem, run.u[0], run.z[0]))
+    return found

@@ -1,0 +1,270 @@
+"""The engine against its peers: ratios in one run, by hand.
+
+    python -m venv /tmp/peers && /tmp/peers/bin/pip install numpy casadi crocoddyl jax
+    python benchmarks/run.py --peers /tmp/peers/bin/python
+
+Every solver gets the same problem (cases.py), the same start, and has to reach the best known cost
+to a part in 10^4. Times are CPU times of the solve alone, least of several; building a problem,
+tracing and compiling are told apart. trajax is not in the registry: its place is taken by the same
+algorithm written in JAX. Parts: solve, horizon, size, swarm, memory, process; all by default.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+import platform
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+HERE = Path(__file__).parent
+PARTS = ("solve", "horizon", "size", "swarm", "memory", "process")
+PEERS = ("crocoddyl", "casadi", "jax")
+
+
+def cpu(function, repeats=20):
+    """Least CPU seconds of a few calls."""
+    times = []
+    for _ in range(repeats):
+        start = time.process_time()
+        function()
+        times.append(time.process_time() - start)
+    return min(times)
+
+
+def our_solve(case, iterations, tolerance=0.0):
+    from grounded.ddp import Options, solve
+
+    options = Options(max_iterations=iterations, tolerance=tolerance)
+    return solve(case.problem, case.u, options=options)
+
+
+def our_row(case):
+    """Our time, iterations and cost, and the marginal cost of an iteration."""
+    from peer_data import CLOSE
+
+    best = our_solve(case, 50, 1e-10).cost
+    iterations = next(i for i in range(1, 50) if our_solve(case, i).cost <= best * (1 + CLOSE))
+    ms = 1e3 * cpu(lambda: our_solve(case, iterations))
+    more = 1e3 * cpu(lambda: our_solve(case, iterations + 4))
+    return best, {
+        "peer": "grounded",
+        "case": case.name,
+        "ms": ms,
+        "iterations": iterations,
+        "cost": our_solve(case, iterations).cost,
+        "iteration_ms": (more - ms) / 4,
+    }
+
+
+def peer_rows(case, best, python, folder, fatrop):
+    """What each peer prints, or why it printed nothing."""
+    path = case.save(folder)
+    calls = [[peer] for peer in PEERS] + ([["casadi", "fatrop"]] if fatrop else [])
+    for peer, *extra in calls:
+        command = [python, f"peer_{peer}.py", str(path), repr(best), *extra]
+        done = subprocess.run(command, cwd=HERE, capture_output=True, text=True, check=False)
+        if done.returncode == 0:
+            yield json.loads(done.stdout.strip().splitlines()[-1])
+        else:
+            why = (done.stderr.strip().splitlines() or ["no output"])[-1]
+            yield {"peer": peer, "case": case.name, "missing": why}
+
+
+def solve_part(options):
+    from cases import cases
+
+    with tempfile.TemporaryDirectory() as folder:
+        for case in cases():
+            best, ours = our_row(case)
+            print(f"\n{case.name}: H = {case.problem.horizon}, nz = {case.problem.nz}")
+            show(ours, ours)
+            if options.peers:
+                rows = peer_rows(case, best, options.peers, Path(folder), options.fatrop)
+                for row in rows:
+                    show(row, ours)
+
+
+def show(row, ours):
+    if "missing" in row:
+        print(f"  {row['peer']:<24} not measured: {row['missing']}")
+        return
+    text = f"  {row['peer']:<24} {row.get('version', ''):<8} {row['ms']:10.3f} ms"
+    text += f"  {row['iterations']} iterations, cost {row['cost']:.6g}, ratio {row['ms'] / ours['ms']:.1f}"
+    if "backward_ms" in row:
+        ratio = row["backward_ms"] / ours["iteration_ms"]
+        text += (
+            f"; its backward pass alone {row['backward_ms']:.3f} ms, {ratio:.1f} of our iterations"
+        )
+    if "iteration_ms" in row:
+        text += f"; an iteration {row['iteration_ms']:.3f} ms"
+    if "build_s" in row:
+        text += f"; builds for {row['build_s']:.1f} s"
+    print(text)
+
+
+def stretched(problem, H):
+    """Level flight for H steps: the same problem at any length."""
+    return dataclasses.replace(
+        problem,
+        bias=np.zeros((H, problem.system.n)),
+        target=np.tile(problem.target[:1], (H + 1, 1)),
+        state_weight=np.tile([0.0, 0.0, 1.0] + [0.0] * 9, (H + 1, 1)),
+        input_target=np.zeros((H, problem.system.m)),
+    )
+
+
+def horizon_part(options):
+    from cases import cases
+
+    from grounded.ddp import Options, solve
+
+    case = cases(["aircraft"])[0]
+    print("\nCPU of 3 iterations against the horizon (aircraft, level flight)")
+    for H in (200, 500, 1000, 2000, 5000, 10_000, 20_000):
+        problem = stretched(case.problem, H)
+        u = np.tile(problem.past, (H, 1))
+        some = Options(max_iterations=3, tolerance=0.0)
+        seconds = cpu(lambda p=problem, u=u: solve(p, u, options=some), 5)
+        print(f"  H = {H:6d}  {1e3 * seconds:9.3f} ms  {1e6 * seconds / H:6.3f} us a step")
+
+
+def network(n, m=4, H=300):
+    """A chain of n coupled states as a problem."""
+    from grounded.compile import Problem, system_of
+
+    rng = np.random.default_rng(n)
+    A = rng.normal(size=(n, n)) / n * (np.abs(np.subtract.outer(np.arange(n), np.arange(n))) <= 1)
+    B = rng.normal(size=(n, m))
+    states, inputs = [f"x{i}" for i in range(n)], [f"u{j}" for j in range(m)]
+
+    def rate(s, a, p):
+        x, u = np.array([s[k] for k in states]), np.array([a[k] for k in inputs])
+        return dict(zip(states, A @ np.sin(x) - x + B @ u, strict=True))
+
+    system = system_of(
+        rate, kind="derivative", states=states, inputs=inputs, params=(), integrator="rk4"
+    )
+    free, zeros = np.full(m, np.inf), np.zeros
+    return Problem(
+        system, p=zeros(0), dt=0.02, start=np.ones(n), past=zeros(m), delay=zeros(m),
+        bias=zeros((H, n)), target=zeros((H + 1, n)), state_weight=np.ones((H + 1, n)),
+        input_target=zeros((H, m)), input_weight=np.ones(m), change_weight=np.ones(m),
+        low=-free, high=free, angles=zeros(n, bool),
+    )  # fmt: skip
+
+
+def size_part(options):
+    from grounded.ddp import solve
+
+    print("\nCPU of a whole solve against the state (a chain, m = 4, H = 300)")
+    for n in (4, 8, 12, 16, 24, 32, 40):
+        problem = network(n)
+        u = np.zeros((300, 4))
+        start = time.process_time()
+        result = solve(problem, u)
+        first = time.process_time() - start
+        ms = 1e3 * cpu(lambda p=problem, u=u: solve(p, u), 5)
+        print(
+            f"  n = {n:3d}  {ms:8.3f} ms  {len(result.trace)} iterations; first call {first:.2f} s"
+        )
+
+
+def swarm_part(options):
+    from cases import cases
+
+    from grounded.ddp import Options, solve
+
+    case, rng = cases(["car"])[0], np.random.default_rng(0)
+    p = case.problem.p
+    models = [p * rng.uniform(0.95, 1.05, len(p)) for _ in range(1000)]
+
+    def all_of_them():
+        for values in models:
+            problem = dataclasses.replace(case.problem, p=values)
+            solve(problem, case.u, options=Options(tolerance=1e-6))
+
+    print(f"\n1000 perturbed cars solved in one process: {cpu(all_of_them, 3):.3f} s of CPU")
+
+
+def memory_part(options):
+    code = (
+        "import resource, sys; sys.path[:0] = sys.argv[1:]\n"
+        "import numpy as np\nfrom cases import cases\nfrom run import stretched\n"
+        "from grounded.ddp import Options, solve\n"
+        "case = cases(['aircraft'])[0]\n"
+        "problem = stretched(case.problem, 20_000)\n"
+        "solve(problem, np.tile(problem.past, (20_000, 1)), options=Options(max_iterations=10))\n"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)"
+    )
+    command = [sys.executable, "-c", code, str(HERE), str(HERE.parent)]
+    peak = subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    print(f"\nPeak memory of a process that solves H = 20,000, n = 16: {float(peak):.0f} MB")
+
+
+def spent(command, environment):
+    """CPU seconds of a process and its children."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    subprocess.run(command, env=environment, check=True, capture_output=True)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def process_part(options):
+    """Whole processes: `grounded propose` on the aircraft, cold and warm, and importing."""
+    python = sys.executable
+    with tempfile.TemporaryDirectory() as folder:
+        environment = os.environ | {"GROUNDED_CACHE": str(Path(folder) / "cache")}
+        grounded = [python, "-m", "grounded_cli.main"]
+        bare = min(spent([python, "-c", "pass"], environment) for _ in range(5))
+        print(f"\nWhole processes, CPU seconds (bare python: {bare:.3f})")
+        imported = min(
+            spent([python, "-c", "import grounded_cli.main"], environment) for _ in range(5)
+        )
+        print(f"  import grounded_cli.main    {imported:.3f}  ({imported - bare:.3f} over bare)")
+        made = Path(folder) / "flight"
+        subprocess.run(
+            [*grounded, "init", str(made), "--example", "flight-figure8"],
+            check=True, capture_output=True, env=environment,
+        )  # fmt: skip
+        for name in ("cold", "warm", "warm", "warm"):
+            for candidate in (made / "candidates").glob("*"):
+                candidate.unlink()  # or the outstanding one is proposed again
+            seconds = spent([*grounded, "propose", "-C", str(made)], environment)
+            print(f"  propose, aircraft, {name}     {seconds:.3f}")
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--peers", help="a Python that has the peers")
+    parser.add_argument(
+        "--fatrop", action="store_true", help="CasADi with fatrop too (slow to build)"
+    )
+    parser.add_argument("parts", nargs="*", help=f"of {', '.join(PARTS)}")
+    options = parser.parse_args()
+    sys.path[:0] = [
+        str(HERE),
+        str(HERE.parent),
+        str(HERE.parent / "cli"),
+        str(HERE.parent / "trials"),
+    ]
+    versions = f"Python {platform.python_version()}, NumPy {np.__version__}"
+    import llvmlite
+
+    print(
+        f"{versions}, llvmlite {llvmlite.__version__}, {platform.processor() or platform.machine()}"
+    )
+    for part in options.parts or PARTS:
+        globals()[f"{part}_part"](options)
+
+
+if __name__ == "__main__":
+    main()
