@@ -43,6 +43,7 @@ class Browser:
         self._at = f"{base}/session/{session}"
 
     def open(self, path: Path) -> None:
+        self.devtools("Emulation.setFocusEmulationEnabled", {"enabled": True})
         _call("POST", f"{self._at}/url", {"url": path.resolve().as_uri()})
 
     def resize(self, width: int, height: int) -> None:
