@@ -82,6 +82,8 @@ def linearised(problem: Problem, z: Array, u: Array) -> Quadratic:
             f"got {z.shape} and {u.shape}"
         )
     sent = queue_of(problem).effective(z[:-1], u)
+    sent = sent if problem.input_shift is None else sent - problem.input_shift
+    sent = sent if problem.input_shift is None else sent - problem.input_shift
     x = np.ascontiguousarray(z[:-1, : problem.system.n])
     f_x, f_u = problem.system.linearise(x, sent, problem.p, problem.dt, problem.smoothing)
     return quadratic(problem, z, u, f_x, f_u)
@@ -120,7 +122,7 @@ def ascent(task: Task, policy: Policy, grounding: Grounding) -> Policy:
         policy: theta, that ran the trial.
         grounding: the trial as the biased model replays it.
     """
-    problem = task.problem(grounding.bias)
+    problem = grounding.on(task.problem())
     found = gradient(problem, grounding.z, grounding.inputs, policy)
     scale = input_scale(problem)
     d = -_descended(problem, grounding, found.inputs) / scale
@@ -190,6 +192,8 @@ def run_class(problem: Problem, policy: ParametricPolicy, theta: Array) -> Run:
             asked = policy.inputs(z[t : t + 1, :n], np.array([t * problem.dt]), theta)[0]
             u[t] = np.clip(asked, problem.low, problem.high)
             sent = queue.effective(z[t], u[t])
+            if problem.input_shift is not None:
+                sent = sent - problem.input_shift[t]
             x = problem.system.step(
                 z[t : t + 1, :n], sent[None], problem.p, problem.dt, problem.smoothing
             )

@@ -41,6 +41,7 @@ def test_rollout_sweep_and_solve_agree(name, delay, limit):
         "low": np.full(m, -limit),
         "high": np.full(m, limit),
         "smoothing": 0.05,
+        "input_shift": 0.02 * np.random.default_rng(3).normal(size=(37, m)) if delay else None,
     }
     fast, slow = pair(name, **changes)
     assert (fast.system.how, slow.system.how) == ("compiled", "traced")
@@ -173,6 +174,7 @@ def test_too_many_operations_are_not_compiled(monkeypatch):
     import grounded.compile as package
 
     monkeypatch.setattr(package, "MAX_COMPILED", 20)
+    monkeypatch.setattr("grounded.compile.compiled.SMALL", 0)
     task = problem("car")
     assert task.system.how == "traced" and "operations" in task.system.note
     with pytest.raises(TooLong):

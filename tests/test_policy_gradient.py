@@ -55,7 +55,8 @@ def differences(cost, theta, h=1e-6):
 @pytest.mark.parametrize(("name", "delay"), CASES)
 def test_open_loop(name, delay):
     m = len(SPECS[name]["inputs"])
-    task = problem(name, 15, delay=np.full(m, delay), smoothing=0.1)
+    shift = np.full((15, m), 0.05)
+    task = problem(name, 15, delay=np.full(m, delay), smoothing=0.1, input_shift=shift)
     u = 0.4 + 0.1 * np.random.default_rng(1).normal(size=(15, m))
     z = task.system.rollout(task, u).z[0]
     near = differences(lambda v: float(task.system.rollout(task, v).cost[0]), u)

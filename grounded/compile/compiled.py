@@ -1,9 +1,9 @@
 """The fast path: the user's function as machine code.
 
-One module holds the kernels that a search needs (step, rollout, linearise, sweep), another the
-sensitivities that a fit needs, made when they are first asked for. Parameters, bias, targets and
-weights are arguments: one compile serves every trial, every perturbed model, every fit. What can't
-be compiled at all, or would take too long to, is left to the interpreted twin (`traced.py`).
+Three modules, each made when it is first asked for: steps and Jacobians of many samples; rollouts
+and sweeps about one layout of z (its delays); the sensitivities that a fit needs. Parameters, bias,
+targets and weights are arguments: one compile serves every trial, every perturbed model, every fit.
+What can't be compiled, or would take too long to, is left to the interpreted twin (`traced.py`).
 """
 
 from __future__ import annotations
@@ -12,7 +12,8 @@ import ctypes
 import hashlib
 import struct
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -32,72 +33,77 @@ from grounded.compile.system import Backward, Swarm
 from grounded.compile.traced import TracedSystem, Variant
 from grounded.compile.tracing import Signature, Trace
 
+SMALL = 600  # operations of a model that need not be counted with their derivatives
 FORMAT = 1  # raise when kernels change their words or their meaning
 
 
 class Kernels:
-    """The compiled modules of one trace."""
+    """The compiled modules of one trace, each made (or loaded) when it is first called."""
 
     def __init__(self, variant: Variant, system: CompiledSystem) -> None:
-        n, m, k = system.n, system.m, system.k
-        kind, integrator = system.kind, system.integrator
-        self.small = dynamics_of(variant, n, m, n + m, kind, integrator)
-        self._wide = dynamics_of(variant, n, m, n + m + k, kind, integrator)
-        self._k = k
-        graph = variant.trace.graph
-        nodes = [*variant.trace.outputs, *(i for _, _, i in variant.entries)]
-        places = [(r, c) for r, c, _ in variant.entries]
+        n, m, k = self.sizes = (system.n, system.m, system.k)
+        self._variant, self._kind, self._integrator = variant, system.kind, system.integrator
+        graph = variant.trace.graph.digest(variant.trace.outputs)  # its derivatives follow from it
         self._key = (
-            f"{FORMAT} {jit.writers()} {graph.digest(nodes)} {places} {n} {m} {kind} {integrator}"
+            f"{FORMAT} {jit.writers()} {graph} {n} {m} {k} {system.kind} {system.integrator}"
         )
         self._libraries: dict[Any, jit.Library] = {}
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
+
+    @cached_property
+    def dynamics(self) -> Dynamics:
+        """Values and derivatives by state and input."""
+        return self._dynamics(self.sizes[0] + self.sizes[1])
+
+    def _dynamics(self, width: int) -> Dynamics:
+        n, m, _ = self.sizes
+        return dynamics_of(self._variant, n, m, width, self._kind, self._integrator)
+
+    def batch(self) -> jit.Library:
+        """Step and linearise, of many samples."""
+        return self._library("batch", ("step", "linearise", "jacobian"), self._batch_text)
 
     def search(self, layout: Layout) -> jit.Library:
-        """Step, linearise, rollout and (for few enough inputs) sweep."""
-        return self._library(layout, self.small, layout)
-
-    def any_search(self) -> jit.Library:
-        """A library with step and linearise, whatever its layout."""
-        with self._lock:
-            for key, known in self._libraries.items():
-                if key != "full":
-                    return known
-        d = self.small
-        return self.search(Layout(d.n, (1,) * d.m, (False,) * d.n))
+        """Rollout and, for few enough inputs, sweep; about a layout of z."""
+        names = ("rollout", "sweep") if layout.m <= MAX_INPUTS else ("rollout",)
+        return self._library(layout, names, lambda: self._search_text(layout))
 
     def full(self) -> jit.Library:
         """Linearise with respect to the parameters as well."""
-        return self._library("full", self._wide, None)
+        return self._library("full", ("linearise",), self._full_text)
 
-    def _library(self, key: Any, d: Dynamics, layout: Layout | None) -> jit.Library:
+    def _library(self, key: Any, names: Sequence[str], write: Callable[[], str]) -> jit.Library:
+        known = self._libraries.get(key)
+        if known is not None:
+            return known
         with self._lock:
             if key not in self._libraries:
-                names = ["linearise"]
-                if layout is not None:
-                    names += ["step", "rollout"] + ["sweep"] * (layout.m <= MAX_INPUTS)
                 digest = hashlib.sha256(f"{self._key} {key}".encode()).hexdigest()
-                self._libraries[key] = jit.library(
-                    digest, lambda: _module(d, layout, self._k), names
-                )
+                self._libraries[key] = jit.library(digest, write, names)
             return self._libraries[key]
 
+    def _batch_text(self) -> str:
+        d, width = self.dynamics, jit.lanes()
+        kernels = (
+            jacobian_function(d, width) + linearise_kernel(d, width, 0) + step_kernel(d, width)
+        )
+        return _start_of_module(d, width) + kernels
 
-def _module(d: Dynamics, layout: Layout | None, k: int) -> str:
-    """The IR text of a module: for a search about a layout, or of the sensitivities."""
-    width = jit.lanes()
-    parts = [
-        declarations({width, LANES}),
-        stage_tables(d),
-        d.uniforms.function(),
-        jacobian_function(d, width),
-        linearise_kernel(d, width, 0 if layout is not None else k),
-    ]
-    if layout is not None:
-        parts += [step_kernel(d, width), rollout_kernel(d, layout)]
-        if layout.m <= MAX_INPUTS:
-            parts += [sweep_tables(d), box_functions(layout.m), sweep_kernel(d, layout, width)]
-    return "".join(parts)
+    def _full_text(self) -> str:
+        d, width = self._dynamics(sum(self.sizes)), jit.lanes()
+        kernels = jacobian_function(d, width) + linearise_kernel(d, width, self.sizes[2])
+        return _start_of_module(d, width) + kernels
+
+    def _search_text(self, layout: Layout) -> str:
+        d, width = self.dynamics, jit.lanes()
+        text = _start_of_module(d, width) + rollout_kernel(d, layout)
+        if layout.m > MAX_INPUTS:
+            return text
+        return text + sweep_tables(d) + box_functions(layout.m) + sweep_kernel(d, layout, width)
+
+
+def _start_of_module(d: Dynamics, width: int) -> str:
+    return declarations({width, LANES}) + stage_tables(d) + d.uniforms.function()
 
 
 def call(function: Any, names: Sequence[str], values: Mapping[str, Any]) -> int:
@@ -133,8 +139,9 @@ class CompiledSystem(TracedSystem):
 
     @property
     def operations(self) -> int:
-        """Operations of the model and its derivatives, 0 while no branch of it is traced."""
-        return max((variant.operations for variant in self._variants), default=0)
+        """Operations of the model and its derivatives where it is large; 0 says it is small."""
+        large = [v for v in self._variants if len(v.trace.graph.nodes) > SMALL]
+        return max((variant.operations() for variant in large), default=0)
 
     def _compiled(self, p: Array, dt: float) -> Kernels:
         variant = self.variant(p, dt)
@@ -146,7 +153,7 @@ class CompiledSystem(TracedSystem):
     def step(self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0) -> Array:
         """See `System.step`."""
         out = np.empty((len(x), self.n))
-        library = self._compiled(p, dt).any_search()
+        library = self._compiled(p, dt).batch()
         self._batch(library["step"], (x, u, p, dt, smoothing), {"out": out})
         return out
 
@@ -156,7 +163,7 @@ class CompiledSystem(TracedSystem):
         """See `System.linearise`."""
         N, n = len(x), self.n
         f_x, f_u = np.zeros((N, n, n)), np.zeros((N, n, self.m))
-        library = self._compiled(p, dt).any_search()
+        library = self._compiled(p, dt).batch()
         self._batch(library["linearise"], (x, u, p, dt, smoothing), {"f_x": f_x, "f_u": f_u})
         return f_x, f_u
 
@@ -217,8 +224,9 @@ class CompiledSystem(TracedSystem):
         z, u, damping = _plain(z), _plain(u), _plain(damping)
         words = self._packed(problem) | {"z_run": z, "u_run": u, "damping": damping}
         words |= {"k": k, "K": K, "expected": expected}
-        kernel = self._compiled(problem.p, problem.dt).search(self._layout(problem))["sweep"]
-        failed = call(kernel, SWEEP, words)
+        kernels = self._compiled(problem.p, problem.dt)
+        words["jacobian"] = kernels.batch().addresses["jacobian"]
+        failed = call(kernels.search(self._layout(problem))["sweep"], SWEEP, words)
         if failed >= 0:
             k[: failed + 1], K[: failed + 1] = 0.0, 0.0
         elif not np.isfinite(K[0]).all():
@@ -232,11 +240,12 @@ class CompiledSystem(TracedSystem):
         """The words that a problem gives every kernel; its arrays are kept alive beside them."""
         known = problem.__dict__.get("_packed")
         if known is None:
-            queue = queue_of(problem)
+            queue, shift = queue_of(problem), problem.input_shift
             arrays = {
                 "start": problem.z_start(),
                 "p": problem.p,
                 "bias": problem.bias,
+                "shift": np.zeros((problem.horizon, self.m)) if shift is None else shift,
                 "target": problem.target,
                 "weight": problem.state_weight,
                 "input_target": problem.input_target,

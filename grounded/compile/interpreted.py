@@ -90,6 +90,8 @@ class Interpreted(ABC):
                     u[:, t] += wrapped(z[:, t] - zbar[t], problem.angles) @ K[t].T
                 u[:, t] = np.clip(u[:, t], problem.low, problem.high)
                 sent = queue.effective(z[:, t], u[:, t])
+                if problem.input_shift is not None:
+                    sent = sent - problem.input_shift[t]
                 x = self.step(z[:, t, :n], sent, problem.p, problem.dt, problem.smoothing)
                 z[:, t + 1, :n] = x + problem.bias[t]
                 z[:, t + 1, n:] = queue.after(z[:, t, n:], u[:, t])
@@ -98,6 +100,7 @@ class Interpreted(ABC):
     def backward(self, problem: Problem, z: Array, u: Array, damping: Array) -> Backward:
         """See `System.backward`."""
         sent = queue_of(problem).effective(z[:-1], u)
+        sent = sent if problem.input_shift is None else sent - problem.input_shift
         x = np.ascontiguousarray(z[:-1, : self.n])
         with np.errstate(all="ignore"):
             f_x, f_u = self.linearise(x, sent, problem.p, problem.dt, problem.smoothing)

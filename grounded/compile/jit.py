@@ -74,8 +74,9 @@ class Library:
     def __init__(self, engine: Any, names: Sequence[str]) -> None:
         self._engine = engine
         prototype = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_void_p)
+        self.addresses = {name: int(engine.get_function_address(name)) for name in names}
         self.functions: dict[str, Callable[[int], int]] = {
-            name: prototype(engine.get_function_address(name)) for name in names
+            name: prototype(address) for name, address in self.addresses.items()
         }
 
     def __getitem__(self, name: str) -> Callable[[int], int]:

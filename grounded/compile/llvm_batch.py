@@ -107,7 +107,7 @@ def linearise_kernel(d: Dynamics, width: int, k: int) -> str:
     with f.loop(blocks) as block:
         first, inputs = f.integer("mul", block, width), f.at(xu, d.n * width)
         gather_rows(f, [(x, d.n, xu), (u, d.m, inputs)], first, count, width)
-        f.do(f"call void @jacobian(ptr {xu}, ptr {table}, ptr {following}, ptr {values})")
+        f.do(f"call i64 @jacobian(ptr {xu}, ptr {table}, ptr {following}, ptr {values})")
         left = f.integer("sub", count, first)
         full = f.emit(f"icmp sgt i64 {left}, {width}")
         with f.loop(f.emit(f"select i1 {full}, i64 {width}, i64 {left}")) as lane:

@@ -114,6 +114,7 @@ class Linearised:
         n, m, nz = layout.n, layout.m, layout.nz
         self.table = start_table(f, words, d)
         self.soa = f.room((nz + m) * width)  # [z, u] of W steps
+        self.shift = f.room(m * width)  # of the received inputs
         self.xu, self.following = f.room((n + m) * width), f.room(n * width)
         self.jac = f.room((len(d.places) + 1) * width)  # the last is zero
         self.sums_room = f.room((n + m) * width)
@@ -130,14 +131,17 @@ class Linearised:
             first = f.integer("and", t, -w)
             u_soa = f.at(self.soa, layout.nz * w)
             z_run, u_run = self.words.pointer("z_run"), self.words.pointer("u_run")
-            gather_rows(f, [(z_run, layout.nz, self.soa), (u_run, layout.m, u_soa)], first, H, w)
+            shift = (self.words.pointer("shift"), layout.m, self.shift)
+            rows = [(z_run, layout.nz, self.soa), (u_run, layout.m, u_soa), shift]
+            gather_rows(f, rows, first, H, w)
             z = [f.load(self.soa, i * w, w) for i in range(layout.nz)]
             u = [f.load(u_soa, j * w, w) for j in range(layout.m)]
             sent = received(f, self.words, layout, z, u, w)
+            sent = [f.sub(v, f.load(self.shift, j * w, w), w) for j, v in enumerate(sent)]
             for i, value in enumerate([*z[: layout.n], *sent]):
                 f.store(value, self.xu, i * w, w)
             f.do(
-                f"call void @jacobian(ptr {self.xu}, ptr {self.table}, "
+                f"call i64 {self.words.pointer('jacobian')}(ptr {self.xu}, ptr {self.table}, "
                 f"ptr {self.following}, ptr {self.jac})"
             )
 

@@ -26,8 +26,9 @@ from grounded.compile.llvm_step import Dynamics
 from grounded.compile.llvm_text import Writer, number, splat
 
 SWEEP = (
-    *("z_run", "u_run", "p", "dt", "eps", "target", "weight", "input_target", "R", "S"),
-    *("low", "high", "now", "past", "damping", "H", "k", "K", "expected"),
+    *("z_run", "u_run", "shift", "p", "dt", "eps", "target", "weight", "input_target"),
+    *("R", "S"),
+    *("low", "high", "now", "past", "damping", "H", "k", "K", "expected", "jacobian"),
 )
 
 

@@ -1,6 +1,7 @@
 """Kernel: W runs of a problem side by side, one for each step length alpha.
 
-    u_t = clip( ubar_t + alpha k_t + K_t (z_t - zbar_t) ),   x_{t+1} = f(x_t, u_eff_t) + bias_t
+    u_t = clip( ubar_t + alpha k_t + K_t (z_t - zbar_t) )
+    x_{t+1} = f(x_t, u_eff_t - shift_t) + bias_t
 
 with the cost added up on the way. The lanes share the trajectory's data and differ in alpha; with
 fewer runs than lanes, one is repeated and not stored. K, zbar and k may be null.
@@ -17,6 +18,7 @@ from grounded.compile.llvm_text import Writer, number, splat
 
 ROLLOUT = (
     *("start", "ubar", "K", "zbar", "k", "alphas", "p", "dt", "eps", "bias", "target", "weight"),
+    "shift",
     *("input_target", "R", "S", "low", "high", "now", "past", "H", "runs", "z", "u", "cost"),
 )
 LANES = 4
@@ -188,8 +190,9 @@ class _Rollout:
         """From z_t to z_{t+1}."""
         f, layout, step = self.f, self.layout, self.step
         z, u = self._all(self.z, layout.nz), self._all(self.u, layout.m)
+        shift = self._row("shift", t, layout.m)
         for j, value in enumerate(received(f, self.words, layout, z, u, LANES)):
-            f.store(value, step.u, j * LANES, LANES)
+            f.store(f.sub(value, f.load_all(shift, j, LANES), LANES), step.u, j * LANES, LANES)
         for j, depth in enumerate(layout.depths):
             for i in range(depth):
                 f.store(

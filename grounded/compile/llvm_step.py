@@ -71,7 +71,7 @@ def dynamics_of(
     variant: Variant, n: int, m: int, width: int, kind: str, integrator: str
 ) -> Dynamics:
     """The dynamics with derivatives for the first `width` of x, u, p."""
-    entries = {(r, c): i for r, c, i in variant.entries if c < width}
+    entries = {(r, c): i for r, c, i in variant.entries(width)}
     stages = STAGES[integrator] if kind == "derivative" else ()
     return Dynamics(variant.trace.graph, variant.trace.outputs, entries, n, m, stages)
 
@@ -263,10 +263,10 @@ def stage_tables(d: Dynamics) -> str:
 
 
 def jacobian_function(d: Dynamics, width: int) -> str:
-    """`void @jacobian(xu, table, next, out)`: xu is [n + m][W], next [n][W], out [places][W]."""
-    f = Writer("internal void @jacobian(ptr %xu, ptr %table, ptr %next, ptr %out)")
+    """`i64 @jacobian(xu, table, next, out)`: xu is [n + m][W], next [n][W], out [places][W]."""
+    f = Writer("i64 @jacobian(ptr %xu, ptr %table, ptr %next, ptr %out)")
     writer = StepWriter(f, d, width, "%table")
     writer.x, writer.u, writer.next = "%xu", f.at("%xu", d.n * width), "%next"
     writer.jacobian("%out")
-    f.do("ret void")
+    f.do("ret i64 0")
     return f.text()

@@ -8,7 +8,7 @@ because two things need them: the cost of input CHANGES (u_t - u_{t-1}) and the 
 an input. D_j = max(1, ceil(delay_j)); with delay_j = d + phi (0 <= phi < 1, in steps) the actuator
 receives, under a zero-order hold, the mean over the step (1 - phi) u_j[t-d] + phi u_j[t-d-1].
 
-    x_{t+1} = f(x_t, u_eff_t) + bias_t
+    x_{t+1} = f(x_t, u_eff_t - input_shift_t) + bias_t
     J = sum_t  W_t |x_t - target_t|^2 + R |u_t - u_target_t|^2 + S |u_t - u_{t-1}|^2
         + W_H |x_H - target_H|^2,                         low <= u_t <= high
 
@@ -54,6 +54,7 @@ class Problem:
     low: Array  # (m,) hard limits, may be -inf
     high: Array  # (m,) may be +inf
     angles: NDArray[np.bool_]  # (n,)
+    input_shift: Array | None = None  # (H, m) off what the actuators receive, see `matching`
     smoothing: float = 0.0  # width of the smoothed indicator terms; 0: exact
 
     @property

@@ -11,6 +11,7 @@ the stages of Runge-Kutta: with k_i = f(x_i), x_i = x + c_i dt k_{i-1}, T_i = d 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -33,33 +34,42 @@ AGREE = 1e-9  # a trace and its original, relative to the size of the state's va
 
 
 class Variant:
-    """One trace and the programs made from it."""
+    """One trace; its derivatives and the programs made of them, when they are asked for."""
 
     def __init__(self, found: Trace, sizes: tuple[int, int, int]) -> None:
-        self.trace = found
+        self.trace, self.sizes = found, sizes
         self.values = Program(found.graph, found.outputs)
-        n, m, k = sizes
-        graph = found.graph
-        letters = [("x", i) for i in range(n)] + [("u", i) for i in range(m)]
-        letters += [("p", i) for i in range(k)]
-        variables = [graph.leaf(*letter) for letter in letters]
-        rows = jacobian(graph, found.outputs, variables)
-        column = {v: c for c, v in enumerate(variables)}
-        self.entries = sorted(
-            (r, column[v], i) for r, row in enumerate(rows) for v, i in row.items()
-        )
-        self.small = self._program(n + m)
-        self.full = self._program(n + m + k)
 
-    @property
+    def entries(self, width: int) -> list[tuple[int, int, int]]:
+        """(row, column, node) of the non-zero derivatives by the first `width` of x, u, p."""
+        graph = self.trace.graph
+        letters = [
+            (letter, i) for letter, size in zip("xup", self.sizes, strict=True) for i in range(size)
+        ]
+        variables = [graph.leaf(*letter) for letter in letters[:width]]
+        column = {v: c for c, v in enumerate(variables)}
+        rows = jacobian(graph, self.trace.outputs, variables)
+        return sorted((r, column[v], i) for r, row in enumerate(rows) for v, i in row.items())
+
+    @cached_property
+    def small(self) -> tuple[Program, list[tuple[int, int]]]:
+        """Values and derivatives by state and input."""
+        return self._program(self.sizes[0] + self.sizes[1])
+
+    @cached_property
+    def full(self) -> tuple[Program, list[tuple[int, int]]]:
+        """Values and derivatives by state, input and parameter."""
+        return self._program(sum(self.sizes))
+
     def operations(self) -> int:
-        """Nodes of the values and their derivatives."""
-        return len(self.trace.graph.live([*self.trace.outputs, *(i for _, _, i in self.entries)]))
+        """Nodes of the values and of their derivatives by state and input."""
+        entries = self.entries(self.sizes[0] + self.sizes[1])
+        return len(self.trace.graph.live([*self.trace.outputs, *(i for _, _, i in entries)]))
 
     def _program(self, width: int) -> tuple[Program, list[tuple[int, int]]]:
-        kept = [(r, c, i) for r, c, i in self.entries if c < width]
-        outputs = [*self.trace.outputs, *(i for _, _, i in kept)]
-        return Program(self.trace.graph, outputs), [(r, c) for r, c, _ in kept]
+        entries = self.entries(width)
+        outputs = [*self.trace.outputs, *(i for _, _, i in entries)]
+        return Program(self.trace.graph, outputs), [(r, c) for r, c, _ in entries]
 
 
 class TracedSystem(Interpreted):
