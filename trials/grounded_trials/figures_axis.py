@@ -41,12 +41,13 @@ class Axis:
         count = math.floor(self.high / step + 1e-9) - first + 1
         decimals = max(0, -math.floor(math.log10(step) + 1e-9))
         values = [(first + i) * step for i in range(count)]
-        return [(v, _text(v, decimals)) for v in values]
+        return [(v, _text(v, decimals, step)) for v in values]
 
 
-def _text(value: float, decimals: int) -> str:
+def _text(value: float, decimals: int, step: float) -> str:
     if abs(value) >= 1e5 or decimals > 5:
-        return f"{value:.3g}"
+        digits = math.log10(max(abs(value), step) / step)
+        return f"{value:.{max(2, math.ceil(digits - 1e-9) + 1)}g}".replace("-", "−")
     text = f"{value:.{decimals}f}"
     return text.replace("-", "−") if float(text) else f"{0:.{decimals}f}"
 
@@ -67,7 +68,7 @@ def _loss_ticks(low: float, high: float, most: int) -> list[tuple[float, str]]:
             break
     if len(values) < 2:
         return Axis(low, high).ticks(most)
-    return [(v, f"{v:g}".replace("-", "−")) for v in values]
+    return [(v, f"{v:g}".replace("-", "−")) for v in sorted(values)]
 
 
 def fitted(values: Iterable[Array], margin: float = 0.06) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""Fewer points for the same picture: what is left out moves no line by more than half a pixel.
+"""Fewer points for the same picture: what is left out lies within a pixel of what is drawn.
 
 First, of the points in one column of pixels only the first, lowest, highest and last are kept (so
 that no peak is lost). Then every second point that lies on the line between its neighbours is

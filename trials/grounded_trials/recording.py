@@ -185,4 +185,4 @@ def _size(findings: Findings, scene: Scene) -> float:
     states = findings.runs[0].trial.states if findings.runs else findings.task.target
     points = scene.points(states)
     points = points[np.isfinite(points).all(axis=1)]
-    return 0.07 * float(np.ptp(points, axis=0).max(initial=0.0) or 1.0)
+    return 0.07 * (float(np.ptp(points, axis=0).max()) or 1.0) if len(points) else 0.07
