@@ -83,7 +83,6 @@ def linearised(problem: Problem, z: Array, u: Array) -> Quadratic:
         )
     sent = queue_of(problem).effective(z[:-1], u)
     sent = sent if problem.input_shift is None else sent - problem.input_shift
-    sent = sent if problem.input_shift is None else sent - problem.input_shift
     x = np.ascontiguousarray(z[:-1, : problem.system.n])
     f_x, f_u = problem.system.linearise(x, sent, problem.p, problem.dt, problem.smoothing)
     return quadratic(problem, z, u, f_x, f_u)
