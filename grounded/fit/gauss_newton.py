@@ -17,7 +17,7 @@ from grounded.estimate import Noise
 from grounded.fit.innovations import Data, Linear, Point, linear, point
 from grounded.frozen import Array
 
-ENOUGH = 0.02  # [nats] a step that promises less is the last
+ENOUGH = 0.002  # [nats] a step that promises less, a sixteenth of a std, is the last
 NOTHING = 1e-9  # of the largest eigenvalue (scaled): below it the data say nothing
 
 
