@@ -11,11 +11,14 @@ from __future__ import annotations
 import importlib
 import os
 import sys
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small; threads only cost start-up
 
 import click
+
+if TYPE_CHECKING:
+    from click.shell_completion import CompletionItem
 
 # name -> (module, one line); in the order in which they are used
 COMMANDS = {
@@ -37,6 +40,7 @@ COMMANDS = {
     "demo": ("demo", "A whole example in an empty folder: learn, diagnose, report."),
     "experiment": ("experiment", "Run the paper's studies again."),
     "challenge": ("challenge", "Make or score blind cases for the diagnosis."),
+    "completion": ("completion", "Print the shell's completion script."),
 }
 
 
@@ -65,6 +69,13 @@ class LazyGroup(click.Group):
         from grounded.errors import nearest
 
         ctx.fail(f"no command '{name}': {nearest(name, COMMANDS)}")
+
+    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
+        """Names for the TAB key without importing any command."""
+        from grounded_cli.completion import commands
+
+        options = click.Command.shell_complete(self, ctx, incomplete)
+        return [*commands(COMMANDS, incomplete), *options]
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """The list of commands without importing any."""
