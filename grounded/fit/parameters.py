@@ -65,7 +65,6 @@ class Fit:
     latency: Array  # (m,) [s]
     noise: Noise
     loglik: float
-    loglik_start: float
     status: str  # converged, still rising, or why it stopped
     sentence: str
     before: PredictionError | None  # on held-out time; None: too little data to hold any out
@@ -125,7 +124,7 @@ def fit(
         )
     else:
         last = first
-    return _report(model, unknowns, first, last, before, after)
+    return _report(model, unknowns, last, before, after)
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +133,6 @@ class _Found:
     climb: Climb
     noise: Noise
     start_noise: Noise
-    loglik_start: float
     thresholds: NDArray[np.bool_]
     status: str
 
@@ -160,7 +158,7 @@ def _first(data: Data, rng: np.random.Generator) -> _Found:
     if not np.isfinite(rough.climb.at.loglik):
         return rough
     found = _search(data, rough.climb.at.theta, rough.noise, rng)
-    return replace(found, start_noise=rough.start_noise, loglik_start=np.nan)
+    return replace(found, start_noise=rough.start_noise)
 
 
 def _search(data: Data, theta: Array, noise: Noise | None, rng: np.random.Generator) -> _Found:
@@ -168,12 +166,9 @@ def _search(data: Data, theta: Array, noise: Noise | None, rng: np.random.Genera
     new = noise is None
     noise = _noise(data, theta, None, rng) if noise is None else noise
     at, start_noise = point(data, noise, theta), noise
-    loglik_start = at.loglik
     thresholds = np.zeros(len(theta), dtype=bool)
     if not np.isfinite(at.loglik):
-        return _Found(
-            data, _stopped(at), noise, noise, loglik_start, thresholds, at.filtered.status
-        )
+        return _Found(data, _stopped(at), noise, noise, thresholds, at.filtered.status)
     if new:
         at = _delays(data, noise, at)
     status = "still rising"
@@ -196,7 +191,7 @@ def _search(data: Data, theta: Array, noise: Noise | None, rng: np.random.Genera
         if there.loglik > at.loglik:
             at, noise = there, later
     found = Climb(at, linear(data, at), 0, status)
-    return _Found(data, found, noise, start_noise, loglik_start, thresholds, status)
+    return _Found(data, found, noise, start_noise, thresholds, status)
 
 
 def _stopped(at: Point) -> Climb:
@@ -285,7 +280,6 @@ def _judged(
 def _report(
     model: Model,
     unknowns: Unknowns,
-    first: _Found,
     last: _Found,
     before: PredictionError | None,
     after: PredictionError | None,
@@ -299,7 +293,6 @@ def _report(
         latency=latency,
         noise=last.noise,
         loglik=at.loglik,
-        loglik_start=first.loglik_start if last is first else np.nan,
         status=last.status,
         sentence=_sentence(unknowns, params, wide, last),
         before=before,
