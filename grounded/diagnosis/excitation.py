@@ -1,0 +1,211 @@
+"""What to run next: the probe that tells two explanations apart best.
+
+Two hypotheses A and B tie on the trials so far. Each of a set of probes (the base policy with a
+staircase, steps, doublets, a sweep of frequencies or a slow ramp added to one input) is run in the
+model with A; then B, its values free to adapt, tries to explain that run through the same filter and
+noise. What it fails to explain is the evidence that the probe is expected to bring:
+
+    E[log p(y | A) - log p(y | B)] = 1/2 |whitened innovations of B on A's run|^2
+
+The probe stays inside the inputs' limits, and both hypotheses' runs inside the task's safety bounds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from grounded.diagnosis.data import prepare, shifted
+from grounded.diagnosis.hypothesis import Hypothesis, Predictor
+from grounded.diagnosis.noise import Noise, Structure
+from grounded.diagnosis.refine import refine
+from grounded.diagnosis.report import Diagnosis
+from grounded.effects import Effect, Library, scales_of, wrap
+from grounded.frozen import Array
+from grounded.model import Model
+from grounded.policy import Policy, Runner
+from grounded.task import Task
+from grounded.trial import Trial
+
+SIZES = (0.15, 0.35)  # of the input's range
+
+
+@dataclass(frozen=True, eq=False)
+class Probe:
+    """A runnable policy, the evidence it is expected to bring [nats], and what it does."""
+
+    policy: Policy
+    expected: float
+    pair: tuple[str, str]
+    sentence: str
+
+
+def probe(
+    task: Task,
+    policy: Policy,
+    diagnosis: Diagnosis,
+    trials: Sequence[Trial],
+    library: Library | None = None,
+) -> Probe | None:
+    """The best probe for the first group that the data can't tell apart; None where nothing ties.
+
+    Args:
+        task: limits, start, safety, latency.
+        policy: what the probe is added to, usually the best policy so far.
+        diagnosis: names the group and the hypotheses' values.
+        trials: the trials it was made from (for the sizes of signals).
+        library: where the effects come from.
+    """
+    if not diagnosis.indistinguishable:
+        return None
+    group = diagnosis.indistinguishable[0]
+    first, second = _hypotheses(task, diagnosis, trials, library or Library(), group[0], group[1])
+    noise = _noise(task.model, diagnosis)
+    best: tuple[float, Policy, str] | None = None
+    for words, candidate in probes(policy, _inputs_of(task.model, (group[0], group[1]))):
+        runs = [_run(task, h, candidate) for h in (first, second)]
+        if any(run is None or not _safe(task, run) for run in runs):
+            continue
+        assert runs[0] is not None and runs[1] is not None
+        expected = min(
+            _evidence(task, runs[0], first, second, noise),
+            _evidence(task, runs[1], second, first, noise),
+        )
+        if best is None or expected > best[0]:
+            best = (expected, candidate, words)
+    if best is None:
+        return None
+    expected, chosen, words = best
+    sentence = (
+        f"{words}: expected to tell {group[0]} from {group[1]} by {expected:.1f} nats"
+        + (" (too little: try larger inputs or another manoeuvre)" if expected < 3 else "")
+    )
+    return Probe(chosen, expected, (group[0], group[1]), sentence)
+
+
+def probes(policy: Policy, inputs: Sequence[int]) -> Iterator[tuple[str, Policy]]:
+    """The base policy itself, then with each pattern added to each input."""
+    yield "the base policy once more", policy
+    t = np.arange(policy.horizon) * policy.dt
+    for j in inputs:
+        low, high = policy.low[j], policy.high[j]
+        room = float(high - low) if np.isfinite(high - low) else 2.0
+        for size in SIZES:
+            for words, shape in patterns(t):
+                feedforward = policy.feedforward.copy()
+                feedforward[:, j] = np.clip(feedforward[:, j] + size * room * shape, low, high)
+                name = policy.input_names[j]
+                yield f"{words} of {size * room:.2g} on {name}", replace(
+                    policy, feedforward=feedforward
+                )
+
+
+def patterns(t: Array) -> list[tuple[str, Array]]:
+    """Shapes of unit size over the times t (H,)."""
+    T = float(t[-1]) + 1e-9
+    phase = t / T
+    stairs = np.round(4 * np.sin(2 * np.pi * phase)) / 4
+    doublets = np.sign(np.sin(2 * np.pi * t / max(T / 5, 0.4)))
+    sweep = np.sin(2 * np.pi * (0.2 * t + 0.5 * (2.0 - 0.2) / T * t**2))
+    return [
+        ("a slow ramp down", -phase),
+        ("a slow ramp up", phase),
+        ("a staircase", stairs),
+        ("doublets", doublets),
+        ("a sweep of frequencies", sweep),
+        ("a pulse to the lower side", -((phase > 0.4) & (phase < 0.7)).astype(float)),
+    ]
+
+
+def _inputs_of(model: Model, names: Sequence[str]) -> list[int]:
+    """Inputs that the tied effects act on; all of them where they act on states."""
+    targets = {t for name in names for t in name.partition(":")[2].split("+")}
+    own = [j for j, n in enumerate(model.input_names) if n in targets]
+    return own or list(range(model.m))
+
+
+def _hypotheses(
+    task: Task,
+    diagnosis: Diagnosis,
+    trials: Sequence[Trial],
+    library: Library,
+    first: str,
+    second: str,
+) -> tuple[Hypothesis, Hypothesis]:
+    states = np.concatenate([trial.states for trial in trials])
+    inputs = np.concatenate([trial.inputs for trial in trials])
+    duration = max(trial.steps for trial in trials) * task.dt
+    scales = scales_of(task.model, states, inputs, task.dt, duration)
+    built: dict[str, Effect] = {}
+    for name in {*diagnosis.effects, first, second}:
+        built[name] = library.effect(name, task.model, scales)
+    rest = [n for n in diagnosis.effects if n not in (first, second)]
+    found = []
+    for name in (first, second):
+        h = Hypothesis()
+        for n in [*rest, name]:
+            h = h.plus(built[n], diagnosis.values(n))
+        found.append(h)
+    return found[0], found[1]
+
+
+def _noise(model: Model, diagnosis: Diagnosis) -> Noise:
+    def logs(kind: str) -> Array:
+        return np.array([2 * np.log(diagnosis.noise[kind][n] + 1e-12) for n in model.state_names])
+
+    q, r = logs("process"), logs("measurement")
+    return Noise(Structure(), q, r, q.copy(), np.full(model.n, -60.0))
+
+
+def _run(task: Task, h: Hypothesis, policy: Policy) -> Trial | None:
+    """A run of the policy in the model with a hypothesis, without noise; None if it diverges."""
+    model = task.model
+    for effect, values in zip(h.effects, h.values, strict=True):
+        current = Library((effect.family,)).effect(effect.name, model, effect.site.scales)
+        model = wrap(current, values, task.dt)
+    assert task.latency is not None
+    start = Trial(task.start[None], np.empty((0, task.model.m)), task.dt, task.model.state_names,
+                  task.model.input_names, start_inputs=task.past)
+    extra = _memory_start(model, task.model, start)
+    z, runner = np.concatenate([task.start, extra]), Runner(policy)
+    states, inputs = [task.start], np.zeros((policy.horizon, model.m))
+    for t in range(policy.horizon):
+        inputs[t] = runner.action(t * policy.dt, states[-1])
+        received = np.array([
+            shifted(inputs[None, : t + 1, j], task.past[j : j + 1], task.latency[j] / task.dt)[0, -1]
+            for j in range(model.m)
+        ])
+        z = model.system.step(z[None], received[None], model.values, task.dt)[0]
+        if not np.isfinite(z).all():
+            return None
+        states.append(z[: task.model.n])
+    return Trial(np.array(states), inputs, task.dt, task.model.state_names,
+                 task.model.input_names, start_inputs=task.past)
+
+
+def _memory_start(wrapped: Model, base: Model, trial: Trial) -> Array:
+    from grounded.effects import memory_start
+
+    return memory_start(wrapped, base, trial)
+
+
+def _safe(task: Task, run: Trial | None) -> bool:
+    if run is None or task.safety_low is None or task.safety_high is None:
+        return run is not None
+    inside = (run.states >= task.safety_low) & (run.states <= task.safety_high)
+    return bool(inside.all())
+
+
+def _evidence(task: Task, run: Trial, true: Hypothesis, rival: Hypothesis, noise: Noise) -> float:
+    """What the rival, its values free, fails to explain of a run [nats]."""
+    data = prepare(task.model, [run], task.latency, task.past)
+    predictor = Predictor(data)
+    rss = []
+    for h in (true, rival):
+        fits = refine(
+            predictor, [(h, noise, data.y.copy())], iterations=4, fixed_noise=True
+        )
+        rss.append(float(fits[0].rss.sum()) if fits else np.inf)
+    return max(0.5 * (rss[1] - rss[0]), 0.0)
