@@ -46,7 +46,7 @@ class StoredTrial:
     @property
     def is_data(self) -> bool:
         """A log that ran no candidate: for fitting and diagnosis only."""
-        return self.meta.get("kind") == "data"
+        return not self.trial.candidate
 
 
 class Workspace:
