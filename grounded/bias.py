@@ -3,18 +3,22 @@
     f_t^(i+1)(s, a) = f_t(s, a) + s_{t+1}^(i) - f_t(s_t^(i), a_t^(i))
 
 The bias is measured on one trial (or on the mean of repeated ones) and added to the model that was
-never changed by an earlier trial: errors do not pile up. In the biased model the trial's own policy
-gives the trial's own states, so derivatives are taken along the true states (section 4.1).
+never changed by an earlier trial: errors do not pile up. With an input shift rho (`matching.py`)
+the model is asked about s, a - rho_t and still replays the trial; rho = 0 is the paper's. In the
+biased model the trial's own policy gives the trial's own states, so derivatives are taken along the
+true states (section 4.1).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from grounded.compile import Problem
 from grounded.errors import GroundedError
 from grounded.frozen import Array
+from grounded.matching import input_shift
 from grounded.rollout import augmented
 from grounded.task import Task
 from grounded.trial import Trial
@@ -22,11 +26,16 @@ from grounded.trial import Trial
 
 @dataclass(frozen=True, eq=False)
 class Grounding:
-    """A trial as the biased model sees it: bias (H, n), z (H + 1, nz), inputs (H, m)."""
+    """A trial as the biased model sees it: bias (H, n), z (H + 1, nz), inputs and shift (H, m)."""
 
     bias: Array
     z: Array
     inputs: Array
+    shift: Array | None = None  # rho of `matching`, None for none
+
+    def on(self, problem: Problem) -> Problem:
+        """The problem with a model that replays the trial."""
+        return replace(problem, bias=self.bias, input_shift=self.shift)
 
 
 def effective_inputs(
@@ -46,13 +55,16 @@ def effective_inputs(
     return received
 
 
-def ground(task: Task, trial: Trial, *, exact: bool = False) -> Grounding:
+def ground(
+    task: Task, trial: Trial, *, exact: bool = False, match_inputs: bool = False
+) -> Grounding:
     """The bias that makes the task's model replay a trial (step 4).
 
     Args:
         task: gives the original model, with its latency.
         trial: a whole trial, finite for H steps; what follows is not used.
         exact: measure the bias of the exact model, not of the smoothed planning model.
+        match_inputs: book on the inputs what inputs can explain (`matching.py`).
 
     Raises:
         GroundedError: if the trial is short or not finite: its bias is not known to the end.
@@ -67,11 +79,13 @@ def ground(task: Task, trial: Trial, *, exact: bool = False) -> Grounding:
     past = task.past if trial.start_inputs is None else trial.start_inputs
     z = augmented(problem, trial.states, trial.inputs, past)
     received = effective_inputs(z, trial.inputs, problem.delay, problem.depths, task.model.n)
+    shift = input_shift(task.problem(), trial.states, received) if match_inputs else None
+    asked = received if shift is None else received - shift
     predicted = problem.system.step(
-        trial.states[:-1], received, problem.p, problem.dt, problem.smoothing
+        trial.states[:-1], asked, problem.p, problem.dt, problem.smoothing
     )
     # s_{t+1} - f(s_t, a_t); NOT wrapped: replay must land on the recorded number itself.
-    return Grounding(trial.states[1:] - predicted, z, trial.inputs)
+    return Grounding(trial.states[1:] - predicted, z, trial.inputs, shift)
 
 
 def residuals(task: Task, trial: Trial) -> Array:

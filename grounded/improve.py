@@ -109,7 +109,7 @@ def direction(
     """
     if options.method == "policy-gradient":
         return _gradient_direction(task, policy, grounding)
-    problem = task.problem(grounding.bias)
+    problem = grounding.on(task.problem())
     if options.step == "damped":
         problem = damped(problem, grounding.inputs, damping)
     gains = ddp.damped_step(problem, grounding.z, grounding.inputs, np.zeros(task.model.m)).gains
@@ -184,8 +184,10 @@ def _improvement(make: _Maker, incumbent: Tried, options: Options) -> Proposal:
     """
     planner, plan = make.planner, make.planner.plan
     own = planner.lift(mean_trial(incumbent.trials, planner.task.model.angle_mask))
-    grounding = ground(plan, own)
-    real = plan.problem(ground(plan, own, exact=True).bias, exact=True)
+    matched = options.match_inputs
+    grounding = ground(plan, own, match_inputs=matched)
+    exact = ground(plan, own, exact=True, match_inputs=matched)
+    real = exact.on(plan.problem(exact=True))
     theta = planner.widened(incumbent.candidate.policy)
     # Where a trial started off s_0, its utility is no measure for runs that start there: theta's
     # own run in the grounded model is. It replays the trial when the start was s_0.

@@ -38,6 +38,7 @@ class Options:
     method: Literal["ddp", "policy-gradient"] = "ddp"
     step: Literal["damped", "full"] = "damped"
     refit: bool = False
+    match_inputs: bool = True  # False: the paper's bias alone, see `matching`
     max_halvings: int = 6
     repeats: int = 1
     max_trials: int = 40

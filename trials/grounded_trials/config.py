@@ -139,6 +139,7 @@ def _search(table: Table) -> Options:
     method = table.choice("method", ("ddp", "policy-gradient"), defaults.method)
     step = table.choice("step", ("damped", "full"), defaults.step)
     options = {
+        "match_inputs": table.take("match_inputs", bool, defaults.match_inputs),
         "refit": table.take("refit", bool, defaults.refit),
         "max_halvings": table.take("max_halvings", int, defaults.max_halvings),
         "repeats": table.take("repeats", int, defaults.repeats),

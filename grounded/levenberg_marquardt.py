@@ -1,0 +1,84 @@
+"""Many small least-squares problems at once, each with its own damping.
+
+    minimise |r_i(w_i)|^2,  low <= w_i <= high,      i = 1 .. N, independent of each other
+
+Levenberg (1944), Marquardt (1963): (J'J + mu diag(J'J)) step = -J'r; mu falls by 5 after a step
+that lowers the error and rises by 5 after one that doesn't. Problems whose error is below `solved` rest.
+Bounds are kept by clipping the step. What is not finite counts as an infinite error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from grounded.frozen import Array
+
+Rows = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """residual(w, rows) -> (len(rows), k) and its jacobian -> (len(rows), k, q), for some rows."""
+
+    residual: Callable[[Array, Rows], Array]
+    jacobian: Callable[[Array, Rows], Array]
+    low: Array  # (q,)
+    high: Array  # (q,)
+    solved: float
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Unknowns w (N, q) and the squared errors (N,)."""
+
+    w: Array
+    error: Array
+
+    def better_of(self, other: Solution, rows: Rows) -> Solution:
+        """Row by row the smaller error; `other` holds only the given rows."""
+        chosen = other.error < self.error[rows]
+        w, error = self.w.copy(), self.error.copy()
+        w[rows[chosen]], error[rows[chosen]] = other.w[chosen], other.error[chosen]
+        return Solution(w, error)
+
+
+def solve(batch: Batch, w: Array, rows: Rows, iterations: int) -> Solution:
+    """Solves the given rows from w (len(rows), q)."""
+    now = Solution(np.clip(w, batch.low, batch.high), np.empty(len(rows)))
+    now = Solution(now.w, _error(batch.residual(now.w, rows)))
+    damping = np.full(len(rows), 1e-3)
+    for _ in range(iterations):
+        open_ = np.flatnonzero(now.error > batch.solved)
+        if not len(open_):
+            break
+        step = _step(batch, now.w[open_], rows[open_], damping[open_])
+        moved = np.clip(now.w[open_] + step, batch.low, batch.high)
+        error = _error(batch.residual(moved, rows[open_]))
+        better = error < now.error[open_]
+        now = now.better_of(Solution(moved, error), open_)
+        damping[open_] = np.clip(damping[open_] * np.where(better, 0.2, 5.0), 1e-9, 1e6)
+    return now
+
+
+def _error(r: Array) -> Array:
+    square = np.einsum("ik,ik->i", r, r)
+    return np.where(np.isfinite(square), square, np.inf)
+
+
+def _step(batch: Batch, w: Array, rows: Rows, damping: Array) -> Array:
+    r, J = batch.residual(w, rows), batch.jacobian(w, rows)
+    usable: NDArray[np.bool_] = np.asarray(
+        np.isfinite(J).all(axis=(1, 2)) & np.isfinite(r).all(axis=1)
+    )
+    J = np.where(usable[:, None, None], J, 0.0)
+    r = np.where(usable[:, None], r, 0.0)
+    normal = J.swapaxes(1, 2) @ J
+    index = np.arange(J.shape[2])
+    diagonal = normal[:, index, index] + 1e-9
+    normal[:, index, index] += damping[:, None] * diagonal + 1e-9
+    gradient = (r[:, None, :] @ J)[:, 0]
+    return np.asarray(-np.linalg.solve(normal, gradient[..., None])[..., 0])
