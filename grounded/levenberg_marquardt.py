@@ -3,8 +3,8 @@
     minimise |r_i(w_i)|^2,  low <= w_i <= high,      i = 1 .. N, independent of each other
 
 Levenberg (1944), Marquardt (1963): (J'J + mu diag(J'J)) step = -J'r; mu falls by 5 after a step
-that lowers the error and rises by 5 after one that doesn't. Problems whose error is below `solved` rest.
-Bounds are kept by clipping the step. What is not finite counts as an infinite error.
+that lowers the error and rises by 5 after one that doesn't. Problems whose error is below `solved`
+rest. Bounds are kept by clipping the step. What is not finite counts as an infinite error.
 """
 
 from __future__ import annotations

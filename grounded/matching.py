@@ -11,8 +11,9 @@ inputs can explain is booked on the inputs, and only the rest is added as a bias
 
 The model still replays the trial exactly, and its derivatives are still taken along the trial's own
 STATES (section 4.1 of the paper); rho = 0 is the paper's step 4. scale is the spread of each
-state's rate along the trial, span that of each input. rho is smoothed over WINDOW steps, since noise
-in the states would shake it. Measured on the car (docs/experiments.md): one trial closes what took five.
+state's rate along the trial, span that of each input. rho is smoothed over WINDOW steps, since
+noise in the states would shake it. Measured on the car (docs/experiments.md): one trial does what
+took five.
 """
 
 from __future__ import annotations

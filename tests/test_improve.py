@@ -142,7 +142,7 @@ def test_predictions_are_made_in_the_exact_model():
     assert first.predicted_utility == simulate(task.problem(exact=True), first.policy).utility
     trial = drive(task, Plant(other(task.model)), first)
     second = propose(task, [first], [trial], Options()).candidate
-    exact = task.problem(ground(task, trial, exact=True).bias, exact=True)
+    exact = ground(task, trial, exact=True, match_inputs=True).on(task.problem(exact=True))
     run = simulate(exact, second.policy)
     assert second.predicted_utility == run.utility
     np.testing.assert_array_equal(second.predicted_states, run.states)
