@@ -103,7 +103,7 @@ def test_processes_share_the_folder(home):
         "print(made.step(np.array([[0.3, -0.2]]), np.array([[0.1]]), p, 0.05).tobytes().hex())"
     )
     here = Path(__file__).parent
-    environment = os.environ | {"PYTHONPATH": str(here.parent)}
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     running = [
         subprocess.Popen(
             [sys.executable, "-c", code, str(here)],

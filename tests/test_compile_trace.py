@@ -207,7 +207,7 @@ def test_users_module_is_left_alone():
 def test_without_llvmlite_the_graph_is_interpreted(monkeypatch):
     from grounded.compile import jit
 
-    monkeypatch.setattr(jit, "available", lambda: False)
+    monkeypatch.setattr(jit, "trouble", lambda: "llvmlite can't be imported")
     system, (x, u, p) = make(with_where), points()
     assert system.how == "traced" and "llvmlite" in system.note
     assert np.allclose(system.step(x, u, p, 0.1), make(with_where).step(x, u, p, 0.1))

@@ -73,7 +73,7 @@ def test_infinite_horizon_gain_is_the_algebraic_riccati_solution():
 def test_one_sweep_solves_a_linear_problem(delay):
     task = problem("double_integrator", 25, delay=np.array([delay]))
     M, r = linear_least_squares(task)
-    best = np.linalg.lstsq(M, r)[0].reshape(25, 1)
+    best = np.linalg.lstsq(M, r, rcond=None)[0].reshape(25, 1)
     run = task.system.rollout(task, np.zeros((25, 1)))
     gains = sweep(task, run.z[0], run.u[0]).gains
     new = task.system.rollout(task, run.u[0], gains.K, run.z[0], gains.k)

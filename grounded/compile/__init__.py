@@ -74,8 +74,9 @@ def system_of(
     found = trace(signature, None, 1.0)
     if isinstance(found, str):
         return differenced(found)
-    if not jit.available():
-        return TracedSystem(signature, found, integrator, "not compiled: llvmlite is missing")
+    trouble = jit.trouble()
+    if trouble:
+        return TracedSystem(signature, found, integrator, f"not compiled: {trouble}")
     try:
         system = CompiledSystem(signature, found, integrator)
     except TooLong as error:

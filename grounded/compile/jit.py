@@ -16,6 +16,7 @@ from typing import Any
 
 from grounded.compile import cache as disk
 
+OLDEST = (0, 45)  # of llvmlite: pointers without a type
 OPTIMISATION = 1  # of LLVM's code generator; the text is optimised as it is written
 _LOCK = threading.Lock()
 
@@ -44,13 +45,14 @@ def _machine() -> Any:
     )
 
 
-def available() -> bool:
-    """Whether llvmlite can be imported."""
+def trouble() -> str:
+    """Why nothing can be compiled here, or nothing: llvmlite is missing or too old."""
     try:
-        import llvmlite.binding  # noqa: F401
-    except (ImportError, OSError):
-        return False
-    return True
+        import llvmlite.binding
+    except (ImportError, OSError) as error:
+        return f"llvmlite can't be imported ({error})"
+    found = tuple(int(part) for part in llvmlite.__version__.split(".")[:2] if part.isdigit())
+    return "" if found >= OLDEST else f"llvmlite {llvmlite.__version__} is older than 0.45"
 
 
 @cache
