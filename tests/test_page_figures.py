@@ -9,12 +9,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from grounded.experiments.pendulum_task import pendulum_task
+from grounded.improve import first_policy
+from grounded.models import pendulum
+from grounded.planner import Planner
+from grounded.rollout import simulate
+from grounded.trial import Trial
 from grounded_trials.figures import Curve, Panel
 from grounded_trials.figures_all import all_figures
 from grounded_trials.figures_axis import Axis, fitted, round_up, without_astray
 from grounded_trials.figures_draw import Stroke, draw
 from grounded_trials.figures_png import dashed, plain, png
 from grounded_trials.figures_thin import thinned
+from grounded_trials.forecast import forecast, forecast_error
 from grounded_trials.gathering import gather
 from grounded_trials.scene import scene_of
 from grounded_trials.workspace import Workspace
@@ -134,6 +141,7 @@ def test_pictures_are_drawn_in_their_colours(cart):
         "inputs",
         "bias",
         "gap",
+        "forecast",
     ]
     for figure in figures:
         image = Image.open(io.BytesIO(png(figure)))
@@ -141,7 +149,7 @@ def test_pictures_are_drawn_in_their_colours(cart):
         counts = image.getcolors(1 << 24)
         assert counts is not None
         colours = {colour for _, colour in counts}
-        assert (0, 114, 178) in colours or figure.name == "error", figure.name
+        assert (0, 114, 178) in colours or figure.name in ("error", "forecast"), figure.name
 
 
 def test_scenes_of_car_aircraft_and_cart(cart, car):
@@ -167,3 +175,37 @@ def test_rotations_are_right_handed_and_point_along_the_heading():
     level[0, task.model.state_names.index("psi")] = 0.0
     level[0, task.model.state_names.index("theta")] = 0.3  # pitched up
     assert scene.rotations(level)[0][2, 0] > 0.2
+
+
+def test_a_forecast_with_the_true_model_stays_on_the_trial():
+    task = pendulum_task(pendulum.model)
+    policy, _ = first_policy(task)
+    made = simulate(task.problem(exact=True), policy)
+    names = (task.model.state_names, task.model.input_names)
+    trial = Trial(made.states, made.inputs, task.dt, *names, start_inputs=task.past)
+    found = forecast(Planner(task, task), trial, 0.5)
+    assert found is not None
+    real = trial.states[np.maximum(found.steps, 0)]
+    np.testing.assert_allclose(found.states[found.steps >= 0], real[found.steps >= 0], atol=1e-9)
+    assert forecast_error(Planner(task, task), trial).max() < 1e-9
+    times, values = found.curve(0, task.dt)
+    assert len(times) == len(values) and np.isnan(values).sum() >= len(found.steps)
+
+
+def test_a_forecast_of_a_wrong_model_parts_from_the_trial():
+    task = pendulum_task(pendulum.model)
+    policy, _ = first_policy(task)
+    made = simulate(task.problem(exact=True), policy)
+    names = (task.model.state_names, task.model.input_names)
+    trial = Trial(made.states, made.inputs, task.dt, *names, start_inputs=task.past)
+    wrong = task.with_model(task.model.with_values({"m": 1.3}))
+    short, long = (forecast_error(Planner(wrong, wrong), trial, s)[0] for s in (0.1, 1.0))
+    assert 1e-6 < short < long
+
+
+def test_a_forecast_of_a_trial_without_steps_is_none():
+    task = pendulum_task(pendulum.model)
+    names = (task.model.state_names, task.model.input_names)
+    trial = Trial(np.full((3, 2), np.nan), np.zeros((2, 1)), task.dt, *names)
+    assert forecast(Planner(task, task), trial) is None
+    assert np.isnan(forecast_error(Planner(task, task), trial)).all()

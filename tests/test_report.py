@@ -190,3 +190,25 @@ def test_nothing_heavy_is_imported_for_text(cart):
     )
     done = subprocess.run([sys.executable, "-c", script, str(cart)], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+def test_a_workspace_of_data_only_shows_the_model_against_the_data(cart, tmp_path):
+    folder = tmp_path / "data"
+    make(folder)
+    for path in sorted(cart.glob("trials/t000[12]-*")):
+        assert grounded("-C", folder, "ingest", path, "--data").code == 0
+    done = grounded("-C", folder, "report", "--html", "--png", "--rrd", "--json")
+    assert done.code == 0, done.err
+    assert [Path(p).name for p in done.json["paths"]["png"]] == ["data-t0001.png", "data-t0002.png"]
+    assert "t0001, crude" in Path(done.json["paths"]["html"]).read_text()
+    out = grounded("-C", folder, "report").out
+    assert "2 logs of data" in out and "error of the crude model 1 s ahead" in out
+
+
+def test_a_candidate_that_was_not_run_yet_is_shown_as_predicted(tmp_path):
+    make(tmp_path / "w")
+    assert grounded("-C", tmp_path / "w", "propose").code == 0
+    done = grounded("-C", tmp_path / "w", "report", "--html", "--rrd", "--png", "--json")
+    assert done.code == 0, done.err
+    assert "predicted for c0001" in Path(done.json["paths"]["html"]).read_text()
+    assert grounded("-C", tmp_path / "w", "report").out.endswith("next: grounded run\n")

@@ -15,6 +15,7 @@ from grounded.frozen import Array
 # Okabe & Ito (2008), told apart by colour-blind people too: role -> (on white, on black)
 COLOURS = {
     "desired": ("#000000", "#ffffff"),
+    "real": ("#000000", "#ffffff"),
     "model": ("#d55e00", "#d55e00"),
     "best": ("#0072b2", "#56b4e9"),
     "predicted": ("#cc79a7", "#cc79a7"),

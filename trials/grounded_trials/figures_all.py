@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from grounded_trials.figures import Figure
+from grounded_trials.figures_forecast import forecast_figures
 from grounded_trials.figures_gap import gap_figure
 from grounded_trials.figures_runs import (
     bias_figure,
@@ -25,5 +26,6 @@ def all_figures(findings: Findings) -> list[Figure]:
         input_figure(findings),
         bias_figure(findings),
         gap_figure(findings.diagnosis),
+        *forecast_figures(findings),
     ]
     return [figure for figure in made if figure is not None]

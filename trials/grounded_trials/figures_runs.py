@@ -26,12 +26,12 @@ STEPS = ("step1", "step2", "step3")
 def path_figure(findings: Findings) -> Figure | None:
     """The paths in the plane, and seen from the side where there is an altitude."""
     scene = scene_of(findings.task.model)
-    if len(scene.axes) < 2 or not findings.runs:
+    if len(scene.axes) < 2 or len(_paths(findings)) < 2:
         return None
     panels = [_plane(findings, scene.axes[0], scene.axes[1], plan=True)]
     if scene.volume:
         panels.append(_plane(findings, scene.axes[0], scene.axes[2], plan=False))
-    if scene.spatial and set(scene.axes) <= set(tracked(findings.task)):
+    if scene.spatial and findings.runs and set(scene.axes) <= set(tracked(findings.task)):
         panels.append(_distance(findings, list(scene.axes)))
     caption = "Grey: all other trials." if len(findings.runs) > 2 else ""
     if not scene.spatial:
@@ -82,13 +82,16 @@ def _name(role: str, run: Run) -> str:
 def _paths(findings: Findings) -> list[tuple[str, str, Array]]:
     """(role, name, states) of what is compared, first what lies behind."""
     found = [(role, _name(role, run), run.trial.states) for role, run in _shown(findings)]
+    waiting = findings.standing.outstanding
+    if not found and waiting is not None:
+        found = [("predicted", f"predicted for {waiting.id}", waiting.predicted_states)]
     return [*found, ("desired", "desired", findings.task.target)]
 
 
 def state_figure(findings: Findings) -> Figure | None:
     """Each state over time, beside its target and prediction."""
     task = findings.task
-    if not findings.runs:
+    if len(_paths(findings)) < 2:
         return None
     known, panels = tracked(task), []
     for i, (name, unit) in enumerate(task.model.states.items()):

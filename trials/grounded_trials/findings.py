@@ -12,6 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from grounded.frozen import Array
+from grounded.planner import Planner
 from grounded.search import Candidate, Standing, Tried, mean_trial
 from grounded.task import Task
 from grounded.trial import Trial
@@ -44,6 +45,14 @@ class Run:
 
 
 @dataclass(frozen=True, eq=False)
+class Log:
+    """A log that ran no candidate: for fitting and diagnosis."""
+
+    trial: Trial
+    residual: Array  # (T, n), as a run's
+
+
+@dataclass(frozen=True, eq=False)
 class Findings:
     """A workspace as a report shows it; `lost` says what could not be shown."""
 
@@ -54,12 +63,19 @@ class Findings:
     method: str  # the [search] table in a few words
     standing: Standing
     runs: tuple[Run, ...]  # trials of this task's candidates, in order of arrival
-    others: int  # stored trials that ran no candidate of this task: data, earlier tasks
+    logs: tuple[Log, ...]  # data of this robot that ran no candidate
+    others: int  # stored trials of earlier tasks or other robots
     lost: tuple[Lost, ...]
     diagnosis: Diagnosis | None
     optimum: float | None  # of the real system, where a study computed it
     noise: float  # standard deviation of one trial's utility, NaN while unknown
     next_command: str
+    explaining: Planner | None = None  # with the adopted or diagnosed effects in the model
+
+    @property
+    def crude(self) -> Planner:
+        """The task with the crude model."""
+        return Planner(self.task, self.task)
 
     @property
     def history(self) -> tuple[Tried, ...]:

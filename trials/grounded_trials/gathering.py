@@ -24,7 +24,7 @@ from grounded.search import Candidate, Standing, standing
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.diagnosis_file import Diagnosis, read_diagnosis
-from grounded_trials.findings import Findings, Lost, Run
+from grounded_trials.findings import Findings, Log, Lost, Run
 from grounded_trials.mcap_log import read_trial
 from grounded_trials.workspace import Workspace, _candidate
 
@@ -39,6 +39,7 @@ def gather(workspace: Workspace) -> Findings:
     trials, policies, lost = _trials(workspace)
     candidates = _candidates(workspace, trials, policies, lost)
     own = [t for t in trials if _fits(task, t) and t.candidate in {c.id for c in candidates}]
+    data = [t for t in trials if _fits(task, t) and not t.candidate]
     now = _settled(workspace, candidates, own, _standing(workspace, candidates, own))
     diagnosis = _diagnosis(workspace, lost)
     explaining = _explaining(workspace, diagnosis, lost)
@@ -50,12 +51,14 @@ def gather(workspace: Workspace) -> Findings:
         method=_method(workspace),
         standing=now,
         runs=tuple(_runs(task, now, own, explaining, lost)),
-        others=len(trials) - len(own),
+        logs=tuple(Log(t, _residual(Planner(task, task), t)) for t in data),
+        others=len(trials) - len(own) - len(data),
         lost=tuple(lost),
         diagnosis=diagnosis,
         optimum=_optimum(workspace.reports),
         noise=utility_noise(now.history)[0],
         next_command=_next(workspace, now, diagnosis),
+        explaining=explaining,
     )
 
 

@@ -13,6 +13,7 @@ from html import escape
 from importlib.resources import files
 
 from grounded_trials.diagnosis_file import Diagnosis
+from grounded_trials.figures_forecast import forecast_figures
 from grounded_trials.figures_gap import gap_figure
 from grounded_trials.figures_runs import (
     bias_figure,
@@ -29,6 +30,7 @@ from grounded_trials.page_tables import (
     channel_table,
     effect_table,
     error_table,
+    forecast_table,
     parameter_table,
 )
 from grounded_trials.words import figure
@@ -71,7 +73,7 @@ def _sections(findings: Findings) -> list[tuple[str, str]]:
         ("Tracking error", figure_block(error_figure(findings)) + error_table(findings)),
         ("Inputs", figure_block(input_figure(findings))),
         ("Bias", figure_block(bias_figure(findings))),
-        ("Gap", _gap(findings.diagnosis)),
+        ("Gap", _gap(findings)),
         ("Task and model", _task(findings)),
         ("What to run next", _next(findings)),
     ]
@@ -126,7 +128,8 @@ def _lost(findings: Findings) -> str:
 
 def _utility(findings: Findings) -> str:
     if not findings.history:
-        return "<p>No candidate was proposed yet.</p>"
+        logs = len(findings.logs)
+        return f"<p>No candidate was proposed yet; {logs} log{'s' * (logs != 1)} of data.</p>"
     from grounded.certainty import last_improvement
 
     sure = last_improvement(findings.history)
@@ -138,12 +141,25 @@ def _utility(findings: Findings) -> str:
     )
 
 
-def _gap(diagnosis: Diagnosis | None) -> str:
+def _gap(findings: Findings) -> str:
+    diagnosis = findings.diagnosis
     if diagnosis is None:
         return (
             "<p>Not diagnosed yet. This says where the model is wrong, and which effect makes it "
-            f"so: {command('grounded diagnose', 'c-diagnose')}</p>"
+            f"so: {command('grounded diagnose', 'c-diagnose')}</p>{_forecasts(findings)}"
         )
+    return _diagnosed(diagnosis) + _forecasts(findings)
+
+
+def _forecasts(findings: Findings) -> str:
+    parts = [
+        f"<h3>{escape(figure.title)}</h3>{figure_block(figure)}"
+        for figure in forecast_figures(findings)
+    ]
+    return "".join([*parts, forecast_table(findings)])
+
+
+def _diagnosed(diagnosis: Diagnosis) -> str:
     parts = [f'<p class="verdict">{escape(diagnosis.sentence or diagnosis.kind)}</p>']
     parts.append(figure_block(gap_figure(diagnosis)))
     if diagnosis.ranking:
@@ -159,9 +175,7 @@ def _gap(diagnosis: Diagnosis | None) -> str:
 
 def _task(findings: Findings) -> str:
     adopted = ", ".join(findings.effects) or "none"
-    words = (
-        f"Adopted effects: {adopted}. Other stored trials (data, earlier tasks): {findings.others}."
-    )
+    words = f"Adopted effects: {adopted}. Stored trials of other tasks: {findings.others}."
     return (
         f"<p>{escape(words)}</p>{channel_table(findings)}"
         f"<details><summary>Parameters of the model</summary>{parameter_table(findings)}</details>"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from html import escape
 
 from grounded_trials.figures import COLOURS, DASHES, Figure, Key
@@ -11,15 +11,18 @@ from grounded_trials.figures_svg import svg
 
 
 def table(
-    identity: str, header: Sequence[str], rows: Sequence[Sequence[str]], strong: int = -1
+    identity: str,
+    header: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    strong: Collection[int] = (),
 ) -> str:
-    """A table with a button that copies it; a column is text where its header ends with a blank."""
+    """A table with a button that copies it; text columns have a header that ends with a blank."""
     kinds = [' class="text"' if name.endswith(" ") else "" for name in header]
     head = "".join(f"<th{k}>{escape(h.strip())}</th>" for h, k in zip(header, kinds, strict=True))
     lines = []
     for number, row in enumerate(rows):
         cells = "".join(f"<td{k}>{escape(c)}</td>" for c, k in zip(row, kinds, strict=True))
-        lines.append(f"<tr{' class=strong' if number == strong else ''}>{cells}</tr>")
+        lines.append(f"<tr{' class=strong' if number in strong else ''}>{cells}</tr>")
     return (
         f'<div class="wide"><table id="{identity}"><thead><tr>{head}</tr></thead>'
         f"<tbody>{''.join(lines)}</tbody></table></div>"

@@ -16,6 +16,7 @@ from grounded_trials.findings import (
     standard_error,
     tracking_error,
 )
+from grounded_trials.forecast import SECONDS, forecast_error
 from grounded_trials.page_parts import table
 from grounded_trials.words import figure
 
@@ -55,7 +56,7 @@ def candidate_table(findings: Findings) -> str:
         "verdict ",
         "trials ",
     )
-    return table("candidates", header, rows, strong)
+    return table("candidates", header, rows, {strong})
 
 
 def error_table(findings: Findings) -> str:
@@ -79,6 +80,28 @@ def error_table(findings: Findings) -> str:
     return table("errors", ("state", "unit", *(name for name, _ in columns)), rows)
 
 
+def forecast_table(findings: Findings) -> str:
+    """Rms error of the model 1 s ahead, by state, for the best run and every log."""
+    best = findings.best or findings.latest
+    trials = ([best.trial] if best is not None else []) + [log.trial for log in findings.logs]
+    if not trials:
+        return ""
+    planners = [("crude", findings.crude)]
+    if findings.explaining is not None:
+        planners.append(("with effects", findings.explaining))
+    columns = []
+    for trial in trials:
+        name = trial.id or trial.candidate
+        columns += [(f"{name}, {words}", forecast_error(p, trial)) for words, p in planners]
+    rows = [
+        (state, unit, *(figure(float(values[i]), 3) for _, values in columns))
+        for i, (state, unit) in enumerate(findings.task.model.states.items())
+    ]
+    header = ("state", "unit", *(name for name, _ in columns))
+    title = f"<h3>Error of the model {SECONDS:g} s ahead, rms</h3>"
+    return title + table("forecasts", header, rows)
+
+
 def effect_table(diagnosis: Diagnosis) -> str:
     """The ranked effects with their parameters and 95 % intervals."""
     rows = [
@@ -92,7 +115,7 @@ def effect_table(diagnosis: Diagnosis) -> str:
         for r in diagnosis.ranking
     ]
     header = ("effect", "evidence [nats]", "gap after", "gap closed", "parameters, 95 % ")
-    strong = next((i for i, r in enumerate(diagnosis.ranking) if r.effect in diagnosis.effects), -1)
+    strong = {i for i, r in enumerate(diagnosis.ranking) if r.effect in diagnosis.effects}
     return table("effects", header, rows, strong)
 
 

@@ -4,6 +4,7 @@
     /state/x/...              the same over time, a plot a state;  /input/u/...  with their limits
     /bias/x/...               what the crude model lacks along the run [unit/s], by iteration
     /trials/t0007/...         everything of one trial: path, prediction, body, state, input, bias
+    /data/t0003/...           the same of a log that ran no candidate
     /utilities, /summary      by iteration, and in words
 
 One timeline, `time`, in seconds since the start of a trial. Numbers go in by whole columns, names
@@ -21,8 +22,9 @@ import numpy as np
 
 from grounded.errors import GroundedError
 from grounded.frozen import Array
+from grounded.trial import Trial
 from grounded_trials import recording_marks as marks
-from grounded_trials.findings import Findings, Run, selection, tracked
+from grounded_trials.findings import Findings, Log, Run, selection, tracked
 from grounded_trials.recording_layout import blueprint
 from grounded_trials.recording_words import summary
 from grounded_trials.scene import Scene, scene_of
@@ -72,6 +74,8 @@ def _everything(stream: Any, findings: Findings, scene: Scene) -> None:
     _biases(stream, findings)
     for run in findings.runs:
         _trial(stream, findings, scene, run)
+    for log in findings.logs:
+        _log(stream, findings, scene, log)
 
 
 def _paths(stream: Any, findings: Findings, scene: Scene) -> None:
@@ -80,6 +84,10 @@ def _paths(stream: Any, findings: Findings, scene: Scene) -> None:
     if all(np.isfinite(task.target[:, i]).all() for i in scene.axes):
         marks.path(stream, "paths/desired", scene.points(task.target), "desired", 2.0)
     shown = {"model_policy": first}
+    waiting = findings.standing.outstanding
+    if first is None and waiting is not None:
+        planned = scene.points(waiting.predicted_states)
+        marks.path(stream, "paths/predicted", planned, "predicted", 1.5)
     if best is not None and (first is None or best.candidate is not first.candidate):
         predicted = scene.points(best.candidate.predicted_states)
         marks.path(stream, "paths/predicted", predicted, "predicted", 1.0)
@@ -158,7 +166,7 @@ def rate(residual: Array, dt: float) -> tuple[Array, float]:
 
 def _trial(stream: Any, findings: Findings, scene: Scene, run: Run) -> None:
     """Everything of one trial, under its own name."""
-    task, at, model = findings.task, f"trials/{run.trial.id}", findings.task.model
+    task, at = findings.task, f"trials/{run.trial.id}"
     colour = "accepted" if run.accepted else "other"
     for role, chosen in (("model_policy", findings.first), ("best", findings.best)):
         if chosen is not None and run.candidate is chosen.candidate:
@@ -166,14 +174,30 @@ def _trial(stream: Any, findings: Findings, scene: Scene, run: Run) -> None:
     _moving(stream, findings, scene, at, run, colour, "/path")
     predicted = scene.points(run.candidate.predicted_states)
     marks.path(stream, f"{at}/predicted", predicted, "predicted", 1.0)
+    _signals(stream, findings, at, run.trial, run.residual)
+    if run.explained is not None:
+        rates = [f"{n} [{u} per s]" for n, u in task.model.states.items()]
+        marks.columns(stream, f"{at}/explained", *rate(run.explained, task.dt), rates)
+
+
+def _log(stream: Any, findings: Findings, scene: Scene, log: Log) -> None:
+    """A log that ran no candidate, and the model set on it anew every second."""
+    task, at, trial = findings.task, f"data/{log.trial.id}", log.trial
+    size = _size(findings, scene)
+    marks.path(stream, f"{at}/path", scene.points(trial.states), "best", 1.5)
+    marks.body(stream, f"{at}/body", scene, trial.states, task.dt, size, "best")
+    _signals(stream, findings, at, trial, log.residual)
+
+
+def _signals(stream: Any, findings: Findings, at: str, trial: Trial, residual: Array) -> None:
+    """States, inputs and bias, each as one entity with named columns."""
+    model, dt = findings.task.model, findings.task.dt
     states = [f"{n} [{u}]" for n, u in model.states.items()]
     inputs = [f"{n} [{u}]" for n, u in model.inputs.items()]
     rates = [f"{n} [{u} per s]" for n, u in model.states.items()]
-    marks.columns(stream, f"{at}/state", run.trial.states, task.dt, states)
-    marks.columns(stream, f"{at}/input", run.trial.inputs, task.dt, inputs)
-    marks.columns(stream, f"{at}/bias", *rate(run.residual, task.dt), rates)
-    if run.explained is not None:
-        marks.columns(stream, f"{at}/explained", *rate(run.explained, task.dt), rates)
+    marks.columns(stream, f"{at}/state", trial.states, dt, states)
+    marks.columns(stream, f"{at}/input", trial.inputs, dt, inputs)
+    marks.columns(stream, f"{at}/bias", *rate(residual, dt), rates)
 
 
 def _words(role: str, run: Run) -> str:
@@ -182,7 +206,8 @@ def _words(role: str, run: Run) -> str:
 
 def _size(findings: Findings, scene: Scene) -> float:
     """The length of a body that can be seen beside the path."""
-    states = findings.runs[0].trial.states if findings.runs else findings.task.target
+    shown = findings.runs or findings.logs
+    states = shown[0].trial.states if shown else findings.task.target
     points = scene.points(states)
     points = points[np.isfinite(points).all(axis=1)]
     return 0.07 * (float(np.ptp(points, axis=0).max()) or 1.0) if len(points) else 0.07

@@ -12,6 +12,7 @@ from grounded_trials.findings import Findings
 from grounded_trials.scene import Scene
 
 TRIALS = 60  # that get a tab of their own
+NAMES = {"state": "states", "input": "inputs", "bias": "bias"}
 FIRST = 4  # states in the overview; all of them have a tab
 
 
@@ -31,7 +32,7 @@ def blueprint(findings: Findings, scene: Scene) -> Any:
         rrb.Tabs(*_trials(findings, scene), name="By trial"),
     ]
     return rrb.Blueprint(
-        rrb.Tabs(*tabs, active_tab=0),
+        rrb.Tabs(*tabs, active_tab=4 if findings.logs and not findings.runs else 0),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.TimePanel(state="collapsed", timeline="time"),
@@ -86,12 +87,18 @@ def _trials(findings: Findings, scene: Scene) -> list[Any]:
     for run in findings.runs[-TRIALS:]:
         at = f"/trials/{run.trial.id}"
         contents = ["/paths/desired", f"{at}/path", f"{at}/predicted", f"{at}/body"]
-        names = {"state": "states", "input": "inputs", "bias": "bias"}
+        names = dict(NAMES)
         if run.explained is not None:
             names["explained"] = "bias that the effects leave"
         plots = [_plot(f"{at}/{key}", name) for key, name in names.items()]
         space = _space(findings, scene, "/", contents, f"{run.label}, utility {run.utility:.4g}")
         tabs.append(rrb.Horizontal(space, rrb.Vertical(*plots), name=run.trial.id))
+    for log in findings.logs[-TRIALS:]:
+        at = f"/data/{log.trial.id}"
+        plots = [_plot(f"{at}/{key}", name) for key, name in NAMES.items()]
+        contents = ["/paths/desired", f"{at}/path", f"{at}/body"]
+        space = _space(findings, scene, "/", contents, f"{log.trial.id}, data")
+        tabs.append(rrb.Horizontal(space, rrb.Vertical(*plots), name=log.trial.id))
     return tabs
 
 
@@ -126,6 +133,7 @@ def _bounds(findings: Findings, scene: Scene) -> tuple[Array, float]:
     """The middle and the size of all that is drawn, without runs that went astray."""
     shown = [findings.task.target] if findings.task.target is not None else []
     shown += [run.trial.states for run in (findings.best, findings.first) if run is not None]
+    shown += [log.trial.states for log in findings.logs] if not findings.runs else []
     points = np.vstack([scene.points(s) for s in shown])
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):

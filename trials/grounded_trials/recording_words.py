@@ -10,7 +10,8 @@ def summary(findings: Findings) -> str:
     task, best, first = findings.task, findings.best, findings.first
     lines = [
         f"# {findings.name}",
-        f"{task.model.name}: {task.horizon} steps of {task.dt:g} s, {len(findings.runs)} trials",
+        f"{task.model.name}: {task.horizon} steps of {task.dt:g} s, {len(findings.runs)} trials, "
+        f"{len(findings.logs)} logs of data",
         "",
         "| | candidate | utility |",
         "|---|---|---|",

@@ -18,6 +18,7 @@ from grounded_trials.findings import (
     standard_error,
     tracking_error,
 )
+from grounded_trials.forecast import SECONDS, forecast_error
 from grounded_trials.words import figure
 
 WIDTH = 80
@@ -40,6 +41,8 @@ def report_text(findings: Findings, table: Table, bars: Callable[[Sequence[float
     if findings.best is not None:
         parts += [_trajectories(findings, table), _biases(findings, table)]
     parts.append(_diagnosis(findings.diagnosis, table))
+    if findings.logs:
+        parts.append(_logs(findings, table))
     if findings.lost:
         lines = ["left out of this report"]
         for one in findings.lost:
@@ -57,6 +60,8 @@ def _head(findings: Findings) -> str:
         f"({task.horizon * task.dt:g} s), {'closed loop' if task.feedback else 'open loop'}; "
         f"{runs} trial{'' if runs == 1 else 's'}"
     )
+    if findings.logs:
+        text += f", {len(findings.logs)} log{'' if len(findings.logs) == 1 else 's'} of data"
     if findings.effects:
         text += "; adopted: " + ", ".join(findings.effects)
     return "\n".join(wrap(text, WIDTH))
@@ -73,7 +78,8 @@ def _utilities(findings: Findings, table: Table, bars: Callable[[Sequence[float]
     if left:
         lines.append(f"  ({left} more that did not improve, or between: grounded status)")
     spark = bars(spaced([t.utility for t in history if t.utilities][-WIDTH // 2 :]))
-    lines.append(f"\n  {spark}  by candidate, higher is better")
+    if spark:
+        lines.append(f"\n  {spark}  by candidate, higher is better")
     first, best = findings.first, findings.best
     if first is not None and best is not None:
         text = f"model's policy {figure(first.utility)}, "
@@ -185,6 +191,18 @@ def _diagnosis(diagnosis: Diagnosis | None, table: Table) -> str:
         ]
         lines.append(table(rows, ("effect", "nats", "gap after", "parameters".ljust(34))))
     return "\n".join(lines)
+
+
+def _logs(findings: Findings, table: Table) -> str:
+    """How far the crude model is off 1 s ahead on logs that ran no candidate."""
+    shown = findings.logs[-ITERATIONS:]
+    columns = [forecast_error(findings.crude, log.trial) for log in shown]
+    rows = [
+        (name, unit, *(figure(float(c[i]), 3) for c in columns))
+        for i, (name, unit) in enumerate(findings.task.model.states.items())
+    ]
+    title = f"data: error of the crude model {SECONDS:g} s ahead, rms\n"
+    return title + table(rows, ("state", "unit", *(log.trial.id for log in shown)))
 
 
 def _value(value: Value) -> str:
