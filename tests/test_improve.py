@@ -194,7 +194,8 @@ def test_the_bias_goes_to_the_original_model_not_to_the_last_biased_one():
     worse = replace(trials[0], states=trials[0].states + 5.0)
     again = propose(task, candidates, [worse, trials[1]], Options()).candidate
     assert made.base == again.base == "c0002"
-    exact = task.problem(ground(task, trials[1], exact=True).bias, exact=True)
+    grounding = ground(task, trials[1], exact=True, match_inputs=True)
+    exact = grounding.on(task.problem(exact=True))
     np.testing.assert_array_equal(made.predicted_states, simulate(exact, made.policy).states)
     np.testing.assert_array_equal(again.predicted_states, simulate(exact, again.policy).states)
 

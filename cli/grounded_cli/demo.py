@@ -88,7 +88,7 @@ def _diagnosis(workspace: Workspace) -> dict[str, Any] | None:
     from grounded_trials.diagnosing import diagnose_in
 
     with progress("diagnosing the gap"):
-        return dict(diagnose_in(workspace)["verdict"])
+        return dict(diagnose_in(workspace).document["verdict"])
 
 
 def _report(workspace: Workspace) -> dict[str, str]:

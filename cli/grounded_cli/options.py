@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 if TYPE_CHECKING:
+    from grounded.effects import Library
     from grounded_trials.workspace import Workspace
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -38,3 +39,32 @@ def open_workspace(folder: str | None) -> Workspace:
     workspace = Workspace(chosen)
     _ = workspace.config
     return workspace
+
+
+def library_of(without: tuple[str, ...] = ()) -> Library:
+    """The effects that may be blamed: built in, and those of other packages.
+
+    A package adds families by the entry point group `grounded.effects`: a family, or a sequence of
+    families.
+
+    Raises:
+        GroundedError: for an entry point that can't be loaded or holds something else.
+    """
+    from importlib.metadata import entry_points
+
+    from grounded.effects import Family, Library
+    from grounded.errors import GroundedError
+
+    found: list[Family] = []
+    for point in entry_points(group="grounded.effects"):
+        try:
+            loaded = point.load()
+        except Exception as error:
+            raise GroundedError(
+                f"the effects of package '{point.value}' can't be loaded: {error}; mend or uninstall it"
+            ) from None
+        families = [loaded] if isinstance(loaded, Family) else list(loaded)
+        if not all(isinstance(family, Family) for family in families):
+            raise GroundedError(f"'{point.value}' must be an effect family or a sequence of them")
+        found += families
+    return Library().with_families(found).without(without)

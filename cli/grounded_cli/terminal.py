@@ -8,7 +8,7 @@ import os
 import re
 import sys
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -76,6 +76,40 @@ def progress(text: str) -> Iterator[None]:
         click.echo(f"{text} ...", err=True, nl=False)
     try:
         yield
+    finally:
+        if live:
+            click.echo("\r\033[K", err=True, nl=False)
+
+
+@contextmanager
+def stages() -> Iterator[Callable[[str], None]]:
+    """A function that shows which stage a long command is in; only on a terminal."""
+    live = sys.stderr.isatty()
+
+    def tell(stage: str) -> None:
+        if live:
+            click.echo(f"\r\033[K{stage} ...", err=True, nl=False)
+
+    try:
+        yield tell
+    finally:
+        if live:
+            click.echo("\r\033[K", err=True, nl=False)
+
+
+@contextmanager
+def bar(text: str) -> Iterator[Callable[[int, int], None]]:
+    """A progress bar on stderr for things that can be counted; only on a terminal."""
+    live, width = sys.stderr.isatty(), 30
+
+    def tell(done: int, total: int) -> None:
+        if live and total:
+            full = done * width // total
+            line = f"{text} [{'#' * full}{'.' * (width - full)}] {done}/{total}"
+            click.echo(f"\r\033[K{line}", err=True, nl=False)
+
+    try:
+        yield tell
     finally:
         if live:
             click.echo("\r\033[K", err=True, nl=False)

@@ -1,0 +1,106 @@
+"""grounded experiment: the paper's studies, by seed, on one machine or on a cluster."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from typing import Any
+
+import click
+
+from grounded_cli.options import as_json
+from grounded_cli.terminal import bar, show, show_json, table
+
+# name -> (module, function, what --seeds is: "seeds", "count" of runs, or none, one line)
+STUDIES = {
+    "flight": ("flight", "run", "count", "Table 1 and Figure 1: the aircraft's figure-8"),
+    "car": ("car", "run", "seeds", "the car's three tasks, Figures 4 and 5"),
+    "fit-car": ("fit_car", "fit_car", "seeds", "footnote 17: parameters from driving"),
+    "nondeterminism": ("nondeterminism", "run", "runs", "repeated open-loop runs (5.2)"),
+    "footnote9": ("footnote9", "run", "", "a model that is wrong by a constant"),
+    "theorem1": ("theorem1", "run", "seeds", "gradient error and where the search ends"),
+    "baselines": ("baselines", "run", "seeds", "trials to close the gap, seven methods"),
+    "noise": ("noise", "run", "seeds", "the line search under noise, six rules"),
+}
+
+
+@click.command("experiment")
+@click.argument("name", type=click.Choice(list(STUDIES)), required=False)
+@click.option("--seeds", metavar="N|A-B|A,B,...", help="How many seeds, or which.")
+@click.option("--jobs", type=click.IntRange(1), default=1, help="Processes on this machine.")
+@click.option("--engine", type=click.Choice(["local", "dask"]), default="local")
+@click.option("--address", metavar="URL", help="Scheduler of a Dask cluster, tcp://host:8786.")
+@click.option("--keep", metavar="DIR", help="Finished jobs (default: .grounded-studies/NAME).")
+@click.option("--png", metavar="FILE", help="Draw the study's picture.")
+@as_json
+def command(
+    name: str | None,
+    seeds: str | None,
+    jobs: int,
+    engine: str,
+    address: str | None,
+    keep: str | None,
+    png: str | None,
+    json_: bool,
+) -> None:
+    """Run one of the paper's studies; the same seeds give the same results on any machine.
+
+    Without NAME the studies are listed. Finished jobs are kept: a study that was cut off goes on.
+    """
+    if name is None:
+        show("\n".join(f"{key:15} {text}" for key, (_, _, _, text) in STUDIES.items()))
+        return
+    from grounded.experiments.jobs import Engine
+    from grounded_trials.study_store import StudyStore
+
+    where = Engine(jobs=jobs, name=engine, address=address)
+    module, function, kind, _ = STUDIES[name]
+    study = getattr(importlib.import_module(f"grounded.experiments.{module}"), function)
+    given: dict[str, Any] = _seeds(seeds, kind, name)
+    if kind:
+        given |= {
+            "engine": where,
+            "finished": StudyStore(Path(keep or f".grounded-studies/{name}")),
+        }
+    with bar(name) as progress:
+        if kind:
+            given["progress"] = progress
+        result = study(**given)
+    if png:
+        from grounded_trials.study_pictures import draw_study
+
+        draw_study(name, result, Path(png))
+    if json_:
+        show_json(result.to_json())
+        return
+    for one in result.tables():
+        show(f"{one.title}\n\n{table(one.rows, one.head)}\n")
+    if png:
+        show(f"picture {png}")
+
+
+def _seeds(text: str | None, kind: str, name: str) -> dict[str, Any]:
+    """The study's own argument for what --seeds says."""
+    if text is None:
+        return {"seeds": range(20)} if name == "fit-car" else {}
+    if not kind:
+        raise click.UsageError(f"'{name}' draws nothing at random: it takes no --seeds")
+    try:
+        if "-" in text:
+            first, last = (int(part) for part in text.split("-"))
+            chosen = list(range(first, last + 1))
+        elif "," in text:
+            chosen = [int(part) for part in text.split(",")]
+        else:
+            chosen = list(range(int(text)))
+    except ValueError:
+        raise click.UsageError(f"--seeds must be like 8, 0-7 or 1,4,9, found '{text}'") from None
+    if not chosen:
+        raise click.UsageError(f"--seeds {text} names no seed")
+    if kind == "seeds":
+        return {"seeds": chosen}
+    if chosen != list(range(chosen[0], chosen[-1] + 1)):
+        raise click.UsageError(f"'{name}' takes a number or a range of seeds")
+    if kind == "runs":
+        return {"runs": len(chosen), "seed": chosen[0]}
+    return {"count": len(chosen), "first_seed": chosen[0]}

@@ -1,0 +1,180 @@
+"""diagnose and adopt in a workspace: which trials, which model, where the result is kept."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from grounded.errors import GroundedError, nearest
+from grounded_trials.fitting import usable_trials
+from grounded_trials.store import write_atomically
+from grounded_trials.toml_edit import set_in_model
+from grounded_trials.workspace import Workspace
+
+if TYPE_CHECKING:
+    from grounded.diagnosis.report import Diagnosis
+    from grounded.effects import Library
+    from grounded.task import Task
+    from grounded.trial import Trial
+
+FILE = "diagnosis.json"
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnosed:
+    """A diagnosis, its document as CONTRACT.md has it, and the probe that was written, if any."""
+
+    diagnosis: Diagnosis
+    document: dict[str, Any]
+    probe: str  # a candidate's id, "" for none
+
+
+def diagnose_in(
+    workspace: Workspace,
+    *,
+    trials: Sequence[str] = (),
+    max_effects: int = 3,
+    library: Library | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Diagnosed:
+    """Diagnoses the gap between the model and the stored trials; keeps reports/diagnosis.json.
+
+    Args:
+        workspace: the model is diagnosed with the effects that were adopted.
+        trials: short names; all usable ones by default.
+        max_effects: at most so many effects at once.
+        library: the effects that may be blamed.
+        progress: told of each stage.
+
+    Raises:
+        GroundedError: for an unknown trial, or where there is none to learn from.
+    """
+    from grounded.diagnosis.diagnose import Options, diagnose
+    from grounded.effects import Library
+
+    library = library or Library()
+    subject, used = _subject(workspace), _chosen(workspace, trials)
+    options = Options(library=library, max_effects=max_effects)
+    found = diagnose(subject, used, options, progress=progress)
+    document = found.to_dict()
+    document["diagnosed"] = {
+        "trials": [trial.id for trial in used],
+        "adopted": [dict(effect) for effect in workspace.config.model.effects],
+    }
+    probe = _probe(workspace, subject, found, used, library)
+    if probe:
+        document["next_trial"] = f"{probe[1]} ({probe[0]}: grounded run {probe[0]})"
+        document["probe"] = probe[0]
+    workspace.reports.mkdir(exist_ok=True)
+    text = json.dumps(_finite(document), indent=1, ensure_ascii=False, allow_nan=False)
+    write_atomically(workspace.reports / FILE, (text + "\n").encode())
+    return Diagnosed(found, document, probe[0] if probe else "")
+
+
+def _subject(workspace: Workspace) -> Task:
+    """The task with adopted effects; without them where they gave the model memory states."""
+    plan = workspace.planner.plan
+    return plan if plan.model.n == workspace.task.model.n else workspace.task
+
+
+def _chosen(workspace: Workspace, names: Sequence[str]) -> list[Trial]:
+    used, guessed = usable_trials(workspace), workspace.estimated_states()
+    known = [trial.id for trial in used]
+    for name in names:
+        if name not in known:
+            raise GroundedError(f"there is no usable trial '{name}': {nearest(name, known)}")
+    used = [trial for trial in used if not names or trial.id in names]
+    return [_measured(trial, guessed) for trial in used] if guessed else used
+
+
+def _measured(trial: Trial, guessed: Sequence[str]) -> Trial:
+    """A trial without the states that were not measured: a smoother's are no evidence."""
+    states = trial.states.copy()
+    states[:, [trial.state_names.index(name) for name in guessed]] = math.nan
+    return replace(trial, states=states)
+
+
+def _probe(
+    workspace: Workspace, task: Task, found: Diagnosis, trials: Sequence[Trial], library: Library
+) -> tuple[str, str] | None:
+    """Writes the candidate that would tell two tied effects apart: (id, sentence)."""
+    if not found.indistinguishable:
+        return None
+    from grounded.diagnosis.excitation import probe
+    from grounded.improve import Candidate, model_fingerprint, simulate
+    from grounded_trials.proposing import standing_in
+
+    best = standing_in(workspace).incumbent
+    if best is None:
+        return None
+    base = workspace.planner.widened(best.candidate.policy)
+    made = probe(task, base, found, trials, library)
+    if made is None:
+        return None
+    predicted = simulate(task.problem(exact=True), made.policy)
+    candidate = Candidate(
+        id=workspace.next_id(),
+        policy=made.policy,
+        iteration=0,
+        alpha=1.0,
+        base=best.candidate.id,
+        model=model_fingerprint(task),
+        predicted_states=predicted.states,
+        predicted_inputs=predicted.inputs,
+        predicted_utility=predicted.utility,
+    )
+    workspace.save_candidate(candidate, workspace.task, kind="probe")
+    return candidate.id, made.sentence
+
+
+def adopt_effect(workspace: Workspace, name: str) -> tuple[Mapping[str, Any], ...]:
+    """Adds a diagnosed effect to [model] effects; returns all that are adopted now.
+
+    Raises:
+        GroundedError: if nothing was diagnosed, or the effect is not in its ranking.
+    """
+    path = workspace.reports / FILE
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+        ranking = {str(entry["effect"]): entry for entry in document["ranking"]}
+    except FileNotFoundError:
+        raise GroundedError("nothing was diagnosed yet: run `grounded diagnose` first") from None
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise GroundedError(
+            f"{path} can't be read ({error}): run `grounded diagnose` again"
+        ) from None
+    if name not in ranking:
+        raise GroundedError(
+            f"'{name}' is not among the effects of the last diagnosis: {nearest(name, ranking)}"
+        )
+    adopted = [dict(effect) for effect in workspace.config.model.effects]
+    if any(effect["name"] == name for effect in adopted):
+        raise GroundedError(f"'{name}' is adopted already; see [model] effects in grounded.toml")
+    entry = ranking[name]
+    values = {key: float(p["value"]) for key, p in entry["params"].items()}
+    values |= {key: float(value) for key, value in entry.get("fixed", {}).items()}
+    family, _, target = name.partition(":")
+    if family == "parameter":
+        params = dict(workspace.config.model.params)
+        nominal = workspace.base_model.params[target].value
+        params[target] = float(f"{nominal + values['d']:.8g}")
+        set_in_model(workspace.config.file, params=params)
+        return tuple(adopted)
+    adopted.append({"name": name, **{key: float(f"{v:.8g}") for key, v in values.items()}})
+    set_in_model(workspace.config.file, effects=adopted)
+    return tuple(adopted)
+
+
+def _finite(value: Any) -> Any:
+    """JSON has no NaN and no infinity: null instead."""
+    if isinstance(value, dict):
+        return {str(key): _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    if isinstance(value, bool) or value is None or isinstance(value, str | int):
+        return value
+    number = float(value)
+    return number if math.isfinite(number) else None
