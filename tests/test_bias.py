@@ -58,20 +58,23 @@ TASKS = {
 }
 
 
+@pytest.mark.parametrize("matched", [False, True], ids=["plain", "matched"])
 @pytest.mark.parametrize("exact", [True, False], ids=["exact", "smoothed"])
 @pytest.mark.parametrize("name", TASKS)
-def test_the_biased_model_replays_the_trial(name, exact):
+def test_the_biased_model_replays_the_trial(name, exact, matched):
     make, real = TASKS[name]
     task = make()
     policy, trial = run_of(task, real)
     assert trial.steps == task.horizon
-    found = ground(task, trial, exact=exact)
-    run = simulate(task.problem(found.bias, exact=exact), policy)
+    found = ground(task, trial, exact=exact, match_inputs=matched)
+    run = simulate(found.on(task.problem(exact=exact)), policy)
     scale = np.maximum(np.abs(trial.states).max(axis=0), 1.0)
     assert (np.abs(run.states - trial.states) / scale).max() < 1e-9
     np.testing.assert_array_equal(run.inputs, trial.inputs)
     assert run.utility == pytest.approx(task.utility(trial), rel=1e-9, abs=1e-9)
-    assert not exact or np.abs(found.bias).max() > 1e-6  # there was something to learn
+    if not matched:  # there was something to learn, and all of it is in the bias
+        assert not exact or np.abs(found.bias).max() > 1e-6
+        assert found.shift is None
 
 
 @pytest.mark.parametrize("exact", [True, False])
@@ -81,9 +84,10 @@ def test_any_fraction_of_latency_is_replayed(delay, exact):
     policy, trial = run_of(
         task, other(task.model), latency={"speed": 0.08, "turn": 0.03}, substeps=5
     )
-    found = ground(task, trial, exact=exact)
-    run = simulate(task.problem(found.bias, exact=exact), policy)
-    assert np.abs(run.states - trial.states).max() < 1e-9
+    for matched in (False, True):
+        found = ground(task, trial, exact=exact, match_inputs=matched)
+        run = simulate(found.on(task.problem(exact=exact)), policy)
+        assert np.abs(run.states - trial.states).max() < 1e-9
 
 
 def test_a_feedback_policy_replays_its_own_trial():
