@@ -14,7 +14,7 @@ to 40 % from the optimum after five iterations (docs/experiments.md). So the pro
 section 6.1):
 
     rho = real gain / predicted gain   of the last accepted step
-    rho >= 0.9 at alpha = 1            lambda / 10
+    rho >= 0.9 at alpha = 1            lambda / 30
     rho <  0.25                        10 lambda, at most 1
     a trial without improvement        10 lambda until 1, and from there alpha / 2
 """
@@ -24,7 +24,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 KEPT, BROKEN = 0.9, 0.25
-FACTOR = 10.0
+EASED, RAISED = 30.0, 10.0
 LEAST = 1e-6
 
 
@@ -45,15 +45,15 @@ def after_success(step: Step, predicted: float, real: float) -> Step:
         real: gain that the trial brought.
     """
     if step.alpha == 1.0 and real >= KEPT * predicted:
-        return Step(max(step.damping / FACTOR, LEAST))
+        return Step(max(step.damping / EASED, LEAST))
     if real < BROKEN * predicted:
-        return Step(min(step.damping * FACTOR, 1.0))
+        return Step(min(step.damping * RAISED, 1.0))
     return Step(step.damping)
 
 
 def after_failure(step: Step, max_halvings: int) -> Step | None:
     """A more cautious step along the way down; None when the search has failed (step 7)."""
     if step.damping < 1.0:
-        return Step(min(step.damping * FACTOR, 1.0), step.alpha)
+        return Step(min(step.damping * RAISED, 1.0), step.alpha)
     alpha = step.alpha / 2
     return Step(1.0, alpha) if alpha >= 2.0**-max_halvings * (1 - 1e-12) else None

@@ -6,7 +6,7 @@ from grounded.trust import LEAST, Step, after_failure, after_success
 
 
 def test_a_kept_promise_lowers_the_damping_and_a_broken_one_raises_it():
-    assert after_success(Step(1.0), 100.0, 95.0) == Step(0.1)
+    assert after_success(Step(0.9), 100.0, 95.0) == Step(pytest.approx(0.03))
     assert after_success(Step(0.1), 100.0, 60.0) == Step(0.1)
     assert after_success(Step(0.1), 100.0, 10.0) == Step(1.0)
     assert after_success(Step(1.0), 100.0, 10.0) == Step(1.0)
