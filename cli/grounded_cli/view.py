@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 import sys
@@ -37,18 +38,21 @@ def _open(path: Path) -> None:
     """
     from grounded.errors import GroundedError
 
+    by_hand = f"copy {path} to a computer with a screen and open it there: rerun {path.name}"
+    if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ):
+        raise GroundedError(f"there is no screen here: {by_hand}")
     beside = Path(sys.executable).with_name("rerun")
     program = str(beside) if beside.exists() else shutil.which("rerun")
     if program is None:
         raise GroundedError(f"the viewer is missing: pip install rerun-sdk, then: rerun {path}")
-    viewer = subprocess.Popen([program, str(path)], stdout=2, start_new_session=True)
+    # A viewer of its own that no other machine can reach: it would listen on every address.
+    words = [program, "--new", "--bind", "127.0.0.1", str(path)]
+    viewer = subprocess.Popen(words, stdout=2, start_new_session=True)
     try:
         code = viewer.wait(timeout=2.0)
     except subprocess.TimeoutExpired:
+        viewer.returncode = 0  # it goes on without us
         say(f"{path} is open in the viewer")
         return
     if code != 0:
-        raise GroundedError(
-            f"the viewer can't be opened here (no screen?): copy {path} to a computer with a "
-            "screen and open it there with: rerun recording.rrd"
-        )
+        raise GroundedError(f"the viewer ended with exit code {code}: {by_hand}")

@@ -147,5 +147,8 @@
       setTimeout(() => { button.textContent = old; }, 1200);
     });
   }
+  addEventListener("beforeprint", () => {
+    for (const part of document.querySelectorAll("details")) part.open = true;
+  });
   document.documentElement.dataset.ready = "yes";
 })();
