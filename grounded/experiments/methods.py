@@ -1,7 +1,7 @@
 """Ways to learn a manoeuvre, each as a list of the policies that it would keep, by real trials.
 
-    paper        this algorithm, DDP to convergence in the biased model (step = "full")
-    grounded     this algorithm as the tool recommends it (the default options)
+    paper        this algorithm as the paper has it: the bias alone, DDP to convergence
+    grounded     this algorithm as the tool recommends it: matched inputs, damped steps
     refit+bias   the same, the model's parameters refitted to all trials before the bias is added
     gradient     this algorithm with policy gradient
     refit        parameters fitted to all trials, the policy solved again, no bias
@@ -141,8 +141,10 @@ def differences(case: Bench, options: Options, budget: int = 5000) -> list[Kept]
 
 def run_method(name: str, case: Bench, options: Options) -> list[Kept]:
     """The policies that a method keeps, in the order of real trials."""
-    if name in ("paper", "grounded"):
-        return search(case, replace(options, step="full") if name == "paper" else options)
+    if name == "grounded":
+        return search(case, options)
+    if name == "paper":
+        return search(case, replace(options, step="full", match_inputs=False))
     if name == "refit+bias":
         return search(case, replace(options, refit=True), fitted)
     if name == "gradient":
