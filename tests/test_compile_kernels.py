@@ -202,3 +202,13 @@ def test_a_failed_sweep_names_the_same_step():
 
 def test_lanes_fit_the_machine():
     assert jit.lanes() in (4, 8)
+
+
+def test_a_hundred_states_are_interpreted_and_forty_run_in_a_thread():
+    big = wide(100, 2, True)
+    assert big.system.how == "traced" and "100 states" in big.system.note
+    forty = wide(40, 4, True)
+    assert forty.system.how == "compiled"
+    u = np.zeros((12, 4))
+    costs = parallel(lambda p: solve(replace(forty, p=p), u).cost, [forty.p] * 2, workers=2)
+    assert costs[0] == costs[1] == solve(forty, u).cost

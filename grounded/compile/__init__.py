@@ -57,7 +57,7 @@ def system_of(
         GroundedError: if the function can't be a model of these names, naming its file and line.
     """
     from grounded.compile import jit
-    from grounded.compile.compiled import CompiledSystem
+    from grounded.compile.compiled import MAX_PLACES, CompiledSystem
 
     def differenced(why: str) -> System:
         return DifferencedSystem(
@@ -79,11 +79,11 @@ def system_of(
         return TracedSystem(signature, found, integrator, f"not compiled: {trouble}")
     try:
         system = CompiledSystem(signature, found, integrator)
+        operations = system.operations
     except TooLong as error:
         return differenced(f"{where(function)}: its derivatives take {error}")
-    if system.operations > MAX_COMPILED:
-        note = (
-            f"not compiled, {where(function)}: {system.operations:,} operations would take too long"
-        )
+    if operations > MAX_COMPILED or system.n * (system.n + system.m) > MAX_PLACES:
+        size = f"{system.n} states and {operations:,} operations"
+        note = f"not compiled, {where(function)}: {size} would take too long"
         return TracedSystem(signature, found, integrator, note)
     return system

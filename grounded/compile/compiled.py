@@ -34,6 +34,7 @@ from grounded.compile.traced import TracedSystem, Variant
 from grounded.compile.tracing import Signature, Trace
 
 SMALL = 600  # operations of a model that need not be counted with their derivatives
+MAX_PLACES = 8_000  # of a Jacobian that a kernel keeps on its stack, 4 MB of it
 FORMAT = 1  # raise when kernels change their words or their meaning
 
 
@@ -171,6 +172,8 @@ class CompiledSystem(TracedSystem):
         self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
     ) -> tuple[Array, Array, Array]:
         """See `System.sensitivities`."""
+        if self.n * (self.n + self.m + self.k) > MAX_PLACES:
+            return super().sensitivities(x, u, p, dt, smoothing)
         N, n = len(x), self.n
         f_x, f_u, f_p = np.zeros((N, n, n)), np.zeros((N, n, self.m)), np.zeros((N, n, self.k))
         out = {"f_x": f_x, "f_u": f_u, "f_p": f_p}

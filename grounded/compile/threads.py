@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable, Iterable
 from typing import TypeVar
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+STACK = 16 * 2**20  # bytes for each thread: kernels keep their matrices there
 
 
 def parallel(
@@ -29,8 +31,12 @@ def parallel(
         return [function(item) for item in work]
     from concurrent.futures import ThreadPoolExecutor
 
-    with ThreadPoolExecutor(count) as pool:
-        return list(pool.map(function, work))
+    before = threading.stack_size(STACK)
+    try:
+        with ThreadPoolExecutor(count) as pool:
+            return list(pool.map(function, work))
+    finally:
+        threading.stack_size(before)
 
 
 def _processors() -> int:
