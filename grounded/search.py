@@ -51,6 +51,10 @@ class Options:
                 raise GroundedError(
                     f"[search] {name} must be {low} to {high}, got {getattr(self, name)}"
                 )
+        if self.repeats > self.max_trials:
+            raise GroundedError(
+                f"[search] repeats = {self.repeats} is more than max_trials = {self.max_trials}"
+            )
         if not 0 <= self.tolerance < 1:
             raise GroundedError(f"[search] tolerance must be in [0, 1), got {self.tolerance}")
 
@@ -172,9 +176,12 @@ def standing(
             outstanding=last.candidate,
             missing=missing,
         )
-    if total >= options.max_trials:
+    if total + options.repeats > options.max_trials:
+        used = "all" if total >= options.max_trials else f"{total} of"
+        needs = f"; a candidate needs {options.repeats}" * (total < options.max_trials)
         return state(
-            "stopped", f"all {options.max_trials} trials are used up ([search] max_trials)"
+            "stopped",
+            f"{used} {options.max_trials} trials are used up{needs} ([search] max_trials)",
         )
     if incumbent is None:
         failed = sum(t.accepted is False for t in history)

@@ -222,11 +222,13 @@ def test_max_trials_ends_the_search():
     assert last.standing.sentence == "all 3 trials are used up ([search] max_trials)"
 
 
-def test_the_last_trials_of_a_repeated_candidate_may_pass_the_limit():
-    story = Story(max_trials=4, repeats=3)
-    for _ in range(6):
-        story.add()
-    assert story.propose().standing.phase == "stopped" and story.now.trials == 6
+def test_repeats_that_do_not_fit_any_more_are_not_begun():
+    story = Story(max_trials=5, repeats=3).add().add().add()
+    assert story.propose().standing.sentence == (
+        "3 of 5 trials are used up; a candidate needs 3 ([search] max_trials)"
+    )
+    with pytest.raises(GroundedError, match="repeats = 3 is more than max_trials = 2"):
+        Options(repeats=3, max_trials=2)
 
 
 def test_a_search_with_nothing_to_gain_ends_before_a_trial_is_spent():
