@@ -2,8 +2,8 @@
 
 They differ once effects are adopted: a lag, a backlash or a rate limit gives the model memory
 states that no sensor of the robot knows. Trials are LIFTED to the planning model (the memory
-follows from the commands), policies are NARROWED to what the robot measures (gains on memory are dropped;
-their part of the feed-forward stays), and the predicted run is the narrowed policy's.
+follows from the commands), policies are NARROWED to what the robot measures (gains on memory are
+dropped; their part of the feed-forward stays), and the predicted run is the narrowed policy's.
 """
 
 from __future__ import annotations

@@ -209,8 +209,8 @@ def _foreign(workspace: Workspace, path: Path, candidate: str | None, data: bool
     if chosen and found.late_s > task.dt / 2:
         raise GroundedError(
             f"{path}: the run starts {found.late_s:.2f} s before every state is known: the "
-            "trial's time would not be the candidate's. Start recording before the run, or take it in "
-            "with --data"
+            "trial's time would not be the candidate's. Start recording before the run, or take "
+            "it in with --data"
         )
     trial = Trial(
         states=found.states,
