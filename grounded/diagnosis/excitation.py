@@ -58,9 +58,10 @@ def probe(
         trials: the trials it was made from (for the sizes of signals).
         library: where the effects come from.
     """
-    if not diagnosis.indistinguishable:
+    ties = [g for g in diagnosis.indistinguishable if all(diagnosis.values(n) for n in g[:2])]
+    if not ties:
         return None
-    group = diagnosis.indistinguishable[0]
+    group = ties[0]
     first, second = _hypotheses(task, diagnosis, trials, library or Library(), group[0], group[1])
     noise = _noise(task.model, diagnosis)
     best: tuple[float, Policy, str] | None = None
