@@ -40,6 +40,20 @@ def test_finished_jobs_are_kept_and_not_run_again():
     assert seen == [(3, 5), (4, 5), (5, 5)]
 
 
+def test_results_of_other_code_are_not_reused(monkeypatch):
+    kept = {}
+    run_jobs(draws(1), finished=kept)
+    monkeypatch.setattr("grounded.experiments.jobs.code", lambda: "another")
+    run_jobs(draws(1), finished=kept)
+    assert len(kept) == 2
+
+
+def test_a_worker_with_another_version_is_refused(monkeypatch):
+    monkeypatch.setattr("grounded.experiments.jobs.code", lambda: "another")
+    with pytest.raises(GroundedError, match="another version of grounded"):
+        run_jobs(draws(2), Engine(jobs=2))
+
+
 def test_the_same_job_twice_is_run_once():
     seen = []
     found = run_jobs(draws(1) * 3, progress=lambda done, total: seen.append(done))

@@ -6,16 +6,20 @@ on one worker or on fifty. The engine is joblib: processes on this machine, or a
 through Dask's own joblib backend (extra `grounded[cluster]`); there is no scheduler of ours.
 
     finished    a mapping from the job's key to its result; jobs found in it are not run again. The
-                caller may keep it on disk: a study that was cut off goes on where it was.
+                caller may keep it on disk: a study that was cut off goes on where it was. The key
+                holds a hash of our sources, so that results of two versions are never mixed.
     lost worker its job is run again (by Dask itself, or here after a process died), not the study.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable, Iterator, MutableMapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 from grounded.errors import GroundedError
@@ -23,6 +27,16 @@ from grounded.errors import GroundedError
 Progress = Callable[[int, int], None]  # jobs done, jobs in all
 CONNECT_S = 10.0  # for a cluster's scheduler to answer
 ROUNDS = 5  # times that jobs of lost workers are handed out again
+
+
+@cache
+def code() -> str:
+    """A hash of this package's sources: results of other code are other results."""
+    digest = hashlib.sha256()
+    root = Path(__file__).parents[1]
+    for path in sorted(root.rglob("*.py")):
+        digest.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
+    return digest.hexdigest()[:12]
 
 
 @dataclass(frozen=True)
@@ -34,10 +48,9 @@ class Job:
 
     @property
     def key(self) -> str:
-        """What identifies its result: the function's name and its arguments."""
-        return f"{self.function.__module__}.{self.function.__name__}:" + json.dumps(
-            self.arguments, sort_keys=True
-        )
+        """What identifies its result: the code, the function's name and its arguments."""
+        name = f"{code()} {self.function.__module__}.{self.function.__name__}"
+        return f"{name}:{json.dumps(self.arguments, sort_keys=True)}"
 
 
 @dataclass(frozen=True)
@@ -83,21 +96,21 @@ def run_jobs(
     Raises:
         GroundedError: if joblib or Dask is missing, or workers keep dying.
     """
-    engine = engine or Engine()
-    finished = {} if finished is None else finished
+    engine, finished = engine or Engine(), {} if finished is None else finished
     results = {job.key: finished[job.key] for job in jobs if job.key in finished}
     waiting = list({job.key: job for job in jobs if job.key not in results}.values())
-    if progress:
-        progress(len(results), len(results) + len(waiting))
     total = len(results) + len(waiting)
+
+    def keep(key: str, result: dict[str, Any]) -> None:
+        finished[key] = results[key] = result
+        if progress:
+            progress(len(results), total)
+
+    if progress:
+        progress(len(results), total)
+    lost: BaseException | None = None
     for _ in range(ROUNDS):
-        try:
-            for key, result in _results(waiting, engine):
-                finished[key] = results[key] = result
-                if progress:
-                    progress(len(results), total)
-        except _lost() as error:
-            lost = error
+        lost = _round(waiting, engine, keep)
         waiting = [job for job in waiting if job.key not in results]
         if not waiting:
             return [results[job.key] for job in jobs]
@@ -105,6 +118,26 @@ def run_jobs(
         f"{len(waiting)} of {total} jobs lost their worker {ROUNDS} times (out of memory?); the "
         f"finished ones are kept, run the study again with fewer --jobs: {lost}"
     )
+
+
+def _round(
+    jobs: Sequence[Job], engine: Engine, keep: Callable[[str, dict[str, Any]], None]
+) -> BaseException | None:
+    """Runs the jobs, keeps what comes back, returns the error of a lost worker."""
+    wanted, foreign = {job.key for job in jobs}, False
+    try:
+        for key, result in _results(jobs, engine):
+            if key in wanted:
+                keep(key, result)
+            foreign |= key not in wanted
+    except _lost() as error:
+        return error
+    if foreign:
+        raise GroundedError(
+            "a worker has another version of grounded than this process: install the same one on "
+            "every machine of the cluster"
+        )
+    return None
 
 
 def _call(job: Job) -> tuple[str, dict[str, Any]]:
