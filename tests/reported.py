@@ -52,6 +52,16 @@ DIAGNOSIS: dict[str, Any] = {
         "held_out": True,
     },
     "next_trial": "a fast run and a slow one",
+    "parameters": {"mass": {"value": 1.4, "std": 0.02, "unit": "kg"}},
+    "leftover": [
+        {
+            "channel": "v",
+            "size": 0.02,
+            "unit": "m/s/s",
+            "evidence": 12.0,
+            "region": {"when": "x > 0.2", "share": 0.6, "occupancy": 0.3},
+        }
+    ],
 }
 
 

@@ -94,6 +94,9 @@ def test_page_shows_what_the_issue_lists(cart):
         "a fast run and a slow one",
         "grounded adopt viscous_friction:v",
         "N s/m",
+        "1.400 (1.36 to 1.44)",
+        "x > 0.2",
+        "model as diagnosed",
     ):
         assert words in text, words
 

@@ -48,7 +48,7 @@ def test_rerun_accepts_the_recording_and_finds_all_of_it(cart, tmp_path):
         "/state/x/best",
         "/input/force/low",
         "/bias/v/iteration_0",
-        "/bias/v/with_the_effects",
+        "/bias/v/left_as_diagnosed",
         "/utilities",
         "/summary",
     ):

@@ -47,6 +47,19 @@ class Ranked:
     evidence: float
     gap_after: float
     shrinkage: float
+    fixed: tuple[tuple[str, float], ...] = ()  # quantities that are no parameters
+
+
+@dataclass(frozen=True)
+class Left:
+    """What no known effect explains: a channel's missing rate, and where most of it is."""
+
+    channel: str
+    size: float
+    unit: str
+    when: str
+    share: float
+    evidence: float
 
 
 @dataclass(frozen=True)
@@ -75,6 +88,10 @@ class Diagnosis:
     indistinguishable: tuple[tuple[str, ...], ...]
     gap: Gap | None
     next_trial: str
+    parameters: tuple[Value, ...] = ()  # of the model, estimated beside the effects
+    leftover: tuple[Left, ...] = ()
+    trials: tuple[str, ...] = ()  # that it was made from
+    adopted: tuple[str, ...] = ()  # effects that were in the model then
 
 
 def read_diagnosis(folder: Path) -> Diagnosis | None:
@@ -100,7 +117,7 @@ def read_diagnosis(folder: Path) -> Diagnosis | None:
 
 def _diagnosis(document: dict[str, Any]) -> Diagnosis:
     verdict, where = document["verdict"], document.get("where") or {}
-    gap = document.get("gap")
+    gap, made = document.get("gap"), document.get("diagnosed") or {}
     return Diagnosis(
         kind=str(verdict["kind"]),
         effects=tuple(map(str, verdict.get("effects") or ())),
@@ -126,6 +143,10 @@ def _diagnosis(document: dict[str, Any]) -> Diagnosis:
         ),
         gap=_gap(gap) if gap else None,
         next_trial=str(document.get("next_trial") or ""),
+        parameters=_values(document.get("parameters")),
+        leftover=tuple(_left(one) for one in document.get("leftover") or ()),
+        trials=tuple(map(str, made.get("trials") or ())),
+        adopted=tuple(str(effect["name"]) for effect in made.get("adopted") or ()),
     )
 
 
@@ -135,12 +156,33 @@ def _time(span: dict[str, Any]) -> Share:
 
 
 def _ranked(row: dict[str, Any]) -> Ranked:
-    params = tuple(
-        Value(str(name), _number(p["value"]), _number(p.get("std")), str(p.get("unit") or ""))
-        for name, p in (row.get("params") or {}).items()
+    return Ranked(
+        effect=str(row["effect"]),
+        params=_values(row.get("params")),
+        evidence=_number(row.get("evidence")),
+        gap_after=_number(row.get("gap_after")),
+        shrinkage=_number(row.get("shrinkage")),
+        fixed=tuple((str(k), _number(v)) for k, v in (row.get("fixed") or {}).items()),
     )
-    numbers = [_number(row.get(key)) for key in ("evidence", "gap_after", "shrinkage")]
-    return Ranked(str(row["effect"]), params, *numbers)
+
+
+def _values(table: dict[str, Any] | None) -> tuple[Value, ...]:
+    return tuple(
+        Value(str(name), _number(p["value"]), _number(p.get("std")), str(p.get("unit") or ""))
+        for name, p in (table or {}).items()
+    )
+
+
+def _left(one: dict[str, Any]) -> Left:
+    region = one.get("region") or {}
+    return Left(
+        channel=str(one["channel"]),
+        size=_number(one.get("size")),
+        unit=str(one.get("unit") or ""),
+        when=str(region.get("when") or ""),
+        share=_number(region.get("share")),
+        evidence=_number(one.get("evidence")),
+    )
 
 
 def _gap(gap: dict[str, Any]) -> Gap:

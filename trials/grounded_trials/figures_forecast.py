@@ -36,7 +36,8 @@ def _figure(findings: Findings, name: str, title: str, trial: Trial) -> Figure |
     crude = forecast(findings.crude, trial)
     if crude is None:
         return None
-    better = forecast(findings.explaining, trial) if findings.explaining else None
+    better = findings.better
+    after = forecast(better.planner, trial) if better is not None else None
     times = np.arange(trial.steps + 1, dtype=np.float64) * trial.dt + begin
     panels = []
     for i, (state, unit) in enumerate(findings.task.model.states.items()):
@@ -45,9 +46,9 @@ def _figure(findings: Findings, name: str, title: str, trial: Trial) -> Figure |
             Curve(times, trial.states[:, i], "real", "real"),
             Curve(t + begin, values, "model", "crude model", 1.2),
         ]
-        if better is not None:
-            t, values = better.curve(i, trial.dt)
-            curves.append(Curve(t + begin, values, "best", "with the effects", 1.2))
+        if better is not None and after is not None:
+            t, values = after.curve(i, trial.dt)
+            curves.append(Curve(t + begin, values, "best", f"model {better.name}", 1.2))
         bounds = fitted(without_astray([curves[0].y], [c.y for c in curves[1:]]))
         label = f"{state} [{unit}]"
         panels.append(Panel(label, "time [s]", unit, tuple(curves), y_range=bounds))

@@ -59,7 +59,7 @@ def _shrinkage(diagnosis: Diagnosis) -> Bars:
     title = f"Prediction error {gap.horizon_s:g} s ahead" if math.isfinite(gap.horizon_s) else "Gap"
     rows = (
         ("crude model", gap.before, "model"),
-        ("with the effects", gap.after, "best"),
+        ("as diagnosed", gap.after, "best"),
         ("noise alone", gap.floor, "other"),
     )
     return Bars(title, tuple(Bar(name, v, figure(v, 3), role) for name, v, role in rows))

@@ -156,9 +156,10 @@ def bias_figure(findings: Findings) -> Figure | None:
             words = f"iteration {run.candidate.iteration}"
             curves.append(_over_time(run.residual[:, i] / task.dt, task.dt, role, words, 1.0))
         best = findings.best
-        if best is not None and best.explained is not None:
+        if best is not None and best.explained is not None and findings.better is not None:
             rest = best.explained[:, i] / task.dt
-            curves.append(_over_time(rest, task.dt, "predicted", "left by the effects", 1.5))
+            words = f"left of the last, model {findings.better.name}"
+            curves.append(_over_time(rest, task.dt, "predicted", words, 1.5))
         panels.append(_timed(f"{name} [{unit} per s]", f"{unit} per s", curves))
     caption = (
         "What must be added to the crude model’s rate of change for it to replay the trial. A "

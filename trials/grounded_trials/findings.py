@@ -16,6 +16,7 @@ from grounded.planner import Planner
 from grounded.search import Candidate, Standing, Tried, mean_trial
 from grounded.task import Task
 from grounded.trial import Trial
+from grounded_trials.better_model import Better
 from grounded_trials.diagnosis_file import Diagnosis
 
 
@@ -36,7 +37,7 @@ class Run:
     accepted: bool | None
     utility: float
     residual: Array  # (T, n): s_{t+1} - f(s_t, a_t) of the crude model; NaN where not finite
-    explained: Array | None = None  # (T, n): the same with the diagnosed effects in the model
+    explained: Array | None = None  # (T, n): the same of the better model
 
     @property
     def label(self) -> str:
@@ -70,12 +71,20 @@ class Findings:
     optimum: float | None  # of the real system, where a study computed it
     noise: float  # standard deviation of one trial's utility, NaN while unknown
     next_command: str
-    explaining: Planner | None = None  # with the adopted or diagnosed effects in the model
+    better: Better | None = None  # the model as diagnosed, or with adopted effects
 
     @property
     def crude(self) -> Planner:
         """The task with the crude model."""
         return Planner(self.task, self.task)
+
+    @property
+    def stale(self) -> int:
+        """Trials of this robot that came after the diagnosis."""
+        if self.diagnosis is None or not self.diagnosis.trials:
+            return 0
+        ids = {run.trial.id for run in self.runs} | {log.trial.id for log in self.logs}
+        return len(ids - set(self.diagnosis.trials))
 
     @property
     def history(self) -> tuple[Tried, ...]:

@@ -10,7 +10,6 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -23,6 +22,7 @@ from grounded.planner import Planner
 from grounded.search import Candidate, Standing, standing
 from grounded.task import Task
 from grounded.trial import Trial
+from grounded_trials.better_model import Better, better_model
 from grounded_trials.diagnosis_file import Diagnosis, read_diagnosis
 from grounded_trials.findings import Findings, Log, Lost, Run
 from grounded_trials.mcap_log import read_trial
@@ -42,7 +42,7 @@ def gather(workspace: Workspace) -> Findings:
     data = [t for t in trials if _fits(task, t) and not t.candidate]
     now = _settled(workspace, candidates, own, _standing(workspace, candidates, own))
     diagnosis = _diagnosis(workspace, lost)
-    explaining = _explaining(workspace, diagnosis, lost)
+    better = _better(workspace, diagnosis, lost)
     return Findings(
         name=workspace.folder.resolve().name,
         task=task,
@@ -50,7 +50,7 @@ def gather(workspace: Workspace) -> Findings:
         effects=tuple(str(e["name"]) for e in workspace.config.model.effects),
         method=_method(workspace),
         standing=now,
-        runs=tuple(_runs(task, now, own, explaining, lost)),
+        runs=tuple(_runs(task, now, own, better, lost)),
         logs=tuple(Log(t, _residual(Planner(task, task), t)) for t in data),
         others=len(trials) - len(own) - len(data),
         lost=tuple(lost),
@@ -58,7 +58,7 @@ def gather(workspace: Workspace) -> Findings:
         optimum=_optimum(workspace.reports),
         noise=utility_noise(now.history)[0],
         next_command=_next(workspace, now, diagnosis),
-        explaining=explaining,
+        better=better,
     )
 
 
@@ -137,30 +137,16 @@ def _settled(
         return now
 
 
-def _explaining(
-    workspace: Workspace, diagnosis: Diagnosis | None, lost: list[Lost]
-) -> Planner | None:
-    """The crude model with the adopted effects, or else with those that the diagnosis names."""
-    effects: list[dict[str, Any]] = [dict(effect) for effect in workspace.config.model.effects]
-    if not effects and diagnosis is not None:
-        ranked = {r.effect: r for r in diagnosis.ranking}
-        for name in diagnosis.effects:
-            if name in ranked:
-                values = {v.name: v.value for v in ranked[name].params}
-                effects.append({"name": name, **values})
-    if not effects:
-        return None
-    from grounded_trials.adopted import planner_with
-
+def _better(workspace: Workspace, diagnosis: Diagnosis | None, lost: list[Lost]) -> Better | None:
     try:
-        return planner_with(workspace.task, effects)
+        return better_model(workspace, diagnosis)
     except GroundedError as error:
-        lost.append(Lost("the bias that the effects leave", str(error)))
+        lost.append(Lost("the model as diagnosed", str(error)))
         return None
 
 
 def _runs(
-    task: Task, now: Standing, trials: list[Trial], explaining: Planner | None, lost: list[Lost]
+    task: Task, now: Standing, trials: list[Trial], better: Better | None, lost: list[Lost]
 ) -> list[Run]:
     by_id = {tried.candidate.id: tried for tried in now.history}
     runs = []
@@ -171,7 +157,7 @@ def _runs(
             lost.append(Lost(trial.id, reason))
             continue
         residual = _residual(Planner(task, task), trial)
-        explained = None if explaining is None else _residual(explaining, trial)
+        explained = None if better is None else _residual(better.planner, trial)
         utility = task.utility(trial)
         runs.append(Run(trial, tried.candidate, tried.accepted, utility, residual, explained))
     return runs

@@ -31,6 +31,7 @@ from grounded_trials.page_tables import (
     effect_table,
     error_table,
     forecast_table,
+    leftover_table,
     parameter_table,
 )
 from grounded_trials.words import figure
@@ -148,7 +149,8 @@ def _gap(findings: Findings) -> str:
             "<p>Not diagnosed yet. This says where the model is wrong, and which effect makes it "
             f"so: {command('grounded diagnose', 'c-diagnose')}</p>{_forecasts(findings)}"
         )
-    return _diagnosed(diagnosis) + _forecasts(findings)
+    stale = f"<p>{findings.stale} trials came after this diagnosis.</p>" if findings.stale else ""
+    return stale + _diagnosed(diagnosis) + _forecasts(findings)
 
 
 def _forecasts(findings: Findings) -> str:
@@ -164,6 +166,8 @@ def _diagnosed(diagnosis: Diagnosis) -> str:
     parts.append(figure_block(gap_figure(diagnosis)))
     if diagnosis.ranking:
         parts.append(f"<h3>Effects that were weighed</h3>{effect_table(diagnosis)}")
+    if diagnosis.leftover:
+        parts.append(f"<h3>What no known effect explains</h3>{leftover_table(diagnosis)}")
     for group in diagnosis.indistinguishable:
         parts.append(f"<p>These data can’t tell apart: {escape(', '.join(group))}.</p>")
     gap = diagnosis.gap

@@ -87,8 +87,8 @@ def forecast_table(findings: Findings) -> str:
     if not trials:
         return ""
     planners = [("crude", findings.crude)]
-    if findings.explaining is not None:
-        planners.append(("with effects", findings.explaining))
+    if findings.better is not None:
+        planners.append((findings.better.name, findings.better.planner))
     columns = []
     for trial in trials:
         name = trial.id or trial.candidate
@@ -124,15 +124,35 @@ def _params(ranked: Ranked) -> str:
 
 
 def _value(v: Value) -> str:
+    return f"{v.name} = {_interval(v)} {v.unit}"
+
+
+def _interval(v: Value) -> str:
     half = INTERVAL * v.std
     if not math.isfinite(half):
-        return f"{v.name} = {figure(v.value)} {v.unit}"
-    interval = f"{figure(v.value - half, 3)} to {figure(v.value + half, 3)}"
-    return f"{v.name} = {figure(v.value)} ({interval}) {v.unit}"
+        return figure(v.value)
+    return f"{figure(v.value)} ({figure(v.value - half, 3)} to {figure(v.value + half, 3)})"
+
+
+def leftover_table(diagnosis: Diagnosis) -> str:
+    """What no known effect explains."""
+    rows = [
+        (
+            left.channel,
+            f"{figure(left.size, 3)} {left.unit}",
+            left.when or "-",
+            f"{100 * left.share:.0f} %" if math.isfinite(left.share) else "-",
+            figure(left.evidence, 3),
+        )
+        for left in diagnosis.leftover
+    ]
+    header = ("channel", "missing rate, rms", "mostly where ", "share there", "evidence [nats]")
+    return table("leftover", header, rows)
 
 
 def parameter_table(findings: Findings) -> str:
-    """The crude model's parameters."""
+    """The crude model's parameters, and what the diagnosis would make of them."""
+    estimated = {v.name: v for v in findings.diagnosis.parameters} if findings.diagnosis else {}
     rows = []
     for name, param in findings.task.model.params.items():
         nominal = findings.nominal.get(name)
@@ -140,10 +160,12 @@ def parameter_table(findings: Findings) -> str:
         limits = (
             "free" if param.low is None and param.high is None else _range(param.low, param.high)
         )
-        rows.append((name, figure(param.value), param.unit, changed or "-", limits))
+        found = _interval(estimated[name]) if name in estimated else "-"
+        rows.append((name, figure(param.value), param.unit, changed or "-", limits, found))
     if not rows:
         return "<p>The model has no parameters.</p>"
-    return table("parameters", ("parameter", "value", "unit", "in model.py", "bounds"), rows)
+    header = ("parameter", "value", "unit", "in model.py", "bounds", "diagnosed, 95 %")
+    return table("parameters", header, rows)
 
 
 def channel_table(findings: Findings) -> str:

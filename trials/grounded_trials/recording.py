@@ -144,14 +144,14 @@ def _biases(stream: Any, findings: Findings) -> None:
         key = f"iteration {run.candidate.iteration}"
         colour = "best" if last else colours[number % 3]
         _rates(stream, findings, key, run.residual, colour)
-    if best is not None and best.explained is not None:
-        _rates(stream, findings, "with the effects", best.explained, "limit")
+    if best is not None and best.explained is not None and findings.better is not None:
+        _rates(stream, findings, f"left, {findings.better.name}", best.explained, "limit")
 
 
 def _rates(stream: Any, findings: Findings, key: str, residual: Array, colour: str) -> None:
     rates, dt = rate(residual, findings.task.dt)
     for i, name in enumerate(findings.task.model.state_names):
-        at = f"bias/{name}/{key.replace(' ', '_')}"
+        at = f"bias/{name}/{key.replace(' ', '_').replace(',', '')}"
         marks.line(stream, at, rates[:, i], dt, colour, key, 1.0)
 
 

@@ -89,7 +89,7 @@ def _trials(findings: Findings, scene: Scene) -> list[Any]:
         contents = ["/paths/desired", f"{at}/path", f"{at}/predicted", f"{at}/body"]
         names = dict(NAMES)
         if run.explained is not None:
-            names["explained"] = "bias that the effects leave"
+            names["explained"] = "bias that is left after the diagnosis"
         plots = [_plot(f"{at}/{key}", name) for key, name in names.items()]
         space = _space(findings, scene, "/", contents, f"{run.label}, utility {run.utility:.4g}")
         tabs.append(rrb.Horizontal(space, rrb.Vertical(*plots), name=run.trial.id))

@@ -41,6 +41,8 @@ def report_text(findings: Findings, table: Table, bars: Callable[[Sequence[float
     if findings.best is not None:
         parts += [_trajectories(findings, table), _biases(findings, table)]
     parts.append(_diagnosis(findings.diagnosis, table))
+    if findings.stale:
+        parts[-1] += f"\n  {findings.stale} trials came after this diagnosis: grounded diagnose"
     if findings.logs:
         parts.append(_logs(findings, table))
     if findings.lost:
