@@ -10,7 +10,7 @@ import click
 from grounded_cli.learn import learn_in
 from grounded_cli.options import as_json
 from grounded_cli.status import summary
-from grounded_cli.terminal import number, progress, say, show, show_json
+from grounded_cli.terminal import field, number, progress, say, show, show_json
 
 if TYPE_CHECKING:
     from grounded_trials.workspace import Workspace
@@ -59,21 +59,18 @@ def command(name: str, folder: str | None, json_: bool) -> None:
 
 
 def _tell(document: dict[str, Any]) -> None:
-    utilities = document["utilities"]
-    improvement = 1 - utilities[-1] / utilities[0]
+    first, last = document["utilities"][0], document["utilities"][-1]
+    gain = f"{100 * (1 - last / first):.1f} % better after {document['trials']} trials"
     show(
-        f"\nutility    {number(utilities[0])} by the model's own policy, "
-        f"{number(utilities[-1])} after {document['trials']} trials: "
-        f"{100 * improvement:.1f} % better"
+        "\n"
+        + field("learned", f"{number(first)} by the model's own policy, {number(last)} now: {gain}")
     )
-    show(
-        f"optimum    {number(document['optimum'])}, planned with the true model "
-        "(never shown to the search)"
-    )
-    if document["verdict"]:
-        show(f"gap        {document['verdict']['sentence']}")
+    if document["optimum"] is not None:
+        known = "planned with the true model, which the search never saw"
+        show(field("optimum", f"{number(document['optimum'])}, {known}"))
+    show(field("gap", document["verdict"]["sentence"]))
     for kind, path in document["paths"].items():
-        show(f"{kind:10} {path}")
+        show(field(kind, path))
     show(f"\nnext: grounded -C {document['workspace']} view")
 
 
