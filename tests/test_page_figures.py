@@ -15,11 +15,12 @@ from grounded.models import pendulum
 from grounded.planner import Planner
 from grounded.rollout import simulate
 from grounded.trial import Trial
-from grounded_trials.figures import Curve, Panel
+from grounded_trials.figures import Band, Curve, Dot, Panel
 from grounded_trials.figures_all import all_figures
 from grounded_trials.figures_axis import Axis, fitted, round_up, without_astray
 from grounded_trials.figures_draw import Stroke, draw
 from grounded_trials.figures_png import dashed, plain, png
+from grounded_trials.figures_svg import svg
 from grounded_trials.figures_thin import thinned
 from grounded_trials.forecast import forecast, forecast_error
 from grounded_trials.gathering import gather
@@ -93,6 +94,17 @@ def test_loss_axes_put_better_higher_and_space_by_ratio():
     places = [float(axis.place(v)) for v in (-100, -10, -1)]
     assert places == pytest.approx([0.0, 0.5, 1.0])
     assert [v for v, _ in axis.ticks()] == sorted(v for v, _ in axis.ticks())
+
+
+def test_noise_beyond_zero_ends_at_the_top_of_a_loss_axis():
+    dots = (
+        Dot(1.0, -50.0, "best", "a", error=60.0),
+        Dot(2.0, -2.0, "best", "b", error=7.0),
+        Dot(3.0, float("nan"), "model", "failed", "cross"),
+    )
+    panel = Panel("p", "x", "y", dots=dots, bands=(Band(-9.0, 5.0, "other", "n"),), loss=True)
+    text = svg(draw(panel), "p")
+    assert "nan" not in text and text.count("<circle") == 2
 
 
 def test_a_run_that_went_astray_does_not_flatten_the_others():

@@ -29,7 +29,7 @@ class Axis:
         if not self.loss:
             return value
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray(-np.log10(-value))
+            return np.asarray(-np.log10(-np.minimum(value, self.high)))
 
     def ticks(self, most: int = 5) -> list[tuple[float, str]]:
         """Round numbers inside the range, as values and as text."""
