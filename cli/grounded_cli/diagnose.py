@@ -1,4 +1,4 @@
-"""grounded diagnose: where the model is wrong, which effect makes it so, how far the gap shrinks."""
+"""grounded diagnose: where the model is wrong, which effect makes it so, how far it shrinks."""
 
 from __future__ import annotations
 
@@ -56,9 +56,13 @@ def _tell(document: dict[str, Any]) -> None:
     for region in document["where"]["regions"][:3]:
         share, time = 100 * region["share"], 100 * region["occupancy"]
         show(field("", f"{region['when']}: {share:.0f} % of the gap in {time:.0f} % of the time"))
-    ranking = [_ranked(entry) for entry in document["ranking"][:8]]
+    ranking = document["ranking"][:8]
     if ranking:
-        show("\n" + table(ranking, ("effect", "evidence", "gap after", "values")))
+        rows = [_ranked(entry) for entry in ranking]
+        show("\n" + table(rows, ("effect (*: claimed)", "evidence [nats]", "gap after")))
+    for entry in ranking:
+        if entry.get("claimed"):
+            show(field(entry["effect"], _values(entry)))
     for group in document["indistinguishable"]:
         show(field("alike", f"the data can't tell apart: {', '.join(group)}"))
     show("\n" + field("next trial", document["next_trial"]))
@@ -75,11 +79,13 @@ def _gap(gap: dict[str, Any]) -> str:
     )
 
 
-def _ranked(entry: dict[str, Any]) -> tuple[str, str, str, str]:
-    values = ", ".join(
+def _ranked(entry: dict[str, Any]) -> tuple[str, str, str]:
+    mark = "* " if entry.get("claimed") else "  "
+    return mark + entry["effect"], f"{entry['evidence']:.1f}", number(entry["gap_after"], 3)
+
+
+def _values(entry: dict[str, Any]) -> str:
+    return ", ".join(
         f"{name} = {number(p['value'], 3)} +- {number(p['std'], 2)} {p['unit']}"
         for name, p in entry["params"].items()
     )
-    after = entry["gap_after"]
-    mark = "* " if entry.get("claimed") else "  "
-    return mark + entry["effect"], f"{entry['evidence']:.1f}", number(after, 3), values

@@ -61,7 +61,8 @@ def library_of(without: tuple[str, ...] = ()) -> Library:
             loaded = point.load()
         except Exception as error:
             raise GroundedError(
-                f"the effects of package '{point.value}' can't be loaded: {error}; mend or uninstall it"
+                f"the effects of package '{point.value}' can't be loaded: {error}; mend or "
+                "uninstall it"
             ) from None
         families = [loaded] if isinstance(loaded, Family) else list(loaded)
         if not all(isinstance(family, Family) for family in families):

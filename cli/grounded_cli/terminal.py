@@ -62,7 +62,7 @@ def _clean(value: Any) -> Any:
 
 def field(label: str, text: str, indent: str = "") -> str:
     """A label and its text, wrapped to 80 columns under itself."""
-    head = f"{indent}{label:<11}"
+    head = f"{indent}{label:<10} "
     return textwrap.fill(
         text, 80, initial_indent=head, subsequent_indent=" " * len(head), break_on_hyphens=False
     )
