@@ -7,6 +7,7 @@ import pytest
 
 from grounded.experiments.bench import bench, optimum
 from grounded.experiments.ilc import deepened, gradient_of, lifted
+from grounded.experiments.scatter import many_runs, start_of
 from grounded.improve import first_policy
 from grounded.rollout import simulate
 
@@ -68,3 +69,18 @@ def test_a_case_is_its_seed():
     a, b = bench("circle", "parametric", 4), bench("circle", "parametric", 4)
     assert (a.plant.model.values == b.plant.model.values).all()
     assert (a.plant.model.values != bench("circle", "parametric", 5).plant.model.values).any()
+
+
+@pytest.mark.parametrize("manoeuvre", ["turn", "circle"])
+def test_many_runs_are_the_plants_runs(manoeuvre):
+    case = bench(manoeuvre, "noise", 2)
+    policy, _ = first_policy(case.task)
+
+    def streams():
+        return [np.random.default_rng([2, i]) for i in range(3)]
+
+    together = many_runs(case.task, case.plant, policy, streams())
+    for trial, rng in zip(together, streams(), strict=True):
+        alone = case.plant.run(policy, start_of(case.task), rng)
+        assert np.abs(trial.states - alone.states).max() < 1e-7
+        assert np.abs(trial.inputs - alone.inputs).max() < 1e-7
