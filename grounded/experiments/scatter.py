@@ -73,7 +73,7 @@ def many_runs(
 
 def _actions(policy: Policy, x: Array, sent: Array, t: int) -> Array:
     """The inputs of step t (N, m) for measured states x (N, n) and the inputs sent before."""
-    u = np.tile(policy.feedforward[t], (len(x), 1))
+    u: Array = np.tile(policy.feedforward[t], (len(x), 1))
     if policy.gain is not None and policy.reference is not None:
         past = [
             sent[:, t - 1 - i, j] if t - 1 - i >= 0 else np.full(len(x), policy.past[j])
@@ -83,7 +83,8 @@ def _actions(policy: Policy, x: Array, sent: Array, t: int) -> Array:
         dz = z_difference(np.column_stack([x, *past]), policy.reference[t], policy.angles)
         correction = dz @ policy.gain[t].T
         u += np.where(np.isfinite(correction).all(axis=1, keepdims=True), correction, 0.0)
-    return np.minimum(np.maximum(u, policy.low), policy.high)
+    clipped: Array = np.clip(u, policy.low, policy.high)
+    return clipped
 
 
 def _advanced(plant: Plant, policy: Policy, x: Array, sent: Array, t: int) -> Array:
