@@ -205,4 +205,5 @@ class Task:
         """U of a real trial (section 2); -inf for one that ended early or is not finite."""
         if trial.steps < self.horizon or trial.finite_steps < self.horizon:
             return -np.inf
-        return float(self.rewards(trial).sum())
+        total = float(self.rewards(trial).sum())
+        return total if np.isfinite(total) else -np.inf  # flew off beyond what a number holds

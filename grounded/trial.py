@@ -10,6 +10,9 @@ from grounded.errors import GroundedError
 from grounded.frozen import Array, readonly
 
 
+HUGE = 1e100  # from here on a number is as good as infinite: squares and products must be numbers
+
+
 @dataclass(frozen=True, eq=False)
 class Trial:
     """States s_0 .. s_T and the COMMANDED inputs a_0 .. a_{T-1}, sampled every dt.
@@ -54,8 +57,8 @@ class Trial:
     @property
     def finite_steps(self) -> int:
         """Steps whose states and inputs are all finite numbers; -1 if the first state isn't."""
-        states = ~np.isfinite(self.states).all(axis=1)
-        inputs = ~np.isfinite(self.inputs).all(axis=1)
+        states = ~(np.abs(self.states) < HUGE).all(axis=1)
+        inputs = ~(np.abs(self.inputs) < HUGE).all(axis=1)
         known = int(np.argmax(states)) - 1 if states.any() else self.steps
         return min(known, int(np.argmax(inputs))) if inputs.any() else known
 

@@ -58,8 +58,10 @@ def step_rewards(
         past: the input held before t = 0, (m,).
     """
     tracked = np.where(np.isnan(error) & (reward.state + reward.terminal == 0), 0.0, error)
-    penalty = tracked**2 @ reward.state
-    penalty[-1] += tracked[-1] ** 2 @ reward.terminal
-    change = np.diff(np.vstack([past, inputs]), axis=0)
-    penalty[:-1] += (inputs - input_target) ** 2 @ reward.input + change**2 @ reward.input_change
+    with np.errstate(over="ignore", invalid="ignore"):  # a run that flew off: `Task.utility`
+        penalty = tracked**2 @ reward.state
+        penalty[-1] += tracked[-1] ** 2 @ reward.terminal
+        change = np.diff(np.vstack([past, inputs]), axis=0)
+        off = inputs - input_target
+        penalty[:-1] += off**2 @ reward.input + change**2 @ reward.input_change
     return np.asarray(-penalty)

@@ -4,6 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from grounded.errors import GroundedError
 from grounded.improve import learn, model_fingerprint, propose
@@ -322,3 +324,55 @@ def test_headings_that_wrap_between_repeats_do_not_spoil_the_mean():
     states[:, 2] += 2 * np.pi
     mean = mean_trial([one, replace(one, states=states)], task.model.angle_mask)
     assert np.abs(task.model.difference(mean.states, one.states)).max() < 1e-9
+
+
+EVENTS = {
+    "good": lambda trial: trial,
+    "bad": bad,
+    "short": cut,
+    "nan": with_nan,
+    "nothing": nothing,
+    "held": lambda trial: replace(trial, start_inputs=np.array([2.0])),
+    "noise": lambda trial: replace(
+        trial, states=trial.states + 0.05 * np.sin(np.arange(82.0)).reshape(41, 2)
+    ),
+    "huge": lambda trial: replace(trial, states=1e200 * (1 + trial.states)),
+    "large": lambda trial: replace(trial, states=1e60 * (1 + trial.states)),
+    "far": lambda trial: replace(trial, states=1e5 * (1 + trial.states)),
+}
+
+
+@given(
+    st.lists(st.sampled_from([*EVENTS, "model", "again", "data"]), max_size=9),
+    st.sampled_from([1, 2]),
+    st.sampled_from(["damped", "full"]),
+)
+@settings(max_examples=40, deadline=None)
+def test_whatever_happens_the_search_goes_on_or_says_why(events, repeats, step):
+    """Any story of crashes, noise, mended models, repeated runs: no exception, no worse policy."""
+    story = Story(repeats=repeats, step=step, max_halvings=2, max_trials=8)
+    for event in events:
+        proposal = story.propose()
+        if event == "model":
+            story.task = story.task.with_model(other(story.task.model, 1.1))
+        elif event == "data":
+            story.trials += [replace(t, candidate="") for t in story.trials[:1]]
+        elif event == "again" and story.trials:
+            story.trials.append(story.trials[-1])
+        elif proposal.candidate is not None and event in EVENTS:
+            trial = drive(story.task, story.plant, proposal.candidate)
+            story.trials.append(EVENTS[event](trial))
+    now = story.now
+    assert now.phase in ("propose", "await-trial", "converged", "stopped") and now.sentence
+    accepted = now.utilities
+    assert accepted == sorted(accepted) and all(np.isfinite(accepted))
+    first, second = (
+        propose(story.task, story.candidates, story.trials, story.options) for _ in "12"
+    )
+    assert (first.candidate is None) == (second.candidate is None)
+    if first.candidate is not None:
+        policy = first.candidate.policy
+        assert policy.feedforward.tobytes() == second.candidate.policy.feedforward.tobytes()
+        assert np.isfinite(policy.feedforward).all() and np.isfinite(policy.gain).all()
+        inside = first.candidate.predicted_inputs
+        assert (inside >= TASK.low).all() and (inside <= TASK.high).all()

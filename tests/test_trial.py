@@ -49,7 +49,7 @@ def test_steps(T):
     assert made.steps == T and made.finite_steps == T
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf])
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -1e200])
 def test_finite_steps_end_before_the_first_bad_number(bad):
     for k in range(6):
         states = np.zeros((6, 2))

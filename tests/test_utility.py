@@ -126,3 +126,10 @@ def test_what_follows_the_horizon_is_not_judged():
     )
     assert task.utility(longer) == task.utility(whole)
     np.testing.assert_array_equal(ground(task, longer).bias, ground(task, whole).bias)
+
+
+def test_a_run_that_flew_off_is_worth_minus_infinity_not_nan():
+    task = cart_task()
+    states = np.array(random_trial(task).states)
+    states[:, 0] = 1e200
+    assert task.utility(replace(random_trial(task), states=states)) == -np.inf

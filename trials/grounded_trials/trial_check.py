@@ -8,7 +8,7 @@ from grounded.bridge import bridge
 from grounded.frozen import Array
 from grounded.policy import Policy, z_difference
 from grounded.task import Task
-from grounded.trial import Trial
+from grounded.trial import HUGE, Trial
 from grounded_trials.workspace import Workspace
 
 FAR = 0.1  # of a state's range in the trial: a start this far from s_0 is worth a warning
@@ -58,7 +58,7 @@ def _first_bad(trial: Trial) -> tuple[str, int]:
         (int(step), name)
         for values, names in ((trial.states, trial.state_names), (trial.inputs, trial.input_names))
         for column, name in zip(values.T, names, strict=True)
-        for step in np.flatnonzero(~np.isfinite(column))[:1]
+        for step in np.flatnonzero(~(np.abs(column) < HUGE))[:1]
     ]
     step, name = min(places, key=lambda place: place[0])
     return name, step
