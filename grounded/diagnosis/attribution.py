@@ -34,6 +34,7 @@ SPREADS = (0.03, 0.1)  # prior relative errors of the model's parameters when th
 PARAM_PRIOR = 0.2  # prior relative error of one parameter that is blamed
 SHORTLIST = 14  # effects that are refined of a scan, and half as many parameters
 TAUS = (0.05, 0.1, 0.3)  # [s] of coloured noise
+LARGE = 8  # states, above which one correlation time and half the shortlist have to do
 
 
 class Search:
@@ -51,6 +52,9 @@ class Search:
         self.N = max(data.steps, 2)
         self.fits: dict[tuple[Structure, float, tuple[str, ...]], Fit] = {}
         families = [e.family.name for e in candidates]
+        large = data.model.n > LARGE
+        self.taus = [tau for tau in (TAUS[1:2] if large else TAUS) if tau > 0.7 * data.dt]
+        self.most = SHORTLIST // 2 if large else SHORTLIST
         self.crowd = {e.name: families.count(e.family.name) for e in candidates}
 
     def price(self, effect: Effect, values: dict[str, float]) -> float:
@@ -58,7 +62,7 @@ class Search:
         if isinstance(effect.family, ParamFamily):
             return math.log(self.crowd.get(effect.name, 1)) + self._param_price(effect, values)
         k = len(effect.free)
-        cost = 0.5 * k * math.log(self.N) + math.log(effect.places)
+        cost = 0.5 * k * math.log(self.N) + math.log(effect.places) + effect.family.vague
         return cost + math.log(self.crowd.get(effect.name, 1))
 
     def _param_price(self, effect: Effect, values: dict[str, float]) -> float:
@@ -119,8 +123,7 @@ class Search:
         if best.noise.structure.tau is None:
             starts += [
                 (bare, best.noise.allowing(Structure(tau), self.data.dt), best.track)
-                for tau in TAUS
-                if tau > 0.7 * self.data.dt
+                for tau in self.taus
             ]
             self.refined(starts[1:], iterations=8)
         self.refined(starts[:1], iterations=10)
@@ -131,8 +134,7 @@ class Search:
             return []
         starts = [
             (fit.hypothesis, fit.noise.allowing(Structure(tau), self.data.dt), fit.track)
-            for tau in TAUS
-            if tau > 0.7 * self.data.dt
+            for tau in self.taus
         ]
         return self.refined(starts, iterations=8)
 
@@ -176,7 +178,7 @@ class Search:
 
     # -- one effect more --------------------------------------------------------------------------
 
-    def shortlist(self, fit: Fit, count: int = SHORTLIST) -> list[Look]:
+    def shortlist(self, fit: Fit, count: int) -> list[Look]:
         """The candidates that would add most to a fit, after their price."""
         taken = set(fit.hypothesis.names)
         free = [
@@ -194,10 +196,10 @@ class Search:
         others = [look for _, look in worth if not isinstance(look.effect.family, ParamFamily)]
         return others[:count] + params[: count // 2]
 
-    def extended(self, fit: Fit, count: int = SHORTLIST, iterations: int = 7) -> list[Fit]:
+    def extended(self, fit: Fit, count: int = 0, iterations: int = 7) -> list[Fit]:
         """The fit with each shortlisted effect added, refined."""
         starts: list[Fit | tuple] = [fit]  # type: ignore[type-arg]
-        for look in self.shortlist(fit, count):
+        for look in self.shortlist(fit, count or self.most):
             h = fit.hypothesis
             starts.append((h.plus(look.effect, look.values), fit.noise, fit.track))
             if look.second is not None and self.far(look):
@@ -245,19 +247,25 @@ def attribute(
         max_effects: at most so many at once.
         tick: called with what is being done, for a progress display.
     """
-    search = Search(data, candidates, tick)
-    search.nulls()
-    best = _explore(search)
-    if outliers(best):
-        search = search.with_weights(clean(search.predictor, best))
-        best = _explore(search)
-    _grow(search, best, max_effects)
+    with np.errstate(all="ignore"):  # a hypothesis that diverges scores minus infinity
+        search, best = _searched(Search(data, candidates, tick))
+        _grow(search, best, max_effects)
     chosen = search.best_null()
     for size in range(1, max_effects + 1):
         for fit in search.of_size(size)[:1]:
             if search.score(fit) > search.score(chosen) + CLAIM:
                 chosen = fit
     return search, chosen
+
+
+def _searched(search: Search) -> tuple[Search, Fit]:
+    """The best single hypothesis; with outliers in the data, the best with their weights."""
+    search.nulls()
+    best = _explore(search)
+    if outliers(best):
+        search = search.with_weights(clean(search.predictor, best))
+        best = _explore(search)
+    return search, best
 
 
 def _explore(search: Search) -> Fit:
@@ -271,7 +279,7 @@ def _explore(search: Search) -> Fit:
         return null
     best = singles[0]
     for _ in range(2):  # with the noise that the best one leaves, others may look better
-        search.extended(_without_last(best), SHORTLIST)
+        search.extended(_without_last(best))
         search.structures(best)
         search.calibrated(best)
         again = search.of_size(1)[0]

@@ -85,8 +85,9 @@ def diagnose(
     candidates = knowable(data, options.library.candidates(model, data.scales), ())
     search, best = attribute(data, candidates, max_effects=options.max_effects, tick=tick)
     tick("leftover")
-    left = leftovers(search.predictor, best)
-    return _Writer(search, best, left, known, options, tick).diagnosis()
+    with np.errstate(all="ignore"):
+        left = leftovers(search.predictor, best)
+        return _Writer(search, best, left, known, options, tick).diagnosis()
 
 
 class _Writer:

@@ -128,6 +128,7 @@ class Family:
         targets: all targets of a model to which it can apply, joined by "+".
         quantities: the numbers to estimate at a site.
         lookalikes: families that the same data may explain.
+        vague: nats that a family pays for naming no mechanism, so that a tie goes to one that does.
     """
 
     name: str
@@ -136,6 +137,7 @@ class Family:
     targets: Callable[[Model], Sequence[str]]
     quantities: Callable[[Site], tuple[Quantity, ...]]
     lookalikes: tuple[str, ...] = ()
+    vague: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -104,6 +104,7 @@ trend = RateFamily(
     targets=places.dynamic,
     quantities=_trend,
     lookalikes=("input_fade", "offset", "periodic"),
+    vague=0.5,
     rate=_trend_rate,
     timed=True,
 )
@@ -115,6 +116,7 @@ coupling = RateFamily(
     targets=places.pairs,
     quantities=_coupling,
     lookalikes=("viscous_friction", "rate_gain", "understeer", "parameter"),
+    vague=1.0,
     rate=_coupling_rate,
 )
 
@@ -125,6 +127,7 @@ periodic = RateFamily(
     targets=places.dynamic,
     quantities=_periodic,
     lookalikes=("trend", "patch"),
+    vague=1.0,
     rate=_periodic_rate,
     timed=True,
 )
