@@ -21,7 +21,7 @@ from typing import Literal
 
 import numpy as np
 
-from grounded.compile import Problem
+from grounded.compile import Backward, Problem
 from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.riccati import CEILING, FLOOR, GROWTH, Sweep, input_scale, sweep
@@ -100,8 +100,10 @@ def solve(
     trace: list[Iteration] = []
     if not np.isfinite(state.cost):
         return _not_finite(problem, state, _first_bad(problem, state.z), trace)
+    gains: Backward | None = None
     while True:
-        found = sweep(problem, state.z, state.u, mu=state.mu)
+        found = sweep(problem, state.z, state.u, mu=state.mu, into=gains)
+        gains = found.gains
         if not found.ok:
             why = f"the sweep failed at step {found.gains.failed_at}"
             return _not_finite(problem, state, why, trace)

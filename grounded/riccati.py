@@ -55,17 +55,23 @@ def input_scale(problem: Problem) -> Array:
 
 
 def sweep(
-    problem: Problem, z: Array, u: Array, damping: Array | None = None, mu: float = 0.0
+    problem: Problem,
+    z: Array,
+    u: Array,
+    damping: Array | None = None,
+    mu: float = 0.0,
+    into: Backward | None = None,
 ) -> Sweep:
     """Sweeps back along z (H+1, nz), u (H, m) with damping (m,) + mu * input_scale.
 
     mu grows tenfold after each failure; when it passes 1e10 the failed sweep is returned, with
-    `ok` False: the trajectory or the model holds no finite numbers.
+    `ok` False: the trajectory or the model holds no finite numbers. `into`: see `System.backward`.
     """
     base = np.zeros(problem.system.m) if damping is None else np.asarray(damping, float)
     scale = input_scale(problem)
+    gains = into
     while True:
-        gains = problem.system.backward(problem, z, u, base + mu * scale)
+        gains = problem.system.backward(problem, z, u, base + mu * scale, gains)
         if gains.failed_at < 0 or mu >= CEILING:
             return Sweep(gains, mu)
         mu = max(FLOOR, GROWTH * mu)

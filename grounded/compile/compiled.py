@@ -218,12 +218,23 @@ class CompiledSystem(TracedSystem):
             call(kernel, ROLLOUT, words)
         return Swarm(z, u, cost)
 
-    def backward(self, problem: Problem, z: Array, u: Array, damping: Array) -> Backward:
+    def backward(
+        self,
+        problem: Problem,
+        z: Array,
+        u: Array,
+        damping: Array,
+        into: Backward | None = None,
+    ) -> Backward:
         """See `System.backward`."""
         if self.m > MAX_INPUTS:
             return super().backward(problem, z, u, damping)
         H, nz = problem.horizon, problem.nz
-        k, K, expected = np.empty((H, self.m)), np.empty((H, self.m, nz)), np.zeros(2)
+        expected = np.zeros(2)
+        if into is not None and into.K.shape == (H, self.m, nz):
+            k, K = into.k, into.K
+        else:
+            k, K = np.empty((H, self.m)), np.empty((H, self.m, nz))
         z, u, damping = _plain(z), _plain(u), _plain(damping)
         words = self._packed(problem) | {"z_run": z, "u_run": u, "damping": damping}
         words |= {"k": k, "K": K, "expected": expected}

@@ -97,7 +97,14 @@ class Interpreted(ABC):
                 z[:, t + 1, n:] = queue.after(z[:, t, n:], u[:, t])
         return Swarm(z, u, trajectory_cost(problem, z, u))
 
-    def backward(self, problem: Problem, z: Array, u: Array, damping: Array) -> Backward:
+    def backward(
+        self,
+        problem: Problem,
+        z: Array,
+        u: Array,
+        damping: Array,
+        into: Backward | None = None,
+    ) -> Backward:
         """See `System.backward`."""
         sent = queue_of(problem).effective(z[:-1], u)
         sent = sent if problem.input_shift is None else sent - problem.input_shift
