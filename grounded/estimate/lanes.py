@@ -21,7 +21,7 @@ def usable(T: int, n: int, ny: int) -> bool:
     """Whether the compiled recursions can run here, for these sizes."""
     from grounded.compile import jit
 
-    return T > 0 and 0 < n <= kernel.LARGEST and 0 < ny <= kernel.LARGEST and jit.available()
+    return T > 0 and 0 < n <= kernel.LARGEST and 0 < ny <= kernel.LARGEST and not jit.trouble()
 
 
 def pack(array: Array, width: int) -> Array:
