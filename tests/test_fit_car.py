@@ -3,13 +3,9 @@
 import numpy as np
 import pytest
 
-from grounded.experiments.fit_car import (
-    bench,
-    drive,
-    first_values,
-    fit_car,
-    true_car,
-)
+from grounded.experiments.driving import drive
+from grounded.experiments.first_values import first_values
+from grounded.experiments.fit_car import bench, fit_car, true_car
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +28,7 @@ def test_the_result_is_plain_and_makes_a_table(found):
     plain = found.to_json()
     assert set(plain["coverage"]) == set(found.runs[0]["params"])
     assert 0 <= plain["coverage_all"] <= 1
-    table = found.table()
+    (table,) = found.tables()
     assert len(table.rows) == 10
     assert all(len(row) == len(table.head) for row in table.rows)
 

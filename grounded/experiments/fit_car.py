@@ -18,7 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from grounded.estimate import Measurement, Record, of_function
+from grounded.experiments.driving import drive, markers
+from grounded.experiments.first_values import first_values
 from grounded.experiments.jobs import Engine, Job, Progress, run_jobs
 from grounded.experiments.summary import Table
 from grounded.fit import fit
@@ -26,11 +27,6 @@ from grounded.frozen import Array
 from grounded.model import Model
 from grounded.models.car import model as car
 
-RATE = 30  # [Hz] of the camera and of the driver's inputs
-RUN = 60.0  # [s] one film
-CAMERA = 0.002  # [m] noise of a marker's position
-PROCESS = (2e-3, 1e-2, 3e-4, 3e-4, 5e-4, 1e-3)  # [state's unit] per camera frame
-START = (0.05, 0.02, CAMERA, CAMERA, 0.02, 0.1)  # how well a car at rest is known
 BENCH = 0.005  # [rad] noise of a steering angle measured on the bench
 FITTED = ("a1", "b1", "a2", "b2", "a3", "a4", "tau_delta", "tau_v", "stall")
 
@@ -61,7 +57,7 @@ class FitCarResult:
             "coverage_all": float(np.mean(every)),
         }
 
-    def table(self) -> Table:
+    def tables(self) -> list[Table]:
         """Per parameter: error of the first value, of the fit, the stated std, the coverage."""
         rows = []
         for name, share in self.coverage.items():
@@ -73,7 +69,7 @@ class FitCarResult:
             rows.append((f"{name} [{each[0]['unit']}]", *row))
         head = ("parameter", "first value's error", "fit's error", "stated std", "inside 95 %")
         title = f"Parameters from {self.minutes:g} minutes of driving, {len(self.runs)} cars"
-        return Table(title, head, tuple(rows))
+        return [Table(title, head, tuple(rows))]
 
 
 def fit_car(
@@ -139,178 +135,8 @@ def true_car(rng: np.random.Generator) -> tuple[Model, float]:
     return car.with_values(values), float(rng.uniform(0.08, 0.12))
 
 
-def markers(length: float) -> Measurement:
-    """The camera: positions of the front and the rear marker, `length` apart [m]."""
-
-    def seen(x: Array) -> Array:
-        ahead = length * np.stack([np.cos(x[:, 4]), np.sin(x[:, 4])], axis=1)
-        return np.hstack([x[:, 2:4] + ahead, x[:, 2:4]])
-
-    def slopes(x: Array) -> Array:
-        H = np.zeros((len(x), 4, 6))
-        H[:, [0, 1, 2, 3], [2, 3, 2, 3]] = 1.0
-        H[:, 0, 4], H[:, 1, 4] = -length * np.sin(x[:, 4]), length * np.cos(x[:, 4])
-        return H
-
-    return of_function(("front_x", "front_y", "rear_x", "rear_y"), seen, slopes)
-
-
-def hands(steps: int, rng: np.random.Generator) -> Array:
-    """A driver's steering and throttle (steps, 2): circles, straights, slow corners, stops."""
-    u = np.zeros((steps, 2))
-    t, target = 0, np.zeros(2)
-    while t < steps:
-        kind = rng.choice(
-            ["circle", "straight", "slow", "stop", "weave"], p=[0.4, 0.2, 0.2, 0.1, 0.1]
-        )
-        steering = 0.0 if kind == "straight" else rng.uniform(-1, 1)
-        throttle = {
-            "circle": rng.uniform(0.3, 0.8),
-            "straight": rng.uniform(0.25, 0.7),
-            "slow": rng.uniform(0.1, 0.35),
-            "stop": 0.0,
-            "weave": rng.uniform(0.3, 0.6),
-        }[str(kind)]
-        if kind == "slow":
-            steering *= 0.3
-        last, target = target, np.array([steering, throttle])
-        count = int(rng.integers(20, 120))
-        ramp = np.minimum(np.arange(1, count + 1) / rng.integers(1, 8), 1.0)[:, None]
-        piece = last + ramp * (target - last)
-        if kind == "weave":
-            piece[:, 0] *= np.cos(2 * np.pi * np.arange(count) / rng.integers(20, 60))
-        u[t : t + count] = piece[: steps - t]
-        t += count
-    return np.asarray(np.clip(u + 0.01 * rng.standard_normal(u.shape) * (u != 0), -1, 1))
-
-
-def drive(truth: Model, latency: float, minutes: float, rng: np.random.Generator) -> list[Record]:
-    """Films of a minute each: what the camera saw and what the driver did."""
-    dt, runs = 1 / RATE, max(1, round(minutes * 60 / RUN))
-    steps = round(RUN * RATE)
-    times = np.asarray(np.arange(steps + 1) * dt)
-    commands = [hands(steps, rng) for _ in range(runs)]
-    nothing = np.zeros((steps + 1, 4))
-    received = np.stack(
-        [Record(times, nothing, times[:-1], u).received(np.full(2, latency))[0] for u in commands],
-        axis=1,
-    )
-    x = np.zeros((steps + 1, runs, 6))
-    for t in range(steps):
-        w = np.array(PROCESS) * rng.standard_normal((runs, 6))
-        x[t + 1] = truth.system.step(x[t], received[t], truth.values, dt) + w
-    see = markers(truth.params["L"].value).function
-    films = []
-    for run, u in enumerate(commands):
-        y = see(x[:, run]) + CAMERA * rng.standard_normal((steps + 1, 4))
-        ahead = y[0, :2] - y[0, 2:]
-        start = np.array([0.0, 0.0, *y[0, 2:], np.arctan2(ahead[1], ahead[0]), 0.0])
-        films.append(Record(times, y, times[:-1], u, start=start, start_std=np.array(START)))
-    return films
-
-
 def bench(truth: Model, rng: np.random.Generator) -> tuple[Array, Array]:
     """Steering angles [rad] measured by hand for inputs from -1 to 1, car standing."""
     u = np.linspace(-1, 1, 9)
     p = truth.params
     return u, p["a1"].value * u + p["b1"].value + BENCH * rng.standard_normal(len(u))
-
-
-def first_values(
-    films: Sequence[Record], length: float, angles: tuple[Array, Array]
-) -> dict[str, float]:
-    """Where the climb begins, as in footnote 17: regressions and step responses.
-
-    Args:
-        films: the camera's records.
-        length: wheelbase [m].
-        angles: inputs and steering angles from the bench.
-    """
-    a1, b1 = np.polyfit(*angles, 1)
-    runs = [(film.commands, *_seen(film, length)) for film in films]
-    steady = np.vstack([_steady(u, v) for u, v, _ in runs])
-    moving = steady[(steady[:, 2] > 0.15) & (steady[:, 1] > 0.25)]
-    ones = np.ones(len(moving))
-    design = np.column_stack([moving[:, 1], np.abs(moving[:, 0]), ones])
-    a2, a3, b2 = np.linalg.lstsq(design, moving[:, 2], rcond=None)[0]
-    standing = steady[(steady[:, 2] < 0.05) & (np.abs(steady[:, 0]) < 0.3), 1]
-    stall = float(np.quantile(standing, 0.98)) if len(standing) else 0.1
-    latency, tau_delta = _steering_response(runs, float(a1), float(b1), length)
-    tau_v, a4 = _speed_response(runs, (float(a2), float(a3), float(b2)), latency)
-    values = {"a1": a1, "b1": b1, "a2": a2, "a3": a3, "b2": b2, "a4": a4, "stall": stall}
-    values |= {"tau_delta": tau_delta, "tau_v": tau_v, "latency": latency}
-    inside = {}
-    for name, value in values.items():
-        p = car.params.get(name)
-        low, high = (0.0, 0.3) if p is None else (p.low, p.high)
-        inside[name] = float(np.clip(value, low, high))
-    return inside
-
-
-def _seen(film: Record, length: float) -> tuple[Array, Array]:
-    """Front-wheel speed [m/s] and heading rate [rad/s] at each frame, (steps,), from a film."""
-    front, rear = film.measured[:, :2], film.measured[:, 2:]
-    heading = np.unwrap(np.arctan2(*(front - rear).T[::-1]))
-    width = 4  # frames on either side
-    dt = 2 * width / RATE
-    velocity = np.zeros_like(front)
-    velocity[width:-width] = (front[2 * width :] - front[: -2 * width]) / dt
-    rate = np.zeros(len(front))
-    rate[width:-width] = (heading[2 * width :] - heading[: -2 * width]) / dt
-    return np.hypot(*velocity.T)[:-1], rate[:-1]
-
-
-def _steady(u: Array, v: Array) -> Array:
-    """Rows [steering, throttle, speed] of the last half second of each stretch of held inputs."""
-    rows, hold = [], 0
-    for t in range(1, len(u)):
-        hold = hold + 1 if np.abs(u[t] - u[t - 1]).max() < 0.1 else 0
-        if hold > 60 and hold % 15 == 0:
-            window = slice(t - 15, t)
-            rows.append([*u[window].mean(axis=0), v[window].mean()])
-    return np.array(rows).reshape(-1, 3)
-
-
-def _lagged(x: Array, tau: float) -> Array:
-    """First-order response to x, sampled at RATE, from zero."""
-    from scipy.signal import lfilter
-
-    decay = np.exp(-1 / (RATE * tau))
-    return np.asarray(lfilter([0.0, 1 - decay], [1.0, -decay], x, axis=0))
-
-
-def _steering_response(
-    runs: Sequence[tuple[Array, Array, Array]], a1: float, b1: float, length: float
-) -> tuple[float, float]:
-    """Latency and tau_delta [s] for which the heading rate follows v sin(delta) / L best."""
-    best = (np.inf, 0.1, 0.1)
-    for frames in range(0, 8):
-        for tau in (0.03, 0.05, 0.07, 0.1, 0.14, 0.2, 0.3):
-            error = 0.0
-            for u, v, rate in runs[:8]:
-                late = np.concatenate([np.zeros(frames), u[: len(u) - frames, 0]])
-                delta = _lagged(a1 * late + b1, tau)
-                error += float(np.sum((rate - v * np.sin(delta) / length) ** 2))
-            best = min(best, (error, frames / RATE, tau))
-    return best[1], best[2]
-
-
-def _speed_response(
-    runs: Sequence[tuple[Array, Array, Array]], steady: tuple[float, float, float], latency: float
-) -> tuple[float, float]:
-    """tau_v [s] and a4 [m/s^2] from how fast the speed rises and falls after the throttle moves."""
-    a2, a3, b2 = steady
-    gaps, rises, falls = [], [], []
-    frames = round(latency * RATE)
-    for u, v, _ in runs:
-        late = np.vstack([np.zeros((frames, 2)), u[: len(u) - frames]])
-        target = np.maximum(a2 * late[:, 1] + a3 * np.abs(late[:, 0]) + b2, 0.0)
-        slope = np.gradient(v) * RATE
-        gap = target - v
-        up, down = gap > 0.3, (gap < -0.4) & (v > 0.3)
-        gaps.append(gap[up])
-        rises.append(slope[up])
-        falls.append(slope[down])
-    gap, rise, fall = (np.concatenate(parts) for parts in (gaps, rises, falls))
-    tau = float(gap @ gap / max(float(gap @ rise), 1e-6)) if len(gap) else 0.4
-    return tau, float(np.median(fall)) if len(fall) else -1.0
