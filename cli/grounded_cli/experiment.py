@@ -16,6 +16,7 @@ STUDIES = {
     "flight": ("flight", "run", "count", "Table 1 and Figure 1: the aircraft's figure-8"),
     "car": ("car", "run", "seeds", "the car's three tasks, Figures 4 and 5"),
     "fit-car": ("fit_car", "fit_car", "seeds", "footnote 17: parameters from driving"),
+    "estimated": ("estimated", "run", "seeds", "the closed-loop car on estimated states"),
     "nondeterminism": ("nondeterminism", "run", "runs", "repeated open-loop runs (5.2)"),
     "footnote9": ("footnote9", "run", "", "a model that is wrong by a constant"),
     "theorem1": ("theorem1", "run", "seeds", "gradient error and where the search ends"),
