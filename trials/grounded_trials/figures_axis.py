@@ -11,6 +11,10 @@ import numpy as np
 from grounded.frozen import Array
 
 
+FAR = 1e4  # ranges outside the axis, where everything looks alike
+LEAST = 1e-12  # a range below which differences are rounding
+
+
 @dataclass(frozen=True)
 class Axis:
     """A range; `loss` spaces negative numbers by the logarithm of their size, 0 far up."""
@@ -22,7 +26,7 @@ class Axis:
     def place(self, value: float | Array) -> Array:
         """0 at the low end, 1 at the high end."""
         a, b = self._scaled(self.low), self._scaled(self.high)
-        return np.asarray((self._scaled(value) - a) / (b - a))
+        return np.asarray(np.clip((self._scaled(value) - a) / (b - a), -FAR, FAR))
 
     def _scaled(self, value: float | Array) -> Array:
         value = np.asarray(value, float)
@@ -78,7 +82,9 @@ def fitted(values: Iterable[Array], margin: float = 0.06) -> tuple[float, float]
     if not kept:
         return 0.0, 1.0
     low, high = min(float(v.min()) for v in kept), max(float(v.max()) for v in kept)
-    room = margin * (high - low) or 0.05 * abs(high) or 1.0
+    size = max(abs(low), abs(high))
+    span = high - low if high - low > 1e-9 * size else 0.0
+    room = margin * span if span > LEAST else max(0.05 * size, LEAST)
     return low - room, high + room
 
 

@@ -32,6 +32,8 @@ def forecast_figures(findings: Findings) -> list[Figure]:
 
 def _figure(findings: Findings, name: str, title: str, trial: Trial) -> Figure | None:
     steps = trial.finite_steps
+    if steps < 1:
+        return None
     trial, begin = _worst_part(findings, trial)
     crude = forecast(findings.crude, trial)
     if crude is None:

@@ -28,6 +28,8 @@ from grounded_trials.findings import Findings, Log, Lost, Run
 from grounded_trials.mcap_log import read_trial
 from grounded_trials.workspace import Workspace, _candidate
 
+RUNAWAY = 1e15  # in any unit: the number of a run that diverged
+
 
 def gather(workspace: Workspace) -> Findings:
     """Reads all that a report shows.
@@ -39,7 +41,7 @@ def gather(workspace: Workspace) -> Findings:
     trials, policies, lost = _trials(workspace)
     candidates = _candidates(workspace, trials, policies, lost)
     own = [t for t in trials if _fits(task, t) and t.candidate in {c.id for c in candidates}]
-    data = [t for t in trials if _fits(task, t) and not t.candidate]
+    data = [_drawable(t) for t in trials if _fits(task, t) and not t.candidate]
     now = _settled(workspace, candidates, own, _standing(workspace, candidates, own))
     diagnosis = _diagnosis(workspace, lost)
     better = _better(workspace, diagnosis, lost)
@@ -156,11 +158,21 @@ def _runs(
             reason = f"it has {trial.steps} steps, the task has {task.horizon}: not drawn"
             lost.append(Lost(trial.id, reason))
             continue
+        utility, trial = task.utility(trial), _drawable(trial)
         residual = _residual(Planner(task, task), trial)
         explained = None if better is None else _residual(better.planner, trial)
-        utility = task.utility(trial)
         runs.append(Run(trial, tried.candidate, tried.accepted, utility, residual, explained))
     return runs
+
+
+def _drawable(trial: Trial) -> Trial:
+    """A trial whose runaway numbers are NaN, as lost samples are: they can't be drawn."""
+    if max(np.abs(trial.states).max(initial=0.0), np.abs(trial.inputs).max(initial=0.0)) < RUNAWAY:
+        return trial
+    states, inputs = (
+        np.where(np.abs(v) < RUNAWAY, v, np.nan) for v in (trial.states, trial.inputs)
+    )
+    return replace(trial, states=states, inputs=inputs)
 
 
 def _residual(planner: Planner, trial: Trial) -> Array:
