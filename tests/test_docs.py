@@ -11,14 +11,20 @@ An HTML comment just above a block says what is special about it:
     <!-- not run: WHY -->         it is not; WHY must be a reason
     <!-- file: NAME -->           it is written to NAME in the page's folder
     <!-- workspace: EXAMPLE -->   from here on the page works in a fresh workspace of an example
-    <!-- needs: shared -->        skipped where ../shared is missing
+    <!-- trial: NAME -->          a trial with states x, y, psi is written to NAME before
+    <!-- needs: shared -->        skipped where ../shared (or an importable module) is missing
     <!-- exit: 1 -->              the last command must end with this code
     <!-- slow -->                 only with GROUNDED_DOCS=all (above ten seconds)
+    <!-- demo-command -->         the README's set-up commands: checked, and run by .ci/run
+    <!-- test-command -->
+
+Every block starts in the page's folder; a `cd` holds to the end of its block.
 """
 
 from __future__ import annotations
 
 import ast
+import importlib.util
 import json
 import os
 import re
@@ -28,15 +34,22 @@ import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from grounded.trial import Trial
+from grounded_trials.mcap_log import write_trial
 from shared_data import DATA
 from workspaces import make
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [p for p in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))) if p.is_file()]
 FENCE = re.compile(r"^( *)```+ *(\S*).*?\n(.*?)^\1```+ *$", re.M | re.S)
-MARK = re.compile(r"<!--\s*(not run|file|workspace|needs|exit|slow)\s*:?\s*(.*?)\s*-->", re.S)
+MARK = re.compile(
+    r"<!--\s*(not run|file|trial|workspace|needs|exit|slow|demo-command|test-command)"
+    r"\s*:?\s*(.*?)\s*-->",
+    re.S,
+)
 RUN = ("console", "python", "bash", "sh", "shell", "toml", "json")
 SHOWN = ("", "text", "mermaid", "cpp", "c++", "c", "cmake", "csv", "diff", "yaml", "xml", "html")
 ALL = os.environ.get("GROUNDED_DOCS") == "all"
@@ -124,6 +137,8 @@ class Page:
             self.count += 1
             folder = self.folder / f"w{self.count}"
             self.folder = make(folder, block.marks["workspace"]).folder
+        if "trial" in block.marks:
+            _write_trial(self.folder / block.marks["trial"])
         if "file" in block.marks:
             path = self.folder / block.marks["file"]
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -154,15 +169,16 @@ class Page:
         if block.language != "console" and not steps:
             steps = [(line, []) for line in block.text.splitlines() if line.strip()]
         assert steps, f"line {block.line}: a console block needs lines that start with '$ '"
+        folder = self.folder
         for k, (command, shown) in enumerate(steps):
             if command.startswith("cd "):
-                self.folder = (self.folder / command[3:].split("&&")[0].strip()).resolve()
+                folder = (folder / command[3:].split("&&")[0].strip()).resolve()
                 if "&&" not in command:
                     continue
                 command = command.split("&&", 1)[1].strip()
             done = subprocess.run(
                 ["bash", "-c", command],
-                cwd=self.folder,
+                cwd=folder,
                 env=self.env,
                 capture_output=True,
                 text=True,
@@ -178,7 +194,19 @@ class Page:
             assert not lost, f"{said}\nshown in the page, not in the output: {lost}"
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def _there(name: str) -> bool:
+    if name == "shared":
+        return DATA is not None
+    return not name or importlib.util.find_spec(name) is not None
+
+
+def _write_trial(path: Path) -> None:
+    states, inputs = np.zeros((21, 3)), np.zeros((20, 2))
+    trial = Trial(states, inputs, 0.05, ("x", "y", "psi"), ("speed", "turn"))
+    write_trial(path, trial, {"kind": "trial"})
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
 def test_every_block_of_the_page_runs(page, tmp_path):
     runner, skipped = Page(tmp_path), []
     for block in blocks_of(page.read_text()):
@@ -191,8 +219,10 @@ def test_every_block_of_the_page_runs(page, tmp_path):
             if "file" in block.marks:
                 (runner.folder / block.marks["file"]).write_text(block.text)
             continue
-        if block.marks.get("needs") == "shared" and DATA is None:
-            skipped.append(f"{where}: ../shared is missing")
+        if not _there(block.marks.get("needs", "")):
+            skipped.append(f"{where}: {block.marks['needs']} is missing")
+            continue
+        if {"demo-command", "test-command"} & set(block.marks):
             continue
         if "slow" in block.marks and not ALL:
             skipped.append(f"{where}: slow (GROUNDED_DOCS=all)")
@@ -200,6 +230,25 @@ def test_every_block_of_the_page_runs(page, tmp_path):
         runner.take(block)
     if skipped:
         print("\n".join(skipped))
+
+
+def test_the_two_set_up_commands_are_complete():
+    """One line each, from nothing but Python: a venv, an install that exists, what is promised."""
+    marked = {}
+    for block in blocks_of((ROOT / "README.md").read_text()):
+        for name in {"demo-command", "test-command"} & set(block.marks):
+            marked[name] = block.text.strip()
+    if not marked:
+        pytest.skip("README.md marks no set-up commands yet")
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    for text in marked.values():
+        assert "\n" not in text and text.startswith(
+            "python3 -m venv .venv && .venv/bin/pip install"
+        )
+        for extra in re.findall(r"\[(\w+)\]", text):
+            assert extra in project["optional-dependencies"]
+    assert marked["demo-command"].endswith(".venv/bin/grounded demo car-figure8")
+    assert "pytest" in marked["test-command"] and len(marked) == 2
 
 
 def test_links_between_pages_lead_somewhere():
@@ -249,7 +298,7 @@ def test_the_harness_runs_and_fails(tmp_path):
     page.take(Block("python", "assert x == 3\n", 2))
     page.take(Block("console", "$ echo hello 7\nhello 8\n", 3))
     page.take(Block("console", "$ false\n", 4, {"exit": "1"}))
-    page.take(Block("console", "$ mkdir a && cd a\n$ cd a\n$ pwd\n...\n", 5))
+    page.take(Block("console", "$ mkdir a && cd a\n$ cd a\n$ pwd\n.../a\n", 5))
     for bad in (
         Block("console", "$ false\n", 6),
         Block("console", "$ echo a\nb\n", 7),
