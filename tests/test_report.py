@@ -173,6 +173,23 @@ def test_a_short_trial_is_shown_as_failed(cart, tmp_path):
     assert "failed" in grounded("-C", folder, "report").out
 
 
+def test_a_trial_that_names_a_file_elsewhere_reads_nothing_there(cart, tmp_path):
+    from dataclasses import replace
+
+    from grounded_trials.mcap_log import trial_bytes
+
+    folder = copied(cart, tmp_path / "w")
+    workspace = Workspace(folder)
+    (tmp_path / "outside.mcap").write_bytes(workspace.candidate_bytes("c0001"))
+    model = workspace.base_model
+    evil = replace(workspace.trials()[0].trial, candidate="../../outside", id="")
+    units = {"state_units": dict(model.states), "input_units": dict(model.inputs)}
+    workspace.store.add(trial_bytes(evil, {"kind": "trial"}, None, start_ns=0, **units))
+    before = grounded("-C", cart, "report", "--json").json
+    after = grounded("-C", folder, "report", "--json").json
+    assert after["utilities"] == before["utilities"]
+
+
 def test_the_optimum_is_shown_where_a_study_left_it(cart, tmp_path):
     folder = copied(cart, tmp_path / "w")
     (folder / "reports" / "optimum.json").write_text(json.dumps({"utility": -0.0123}))

@@ -10,7 +10,6 @@ import numpy as np
 
 from grounded.frozen import Array
 
-
 FAR = 1e4  # ranges outside the axis, where everything looks alike
 LEAST = 1e-12  # a range below which differences are rounding
 

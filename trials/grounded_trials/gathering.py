@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -92,7 +93,8 @@ def _candidates(
     """The search's candidates of this task, from their files or from trials that ran them."""
     files = {path.stem for path in (workspace.folder / "candidates").glob("c[0-9]*.mcap")}
     found = []
-    for identity in sorted(files | {t.candidate for t in trials if t.candidate}):
+    named = {t.candidate for t in trials if t.candidate}
+    for identity in sorted(name for name in files | named if re.fullmatch(r"c\d+", name)):
         path = workspace.candidate_path(identity)
         sources = [path.read_bytes()] if path.is_file() else []
         sources += [policies[identity]] if identity in policies else []
