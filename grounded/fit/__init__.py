@@ -6,7 +6,8 @@ prediction_error   one step and a second ahead, open loop
 
 from __future__ import annotations
 
-from grounded.fit.parameters import Estimate, Fit, fit
+from grounded.fit.parameters import fit
 from grounded.fit.prediction import PredictionError, prediction_error
+from grounded.fit.result import Estimate, Fit
 
 __all__ = ["Estimate", "Fit", "PredictionError", "fit", "prediction_error"]
