@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +12,7 @@ import pytest
 from cli import grounded
 from grounded_trials.findings import prediction_error, rms, tracking_error
 from grounded_trials.gathering import gather
+from grounded_trials.reporting import save_optimum
 from grounded_trials.workspace import Workspace
 from reported import DIAGNOSIS, car, cart, copied, damage
 from workspaces import make
@@ -192,7 +192,7 @@ def test_a_trial_that_names_a_file_elsewhere_reads_nothing_there(cart, tmp_path)
 
 def test_the_optimum_is_shown_where_a_study_left_it(cart, tmp_path):
     folder = copied(cart, tmp_path / "w")
-    (folder / "reports" / "optimum.json").write_text(json.dumps({"utility": -0.0123}))
+    save_optimum(Workspace(folder), -0.0123)
     assert "optimum -0.01230" in grounded("-C", folder, "report").out
 
 

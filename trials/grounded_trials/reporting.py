@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 from grounded.errors import GroundedError
@@ -10,7 +11,7 @@ from grounded_trials.gathering import gather
 from grounded_trials.store import write_atomically
 from grounded_trials.workspace import Workspace
 
-RECORDING, PAGE = "recording.rrd", "report.html"
+RECORDING, PAGE, OPTIMUM = "recording.rrd", "report.html", "optimum.json"
 
 
 def save_recording(workspace: Workspace, findings: Findings | None = None) -> Path:
@@ -42,6 +43,13 @@ def save_pictures(workspace: Workspace, findings: Findings | None = None) -> lis
         write_atomically(path, png(figure))
         paths.append(path)
     return paths
+
+
+def save_optimum(workspace: Workspace, utility: float | None) -> None:
+    """Leaves the optimum of the real system, where a study knows it, for the report to show."""
+    if utility is not None:
+        document = json.dumps({"utility": utility}, allow_nan=False)
+        write_atomically(_place(workspace) / OPTIMUM, document.encode())
 
 
 def save(
