@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -131,6 +133,18 @@ def test_the_bias_of_long_trials_is_averaged_not_thinned_out():
     np.testing.assert_array_equal(same, residual[:100] / 0.02)
 
 
+def _ended(command: list[str], log: Path, seconds: float) -> str:
+    """What a program said; after so many seconds it is ended with all that it started."""
+    with log.open("w") as out:
+        started = subprocess.Popen(command, stdout=out, stderr=out, start_new_session=True)
+        try:
+            started.wait(seconds)
+        except subprocess.TimeoutExpired:
+            os.killpg(started.pid, signal.SIGTERM)
+            started.wait()
+    return log.read_text()
+
+
 @needs_tool
 @pytest.mark.skipif(shutil.which("xvfb-run") is None, reason="xvfb-run is not installed")
 def test_the_viewer_shows_the_paths(car, tmp_path):
@@ -140,10 +154,10 @@ def test_the_viewer_shows_the_paths(car, tmp_path):
     screen = ["xvfb-run", "-a", "-s", "-screen 0 1600x1000x24"]
     flags = ["--new", "--bind", "127.0.0.1", "--window-size", "1400x900", "--renderer", "vulkan"]
     command = [*screen, str(RERUN), *flags, "--screenshot-to", str(shot), str(path)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=240)
+    said = _ended(command, tmp_path / "said", 240)
     if not shot.exists():
-        pytest.skip(f"the viewer can't draw here: {done.stderr[-300:]}")
-    assert "ERROR" not in done.stdout + done.stderr
+        pytest.skip(f"the viewer can't draw here: {said[-300:]}")
+    assert "ERROR" not in said
     from PIL import Image
 
     image = np.asarray(Image.open(shot).convert("RGB")).astype(int)
