@@ -115,4 +115,4 @@ def _from_scratch(task: Task, batch: Batch, states: Array, knots: Rows) -> Solut
 def _toward_limit(task: Task, held: Array, part: float) -> Array:
     """Inputs that fraction of the way to the upper (negative: lower) limit, where there is one."""
     limit = task.high if part >= 0 else task.low
-    return np.where(np.isfinite(limit), held + abs(part) * (limit - held), held)
+    return held + abs(part) * (np.where(np.isfinite(limit), limit, held) - held)
