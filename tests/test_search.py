@@ -13,6 +13,7 @@ from grounded.plant import Noise, Plant
 from grounded.search import MAX_CAUTION, Options, mean_trial, standing
 from grounded.trial import Trial
 from grounded.trust import Step
+from grounded.utility import Reward
 from small_tasks import cart_task, drive, other, rover_task
 
 TASK = cart_task()
@@ -376,3 +377,49 @@ def test_whatever_happens_the_search_goes_on_or_says_why(events, repeats, step):
         assert np.isfinite(policy.feedforward).all() and np.isfinite(policy.gain).all()
         inside = first.candidate.predicted_inputs
         assert (inside >= TASK.low).all() and (inside <= TASK.high).all()
+
+
+def weights(state=10.0, terminal=0.0, effort=0.01, change=0.01):
+    return Reward(
+        np.array([state, 0.0]), np.array([terminal, 0.0]), np.array([effort]), np.array([change])
+    )
+
+
+JUMP = np.column_stack([np.repeat([0.0, 1.0], [20, 21]), np.full(41, np.nan)])
+ODD = {
+    "no input weights": {"reward": weights(effort=0.0, change=0.0)},
+    "nothing bounds the inputs": {
+        "reward": weights(effort=0.0, change=0.0),
+        "low": np.array([-np.inf]),
+        "high": np.array([np.inf]),
+    },
+    "terminal weights alone": {"reward": weights(state=0.0, terminal=10.0)},
+    "one step": {"target": TASK.target[:2]},
+    "two steps": {"target": TASK.target[:3]},
+    "a target that jumps": {"target": JUMP},
+    "a target out of reach": {"target": 1000 * JUMP},
+    "huge weights": {"reward": weights(1e12, 0.0, 1e-6, 1e-6)},
+    "tiny weights": {"reward": weights(1e-12, 0.0, 1e-14, 1e-14)},
+    "one limit": {"low": np.array([0.0]), "high": np.array([np.inf])},
+    "latency as long as the manoeuvre": {"latency": np.array([2.5])},
+    "open loop": {"feedback": False},
+    "a far start": {"start": np.array([100.0, 50.0])},
+    "limits that leave no choice": {"low": np.array([0.999]), "high": np.array([1.0])},
+    "held beyond the limits": {"past": np.array([9.0])},
+    "exact planning": {"smoothing": 0.0},
+    "nothing to do": {"target": np.column_stack([np.zeros(41), np.full(41, np.nan)])},
+}
+
+
+@pytest.mark.parametrize("options", [{}, {"step": "full"}, {"method": "policy-gradient"}], ids=str)
+@pytest.mark.parametrize("name", ODD)
+def test_odd_tasks_are_searched_or_ended_with_a_sentence(name, options):
+    task = cart_task(**ODD[name])
+    plant = Plant(other(task.model, 1.5), latency={"force": 0.02})
+    now, _candidates, trials = learn(
+        task, lambda c: drive(task, plant, c), Options(max_trials=4, **options)
+    )
+    assert now.phase in ("converged", "stopped") and now.sentence and trials
+    assert now.utilities == sorted(now.utilities) and all(np.isfinite(now.utilities))
+    for trial in trials:
+        assert (trial.inputs >= task.low).all() and (trial.inputs <= task.high).all()
