@@ -1,4 +1,4 @@
-"""The diagnosis: its filter against dense algebra, its verdicts on small systems with known answers."""
+"""The diagnosis: its filter against dense algebra, its verdicts on known answers."""
 
 import json
 
@@ -22,7 +22,7 @@ DT = 0.05
 
 
 def cart(friction=0.0, dead=0.0, asymmetric=0.0, trials=4, steps=120, noise=1.0, seed=0):
-    """A cart that is pushed: v' = k u - v / tau, driven by waves, with noise; and its crude model."""
+    """A cart that is pushed: v' = k u - v / tau, with noise; and its crude model."""
     model = Model(
         states={"x": "m", "v": "m/s"},
         inputs={"u": "1"},

@@ -1,4 +1,4 @@
-"""Every effect: adopted and diagnosed it is the same equation, it compiles, it is absent at its start."""
+"""Every effect: adopted and diagnosed one equation, it compiles, it is absent at its start."""
 
 import numpy as np
 import pytest
@@ -75,10 +75,14 @@ def test_an_adopted_effect_is_the_one_that_was_diagnosed(effect):
     if effect.family.name == "sensor_delay":
         return  # the adopted one keeps a hidden true value; see test_sensor_delay
     ahead = predictor.next(h, x[:, None, :])[:, 0]
-    ahead = ahead + np.asarray(predictor.offset(h, ahead[:, None, :]))[..., 0, :] if (
-        effect.family.name.startswith("sensor")
-    ) else ahead
-    carried = car.state_names.index("psi_rate")  # the heading's rate, by a short step in one of them
+    ahead = (
+        ahead + np.asarray(predictor.offset(h, ahead[:, None, :]))[..., 0, :]
+        if (effect.family.name.startswith("sensor"))
+        else ahead
+    )
+    carried = car.state_names.index(
+        "psi_rate"
+    )  # the heading's rate, by a short step in one of them
     np.testing.assert_allclose(adopted[:, carried], ahead[:, carried], atol=1e-3)
     np.testing.assert_allclose(
         np.delete(adopted, carried, 1), np.delete(ahead, carried, 1), atol=2e-6
@@ -98,7 +102,9 @@ def test_an_adopted_effect_compiles_and_its_derivatives_are_right(effect):
         nudge = np.zeros(wrapped.n)
         nudge[j] = h
         ends = [wrapped.system.step(x + s * nudge, u, wrapped.values, DT) for s in (1, -1)]
-        np.testing.assert_allclose(f_x[:, :, j], (ends[0] - ends[1]) / (2 * h), atol=2e-4, rtol=1e-4)
+        np.testing.assert_allclose(
+            f_x[:, :, j], (ends[0] - ends[1]) / (2 * h), atol=2e-4, rtol=1e-4
+        )
     assert np.isfinite(f_u).all()
 
 
@@ -128,8 +134,9 @@ def test_an_effect_is_absent_at_its_start(effect):
 
 def test_the_contract_names_every_family():
     named = (
-        "input_bias input_gain delay first_order_lag dead_zone stall saturation rate_limit backlash "
-        "input_fade offset rate_gain viscous_friction coulomb_friction quadratic_drag stiction "
+        "input_bias input_gain delay first_order_lag dead_zone stall saturation rate_limit "
+        "backlash input_fade offset rate_gain viscous_friction coulomb_friction quadratic_drag "
+        "stiction "
         "coupling periodic patch drift_world drift_body side_slip understeer slope trend "
         "odometry_scale sensor_bias sensor_scale sensor_delay parameter"
     )
@@ -188,7 +195,9 @@ def test_a_black_box_model_takes_effects_too():
             return {"v": 0.0}
         return {"v": s["v"] + dt * (a["u"] - p["k"] * s["v"])}
 
-    box = Model(states={"v": "m/s"}, inputs={"u": "m/s^2"}, params={"k": Param(0.5, "1/s")}, step=step)
+    box = Model(
+        states={"v": "m/s"}, inputs={"u": "m/s^2"}, params={"k": Param(0.5, "1/s")}, step=step
+    )
     effect = Library().effect("coulomb_friction:v", box)
     wrapped = wrap(effect, {"c": 0.2}, DT)
     after = wrapped.system.step(np.array([[1.0]]), np.array([[0.0]]), wrapped.values, DT)

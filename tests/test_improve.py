@@ -24,7 +24,7 @@ from grounded.search import Options
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded.utility import Reward
-from small_tasks import black_box, cart_task, drive, other, rover_task
+from small_tasks import black_box, cart_task, drive, other, rover, rover_task
 
 PAPER = {"turn": 0.97, "circle": 0.88, "figure8": 0.63}  # section 5.2
 
@@ -276,3 +276,20 @@ def test_refit_plans_with_parameters_from_all_trials():
     plain = propose(task, candidates, trials, Options()).candidate
     assert np.abs(made.policy.feedforward - plain.policy.feedforward).max() > 1e-6
     assert isinstance(trials[0], Trial)
+
+
+@pytest.mark.parametrize("name", ["car", "far"])
+def test_the_fingerprint_is_the_same_without_a_compiler(name, monkeypatch):
+    """Another machine rounds its last bits otherwise: the model is the same model."""
+    from grounded.compile import jit
+
+    make = {
+        "car": lambda: car_task("circle", replace(car.model)),
+        "far": lambda: rover_task(model=replace(rover), start=np.array([1e4, -2e4, 30.0])),
+    }[name]
+    compiled = make()
+    here = model_fingerprint(compiled)
+    monkeypatch.setattr(jit, "trouble", lambda: "switched off")
+    plain = make()
+    assert model_fingerprint(plain) == here
+    assert type(plain.model.system) is not type(compiled.model.system)

@@ -66,7 +66,7 @@ class Search:
         return cost + math.log(self.crowd.get(effect.name, 1))
 
     def _param_price(self, effect: Effect, values: dict[str, float]) -> float:
-        """A normal prior of a fifth of the parameter's size in place of the free parameter's cost."""
+        """A normal prior of a fifth of the parameter's size, not a free parameter's cost."""
         value = effect.site.model.params[effect.site.target].value
         size = PARAM_PRIOR * (abs(value) or 1.0)
         return 0.5 * (values.get("d", 0.0) / size) ** 2 + 0.25 * math.log(self.N) + 1.0
@@ -139,7 +139,7 @@ class Search:
         return self.refined(starts, iterations=8)
 
     def calibrated(self, fit: Fit) -> list[Fit]:
-        """The same hypothesis with the model's parameters free to move a little, or a little more."""
+        """The same hypothesis with the model's parameters free to move a little, or more."""
         shift = np.zeros(self.data.model.system.k)
         if fit.hypothesis.spread > 0 or not len(shift):
             return []

@@ -10,6 +10,7 @@ the other: states (sum T + S, n), steps (sum T, ...).
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -109,7 +110,7 @@ def prepare(
         past: the input held before t = 0 where a trial does not say (m,).
 
     Raises:
-        GroundedError: for trials of other states or inputs, of different dt, or with nothing in them.
+        GroundedError: for trials of other states or inputs, of different dt, or empty ones.
     """
     _check(model, trials)
     used = [(trial, _usable(trial)) for trial in trials]
@@ -185,7 +186,7 @@ def _cut(lengths: Any) -> tuple[Any, Any, Array, Any]:
     for i, T in enumerate(lengths):
         parts = int(np.ceil(T / LONGEST_RUN))
         edges = np.linspace(0, T, parts + 1).astype(int)
-        pieces += [(i, step0 + a, state0 + a, b - a) for a, b in zip(edges, edges[1:], strict=False)]
+        pieces += [(i, step0 + a, state0 + a, b - a) for a, b in itertools.pairwise(edges)]
         step0, state0 = step0 + T, state0 + T + 1
     L = max(length for *_, length in pieces)
     offsets = np.arange(L + 1)

@@ -1,23 +1,23 @@
 """START HERE: the sim-to-real gap, diagnosed. Trials and a crude model in, a verdict out.
 
-    limits       what can't be known from these data
-    attribution  which effects, by evidence                      (effects/, scan, refine, noise)
-    leftover     what no effect explains
-    gap          where the gap lies: channels, times, regions
-    shrinkage    how far it shrinks on trials that were left out
-    excitation   what to run next, where two explanations tie
+limits       what can't be known from these data
+attribution  which effects, by evidence                      (effects/, scan, refine, noise)
+leftover     what no effect explains
+gap          where the gap lies: channels, times, regions
+shrinkage    how far it shrinks on trials that were left out
+excitation   what to run next, where two explanations tie
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from grounded.diagnosis.attribution import CLAIM, TIE, Search, attribute
-from grounded.diagnosis.data import Data, prepare
+from grounded.diagnosis.data import prepare
 from grounded.diagnosis.gap import by_region, by_time, explained, horizon, normalised
 from grounded.diagnosis.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.intervals import standard_deviations
@@ -52,7 +52,7 @@ class Options:
         horizon: how far ahead predictions are judged [s].
     """
 
-    library: Library = Library()
+    library: Library = field(default_factory=Library)
     max_effects: int = 3
     horizon: float = 1.0
 
@@ -64,7 +64,7 @@ def diagnose(
     *,
     progress: Callable[[str], None] | None = None,
 ) -> Diagnosis:
-    """Where the gap between a model and real trials lies, which effect makes it, how far it shrinks.
+    """Where the gap between model and trials lies, which effect makes it, how far it shrinks.
 
     Args:
         subject: the task (its latency counts as modelled) or the bare model.
@@ -123,7 +123,9 @@ class _Writer:
         ranking = self.ranking(track, where, shrunk.gap_before)
         groups = self.groups()
         remainder = tuple(self.remainder(left) for left in self.left)
-        kind, sentence = self.verdict(shrunk.gap_before, shrunk.gap_after, ranking, groups, remainder)
+        kind, sentence = self.verdict(
+            shrunk.gap_before, shrunk.gap_after, ranking, groups, remainder
+        )
         named = () if kind in ("none",) or self.known.no_cause else self.names
         return Diagnosis(
             kind=kind,
@@ -155,9 +157,10 @@ class _Writer:
         )
 
     def track(self) -> Any:
-        """Filtered states that predictions start from: of the best hypothesis, in what is logged."""
+        """Filtered states that predictions start from: the best hypothesis', as logged."""
         sensors = [
-            e for e in self.best.hypothesis.effects
+            e
+            for e in self.best.hypothesis.effects
             if isinstance(e.family, SensorFamily | SensorDelayFamily)
         ]
         return self.null.track if sensors else self.best.track
@@ -184,7 +187,9 @@ class _Writer:
         whole = search.score(self.best)
         for name in self.names:
             rest = tuple(sorted(n for n in self.names if n != name))
-            fits = [f for f in search.of_size(len(rest)) if tuple(sorted(f.hypothesis.names)) == rest]
+            fits = [
+                f for f in search.of_size(len(rest)) if tuple(sorted(f.hypothesis.names)) == rest
+            ]
             found[name] = whole - max([search.score(f) for f in fits] or [self.base])
         return found
 
@@ -217,13 +222,14 @@ class _Writer:
         return found
 
     def groups(self) -> tuple[tuple[str, ...], ...]:
-        """For each claimed effect, what could stand in its place within a few nats (three in all)."""
+        """For each claimed effect, what could stand in its place within a few nats."""
         found = []
         whole = self.search.score(self.best)
         for name in self.names:
             rest = set(self.names) - {name}
             rivals = [
-                f for f in self.search.of_size(len(self.names))
+                f
+                for f in self.search.of_size(len(self.names))
                 if rest <= set(f.hypothesis.names) and name not in f.hypothesis.names
             ]
             close = [f for f in rivals if whole - self.search.score(f) < TIE]
@@ -255,18 +261,20 @@ class _Writer:
             if self.null.hypothesis.spread > 0:
                 return self._calibration(before)
             return "none", (
-                f"The model explains the data down to the noise (predictions {number(before)} times "
-                "what noise alone makes)."
+                f"The model explains the data down to the noise (predictions "
+                f"{number(before)} times what noise alone makes)."
             )
         if not self.names:
             return "unknown", f"A gap remains that no known effect explains: {left}."
         row = {r.effect: r for r in ranking}
         effects = {e.name: e for e in self.best.hypothesis.effects}
-        because = "; ".join(meaning(effects[n], row[n].params) for n in sorted(
-            self.names, key=lambda n: -row[n].evidence))
+        because = "; ".join(
+            meaning(effects[n], row[n].params)
+            for n in sorted(self.names, key=lambda n: -row[n].evidence)
+        )
         sentence = (
-            f"{because[:1].upper()}{because[1:]}. Held-out predictions improve from {number(before)} "
-            f"to {number(after)} times the noise."
+            f"{because[:1].upper()}{because[1:]}. Held-out predictions improve from "
+            f"{number(before)} to {number(after)} times the noise."
         )
         for group in groups:
             sentence += f" The data can't tell {' from '.join(group)}."
@@ -356,9 +364,8 @@ class _Writer:
         if self.known.no_cause:
             return "Run two or more trials in which every input changes."
         if groups:
-            return (
-                f"Run a probe that tells {' from '.join(groups[0])}: "
-                + " ".join(distinguishing(groups[0]))
+            return f"Run a probe that tells {' from '.join(groups[0])}: " + " ".join(
+                distinguishing(groups[0])
             )
         if not self.names and self.left:
             return (

@@ -2,18 +2,19 @@
 
 Two hypotheses A and B tie on the trials so far. Each of a set of probes (the base policy with a
 staircase, steps, doublets, a sweep of frequencies or a slow ramp added to one input) is run in the
-model with A; then B, its values free to adapt, tries to explain that run through the same filter and
-noise. What it fails to explain is the evidence that the probe is expected to bring:
+model with A; then B, its values free to adapt, tries to explain that run through the same filter
+and noise. What it fails to explain is the evidence that the probe is expected to bring:
 
     E[log p(y | A) - log p(y | B)] = 1/2 |whitened innovations of B on A's run|^2
 
-The probe stays inside the inputs' limits, and both hypotheses' runs inside the task's safety bounds.
+The probe stays inside the inputs' limits, and both hypotheses' runs inside the task's safety.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -79,9 +80,8 @@ def probe(
     if best is None:
         return None
     expected, chosen, words = best
-    sentence = (
-        f"{words}: expected to tell {group[0]} from {group[1]} by {expected:.1f} nats"
-        + (" (too little: try larger inputs or another manoeuvre)" if expected < 3 else "")
+    sentence = f"{words}: expected to tell {group[0]} from {group[1]} by {expected:.1f} nats" + (
+        " (too little: try larger inputs or another manoeuvre)" if expected < 3 else ""
     )
     return Probe(chosen, expected, (group[0], group[1]), sentence)
 
@@ -89,7 +89,7 @@ def probe(
 def probes(policy: Policy, inputs: Sequence[int]) -> Iterator[tuple[str, Policy]]:
     """The base policy itself, then with each pattern added to each input."""
     yield "the base policy once more", policy
-    t = np.arange(policy.horizon) * policy.dt
+    t = np.arange(policy.horizon, dtype=float) * policy.dt
     for j in inputs:
         low, high = policy.low[j], policy.high[j]
         room = float(high - low) if np.isfinite(high - low) else 2.0
@@ -98,12 +98,13 @@ def probes(policy: Policy, inputs: Sequence[int]) -> Iterator[tuple[str, Policy]
                 feedforward = policy.feedforward.copy()
                 feedforward[:, j] = np.clip(feedforward[:, j] + size * room * shape, low, high)
                 name = policy.input_names[j]
-                yield f"{words} of {size * room:.2g} on {name}", replace(
-                    policy, feedforward=feedforward
+                yield (
+                    f"{words} of {size * room:.2g} on {name}",
+                    replace(policy, feedforward=feedforward),
                 )
 
 
-def patterns(t: Array) -> list[tuple[str, Array]]:
+def patterns(t: Any) -> list[tuple[str, Array]]:
     """Shapes of unit size over the times t (H,)."""
     T = float(t[-1]) + 1e-9
     phase = t / T
@@ -167,23 +168,39 @@ def _run(task: Task, h: Hypothesis, policy: Policy) -> Trial | None:
         current = Library((effect.family,)).effect(effect.name, model, effect.site.scales)
         model = wrap(current, values, task.dt)
     assert task.latency is not None
-    start = Trial(task.start[None], np.empty((0, task.model.m)), task.dt, task.model.state_names,
-                  task.model.input_names, start_inputs=task.past)
+    start = Trial(
+        task.start[None],
+        np.empty((0, task.model.m)),
+        task.dt,
+        task.model.state_names,
+        task.model.input_names,
+        start_inputs=task.past,
+    )
     extra = _memory_start(model, task.model, start)
     z, runner = np.concatenate([task.start, extra]), Runner(policy)
     states, inputs = [task.start], np.zeros((policy.horizon, model.m))
     for t in range(policy.horizon):
         inputs[t] = runner.action(t * policy.dt, states[-1])
-        received = np.array([
-            shifted(inputs[None, : t + 1, j], task.past[j : j + 1], task.latency[j] / task.dt)[0, -1]
-            for j in range(model.m)
-        ])
+        received = np.array(
+            [
+                shifted(inputs[None, : t + 1, j], task.past[j : j + 1], task.latency[j] / task.dt)[
+                    0, -1
+                ]
+                for j in range(model.m)
+            ]
+        )
         z = model.system.step(z[None], received[None], model.values, task.dt)[0]
         if not np.isfinite(z).all():
             return None
         states.append(z[: task.model.n])
-    return Trial(np.array(states), inputs, task.dt, task.model.state_names,
-                 task.model.input_names, start_inputs=task.past)
+    return Trial(
+        np.array(states),
+        inputs,
+        task.dt,
+        task.model.state_names,
+        task.model.input_names,
+        start_inputs=task.past,
+    )
 
 
 def _memory_start(wrapped: Model, base: Model, trial: Trial) -> Array:
@@ -205,8 +222,6 @@ def _evidence(task: Task, run: Trial, true: Hypothesis, rival: Hypothesis, noise
     predictor = Predictor(data)
     rss = []
     for h in (true, rival):
-        fits = refine(
-            predictor, [(h, noise, data.y.copy())], iterations=4, fixed_noise=True
-        )
+        fits = refine(predictor, [(h, noise, data.y.copy())], iterations=4, fixed_noise=True)
         rss.append(float(fits[0].rss.sum()) if fits else np.inf)
     return max(0.5 * (rss[1] - rss[0]), 0.0)

@@ -60,9 +60,7 @@ def transition(F: Array, phi: float | None, G: Array | None = None) -> Array:
     return A
 
 
-def gains(
-    A: Array, Q: Array, R: Array, seen: Array, start: Array, G: Array | None = None
-) -> Gains:
+def gains(A: Array, Q: Array, R: Array, seen: Array, start: Array, G: Array | None = None) -> Gains:
     """The covariance recursion.
 
     Args:

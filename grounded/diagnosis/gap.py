@@ -2,15 +2,17 @@
 
 Predictions start at the filtered state and run on with the recorded commands; their errors after a
 second are compared with what noise alone would make of them (the filter's own covariance, carried
-on): 1.0 is the floor, what is above it can be explained. What the best hypothesis, or a flexible one,
-explains of the innovations is laid out by channel, by time and by the half-space of a state or an
-input that holds most of it in the least time.
+on): 1.0 is the floor, what is above it can be explained. What the best hypothesis, or a flexible
+one, explains of the innovations is laid out by channel, by time and by the half-space of a state or
+an input that holds most of it in the least time.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -32,8 +34,8 @@ class Horizon:
     """
 
     steps: int
-    at: Array
-    run: Array
+    at: Any
+    run: Any
     spread: Array
 
 
@@ -63,7 +65,7 @@ def horizon(predictor: Predictor, fit: Fit, seconds: float) -> Horizon:
     P = np.zeros((len(at), N, N))
     P[:, :n, :n] = g.K[np.maximum(at - 1, 0), run][:, :n] * R[at, run][:, None, :]
     k = np.arange(n, N)
-    P[:, k, k] = fit.noise.start(1)[0] if N > n else 0.0
+    P[:, k, k] = fit.noise.start(1)[0] if n < N else 0.0
     G = noise_entry(predictor, fit.hypothesis, fit.track)
     for j in range(steps):
         A, q = g.A[at + j, run], Q[at + j, run]
@@ -79,7 +81,7 @@ def horizon(predictor: Predictor, fit: Fit, seconds: float) -> Horizon:
 
 
 def errors(predictor: Predictor, h: Hypothesis, track: Array, where: Horizon) -> Array:
-    """y - prediction at the horizon, (M, n); NaN where nothing was measured."""
+    """Y - prediction at the horizon, (M, n); NaN where nothing was measured."""
     data = predictor.data
     x = track[where.at, where.run]
     u, t = predictor.inputs(h), data.time
@@ -124,7 +126,7 @@ def by_time(gain: Array, data: Data, parts: int = 8) -> list[dict[str, float]]:
     end = float(data.time.max()) + data.dt
     edges = np.linspace(0, end, parts + 1)
     found = []
-    for a, b in zip(edges[:-1], edges[1:], strict=True):
+    for a, b in itertools.pairwise(edges):
         inside = (data.time >= a) & (data.time < b)
         share = float(gain[inside].sum()) / whole
         found.append({"from": float(a), "to": float(b), "share": max(share, 0.0)})
@@ -154,7 +156,7 @@ def by_region(
 
 
 def _stump(
-    name: str, signal: Array, gain: Array, valid: Array, whole: float
+    name: str, signal: Array, gain: Array, valid: Any, whole: float
 ) -> dict[str, float | str] | None:
     """The best threshold of one signal, of its value or its size."""
     best: dict[str, float | str] | None = None

@@ -199,7 +199,7 @@ class Predictor:
         return total
 
     def offset(self, h: Hypothesis, track: Array) -> Array | float:
-        """Y - x under a hypothesis along a track (L + 1, B, n); 0.0 where nothing is measured wrong."""
+        """The log minus the state along a track (L + 1, B, n); 0.0 where sensors are right."""
         sensors = [
             (e, v)
             for e, v in zip(h.effects, h.values, strict=True)
@@ -225,7 +225,7 @@ def sensor_offset(effect: Effect, values: Mapping[str, float], track: Array, dt:
     line = np.concatenate([first, track])
     count = len(track)
     old = (1 - part) * line[1 : count + 1] + part * line[:count]
-    return old - track
+    return np.asarray(old - track)
 
 
 def transformed(effect: Effect, values: Mapping[str, float], u: Array, data: Data) -> Array:
@@ -242,6 +242,6 @@ def transformed(effect: Effect, values: Mapping[str, float], u: Array, data: Dat
                 out[:, :, j] = shifted(u[:, :, j], data.held[:, j], values["d"] / data.dt)
                 continue
             z = tuple([data.held[:, j]] * family.depth(values, data.dt))
-            for t in range(u.shape[1]):
-                out[:, t, j], z = family.advance(u[:, t, j], z, values, data.dt)
+            for k in range(u.shape[1]):
+                out[:, k, j], z = family.advance(u[:, k, j], z, values, data.dt)
     return out

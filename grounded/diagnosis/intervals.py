@@ -1,7 +1,7 @@
 """How sure a value is: Fisher information, jackknifed over trials.
 
-The Fisher information trusts the noise model; the jackknife asks the trials themselves, each left out
-once (Efron & Tibshirani 1993, ch. 11). The larger of the two is reported.
+The Fisher information trusts the noise model; the jackknife asks the trials themselves, each left
+out once (Efron & Tibshirani 1993, ch. 11). The larger of the two is reported.
 """
 
 from __future__ import annotations
@@ -12,7 +12,23 @@ from grounded.diagnosis.refine import Fit
 from grounded.frozen import Array
 
 # 97.5 % quantiles of Student's t for 1 to 30 degrees of freedom
-T = (12.71, 4.30, 3.18, 2.78, 2.57, 2.45, 2.36, 2.31, 2.26, 2.23, 2.20, 2.18, 2.16, 2.14, 2.13)
+T: tuple[float, ...] = (
+    12.71,
+    4.30,
+    3.18,
+    2.78,
+    2.57,
+    2.45,
+    2.36,
+    2.31,
+    2.26,
+    2.23,
+    2.20,
+    2.18,
+    2.16,
+    2.14,
+    2.13,
+)
 T += (2.12, 2.11, 2.10, 2.09, 2.09, 2.08, 2.07, 2.07, 2.06, 2.06, 2.06, 2.05, 2.05, 2.05, 2.04)
 
 

@@ -8,12 +8,13 @@ channel a correction of its rate, linear in features that no engineer would name
 
 Its columns are whitened by the filter of the best hypothesis and solved by ridge regression on all
 trials but one; what counts is the likelihood gained on the trial left out. Noise, however coloured
-or heavy, gains nothing there. A correction that does gain is a leftover: stated with its channel, its
-size and the region where it acts.
+or heavy, gains nothing there. A correction that does gain is a leftover: stated with its channel,
+its size and the region where it acts.
 """
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,7 +33,7 @@ RHO_LAGS = 10
 
 @dataclass(frozen=True, eq=False)
 class Leftover:
-    """What remains in one channel: gain [nats] on held-out trials, size [unit/s] rms of the rate."""
+    """What remains in one channel: gain [nats] on held-out trials, size [unit/s] of the rate."""
 
     channel: str
     gain: float
@@ -67,8 +68,11 @@ def flexible(predictor: Predictor, fit: Fit) -> Array:
     names = [n for n in places.dynamic(model) if n in model.state_names]
     states = [_scaled(x[..., model.state_names.index(n)]) for n in names][:6]
     inputs = [_scaled(u[..., j]) for j in range(model.m)]
-    lagged = [_scaled(np.abs(_late(u[..., j], k)) * np.sign(_late(u[..., j], k)))
-              for j in range(model.m) for k in LAGS]
+    lagged = [
+        _scaled(np.abs(_late(u[..., j], k)) * np.sign(_late(u[..., j], k)))
+        for j in range(model.m)
+        for k in LAGS
+    ]
     clock = data.time / max(float(data.time.max()), data.dt)
     columns: list[Array] = [np.ones_like(clock)]
     for value in inputs:
@@ -76,7 +80,7 @@ def flexible(predictor: Predictor, fit: Fit) -> Array:
         columns += _bins(value, 10)
         columns += [value * (clock > part) for part in (0.33, 0.5, 0.67)]
     columns += lagged
-    columns += [s for s in states] + [s**2 for s in states] + [s**3 for s in states]
+    columns += list(states) + [s**2 for s in states] + [s**3 for s in states]
     columns += [a * b for k, a in enumerate(inputs) for b in inputs[k + 1 :]]
     columns += [a**2 * np.sign(b) for a in inputs for b in inputs if a is not b]
     columns += [a * b for a in inputs for b in states]
@@ -105,15 +109,13 @@ def _rate(value: Array) -> Array:
 def _bins(value: Array, count: int) -> list[Array]:
     """1 inside each of `count` bins of equal width."""
     edges = np.linspace(float(value.min()), float(value.max()) + 1e-9, count + 1)
-    pairs = zip(edges[:-1], edges[1:], strict=True)
+    pairs = itertools.pairwise(edges)
     inside = [((value >= a) & (value < b)).astype(float) for a, b in pairs]
     return [column for column in inside if column.mean() > 0.01]
 
 
-def _channel(
-    predictor: Predictor, fit: Fit, features: Array, i: int
-) -> tuple[float, Array, Array]:
-    """Held-out gain of correcting one channel's rate: total, by step (L, B); weights on all trials."""
+def _channel(predictor: Predictor, fit: Fit, features: Array, i: int) -> tuple[float, Array, Array]:
+    """Held-out gain of correcting one channel's rate: total, by step (L, B); the weights."""
     data = predictor.data
     gains = filter_of(predictor, fit)
     L, B, K = features.shape

@@ -59,7 +59,9 @@ def constant_inputs(data: Data) -> list[str]:
     return [
         name
         for j, name in enumerate(names)
-        if float(np.ptp(np.concatenate([data.commands[i, :T, j] for i, T in enumerate(data.lengths)])))
+        if float(
+            np.ptp(np.concatenate([data.commands[i, :T, j] for i, T in enumerate(data.lengths)]))
+        )
         <= 1e-9 * max(data.scales.peak(name), 1e-12)
     ]
 

@@ -6,9 +6,9 @@ which real noise differs from the textbook's, allowed before an effect is claime
     coloured   beside w, a disturbance c_{t+1} = phi c_t + eta with phi = exp(-dt / tau): a gust, a
                carpet, a swaying antenna (variance C of c, a channel)
     heavy      v and w are Student-t of 4 degrees of freedom: each is normal with its own precision,
-               whose expectation weighs it, (dof + 1) / (dof + E[v^2] / R). The weights are found for
-               one fit (`cleaned`) and then belong to the data: every hypothesis is judged with the
-               same ones, so that outliers count for little and favour nobody.
+               whose expectation weighs it, (dof + 1) / (dof + E[v^2] / R). The weights are found
+               for one fit (`cleaned`) and then belong to the data: every hypothesis is judged with
+               the same ones, so that outliers count for little and favour nobody.
 
 Variances climb the likelihood by scoring: with the smoother's adjoint r and its covariance N,
 d loglik / d log q = q sum(r^2 - N) / 2; the information is that of a channel by itself (`climbed`).
@@ -59,9 +59,9 @@ class Noise:
     weight_v: Array | float = 1.0
     last: Array | None = None  # the steps that were taken last, (2 or 3, n)
 
-    def process(self, dt: float) -> Array | float:
+    def process(self, dt: float) -> Array:
         """Q for the filter: (L, B, N) or (N,)."""
-        q = np.exp(self.log_q) / self.weight_w
+        q = np.asarray(np.exp(self.log_q) / self.weight_w)
         phi = self.structure.phi(dt)
         if phi is None:
             return q
@@ -85,7 +85,7 @@ class Noise:
         """The same noise, free to be coloured (or not): where its fit starts."""
         if structure.tau is None:
             return replace(self, structure=structure, last=None)
-        # a tenth of the low-frequency power: the sum of c over time has about 2 tau / dt times its own
+        # a tenth of the low-frequency power: summed over time c has about 2 tau / dt times its own
         share = math.log(0.1 * dt / (2 * structure.tau))
         log_c = np.maximum(self.log_q + share, self.floor)
         return replace(self, structure=structure, log_c=log_c, last=None)
@@ -150,7 +150,10 @@ def climbed(
     share = np.stack([part / whole for part in parts])  # (2 or 3, 40, n)
     info = 0.5 * count * np.einsum("afn,bfn->nab", share, share) / len(omega)
     slope = np.stack(
-        [0.5 * (v * (s**2 - c)).sum(axis=(0, 1)) for v, (s, c) in zip(variances, scores, strict=True)]
+        [
+            0.5 * (v * (s**2 - c)).sum(axis=(0, 1))
+            for v, (s, c) in zip(variances, scores, strict=True)
+        ]
     )
     info += 1e-3 * count * np.eye(len(logs))
     step = np.linalg.solve(info, slope.T[:, :, None])[:, :, 0].T
@@ -172,7 +175,7 @@ def climbed(
 
 
 def cleaned(noise: Noise, adjoint: Adjoint) -> Noise:
-    """One round of outlier weights: scales by what the weighted disturbances are, then new weights."""
+    """One round of outlier weights: scales from the weighted disturbances, then new weights."""
     n = len(noise.log_q)
     q_t, r_t = np.exp(noise.log_q) / noise.weight_w, np.exp(noise.log_r) / noise.weight_v
     w2 = _moment(q_t, adjoint.r[..., :n], adjoint.N[..., :n])

@@ -7,7 +7,7 @@ model hides what is wrong with it, so every hypothesis gets its own.
 
 The shifts of the model's parameters have a normal prior and are integrated out (Laplace):
 
-    log p(y | h) = loglik - shift' P shift / 2 - log det(1 + P^-1 G) / 2,     P = 1 / (spread scale)^2
+    log p(y | h) = loglik - shift' P shift / 2 - log det(1 + P^-1 G) / 2,   P = (spread scale)^-2
 
 All hypotheses of one noise structure step through time together, along the batch axis.
 """
@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -68,7 +69,9 @@ class Fit:
         """Precision of each column, (C,): zero for effects."""
         h = self.hypothesis
         k = len(h.theta)
-        return np.concatenate([np.zeros(k), shift_precision(self.hypothesis, self.gram.shape[-1] - k)])
+        return np.concatenate(
+            [np.zeros(k), shift_precision(self.hypothesis, self.gram.shape[-1] - k)]
+        )
 
 
 def shift_precision(h: Hypothesis, count: int) -> Array:
@@ -76,7 +79,7 @@ def shift_precision(h: Hypothesis, count: int) -> Array:
     return np.full(count, 1.0 / h.spread**2) if count else np.zeros(0)
 
 
-def calibrated(data: Data) -> Array:
+def calibrated(data: Data) -> Any:
     """Parameters that have a scale, as indices: those that a shift makes sense for."""
     return np.flatnonzero(param_scale(data.model) > 0)
 
@@ -140,7 +143,8 @@ def _iterate(predictor: Predictor, works: list[_Work], fixed_noise: bool) -> Non
     r = np.concatenate([_padded(part[2], width) for part in parts], axis=1)
     F = np.concatenate([part[0] for part in parts], axis=1)
     carried = [noise_entry(predictor, work.h, work.track) for work in works]
-    G = np.concatenate(carried, axis=1) if carried[0] is not None else None  # type: ignore[arg-type]
+    entries = [entry for entry in carried if entry is not None]
+    G = np.concatenate(entries, axis=1) if entries else None
     phi = works[0].noise.structure.phi(data.dt)
     Q = np.concatenate([_spread(w.noise.process(data.dt), (L, B)) for w in works], axis=1)
     R = np.concatenate([_spread(w.noise.measurement(L), (L + 1, B)) for w in works], axis=1)
@@ -242,7 +246,10 @@ def _linearised(predictor: Predictor, work: _Work) -> tuple[Array, Array, Array]
         shifted = predictor.offset(other, ahead)
         columns_r.append((np.zeros_like(track) + offset - shifted) / moved)
     d, r = np.stack(columns_d, axis=-1), np.stack(columns_r, axis=-1)
-    flat = (np.ascontiguousarray(x.reshape(-1, model.n)), np.ascontiguousarray(u.reshape(-1, model.m)))
+    flat = (
+        np.ascontiguousarray(x.reshape(-1, model.n)),
+        np.ascontiguousarray(u.reshape(-1, model.m)),
+    )
     p = predictor.params(h)
     if h.spread > 0:
         which = calibrated(data)

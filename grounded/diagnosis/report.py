@@ -102,7 +102,9 @@ class Diagnosis:
     unknowable: tuple[str, ...] = ()
     noise: Mapping[str, Any] = field(default_factory=dict)
     whole_run: Mapping[str, Any] = field(default_factory=dict)
-    parameters: Mapping[str, Estimate] = field(default_factory=dict)  # calibrated beside the effects
+    parameters: Mapping[str, Estimate] = field(
+        default_factory=dict
+    )  # calibrated beside the effects
     trials: int = 0
     steps: int = 0
     candidates: int = 0

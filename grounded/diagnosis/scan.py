@@ -120,9 +120,13 @@ class _Context:
         self.base = self._base()
 
     def _base(self) -> Array:
-        """Whitened columns of what the fit estimates, orthogonalised with their priors: Gram inverse."""
+        """Inverse Gram matrix of what the fit estimates, priors included."""
         self.base_gram = self.fit.gram.sum(axis=0) + np.diag(self.fit.prior)
-        return np.linalg.pinv(self.base_gram, hermitian=True) if len(self.base_gram) else np.zeros((0, 0))
+        return (
+            np.linalg.pinv(self.base_gram, hermitian=True)
+            if len(self.base_gram)
+            else np.zeros((0, 0))
+        )
 
     def columns(self, i: int, point: int, effect: Effect, grid: dict[str, float]) -> list[_Column]:
         family = effect.family
@@ -185,7 +189,8 @@ class _Context:
             ahead = self.after if when == 0 else self.predictor.step(x, self.u, self.p)
             rate = data.model.difference(ahead, x) / data.dt
             cache[when] = Named("state", data.model.state_names, list(np.moveaxis(rate, -1, 0)))
-        return cache[when]
+        found: Named = cache[when]
+        return found
 
     def _input(self, i: int, point: int, effect: Effect, grid: dict[str, float]) -> list[_Column]:
         data, predictor = self.predictor.data, self.predictor
@@ -223,7 +228,7 @@ class _Context:
         block: list[_Column],
         results: dict[tuple[int, int], list[tuple[str, float, Array, Array]]],
     ) -> None:
-        """Whitens a block of columns and keeps their products with residual, base and each other."""
+        """Whitens a block of columns, keeps their products with residual, base, each other."""
         L, B, n = self.white.shape
         d = np.zeros((L, B, n, len(block)))
         r = np.zeros((L + 1, B, n, len(block)))

@@ -1,8 +1,8 @@
 """How far the gap shrinks: predictions of trials that had no part in the values.
 
 For each trial the values are estimated from the other trials (one Newton step from the estimate on
-all), and the trial is predicted from many of its moments, a second ahead, with the commands that were
-really sent. Errors are in units of what noise alone would make of them; 1 is the floor.
+all), and the trial is predicted from many of its moments, a second ahead, with the commands that
+were really sent. Errors are in units of what noise alone would make of them; 1 is the floor.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def moved(predictor: Predictor, h: Hypothesis, shift: Array) -> Hypothesis:
 
 
 def whole_runs(predictor: Predictor, h: Hypothesis, track: Array) -> Array:
-    """rms error of each state when runs are predicted from their first state to their end, (n,)."""
+    """Rms error of each state when runs are predicted from their first state to their end, (n,)."""
     data = predictor.data
     lengths = data.valid.sum(axis=1).astype(int)
     total, count = np.zeros(data.model.n), np.zeros(data.model.n)
@@ -89,8 +89,6 @@ def whole_runs(predictor: Predictor, h: Hypothesis, track: Array) -> Array:
     return np.asarray(np.sqrt(total / np.maximum(count, 1)))
 
 
-def gaps_of(
-    predictor: Predictor, fits: Sequence[Fit], track: Array, where: Horizon
-) -> list[float]:
+def gaps_of(predictor: Predictor, fits: Sequence[Fit], track: Array, where: Horizon) -> list[float]:
     """The gap that each of several hypotheses leaves, held out."""
     return [normalised(held_out(predictor, fit, track, where), where) for fit in fits]

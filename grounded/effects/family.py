@@ -4,11 +4,11 @@ An effect's name is `family:target`. A family says where it acts and writes one 
 NumPy; the same equation is traced into the adopted model, evaluated on whole trials by the
 diagnosis, and listed in docs/effects.md.
 
-    InputFamily     u_eff = effect(u, t, c)                       what the actuator makes of a command
-    MemoryFamily    u_eff, z+ = advance(u, z, c, dt)              the same, with a memory z
-    RateFamily      ds/dt = model + rate(s, a, own, t, c)         added to the rates of states
-    SensorFamily    y = measure(s, c),  s = recover(y, c)         what is logged of a state
-    ParamFamily     p + c                                         the model's own parameter is wrong
+    InputFamily     u_eff = effect(u, t, c)                 what the actuator makes of a command
+    MemoryFamily    u_eff, z+ = advance(u, z, c, dt)        the same, with a memory z
+    RateFamily      ds/dt = model + rate(s, a, own, t, c)   added to the rates of states
+    SensorFamily    y = measure(s, c),  s = recover(y, c)   what is logged of a state
+    ParamFamily     p + c                                   the model's own parameter is wrong
 
 c are the effect's quantities by name. A quantity without a scan grid is absent at zero and the
 equation is (to first order) linear in it; one with a grid is scanned first, then refined. A fixed
@@ -111,7 +111,7 @@ class Site:
 
 
 def per(unit: str, by: str = "s") -> str:
-    """Unit / by, readable: per("m/s", "s") is "m/s^2"."""
+    """A unit divided by another, readable: m/s by s is m/s^2."""
     if unit == "1":
         return f"1/{by}"
     return f"{unit}^2" if unit.endswith(f"/{by}") else f"{unit}/{by}"

@@ -57,7 +57,9 @@ def _patch(site: Site) -> tuple[Quantity, ...]:
         low = site.scales.low.get(name, -1.0)
         grid = tuple(float(low + spread * (i + 0.5) / count) for i in range(count))
         found.append(
-            Quantity(f"{name}0", site.unit(name), grid, low - spread, low + 2 * spread, places=count)
+            Quantity(
+                f"{name}0", site.unit(name), grid, low - spread, low + 2 * spread, places=count
+            )
         )
     size = float(np.sqrt(np.prod(spreads))) if len(where) == 2 else spreads[0]
     radii = tuple(size * r for r in (0.08, 0.16))

@@ -157,7 +157,8 @@ def _memory_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[s
     names = {n: [f"{n}_{family.name}_{i + 1}" for i in range(depth)] for n in effect.site.targets}
 
     def step(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
-        c, u, kept = _quantities(effect, p), {}, {}
+        c, u = _quantities(effect, p), dict[str, Any]()
+        kept: dict[str, Any] = {}
         for n, memory in names.items():
             u[n], later = family.advance(a[n], tuple(s[z] for z in memory), c, dt)
             kept.update(zip(memory, later, strict=True))
@@ -198,7 +199,15 @@ def _in_order(model: Model, values: Mapping[str, Any]) -> list[Any]:
 
 
 def _kick(
-    family: RateFamily, effect: Effect, base: Step, s: Named, a: Any, p: Any, dt: Any, t: Any, c: Any
+    family: RateFamily,
+    effect: Effect,
+    base: Step,
+    s: Named,
+    a: Any,
+    p: Any,
+    dt: Any,
+    t: Any,
+    c: Any,
 ) -> tuple[Values, Named]:
     """Half a step of the added rate alone: the rate, and the state after it."""
     own: Any = {}
@@ -221,7 +230,9 @@ def _sensor_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[s
             family.recover(s[n], c) if n in effect.site.targets else s[n] for n in model.state_names
         ]
         after = base(Named("state", model.state_names, true), a, p, dt)
-        return {n: family.measure(v, c) if n in effect.site.targets else v for n, v in after.items()}
+        return {
+            n: family.measure(v, c) if n in effect.site.targets else v for n, v in after.items()
+        }
 
     return step, {}
 

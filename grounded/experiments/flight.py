@@ -22,7 +22,7 @@ import numpy as np
 from grounded.errors import GroundedError
 from grounded.experiments.figure8 import RADIUS, figure8_target, flight_task, perturbed
 from grounded.experiments.jobs import Engine, Job, Progress, run_jobs
-from grounded.experiments.summary import Table, improvement, mean_se
+from grounded.experiments.summary import Table, improvement, jsonable, mean_se
 from grounded.frozen import Array
 from grounded.improve import first_policy, learn, propose
 from grounded.models.aircraft import model as aircraft
@@ -114,7 +114,8 @@ class FlightResult:
         ]
         shown = self.representative
         figure = {"seed": shown.seed, "desired": self.desired, **shown.paths}
-        return {"runs": runs, **self.summary(), "figure": figure, "paper": PAPER}
+        whole = {"runs": runs, **self.summary(), "figure": figure, "paper": PAPER}
+        return dict(jsonable(whole))
 
     def tables(self) -> list[Table]:
         """Table 1 beside the paper's."""

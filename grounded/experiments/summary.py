@@ -8,8 +8,9 @@ means; both are given.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -34,6 +35,15 @@ def mean_se(values: Sequence[float]) -> tuple[float, float]:
     if len(data) < 2:
         return (float(data.mean()) if len(data) else math.nan), math.nan
     return float(data.mean()), float(data.std(ddof=1) / math.sqrt(len(data)))
+
+
+def jsonable(value: Any) -> Any:
+    """The same with null for numbers that JSON does not have (nan, infinities)."""
+    if isinstance(value, Mapping):
+        return {key: jsonable(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [jsonable(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def slope(x: Sequence[float], y: Sequence[float]) -> tuple[float, float]:

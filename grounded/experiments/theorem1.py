@@ -29,7 +29,7 @@ import numpy as np
 from grounded.bias import ground
 from grounded.compile import Problem
 from grounded.experiments.jobs import Engine, Job, Progress, run_jobs
-from grounded.experiments.summary import Table, mean_se, slope
+from grounded.experiments.summary import Table, jsonable, mean_se, slope
 from grounded.frozen import Array
 from grounded.model import Model, Param
 from grounded.policy_gradient import gradient
@@ -84,12 +84,9 @@ class Theorem1Result:
         slopes = {k: {"slope": v[0], "se": v[1]} for k, v in self.slopes().items()}
         worst = max(row.ratio for row in self.rows)
         paper = {"gradient_error": 1, "squared_gradient": 2}
-        return {
-            "rows": [vars(row) for row in self.rows],
-            "slopes": slopes,
-            "largest_ratio_to_bound": worst,
-            "paper": paper,
-        }
+        found = {"rows": [vars(row) for row in self.rows], "slopes": slopes}
+        found |= {"largest_ratio_to_bound": worst, "paper": paper}
+        return dict(jsonable(found))
 
     def tables(self) -> list[Table]:
         """Medians by epsilon, and the slopes beside the theorem's."""

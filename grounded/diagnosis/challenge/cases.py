@@ -17,7 +17,7 @@ import numpy as np
 
 from grounded.diagnosis.challenge import systems, withheld
 from grounded.diagnosis.challenge.truth import Disturbance, Truth
-from grounded.effects import Effect, Library, ParamFamily, scales_of
+from grounded.effects import Effect, Library, ParamFamily, Scales, scales_of
 from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.model import Model
@@ -130,7 +130,12 @@ def _case(
     )
     truth, label = _truth(kind, system, plans, setting, disturbance, rng)
     runs = [_run(system, truth, plan, setting, rng) for plan in plans]
-    label |= {"noise": setting.kind, "level": setting.level, "roughness": setting.roughness, "param_error": error}
+    label |= {
+        "noise": setting.kind,
+        "level": setting.level,
+        "roughness": setting.roughness,
+        "param_error": error,
+    }
     label |= {"system": system.name, "kind": kind, "case": name}
     return Case(
         name=name,
@@ -162,7 +167,7 @@ Plan = tuple[Array, Array, Array, Array]  # inputs (T, m), start (n,), target (T
 def _plans(
     system: systems.SystemUnderTest, crude: Model, setting: _Setting, rng: np.random.Generator
 ) -> list[Plan]:
-    """A manoeuvre for each trial (or one for all, its inputs varied a little), and two fresh ones."""
+    """A manoeuvre for each trial (or one for all, inputs varied a little), and two fresh ones."""
     t = np.arange(setting.steps) * setting.dt
     found: list[Plan] = []
     for i in range(setting.trials + 2):
@@ -189,7 +194,7 @@ def _run(
 
     def control(t: int, y: Array) -> Array:
         error = np.clip(model.difference(y, target[t]), -2.0, 2.0)
-        return np.clip(u[t] + gains[t] @ error, system.low, system.high)
+        return np.asarray(np.clip(u[t] + gains[t] @ error, system.low, system.high))
 
     held = u[0] if system.name == "aircraft" else system.held
     wobble = np.array([truth.disturbance.measurement.get(n, 0.0) for n in model.state_names])
@@ -236,8 +241,8 @@ def _truth(
             name = effect.site.target
             true_model = true_model.with_values({name: true_model.params[name].value + values["d"]})
     acting = tuple((e, v) for e, v in effects if not isinstance(e.family, ParamFamily))
-    label = [{"effect": e.name, "params": dict(v)} for e, v in effects]
-    return Truth(true_model, acting, disturbance, latency=latency), {"effects": label}
+    named = [{"effect": e.name, "params": dict(v)} for e, v in effects]
+    return Truth(true_model, acting, disturbance, latency=latency), {"effects": named}
 
 
 def _draw(model: Model, scales: Any, rng: np.random.Generator) -> Effect:
@@ -279,7 +284,7 @@ def _value(
     quantity: str,
     size: float,
     sign: float,
-    scales: Any,
+    scales: Scales,
     rng: np.random.Generator,
     model: Model,
     target: str,

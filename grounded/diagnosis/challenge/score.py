@@ -55,12 +55,14 @@ def oracle(
         h = Hypothesis()
         for i in which:
             h = h.plus(effects[i], values[i])
-        for start in [f for f in search.of_size(0)] + list(_plain(search)):
+        for start in list(search.of_size(0)) + list(_plain(search)):
             fits = search.refined([(h, start.noise, start.track)], 12)
             for fit in fits:
                 search.calibrated(fit)
         names = tuple(sorted(h.names))
-        found = [f for f in search.of_size(len(which)) if tuple(sorted(f.hypothesis.names)) == names]
+        found = [
+            f for f in search.of_size(len(which)) if tuple(sorted(f.hypothesis.names)) == names
+        ]
         search.fair(found[0])
         return search.score(found[0])
 
@@ -145,7 +147,8 @@ def summary(marks: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         some = [m for m in marks if m["kind"] == kind]
         row: dict[str, Any] = {"cases": len(some)}
         row["verdicts"] = {
-            v: sum(m["verdict"] == v for m in some) for v in ("effect", "several", "none", "unknown")
+            v: sum(m["verdict"] == v for m in some)
+            for v in ("effect", "several", "none", "unknown")
         }
         if kind == "single":
             seen = [m for m in some if m.get("detectable")]

@@ -1,7 +1,7 @@
 """The systems of the blind challenge: what is driven, how, and how noisy it is.
 
 A manoeuvre is a random sequence of inputs, its run in the crude model is the target, and a
-time-varying linear-quadratic regulator about it is the policy: closed-loop data, as real trials are.
+time-varying linear-quadratic regulator about it is the policy: closed-loop data, as real ones are.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ class SystemUnderTest:
     measurement: dict[str, float]
     tracking: dict[str, float]  # weights of the regulator
     effort: Array  # (m,) weights of inputs
-    manoeuvre: Callable[[np.random.Generator, Array, Model], tuple[Array, Array]]
+    manoeuvre: Callable[[np.random.Generator, Any, Model], tuple[Array, Array]]
     held: Array
     rates: tuple[float, ...] = (20.0, 30.0, 50.0)  # [Hz]
     latency: tuple[float, ...] = ()
 
 
-def wave(rng: np.random.Generator, t: Array, count: int, low: float, high: float) -> Array:
+def wave(rng: np.random.Generator, t: Any, count: int, low: float, high: float) -> Array:
     """A sum of sines of random frequency [Hz] and phase, peak about 1."""
     total = np.zeros_like(t)
     for _ in range(count):
         f = rng.uniform(low, high)
         total += rng.uniform(0.4, 1.0) * np.sin(2 * np.pi * f * t + rng.uniform(0, 2 * np.pi))
-    return total / np.sqrt(count)
+    return np.asarray(total / np.sqrt(count))
 
 
 def steps(rng: np.random.Generator, t: Array, low: float, high: float, every: float) -> Array:
@@ -104,7 +104,14 @@ def car() -> SystemUnderTest:
         low=np.array([-1.0, 0.0]),
         high=np.array([1.0, 1.0]),
         process={"delta": 0.01, "v": 0.03, "x": 0.004, "y": 0.004, "psi": 0.01, "psi_rate": 0.1},
-        measurement={"delta": 0.01, "v": 0.02, "x": 0.004, "y": 0.004, "psi": 0.01, "psi_rate": 0.1},
+        measurement={
+            "delta": 0.01,
+            "v": 0.02,
+            "x": 0.004,
+            "y": 0.004,
+            "psi": 0.01,
+            "psi_rate": 0.1,
+        },
         tracking={"delta": 0.2, "v": 1.0, "x": 4.0, "y": 4.0, "psi": 1.0},
         effort=np.array([2.0, 2.0]),
         manoeuvre=_drive,

@@ -49,7 +49,7 @@ class Disturbance:
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """The real system: a model with its true parameters, effects in it, disturbances, withheld parts."""
+    """The real system: a model with true parameters, effects, disturbances, withheld parts."""
 
     model: Model
     effects: tuple[tuple[Effect, Mapping[str, float]], ...] = ()
@@ -95,14 +95,14 @@ class _Run:
         self.tied = [
             (self.names.index(n), self.names.index(k))
             for n in self.names
-            if (k := partner(model, n))
+            if (k := partner(model, n)) is not None
         ]
         self.past = [self.x.copy()]
         logged, inputs = [self.measure()], []
         for t in range(steps):
             u = np.asarray(controller(t, logged[-1]), float)
-            for k in range(FINE):
-                self.advance(u, t * self.dt + k * self.fine)
+            for part in range(FINE):
+                self.advance(u, t * self.dt + part * self.fine)
                 self.past.append(self.x.copy())
             self.disturb()
             self.tie(u, (t + 1) * self.dt)
@@ -186,12 +186,12 @@ class _Run:
 
     def _draw(self, count: int) -> Array:
         if self.truth.disturbance.kind == "heavy":
-            return self.rng.standard_t(3, count) / np.sqrt(3.0)
+            return np.asarray(self.rng.standard_t(3, count) / np.sqrt(3.0))
         return self.rng.standard_normal(count)
 
     def measure(self) -> Array:
         """The log of this moment."""
-        model, noise = self.truth.model, self.truth.disturbance
+        _model, noise = self.truth.model, self.truth.disturbance
         y = self.x.copy()
         for effect, values in self.truth.effects:
             i = self.names.index(effect.site.target) if effect.site.target in self.names else -1

@@ -100,7 +100,7 @@ def _dropouts(rng: np.random.Generator, j: int, model: Model, peak: float, T: fl
             if own["rng"].random() < rate * dt:
                 until = t + own["rng"].uniform(0.1, 0.4)
         own["dropouts"] = (until, held)
-        return held.copy()
+        return np.array(held)
 
     return _named("dropouts", model, j, {"per_second": rate}, act)
 
