@@ -120,7 +120,7 @@ def test_an_effect_is_absent_at_its_start(effect):
     else:
         values = {q.name: q.start or 1e-9 for q in effect.free}
     if effect.family.name == "rate_limit":
-        values = {"r": 1e4}  # the first command is a jump from what was held before
+        values = {"r": 1e8}  # the first command is a jump from what was held before
     predictor = Predictor(prepare(car, [TRIAL]))
     x = TRIAL.states[:-1][:, None, :]
     with_it = predictor.next(Hypothesis().plus(effect, values), x)

@@ -94,7 +94,7 @@ def flexible(predictor: Predictor, fit: Fit) -> Array:
 def _scaled(value: Array) -> Array:
     """Zero mean, unit spread, clipped to three."""
     spread = float(value.std())
-    return np.clip((value - value.mean()) / (spread if spread > 1e-12 else 1.0), -3, 3)
+    return np.asarray(np.clip((value - value.mean()) / max(spread, 1e-12), -3, 3))
 
 
 def _late(value: Array, steps: int) -> Array:

@@ -298,7 +298,7 @@ def _value(
     if family == "backlash":
         return size * scales.spread(target)
     if family == "rate_limit":
-        return float(scales.spread(target)) * np.exp(rng.uniform(np.log(0.3), np.log(3.0)))
+        return float(float(scales.spread(target)) * np.exp(rng.uniform(np.log(0.3), np.log(3.0))))
     if family in ("delay", "sensor_delay"):
         return 0.6 * size
     if family == "first_order_lag":
