@@ -84,7 +84,7 @@ class Theorem1Result:
         slopes = {k: {"slope": v[0], "se": v[1]} for k, v in self.slopes().items()}
         worst = max(row.ratio for row in self.rows)
         paper = {"gradient_error": 1, "squared_gradient": 2}
-        found = {"rows": [vars(row) for row in self.rows], "slopes": slopes}
+        found: dict[str, Any] = {"rows": [vars(r) for r in self.rows], "slopes": slopes}
         found |= {"largest_ratio_to_bound": worst, "paper": paper}
         return dict(jsonable(found))
 
