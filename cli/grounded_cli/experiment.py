@@ -29,7 +29,12 @@ STUDIES = {
 @click.argument("name", type=click.Choice(list(STUDIES)), required=False)
 @click.option("--seeds", metavar="N|A-B|A,B,...", help="How many seeds, or which.")
 @click.option("--jobs", type=click.IntRange(1), default=1, help="Processes on this machine.")
-@click.option("--engine", type=click.Choice(["local", "dask"]), default="local")
+@click.option(
+    "--engine",
+    type=click.Choice(["local", "dask"]),
+    default="local",
+    help="Where jobs run: here (default) or on a Dask cluster.",
+)
 @click.option("--address", metavar="URL", help="Scheduler of a Dask cluster, tcp://host:8786.")
 @click.option("--keep", metavar="DIR", help="Finished jobs (default: .grounded-studies/NAME).")
 @click.option("--png", metavar="FILE", help="Draw the study's picture.")
