@@ -236,3 +236,11 @@ def test_missing_and_unknown_quantities_are_named():
         wrap(effect, {"width": 0.1}, DT)
     with pytest.raises(GroundedError, match="needs a value for 'c'"):
         wrap(effect, {}, DT)
+
+
+def test_the_docs_have_a_row_for_every_family():
+    from pathlib import Path
+
+    text = (Path(__file__).parent.parent / "docs" / "effects.md").read_text(encoding="utf-8")
+    for family in Library().families:
+        assert f"| `{family.name}` |" in text

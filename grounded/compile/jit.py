@@ -103,7 +103,9 @@ def library(key: str, write: Callable[[], str], names: Sequence[str]) -> Library
             module.triple = llvm.get_process_triple()
             code = machine.emit_object(module)
             disk.write(digest, code)
-        engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
+        # lmm: one block of memory for code and constants. LLVM's own manager may map them more than
+        # 2 GB apart, which the small code model can't reach: it aborts, or worse.
+        engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine, use_lmm=True)
         engine.add_object_file(llvm.ObjectFileRef.from_data(code))
         engine.finalize_object()
         return Library(engine, names)
