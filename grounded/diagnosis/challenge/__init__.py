@@ -10,5 +10,17 @@ from __future__ import annotations
 
 from grounded.diagnosis.challenge.cases import KINDS, Case, make, sealed
 from grounded.diagnosis.challenge.score import Oracle, judge, oracle, summary
+from grounded.diagnosis.challenge.study import study, task_of
 
-__all__ = ["KINDS", "Case", "Oracle", "judge", "make", "oracle", "sealed", "summary"]
+__all__ = [
+    "KINDS",
+    "Case",
+    "Oracle",
+    "judge",
+    "make",
+    "oracle",
+    "sealed",
+    "study",
+    "summary",
+    "task_of",
+]
