@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import click
 
+from grounded_cli import completion as complete
 from grounded_cli.options import as_json, in_workspace, open_workspace
-from grounded_cli.terminal import show, show_json
+from grounded_cli.terminal import field, number, show, show_json
 
 
 @click.command("adopt")
-@click.argument("effect", metavar="EFFECT")
+@click.argument("effect", metavar="EFFECT", shell_complete=complete.effects)
+@click.option("--effect-only", is_flag=True, help="Leave the model's own parameters alone.")
 @in_workspace
 @as_json
-def command(effect: str, folder: str | None, json_: bool) -> None:
+def command(effect: str, effect_only: bool, folder: str | None, json_: bool) -> None:
     """Add an effect of the last diagnosis (`family:target`) to [model] in grounded.toml.
+
+    Parameters that were calibrated beside it come along.
 
     The search goes on from the best policy, planned with the better model. To undo it, take the
     effect out of grounded.toml again.
@@ -21,9 +25,11 @@ def command(effect: str, folder: str | None, json_: bool) -> None:
     workspace = open_workspace(folder)
     from grounded_trials.diagnosing import adopt_effect
 
-    adopted = adopt_effect(workspace, effect)
+    adopted, params = adopt_effect(workspace, effect, parameters=not effect_only)
     if json_:
-        show_json({"effects": [dict(one) for one in adopted]})
+        show_json({"effects": [dict(one) for one in adopted], "params": params})
         return
     show(f"{effect} is part of the model now ({workspace.config.file})")
+    for name, value in params.items():
+        show(field(name, f"{number(value)}, calibrated beside it", "  "))
     show("\nnext: grounded propose")

@@ -28,6 +28,7 @@ def command(name: str, folder: str | None, json_: bool) -> None:
     """
     from grounded.errors import GroundedError
     from grounded_trials.examples import example, write_example
+    from grounded_trials.reporting import save_optimum
     from grounded_trials.workspace import Workspace
 
     example(name)
@@ -39,6 +40,7 @@ def command(name: str, folder: str | None, json_: bool) -> None:
     say(f"workspace {target}: {name}, a crude model and a simulated real system\n")
     standing = learn_in(workspace)
     optimum = _optimum(workspace)
+    save_optimum(workspace, optimum)
     verdict = _diagnosis(workspace)
     paths = _report(workspace)
     document = {

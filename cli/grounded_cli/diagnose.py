@@ -6,12 +6,18 @@ from typing import Any
 
 import click
 
+from grounded_cli import completion as complete
 from grounded_cli.options import as_json, in_workspace, library_of, open_workspace
 from grounded_cli.terminal import field, number, show, show_json, stages, table
 
 
 @click.command("diagnose")
-@click.option("--trials", metavar="T1,T2,...", help="Only these trials (default: all).")
+@click.option(
+    "--trials",
+    metavar="T1,T2,...",
+    shell_complete=complete.trials,
+    help="Only these trials (default: all).",
+)
 @click.option("--max-effects", type=click.IntRange(1, 6), default=3, help="At most K at once.")
 @click.option("--without", multiple=True, metavar="FAMILY", help="A family not to blame.")
 @in_workspace

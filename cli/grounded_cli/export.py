@@ -6,12 +6,13 @@ from pathlib import Path
 
 import click
 
+from grounded_cli import completion as complete
 from grounded_cli.options import as_json, in_workspace, open_workspace
 from grounded_cli.terminal import show, show_json
 
 
 @click.command("export")
-@click.argument("candidate", metavar="ID")
+@click.argument("candidate", metavar="ID", shell_complete=complete.candidates)
 @click.option(
     "--format",
     "form",

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from grounded_cli import completion as complete
 from grounded_cli.options import as_json, in_workspace, open_workspace
 from grounded_cli.terminal import number, progress, say, show, show_json, table
 
@@ -16,7 +17,9 @@ if TYPE_CHECKING:
 
 @click.command("ingest")
 @click.argument("files", nargs=-1, required=True, metavar="FILE...")
-@click.option("--candidate", metavar="ID", help="Which candidate was run.")
+@click.option(
+    "--candidate", metavar="ID", shell_complete=complete.candidates, help="Which candidate was run."
+)
 @click.option("--data", is_flag=True, help="The log ran no candidate: for fit and diagnose only.")
 @in_workspace
 @as_json

@@ -6,13 +6,20 @@ from pathlib import Path
 
 import click
 
+from grounded_cli import completion as complete
 from grounded_cli.options import as_json
 from grounded_cli.terminal import show, show_json
 
 
 @click.command("init")
 @click.argument("folder", metavar="DIR", required=False)
-@click.option("--example", "name", metavar="NAME", help="Which example (see --list).")
+@click.option(
+    "--example",
+    "name",
+    metavar="NAME",
+    shell_complete=complete.examples,
+    help="Which example (see --list).",
+)
 @click.option("--list", "list_", is_flag=True, help="List the examples.")
 @as_json
 def command(folder: str | None, name: str | None, list_: bool, json_: bool) -> None:

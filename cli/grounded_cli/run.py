@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import click
 
+from grounded_cli import completion as complete
 from grounded_cli.options import as_json, in_workspace, open_workspace
 from grounded_cli.terminal import progress, show, show_json
 
 
 @click.command("run")
-@click.argument("candidate", required=False)
+@click.argument("candidate", required=False, shell_complete=complete.candidates)
 @in_workspace
 @as_json
 def command(candidate: str | None, folder: str | None, json_: bool) -> None:

@@ -27,8 +27,8 @@ def command(folder: str | None, json_: bool) -> None:
         show_json(as_document(standing))
         return
     show(summary(standing))
-    system = workspace.config.system
-    show(f"\nnext: {next_command(standing, bool(system.command or system.model))}")
+    system, diagnosed = workspace.config.system, (workspace.reports / "diagnosis.json").exists()
+    show(f"\nnext: {next_command(standing, bool(system.command or system.model), diagnosed)}")
 
 
 def as_document(standing: Standing) -> dict[str, Any]:
@@ -63,11 +63,13 @@ def as_document(standing: Standing) -> dict[str, Any]:
 
 def summary(standing: Standing) -> str:
     """The history as a table, with a line of bars and how sure the last improvement is."""
+    from grounded_trials.report_text import spaced
+
     lines = []
     if standing.history:
-        header = ("candidate", "iteration", "alpha", "predicted", "utility", "+-", "trials", "")
+        header = ("id", "iter", "alpha", "damp", "predicted", "utility", "+-", "trials", "")
         lines.append(table([_row(t) for t in standing.history], header))
-        bars = sparkline([t.utility for t in standing.history if t.utilities])
+        bars = sparkline(spaced([t.utility for t in standing.history if t.utilities]))
         lines.append("\n" + field("utility", bars))
     if standing.incumbent is not None:
         best, first = standing.incumbent, standing.utilities[0]
@@ -89,6 +91,7 @@ def _row(tried: Tried) -> tuple[str, ...]:
         tried.candidate.id,
         str(tried.candidate.iteration),
         f"{tried.candidate.alpha:g}",
+        f"{tried.candidate.damping:.2g}" if tried.candidate.base else "-",
         number(tried.candidate.predicted_utility),
         number(tried.utility),
         "-" if error != error else f"{error:.2g}",
@@ -104,10 +107,10 @@ def certainty(standing: Standing) -> str:
     return last_improvement(standing.history)
 
 
-def next_command(standing: Standing, can_run: bool) -> str:
+def next_command(standing: Standing, can_run: bool, diagnosed: bool = False) -> str:
     """The command to type next."""
     if standing.phase == "await-trial":
         return "grounded run" if can_run else "grounded ingest TRIAL.mcap"
     if standing.phase == "propose":
         return "grounded propose"
-    return "grounded diagnose"
+    return "grounded report --html" if diagnosed else "grounded diagnose"

@@ -143,12 +143,7 @@ def number(value: float | None, digits: int = 4) -> str:
 
 
 def sparkline(values: Sequence[float]) -> str:
-    """Utilities as little bars, worst to best; a failed run is a cross.
-
-    Penalties shrink by factors, so the bars are logarithmic where all utilities are negative.
-    """
-    if all(v < 0 for v in values):
-        values = [-math.log(-v) if math.isfinite(v) else v for v in values]
+    """Values as little bars, lowest to highest; a failed run is a cross."""
     known = [v for v in values if math.isfinite(v)]
     if not known:
         return "x" * len(values)

@@ -104,7 +104,9 @@ def _probe(
     if not found.indistinguishable:
         return None
     from grounded.diagnosis.excitation import probe
-    from grounded.improve import Candidate, model_fingerprint, simulate
+    from grounded.improve import model_fingerprint
+    from grounded.rollout import simulate
+    from grounded.search import Candidate
     from grounded_trials.proposing import standing_in
 
     best = standing_in(workspace).incumbent
@@ -130,8 +132,13 @@ def _probe(
     return candidate.id, made.sentence
 
 
-def adopt_effect(workspace: Workspace, name: str) -> tuple[Mapping[str, Any], ...]:
-    """Adds a diagnosed effect to [model] effects; returns all that are adopted now.
+def adopt_effect(
+    workspace: Workspace, name: str, *, parameters: bool = True
+) -> tuple[tuple[Mapping[str, Any], ...], dict[str, float]]:
+    """Adds a diagnosed effect to [model] effects: all that are adopted now, and new parameters.
+
+    Where the diagnosis calibrated the model's own parameters beside the effects, they are adopted
+    too: the effect's values hold beside them.
 
     Raises:
         GroundedError: if nothing was diagnosed, or the effect is not in its ranking.
@@ -156,16 +163,17 @@ def adopt_effect(workspace: Workspace, name: str) -> tuple[Mapping[str, Any], ..
     entry = ranking[name]
     values = {key: float(p["value"]) for key, p in entry["params"].items()}
     values |= {key: float(value) for key, value in entry.get("fixed", {}).items()}
+    found = document.get("parameters", {}) if parameters else {}
+    params = {key: float(f"{p['value']:.8g}") for key, p in found.items()}
     family, _, target = name.partition(":")
     if family == "parameter":
-        params = dict(workspace.config.model.params)
         nominal = workspace.base_model.params[target].value
         params[target] = float(f"{nominal + values['d']:.8g}")
-        set_in_model(workspace.config.file, params=params)
-        return tuple(adopted)
-    adopted.append({"name": name, **{key: float(f"{v:.8g}") for key, v in values.items()}})
-    set_in_model(workspace.config.file, effects=adopted)
-    return tuple(adopted)
+    else:
+        adopted.append({"name": name, **{key: float(f"{v:.8g}") for key, v in values.items()}})
+    whole = dict(workspace.config.model.params) | params
+    set_in_model(workspace.config.file, params=whole if params else None, effects=adopted or None)
+    return tuple(adopted), params
 
 
 def _finite(value: Any) -> Any:

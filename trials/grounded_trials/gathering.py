@@ -27,7 +27,7 @@ from grounded_trials.better_model import Better, better_model
 from grounded_trials.diagnosis_file import Diagnosis, read_diagnosis
 from grounded_trials.findings import Findings, Log, Lost, Run
 from grounded_trials.mcap_log import read_trial
-from grounded_trials.workspace import Workspace, _candidate
+from grounded_trials.workspace import Workspace, candidate_of
 
 RUNAWAY = 1e15  # in any unit: the number of a run that diverged
 
@@ -101,7 +101,7 @@ def _candidates(
         reason = "its file is gone and no trial carries it"
         for data in sources:
             try:
-                candidate, meta = _candidate(data, f"candidates/{identity}.mcap")
+                candidate, meta = candidate_of(data, f"candidates/{identity}.mcap")
             except GroundedError as error:
                 reason = str(error)
                 continue

@@ -134,7 +134,7 @@ class Workspace:
         Raises:
             GroundedError: if neither is there, or the file is damaged.
         """
-        return _candidate(self.candidate_bytes(identity), f"candidates/{identity}.mcap")
+        return candidate_of(self.candidate_bytes(identity), f"candidates/{identity}.mcap")
 
     def candidate_bytes(self, identity: str) -> bytes:
         """The candidate's file.
@@ -207,7 +207,8 @@ class Workspace:
         ]
 
 
-def _candidate(data: bytes, name: str) -> tuple[Candidate, dict[str, str]]:
+def candidate_of(data: bytes, name: str) -> tuple[Candidate, dict[str, str]]:
+    """A candidate and its metadata from the bytes of its file, called `name` in messages."""
     policy, states, inputs, meta = read_candidate(data, name)
     try:
         candidate = Candidate(
