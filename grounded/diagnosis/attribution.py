@@ -277,7 +277,10 @@ def _explore(search: Search) -> Fit:
     singles = search.of_size(1)
     if not singles:
         return null
-    best = singles[0]
+    for kind in {fit.noise.structure for fit in singles[:SHORTLIST]}:
+        # a large effect has a long way from its first look
+        search.refined([f for f in singles[:SHORTLIST] if f.noise.structure == kind], 8)
+    best = search.of_size(1)[0]
     for _ in range(2):  # with the noise that the best one leaves, others may look better
         search.extended(_without_last(best))
         search.structures(best)

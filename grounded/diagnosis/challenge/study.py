@@ -1,4 +1,4 @@
-"""A whole study in memory: cases made, diagnosed, judged. Files and seals are the command line's."""
+"""A whole study in memory: cases made, diagnosed, judged. Files and seals are the CLI's."""
 
 from __future__ import annotations
 
