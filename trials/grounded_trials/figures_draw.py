@@ -187,7 +187,7 @@ def _axes(panel: Panel, aspect: float) -> tuple[Axis, Axis]:
     xs = [c.x for c in seen] + [np.array([d.x for d in panel.dots])]
     ys = [c.y for c in seen] + [np.array([d.y for d in panel.dots])]
     ys.append(np.array([rule.y for rule in panel.rules]))
-    x_low, x_high = fitted(xs, 0.06 if panel.equal else 0.0)
+    x_low, x_high = fitted(xs, 0.06 if panel.equal else 0.03 if panel.dots else 0.0)
     if panel.whole:
         x_low, x_high = x_low - 0.6, x_high + 0.6
     y_low, y_high = panel.y_range or fitted(ys)
