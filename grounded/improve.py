@@ -184,6 +184,7 @@ def _improvement(make: _Maker, incumbent: Tried, options: Options) -> Proposal:
     """
     planner, plan = make.planner, make.planner.plan
     own = planner.lift(mean_trial(incumbent.trials, planner.task.model.angle_mask))
+    plan.model.system.check(own.states[:-1], own.inputs, plan.model.values, plan.dt)
     matched = options.match_inputs
     grounding = ground(plan, own, match_inputs=matched)
     exact = ground(plan, own, exact=True, match_inputs=matched)

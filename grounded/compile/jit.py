@@ -36,12 +36,16 @@ def _host() -> tuple[str, str, str]:
 
 
 def _machine() -> Any:
-    """The host as a target machine; an engine takes it over, so each gets its own."""
+    """The host as a target machine; an engine takes it over, so each gets its own.
+
+    Code and constants are mapped apart, now and then by more than the 2 GB that the small code
+    model reaches: then LLVM aborts, or worse. The large one addresses anything.
+    """
     import llvmlite.binding as llvm
 
     name, features, _ = _host()
     return llvm.Target.from_default_triple().create_target_machine(
-        cpu=name, features=features, opt=OPTIMISATION, reloc="pic", codemodel="small", jit=True
+        cpu=name, features=features, opt=OPTIMISATION, reloc="static", codemodel="large", jit=True
     )
 
 
@@ -103,9 +107,7 @@ def library(key: str, write: Callable[[], str], names: Sequence[str]) -> Library
             module.triple = llvm.get_process_triple()
             code = machine.emit_object(module)
             disk.write(digest, code)
-        # lmm: one block of memory for code and constants. LLVM's own manager may map them more than
-        # 2 GB apart, which the small code model can't reach: it aborts, or worse.
-        engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine, use_lmm=True)
+        engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
         engine.add_object_file(llvm.ObjectFileRef.from_data(code))
         engine.finalize_object()
         return Library(engine, names)

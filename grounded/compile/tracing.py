@@ -82,7 +82,13 @@ def trace(signature: Signature, p: Array | None, dt: float, limit: int = MAX_NOD
     except GroundedError:
         raise
     except TooLong as error:
-        return f"{raised_at(error, signature.function)}: it unrolls to {error} (a long loop?)"
+        found = f"{raised_at(error, signature.function)}: it unrolls to {error} (a long loop?)"
+        if signature.kind == "step":  # a simulator of one's own runs as it is
+            return found
+        raise GroundedError(
+            f"{found}; write it with fewer steps, or give the model as step=, which is run as it "
+            "is, on finite differences"
+        ) from None
     except NotTraceable as error:
         return f"{raised_at(error, signature.function)}: {error}"
     except Exception as error:  # the plain call will tell whether this is the user's mistake
