@@ -9,7 +9,6 @@ import numpy as np
 from grounded.errors import GroundedError
 from grounded.frozen import Array, readonly
 
-
 HUGE = 1e100  # from here on a number is as good as infinite: squares and products must be numbers
 
 

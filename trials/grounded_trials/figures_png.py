@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 SCALE, SMOOTH = 2, 2  # pixels of the picture for one of the page; drawn so much larger
 HEAD, GAP = 64, 16
+LINE = 14  # of the legend
 SIZES = {"text": 12.0, "title": 13.0, "faint": 11.5}
 GREY = {"text": (26, 26, 26), "title": (0, 0, 0), "faint": (92, 92, 92)}
 SPELLED = {
@@ -47,13 +48,15 @@ def png(figure: Figure) -> bytes:
     rows = [drawings[i : i + columns] for i in range(0, len(drawings), columns)]
     heights = [max(d.height for d in row) for row in rows]
     wide = round(columns * (drawings[0].width + GAP) + GAP) * SCALE
-    high = round(HEAD + sum(heights) + GAP * len(rows)) * SCALE
+    places = _legend_places(figure.key, wide)
+    head = HEAD + (LINE * places[-1][1] if places else 0)
+    high = round(head + sum(heights) + GAP * len(rows)) * SCALE
     sheet = Image.new("RGB", (wide, high), "white")
     pen = ImageDraw.Draw(sheet)
     text = plain(figure.title)
     pen.text((GAP * SCALE, 10 * SCALE), text, font=_font(16.0 * SCALE), fill=(0, 0, 0))
-    _legend(pen, figure.key, wide)
-    top = float(HEAD)
+    _legend(pen, figure.key, places)
+    top = float(head)
     for row, height in zip(rows, heights, strict=True):
         for column, drawing in enumerate(row):
             left = GAP + column * (drawing.width + GAP)
@@ -168,15 +171,24 @@ def _spot(pen: Any, spot: Spot, factor: int) -> None:
         pen.line([(x - 6 * factor, y), (x + 6 * factor, y)], fill=colour, width=2 * factor)
 
 
-def _legend(pen: Any, keys: tuple[Key, ...], wide: int) -> None:
+def _legend_places(keys: tuple[Key, ...], wide: int) -> list[tuple[float, int]]:
+    """Where each entry begins, in pixels, and in which line."""
+    font = _font(12.0 * SCALE)
+    places, x, line = [], float(GAP * SCALE), 0
+    for key in keys:
+        length = 34 * SCALE + font.getlength(plain(key.name)) + 18 * SCALE
+        if x + length > wide and x > GAP * SCALE:
+            x, line = float(GAP * SCALE), line + 1
+        places.append((x, line))
+        x += length
+    return places
+
+
+def _legend(pen: Any, keys: tuple[Key, ...], places: list[tuple[float, int]]) -> None:
     """The legend in lines below the title."""
     font = _font(12.0 * SCALE)
-    x, y = float(GAP * SCALE), 38.0 * SCALE
-    for key in keys:
-        text = plain(key.name)
-        length = 34 * SCALE + font.getlength(text) + 18 * SCALE
-        if x + length > wide and x > GAP * SCALE:
-            x, y = float(GAP * SCALE), y + 14 * SCALE
+    for key, (x, line) in zip(keys, places, strict=True):
+        y = (38.0 + LINE * line) * SCALE
         middle = y + 7 * SCALE
         if key.shape in ("disc", "ring", "cross", "dash"):
             spot = Spot(x / SCALE + 13, middle / SCALE, key.role, key.shape, "")
@@ -186,8 +198,7 @@ def _legend(pen: Any, keys: tuple[Key, ...], wide: int) -> None:
         else:
             ends = np.array([[x, middle], [x + 26 * SCALE, middle]]) / SCALE
             _stroke(pen, Stroke(ends, key.role, 2.0), SCALE)
-        pen.text((x + 34 * SCALE, y), text, font=font, fill=GREY["text"])
-        x += length
+        pen.text((x + 34 * SCALE, y), plain(key.name), font=font, fill=GREY["text"])
 
 
 def _rgb(role: str) -> tuple[int, int, int]:

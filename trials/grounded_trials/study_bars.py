@@ -24,17 +24,15 @@ QUANTITIES = (("Position", "mm", 1e3), ("Heading", "mrad", 1e3), ("Speed", "m/s"
 
 def footnote9_figure(result: Footnote9Result) -> Figure:
     """Shares of the optimum for each b: the model's policy, one iteration, policy gradient."""
-    kinds = (
-        ("model", "model-based", lambda row: row.model_based),
-        ("best", "one iteration", lambda row: row.solved),
-        ("other", "policy gradient", lambda row: row.gradient),
-    )
+    kinds = (("model", "model-based"), ("best", "one iteration"), ("other", "policy gradient"))
     bars = [
-        Bar(f"b = {row.b:g}, {name}", value(row), f"{value(row):.3g}", role)
+        Bar(f"b = {row.b:g}, {name}", value, f"{value:.3g}", role)
         for row in result.rows
-        for role, name, value in kinds
+        for (role, name), value in zip(
+            kinds, (row.model_based, row.solved, row.gradient), strict=True
+        )
     ]
-    key = tuple(Key(role, name, "disc") for role, name, _ in kinds)
+    key = tuple(Key(role, name, "disc") for role, name in kinds)
     title = "Footnote 9: a model that is wrong by b"
     panel = Bars("Real utility as a share of the optimum", tuple(bars))
     return Figure("footnote9", title, "", (panel,), key)

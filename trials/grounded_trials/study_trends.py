@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -75,17 +76,14 @@ def noise_figure(result: NoiseResult) -> Figure:
     panels = []
     for name in dict.fromkeys(o.manoeuvre for o in result.outcomes):
         own = [o for o in result.outcomes if o.manoeuvre == name]
-        panels += [
-            _shares(own, f"{name}: gap closed, median of the seeds", np.median),
-            _shares(own, f"{name}: gap closed, the worst seed", np.min),
-        ]
+        panels.append(_shares(own, f"{name}: gap closed, median of the seeds", np.median))
+        if len({o.seed for o in own}) > 1:
+            panels.append(_shares(own, f"{name}: gap closed, the worst seed", np.min))
     title = f"The line search under noise; best on the whole: {result.recommended}"
     return Figure("noise", title, "", tuple(panels), legend(panels))
 
 
-def _shares(
-    outcomes: Sequence[Outcome], title: str, of: Callable[[Array], float | np.floating[object]]
-) -> Panel:
+def _shares(outcomes: Sequence[Outcome], title: str, of: Callable[[Array], Any]) -> Panel:
     """A curve a rule."""
     curves, dots = [], []
     for k, rule in enumerate(dict.fromkeys(o.rule for o in outcomes)):
