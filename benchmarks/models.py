@@ -1,8 +1,8 @@
 """The two models of the benchmark, written once for NumPy, CasADi and JAX alike.
 
 `xp` is numpy, jax.numpy or casadi's functions; x, u, p are sequences of numbers, arrays or symbols.
-The aircraft is `grounded.models.aircraft`, state for state; the car is `grounded.models.car` without
-its stall and its braking, so that every solver sees smooth functions.
+The aircraft is `grounded.models.aircraft`, state for state; the car is `grounded.models.car`
+without its stall and its braking, so that every solver sees smooth functions.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""JAX: the same DDP written with scans and jitted by the user, 64 bit. Not a package: a yardstick."""
+"""JAX: the same DDP written with scans and jitted by the user, 64 bit: a yardstick, no package."""
 
 from __future__ import annotations
 
