@@ -7,11 +7,14 @@ import pytest
 
 from grounded import GroundedError, Model, Param, Trial
 from grounded.diagnosis import filter as kalman
+from grounded.diagnosis.calibration import loss
 from grounded.diagnosis.challenge import judge, make, oracle, sealed, summary
 from grounded.diagnosis.data import prepare, shifted
 from grounded.diagnosis.diagnose import Options, diagnose
 from grounded.diagnosis.excitation import probe
 from grounded.diagnosis.leftover import chi2_tail
+from grounded.diagnosis.report import Estimate
+from grounded.diagnosis.words import meaning, sentence
 from grounded.effects import Library
 from grounded.models.pendulum import model as pendulum
 from grounded.policy import Policy
@@ -170,6 +173,58 @@ def test_a_parameter_that_is_off_is_blamed_as_a_parameter():
     found = diagnose(model.with_values({"tau": 1.2}), trials)
     assert "parameter:tau" in [r.effect for r in found.ranking[:3]]
     assert found.gap["after"] < 1.2
+
+
+def test_parameters_that_are_off_are_named_most_important_first():
+    model, trials = cart(trials=6)
+    found = diagnose(model.with_values({"k": 1.7, "tau": 1.25}), trials)
+    named = {f"parameter:{name}" for name in ("k", "tau")}
+    assert set(found.effects) & named, found.sentence
+    assert set(found.effects) <= named
+    assert found.kind == ("effect" if len(found.effects) == 1 else "several")
+    claimed = [row for row in found.ranking if row.claimed]
+    assert tuple(row.effect for row in claimed) == found.effects
+    assert [row.effect for row in found.ranking[: len(claimed)]] == list(found.effects)
+    evidences = [row.evidence for row in claimed]
+    assert evidences == sorted(evidences, reverse=True)
+    for row in claimed:
+        assert f"{row.effect.partition(':')[2]} " in found.sentence
+
+
+def test_of_two_parameters_that_are_one_only_one_is_blamed():
+    H = np.array([[100.0, 99.0], [99.0, 100.0]])
+    b = np.array([0.5, 0.5])
+    assert loss(H, b, [0, 1]) == 0
+    assert loss(H, b, [0]) < 1 < 40 < loss(H, b, [])
+
+
+def test_sentences_are_english():
+    model = Model(
+        states={"x": "m", "v": "m/s", "w": "1"},
+        inputs={"steering": "1", "throttle": "1", "u": "N"},
+        params={"k": Param(1.0, "1/s")},
+        roles={"position": ("x",), "speed": "v"},
+        derivative=lambda s, a, p: {"x": s.v, "v": a.throttle + a.u, "w": p.k * a.steering},
+    )
+
+    def said(name, **values):
+        effect = Library().effect(name, model)
+        units = {q.name: q.unit for q in effect.quantities}
+        known = {n: Estimate(v, 0.0, v, v, units[n]) for n, v in values.items()}
+        return sentence([meaning(effect, known)])
+
+    assert said("delay:steering+throttle+u", d=0.04) == (
+        "The steering and the throttle and the input u arrive 0.04 s later than modelled."
+    )
+    assert said("delay:u", d=0.04) == "The input u arrives 0.04 s later than modelled."
+    assert said("offset:v", c=0.1) == "The speed v drifts by 0.1 m/s^2."
+    assert said("offset:w", c=0.1) == "The state w drifts by 0.1 1/s."
+    assert said("input_gain:throttle", g=-0.2) == "The throttle acts 20 % weaker than modelled."
+    assert said("parameter:k", d=0.1) == "The parameter k is off by 0.1 1/s."
+    for effect in Library().candidates(model):
+        known = {q.name: Estimate(0.1, 0, 0.1, 0.1, q.unit) for q in effect.quantities}
+        text = meaning(effect, known)
+        assert "{" not in text and ":" not in text, text
 
 
 def test_what_no_effect_explains_is_left_over():

@@ -155,6 +155,17 @@ class Search:
         """The likeliest fit without effects."""
         return max((f for f in self.fits.values() if not f.hypothesis.effects), key=self.score)
 
+    def exact_null(self) -> Fit:
+        """The likeliest fit without effects and with the parameters as they are."""
+        bare = (f for (_, spread, names), f in self.fits.items() if not names and spread == 0)
+        return max(bare, key=self.score)
+
+    def calibrates(self) -> bool:
+        """Whether calibrating the model's parameters explains more than noise does."""
+        best = self.best_null()
+        spread = best.hypothesis.spread
+        return spread > 0 and self.score(best) > self.score(self.exact_null()) + CLAIM
+
     def with_weights(self, clean_fit: Fit) -> Search:
         """A new search on the same data with a clean fit's outlier weights in all noise."""
         other = Search(self.data, self.candidates, self.tick)
@@ -255,7 +266,17 @@ def attribute(
         for fit in search.of_size(size)[:1]:
             if search.score(fit) > search.score(chosen) + CLAIM:
                 chosen = fit
+    if not chosen.hypothesis.effects and search.calibrates():
+        # one parameter is a calibration too: it need only be likelier than the shift of all
+        single = [f for f in search.of_size(1) if parametric(f)]
+        chosen = max([chosen, *single[:1]], key=search.score)
     return search, chosen
+
+
+def parametric(fit: Fit) -> bool:
+    """Whether all that a fit blames is the model's own parameters."""
+    effects = fit.hypothesis.effects
+    return bool(effects) and all(isinstance(e.family, ParamFamily) for e in effects)
 
 
 def _searched(search: Search) -> tuple[Search, Fit]:

@@ -2,6 +2,7 @@
 
 limits       what can't be known from these data
 attribution  which effects, by evidence                      (effects/, scan, refine, noise)
+calibration  or which of the model's own parameters
 leftover     what no effect explains
 gap          where the gap lies: channels, times, regions
 shrinkage    how far it shrinks on trials that were left out
@@ -11,12 +12,13 @@ excitation   what to run next, where two explanations tie
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis.attribution import CLAIM, TIE, Search, attribute
+from grounded.diagnosis.attribution import CLAIM, TIE, Search, attribute, parametric
+from grounded.diagnosis.calibration import blamed
 from grounded.diagnosis.data import prepare
 from grounded.diagnosis.gap import by_region, by_time, explained, horizon, normalised
 from grounded.diagnosis.hypothesis import Hypothesis, param_scale
@@ -30,10 +32,11 @@ from grounded.diagnosis.report import (
     Kind,
     Ranked,
     Remainder,
-    meaning,
     number,
+    quantity,
 )
 from grounded.diagnosis.shrinkage import gaps_of, held_out, shrinkage, whole_runs
+from grounded.diagnosis.words import distinguishing, improvement, meaning, sentence, tied
 from grounded.effects import Effect, Library, ParamFamily, SensorDelayFamily, SensorFamily
 from grounded.model import Model
 from grounded.task import Task
@@ -107,7 +110,9 @@ class _Writer:
         self.predictor, self.data = search.predictor, search.data
         self.null = search.best_null()
         self.names = best.hypothesis.names
-        self.base = search.score(self.null)
+        self.base = search.score(search.exact_null() if parametric(best) else self.null)
+        calibrating = not self.names and not left and search.calibrates()
+        self.blamed = blamed(self.data, self.null) if calibrating else ()
 
     def diagnosis(self) -> Diagnosis:
         data, predictor = self.data, self.predictor
@@ -126,7 +131,7 @@ class _Writer:
         kind, sentence = self.verdict(
             shrunk.gap_before, shrunk.gap_after, ranking, groups, remainder
         )
-        named = () if kind in ("none",) or self.known.no_cause else self.names
+        named = tuple(row.effect for row in ranking if row.claimed)
         return Diagnosis(
             kind=kind,
             effects=named,
@@ -171,8 +176,11 @@ class _Writer:
         parts = self.parts()
         after = normalised(held_out(self.predictor, self.best, track, where), where)
         for name in sorted(self.names, key=lambda n: -parts[n]):
-            rows.append(self._row(self.best, name, parts[name], after, before, claimed=True))
-        singles = [f for f in search.of_size(1) if f.hypothesis.names[0] not in self.names]
+            claimed = not self.known.no_cause
+            rows.append(self._row(self.best, name, parts[name], after, before, claimed=claimed))
+        rows += self.off(after, before)
+        listed = [row.effect for row in rows]
+        singles = [f for f in search.of_size(1) if f.hypothesis.names[0] not in listed]
         singles = singles[: max(RANKED - len(rows), 3)]
         gaps = gaps_of(self.predictor, singles, track, where)
         for fit, gap in zip(singles, gaps, strict=True):
@@ -180,6 +188,26 @@ class _Writer:
             evidence = search.score(fit) - self.base
             rows.append(self._row(fit, name, evidence, gap, before, claimed=False))
         return tuple(rows)
+
+    def off(self, after: float, before: float) -> list[Ranked]:
+        """The model's own parameters, where calibrating them explains the gap."""
+        model, known, rows = self.data.model, self.parameters(), []
+        for blame in self.blamed:
+            name = model.param_names[blame.index]
+            nominal, e = float(model.values[blame.index]), known[name]
+            d = Estimate(e.value - nominal, e.std, e.low - nominal, e.high - nominal, e.unit)
+            rows.append(
+                Ranked(
+                    effect=f"parameter:{name}",
+                    params={"d": d},
+                    fixed={},
+                    evidence=blame.nats,
+                    gap_after=after,
+                    shrinkage=1 - after / before if before > 0 else 0.0,
+                    claimed=not self.known.no_cause,
+                )
+            )
+        return rows
 
     def parts(self) -> dict[str, float]:
         """What the evidence loses without each claimed effect."""
@@ -190,7 +218,8 @@ class _Writer:
             fits = [
                 f for f in search.of_size(len(rest)) if tuple(sorted(f.hypothesis.names)) == rest
             ]
-            found[name] = whole - max([search.score(f) for f in fits] or [self.base])
+            scores = [search.score(f) for f in fits] if rest else []
+            found[name] = whole - max(scores or [self.base])
         return found
 
     def _row(
@@ -257,43 +286,38 @@ class _Writer:
         left = "; ".join(r.sentence() for r in remainder[:2])
         if self.known.no_cause:
             return "unknown", f"No cause is named: {self.known.sentences[0]}."
+        if self.blamed:
+            return self._calibration(before, after, ranking)
         if not self.names and not remainder:
-            if self.null.hypothesis.spread > 0:
-                return self._calibration(before)
             return "none", (
                 f"The model explains the data down to the noise (predictions "
                 f"{number(before)} times what noise alone makes)."
             )
         if not self.names:
             return "unknown", f"A gap remains that no known effect explains: {left}."
-        row = {r.effect: r for r in ranking}
         effects = {e.name: e for e in self.best.hypothesis.effects}
-        because = "; ".join(
-            meaning(effects[n], row[n].params)
-            for n in sorted(self.names, key=lambda n: -row[n].evidence)
-        )
-        sentence = (
-            f"{because[:1].upper()}{because[1:]}. Held-out predictions improve from "
-            f"{number(before)} to {number(after)} times the noise."
-        )
-        for group in groups:
-            sentence += f" The data can't tell {' from '.join(group)}."
+        claimed = [row for row in ranking if row.claimed]
+        words = [sentence(meaning(effects[row.effect], row.params) for row in claimed)]
+        words.append(improvement(before, after))
+        words += [f"The data can't tell {tied(group)}." for group in groups]
         if remainder:
-            sentence += f" Something is left that no known effect explains: {left}."
-        return ("effect" if len(self.names) == 1 else "several"), sentence
+            words.append(f"Something is left that no known effect explains: {left}.")
+        return ("effect" if len(self.names) == 1 else "several"), " ".join(words)
 
-    def _calibration(self, before: float) -> tuple[Kind, str]:
+    def _calibration(
+        self, before: float, after: float, ranking: Sequence[Ranked]
+    ) -> tuple[Kind, str]:
         """The model's form is right, its numbers are not."""
-        shift = self.null.hypothesis.shift
-        assert shift is not None
-        model = self.data.model
-        relative = shift / np.where(model.values == 0, 1.0, np.abs(model.values))
-        worst = np.argsort(-np.abs(relative))[:3]
-        listed = ", ".join(f"{model.param_names[i]} by {relative[i]:+.1%}" for i in worst)
-        return "several", (
-            f"The model's form explains the data; several of its parameters are off, most of all "
-            f"{listed}: run `grounded fit`."
-        )
+        model, listed = self.data.model, []
+        for row in ranking[: len(self.blamed)]:
+            name = row.effect.partition(":")[2]
+            nominal, d = model.params[name].value, row.params["d"]
+            new = quantity(replace(d, value=nominal + d.value))
+            part = f" ({d.value / abs(nominal):+.1%})" if nominal else ""
+            listed.append(f"{name} should be {new}{part}")
+        text = sentence(["the model's form explains the data, its numbers don't", *listed])
+        words = [text, improvement(before, after), "`grounded fit` fits them all."]
+        return ("effect" if len(listed) == 1 else "several"), " ".join(words)
 
     def channels(self, gain: Any, error: Any, spread: Any) -> list[dict[str, Any]]:
         """Each state's part of the gap."""
@@ -364,48 +388,17 @@ class _Writer:
         if self.known.no_cause:
             return "Run two or more trials in which every input changes."
         if groups:
-            return f"Run a probe that tells {' from '.join(groups[0])}: " + " ".join(
-                distinguishing(groups[0])
+            return " ".join(
+                [f"Run a probe that tells {tied(groups[0])}.", *distinguishing(groups[0])]
             )
         if not self.names and self.left:
             return (
                 f"Repeat a trial twice with the same inputs to see whether the leftover in "
                 f"{self.left[0].channel} repeats."
             )
+        if not self.names and not self.blamed:
+            return "Nothing is tied and nothing to adopt: go on with the search."
         return "Nothing is tied: go on with the search, or adopt the effect first."
-
-
-HINTS = {
-    "dead_zone": "sweep it slowly through zero and hold small commands",
-    "stall": "sweep it slowly through zero and hold small commands",
-    "stiction": "start and stop often, from small commands",
-    "coulomb_friction": "coast down from different speeds",
-    "viscous_friction": "hold several speeds, slow and fast",
-    "quadratic_drag": "hold several speeds, slow and fast",
-    "delay": "step the input sharply, by different amounts",
-    "first_order_lag": "step the input sharply, by different amounts",
-    "rate_limit": "step the input by small and large amounts",
-    "input_bias": "use commands of both signs and of different size",
-    "input_gain": "use small and large commands",
-    "input_fade": "repeat the same manoeuvre early and late in one trial",
-    "understeer": "drive the same curve slowly and fast",
-    "rate_gain": "drive the same curve slowly and fast",
-    "sensor_bias": "start from different headings and reverse direction",
-    "patch": "cross the same places at other speeds and directions",
-    "slope": "drive the same way in several headings",
-}
-
-
-def distinguishing(group: Sequence[str]) -> list[str]:
-    """What to do in a trial that tells a group apart, in words."""
-    found = []
-    for name in group:
-        family, _, target = name.partition(":")
-        hint = HINTS.get(family)
-        text = f"{hint} ({target})." if hint else ""
-        if text and text not in found:
-            found.append(text)
-    return found or ["excite every input over its whole range."]
 
 
 __all__ = ["CLAIM", "Diagnosis", "Effect", "Options", "ParamFamily", "diagnose"]

@@ -23,6 +23,7 @@ from grounded.diagnosis import filter as kalman
 from grounded.diagnosis.hypothesis import Predictor
 from grounded.diagnosis.refine import Fit, noise_entry
 from grounded.effects import places
+from grounded.effects.family import per
 from grounded.frozen import Array
 
 CLAIM = 5.0  # nats gained on held-out trials from which a leftover is stated
@@ -56,7 +57,7 @@ def leftovers(predictor: Predictor, fit: Fit) -> list[Leftover]:
             correction = features @ weights
             size = float(np.sqrt((correction**2 * data.valid.T).sum() / data.valid.sum()))
             unit = data.model.states[name]
-            found.append(Leftover(name, gain, size, f"{unit}/s", correction, step_gain))
+            found.append(Leftover(name, gain, size, per(unit), correction, step_gain))
     return sorted(found, key=lambda left: -left.gain)
 
 

@@ -30,9 +30,7 @@ def limits(data: Data) -> Limits:
     """What the trials are too few or too quiet for."""
     found, no_cause = [], False
     if data.count < 2:
-        found.append(
-            "one trial: nothing can be confirmed on another, so no cause is named; run a second one"
-        )
+        found.append("one trial alone confirms nothing; run a second one")
         no_cause = True
     if data.steps < FEW_STEPS:
         found.append(
@@ -42,7 +40,7 @@ def limits(data: Data) -> Limits:
         no_cause = True
     still = constant_inputs(data)
     for name in still:
-        found.append(f"input {name} never changed: nothing can be said of its actuator")
+        found.append(f"input {name} never changed, so nothing can be said of its actuator")
     if len(still) == data.model.m:
         no_cause = True
     if data.skipped:

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
-
-from grounded.effects import Effect
 
 Kind = Literal["effect", "several", "none", "unknown"]
 
@@ -153,12 +150,3 @@ def quantity(estimate: Estimate) -> str:
     """A value with its unit; pure numbers as they are."""
     unit = "" if estimate.unit == "1" else f" {estimate.unit}"
     return f"{number(estimate.value)}{unit}"
-
-
-def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
-    """The family's sentence with names and numbers filled in."""
-    words: dict[str, str] = {name: quantity(e) for name, e in params.items()}
-    words["target"] = " and ".join(effect.site.targets)
-    driven, _, source = effect.site.target.partition("<-")
-    words |= {"driven": driven, "source": source}
-    return re.sub(r"\{(\w+)\}", lambda m: words.get(m.group(1), m.group(0)), effect.family.sentence)

@@ -124,7 +124,8 @@ class Family:
     Args:
         name: `dead_zone`.
         equation: one line of maths for docs and messages.
-        sentence: "the {targets} ...": what it means in the workshop, after "because".
+        sentence: what it means in the workshop. {target} and quantities are filled in; {s} is a
+            verb's ending, {g%} a percentage, {g%stronger|weaker} one with its direction.
         targets: all targets of a model to which it can apply, joined by "+".
         quantities: the numbers to estimate at a site.
         lookalikes: families that the same data may explain.

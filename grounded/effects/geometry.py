@@ -150,7 +150,7 @@ side_slip = RateFamily(
 understeer = RateFamily(
     name="understeer",
     equation="psi' = model / (1 + k v^2)",
-    sentence="it understeers: the heading turns less the faster it drives ({k})",
+    sentence="it understeers by {k}, turning less the faster it drives",
     targets=lambda model: [h] if _moving(model) and (h := places.heading(model)) else [],
     quantities=_understeer,
     lookalikes=("rate_gain", "coupling", "parameter"),
@@ -161,7 +161,7 @@ understeer = RateFamily(
 slope = RateFamily(
     name="slope",
     equation="v' = model + a cos(psi) + b sin(psi)",
-    sentence="the ground slopes: {a} towards the first axis, {b} towards the second",
+    sentence="the ground slopes, by {a} towards the first axis and {b} towards the second",
     targets=lambda model: [v] if _moving(model) and (v := places.speed(model)) else [],
     quantities=_two_drifts,
     lookalikes=("offset", "patch", "coulomb_friction"),

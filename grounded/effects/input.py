@@ -52,7 +52,7 @@ input_bias = InputFamily(
 input_gain = InputFamily(
     name="input_gain",
     equation="u_eff = (1 + g) u",
-    sentence="{target} acts {g} stronger than modelled",
+    sentence="{target} acts {g%stronger|weaker} than modelled",
     targets=places.inputs,
     quantities=_gain,
     lookalikes=("viscous_friction", "rate_gain", "parameter", "input_fade"),
@@ -62,7 +62,7 @@ input_gain = InputFamily(
 dead_zone = InputFamily(
     name="dead_zone",
     equation="u_eff = sign(u) max(|u| - c, 0)",
-    sentence="{target} has a dead zone of {c}: what is commanded loses that much",
+    sentence="{target} has a dead zone of {c}, which every command loses",
     targets=places.inputs,
     quantities=_threshold,
     lookalikes=("stall", "stiction", "coulomb_friction", "backlash", "input_bias"),
@@ -92,7 +92,7 @@ saturation = InputFamily(
 input_fade = InputFamily(
     name="input_fade",
     equation="u_eff = (1 - k t) u",
-    sentence="{target} fades by {k} (a battery that sags)",
+    sentence="{target} fades by {k%} every second (a battery that sags)",
     targets=places.inputs,
     quantities=_fade,
     lookalikes=("input_gain", "trend", "input_bias"),

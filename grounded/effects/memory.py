@@ -93,7 +93,7 @@ def _queue_length(values: Mapping[str, float], dt: float) -> int:
 delay = MemoryFamily(
     name="delay",
     equation="u_eff(t) = u(t - d)",
-    sentence="{target} arrives {d} later than modelled",
+    sentence="{target} arrive{s} {d} later than modelled",
     targets=lambda model: [*model.input_names, *_together(model.input_names)],
     quantities=_delay,
     lookalikes=("first_order_lag", "rate_limit", "sensor_delay"),

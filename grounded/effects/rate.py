@@ -89,7 +89,7 @@ offset = RateFamily(
 rate_gain = RateFamily(
     name="rate_gain",
     equation="s' = (1 + g) model",
-    sentence="{target} changes {g} faster than modelled",
+    sentence="{target} changes {g%faster|slower} than modelled",
     targets=lambda model: [n for n in model.state_names if n not in places.position(model)],
     quantities=_gain,
     lookalikes=("input_gain", "understeer", "parameter", "sensor_scale"),

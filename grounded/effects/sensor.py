@@ -45,7 +45,7 @@ def _odometry_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Valu
 odometry_scale = RateFamily(
     name="odometry_scale",
     equation="x' = (1 + k) model, y' = (1 + k) model",
-    sentence="distances are {k} longer than modelled",
+    sentence="distances are {k%longer|shorter} than modelled",
     targets=lambda model: ["+".join(p)] if (p := places.position(model)) else [],
     quantities=_scale,
     lookalikes=("sensor_scale", "rate_gain", "drift_body"),
@@ -67,7 +67,7 @@ sensor_bias = SensorFamily(
 sensor_scale = SensorFamily(
     name="sensor_scale",
     equation="y = (1 + k) s",
-    sentence="the log of {target} is {k} too large",
+    sentence="the log of {target} is {k%too large|too small}",
     targets=lambda model: [
         n for n in model.state_names if n not in model.angles and n not in places.position(model)
     ],
