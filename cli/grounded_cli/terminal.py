@@ -14,6 +14,24 @@ from typing import Any
 
 import click
 
+from grounded_trials.words import figure as number
+
+
+__all__ = [
+    "bar",
+    "field",
+    "harmless",
+    "number",
+    "progress",
+    "say",
+    "show",
+    "show_json",
+    "sparkline",
+    "stages",
+    "style",
+    "table",
+]
+
 
 def style(text: str, **how: Any) -> str:
     """Coloured text, unless NO_COLOR is set or the output is not a terminal."""
@@ -128,18 +146,6 @@ def table(rows: Sequence[Sequence[str]], header: Sequence[str]) -> str:
         text = "  ".join(cells).rstrip()
         out.append(style(text, bold=True) if number == 0 else text)
     return "\n".join(out)
-
-
-def number(value: float | None, digits: int = 4) -> str:
-    """A number for a person: significant digits, "failed" for minus infinity, "-" for none."""
-    if value is None or math.isnan(value):
-        return "-"
-    if value == -math.inf:
-        return "failed"
-    if value != 0 and not 1e-3 <= abs(value) < 1e6:
-        return f"{value:.{digits - 1}e}"
-    decimals = max(digits - 1 - math.floor(math.log10(abs(value))) if value else digits - 1, 0)
-    return f"{value:,.{decimals}f}"
 
 
 def sparkline(values: Sequence[float]) -> str:
