@@ -8,8 +8,9 @@ The same search as in `car`, on the same simulated real car with its scatter, tw
 
 Both are judged by the TRUE utility, that of the true states in fresh runs, flown as the search
 flew. "Optimum" is the policy of a search that knows the true model, planned without disturbances:
-a local optimum, which the trials may beat. The noise that the filter assumes is estimated from two minutes of manual driving: what the
-crude model gets wrong counts as process noise. Nothing is tuned by manoeuvre or seed.
+a local optimum, which the trials may beat. The noise that the filter assumes is estimated from two
+minutes of manual driving: what the crude model gets wrong counts as process noise. Nothing is tuned
+by manoeuvre or seed.
 """
 
 from __future__ import annotations
