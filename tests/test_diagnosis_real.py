@@ -127,3 +127,6 @@ def test_the_dart_throttle_has_a_dead_zone():
     found = diagnose(*dart_throttle())
     assert found.ranking[0].effect == "dead_zone:throttle"
     assert 0.15 < found.values("dead_zone:throttle")["c"] < 0.22
+    alike = {one.like: one.share for one in found.lookalikes if one.effect == "dead_zone:throttle"}
+    assert 0.75 < alike["coulomb_friction:v"] < 1
+    assert "dead_zone:throttle is nearly inseparable from" in found.sentence

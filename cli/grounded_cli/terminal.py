@@ -16,7 +16,6 @@ import click
 
 from grounded_trials.words import figure as number
 
-
 __all__ = [
     "bar",
     "field",
@@ -138,13 +137,13 @@ def table(rows: Sequence[Sequence[str]], header: Sequence[str]) -> str:
     lines = [list(header), *[list(row) for row in rows]]
     widths = [max(len(line[i]) for line in lines) for i in range(len(header))]
     out = []
-    for number, line in enumerate(lines):
+    for row, line in enumerate(lines):
         cells = [
             cell.ljust(width) if i == 0 else cell.rjust(width)
             for i, (cell, width) in enumerate(zip(line, widths, strict=True))
         ]
         text = "  ".join(cells).rstrip()
-        out.append(style(text, bold=True) if number == 0 else text)
+        out.append(style(text, bold=True) if row == 0 else text)
     return "\n".join(out)
 
 

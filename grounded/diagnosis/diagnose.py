@@ -25,6 +25,7 @@ from grounded.diagnosis.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.intervals import standard_deviations
 from grounded.diagnosis.leftover import Leftover, leftovers
 from grounded.diagnosis.limits import Limits, knowable, limits
+from grounded.diagnosis.lookalike import Likeness, lookalikes
 from grounded.diagnosis.refine import Fit, calibrated
 from grounded.diagnosis.report import (
     Diagnosis,
@@ -36,7 +37,7 @@ from grounded.diagnosis.report import (
     quantity,
 )
 from grounded.diagnosis.shrinkage import gaps_of, held_out, shrinkage, whole_runs
-from grounded.diagnosis.words import distinguishing, improvement, meaning, sentence, tied
+from grounded.diagnosis.words import distinguishing, improvement, meaning, nearly, sentence, tied
 from grounded.effects import Effect, Library, ParamFamily, SensorDelayFamily, SensorFamily
 from grounded.model import Model
 from grounded.task import Task
@@ -110,6 +111,7 @@ class _Writer:
         self.predictor, self.data = search.predictor, search.data
         self.null = search.best_null()
         self.names = best.hypothesis.names
+        self.alike: tuple[Likeness, ...] = ()
         self.base = search.score(search.exact_null() if parametric(best) else self.null)
         calibrating = not self.names and not left and search.calibrates()
         self.blamed = blamed(self.data, self.null) if calibrating else ()
@@ -127,6 +129,7 @@ class _Writer:
             gain[..., i] += self.left[0].improvement
         ranking = self.ranking(track, where, shrunk.gap_before)
         groups = self.groups()
+        self.alike = self.nearly(groups)
         remainder = tuple(self.remainder(left) for left in self.left)
         kind, sentence = self.verdict(
             shrunk.gap_before, shrunk.gap_after, ranking, groups, remainder
@@ -156,6 +159,7 @@ class _Writer:
             noise=self.noise(),
             whole_run=self.whole_run(track),
             parameters=self.parameters(),
+            lookalikes=self.alike,
             trials=data.count,
             steps=data.steps,
             candidates=len(self.search.candidates),
@@ -267,6 +271,14 @@ class _Writer:
                 found.append((name, *others))
         return tuple(found)
 
+    def nearly(self, groups: tuple[tuple[str, ...], ...]) -> tuple[Likeness, ...]:
+        """Look-alikes by shape, beside those that tie."""
+        if self.known.no_cause:
+            return ()
+        tied = {(group[0], other) for group in groups for other in group[1:]}
+        found = lookalikes(self.predictor, self.best, self.search.candidates)
+        return tuple(one for one in found if (one.effect, one.like) not in tied)
+
     def remainder(self, left: Leftover) -> Remainder:
         """A leftover with the region where it acts."""
         size = left.correction**2 * self.data.valid.T
@@ -300,6 +312,8 @@ class _Writer:
         words = [sentence(meaning(effects[row.effect], row.params) for row in claimed)]
         words.append(improvement(before, after))
         words += [f"The data can't tell {tied(group)}." for group in groups]
+        if self.alike:
+            words.append(nearly(self.alike))
         if remainder:
             words.append(f"Something is left that no known effect explains: {left}.")
         return ("effect" if len(self.names) == 1 else "several"), " ".join(words)

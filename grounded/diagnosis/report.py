@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from grounded.diagnosis.lookalike import Likeness
+
 Kind = Literal["effect", "several", "none", "unknown"]
 
 
@@ -102,6 +104,7 @@ class Diagnosis:
     parameters: Mapping[str, Estimate] = field(
         default_factory=dict
     )  # calibrated beside the effects
+    lookalikes: tuple[Likeness, ...] = ()  # that hardly differ from a claimed effect
     trials: int = 0
     steps: int = 0
     candidates: int = 0
@@ -128,6 +131,7 @@ class Diagnosis:
             },
             "ranking": [r.to_dict() for r in self.ranking],
             "indistinguishable": [list(group) for group in self.indistinguishable],
+            "lookalikes": [dict(one.to_dict()) for one in self.lookalikes],
             "gap": dict(self.gap),
             "whole_run": dict(self.whole_run),
             "leftover": [left.to_dict() for left in self.leftover],

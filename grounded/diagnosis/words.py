@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 
+from grounded.diagnosis.lookalike import Likeness
 from grounded.diagnosis.report import Estimate, number, quantity
 from grounded.effects import Effect, ParamFamily, places
 from grounded.model import Model
@@ -83,6 +84,17 @@ def improvement(before: float, after: float) -> str:
 def tied(group: Sequence[str]) -> str:
     """`A from B or C`."""
     return f"{group[0]} from {' or '.join(group[1:])}"
+
+
+def nearly(alike: Sequence[Likeness]) -> str:
+    """Which other effects would do nearly the same."""
+    parts = []
+    for name in dict.fromkeys(one.effect for one in alike):
+        others = [
+            f"{a.like} ({100 * a.share:.0f} % of its signal)" for a in alike if a.effect == name
+        ]
+        parts.append(f"{name} is nearly inseparable from {' and '.join(others)}")
+    return f"In these trials {'; '.join(parts)}."
 
 
 def distinguishing(group: Sequence[str]) -> list[str]:
