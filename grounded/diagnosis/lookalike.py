@@ -1,0 +1,92 @@
+"""What acts nearly the same as a claimed effect in these trials: look-alikes that hardly differ.
+
+Evidence can rest on a few moments: a dead zone and a dry friction are one constant force while the
+car rolls, and differ only where it stands. So beside the ties (explanations within a few nats) the
+look-alikes of each claimed effect are measured by their shape. The effect's own signal is
+
+    s = whitened (f with the effect - f without it)
+
+after what the calibration and the other effects can take up is projected out; a candidate whose
+best values reproduce most of |s|^2 is named with that share, whatever the evidence says besides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from grounded.diagnosis import filter as kalman
+from grounded.diagnosis.hypothesis import Predictor
+from grounded.diagnosis.leftover import filter_of
+from grounded.diagnosis.refine import Fit, base_columns
+from grounded.diagnosis.scan import scan
+from grounded.effects import Effect, ParamFamily
+
+NEARLY = 0.75  # share of an effect's signal from which a look-alike is named
+MOST = 3  # that are named for one effect
+
+
+@dataclass(frozen=True)
+class Likeness:
+    """A candidate that reproduces a share of a claimed effect's signal."""
+
+    effect: str
+    like: str
+    share: float
+
+    def to_dict(self) -> Mapping[str, Any]:
+        """For JSON."""
+        return {"effect": self.effect, "like": self.like, "share": self.share}
+
+
+def lookalikes(
+    predictor: Predictor, fit: Fit, candidates: Sequence[Effect], nearly: float = NEARLY
+) -> tuple[Likeness, ...]:
+    """Look-alikes of each claimed effect that reproduce nearly all of its signal, most first."""
+    found: list[Likeness] = []
+    for effect in fit.hypothesis.effects:
+        own = [c for c in candidates if related(effect, c) and c.name not in fit.hypothesis.names]
+        if fit.hypothesis.spread > 0:
+            own = [c for c in own if not isinstance(c.family, ParamFamily)]
+        shares = _shares(predictor, fit, effect, own) if own else []
+        likely = [Likeness(effect.name, c.name, s) for c, s in zip(own, shares, strict=True)]
+        near = sorted((one for one in likely if one.share > nearly), key=lambda one: -one.share)
+        found += near[:MOST]
+    return tuple(found)
+
+
+def related(one: Effect, other: Effect) -> bool:
+    """Whether one of two families lists the other among its look-alikes."""
+    a, b = one.family, other.family
+    return b.name in a.lookalikes or a.name in b.lookalikes
+
+
+def _shares(predictor: Predictor, fit: Fit, effect: Effect, own: Sequence[Effect]) -> list[float]:
+    """Share of an effect's signal that the best values of each candidate reproduce."""
+    h, gains = fit.hypothesis, filter_of(predictor, fit)
+    data = predictor.data
+    if h.shift is not None:  # around the calibrated model, so that the prior doesn't pull
+        moved = dict(zip(data.model.param_names, data.model.values + h.shift, strict=True))
+        data = replace(data, model=data.model.with_values(moved))
+        h = replace(h, shift=np.zeros_like(h.shift))
+    predictor, without = Predictor(data), h.minus(effect.name)
+    x, model = fit.track[:-1], data.model
+    bare, full = predictor.next(without, x), predictor.next(h, x)
+    d = model.difference(bare, full)
+    track = np.concatenate([fit.track[:1], full])
+    r = np.zeros_like(track) + predictor.offset(h, track) - predictor.offset(without, track)
+    signal = kalman.innovations(gains, d[..., None], r[..., None])[0][..., 0]
+    other = replace(fit, hypothesis=without, white=signal)
+    columns, of_log = base_columns(predictor, other)
+    W = np.zeros((signal.size, columns.shape[-1]))
+    if W.shape[1]:
+        W = kalman.innovations(gains, columns, of_log)[0].reshape(W.shape)
+    other = replace(other, gram=(W.T @ W)[None], score=np.zeros((1, W.shape[1])))
+    flat = signal.reshape(-1)
+    taken = W.T @ flat
+    power = 0.5 * float(flat @ flat - taken @ other.covariance @ taken)
+    looks = scan(predictor, other, own)
+    return [float(np.clip(look.gain / max(power, 1e-12), 0.0, 1.0)) for look in looks]
