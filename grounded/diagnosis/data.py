@@ -113,7 +113,7 @@ def prepare(
         GroundedError: for trials of other states or inputs, of different dt, or empty ones.
     """
     _check(model, trials)
-    used = [(trial, _usable(trial)) for trial in trials]
+    used = [(trial, usable(trial)) for trial in trials]
     used = [(trial, T) for trial, T in used if T >= 2]
     if not used:
         raise GroundedError(
@@ -171,7 +171,7 @@ def _check(model: Model, trials: Sequence[Trial]) -> None:
             )
 
 
-def _usable(trial: Trial) -> int:
+def usable(trial: Trial) -> int:
     """Steps up to the first missing input or the last state of which anything is known."""
     bad = ~np.isfinite(trial.inputs).all(axis=1)
     last = int(np.argmax(bad)) if bad.any() else trial.steps

@@ -19,11 +19,11 @@ import numpy as np
 
 from grounded.diagnosis.attribution import CLAIM, TIE, Search, attribute, parametric
 from grounded.diagnosis.calibration import blamed
-from grounded.diagnosis.data import prepare
-from grounded.diagnosis.gap import by_region, by_time, explained, horizon, normalised
+from grounded.diagnosis.data import prepare, usable
+from grounded.diagnosis.gap import Horizon, by_region, by_time, explained, horizon, normalised
 from grounded.diagnosis.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.intervals import standard_deviations
-from grounded.diagnosis.leftover import Leftover, leftovers
+from grounded.diagnosis.leftover import Leftover, leftovers, whiteness
 from grounded.diagnosis.limits import Limits, knowable, limits
 from grounded.diagnosis.lookalike import Likeness, lookalikes
 from grounded.diagnosis.refine import Fit, calibrated
@@ -37,6 +37,8 @@ from grounded.diagnosis.report import (
     quantity,
 )
 from grounded.diagnosis.shrinkage import gaps_of, held_out, shrinkage, whole_runs
+from grounded.diagnosis.split import repeated, split
+from grounded.diagnosis.utility_prediction import utility_prediction
 from grounded.diagnosis.words import distinguishing, improvement, meaning, nearly, sentence, tied
 from grounded.effects import Effect, Library, ParamFamily, SensorDelayFamily, SensorFamily
 from grounded.model import Model
@@ -91,7 +93,9 @@ def diagnose(
     tick("leftover")
     with np.errstate(all="ignore"):
         left = leftovers(search.predictor, best)
-        return _Writer(search, best, left, known, options, tick).diagnosis()
+        task = subject if isinstance(subject, Task) else None
+        used = [trial for trial in trials if usable(trial) >= 2]
+        return _Writer(search, best, left, known, options, tick, task, used).diagnosis()
 
 
 class _Writer:
@@ -105,7 +109,10 @@ class _Writer:
         known: Limits,
         options: Options,
         tick: Callable[[str], None],
+        task: Task | None,
+        trials: Sequence[Trial],
     ) -> None:
+        self.task, self.trials = task, trials
         self.search, self.best, self.left, self.known = search, best, left, known
         self.options, self.tick = options, tick
         self.predictor, self.data = search.predictor, search.data
@@ -160,6 +167,9 @@ class _Writer:
             whole_run=self.whole_run(track),
             parameters=self.parameters(),
             lookalikes=self.alike,
+            split=self.split(track, where),
+            whiteness=self.whiteness(),
+            utility_prediction=self.utility_prediction(track),
             trials=data.count,
             steps=data.steps,
             candidates=len(self.search.candidates),
@@ -396,6 +406,32 @@ class _Writer:
             n: {"before": float(b), "after": float(a), "unit": self.data.model.states[n]}
             for n, b, a in zip(names, before, after, strict=True)
         }
+
+    def split(self, track: Any, where: Horizon) -> dict[str, Any]:
+        """Explained, unexplained, irreducible: one step, the horizon, a whole run."""
+        repeats = repeated([trial.candidate for trial in self.trials])
+        horizons = {
+            "one_step": horizon(self.predictor, self.best, self.data.dt),
+            "horizon": where,
+            "whole_run": horizon(self.predictor, self.best, np.inf),
+        }
+        return {
+            name: split(self.predictor, self.best, track, one, repeats).to_dict(self.data)
+            for name, one in horizons.items()
+        }
+
+    def whiteness(self) -> dict[str, float]:
+        """The chance that white noise leaves innovations as correlated as these, by channel."""
+        found = whiteness(self.best, self.data.seen)
+        return {name: found[str(i)] for i, name in enumerate(self.data.model.state_names)}
+
+    def utility_prediction(self, track: Any) -> dict[str, Any] | None:
+        """Rms errors of predicted utilities, held out; None for a bare model."""
+        if self.task is None:
+            return None
+        self.tick("utility")
+        found = utility_prediction(self.predictor, self.best, track, self.task, self.trials)
+        return found.to_dict()
 
     def next_trial(self, groups: tuple[tuple[str, ...], ...]) -> str:
         """A sentence; `excitation.probe` makes the trial itself."""

@@ -50,7 +50,8 @@ def horizon(predictor: Predictor, fit: Fit, seconds: float) -> Horizon:
     data = predictor.data
     L, B = data.time.shape
     lengths = data.valid.sum(axis=1).astype(int)
-    steps = max(1, min(round(seconds / data.dt), int(np.median(lengths)) - 2))
+    longest = max(int(np.median(lengths)) - 2, 1)
+    steps = max(1, round(min(seconds / data.dt, longest)))
     pairs = [(t, b) for b in range(B) for t in range(1, lengths[b] - steps + 1)]
     if not pairs:
         steps = max(1, int(lengths.max()) - 2)

@@ -101,20 +101,29 @@ class Predictor:
 
     def inputs(self, h: Hypothesis) -> Array:
         """What the actuators receive under a hypothesis, by run (L, B, m)."""
-        acting = [
-            (e, v)
-            for e, v in zip(h.effects, h.values, strict=True)
-            if isinstance(e.family, InputFamily | MemoryFamily)
-        ]
+        acting = self.acting(h)
         key = tuple((e.name, tuple(sorted(v.items()))) for e, v in acting)
         if key not in self._inputs:
             if len(self._inputs) > 64:
                 self._inputs.clear()
-            u = self.data.commands
-            for effect, values in acting:
-                u = transformed(effect, values, u, self.data)
-            self._inputs[key] = self.data.runs(self.data.delayed(u))
+            self._inputs[key] = self.data.runs(self.received(h))
         return self._inputs[key]
+
+    def received(self, h: Hypothesis) -> Array:
+        """The same on whole trials, (S, T_max, m)."""
+        u = self.data.commands
+        for effect, values in self.acting(h):
+            u = transformed(effect, values, u, self.data)
+        return self.data.delayed(u)
+
+    @staticmethod
+    def acting(h: Hypothesis) -> list[tuple[Effect, Mapping[str, float]]]:
+        """The effects on inputs with their values."""
+        return [
+            (e, v)
+            for e, v in zip(h.effects, h.values, strict=True)
+            if isinstance(e.family, InputFamily | MemoryFamily)
+        ]
 
     def params(self, h: Hypothesis) -> Array:
         """The model's parameters under a hypothesis (k,)."""

@@ -104,6 +104,9 @@ class Diagnosis:
     parameters: Mapping[str, Estimate] = field(
         default_factory=dict
     )  # calibrated beside the effects
+    split: Mapping[str, Any] = field(default_factory=dict)  # of the error, by horizon
+    whiteness: Mapping[str, float] = field(default_factory=dict)  # p-value of what is left
+    utility_prediction: Mapping[str, Any] | None = None  # where the subject was a task
     lookalikes: tuple[Likeness, ...] = ()  # that hardly differ from a claimed effect
     trials: int = 0
     steps: int = 0
@@ -128,11 +131,14 @@ class Diagnosis:
                 "channels": [dict(c) for c in self.channels],
                 "times": [dict(t) for t in self.times],
                 "regions": [dict(r) for r in self.regions],
+                "split": dict(self.split),
+                "whiteness": dict(self.whiteness),
             },
             "ranking": [r.to_dict() for r in self.ranking],
             "indistinguishable": [list(group) for group in self.indistinguishable],
             "lookalikes": [dict(one.to_dict()) for one in self.lookalikes],
             "gap": dict(self.gap),
+            "utility_prediction": self.utility_prediction and dict(self.utility_prediction),
             "whole_run": dict(self.whole_run),
             "leftover": [left.to_dict() for left in self.leftover],
             "next_trial": self.next_trial,

@@ -93,7 +93,7 @@ def nearly(alike: Sequence[Likeness]) -> str:
         others = [
             f"{a.like} ({100 * a.share:.0f} % of its signal)" for a in alike if a.effect == name
         ]
-        parts.append(f"{name} is nearly inseparable from {' and '.join(others)}")
+        parts.append(f"{name} is nearly inseparable from {', '.join(others)}")
     return f"In these trials {'; '.join(parts)}."
 
 

@@ -1,0 +1,142 @@
+"""What the prediction error is made of: explained, unexplained, irreducible; one step, 1 s, a run.
+
+    mean e^2 of the bare model  =  explained    what the effects take away on held-out trials
+                                +  unexplained  what they leave above the noise
+                                +  irreducible  process and measurement noise: no model predicts it
+
+Two estimates of the irreducible part. The filter's: the estimated noises, carried on by the model's
+own Jacobian. And, where a candidate was run several times, the trials': predictions of the repeats
+from the same moment miss by the same model error and by different noise, so the variance of the
+errors among the repeats is the noise, whatever the model. The second is taken where there is one.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from grounded.diagnosis.data import Data
+from grounded.diagnosis.gap import Horizon, errors
+from grounded.diagnosis.hypothesis import Hypothesis, Predictor
+from grounded.diagnosis.refine import Fit
+from grounded.diagnosis.shrinkage import held_out
+from grounded.frozen import Array
+
+MOST_MOMENTS = 40  # at which repeats are compared
+
+
+@dataclass(frozen=True, eq=False)
+class Split:
+    """Mean squared errors of each state (n,) at one horizon; `noise` is the filter's estimate."""
+
+    horizon: float  # [s]
+    before: Array
+    after: Array
+    noise: Array
+    repeats: Array | None  # from repeated trials
+
+    @property
+    def irreducible(self) -> Array:
+        """The part that no model predicts."""
+        return self.noise if self.repeats is None else self.repeats
+
+    def shares(self, weight: Array | None = None) -> Any:
+        """explained, unexplained, irreducible: of each channel (3, n), or of their sum (3,)."""
+        w = np.ones_like(self.before) if weight is None else weight
+        parts = [np.nan_to_num(w * p) for p in (self.before, self.after, self.irreducible)]
+        before, after, floor = parts if weight is None else [p.sum() for p in parts]
+        after = np.minimum(after, before)
+        floor = np.minimum(floor, after)
+        return np.stack([before - after, after - floor, floor]) / np.maximum(before, 1e-300)
+
+    def to_dict(self, data: Data) -> dict[str, Any]:
+        """For JSON; in all, each channel counts in units of its noise."""
+        model, each = data.model, self.shares()
+        whole = self.shares(1 / np.maximum(self.noise, 1e-300))
+        return {
+            "horizon_s": self.horizon,
+            "all": _named(whole),
+            "channels": [
+                {
+                    "name": name,
+                    "unit": model.states[name],
+                    "rms": float(np.sqrt(np.nan_to_num(self.before[i]))),
+                    **_named(each[:, i]),
+                }
+                for i, name in enumerate(model.state_names)
+            ],
+            "irreducible_from": "noise" if self.repeats is None else "repeats",
+        }
+
+
+def _named(shares: Array) -> dict[str, float]:
+    keys = ("explained", "unexplained", "irreducible")
+    return {key: float(share) for key, share in zip(keys, shares, strict=True)}
+
+
+def split(
+    predictor: Predictor, fit: Fit, track: Array, where: Horizon, repeats: Sequence[Sequence[int]]
+) -> Split:
+    """The parts of the error at one horizon.
+
+    Args:
+        predictor: the data.
+        fit: the best hypothesis.
+        track: filtered states that predictions start from.
+        where: the horizon (`gap.horizon`).
+        repeats: groups of trials (indices) that ran the same candidate.
+    """
+    before = errors(predictor, Hypothesis(), track, where)
+    after = held_out(predictor, fit, track, where)
+    return Split(
+        where.steps * predictor.data.dt,
+        _mean_square(before),
+        _mean_square(after),
+        (where.spread**2).mean(axis=0),
+        scatter(predictor, fit, track, where.steps, repeats),
+    )
+
+
+def _mean_square(error: Array) -> Array:
+    seen = np.isfinite(error)
+    total = np.where(seen, error, 0.0) ** 2
+    return np.asarray(total.sum(axis=0) / np.maximum(seen.sum(axis=0), 1))
+
+
+def scatter(
+    predictor: Predictor, fit: Fit, track: Array, steps: int, repeats: Sequence[Sequence[int]]
+) -> Array | None:
+    """Variance of prediction errors among repeats of one candidate, (n,); None without repeats."""
+    data = predictor.data
+    lengths = data.valid.sum(axis=1).astype(int)
+    total, count = np.zeros(data.model.n), np.zeros(data.model.n)
+    for group in repeats:
+        by_trial = [np.flatnonzero(data.trial_of == trial) for trial in group]
+        for part in range(min((len(runs) for runs in by_trial), default=0)):
+            runs = np.array([own[part] for own in by_trial])
+            moments = np.arange(1, int(lengths[runs].min()) - steps + 1)
+            moments = moments[:: max(1, len(moments) // MOST_MOMENTS)]
+            if len(runs) < 2 or not len(moments):
+                continue
+            at, run = np.tile(moments, len(runs)), np.repeat(runs, len(moments))
+            where = Horizon(steps, at, run, np.ones((len(at), data.model.n)))
+            error = errors(predictor, fit.hypothesis, track, where)
+            error = error.reshape(len(runs), len(moments), -1)
+            whole = np.isfinite(error).all(axis=0)
+            variance = np.where(whole, np.nan_to_num(error).var(axis=0, ddof=1), 0.0)
+            total += (len(runs) - 1) * variance.sum(axis=0)
+            count += (len(runs) - 1) * whole.sum(axis=0)
+    return total / count if (count > 0).all() else None
+
+
+def repeated(candidates: Sequence[str]) -> list[list[int]]:
+    """Groups of trials that ran the same candidate, as indices; logs that ran none are no group."""
+    groups: dict[str, list[int]] = defaultdict(list)
+    for i, candidate in enumerate(candidates):
+        if candidate:
+            groups[candidate].append(i)
+    return [group for group in groups.values() if len(group) > 1]
