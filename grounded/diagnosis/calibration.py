@@ -17,8 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from grounded.diagnosis.data import Data
+from grounded.diagnosis.fitted import Fit, calibrated
 from grounded.diagnosis.hypothesis import param_scale
-from grounded.diagnosis.refine import Fit, calibrated
 from grounded.frozen import Array
 
 ENOUGH = 3.0  # nats that the parameters that are not named may still hold

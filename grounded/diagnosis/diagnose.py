@@ -17,16 +17,16 @@ from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis.attribution import CLAIM, TIE, Search, attribute, parametric
+from grounded.diagnosis.attribution import attribute
 from grounded.diagnosis.calibration import blamed
 from grounded.diagnosis.data import prepare, usable
+from grounded.diagnosis.fitted import Fit, calibrated
 from grounded.diagnosis.gap import Horizon, by_region, by_time, explained, horizon, normalised
 from grounded.diagnosis.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.intervals import standard_deviations
 from grounded.diagnosis.leftover import Leftover, leftovers, whiteness
 from grounded.diagnosis.limits import Limits, knowable, limits
 from grounded.diagnosis.lookalike import Likeness, lookalikes
-from grounded.diagnosis.refine import Fit, calibrated
 from grounded.diagnosis.report import (
     Diagnosis,
     Estimate,
@@ -36,6 +36,7 @@ from grounded.diagnosis.report import (
     number,
     quantity,
 )
+from grounded.diagnosis.search import CLAIM, TIE, Search, parametric
 from grounded.diagnosis.shrinkage import gaps_of, held_out, shrinkage, whole_runs
 from grounded.diagnosis.split import repeated, split
 from grounded.diagnosis.utility_prediction import utility_prediction

@@ -17,10 +17,11 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis import filter as kalman
+from grounded.diagnosis.columns import noise_entry
 from grounded.diagnosis.data import Data
+from grounded.diagnosis.fitted import Fit
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor
 from grounded.diagnosis.leftover import filter_of
-from grounded.diagnosis.refine import Fit, noise_entry
 from grounded.frozen import Array
 
 MOST_STARTS = 400

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from grounded.diagnosis.refine import Fit
+from grounded.diagnosis.fitted import Fit
 from grounded.frozen import Array
 
 # 97.5 % quantiles of Student's t for 1 to 30 degrees of freedom

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from grounded.diagnosis.data import Data
-from grounded.diagnosis.refine import Fit
+from grounded.diagnosis.fitted import Fit
 from grounded.effects import Effect, InputFamily, MemoryFamily, RateFamily, SensorFamily
 
 FEW_STEPS = 30

@@ -16,72 +16,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from grounded.diagnosis import filter as kalman
+from grounded.diagnosis.columns import linearised, noise_entry, step_sizes
 from grounded.diagnosis.data import Data
+from grounded.diagnosis.fitted import Fit, calibrated, shift_precision
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor, param_scale
 from grounded.diagnosis.noise import Noise, cleaned, climbed
 from grounded.frozen import Array
 
 MOST_NUMBERS = 1.2e7  # of one (L, B, N, N) array
-
-
-@dataclass(frozen=True, eq=False)
-class Fit:
-    """A hypothesis at its most likely values.
-
-    Per run (B): `gram` (B, C, C), `score` (B, C), `rss` (B,), `logdet` (B,) of the whitened columns
-    in the order [effects' free values, shifts]; `white` (L, B, n) are the whitened innovations.
-    """
-
-    hypothesis: Hypothesis
-    noise: Noise
-    track: Array  # (L + 1, B, n)
-    loglik: float  # of the data
-    evidence: float  # log p(y | h): the shifts integrated out
-    gram: Array
-    score: Array
-    rss: Array
-    logdet: Array
-    white: Array
-    residual: Array  # (L, B, n) x_{t+1|t+1} - prediction: what the filter had to correct
-
-    @property
-    def covariance(self) -> Array:
-        """Of the free values and shifts, (C, C), from the Fisher information."""
-        G = self.gram.sum(axis=0) + np.diag(self.prior)
-        return np.linalg.pinv(G, hermitian=True)
-
-    def prior_pull(self, data: Data) -> Array:
-        """The prior's slope at the shifts as they are, (C,)."""
-        h, pull = self.hypothesis, np.zeros(self.gram.shape[-1])
-        k = len(h.theta)
-        if h.shift is not None and len(pull) > k:
-            which = calibrated(data)
-            pull[k:] = self.prior[k:] * h.shift[which] / param_scale(data.model)[which]
-        return pull
-
-    @property
-    def prior(self) -> Array:
-        """Precision of each column, (C,): zero for effects."""
-        h = self.hypothesis
-        k = len(h.theta)
-        return np.concatenate(
-            [np.zeros(k), shift_precision(self.hypothesis, self.gram.shape[-1] - k)]
-        )
-
-
-def shift_precision(h: Hypothesis, count: int) -> Array:
-    """Prior precision of the calibrated parameters' shifts (count,), in units of their scale."""
-    return np.full(count, 1.0 / h.spread**2) if count else np.zeros(0)
-
-
-def calibrated(data: Data) -> Any:
-    """Parameters that have a scale, as indices: those that a shift makes sense for."""
-    return np.flatnonzero(param_scale(data.model) > 0)
 
 
 @dataclass(eq=False)
@@ -137,7 +83,7 @@ def refine(
 def _iterate(predictor: Predictor, works: list[_Work], fixed_noise: bool) -> None:
     data = predictor.data
     L, B = data.time.shape
-    parts = [_linearised(predictor, work) for work in works]
+    parts = [linearised(predictor, work.h, work.track) for work in works]
     width = max(part[1].shape[-1] for part in parts)
     d = np.concatenate([_padded(part[1], width) for part in parts], axis=1)
     r = np.concatenate([_padded(part[2], width) for part in parts], axis=1)
@@ -187,7 +133,7 @@ def clean(predictor: Predictor, fit: Fit, rounds: int = 8) -> Fit:
     for _ in range(rounds):
         if not np.isfinite(work.track).all():
             return fit
-        F, d, r = _linearised(predictor, work)
+        F, d, r = linearised(predictor, work.h, work.track)
         G = noise_entry(predictor, work.h, work.track)
         try:
             g = kalman.gains(
@@ -218,101 +164,6 @@ def _spread(values: Array | float, shape: tuple[int, int]) -> Array:
 def _padded(columns: Array, width: int) -> Array:
     missing = width - columns.shape[-1]
     return np.pad(columns, [(0, 0)] * (columns.ndim - 1) + [(0, missing)]) if missing else columns
-
-
-def _linearised(predictor: Predictor, work: _Work) -> tuple[Array, Array, Array]:
-    """F (L, B, n, n); columns of d and r: the residual first, then each value, then each shift."""
-    data, h = predictor.data, work.h
-    model, track = data.model, work.track
-    L, B = data.time.shape
-    x = track[:-1]
-    u = predictor.inputs(h)
-    after = predictor.advance(h, x, u, data.time)
-    ahead = np.concatenate([track[:1], after])  # predicted: a measurement must not explain itself
-    offset = predictor.offset(h, ahead)
-    columns_d = [model.difference(after, track[1:])]
-    columns_r = [model.difference(data.y - track, np.asarray(offset))]
-    theta = h.theta
-    for j, size in enumerate(step_sizes(h)):
-        other, moved = _nudged(h, theta, j, size)
-        if moved == 0:
-            columns_d.append(np.zeros_like(after))
-            columns_r.append(np.zeros_like(track))
-            continue
-        columns_d.append(
-            model.difference(predictor.advance(other, x, predictor.inputs(other), data.time), after)
-            / moved
-        )
-        shifted = predictor.offset(other, ahead)
-        columns_r.append((np.zeros_like(track) + offset - shifted) / moved)
-    d, r = np.stack(columns_d, axis=-1), np.stack(columns_r, axis=-1)
-    flat = (
-        np.ascontiguousarray(x.reshape(-1, model.n)),
-        np.ascontiguousarray(u.reshape(-1, model.m)),
-    )
-    p = predictor.params(h)
-    if h.spread > 0:
-        which = calibrated(data)
-        f_x, _, f_p = model.system.sensitivities(*flat, p, data.dt)
-        scaled = f_p[:, :, which] * param_scale(model)[which]
-        d = np.concatenate([d, scaled.reshape(L, B, model.n, -1)], axis=-1)
-        r = np.concatenate([r, np.zeros((L + 1, B, model.n, len(which)))], axis=-1)
-    else:
-        f_x, _ = model.system.linearise(*flat, p, data.dt)
-    return f_x.reshape(L, B, model.n, model.n), d, r
-
-
-def noise_entry(predictor: Predictor, h: Hypothesis, track: Array) -> Array | None:
-    """G of the filter (L, B, n, n): a carried heading rate moves with what it is a function of."""
-    tied = predictor.tied()
-    if not tied:
-        return None
-    data = predictor.data
-    model, (L, B) = data.model, data.time.shape
-    x = np.ascontiguousarray(track[1:].reshape(-1, model.n))
-    u = np.ascontiguousarray(predictor.inputs(h).reshape(-1, model.m))
-    short = 1e-3 * data.dt
-    f_x, _ = model.system.linearise(x, u, predictor.params(h), short)
-    G = np.zeros((L * B, model.n, model.n))
-    G[:, np.arange(model.n), np.arange(model.n)] = 1.0
-    for heading, rate in tied:
-        slope = f_x[:, heading, :] / short
-        slope[:, [heading, rate]] = 0.0
-        G[:, rate, :] += slope
-    return G.reshape(L, B, model.n, model.n)
-
-
-def base_columns(predictor: Predictor, fit: Fit) -> tuple[Array, Array]:
-    """What a fit's own values and shifts add to d and r: (L, B, n, C), (L + 1, B, n, C)."""
-    _, d, r = _linearised(predictor, _Work(fit.hypothesis, fit.noise, fit.track))
-    return d[..., 1:], r[..., 1:]
-
-
-def step_sizes(h: Hypothesis) -> list[float]:
-    """Half a step of the difference quotient of each free value."""
-    sizes = []
-    for effect, values in zip(h.effects, h.values, strict=True):
-        for q in effect.free:
-            if q.grid:
-                grid = np.sort(np.array(q.grid))
-                near = int(np.argmin(np.abs(grid - values[q.name])))
-                gaps = np.diff(grid) if len(grid) > 1 else np.array([abs(grid[0]) or 1.0])
-                sizes.append(0.1 * float(gaps[min(near, len(gaps) - 1)]))
-            else:
-                sizes.append(1e-3 * max(abs(values[q.name]), 1e-2))
-    return sizes
-
-
-def _nudged(h: Hypothesis, theta: Array, j: int, size: float) -> tuple[Hypothesis, float]:
-    up = theta.copy()
-    up[j] += size
-    other = h.with_theta(up)
-    moved = float(other.theta[j] - theta[j])
-    if moved == 0:
-        up[j] = theta[j] - size
-        other = h.with_theta(up)
-        moved = float(other.theta[j] - theta[j])
-    return other, moved
 
 
 def _update(

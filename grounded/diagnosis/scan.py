@@ -22,8 +22,9 @@ import numpy as np
 
 from grounded.compile import Named
 from grounded.diagnosis import filter as kalman
+from grounded.diagnosis.columns import base_columns, noise_entry
+from grounded.diagnosis.fitted import Fit
 from grounded.diagnosis.hypothesis import Predictor, sensor_offset, transformed
-from grounded.diagnosis.refine import Fit, base_columns, noise_entry
 from grounded.effects import (
     Effect,
     InputFamily,
@@ -101,8 +102,7 @@ class _Context:
             np.ascontiguousarray(self.x.reshape(-1, model.n)),
             np.ascontiguousarray(self.u.reshape(-1, model.m)),
         )
-        self.needs_params = True
-        f_x, self.f_u, f_p = model.system.sensitivities(*flat, self.p, data.dt)
+        f_x, _, f_p = model.system.sensitivities(*flat, self.p, data.dt)
         self.F = f_x.reshape(L, B, model.n, model.n)
         self.f_p = f_p.reshape(L, B, model.n, -1)
         noise = fit.noise
@@ -117,16 +117,7 @@ class _Context:
             G,
         )
         self.white = fit.white
-        self.base = self._base()
-
-    def _base(self) -> Array:
-        """Inverse Gram matrix of what the fit estimates, priors included."""
-        self.base_gram = self.fit.gram.sum(axis=0) + np.diag(self.fit.prior)
-        return (
-            np.linalg.pinv(self.base_gram, hermitian=True)
-            if len(self.base_gram)
-            else np.zeros((0, 0))
-        )
+        self.base = fit.covariance if fit.gram.shape[-1] else np.zeros((0, 0))
 
     def columns(self, i: int, point: int, effect: Effect, grid: dict[str, float]) -> list[_Column]:
         family = effect.family

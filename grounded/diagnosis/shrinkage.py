@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from grounded.diagnosis.fitted import Fit, calibrated
 from grounded.diagnosis.gap import Horizon, errors, normalised
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor, param_scale
 from grounded.diagnosis.intervals import leave_one_out
-from grounded.diagnosis.refine import Fit, calibrated
 from grounded.frozen import Array
 
 

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from grounded.diagnosis.fitted import Fit
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor
 from grounded.diagnosis.intervals import leave_one_out
-from grounded.diagnosis.refine import Fit
 from grounded.diagnosis.shrinkage import moved
 from grounded.frozen import Array
 from grounded.task import Task

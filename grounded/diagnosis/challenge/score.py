@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis.attribution import Search
 from grounded.diagnosis.data import prepare
 from grounded.diagnosis.gap import horizon, normalised
 from grounded.diagnosis.hypothesis import Hypothesis
+from grounded.diagnosis.search import Search
 from grounded.diagnosis.shrinkage import held_out
 from grounded.effects import Library
 from grounded.frozen import Array

@@ -1,0 +1,109 @@
+"""A hypothesis to first order: its Jacobian, its residual, what each of its values adds to a step.
+
+    e_{t+1} = F_t e_t + d_t,   r_t = y_t - x_t - offset_t
+
+d and r as columns: the residual first, then the derivative by each value and each shift.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from grounded.diagnosis.fitted import Fit, calibrated
+from grounded.diagnosis.hypothesis import Hypothesis, Predictor, param_scale
+from grounded.frozen import Array
+
+
+def linearised(predictor: Predictor, h: Hypothesis, track: Array) -> tuple[Array, Array, Array]:
+    """F (L, B, n, n); columns of d and r: the residual first, then each value, then each shift."""
+    data = predictor.data
+    model = data.model
+    L, B = data.time.shape
+    x = track[:-1]
+    u = predictor.inputs(h)
+    after = predictor.advance(h, x, u, data.time)
+    ahead = np.concatenate([track[:1], after])  # predicted: a measurement must not explain itself
+    offset = predictor.offset(h, ahead)
+    columns_d = [model.difference(after, track[1:])]
+    columns_r = [model.difference(data.y - track, np.asarray(offset))]
+    theta = h.theta
+    for j, size in enumerate(step_sizes(h)):
+        other, moved = _nudged(h, theta, j, size)
+        if moved == 0:
+            columns_d.append(np.zeros_like(after))
+            columns_r.append(np.zeros_like(track))
+            continue
+        columns_d.append(
+            model.difference(predictor.advance(other, x, predictor.inputs(other), data.time), after)
+            / moved
+        )
+        shifted = predictor.offset(other, ahead)
+        columns_r.append((np.zeros_like(track) + offset - shifted) / moved)
+    d, r = np.stack(columns_d, axis=-1), np.stack(columns_r, axis=-1)
+    flat = (
+        np.ascontiguousarray(x.reshape(-1, model.n)),
+        np.ascontiguousarray(u.reshape(-1, model.m)),
+    )
+    p = predictor.params(h)
+    if h.spread > 0:
+        which = calibrated(data)
+        f_x, _, f_p = model.system.sensitivities(*flat, p, data.dt)
+        scaled = f_p[:, :, which] * param_scale(model)[which]
+        d = np.concatenate([d, scaled.reshape(L, B, model.n, -1)], axis=-1)
+        r = np.concatenate([r, np.zeros((L + 1, B, model.n, len(which)))], axis=-1)
+    else:
+        f_x, _ = model.system.linearise(*flat, p, data.dt)
+    return f_x.reshape(L, B, model.n, model.n), d, r
+
+
+def noise_entry(predictor: Predictor, h: Hypothesis, track: Array) -> Array | None:
+    """G of the filter (L, B, n, n): a carried heading rate moves with what it is a function of."""
+    tied = predictor.tied()
+    if not tied:
+        return None
+    data = predictor.data
+    model, (L, B) = data.model, data.time.shape
+    x = np.ascontiguousarray(track[1:].reshape(-1, model.n))
+    u = np.ascontiguousarray(predictor.inputs(h).reshape(-1, model.m))
+    short = 1e-3 * data.dt
+    f_x, _ = model.system.linearise(x, u, predictor.params(h), short)
+    G = np.zeros((L * B, model.n, model.n))
+    G[:, np.arange(model.n), np.arange(model.n)] = 1.0
+    for heading, rate in tied:
+        slope = f_x[:, heading, :] / short
+        slope[:, [heading, rate]] = 0.0
+        G[:, rate, :] += slope
+    return G.reshape(L, B, model.n, model.n)
+
+
+def base_columns(predictor: Predictor, fit: Fit) -> tuple[Array, Array]:
+    """What a fit's own values and shifts add to d and r: (L, B, n, C), (L + 1, B, n, C)."""
+    _, d, r = linearised(predictor, fit.hypothesis, fit.track)
+    return d[..., 1:], r[..., 1:]
+
+
+def step_sizes(h: Hypothesis) -> list[float]:
+    """Half a step of the difference quotient of each free value."""
+    sizes = []
+    for effect, values in zip(h.effects, h.values, strict=True):
+        for q in effect.free:
+            if q.grid:
+                grid = np.sort(np.array(q.grid))
+                near = int(np.argmin(np.abs(grid - values[q.name])))
+                gaps = np.diff(grid) if len(grid) > 1 else np.array([abs(grid[0]) or 1.0])
+                sizes.append(0.1 * float(gaps[min(near, len(gaps) - 1)]))
+            else:
+                sizes.append(1e-3 * max(abs(values[q.name]), 1e-2))
+    return sizes
+
+
+def _nudged(h: Hypothesis, theta: Array, j: int, size: float) -> tuple[Hypothesis, float]:
+    up = theta.copy()
+    up[j] += size
+    other = h.with_theta(up)
+    moved = float(other.theta[j] - theta[j])
+    if moved == 0:
+        up[j] = theta[j] - size
+        other = h.with_theta(up)
+        moved = float(other.theta[j] - theta[j])
+    return other, moved

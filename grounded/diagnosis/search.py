@@ -1,0 +1,245 @@
+"""The bookkeeping of one attribution: which hypotheses were fitted, their evidence, what to try.
+
+    evidence(h) = log p(y | h) - k/2 ln N - ln(places looked at) - ln(targets of the family)
+                  - what the noise structure costs
+
+N time steps, k free values. The price of looking pays for thresholds, frequencies and places that
+were scanned and for families that could have been blamed at many targets; a parameter of the model
+pays by its prior (a fifth of its size) instead.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from grounded.diagnosis.data import Data
+from grounded.diagnosis.fitted import Fit
+from grounded.diagnosis.hypothesis import Hypothesis, Predictor
+from grounded.diagnosis.noise import Structure, first_guess
+from grounded.diagnosis.refine import refine
+from grounded.diagnosis.scan import Look, scan
+from grounded.effects import Effect, ParamFamily
+
+CLAIM = 5.0  # nats from which an effect is claimed
+TIE = 3.0  # nats within which two explanations are not told apart
+SPREADS = (0.03, 0.1)  # prior relative errors of the model's parameters when they are calibrated
+PARAM_PRIOR = 0.2  # prior relative error of one parameter that is blamed
+SHORTLIST = 14  # effects that are refined of a scan, and half as many parameters
+TAUS = (0.05, 0.1, 0.3)  # [s] of coloured noise
+LARGE = 8  # states, above which one correlation time and half the shortlist have to do
+
+
+class Search:
+    """The bookkeeping of one attribution."""
+
+    def __init__(
+        self,
+        data: Data,
+        candidates: Sequence[Effect],
+        tick: Callable[[str], None] | None = None,
+    ) -> None:
+        self.data, self.predictor = data, Predictor(data)
+        self.candidates = tuple(candidates)
+        self.tick = tick or (lambda what: None)
+        self.N = max(data.steps, 2)
+        self.fits: dict[tuple[Structure, float, tuple[str, ...]], Fit] = {}
+        families = [e.family.name for e in candidates]
+        large = data.model.n > LARGE
+        self.taus = [tau for tau in (TAUS[1:2] if large else TAUS) if tau > 0.7 * data.dt]
+        self.most = SHORTLIST // 2 if large else SHORTLIST
+        self.crowd = {e.name: families.count(e.family.name) for e in candidates}
+
+    def price(self, effect: Effect, values: dict[str, float]) -> float:
+        """What an effect pays beside its likelihood, in nats."""
+        if isinstance(effect.family, ParamFamily):
+            return math.log(self.crowd.get(effect.name, 1)) + self._param_price(effect, values)
+        k = len(effect.free)
+        cost = 0.5 * k * math.log(self.N) + math.log(effect.places) + effect.family.vague
+        return cost + math.log(self.crowd.get(effect.name, 1))
+
+    def _param_price(self, effect: Effect, values: dict[str, float]) -> float:
+        """A normal prior of a fifth of the parameter's size, not a free parameter's cost."""
+        value = effect.site.model.params[effect.site.target].value
+        size = PARAM_PRIOR * (abs(value) or 1.0)
+        return 0.5 * (values.get("d", 0.0) / size) ** 2 + 0.25 * math.log(self.N) + 1.0
+
+    def score(self, fit: Fit) -> float:
+        """Evidence of a fit in nats, up to a constant of the data."""
+        h = fit.hypothesis
+        paid = sum(self.price(e, dict(v)) for e, v in zip(h.effects, h.values, strict=True))
+        extra = fit.noise.structure.numbers(self.data.model.n)
+        calibration = 1.0 if h.spread > 0 else 0.0
+        return fit.evidence - paid - 0.5 * extra * math.log(self.N) - calibration
+
+    def keep(self, fits: Sequence[Fit]) -> None:
+        """Remembers the best fit of every hypothesis under every structure."""
+        for fit in fits:
+            h = fit.hypothesis
+            key = (fit.noise.structure, h.spread, tuple(sorted(h.names)))
+            if key not in self.fits or self.score(fit) > self.score(self.fits[key]):
+                self.fits[key] = fit
+
+    def refined(self, starts: Sequence[Fit | tuple], iterations: int = 6) -> list[Fit]:  # type: ignore[type-arg]
+        """Refines, remembers, returns."""
+        fits = refine(
+            self.predictor, starts, iterations=iterations, tick=lambda: self.tick("refine")
+        )
+        self.keep(fits)
+        return fits
+
+    # -- without effects ------------------------------------------------------------------------
+
+    def nulls(self) -> Fit:
+        """The model alone under every noise structure, and with its parameters calibrated."""
+        data = self.data
+        h, track = Hypothesis(), data.y.copy()
+        residual = data.model.difference(self.predictor.next(h, track[:-1]), track[1:])
+        scale = np.array([data.scales.spread(n) for n in data.model.state_names])
+        noise = first_guess(residual, data.seen, scale)
+        (plain,) = self.refined([(h, noise, track)], iterations=20)
+        self.structures(plain)
+        self.calibrated(plain)
+        if self.best_null() is not plain:
+            self.calibrated(self.best_null())
+        return self.best_null()
+
+    def fair(self, best: Fit) -> None:
+        """The model alone, starting from the noise and the shifts that the best hypothesis has.
+
+        What is compared with must have climbed as high as it can, or a better noise passes for an
+        effect.
+        """
+        h = best.hypothesis
+        bare = Hypothesis(shift=h.shift, spread=h.spread)
+        starts = [(bare, best.noise, best.track)]
+        if best.noise.structure.tau is None:
+            starts += [
+                (bare, best.noise.allowing(Structure(tau), self.data.dt), best.track)
+                for tau in self.taus
+            ]
+            self.refined(starts[1:], iterations=8)
+        self.refined(starts[:1], iterations=10)
+
+    def structures(self, fit: Fit) -> list[Fit]:
+        """A hypothesis with coloured noise of several correlation times (if it had none)."""
+        if fit.noise.structure.tau is not None:
+            return []
+        starts = [
+            (fit.hypothesis, fit.noise.allowing(Structure(tau), self.data.dt), fit.track)
+            for tau in self.taus
+        ]
+        return self.refined(starts, iterations=8)
+
+    def calibrated(self, fit: Fit) -> list[Fit]:
+        """The same hypothesis with the model's parameters free to move a little, or more."""
+        shift = np.zeros(self.data.model.system.k)
+        if fit.hypothesis.spread > 0 or not len(shift):
+            return []
+        return self.refined(
+            [
+                (replace(fit.hypothesis, spread=spread, shift=shift), fit.noise, fit.track)
+                for spread in SPREADS
+            ],
+            iterations=9,
+        )
+
+    def best_null(self) -> Fit:
+        """The likeliest fit without effects."""
+        return max((f for f in self.fits.values() if not f.hypothesis.effects), key=self.score)
+
+    def exact_null(self) -> Fit:
+        """The likeliest fit without effects and with the parameters as they are."""
+        bare = (f for (_, spread, names), f in self.fits.items() if not names and spread == 0)
+        return max(bare, key=self.score)
+
+    def calibrates(self) -> bool:
+        """Whether calibrating the model's parameters explains more than noise does."""
+        best = self.best_null()
+        spread = best.hypothesis.spread
+        return spread > 0 and self.score(best) > self.score(self.exact_null()) + CLAIM
+
+    def with_weights(self, clean_fit: Fit) -> Search:
+        """A new search on the same data with a clean fit's outlier weights in all noise."""
+        other = Search(self.data, self.candidates, self.tick)
+        weights = clean_fit.noise
+        starts = []
+        for fit in [*self.of_size(0), *self.of_size(1)[:SHORTLIST], clean_fit]:
+            noise = replace(
+                weights if fit.noise.structure == weights.structure else fit.noise,
+                weight_w=weights.weight_w,
+                weight_v=weights.weight_v,
+                last=None,
+            )
+            starts.append((fit.hypothesis, noise, fit.track))
+        for structure in {s[1].structure for s in starts}:
+            other.refined([s for s in starts if s[1].structure == structure], 8)
+        plain = [f for f in other.fits.values() if not f.hypothesis.effects]
+        if not any(f.noise.structure == Structure() and not f.hypothesis.spread for f in plain):
+            noise = replace(weights, structure=Structure(), last=None)
+            other.refined([(Hypothesis(), noise, clean_fit.track)], 12)
+        return other
+
+    # -- one effect more --------------------------------------------------------------------------
+
+    def shortlist(self, fit: Fit, count: int) -> list[Look]:
+        """The candidates that would add most to a fit, after their price."""
+        taken = set(fit.hypothesis.names)
+        free = [
+            e
+            for e in self.candidates
+            if e.name not in taken
+            and not (isinstance(e.family, ParamFamily) and fit.hypothesis.spread > 0)
+        ]
+        self.tick("scan")
+        looks = scan(self.predictor, fit, free)
+        worth = [(look.gain - self.price(look.effect, look.values), look) for look in looks]
+        worth = [(w, look) for w, look in worth if np.isfinite(w) and look.values]
+        worth.sort(key=lambda pair: -pair[0])
+        params = [look for _, look in worth if isinstance(look.effect.family, ParamFamily)]
+        others = [look for _, look in worth if not isinstance(look.effect.family, ParamFamily)]
+        return others[:count] + params[: count // 2]
+
+    def extended(self, fit: Fit, count: int = 0, iterations: int = 7) -> list[Fit]:
+        """The fit with each shortlisted effect added, refined."""
+        starts: list[Fit | tuple] = [fit]  # type: ignore[type-arg]
+        for look in self.shortlist(fit, count or self.most):
+            h = fit.hypothesis
+            starts.append((h.plus(look.effect, look.values), fit.noise, fit.track))
+            if look.second is not None and self.far(look):
+                starts.append((h.plus(look.effect, look.second), fit.noise, fit.track))
+        return self.refined(starts, iterations)[1:]
+
+    @staticmethod
+    def far(look: Look) -> bool:
+        """Whether the second grid point is not the first one's neighbour."""
+        assert look.second is not None
+        for q in look.effect.free:
+            if q.grid:
+                grid = list(q.grid)
+                i, j = (
+                    int(np.argmin(np.abs(np.array(grid) - v[q.name])))
+                    for v in (look.values, look.second)
+                )
+                if abs(i - j) > 1:
+                    return True
+        return False
+
+    def of_size(self, count: int) -> list[Fit]:
+        """All fits with that many effects, best first, one a set of effects."""
+        best: dict[tuple[str, ...], Fit] = {}
+        for (_, _, names), fit in self.fits.items():
+            if len(names) == count and (
+                names not in best or self.score(fit) > self.score(best[names])
+            ):
+                best[names] = fit
+        return sorted(best.values(), key=lambda f: -self.score(f))
+
+
+def parametric(fit: Fit) -> bool:
+    """Whether all that a fit blames is the model's own parameters."""
+    effects = fit.hypothesis.effects
+    return bool(effects) and all(isinstance(e.family, ParamFamily) for e in effects)
