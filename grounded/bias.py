@@ -56,7 +56,12 @@ def effective_inputs(
 
 
 def ground(
-    task: Task, trial: Trial, *, exact: bool = False, match_inputs: bool = False
+    task: Task,
+    trial: Trial,
+    *,
+    exact: bool = False,
+    match_inputs: bool = False,
+    shift: Array | None = None,
 ) -> Grounding:
     """The bias that makes the task's model replay a trial (step 4).
 
@@ -65,6 +70,7 @@ def ground(
         trial: a whole trial, finite for H steps; what follows is not used.
         exact: measure the bias of the exact model, not of the smoothed planning model.
         match_inputs: book on the inputs what inputs can explain (`matching.py`).
+        shift: rho (H, m), where it is known already.
 
     Raises:
         GroundedError: if the trial is short or not finite: its bias is not known to the end.
@@ -79,7 +85,8 @@ def ground(
     past = task.past if trial.start_inputs is None else trial.start_inputs
     z = augmented(problem, trial.states, trial.inputs, past)
     received = effective_inputs(z, trial.inputs, problem.delay, problem.depths, task.model.n)
-    shift = input_shift(task.problem(), trial.states, received) if match_inputs else None
+    if match_inputs and shift is None:
+        shift = input_shift(task.problem(), trial.states, received)
     asked = received if shift is None else received - shift
     predicted = problem.system.step(
         trial.states[:-1], asked, problem.p, problem.dt, problem.smoothing

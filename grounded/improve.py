@@ -187,7 +187,7 @@ def _improvement(make: _Maker, incumbent: Tried, options: Options) -> Proposal:
     plan.model.system.check(own.states[:-1], own.inputs, plan.model.values, plan.dt)
     matched = options.match_inputs
     grounding = ground(plan, own, match_inputs=matched)
-    exact = ground(plan, own, exact=True, match_inputs=matched)
+    exact = ground(plan, own, exact=True, shift=grounding.shift)
     real = exact.on(plan.problem(exact=True))
     theta = planner.widened(incumbent.candidate.policy)
     # Where a trial started off s_0, its utility is no measure for runs that start there: theta's

@@ -4,7 +4,8 @@
 
 Levenberg (1944), Marquardt (1963): (J'J + mu diag(J'J)) step = -J'r; mu falls by 5 after a step
 that lowers the error and rises by 5 after one that doesn't. Problems whose error is below `solved`
-rest. Bounds are kept by clipping the step. What is not finite counts as an infinite error.
+rest, and those that gain less than SETTLED of it or can't gain. Bounds are kept by clipping the
+step. What is not finite counts as an infinite error.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from grounded.frozen import Array
 
 Rows = NDArray[np.intp]
+SETTLED, STUCK = 1e-6, 1e4  # relative gain of a step, damping
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,15 +52,17 @@ def solve(batch: Batch, w: Array, rows: Rows, iterations: int) -> Solution:
     """Solves the given rows from w (len(rows), q)."""
     now = Solution(np.clip(w, batch.low, batch.high), np.empty(len(rows)))
     now = Solution(now.w, _error(batch.residual(now.w, rows)))
-    damping = np.full(len(rows), 1e-3)
+    damping, settled = np.full(len(rows), 1e-3), np.zeros(len(rows), dtype=bool)
     for _ in range(iterations):
-        open_ = np.flatnonzero(now.error > batch.solved)
+        open_ = np.flatnonzero((now.error > batch.solved) & ~settled & (damping < STUCK))
         if not len(open_):
             break
         step = _step(batch, now.w[open_], rows[open_], damping[open_])
         moved = np.clip(now.w[open_] + step, batch.low, batch.high)
         error = _error(batch.residual(moved, rows[open_]))
-        better = error < now.error[open_]
+        before = now.error[open_]
+        better = error < before
+        settled[open_] = better & (error > (1 - SETTLED) * before) & np.isfinite(before)
         now = now.better_of(Solution(moved, error), open_)
         damping[open_] = np.clip(damping[open_] * np.where(better, 0.2, 5.0), 1e-9, 1e6)
     return now

@@ -19,6 +19,7 @@ took five.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from grounded.compile import Problem
 from grounded.frozen import Array
@@ -27,7 +28,8 @@ from grounded.levenberg_marquardt import Batch, Rows, solve
 PULL = 0.2  # price of leaving the recorded input: a whole span costs as much as 0.2 spreads of rate
 WINDOW = 5  # steps of the Hann window
 ITERATIONS = 15
-ELSEWHERE = (-0.15, 0.15)  # further starts, in spans: a stalled motor has no slope to follow
+ELSEWHERE = (-0.15, 0.15)  # further starts, in spans, where a stalled motor has no slope
+DEAD = 0.1  # of an input's usual effect
 
 
 def input_shift(problem: Problem, x: Array, received: Array) -> Array:
@@ -41,9 +43,10 @@ def input_shift(problem: Problem, x: Array, received: Array) -> Array:
     T, batch = len(received), _moves(problem, x, received)
     rows = np.arange(T)
     best = solve(batch, received, rows, ITERATIONS)
-    for part in ELSEWHERE:
-        found = solve(batch, received + part * _span(problem, received), rows, ITERATIONS)
-        best = best.better_of(found, rows)
+    lost = np.flatnonzero(_without_slope(batch.jacobian(best.w, rows)[:, : x.shape[1]]))
+    for part in ELSEWHERE if len(lost) else ():
+        start = received[lost] + part * _span(problem, received)
+        best = best.better_of(solve(batch, start, lost, ITERATIONS), lost)
     rho = received - best.w
     if not np.isfinite(rho).all():
         return np.zeros_like(received)
@@ -51,6 +54,12 @@ def input_shift(problem: Problem, x: Array, received: Array) -> Array:
     padded = np.pad(rho, ((WINDOW // 2, WINDOW // 2), (0, 0)), mode="edge")
     smooth = [np.convolve(column, window / window.sum(), mode="valid") for column in padded.T]
     return np.column_stack(smooth)
+
+
+def _without_slope(J: Array) -> NDArray[np.bool_]:
+    """Steps at which some input does next to nothing, (T,), for J (T, n, m)."""
+    effect = np.linalg.norm(J, axis=1)
+    return np.asarray((effect < DEAD * np.median(effect, axis=0)).any(axis=1))
 
 
 def _span(problem: Problem, received: Array) -> Array:

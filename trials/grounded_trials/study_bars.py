@@ -18,6 +18,11 @@ from grounded_trials.figures import Bar, Bars, Figure, Key
 
 LEVEL = 2  # of SHARES: what the picture of the baselines counts trials to
 PAPER_SPREAD = 50.0  # [cm] the largest that the paper saw
+KINDS = {
+    "parametric": "parametric error",
+    "structural": "structural error",
+    "noise": "structural error and noise",
+}
 WORDS = {"camera": "estimated", "true": "true states"}
 QUANTITIES = (("Position", "mm", 1e3), ("Heading", "mrad", 1e3), ("Speed", "m/s", 1.0))
 
@@ -70,7 +75,7 @@ def baselines_figure(result: BaselinesResult) -> Figure:
         own = [li for li in result.lines if (li.manoeuvre, li.kind) == (manoeuvre, kind)]
         methods = dict.fromkeys(line.method for line in own)
         bars = [_method([line for line in own if line.method == m]) for m in methods]
-        panels.append(Bars(f"{manoeuvre}, {kind} error", tuple(bars)))
+        panels.append(Bars(f"{manoeuvre}, {KINDS.get(kind, kind)}", tuple(bars)))
     key = (
         Key("best", "this tool", "disc"),
         Key("other", "other methods", "disc"),
@@ -108,8 +113,8 @@ def fit_car_figure(result: FitCarResult) -> Figure:
         honest.append(Bar(name, last / stated, f"{last / stated:.2f}"))
     panels = (
         Bars("Cars whose 95 % interval holds the true value", tuple(held)),
-        Bars("Error of the fit, of the first value’s error", tuple(gained)),
-        Bars("Error of the fit, in stated standard deviations", tuple(honest)),
+        Bars("Rms error of the fit, as a share of the first value’s", tuple(gained)),
+        Bars("Rms error of the fit, in stated standard deviations", tuple(honest)),
     )
     title = f"Parameters from {result.minutes:g} minutes of driving, {count} cars"
     return Figure("fit-car", title, "", panels)
