@@ -214,8 +214,8 @@ def _improvement(make: _Maker, incumbent: Tried, options: Options) -> Proposal:
     if unsafe is not None:
         return unsafe
     sentence = (
-        f"the model sees no gain of more than {options.tolerance:g} of {already:.6g} in any step "
-        f"([search] tolerance): {incumbent.candidate.id} is the result"
+        f"the model promises less than {100 * options.tolerance:g} % more from any step ([search] "
+        f"tolerance): {incumbent.candidate.id} is the result"
     )
     ended = dataclasses.replace(make.now, phase="converged", step=None, sentence=sentence)
     return Proposal(ended, None, is_new=False)

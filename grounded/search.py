@@ -109,8 +109,8 @@ class Tried:
 
     @property
     def standard_error(self) -> float:
-        """Of the mean; nan for fewer than two trials."""
-        if len(self.utilities) < 2:
+        """Of the mean; nan for fewer than two trials, or where one of them failed."""
+        if len(self.utilities) < 2 or not np.isfinite(self.utilities).all():
             return float("nan")
         return float(np.std(self.utilities, ddof=1) / np.sqrt(len(self.utilities)))
 

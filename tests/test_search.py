@@ -238,7 +238,7 @@ def test_a_search_with_nothing_to_gain_ends_before_a_trial_is_spent():
     story = Story(plant=Plant(TASK.model), tolerance=0.01).add()
     last = story.propose()
     assert last.candidate is None and last.standing.phase == "converged"
-    assert "the model sees no gain of more than 0.01 of" in last.standing.sentence
+    assert "promises less than 1 % more from any step" in last.standing.sentence
     assert last.standing.sentence.endswith("c0001 is the result")
 
 

@@ -30,6 +30,10 @@ def command(effect: str, effect_only: bool, folder: str | None, json_: bool) -> 
         show_json({"effects": [dict(one) for one in adopted], "params": params})
         return
     show(f"{effect} is part of the model now ({workspace.config.file})")
-    for name, value in params.items():
-        show(field(name, f"{number(value)}, calibrated beside it", "  "))
+    before = workspace.base_model.params
+    changed = {n: v for n, v in params.items() if abs(v - before[n].value) > 1e-6 * abs(v)}
+    if changed:
+        show("the model's own parameters, calibrated beside it:")
+    for name, value in changed.items():
+        show(field(name, f"{number(before[name].value)} -> {number(value)}", "  "))
     show("\nnext: grounded propose")

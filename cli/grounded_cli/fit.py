@@ -45,7 +45,8 @@ def command(
     if apply_:
         show("\nwritten to grounded.toml [model] params\nnext: grounded propose")
     else:
-        show("\nnext: grounded fit --apply   writes the values to grounded.toml")
+        again = f" --params {params}" * bool(params) + " --latency" * latency
+        show(f"\nnext: grounded fit{again} --apply   writes the values to grounded.toml")
 
 
 def as_document(found: Fit, applied: bool) -> dict[str, Any]:

@@ -49,4 +49,4 @@ def command(folder: str | None, name: str | None, list_: bool, json_: bool) -> N
     ]
     show(f"{folder} is a workspace for {name}:")
     show("\n".join(f"  {a:14} {b}" for a, b in files))
-    show(f"\nnext: cd {folder} && grounded propose")
+    show("\nnext: " + f"cd {folder} && " * (folder != ".") + "grounded propose")

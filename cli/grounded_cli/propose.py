@@ -71,6 +71,7 @@ def _tell(workspace: Workspace, proposed: Proposed) -> None:
         say(f"note: the model is not compiled: {note}")
     if candidate is None:
         show(field("end", f"nothing to run: {standing.sentence}"))
+        show("\nnext: grounded diagnose")
         return
     waiting = "" if proposed.proposal.is_new else " (proposed before, its trial is missing)"
     show(f"Run {candidate.id}{waiting}: {proposed.file}")

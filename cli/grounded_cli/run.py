@@ -28,8 +28,8 @@ def command(candidate: str | None, folder: str | None, json_: bool) -> None:
         standing = standing_in(workspace)
         if standing.outstanding is None:
             raise GroundedError(
-                f"no candidate is waiting to be run ({standing.sentence}): call `grounded propose` "
-                "first, or name the candidate to run again"
+                "no candidate is waiting to be run: `grounded propose` makes the next one, or says "
+                "that the search has ended; name a candidate to run it again"
             )
         candidate = standing.outstanding.id
     with progress(f"running {candidate}"):
