@@ -1,11 +1,13 @@
 """START HERE: the sim-to-real gap, diagnosed. Trials and a crude model in, a verdict out.
 
 limits       what can't be known from these data
-attribution  which effects, by evidence                      (effects/, scan, refine, noise)
-calibration  or which of the model's own parameters
+attribution  which effects, by evidence                      (effects/, search, scan, refine, noise)
+claims       what is claimed, what ties, what is nearly the same   (calibration, lookalike)
 leftover     what no effect explains
 gap          where the gap lies: channels, times, regions
-shrinkage    how far it shrinks on trials that were left out
+split        what the error is made of: explained, unexplained, irreducible
+shrinkage    how far it shrinks on trials that were left out     (utility_prediction)
+verdict      all of it in sentences                              (words)
 excitation   what to run next, where two explanations tie
 """
 
@@ -25,10 +27,7 @@ from grounded.diagnosis.gap import Horizon, by_region, by_time, explained, horiz
 from grounded.diagnosis.hypothesis import Hypothesis
 from grounded.diagnosis.leftover import Leftover, leftovers, whiteness
 from grounded.diagnosis.limits import Limits, knowable, limits
-from grounded.diagnosis.report import (
-    Diagnosis,
-    Remainder,
-)
+from grounded.diagnosis.report import Diagnosis, Remainder
 from grounded.diagnosis.search import Search
 from grounded.diagnosis.shrinkage import shrinkage, whole_runs
 from grounded.diagnosis.split import repeated, split

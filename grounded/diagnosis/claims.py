@@ -1,0 +1,154 @@
+"""What is claimed, with values and intervals; what lost; what ties; what is nearly the same."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from grounded.diagnosis.calibration import blamed
+from grounded.diagnosis.fitted import Fit, calibrated
+from grounded.diagnosis.gap import normalised
+from grounded.diagnosis.hypothesis import param_scale
+from grounded.diagnosis.intervals import standard_deviations
+from grounded.diagnosis.limits import Limits
+from grounded.diagnosis.lookalike import Likeness, lookalikes
+from grounded.diagnosis.report import (
+    Estimate,
+    Ranked,
+)
+from grounded.diagnosis.search import TIE, Search, parametric
+from grounded.diagnosis.shrinkage import gaps_of, held_out
+
+RANKED = 12  # explanations that are listed
+
+
+class Claims:
+    """What the best hypothesis blames: effects, or parameters where calibrating them is enough."""
+
+    def __init__(self, search: Search, best: Fit, known: Limits, *, left: bool) -> None:
+        self.search, self.best, self.known = search, best, known
+        self.predictor, self.data = search.predictor, search.data
+        self.null = search.best_null()
+        self.names = best.hypothesis.names
+        self.base = search.score(search.exact_null() if parametric(best) else self.null)
+        calibrating = not self.names and not left and search.calibrates()
+        self.blamed = blamed(self.data, self.null) if calibrating else ()
+
+    def ranking(self, track: Any, where: Any, before: float) -> tuple[Ranked, ...]:
+        """The claimed effects first (by what would be lost without each), then what lost."""
+        search, rows = self.search, []
+        parts = self.parts()
+        after = normalised(held_out(self.predictor, self.best, track, where), where)
+        for name in sorted(self.names, key=lambda n: -parts[n]):
+            claimed = not self.known.no_cause
+            rows.append(self._row(self.best, name, parts[name], after, before, claimed=claimed))
+        rows += self.off(after, before)
+        listed = [row.effect for row in rows]
+        singles = [f for f in search.of_size(1) if f.hypothesis.names[0] not in listed]
+        singles = singles[: max(RANKED - len(rows), 3)]
+        gaps = gaps_of(self.predictor, singles, track, where)
+        for fit, gap in zip(singles, gaps, strict=True):
+            name = fit.hypothesis.names[0]
+            evidence = search.score(fit) - self.base
+            rows.append(self._row(fit, name, evidence, gap, before, claimed=False))
+        return tuple(rows)
+
+    def off(self, after: float, before: float) -> list[Ranked]:
+        """The model's own parameters, where calibrating them explains the gap."""
+        model, known, rows = self.data.model, self.parameters(), []
+        for blame in self.blamed:
+            name = model.param_names[blame.index]
+            nominal, e = float(model.values[blame.index]), known[name]
+            d = Estimate(e.value - nominal, e.std, e.low - nominal, e.high - nominal, e.unit)
+            rows.append(
+                Ranked(
+                    effect=f"parameter:{name}",
+                    params={"d": d},
+                    fixed={},
+                    evidence=blame.nats,
+                    gap_after=after,
+                    shrinkage=1 - after / before if before > 0 else 0.0,
+                    claimed=not self.known.no_cause,
+                )
+            )
+        return rows
+
+    def parts(self) -> dict[str, float]:
+        """What the evidence loses without each claimed effect."""
+        search, found = self.search, {}
+        whole = search.score(self.best)
+        for name in self.names:
+            rest = tuple(sorted(n for n in self.names if n != name))
+            fits = [
+                f for f in search.of_size(len(rest)) if tuple(sorted(f.hypothesis.names)) == rest
+            ]
+            scores = [search.score(f) for f in fits] if rest else []
+            found[name] = whole - max(scores or [self.base])
+        return found
+
+    def _row(
+        self, fit: Fit, name: str, evidence: float, gap: float, before: float, *, claimed: bool
+    ) -> Ranked:
+        index = fit.hypothesis.names.index(name)
+        effect = fit.hypothesis.effects[index]
+        return Ranked(
+            effect=name,
+            params=self.estimates(fit)[index],
+            fixed=effect.fixed,
+            evidence=evidence,
+            gap_after=gap,
+            shrinkage=1 - gap / before if before > 0 else 0.0,
+            claimed=claimed,
+        )
+
+    def estimates(self, fit: Fit) -> list[dict[str, Estimate]]:
+        """Values with intervals, effect by effect."""
+        stds, halves = standard_deviations(fit, self.data.trial_of)
+        found, at = [], 0
+        for effect, values in zip(fit.hypothesis.effects, fit.hypothesis.values, strict=True):
+            some = {}
+            for q in effect.free:
+                v, s, w = float(values[q.name]), float(stds[at]), float(halves[at])
+                some[q.name] = Estimate(v, s, v - w, v + w, q.unit)
+                at += 1
+            found.append(some)
+        return found
+
+    def groups(self) -> tuple[tuple[str, ...], ...]:
+        """For each claimed effect, what could stand in its place within a few nats."""
+        found = []
+        whole = self.search.score(self.best)
+        for name in self.names:
+            rest = set(self.names) - {name}
+            rivals = [
+                f
+                for f in self.search.of_size(len(self.names))
+                if rest <= set(f.hypothesis.names) and name not in f.hypothesis.names
+            ]
+            close = [f for f in rivals if whole - self.search.score(f) < TIE]
+            others = [next(n for n in f.hypothesis.names if n not in rest) for f in close[:2]]
+            if others:
+                found.append((name, *others))
+        return tuple(found)
+
+    def nearly(self, groups: tuple[tuple[str, ...], ...]) -> tuple[Likeness, ...]:
+        """Look-alikes by shape, beside those that tie."""
+        if self.known.no_cause:
+            return ()
+        tied = {(group[0], other) for group in groups for other in group[1:]}
+        found = lookalikes(self.predictor, self.best, self.search.candidates)
+        return tuple(one for one in found if (one.effect, one.like) not in tied)
+
+    def parameters(self) -> dict[str, Estimate]:
+        """Values of the model's parameters where they were calibrated beside the effects."""
+        h, model = self.best.hypothesis, self.data.model
+        if h.spread == 0 or h.shift is None:
+            return {}
+        stds, halves = standard_deviations(self.best, self.data.trial_of)
+        scale, k = param_scale(model), len(h.theta)
+        found = {}
+        for at, index in enumerate(calibrated(self.data)):
+            value = float(model.values[index] + h.shift[index])
+            std, half = (float(a[k + at] * scale[index]) for a in (stds, halves))
+            name = model.param_names[index]
+            found[name] = Estimate(value, std, value - half, value + half, model.params[name].unit)
+        return found
