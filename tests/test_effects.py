@@ -244,3 +244,15 @@ def test_the_docs_have_a_row_for_every_family():
     text = (Path(__file__).parent.parent / "docs" / "effects.md").read_text(encoding="utf-8")
     for family in Library().families:
         assert f"| `{family.name}` |" in text
+
+
+def test_the_docs_show_every_family():
+    from pathlib import Path
+
+    docs = Path(__file__).parent.parent / "docs"
+    pictures = "".join(path.read_text(encoding="utf-8") for path in docs.glob("effects-*.svg"))
+    text = (docs / "effects.md").read_text(encoding="utf-8")
+    for family in Library().families:
+        assert f">{family.name} (" in pictures
+    for path in docs.glob("effects-*.svg"):
+        assert f"({path.name})" in text
