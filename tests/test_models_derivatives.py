@@ -3,11 +3,14 @@
 import numpy as np
 import pytest
 
+from grounded import ddp
 from grounded.errors import GroundedError
 from grounded.experiments.figure8 import flight_task
 from grounded.first_guess import first_guess
 from grounded.model import Model
 from grounded.models import aircraft, car, pendulum
+from grounded.task import Task
+from grounded.utility import Reward
 
 
 def samples(model, rng):
@@ -76,3 +79,32 @@ def test_a_loop_that_unrolls_too_far_names_file_and_line():
     model = Model(states={"x": "m"}, inputs={"u": "1"}, derivative=endless)
     with pytest.raises(GroundedError, match=r"test_models_derivatives\.py:\d+: it unrolls to more"):
         _ = model.system
+
+
+@pytest.mark.parametrize("integrator", ["rk4", "euler"])
+@pytest.mark.parametrize("which", ["constant", "input alone", "one state of many"])
+def test_rates_that_depend_on_little(which, integrator):
+    """A loop of a kernel runs at least once: empty Jacobians must not reach it."""
+
+    def derivative(s, a, p):
+        own = {"constant": 2.5, "input alone": a.u, "one state of many": s.x1}[which]
+        return {"x0": 1.5, **{f"x{i}": 0.0 for i in range(2, 12)}, "x1": own}
+
+    names = [f"x{i}" for i in range(12)]
+    model = Model(
+        states=dict.fromkeys(names, "1"),
+        inputs={"u": "1"},
+        derivative=derivative,
+        integrator=integrator,
+    )
+    system, rng = model.system, np.random.default_rng(0)
+    x, u = rng.normal(size=(11, 12)), rng.normal(size=(11, 1))
+    f_x, f_u = system.linearise(x, u, model.values, 0.1)
+    np.testing.assert_allclose(f_x[0][2:, 2:], np.eye(10))
+    assert f_u[0, 1, 0] == pytest.approx(0.1 if which == "input alone" else 0.0)
+    assert system.how == "compiled"
+    weights = Reward(np.ones(12), np.zeros(12), np.ones(1), np.ones(1))
+    bounds = {"low": np.array([-1.0]), "high": np.array([1.0])}
+    task = Task(model, 0.1, np.zeros((21, 12)), weights, np.ones(12), np.zeros(1), **bounds)
+    result = ddp.solve(task.problem(), np.zeros((20, 1)))
+    assert np.isfinite(result.cost) and np.isfinite(result.K).all()

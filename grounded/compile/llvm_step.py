@@ -169,14 +169,15 @@ class StepWriter:
     def _sum_of_stages(self, rates: str, out: str) -> None:
         """A = I + dt sum of b_i K_i."""
         f, d, w = self.f, self.d, self.width
-        dt = f.load(self.table, DT)
-        weights = [f.spread(f.mul(dt, number(b)), w) for _, b in d.stages]
-        with f.loop(len(d.rates)) as rate:
-            total, at = f.load_all("@chain_diagonal", rate, w), f.integer("mul", rate, w)
-            for i, b in enumerate(weights):
-                K = f.load(f.at(rates, (i + 1) * len(d.rates) * w), at, w)
-                total = f.fma(b, K, total, w)
-            f.store(total, out, at, w)
+        if d.rates:  # a loop runs at least once: not for rates that depend on nothing
+            dt = f.load(self.table, DT)
+            weights = [f.spread(f.mul(dt, number(b)), w) for _, b in d.stages]
+            with f.loop(len(d.rates)) as rate:
+                total, at = f.load_all("@chain_diagonal", rate, w), f.integer("mul", rate, w)
+                for i, b in enumerate(weights):
+                    K = f.load(f.at(rates, (i + 1) * len(d.rates) * w), at, w)
+                    total = f.fma(b, K, total, w)
+                f.store(total, out, at, w)
         for e in range(len(d.rates), len(d.places)):
             f.store(splat(1.0, w), out, e * w, w)
 
