@@ -82,9 +82,7 @@ def ground(
             f"{trial.finite_steps}"
         )
     problem = task.problem(exact=exact)
-    past = task.past if trial.start_inputs is None else trial.start_inputs
-    z = augmented(problem, trial.states, trial.inputs, past)
-    received = effective_inputs(z, trial.inputs, problem.delay, problem.depths, task.model.n)
+    z, received = _along(problem, trial)
     if match_inputs and shift is None:
         shift = input_shift(task.problem(), trial.states, received)
     asked = received if shift is None else received - shift
@@ -95,11 +93,17 @@ def ground(
     return Grounding(trial.states[1:] - predicted, z, trial.inputs, shift)
 
 
+def _along(problem: Problem, trial: Trial) -> tuple[Array, Array]:
+    """A trial's z (T + 1, nz), and what the actuators received (T, m)."""
+    past = problem.past if trial.start_inputs is None else trial.start_inputs
+    z = augmented(problem, trial.states, trial.inputs, past)
+    n = trial.states.shape[1]
+    return z, effective_inputs(z, trial.inputs, problem.delay, problem.depths, n)
+
+
 def residuals(task: Task, trial: Trial) -> Array:
     """One-step residuals of the exact model on a trial, (T, n), angles wrapped."""
     problem = task.problem(exact=True)
-    past = task.past if trial.start_inputs is None else trial.start_inputs
-    z = augmented(problem, trial.states, trial.inputs, past)
-    received = effective_inputs(z, trial.inputs, problem.delay, problem.depths, task.model.n)
+    _, received = _along(problem, trial)
     predicted = problem.system.step(trial.states[:-1], received, problem.p, problem.dt)
     return task.model.difference(trial.states[1:], predicted)

@@ -6,10 +6,10 @@ Each iteration sweeps back for gains (`riccati.py`) and rolls the nonlinear mode
 
 until the cost falls by at least a tenth of the predicted alpha d1 + alpha^2 d2.
 A failed sweep or search raises the regularisation mu of Q_uu (in units of the inputs' own weights),
-a success lowers it. `solve` runs to convergence; `damped_step` is ONE step with a damping of the
-caller's choice, the direction d of the search on the real system: run to convergence, DDP finds the
-optimum of the model, towards which the REAL utility need not ascend; damped, it approaches the
-gradient, for which the paper's theorem holds.
+a success lowers it. `solve` runs to convergence. `damped_step` is ONE step with a damping of the
+caller's choice; it gives the gains with which the search starts along a trial. What keeps the
+search close to the trial is a price on leaving its inputs, part of the problem itself
+(`improve.damped`).
 
 Settings as measured on a car (H = 200) and a 6-DOF aircraft (H = 3000): 4 and 5 iterations.
 """
@@ -126,7 +126,7 @@ def damped_step(problem: Problem, z: Array, u: Array, damping: Array) -> Sweep:
         problem: with the bias that makes the model replay the trial.
         z: (H+1, nz) the trial's states and past inputs.
         u: (H, m) its inputs.
-        damping: (m,) non-negative; `natural_damping` is the default of the search.
+        damping: (m,) non-negative, such as `natural_damping`.
 
     Raises:
         GroundedError: for arrays that do not fit the problem.

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from grounded.diagnosis.data import Data
-from grounded.diagnosis.fitted import Fit
 from grounded.effects import Effect, InputFamily, MemoryFamily, RateFamily, SensorFamily
 
 FEW_STEPS = 30
@@ -62,13 +61,6 @@ def constant_inputs(data: Data) -> list[str]:
         )
         <= 1e-9 * max(data.scales.peak(name), 1e-12)
     ]
-
-
-def quiet_states(data: Data, fit: Fit) -> list[str]:
-    """States whose filtered track moved less than their measurement noise."""
-    noise = np.exp(0.5 * fit.noise.log_r)
-    moved = fit.track.reshape(-1, data.model.n).std(axis=0)
-    return [n for n, m, v in zip(data.model.state_names, moved, noise, strict=True) if m < 2 * v]
 
 
 def knowable(data: Data, effects: Sequence[Effect], quiet: Sequence[str]) -> tuple[Effect, ...]:

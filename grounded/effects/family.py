@@ -82,10 +82,6 @@ class Scales:
         value = self.high.get(name, 1.0) - self.low.get(name, -1.0)
         return value if value > 1e-12 else 1.0
 
-    def fractions(self, name: str, count: int, top: float = 1.0) -> tuple[float, ...]:
-        """`count` thresholds up to `top` times the peak of |signal|, evenly spaced."""
-        return tuple(float(g) for g in np.linspace(0, top * self.peak(name), count + 1)[1:])
-
 
 @dataclass(frozen=True)
 class Site:

@@ -72,11 +72,6 @@ class Struct:
         """Field by name."""
         return {f.name: f for f in self.fields}
 
-    @cached_property
-    def by_number(self) -> dict[int, Field]:
-        """Field by protobuf number."""
-        return {f.number: f for f in self.fields}
-
     def __str__(self) -> str:
         return self.name
 

@@ -8,7 +8,7 @@ log. What they share is the equation of an effect, no numerics.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -213,8 +213,3 @@ class _Run:
         last = len(self.past) - 1
         new, old = self.past[max(last - k, 0)][i], self.past[max(last - k - 1, 0)][i]
         return float((1 - part) * new + part * old)
-
-
-def no_effects(effects: Sequence[Any]) -> bool:
-    """Whether a truth has none of the library's effects."""
-    return not effects
