@@ -39,9 +39,9 @@ from grounded.planner import Planner
 from grounded.policy import Policy
 from grounded.rollout import simulate
 from grounded.safety import objections, spread
-from grounded.search import Candidate, Options, Standing, Tried, mean_trial, standing
+from grounded.search import Candidate, Options, Standing, Tried, standing
 from grounded.task import Task
-from grounded.trial import Trial
+from grounded.trial import Trial, mean_trial
 from grounded.trust import Step
 
 PLANNING = ddp.Options(max_iterations=30, tolerance=1e-6)  # a direction needs no more digits

@@ -6,6 +6,7 @@ in which they were proposed, and the trials that came back, say all there is to 
     the incumbent    the best candidate so far, pi_theta^(i); its trials measure the next bias
     outstanding      the candidate that was proposed and has not been run often enough
     tried            the alphas along the present direction that did not improve (step 6)
+    in doubt         a loss that may be luck: the incumbent is run once more before it is believed
 
 Same candidates and trials, same state: nothing depends on the clock or on the process that asks.
 """
@@ -13,11 +14,10 @@ Same candidates and trials, same state: nothing depends on the clock or on the p
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from grounded.errors import GroundedError
 from grounded.frozen import Array
@@ -41,6 +41,7 @@ class Options:
     match_inputs: bool = True  # False: the paper's bias alone, see `matching`
     max_halvings: int = 6
     repeats: int = 1
+    rerun_incumbent: bool = True  # see `_in_doubt`
     max_trials: int = 40
     tolerance: float = 1e-3  # stop when the model predicts less relative gain than this
 
@@ -101,6 +102,7 @@ class Tried:
     trials: tuple[Trial, ...]
     utilities: tuple[float, ...]
     accepted: bool | None  # None: not decided, trials are missing
+    in_doubt: bool = False  # its own trials are there: the incumbent's are missing
 
     @property
     def utility(self) -> float:
@@ -152,9 +154,10 @@ def standing(
         options: the [search] table.
         model: fingerprint of the task's model now; a direction belongs to one model.
     """
-    history, incumbent, iteration = _judge(task, candidates, trials, options)
+    history, incumbent, iteration = _judge(task, candidates, trials, options, model)
     total = sum(len(t.trials) for t in history)
     last = history[-1] if history else None
+    doubt = next((t for t in history if t.in_doubt), None)
 
     def state(phase: Phase, sentence: str, **more: object) -> Standing:
         fields = {"outstanding": None, "missing": 0, "step": None, "caution": 0} | more
@@ -168,6 +171,15 @@ def standing(
             **fields,  # type: ignore[arg-type]
         )
 
+    if doubt is not None and incumbent is not None:
+        own = incumbent.candidate.id
+        return state(
+            "await-trial",
+            f"{doubt.candidate.id} lost to {own} by less than luck may do: {own} is waiting for "
+            "another trial",
+            outstanding=incumbent.candidate,
+            missing=1,
+        )
     if last is not None and last.accepted is None and last.candidate.model == model:
         missing = options.repeats - len(last.trials)
         return state(
@@ -227,12 +239,18 @@ def _next_step(
 
 
 def _judge(
-    task: Task, candidates: Sequence[Candidate], trials: Sequence[Trial], options: Options
+    task: Task,
+    candidates: Sequence[Candidate],
+    trials: Sequence[Trial],
+    options: Options,
+    model: str,
 ) -> tuple[tuple[Tried, ...], Tried | None, int]:
     """Every candidate with its trials, accepted or not; the incumbent; iterations done."""
     history: list[Tried] = []
     incumbent: Tried | None = None
-    iteration = 0
+    iteration = losses = 0  # accepted improvements; steps from the incumbent that did not improve
+    ids = {c.id for c in candidates}
+    spent = sum(t.candidate in ids for t in trials) >= options.max_trials
     for candidate in candidates:
         own = tuple(t.until(task.horizon) for t in trials if t.candidate == candidate.id)
         utilities = tuple(task.utility(t) for t in own)
@@ -243,31 +261,33 @@ def _judge(
         better = incumbent is None or float(np.mean(utilities)) > incumbent.utility
         accepted = better and not failed
         tried = Tried(candidate, own, utilities, accepted)
-        history.append(tried)
         if accepted:
             iteration += incumbent is not None
-            incumbent = tried
+            incumbent, losses = tried, 0
+        elif incumbent is not None and (candidate.base, candidate.model) == (
+            incumbent.candidate.id,
+            model,
+        ):
+            losses += 1
+            if (
+                options.rerun_incumbent
+                and not spent
+                and _in_doubt(incumbent, tried, losses + options.repeats)
+            ):
+                tried = replace(tried, accepted=None, in_doubt=True)
+        history.append(tried)
     return tuple(history), incumbent, iteration
 
 
-def mean_trial(trials: Sequence[Trial], angles: NDArray[np.bool_] | None = None) -> Trial:
-    """The mean of repeated whole trials: states, inputs, the held input; one trial is itself.
+def _in_doubt(incumbent: Tried, loser: Tried, most: int) -> bool:
+    """Whether a loss may be luck: the incumbent's, whose trials were the best of several.
 
-    Angles (n,) are taken near the first trial's: one log may be a full turn off another.
+    A lucky winner blocks every step from there on. So a loss within two standard errors of the
+    incumbent's own scatter (unknown after one trial) sends it out once more, until it has `most`
+    trials: one for each loss. Where trials repeat themselves exactly, it costs one trial a winner.
     """
-    if len(trials) == 1:
-        return trials[0]
-    first = trials[0]
-    off = np.array([t.states - first.states for t in trials])
-    if angles is not None:
-        off[..., angles] -= 2 * np.pi * np.rint(off[..., angles] / (2 * np.pi))
-    held = [t.start_inputs for t in trials if t.start_inputs is not None]
-    return Trial(
-        states=first.states + off.mean(axis=0),
-        inputs=np.mean([t.inputs for t in trials], axis=0),
-        dt=first.dt,
-        state_names=first.state_names,
-        input_names=first.input_names,
-        candidate=first.candidate,
-        start_inputs=np.mean(held, axis=0) if len(held) == len(trials) else None,
-    )
+    if not np.isfinite(loser.utility) or len(incumbent.trials) >= most:
+        return False
+    scatter = incumbent.standard_error * np.sqrt(len(incumbent.trials))
+    error = scatter * np.sqrt(1 / len(incumbent.trials) + 1 / len(loser.trials))
+    return not incumbent.utility - loser.utility > 2 * error

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from grounded.errors import GroundedError
 from grounded.frozen import Array, readonly
@@ -66,3 +68,26 @@ class Trial:
         if steps >= self.steps:
             return self
         return replace(self, states=self.states[: steps + 1], inputs=self.inputs[:steps])
+
+
+def mean_trial(trials: Sequence[Trial], angles: NDArray[np.bool_] | None = None) -> Trial:
+    """The mean of repeated whole trials: states, inputs, the held input; one trial is itself.
+
+    Angles (n,) are taken near the first trial's: one log may be a full turn off another.
+    """
+    if len(trials) == 1:
+        return trials[0]
+    first = trials[0]
+    off = np.array([t.states - first.states for t in trials])
+    if angles is not None:
+        off[..., angles] -= 2 * np.pi * np.rint(off[..., angles] / (2 * np.pi))
+    held = [t.start_inputs for t in trials if t.start_inputs is not None]
+    return Trial(
+        states=first.states + off.mean(axis=0),
+        inputs=np.mean([t.inputs for t in trials], axis=0),
+        dt=first.dt,
+        state_names=first.state_names,
+        input_names=first.input_names,
+        candidate=first.candidate,
+        start_inputs=np.mean(held, axis=0) if len(held) == len(trials) else None,
+    )

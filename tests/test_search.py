@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from grounded.errors import GroundedError
 from grounded.improve import learn, model_fingerprint, propose
 from grounded.plant import Noise, Plant
-from grounded.search import MAX_CAUTION, Options, mean_trial, standing
-from grounded.trial import Trial
+from grounded.search import MAX_CAUTION, Options, standing
+from grounded.trial import Trial, mean_trial
 from grounded.trust import Step
 from grounded.utility import Reward
 from small_tasks import cart_task, drive, other, rover_task
@@ -31,7 +31,8 @@ class Story:
     """A search whose trials are made to order."""
 
     def __init__(self, task=TASK, plant=PLANT, **options):
-        self.task, self.plant, self.options = task, plant, Options(**options)
+        self.task, self.plant = task, plant
+        self.options = Options(**{"rerun_incumbent": False} | options)
         self.candidates, self.trials = [], []
 
     def propose(self):
@@ -133,6 +134,68 @@ def test_a_candidate_run_more_often_is_averaged_too():
     each = [story.task.utility(t) for t in story.trials]
     assert story.now.incumbent.utility == pytest.approx(np.mean(each))
     assert story.now.trials == 2
+
+
+# a loss that may be luck
+
+
+def worse(by):
+    """A trial whose utility is lower by about so much: the cart stands a little further off."""
+    return lambda trial: bad(trial, by)
+
+
+def test_a_loss_sends_the_incumbent_out_again_before_it_is_believed():
+    story = Story(rerun_incumbent=True, tolerance=0.0).add().add(worse(0.3))
+    now = story.now
+    assert now.phase == "await-trial" and now.outstanding.id == "c0001" and now.missing == 1
+    assert now.history[-1].accepted is None and now.history[-1].in_doubt
+    assert now.sentence == (
+        "c0002 lost to c0001 by less than luck may do: c0001 is waiting for another trial"
+    )
+    story.add()  # the same again: it was no luck
+    now = story.now
+    assert now.history[-1].accepted is False and now.phase == "propose"
+    story.add(worse(0.3))  # scatter is known to be none now: the next loss is believed at once
+    assert story.now.history[-1].accepted is False and len(story.trials) == 4
+
+
+def test_a_lucky_winner_loses_its_luck():
+    """c0001's only trial flattered it; c0002, truly better, wins once c0001 was run again."""
+    story = Story(rerun_incumbent=True).add().add()
+    honest = [story.task.utility(t) for t in story.trials]
+    assert honest[1] > honest[0]
+    lucky = replace(story.trials[1], candidate="c0001")
+    lucky = replace(lucky, states=np.nan_to_num(TASK.target), inputs=0.0 * lucky.inputs)
+    story.trials[0] = lucky
+    assert story.task.utility(lucky) > honest[1]
+    assert story.now.outstanding.id == "c0001"
+    for _ in range(3):
+        story.trials.append(bad(story.trials[1], 2.0))
+        story.trials[-1] = replace(story.trials[-1], candidate="c0001")
+    assert story.now.incumbent.candidate.id == "c0002" and story.now.iteration == 1
+
+
+def test_losses_are_not_checked_for_ever():
+    """At most one trial more for each loss, however much trials scatter."""
+    noisy = Plant(PLANT.model, noise=Noise(process={"v": 0.2}))
+    story = Story(plant=noisy, rerun_incumbent=True, max_trials=60)
+    while story.propose().candidate is not None:
+        story.add()
+    losses: dict[str, int] = {}
+    for tried in story.now.history:
+        if not tried.accepted and tried.candidate.base:
+            losses[tried.candidate.base] = losses.get(tried.candidate.base, 0) + 1
+    for tried in story.now.history:
+        if tried.accepted:
+            assert len(tried.trials) <= 1 + losses.get(tried.candidate.id, 0)
+    assert story.now.phase in ("converged", "stopped") and len(story.trials) <= 60
+
+
+def test_a_crash_and_the_last_trial_are_believed_at_once():
+    story = Story(rerun_incumbent=True).add().add(cut)
+    assert story.now.history[-1].accepted is False and story.now.phase == "propose"
+    story = Story(rerun_incumbent=True, max_trials=2).add().add(worse(0.3))
+    assert story.now.history[-1].accepted is False and story.now.phase == "stopped"
 
 
 # what goes wrong on a robot

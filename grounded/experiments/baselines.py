@@ -104,7 +104,7 @@ def one(method: str, manoeuvre: str, kind: str, seed: int) -> dict[str, Any]:
     """A job: one method, one case."""
     case = bench(manoeuvre, kind, seed)
     noisy = kind == "noise"
-    options = Options(max_trials=BUDGET, repeats=3 if noisy else 1, max_halvings=3 if noisy else 6)
+    options = Options(max_trials=BUDGET)
     best_policy, best = optimum(case)
     if noisy:
         best = true_utility(case.task, case.plant, best_policy, FRESH, seed)

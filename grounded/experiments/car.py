@@ -32,7 +32,6 @@ from grounded.trial import Trial
 PAPER = {"turn": 0.97, "circle": 0.88, "figure8": 0.63}
 ITERATIONS = 10  # "after 5-10 iterations"
 BUDGET = 40
-REPEATS, HALVINGS = 2, 3  # with scatter: the rule that `noise` recommends
 FRESH = 30
 
 
@@ -143,8 +142,6 @@ def one(manoeuvre: str, seed: int, noisy: bool) -> dict[str, Any]:
     """A job: one repetition of one manoeuvre."""
     case = real_case(manoeuvre, seed, noisy)
     options = Options(max_trials=BUDGET)
-    if noisy:
-        options = replace(options, repeats=REPEATS, max_halvings=HALVINGS)
     trials: list[Trial] = []
 
     def real(candidate: Candidate) -> Trial:

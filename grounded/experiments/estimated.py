@@ -23,7 +23,7 @@ import numpy as np
 
 from grounded.estimate import Measurement, Noise, noise_of
 from grounded.experiments.bench import Bench, optimum
-from grounded.experiments.car import BUDGET, HALVINGS, ITERATIONS, PAPER, REPEATS, real_case
+from grounded.experiments.car import BUDGET, ITERATIONS, PAPER, real_case
 from grounded.experiments.driving import RATE, film, hands, markers
 from grounded.experiments.filmed import Filmed, Flown
 from grounded.experiments.jobs import Engine, Job, Progress, run_jobs
@@ -178,7 +178,7 @@ def one(manoeuvre: str, seed: int, states: str) -> dict[str, Any]:
     case = real_case(manoeuvre, seed, True)
     see = markers(SPACING)
     filmed = Filmed(case.task, case.plant, see, CAMERA, assumed_noise(case, see, seed))
-    options = Options(max_trials=BUDGET, repeats=REPEATS, max_halvings=HALVINGS)
+    options = Options(max_trials=BUDGET)
     flights: list[Flown] = []
 
     def real(candidate: Candidate) -> Trial:

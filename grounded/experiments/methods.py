@@ -25,9 +25,9 @@ from grounded.frozen import Array
 from grounded.improve import first_policy, propose
 from grounded.model import Model
 from grounded.policy import Policy
-from grounded.search import Candidate, Options, mean_trial
+from grounded.search import Candidate, Options
 from grounded.task import Task
-from grounded.trial import Trial
+from grounded.trial import Trial, mean_trial
 
 Refit = Callable[[Task, Sequence[Trial]], Model]
 
@@ -93,7 +93,7 @@ def learning_control(case: Bench, options: Options, rounds: int = 12) -> list[Ke
         kept.append(Kept(done, policy, utility))
         if not np.isfinite(utility):
             break
-        policy = update(case.task, model, policy, mean_trial(repeats))
+        policy = update(case.task, model, policy, mean_trial(repeats, case.task.model.angle_mask))
     return kept
 
 

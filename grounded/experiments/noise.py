@@ -1,15 +1,17 @@
 """The line search when trials scatter: what a comparison of single trials costs, and what helps.
 
-Six rules at four levels of scatter, as multiples of the simulated car's own (`real_car.SCATTER`).
+Rules at four levels of scatter, as multiples of the simulated car's own (`real_car.SCATTER`).
 Judged is the TRUE utility, the mean of fresh runs, of each policy that a rule accepts:
 
     false      accepted steps that made the policy truly worse
     closed     share of the gap between the model's policy and the optimum that the final one closes
+    early      the same after EARLY trials: who has fewer batteries than BUDGET
     flattered  utility that the winner's own trials claim, minus its true utility, by the gap
 
 A rule runs a candidate `repeats` times and averages states, inputs and utilities; the bias is that
 of the mean. "incumbent again" runs the best policy once more beside every candidate, so that a
-lucky winner loses its luck.
+lucky winner loses its luck; "losses checked" does so only after a loss that may be luck
+([search] rerun_incumbent).
 """
 
 from __future__ import annotations
@@ -33,6 +35,7 @@ from grounded.trial import Trial
 LEVELS = (0.5, 1.0, 2.0, 3.0)
 MANOEUVRES = ("turn", "figure8")
 BUDGET = 40  # trials
+EARLY = 10  # trials
 FRESH = 30  # runs that judge a policy
 
 
@@ -44,14 +47,16 @@ class Rule:
     repeats: int
     max_halvings: int
     again: bool = False  # the incumbent is run again beside every candidate
+    checked: bool = False  # ... only after a loss that may be luck
 
 
 RULES = (
     Rule("single trials, alpha to 1/64", 1, 6),
     Rule("single trials, alpha to 1/8", 1, 3),
     Rule("single trials, incumbent again", 1, 3, again=True),
+    Rule("losses checked, alpha to 1/64", 1, 6, checked=True),
+    Rule("losses checked, alpha to 1/8", 1, 3, checked=True),
     Rule("2 trials, alpha to 1/8", 2, 3),
-    Rule("3 trials, alpha to 1/64", 3, 6),
     Rule("3 trials, alpha to 1/8", 3, 3),
 )
 
@@ -67,6 +72,7 @@ class Outcome:
     accepted: int  # steps
     false: int
     closed: float
+    early: float
     flattered: float
     trials: int
 
@@ -112,11 +118,13 @@ class NoiseResult:
                     f"{false} of {steps}",
                     f"{np.median(closed):.1%}",
                     f"{min(closed):.1%}",
+                    f"{np.median([o.early for o in own]):.1%}",
                     f"{np.median([o.flattered for o in own]):.1%}",
                     f"{np.median([o.trials for o in own]):g}",
                 )
             )
-        head = ("rule", "false acceptances", "gap closed", "worst", "flattered by", "trials")
+        after = f"after {EARLY}"
+        head = ("rule", "false acceptances", "gap closed", "worst", after, "flattered by", "trials")
         return Table(f"{manoeuvre}, scatter x{level:g}", head, tuple(rows))
 
 
@@ -153,7 +161,8 @@ def one(rule: dict[str, Any], manoeuvre: str, level: float, seed: int) -> dict[s
         return true_utility(case.task, case.plant, policy, FRESH, seed)
 
     accepted, claimed, trials = _search(how, case.real, case.task)
-    utilities = [truly(policy) for policy in accepted]
+    utilities = [truly(policy) for _, policy in accepted]
+    early = [u for (ran, _), u in zip(accepted, utilities, strict=True) if ran <= EARLY][-1]
     gap = truly(best) - utilities[0]
     return {
         "rule": how.name,
@@ -163,6 +172,7 @@ def one(rule: dict[str, Any], manoeuvre: str, level: float, seed: int) -> dict[s
         "accepted": len(accepted) - 1,
         "false": int((np.diff(utilities) < 0).sum()),
         "closed": (utilities[-1] - utilities[0]) / gap,
+        "early": (early - utilities[0]) / gap,
         "flattered": (claimed - utilities[-1]) / gap,
         "trials": trials,
     }
@@ -170,17 +180,22 @@ def one(rule: dict[str, Any], manoeuvre: str, level: float, seed: int) -> dict[s
 
 def _search(
     rule: Rule, real: Callable[[Policy, int], Trial], task: Task
-) -> tuple[list[Policy], float, int]:
-    """The policies accepted in turn, the utility that the last one's trials claim, trials run."""
-    options = Options(max_trials=BUDGET, repeats=rule.repeats, max_halvings=rule.max_halvings)
+) -> tuple[list[tuple[int, Policy]], float, int]:
+    """The policies kept in turn and after how many trials, what the last one claims, trials run."""
+    options = Options(
+        max_trials=BUDGET,
+        repeats=rule.repeats,
+        max_halvings=rule.max_halvings,
+        rerun_incumbent=rule.checked,
+    )
     candidates: list[Candidate] = []
     trials: list[Trial] = []
-    accepted: list[Policy] = []
+    accepted: list[tuple[int, Policy]] = []
     while True:
         proposal = propose(task, candidates, trials, options)
         best = proposal.standing.incumbent
-        if best is not None and (not accepted or accepted[-1] is not best.candidate.policy):
-            accepted.append(best.candidate.policy)
+        if best is not None and (not accepted or accepted[-1][1] is not best.candidate.policy):
+            accepted.append((len(trials), best.candidate.policy))
         if proposal.candidate is None or len(trials) >= BUDGET:
             assert best is not None
             return accepted, best.utility, len(trials)

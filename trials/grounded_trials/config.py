@@ -141,6 +141,7 @@ def _search(table: Table) -> Options:
     options = {
         "match_inputs": table.take("match_inputs", bool, defaults.match_inputs),
         "refit": table.take("refit", bool, defaults.refit),
+        "rerun_incumbent": table.take("rerun_incumbent", bool, defaults.rerun_incumbent),
         "max_halvings": table.take("max_halvings", int, defaults.max_halvings),
         "repeats": table.take("repeats", int, defaults.repeats),
         "max_trials": table.take("max_trials", int, defaults.max_trials),

@@ -13,9 +13,9 @@ import numpy as np
 
 from grounded.frozen import Array
 from grounded.planner import Planner
-from grounded.search import Candidate, Standing, Tried, mean_trial
+from grounded.search import Candidate, Standing, Tried
 from grounded.task import Task
-from grounded.trial import Trial
+from grounded.trial import Trial, mean_trial
 from grounded_trials.better_model import Better
 from grounded_trials.diagnosis_file import Diagnosis
 
