@@ -37,7 +37,7 @@ def last_improvement(history: Sequence[Tried]) -> str:
     if not freedom:
         return (
             f"the last gain is {gain:.3g}; every candidate was run once, so the noise of a "
-            "trial is unknown: run one again, or set [search] repeats = 3"
+            "trial is unknown: run the best one again"
         )
     error = noise * math.sqrt(1 / len(before.utilities) + 1 / len(after.utilities))
     if error == 0:

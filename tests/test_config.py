@@ -1,20 +1,42 @@
 """grounded.toml: every wrong key is one sentence with the file, the key and the nearest name."""
 
 import itertools
+import json
+import re
 import tomllib
+from dataclasses import fields
+from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from grounded.errors import GroundedError
-from grounded_trials.config import read_config
+from grounded.search import Options
+from grounded_trials.config import ModelTable, SystemTable, TaskTable, read_config
 from grounded_trials.log_table import log_mapping
 from grounded_trials.running import simulated_plant
 from grounded_trials.toml_table import Table
-from grounded_trials.unmeasured import read_estimate
+from grounded_trials.unmeasured import EstimateTable, read_estimate
 from grounded_trials.workspace import Workspace
 from workspaces import CONFIG, make
+
+REFERENCE = Path(__file__).resolve().parents[1] / "docs" / "configuration.md"
+
+
+@pytest.mark.parametrize("table", [ModelTable, TaskTable, Options, SystemTable, EstimateTable])
+def test_the_reference_lists_every_key_with_its_default(table):
+    rows = re.findall(r"^\| `(\w+)` \| (.*?) \|", REFERENCE.read_text(), re.M)
+    listed = dict(rows)
+    for key in fields(table):
+        assert key.name in listed, f"docs/configuration.md does not say what {key.name} is"
+        if table is Options:
+            default = key.default
+            shown = listed[key.name].strip("`")
+            assert shown == (
+                json.dumps(default) if isinstance(default, str | bool) else f"{default:g}"
+            )
+
 
 LOG = """
 [log]
