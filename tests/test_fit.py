@@ -134,6 +134,39 @@ def test_a_threshold_is_found_by_scanning():
     assert abs(found.params["gain"].value - 2.0) < 3 * found.params["gain"].std
 
 
+def test_correlated_disturbances_widen_intervals_of_thresholds_too():
+    """A wind that the model knows nothing of: nats of white noise would be far too sure."""
+    stalling = Model(
+        states={"v": "m/s"},
+        inputs={"throttle": "1"},
+        params={
+            "gain": Param(2.0, "m/s", 0.1, 10.0),
+            "tau": Param(0.4, "s", 0.05, 3.0),
+            "stall": Param(0.31, "1", 0.0, 0.8),
+        },
+        derivative=_stalling,
+    )
+    calm = Noise(np.array([0.005]), np.array([0.02]), DT)
+    widths = {}
+    for wind in (0.0, 0.15):
+        covered, each = 0, []
+        for seed in range(4):
+            rng = np.random.default_rng(seed)
+            trials = simulated(stalling, rng, calm, B=4, low=0.0)
+            t = np.arange(len(trials[0].states)) * DT
+            gusts = [wind * np.sin(2 * np.pi * t / 2.0 + rng.uniform(0, 6)) for _ in trials]
+            trials = [
+                dataclasses.replace(trial, states=trial.states + gust[:, None])
+                for trial, gust in zip(trials, gusts, strict=True)
+            ]
+            stall = fit(stalling, trials, ["stall", "gain"], hold_out=0.0).params["stall"]
+            covered += stall.low <= 0.31 <= stall.high
+            each.append(stall.high - stall.low)
+        widths[wind] = np.median(each)
+        assert covered >= 3
+    assert widths[0.15] > 1.5 * widths[0.0]
+
+
 def test_what_the_data_cannot_tell_is_named():
     noise = Noise(np.array([1e-3, 1e-2]), np.array([5e-3, 2e-2]), DT)
     trials = simulated(pendulum, np.random.default_rng(4), noise, B=4, T=100)

@@ -63,6 +63,21 @@ def spread(slopes: Linear, free: NDArray[np.bool_]) -> Spread:
     return Spread(std, covariance, tuple(together))
 
 
+def inflation(slopes: Linear, free: NDArray[np.bool_]) -> float:
+    """How much less a nat is worth than it says: mean ratio of sandwich to information, >= 1.
+
+    Where innovations are correlated (quantised encoders, an effect that the model has no term for),
+    log-likelihoods differ by more than they should; an interval read off them must drop further
+    (Kent, Biometrika 69, 1982).
+    """
+    use = np.flatnonzero(free & (np.sum(slopes.W**2, axis=0) > 0))
+    if len(use) == 0:
+        return 1.0
+    N = (slopes.W.T @ slopes.W)[np.ix_(use, use)]
+    inverse = np.linalg.pinv(N, rcond=NULL, hermitian=True)
+    return max(1.0, float(np.trace(inverse @ _meat(slopes, use))) / np.linalg.matrix_rank(N))
+
+
 def _meat(slopes: Linear, use: NDArray[np.int64]) -> Array:
     """The sum over blocks of g_b g_b', with the correction for few blocks."""
     count = int(slopes.block.max()) + 1

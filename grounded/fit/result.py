@@ -9,7 +9,7 @@ from types import MappingProxyType
 import numpy as np
 
 from grounded.estimate import Noise
-from grounded.fit.interval import Spread, spread
+from grounded.fit.interval import Spread, inflation, spread
 from grounded.fit.prediction import PredictionError
 from grounded.fit.scan import likelihood_interval, quiet
 from grounded.fit.search import Found
@@ -89,7 +89,7 @@ def report(
 
 
 def _estimates(unknowns: Unknowns, found: Found) -> tuple[dict[str, Estimate], Spread]:
-    at, scanned = found.climb.at, np.zeros(unknowns.k, dtype=bool)
+    at, scanned, worth = found.climb.at, np.zeros(unknowns.k, dtype=bool), 1.0
     if not np.isfinite(at.loglik):
         k = unknowns.k
         wide = Spread(np.full(k, np.inf), np.zeros((k, k)), ())
@@ -97,12 +97,13 @@ def _estimates(unknowns: Unknowns, found: Found) -> tuple[dict[str, Estimate], S
         scanned = quiet(found.data, found.climb.slopes) | found.thresholds
         smooth, scanned = ~scanned, scanned & np.isfinite(unknowns.scale)
         wide = spread(found.climb.slopes, smooth)
+        worth = inflation(found.climb.slopes, smooth)
     params: dict[str, Estimate] = {}
     for i, name in enumerate(unknowns.names):
         value, std = float(at.theta[i]), float(wide.std[i])
         low, high = value - 1.96 * std, value + 1.96 * std
         if scanned[i]:
-            low, high = likelihood_interval(found.data, found.noise, at, i)
+            low, high = likelihood_interval(found.data, found.noise, at, i, worth)
             std = (high - low) / (2 * 1.96)
         range_ = unknowns.high[i] - unknowns.low[i]
         std = np.inf if high - low >= range_ else std

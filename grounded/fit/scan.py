@@ -113,37 +113,48 @@ def _centred(data: Data, noise: Noise, best: Point, i: int, level: Array) -> Poi
     return best
 
 
-def likelihood_interval(data: Data, noise: Noise, at: Point, i: int) -> tuple[float, float]:
+def likelihood_interval(
+    data: Data, noise: Noise, at: Point, i: int, inflation: float = 1.0
+) -> tuple[float, float]:
     """The values of unknown i around the best whose log-likelihood is within DROP of it.
 
     The likelihood of a threshold is rough: the outermost such value counts, sought as far as it has
     fallen for good. A bound of the unknown is returned where it never falls that far.
+
+    Args:
+        data: the records.
+        noise: held fixed.
+        at: the best point.
+        i: the unknown.
+        inflation: what DROP is multiplied by where innovations are correlated.
     """
-    low, high = data.unknowns.low[i], data.unknowns.high[i]
-    return _end(data, noise, at, i, float(low)), _end(data, noise, at, i, float(high))
+    drop = DROP * inflation
+    ends = (float(data.unknowns.low[i]), float(data.unknowns.high[i]))
+    low, high = (_end(data, noise, at, i, bound, drop) for bound in ends)
+    return low, high
 
 
-def _end(data: Data, noise: Noise, at: Point, i: int, bound: float) -> float:
+def _end(data: Data, noise: Noise, at: Point, i: int, bound: float, drop: float) -> float:
     best = float(at.theta[i])
     span = abs(bound - best)
-    if span == 0 or _loglik(data, noise, at, i, bound) > at.loglik - DROP:
+    if span == 0 or _loglik(data, noise, at, i, bound) > at.loglik - drop:
         return bound
     sign, step, good = np.sign(bound - best), 1e-3 * span, 0.0
     while step < span:
         fallen = at.loglik - _loglik(data, noise, at, i, best + sign * step)
-        good = step if fallen < DROP else good
-        if fallen > 3 * DROP:
+        good = step if fallen < drop else good
+        if fallen > 3 * drop:
             break
         step *= 2
     far = min(step, span)
     grid = np.linspace(good, far, GRID + 1)[1:-1]
-    inside = [g for g in grid if _loglik(data, noise, at, i, best + sign * g) > at.loglik - DROP]
+    inside = [g for g in grid if _loglik(data, noise, at, i, best + sign * g) > at.loglik - drop]
     width = (far - good) / GRID
     good = max([good, *inside])
     outside = min(far, good + width)
     for _ in range(3):
         middle = 0.5 * (good + outside)
-        if _loglik(data, noise, at, i, best + sign * middle) > at.loglik - DROP:
+        if _loglik(data, noise, at, i, best + sign * middle) > at.loglik - drop:
             good = middle
         else:
             outside = middle
