@@ -64,8 +64,31 @@ def test_a_label_that_was_changed_is_not_opened(made, tmp_path):
 def test_a_case_without_a_diagnosis_says_what_to_run(made):
     folder, labels, document = made
     name = document["cases"][1]
-    with pytest.raises(GroundedError, match=f"was not diagnosed: run .*{name} diagnose"):
+    with pytest.raises(GroundedError, match=f"was not diagnosed: run .grounded challenge run "):
         score_case(folder, labels, name, read_manifest(folder)[name])
+
+
+def test_cases_are_run_and_scored_as_jobs_and_a_run_goes_on(tmp_path):
+    folder = tmp_path / "cases"
+
+    def say(*words):
+        result = CliRunner().invoke(cli, ["challenge", *words, "--json"])
+        assert result.exit_code == 0, result.output
+        return json.loads(result.stdout)
+
+    say("make", str(folder), "--kind", "none", "--cases", "2", "--seed", "5")
+    (folder / "none-0000" / "reports").mkdir()
+    done = {"verdict": {"kind": "none", "effects": []}, "ranking": [], "indistinguishable": []}
+    done |= {"leftover": [], "gap": {"after": 1.0}}
+    (folder / "none-0000" / "reports" / "diagnosis.json").write_text(json.dumps(done))
+    assert list(say("run", str(folder))["cpu_s"]) == ["none-0001"]  # the other one had been
+    found = say("run", str(folder))
+    assert found["cases"] == ["none-0001"] and found["cpu_s"]["none-0001"] > 0.05
+    scored = say("score", str(folder), "--jobs", "2")
+    assert [m["case"] for m in scored["cases"]] == ["none-0000", "none-0001"]
+    row = scored["summary"]["none"]
+    assert row["cases"] == 2 and row["cpu_s_mean"] == found["cpu_s"]["none-0001"]
+    assert sum(row["verdicts"].values()) == 2
 
 
 def test_labels_inside_the_cases_are_refused(tmp_path):

@@ -13,10 +13,32 @@ from grounded_cli.terminal import bar, number, show, show_json, table
 
 @click.group("challenge")
 def command() -> None:
-    """Make or score blind cases for the diagnosis.
+    """Make, diagnose and score blind cases for the diagnosis.
 
-    Diagnose each case with `grounded -C DIR/CASE diagnose`, where the labels are not on the disk.
+    Run `grounded challenge run DIR` where the labels are not on the disk.
     """
+
+
+def parallel(function: Any) -> Any:
+    """The options of a command that is a list of independent jobs."""
+    for option in (
+        click.option("--address", metavar="URL", help="Scheduler of a Dask cluster."),
+        click.option(
+            "--engine",
+            type=click.Choice(["local", "dask"]),
+            default="local",
+            help="Where jobs run: here (default) or on a Dask cluster that sees this disk.",
+        ),
+        click.option(
+            "--jobs",
+            type=click.IntRange(1),
+            metavar="N",
+            default=1,
+            help="Processes on this machine.",
+        ),
+    ):
+        function = option(function)
+    return function
 
 
 @command.command("make")
@@ -48,32 +70,64 @@ def make_cases(
         show_json({"workspace": folder, "labels": str(sealed), "cases": names})
         return
     show(f"{len(names)} cases in {folder}, their labels in {sealed} (keep them away from it)")
-    show(f"\nnext: grounded -C {folder}/{names[0]} diagnose")
+    show(f"\nnext: grounded challenge run {folder}")
+
+
+@command.command("run")
+@click.argument("folder", metavar="DIR")
+@click.option("--without", multiple=True, metavar="FAMILY", help="Not to blame (repeatable).")
+@click.option("--again", is_flag=True, help="Those that were diagnosed before too.")
+@parallel
+@as_json
+def run_cases(
+    folder: str,
+    without: tuple[str, ...],
+    again: bool,
+    jobs: int,
+    engine: str,
+    address: str | None,
+    json_: bool,
+) -> None:
+    """Diagnose the cases of DIR that were not yet; a run that was cut off goes on."""
+    from grounded.experiments.jobs import Engine
+    from grounded_trials.challenge_jobs import diagnose_cases
+
+    where = Engine(jobs=jobs, name=engine, address=address)
+    with bar("diagnoses") as progress:
+        times = diagnose_cases(
+            Path(folder), without=without, again=again, engine=where, progress=progress
+        )
+    if json_:
+        show_json({"cases": list(times), "cpu_s": times})
+        return
+    mean = sum(times.values()) / max(len(times), 1)
+    show(f"{len(times)} cases are diagnosed, {mean:.1f} s of CPU each")
+    show(f"\nnext: grounded challenge score {folder}")
 
 
 @command.command("score")
 @click.argument("folder", metavar="DIR")
 @click.option("--labels", metavar="DIR", help="Where the labels are (default: DIR-labels).")
+@parallel
 @as_json
-def score_cases(folder: str, labels: str | None, json_: bool) -> None:
+def score(
+    folder: str, labels: str | None, jobs: int, engine: str, address: str | None, json_: bool
+) -> None:
     """Open the labels and mark the diagnoses of DIR, beside an oracle that knows the effects."""
-    from grounded.diagnosis.challenge import summary
-    from grounded_trials.challenge_files import read_manifest, score_case
+    from grounded.experiments.jobs import Engine
+    from grounded_trials.challenge_jobs import figures, score_cases
 
     sealed = Path(labels or f"{folder}-labels")
-    entries = read_manifest(Path(folder))
-    marks = []
+    where = Engine(jobs=jobs, name=engine, address=address)
     with bar("cases") as progress:
-        for done, (name, entry) in enumerate(entries.items(), start=1):
-            marks.append(score_case(Path(folder), sealed, name, entry))
-            progress(done, len(entries))
-    figures = summary(marks)
+        marks = score_cases(Path(folder), sealed, engine=where, progress=progress)
+    found = figures(marks)
     if json_:
-        show_json({"summary": figures, "cases": marks})
+        show_json({"summary": found, "cases": marks})
         return
     rows = [(m["case"], ", ".join(m["truth"]), m["verdict"], ", ".join(m["named"])) for m in marks]
     show(table(rows, ("case", "truth", "verdict", "named")))
-    for kind, row in figures.items():
+    for kind, row in found.items():
         show(f"\n{kind}: {_words(row)}")
 
 

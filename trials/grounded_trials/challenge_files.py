@@ -127,7 +127,7 @@ def score_case(folder: Path, labels: Path, name: str, entry: dict[str, Any]) -> 
         diagnosis = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         raise GroundedError(
-            f"{folder / name} was not diagnosed: run `grounded -C {folder / name} diagnose`"
+            f"{folder / name} was not diagnosed: run `grounded challenge run {folder}`"
         ) from None
     label = open_label(labels, name, entry)
     task = workspace.task
