@@ -64,7 +64,7 @@ def test_a_label_that_was_changed_is_not_opened(made, tmp_path):
 def test_a_case_without_a_diagnosis_says_what_to_run(made):
     folder, labels, document = made
     name = document["cases"][1]
-    with pytest.raises(GroundedError, match="was not diagnosed: run .grounded challenge run "):
+    with pytest.raises(GroundedError, match=r"was not diagnosed: run `grounded challenge run "):
         score_case(folder, labels, name, read_manifest(folder)[name])
 
 
