@@ -133,9 +133,22 @@ def test_baselines_count_trials():
 
 
 def test_noise_judges_by_fresh_runs():
-    rules = (noise.RULES[0], noise.RULES[3])
+    rules = (noise.RULES[0], noise.RULES[5])
     result = noise.run([0], manoeuvres=("turn",), levels=(1.0,), rules=rules)
     document = plain(result)
     assert [o["rule"] for o in document["outcomes"]] == [rule.name for rule in rules]
     assert all(o["closed"] > 0.8 for o in document["outcomes"])
     assert document["recommended"] in [rule.name for rule in rules]
+    assert result.tables()[-1].rows[0][-1] == f"{document['outcomes'][0]['trials']:.1f}"
+
+
+def test_the_recommended_rule_is_the_cheapest_that_is_as_good_as_the_best():
+    def outcome(rule, seed, closed, trials):
+        return noise.Outcome(rule, "turn", 1.0, seed, 5, 1, closed, closed, 0.0, trials)
+
+    lucky = [outcome("dear", s, 0.99 + 0.01 * (-1) ** s, 40) for s in range(8)]
+    cheap = [outcome("cheap", s, 0.988 - 0.01 * (-1) ** s, 20) for s in range(8)]
+    bad = [outcome("bad", s, 0.8, 5) for s in range(8)]
+    assert noise.NoiseResult((*lucky, *cheap, *bad)).recommended == "cheap"
+    worse = [outcome("cheap", s, 0.9, 20) for s in range(8)]
+    assert noise.NoiseResult((*lucky, *worse, *bad)).recommended == "dear"

@@ -26,6 +26,7 @@ from grounded.experiments.bench import bench, optimum
 from grounded.experiments.jobs import Engine, Job, Progress, run_jobs
 from grounded.experiments.scatter import scaled, true_utility
 from grounded.experiments.summary import Table
+from grounded.frozen import Array
 from grounded.improve import propose
 from grounded.policy import Policy
 from grounded.search import Candidate, Options
@@ -89,20 +90,63 @@ class NoiseResult:
 
     @property
     def recommended(self) -> str:
-        """The rule with the largest mean share closed over all cases and seeds."""
-        return max(dict.fromkeys(o.rule for o in self.outcomes), key=self._score)
+        """The cheapest rule that closes as much as the best one, within a standard error.
 
-    def _score(self, rule: str) -> float:
-        return float(np.mean([o.closed for o in self.outcomes if o.rule == rule]))
+        Shares are compared case by case and seed by seed; cheap is the mean number of trials.
+        """
+        closed = {rule: self._over_cases(rule, "closed") for rule in self._rules}
+        best = closed[max(closed, key=lambda rule: float(closed[rule].mean()))]
+
+        def as_good(rule: str) -> bool:
+            short = best - closed[rule]
+            error = short.std(ddof=1) / np.sqrt(len(short)) if len(short) > 1 else 0.0
+            return bool(short.mean() <= error)
+
+        good = [rule for rule in self._rules if as_good(rule)]
+        return min(good, key=lambda rule: float(self._over_cases(rule, "trials").mean()))
+
+    @property
+    def _rules(self) -> list[str]:
+        return list(dict.fromkeys(o.rule for o in self.outcomes))
+
+    def _over_cases(self, rule: str, what: str) -> Array:
+        """One figure a case and seed, in the same order for every rule."""
+        own = sorted(
+            (o.manoeuvre, o.level, o.seed, getattr(o, what))
+            for o in self.outcomes
+            if o.rule == rule
+        )
+        return np.array([values[-1] for values in own])
+
+    def _summary(self) -> Table:
+        rows = []
+        for rule in self._rules:
+            closed, early, trials = (
+                self._over_cases(rule, k) for k in ("closed", "early", "trials")
+            )
+            error = closed.std(ddof=1) / np.sqrt(len(closed)) if len(closed) > 1 else float("nan")
+            mark = "* " if rule == self.recommended else "  "
+            rows.append(
+                (
+                    mark + rule,
+                    f"{closed.mean():.1%} (±{error:.1%})",
+                    f"{closed.min():.1%}",
+                    f"{early.mean():.1%}",
+                    f"{trials.mean():.1f}",
+                )
+            )
+        head = ("rule (*: recommended)", "gap closed", "worst", f"after {EARLY}", "trials")
+        return Table("all cases: means", head, tuple(rows))
 
     def _of(self, rule: str, manoeuvre: str, level: float) -> list[Outcome]:
         wanted = (rule, manoeuvre, level)
         return [o for o in self.outcomes if (o.rule, o.manoeuvre, o.level) == wanted]
 
     def tables(self) -> list[Table]:
-        """By manoeuvre and level: false acceptances, share closed, how much the winner flatters."""
+        """By manoeuvre and level: false acceptances, share closed, flattery; then all cases."""
         cases = dict.fromkeys((o.manoeuvre, o.level) for o in self.outcomes)
-        return [self._table(manoeuvre, level) for manoeuvre, level in cases]
+        each = [self._table(manoeuvre, level) for manoeuvre, level in cases]
+        return [*each, self._summary()]
 
     def _table(self, manoeuvre: str, level: float) -> Table:
         rows = []
