@@ -84,10 +84,10 @@ class CarResult:
         head = (
             "manoeuvre",
             "quiet: improvement",
-            "optimum",
+            "its optimum",
             "trials",
             "with scatter: true improvement",
-            "optimum",
+            "optimum under scatter",
             "trials an iteration",
             "paper",
         )
