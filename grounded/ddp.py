@@ -17,29 +17,18 @@ Settings as measured on a car (H = 200) and a 6-DOF aircraft (H = 3000): 4 and 5
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 
-from grounded.compile import Backward, Problem
+from grounded.compile import Backward, Descent, Options, Problem, Status
+from grounded.compile.descent import CEILING, FLOOR, GROWTH, LARGE_MU, LEAST, SEARCH_FLOOR
 from grounded.errors import GroundedError
 from grounded.frozen import Array
-from grounded.riccati import CEILING, FLOOR, GROWTH, Sweep, input_scale, sweep
+from grounded.riccati import Sweep, input_scale, sweep
 
-Status = Literal["converged", "max iterations", "no improvement", "not finite"]
-
-SEARCH_FLOOR = 1e-3  # regularisation after a failed search
-LARGE_MU = 1.0
-
-
-@dataclass(frozen=True)
-class Options:
-    """Settings of `solve`."""
-
-    max_iterations: int = 100
-    tolerance: float = 1e-8  # stop when the predicted change is below this times the cost
-    halvings: int = 11  # alpha = 1 ... 1/2^11
-    accept: float = 0.1  # least part of the predicted change
+__all__ = [
+    "Iteration", "Options", "Result", "damped_step", "descended", "natural_damping", "solve",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -95,28 +84,9 @@ def solve(
     """
     options = options or Options()
     _check(problem, ubar, K, zbar)
-    first = problem.system.rollout(problem, ubar, K, zbar)
-    state = _State(first.z[0], first.u[0], float(first.cost[0]), 0.0)
-    trace: list[Iteration] = []
-    if not np.isfinite(state.cost):
-        return _not_finite(problem, state, _first_bad(problem, state.z), trace)
-    gains: Backward | None = None
-    while True:
-        found = sweep(problem, state.z, state.u, mu=state.mu, into=gains)
-        gains = found.gains
-        if not found.ok:
-            why = f"the sweep failed at step {found.gains.failed_at}"
-            return _not_finite(problem, state, why, trace)
-        predicted = found.gains.d1 + found.gains.d2
-        if -predicted <= options.tolerance * abs(state.cost) + 1e-14:
-            small = found.mu < LARGE_MU  # or else it is mu that makes the change small
-            return _result("converged" if small else "no improvement", state, found, trace)
-        if len(trace) >= options.max_iterations:
-            return _result("max iterations", state, found, trace)
-        state, line = _search(problem, state, found, options)
-        trace.append(line)
-        if line.alpha == 0.0 and state.mu > CEILING:
-            return _result("no improvement", state, found, trace)
+    start = (ubar, K, zbar)
+    found = problem.system.descend(problem, input_scale(problem), *start, options)
+    return _result(problem, found or descended(problem, *start, options))
 
 
 def damped_step(problem: Problem, z: Array, u: Array, damping: Array) -> Sweep:
@@ -148,38 +118,70 @@ class _State:
     mu: float
 
 
+def descended(
+    problem: Problem, ubar: Array, K: Array | None, zbar: Array | None, options: Options
+) -> Descent:
+    """The loop of `solve`; a compiled system has the same in one kernel (`System.descend`)."""
+    first = problem.system.rollout(problem, ubar, K, zbar)
+    state = _State(first.z[0], first.u[0], float(first.cost[0]), 0.0)
+    lines: list[tuple[float, float, float, float]] = []
+    gains: Backward | None = None
+
+    def ended(status: Status, failed_at: int = -1) -> Descent:
+        k, K = (np.zeros(0), np.zeros(0)) if gains is None else (gains.k, gains.K)
+        trace = np.array(lines).reshape(-1, 4)
+        return Descent(status, state.z, state.u, k, K, state.cost, failed_at, trace)
+
+    if not np.isfinite(state.cost):
+        return ended("not finite")
+    while True:
+        found = sweep(problem, state.z, state.u, mu=state.mu, into=gains)
+        gains = found.gains
+        if not found.ok:
+            return ended("not finite", gains.failed_at)
+        if -(gains.d1 + gains.d2) <= options.tolerance * abs(state.cost) + LEAST:
+            small = found.mu < LARGE_MU  # or else it is mu that makes the change small
+            return ended("converged" if small else "no improvement")
+        if len(lines) >= options.max_iterations:
+            return ended("max iterations")
+        state, alpha = _search(problem, state, found, options)
+        lines.append((state.cost, gains.d1 + gains.d2, alpha, found.mu))
+        if alpha == 0.0 and state.mu > CEILING:
+            return ended("no improvement")
+
+
 def _search(
     problem: Problem, state: _State, found: Sweep, options: Options
-) -> tuple[_State, Iteration]:
-    """The first alpha that keeps its promise, or a higher regularisation."""
+) -> tuple[_State, float]:
+    """The first alpha that keeps its promise; 0 and a higher regularisation if none does."""
     gains, alphas = found.gains, np.float64(0.5) ** np.arange(options.halvings + 1)
-    predicted = gains.d1 + gains.d2
     for some in (alphas[:1], alphas[1:5], alphas[5:]):  # the first is nearly always enough
         swarm = problem.system.rollout(problem, state.u, gains.K, state.z, gains.k, some)
         enough = swarm.cost - state.cost <= options.accept * (some * gains.d1 + some**2 * gains.d2)
         if enough.any():
             i = int(np.argmax(enough))
-            cost, mu = float(swarm.cost[i]), _lower(found.mu)
-            line = Iteration(cost, predicted, float(some[i]), found.mu)
-            return _State(swarm.z[i], swarm.u[i], cost, mu), line
-    line = Iteration(state.cost, predicted, 0.0, found.mu)
-    return replace(state, mu=max(SEARCH_FLOOR, GROWTH * found.mu)), line
+            mu = found.mu / GROWTH if found.mu / GROWTH >= FLOOR else 0.0
+            return _State(swarm.z[i], swarm.u[i], float(swarm.cost[i]), mu), float(some[i])
+    return replace(state, mu=max(SEARCH_FLOOR, GROWTH * found.mu)), 0.0
 
 
-def _lower(mu: float) -> float:
-    return mu / GROWTH if mu / GROWTH >= FLOOR else 0.0
-
-
-def _result(status: Status, state: _State, found: Sweep, trace: list[Iteration]) -> Result:
-    sentences = {
+def _result(problem: Problem, found: Descent) -> Result:
+    trace = tuple(Iteration(*(float(value) for value in line)) for line in found.lines)
+    sentences: dict[Status, str] = {
         "converged": f"converged after {len(trace)} iterations",
         "max iterations": f"stopped after {len(trace)} iterations, still improving",
         "no improvement": "no step along the search direction lowers the cost any more",
     }
-    gains = found.gains
-    return Result(
-        status, sentences[status], state.z, state.u, gains.k, gains.K, state.cost, tuple(trace)
-    )
+    k, K = found.k, found.K
+    if found.status == "not finite":
+        k, K = np.zeros(found.u.shape), np.zeros((*found.u.shape, problem.nz))
+        sentences["not finite"] = (
+            _first_bad(problem, found.z)
+            if found.failed_at < 0
+            else f"the sweep failed at step {found.failed_at}"
+        )
+    sentence = sentences[found.status]
+    return Result(found.status, sentence, found.z, found.u, k, K, found.cost, trace)
 
 
 def _first_bad(problem: Problem, z: Array) -> str:
@@ -192,11 +194,6 @@ def _first_bad(problem: Problem, z: Array) -> str:
         f"the first rollout leaves the finite numbers at step {when}, state '{name}' "
         f"(the model is at {system.source})"
     )
-
-
-def _not_finite(problem: Problem, state: _State, why: str, trace: list[Iteration]) -> Result:
-    k, K = np.zeros(state.u.shape), np.zeros((*state.u.shape, problem.nz))
-    return Result("not finite", why, state.z, state.u, k, K, state.cost, tuple(trace))
 
 
 def _check(problem: Problem, u: Array, K: Array | None, z: Array | None) -> None:

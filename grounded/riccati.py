@@ -24,11 +24,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from grounded.compile import Backward, Problem
+from grounded.compile.descent import CEILING, FLOOR, GROWTH
 from grounded.frozen import Array
-
-FLOOR = 1e-6  # first regularisation after a failed factorisation
-GROWTH = 10.0
-CEILING = 1e10
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from grounded.compile.descent import Descent, Options, Status
 from grounded.compile.graph import TooLong
 from grounded.compile.interpreted import Integrator, Kind
 from grounded.compile.names import Named, where
@@ -21,8 +22,11 @@ from grounded.compile.tracing import Signature, trace
 
 __all__ = [
     "Backward",
+    "Descent",
     "Named",
+    "Options",
     "Problem",
+    "Status",
     "Swarm",
     "System",
     "history_depths",

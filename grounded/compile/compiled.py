@@ -10,28 +10,39 @@ from __future__ import annotations
 
 import ctypes
 import hashlib
-import struct
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from grounded.compile import jit
+from grounded.compile.descent import STATUSES, Descent, Options
 from grounded.compile.interpreted import Integrator
 from grounded.compile.llvm_batch import BATCH, linearise_kernel, step_kernel
 from grounded.compile.llvm_box import MAX_INPUTS, box_functions
+from grounded.compile.llvm_descent import (
+    COST,
+    COUNT,
+    DESCENT,
+    FAILED_AT,
+    TURN,
+    descent_kernel,
+)
 from grounded.compile.llvm_product import sweep_tables
 from grounded.compile.llvm_riccati import SWEEP, sweep_kernel
 from grounded.compile.llvm_rollout import LANES, ROLLOUT, Layout, rollout_kernel
 from grounded.compile.llvm_step import Dynamics, dynamics_of, jacobian_function, stage_tables
 from grounded.compile.llvm_text import declarations
+from grounded.compile.memory import empty
 from grounded.compile.problem import Array, Problem
-from grounded.compile.queue import queue_of
 from grounded.compile.system import Backward, Swarm
 from grounded.compile.traced import TracedSystem, Variant
 from grounded.compile.tracing import Signature, Trace
+from grounded.compile.words import call, packed, plain, run, table
+
+__all__ = ["BATCH", "CompiledSystem", "Kernels", "call"]
 
 SMALL = 600  # operations of a model that need not be counted with their derivatives
 MAX_PLACES = 8_000  # of a Jacobian that a kernel keeps on its stack, 4 MB of it
@@ -65,8 +76,9 @@ class Kernels:
         return self._library("batch", ("step", "linearise", "jacobian"), self._batch_text)
 
     def search(self, layout: Layout) -> jit.Library:
-        """Rollout and, for few enough inputs, sweep; about a layout of z."""
-        names = ("rollout", "sweep") if layout.m <= MAX_INPUTS else ("rollout",)
+        """Rollout and, for few enough inputs, sweep and descent; about a layout of z."""
+        small = layout.m <= MAX_INPUTS
+        names = ("rollout", "sweep", "descent") if small else ("rollout",)
         return self._library(layout, names, lambda: self._search_text(layout))
 
     def full(self) -> jit.Library:
@@ -100,33 +112,12 @@ class Kernels:
         text = _start_of_module(d, width) + rollout_kernel(d, layout)
         if layout.m > MAX_INPUTS:
             return text
-        return text + sweep_tables(d) + box_functions(layout.m) + sweep_kernel(d, layout, width)
+        text += sweep_tables(d) + box_functions(layout.m) + sweep_kernel(d, layout, width)
+        return text + descent_kernel(layout.m, layout.nz)
 
 
 def _start_of_module(d: Dynamics, width: int) -> str:
     return declarations({width, LANES}) + stage_tables(d) + d.uniforms.function()
-
-
-def call(function: Any, names: Sequence[str], values: Mapping[str, Any]) -> int:
-    """Calls a kernel with its table of words; arrays must be contiguous float64."""
-    table = (ctypes.c_int64 * len(names))(*[_word(values[name]) for name in names])
-    return int(function(ctypes.addressof(table)))
-
-
-def _word(value: Any) -> int:
-    if type(value) is int:
-        return value
-    if isinstance(value, np.ndarray):
-        return int(value.ctypes.data) if value.size == 0 else _address(value)
-    return int(struct.unpack("<q", struct.pack("<d", value))[0])
-
-
-def _address(array: Array) -> int:
-    return int(array.__array_interface__["data"][0])
-
-
-def _plain(array: Any) -> Array:
-    return np.ascontiguousarray(array, dtype=np.float64)
 
 
 class CompiledSystem(TracedSystem):
@@ -186,7 +177,7 @@ class CompiledSystem(TracedSystem):
         x, u, p, dt, eps = point
         if len(x) == 0:
             return
-        words = dict.fromkeys(BATCH, 0) | {"x": _plain(x), "u": _plain(u), "p": _plain(p)}
+        words = dict.fromkeys(BATCH, 0) | {"x": plain(x), "u": plain(u), "p": plain(p)}
         call(kernel, BATCH, words | {"dt": float(dt), "eps": float(eps), "N": len(x)} | out)
 
     def rollout(
@@ -201,21 +192,15 @@ class CompiledSystem(TracedSystem):
         """See `System.rollout`."""
         steps = np.ones(1) if alphas is None else np.asarray(alphas, float)
         runs, H, nz = len(steps), problem.horizon, problem.nz
-        z, u, cost = np.empty((runs, H + 1, nz)), np.empty((runs, H, self.m)), np.empty(runs)
-        packed = self._packed(problem)
-        lanes = np.empty(LANES)
-        arrays = [None if a is None else _plain(a) for a in (ubar, K, zbar, k)]
-        if arrays[2] is None:
-            arrays[1] = None
-        words = packed | dict(
-            zip(("ubar", "K", "zbar", "k"), [0 if a is None else a for a in arrays], strict=True)
-        )
-        kernel = self._compiled(problem.p, problem.dt).search(self._layout(problem))["rollout"]
+        z, u, cost = empty((runs, H + 1, nz)), empty((runs, H, self.m)), np.empty(runs)
+        known, lanes = packed(problem), np.empty(LANES)
+        values = _policy(ubar, K, zbar, k) | {"alphas": lanes}
+        kernel = self._search(problem)["rollout"]
         for at in range(0, runs, LANES):
             some = min(LANES, runs - at)
             lanes[:some], lanes[some:] = steps[at : at + some], steps[at]
-            words |= {"alphas": lanes, "runs": some, "z": z[at:], "u": u[at:], "cost": cost[at:]}
-            call(kernel, ROLLOUT, words)
+            values |= {"runs": some, "z": z[at:], "u": u[at:], "cost": cost[at:]}
+            run(kernel, table(ROLLOUT, known.words, values))
         return Swarm(z, u, cost)
 
     def backward(
@@ -234,46 +219,63 @@ class CompiledSystem(TracedSystem):
         if into is not None and into.K.shape == (H, self.m, nz):
             k, K = into.k, into.K
         else:
-            k, K = np.empty((H, self.m)), np.empty((H, self.m, nz))
-        z, u, damping = _plain(z), _plain(u), _plain(damping)
-        words = self._packed(problem) | {"z_run": z, "u_run": u, "damping": damping}
-        words |= {"k": k, "K": K, "expected": expected}
-        kernels = self._compiled(problem.p, problem.dt)
-        words["jacobian"] = kernels.batch().addresses["jacobian"]
-        failed = call(kernels.search(self._layout(problem))["sweep"], SWEEP, words)
+            k, K = empty((H, self.m)), empty((H, self.m, nz))
+        values = {"z_run": plain(z), "u_run": plain(u), "damping": plain(damping)}
+        values |= {"k": k, "K": K, "expected": expected}
+        words = table(SWEEP, packed(problem).words | self._jacobian(problem), values)
+        failed = run(self._search(problem)["sweep"], words)
         if failed >= 0:
             k[: failed + 1], K[: failed + 1] = 0.0, 0.0
         elif not np.isfinite(K[0]).all():
             failed = 0
         return Backward(k, K, float(expected[0]), float(expected[1]), failed)
 
-    def _layout(self, problem: Problem) -> Layout:
-        return Layout(self.n, problem.depths, tuple(bool(a) for a in problem.angles))
+    def descend(
+        self,
+        problem: Problem,
+        scale: Array,
+        ubar: Array,
+        K: Array | None,
+        zbar: Array | None,
+        options: Options,
+    ) -> Descent | None:
+        """See `System.descend`."""
+        if self.m > MAX_INPUTS:
+            return None
+        H, nz, m = problem.horizon, problem.nz, self.m
+        z, u = [empty((H + 1, nz)) for _ in "01"], [empty((H, m)) for _ in "01"]
+        gains: dict[str, Any] = {
+            "k": empty((H, m)),
+            "K": empty((H, m, nz)),
+            "expected": np.zeros(2),
+        }
+        lanes, costs, damping = np.ones(LANES), np.empty(LANES), np.zeros(m)
+        lines, result = np.empty((max(options.max_iterations, 0) + 1, 4)), np.empty(4)
+        policy, known = _policy(ubar, K, zbar, None), packed(problem).words
+        first = {"alphas": lanes, "cost": costs, "runs": 1, "z": z[0], "u": u[0]}
+        rollout = table(ROLLOUT, known, policy | first)
+        sweep = table(SWEEP, known | self._jacobian(problem), gains | {"damping": damping})
+        values = gains | {"z0": z[0], "z1": z[1], "u0": u[0], "u1": u[1], "alphas": lanes}
+        values |= {"rollout": ctypes.addressof(rollout), "sweep": ctypes.addressof(sweep)}
+        values |= {"costs": costs, "scale": plain(scale), "damping": damping, "lines": lines}
+        values |= {"result": result, "halvings": options.halvings, "accept": float(options.accept)}
+        values |= {"max_iterations": options.max_iterations, "tolerance": float(options.tolerance)}
+        words = table(DESCENT, {}, values)
+        status = STATUSES[run(self._search(problem)["descent"], words)]
+        last, cost = int(result[TURN]), float(result[COST])
+        lines, failed = lines[: int(result[COUNT])], int(result[FAILED_AT])
+        return Descent(status, z[last], u[last], gains["k"], gains["K"], cost, failed, lines)
 
-    def _packed(self, problem: Problem) -> dict[str, Any]:
-        """The words that a problem gives every kernel; its arrays are kept alive beside them."""
-        known = problem.__dict__.get("_packed")
-        if known is None:
-            queue, shift = queue_of(problem), problem.input_shift
-            arrays = {
-                "start": problem.z_start(),
-                "p": problem.p,
-                "bias": problem.bias,
-                "shift": np.zeros((problem.horizon, self.m)) if shift is None else shift,
-                "target": problem.target,
-                "weight": problem.state_weight,
-                "input_target": problem.input_target,
-                "R": problem.input_weight,
-                "S": problem.change_weight,
-                "low": problem.low,
-                "high": problem.high,
-                "now": queue.now,
-                "past": queue.past,
-            }
-            kept = {name: _plain(array) for name, array in arrays.items()}
-            settings = {"dt": problem.dt, "eps": problem.smoothing}
-            words: dict[str, Any] = {name: _word(array) for name, array in kept.items()}
-            words |= {name: _word(float(value)) for name, value in settings.items()}
-            known = words | {"H": problem.horizon, "kept": kept}
-            problem.__dict__["_packed"] = known
-        return known
+    def _search(self, problem: Problem) -> jit.Library:
+        return self._compiled(problem.p, problem.dt).search(packed(problem).layout)
+
+    def _jacobian(self, problem: Problem) -> dict[str, int]:
+        """The word of the batch module's function that the sweep calls."""
+        library = self._compiled(problem.p, problem.dt).batch()
+        return {"jacobian": library.addresses["jacobian"]}
+
+
+def _policy(ubar: Array, K: Array | None, zbar: Array | None, k: Array | None) -> dict[str, Any]:
+    """Words of a policy: those that are not given are null."""
+    given = {"ubar": ubar, "K": None if zbar is None else K, "zbar": zbar, "k": k}
+    return {name: 0 if array is None else plain(array) for name, array in given.items()}

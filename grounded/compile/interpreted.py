@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 
 from grounded.compile.cost import trajectory_cost, wrapped
+from grounded.compile.descent import Descent, Options
 from grounded.compile.problem import Array, Problem
 from grounded.compile.queue import queue_of
 from grounded.compile.sweep import sweep
@@ -112,3 +113,15 @@ class Interpreted(ABC):
         with np.errstate(all="ignore"):
             f_x, f_u = self.linearise(x, sent, problem.p, problem.dt, problem.smoothing)
             return sweep(problem, z, u, f_x, f_u, damping)
+
+    def descend(
+        self,
+        problem: Problem,
+        scale: Array,
+        ubar: Array,
+        K: Array | None,
+        zbar: Array | None,
+        options: Options,
+    ) -> Descent | None:
+        """See `System.descend`."""
+        return None

@@ -68,6 +68,23 @@ def _transpose_rows(f: Writer, source: str, target: str, size: tuple[int, int], 
             f.store(column, target, (r + i) * C, count)
 
 
+def symmetric(f: Writer, V: str, P: int) -> None:
+    """V (P, P) becomes (V + V') / 2, in blocks of four by four."""
+    half = splat(0.5, 4)
+    with f.loop(P // 4) as i, f.loop(f.integer("add", i, 1)) as j:
+        first, second = f.integer("mul", i, 4), f.integer("mul", j, 4)
+        below = f.at(V, f.integer("add", f.integer("mul", first, P), second))
+        above = f.at(V, f.integer("add", f.integer("mul", second, P), first))
+        mirrored = _transpose_block(f, [f.load(above, r * P, 4) for r in range(4)])
+        mean = [
+            f.mul(f.add(f.load(below, r * P, 4), row, 4), half, 4) for r, row in enumerate(mirrored)
+        ]
+        for r, row in enumerate(mean):
+            f.store(row, below, r * P, 4)
+        for r, row in enumerate(_transpose_block(f, mean)):
+            f.store(row, above, r * P, 4)
+
+
 def _transpose_block(f: Writer, a: list[str]) -> list[str]:
     """Columns of four rows of four."""
     kind = vector(4)
@@ -121,29 +138,32 @@ class Linearised:
         self.now = ""
         f.store(splat(0.0, width), self.jac, len(d.places) * width, width)
 
+    def begins(self, t: str) -> str:
+        """Whether t is the last step of a block, whose Jacobians are not there yet."""
+        f = self.f
+        last = f.emit(f"icmp eq i64 {t}, {f.integer('sub', self.words.integer('H'), 1)}")
+        edge = f.emit(f"icmp eq i64 {f.integer('and', t, self.width - 1)}, {self.width - 1}")
+        return f.emit(f"or i1 {last}, {edge}")
+
     def linearise(self, t: str) -> None:
-        """The Jacobians of W steps, when t is the last of a block."""
+        """The Jacobians of the W steps of the block of t."""
         f, layout, w = self.f, self.layout, self.width
-        H = self.words.integer("H")
-        last = f.emit(f"icmp eq i64 {t}, {f.integer('sub', H, 1)}")
-        edge = f.emit(f"icmp eq i64 {f.integer('and', t, w - 1)}, {w - 1}")
-        with f.when(f.emit(f"or i1 {last}, {edge}")):
-            first = f.integer("and", t, -w)
-            u_soa = f.at(self.soa, layout.nz * w)
-            z_run, u_run = self.words.pointer("z_run"), self.words.pointer("u_run")
-            shift = (self.words.pointer("shift"), layout.m, self.shift)
-            rows = [(z_run, layout.nz, self.soa), (u_run, layout.m, u_soa), shift]
-            gather_rows(f, rows, first, H, w)
-            z = [f.load(self.soa, i * w, w) for i in range(layout.nz)]
-            u = [f.load(u_soa, j * w, w) for j in range(layout.m)]
-            sent = received(f, self.words, layout, z, u, w)
-            sent = [f.sub(v, f.load(self.shift, j * w, w), w) for j, v in enumerate(sent)]
-            for i, value in enumerate([*z[: layout.n], *sent]):
-                f.store(value, self.xu, i * w, w)
-            f.do(
-                f"call i64 {self.words.pointer('jacobian')}(ptr {self.xu}, ptr {self.table}, "
-                f"ptr {self.following}, ptr {self.jac})"
-            )
+        first, H = f.integer("and", t, -w), self.words.integer("H")
+        u_soa = f.at(self.soa, layout.nz * w)
+        z_run, u_run = self.words.pointer("z_run"), self.words.pointer("u_run")
+        shift = (self.words.pointer("shift"), layout.m, self.shift)
+        rows = [(z_run, layout.nz, self.soa), (u_run, layout.m, u_soa), shift]
+        gather_rows(f, rows, first, H, w)
+        z = [f.load(self.soa, i * w, w) for i in range(layout.nz)]
+        u = [f.load(u_soa, j * w, w) for j in range(layout.m)]
+        sent = received(f, self.words, layout, z, u, w)
+        sent = [f.sub(v, f.load(self.shift, j * w, w), w) for j, v in enumerate(sent)]
+        for i, value in enumerate([*z[: layout.n], *sent]):
+            f.store(value, self.xu, i * w, w)
+        f.do(
+            f"call i64 {self.words.pointer('jacobian')}(ptr {self.xu}, ptr {self.table}, "
+            f"ptr {self.following}, ptr {self.jac})"
+        )
 
     def select(self, t: str) -> None:
         """From here on `rows` means those of step t."""

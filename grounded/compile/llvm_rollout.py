@@ -4,7 +4,8 @@
     x_{t+1} = f(x_t, u_eff_t - shift_t) + bias_t
 
 with the cost added up on the way. The lanes share the trajectory's data and differ in alpha; with
-fewer runs than lanes, one is repeated and not stored. K, zbar and k may be null.
+fewer runs than lanes, one is repeated and not stored. K, zbar and k may be null, z and u too: then
+the cost is all that is wanted.
 """
 
 from __future__ import annotations
@@ -172,19 +173,20 @@ class _Rollout:
         """Stores z_t and u_t of the runs that were asked for."""
         f, layout, H = self.f, self.layout, self.words.integer("H")
         z, u = self.words.pointer("z"), self.words.pointer("u")
-        with f.loop(self.words.integer("runs")) as run:
+        with (
+            f.when(f.emit(f"icmp ne ptr {z}, null")),
+            f.loop(self.words.integer("runs")) as run,
+        ):
             row = f.integer("add", f.integer("mul", run, f.integer("add", H, 1)), t)
             to = f.at(z, f.integer("mul", row, layout.nz))
             lane = f.at(self.z, run)
             for i in range(layout.nz):
                 f.store(f.load(lane, i * LANES), to, i)
-            if last:
-                f.store(f.load(self.cost, run), self.words.pointer("cost"), run)
-                return
-            row = f.integer("add", f.integer("mul", run, H), t)
-            to, lane = f.at(u, f.integer("mul", row, layout.m)), f.at(self.u, run)
-            for j in range(layout.m):
-                f.store(f.load(lane, j * LANES), to, j)
+            if not last:
+                row = f.integer("add", f.integer("mul", run, H), t)
+                to, lane = f.at(u, f.integer("mul", row, layout.m)), f.at(self.u, run)
+                for j in range(layout.m):
+                    f.store(f.load(lane, j * LANES), to, j)
 
     def advance(self, t: str) -> None:
         """From z_t to z_{t+1}."""
@@ -209,9 +211,11 @@ class _Rollout:
 
     def finish(self) -> None:
         """The end state and its cost."""
-        H = self.words.integer("H")
+        f, H = self.f, self.words.integer("H")
         self._tracking(H)
         self.save(H, last=True)
+        with f.loop(self.words.integer("runs")) as run:
+            f.store(f.load(self.cost, run), self.words.pointer("cost"), run)
 
 
 __all__ = ["LANES", "ROLLOUT", "Layout", "number", "received", "rollout_kernel", "wrap"]

@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
+from grounded.compile.descent import Descent, Options
 from grounded.compile.problem import Array, Problem
 
 
@@ -102,5 +103,20 @@ class System(Protocol):
         Input limits are part of each step's quadratic programme (box-DDP, Tassa et al. 2014): the
         rows of K of a clamped input are zero. `into` is an earlier result that nobody needs any
         more: its arrays may be used again.
+        """
+        ...
+
+    def descend(
+        self,
+        problem: Problem,
+        scale: Array,
+        ubar: Array,
+        K: Array | None,
+        zbar: Array | None,
+        options: Options,
+    ) -> Descent | None:
+        """The loop of `ddp.solve` in one piece; None where it is left to `ddp`.
+
+        From the rollout of ubar (H, m) or of ubar + K (z - zbar); scale (m,) times mu regularises.
         """
         ...

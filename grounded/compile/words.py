@@ -1,0 +1,99 @@
+"""Tables of 64-bit words, a kernel's only argument: addresses, integers, doubles.
+
+What a problem gives every kernel is packed once and kept beside the problem; a call adds its own.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from grounded.compile.llvm_rollout import Layout
+from grounded.compile.problem import Array, Problem
+from grounded.compile.queue import queue_of
+
+Table = ctypes.Array[ctypes.c_int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Packed:
+    """A problem as words, its arrays kept alive beside them."""
+
+    words: dict[str, int]
+    kept: tuple[Array, ...]
+    layout: Layout
+
+
+def packed(problem: Problem) -> Packed:
+    """The words of a problem, made when they are first asked for."""
+    known: Packed | None = problem.__dict__.get("_packed")
+    if known is None:
+        known = problem.__dict__["_packed"] = _pack(problem)
+    return known
+
+
+def _pack(problem: Problem) -> Packed:
+    queue, shift = queue_of(problem), problem.input_shift
+    m = len(problem.depths)
+    arrays = {
+        "start": problem.z_start(),
+        "p": problem.p,
+        "bias": problem.bias,
+        "shift": np.zeros((problem.horizon, m)) if shift is None else shift,
+        "target": problem.target,
+        "weight": problem.state_weight,
+        "input_target": problem.input_target,
+        "R": problem.input_weight,
+        "S": problem.change_weight,
+        "low": problem.low,
+        "high": problem.high,
+        "now": queue.now,
+        "past": queue.past,
+    }
+    kept = {name: plain(array) for name, array in arrays.items()}
+    words = {name: word(array) for name, array in kept.items()}
+    words |= {"dt": word(float(problem.dt)), "eps": word(float(problem.smoothing))}
+    words["H"] = problem.horizon
+    layout = Layout(problem.system.n, problem.depths, tuple(bool(a) for a in problem.angles))
+    return Packed(words, tuple(kept.values()), layout)
+
+
+def table(names: Sequence[str], known: Mapping[str, int], values: Mapping[str, Any]) -> Table:
+    """Words in the order of `names`: of `values`, else `known`, else 0 (a null pointer)."""
+    return (ctypes.c_int64 * len(names))(
+        *[word(values[name]) if name in values else known.get(name, 0) for name in names]
+    )
+
+
+def call(function: Any, names: Sequence[str], values: Mapping[str, Any]) -> int:
+    """Calls a kernel with these words; arrays must be contiguous float64."""
+    return run(function, table(names, {}, values))
+
+
+def run(function: Any, words: Table) -> int:
+    """Calls a kernel with its table, which outlives the call."""
+    return int(function(ctypes.addressof(words)))
+
+
+def word(value: Any) -> int:
+    """An integer as it is, an array's address, a double's bits."""
+    if type(value) is int:
+        return value
+    if isinstance(value, np.ndarray):
+        return address(value) if value.size else int(value.ctypes.data)
+    return int(struct.unpack("<q", struct.pack("<d", value))[0])
+
+
+def address(array: Array) -> int:
+    """Where an array's first element is."""
+    return int(array.__array_interface__["data"][0])
+
+
+def plain(array: Any) -> Array:
+    """The array as a kernel reads it."""
+    return np.ascontiguousarray(array, dtype=np.float64)
