@@ -11,7 +11,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from grounded_trials.diagnosis_file import _diagnosis
+from grounded_trials.diagnosis_file import diagnosis_of
 from grounded_trials.findings import Lost
 from grounded_trials.gathering import gather
 from grounded_trials.page import page
@@ -97,8 +97,27 @@ def test_page_shows_what_the_issue_lists(cart):
         "1.400 (1.36 to 1.44)",
         "x > 0.2",
         "model as diagnosed",
+        "90.5 % of the squared error is explained",
+        "whole run (2 s)",
+        "By state, 1 s ahead",
+        "What is left of v is no white noise",
+        "off by 3.21, the diagnosed one off by 0.0456",
+        "coulomb_friction:v",
+        "96.0 %",
+        "first or better",
+        "no better",
     ):
         assert words in text, words
+
+
+def test_page_of_an_older_diagnosis_leaves_out_what_it_lacks(cart):
+    findings = gather(Workspace(cart))
+    new = ("split", "whiteness")
+    where = {key: value for key, value in DIAGNOSIS["where"].items() if key not in new}
+    old = {k: v for k, v in DIAGNOSIS.items() if k not in ("utility_prediction", "lookalikes")}
+    text = page(replace(findings, diagnosis=diagnosis_of(old | {"where": where})))
+    for words in ("What the error is made of", "Is the rest noise", "Look-alikes", "predicted<"):
+        assert words not in text
 
 
 def test_page_without_a_diagnosis_names_the_command(car):
@@ -126,6 +145,9 @@ def hostile(folder):
     document["verdict"]["sentence"] = document["next_trial"] = document["gap"]["unit"] = EVIL
     document["where"]["channels"][0] |= {"name": EVIL, "unit": EVIL}
     document["where"]["regions"][0]["when"] = EVIL
+    document["where"]["split"]["horizon"]["channels"][0]["name"] = EVIL
+    document["where"]["whiteness"][EVIL] = 0.0
+    document["lookalikes"][0]["like"] = EVIL
     standing = replace(findings.standing, sentence=EVIL)
     model = replace(
         findings.task.model,
@@ -141,7 +163,7 @@ def hostile(folder):
         method=EVIL,
         standing=standing,
         lost=(Lost(EVIL, EVIL),),
-        diagnosis=_diagnosis(document),
+        diagnosis=diagnosis_of(document),
         next_command=EVIL,
     )
 

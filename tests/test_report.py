@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -41,6 +42,31 @@ def test_text_shows_the_diagnosis(cart):
     assert "explains 90 % of the gap" in out
     assert "k = 0.3 +- 0.01" in out
     assert "4.10 before, 1.10 after, floor 1.00" in out
+
+
+def test_text_and_status_explain_their_columns(cart):
+    for command, words in (("report", "alpha: "), ("status", "damp: ")):
+        lines = grounded("-C", cart, command).out.splitlines()
+        (legend,) = [line for line in lines if line.startswith(f"  {words}")]
+        assert "+-: standard error" in legend and len(legend) <= 80
+
+
+def test_text_says_what_the_error_is_made_of(cart):
+    out = " ".join(grounded("-C", cart, "report").out.split())
+    assert "1 s ahead, 90.5 % of the squared error is explained, 0.4 % is not, 9.1 %" in out
+    assert "what is left of v is no white noise" in out
+    assert "5 whole trials off by 3.21, the diagnosed one off by 0.0456" in out
+    assert "quadratic_drag:v makes 96.0 %, coulomb_friction:v 80 % of the signal of" in out
+
+
+def test_half_a_number_is_never_shown(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    params = {f"k{i}": {"value": 0.123456, "std": 0.01, "unit": "m/s"} for i in range(4)}
+    entry = {"effect": "patch:v", "params": params, "evidence": 9.0, "gap_after": 1.0}
+    document = DIAGNOSIS | {"ranking": [entry]}
+    (folder / "reports" / "diagnosis.json").write_text(json.dumps(document))
+    (line,) = [x for x in grounded("-C", folder, "report").out.splitlines() if "patch:v" in x]
+    assert line.endswith("k0 = 0.123 +- 0.01 m/s, ...")
 
 
 def test_json_holds_what_the_contract_says(cart):

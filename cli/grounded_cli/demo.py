@@ -11,6 +11,7 @@ from grounded_cli.learn import learn_in
 from grounded_cli.options import as_json
 from grounded_cli.status import summary
 from grounded_cli.terminal import field, number, progress, say, show, show_json
+from grounded_trials.words import count
 
 if TYPE_CHECKING:
     from grounded_trials.workspace import Workspace
@@ -62,7 +63,7 @@ def command(name: str, folder: str | None, json_: bool) -> None:
 
 def _tell(document: dict[str, Any]) -> None:
     first, last = document["utilities"][0], document["utilities"][-1]
-    gain = f"{100 * (1 - last / first):.1f} % better after {document['trials']} trials"
+    gain = f"{100 * (1 - last / first):.1f} % better after {count(document['trials'], 'trial')}"
     show(
         "\n"
         + field("learned", f"{number(first)} by the model's own policy, {number(last)} now: {gain}")

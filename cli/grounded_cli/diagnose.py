@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from grounded_cli import completion as complete
 from grounded_cli.options import as_json, in_workspace, library_of, open_workspace
 from grounded_cli.terminal import field, number, show, show_json, stages, table
+from grounded_trials.words import with_unit
+
+if TYPE_CHECKING:
+    from grounded_trials.diagnosing import Diagnosed
+    from grounded_trials.workspace import Workspace
 
 
 @click.command("diagnose")
@@ -18,8 +23,14 @@ from grounded_cli.terminal import field, number, show, show_json, stages, table
     shell_complete=complete.trials,
     help="Only these trials (default: all).",
 )
-@click.option("--max-effects", type=click.IntRange(1, 6), default=3, help="At most K at once.")
-@click.option("--without", multiple=True, metavar="FAMILY", help="A family not to blame.")
+@click.option(
+    "--max-effects",
+    type=click.IntRange(1, 6),
+    default=3,
+    metavar="K",
+    help="Blame at most K effects at once, 1 to 6 (default: 3).",
+)
+@click.option("--without", multiple=True, metavar="FAMILY", help="Not to blame (repeatable).")
 @in_workspace
 @as_json
 def command(
@@ -44,37 +55,68 @@ def command(
         show_json(found.document)
     else:
         _tell(found.document)
+        show(f"\n{_follow(workspace, found)}")
+
+
+def _follow(workspace: Workspace, found: Diagnosed) -> str:
+    """The command that follows: adopt what was claimed, or see the whole."""
+    from grounded_trials.next_step import after_diagnosis, folded
+
+    verdict = found.document["verdict"]
+    command = after_diagnosis(workspace, verdict["kind"], verdict["effects"])
+    if not command and found.probe:
+        command = f"grounded run {found.probe}"
+    return folded(command or "grounded report --html")
 
 
 def _tell(document: dict[str, Any]) -> None:
-    verdict, gap = document["verdict"], document["gap"]
-    show(field("verdict", f"{verdict['kind']}: {verdict['sentence']}"))
+    from grounded_trials.diagnosis_file import diagnosis_of
+    from grounded_trials.diagnosis_words import error_lines
+
+    verdict = document["verdict"]
+    show(_verdict(verdict["kind"], verdict["sentence"]))
     for text in document.get("unknowable", []):
         show(field("unknown", text))
-    show(field("gap", _gap(gap)))
+    show(field("gap", _gap(document["gap"])))
+    for title, text in error_lines(diagnosis_of(document)):
+        show(field(title, text))
+    _places(document["where"])
+    _effects(document)
+    show("\n" + field("next trial", document["next_trial"]))
+
+
+def _verdict(kind: str, text: str) -> str:
+    """The kind, then a sentence a line: they say different things."""
+    from grounded_trials.diagnosis_words import sentences
+
+    first, *others = sentences(text)
+    lines = [field("verdict", f"{kind}: {first}")]
+    return "\n".join([*lines, *(field("", sentence) for sentence in others)])
+
+
+def _places(where: dict[str, Any]) -> None:
     channels = [
-        (c["name"], f"{100 * c['share']:.0f} %", f"{number(c['rms'], 3)} {c['unit']}")
-        for c in document["where"]["channels"]
+        (c["name"], f"{100 * c['share']:.0f} %", with_unit(number(c["rms"], 3), c["unit"]))
+        for c in where["channels"]
         if c["share"] >= 0.005
     ]
     if channels:
         show("\n" + table(channels, ("where", "share of the gap", "rms")))
-    for region in document["where"]["regions"][:3]:
+    for region in where["regions"][:3]:
         share, time = 100 * region["share"], 100 * region["occupancy"]
         show(field("", f"{region['when']}: {share:.0f} % of the gap in {time:.0f} % of the time"))
+
+
+def _effects(document: dict[str, Any]) -> None:
     ranking = document["ranking"][:8]
     if ranking:
         rows = [_ranked(entry) for entry in ranking]
         show("\n" + table(rows, ("effect (*: claimed)", "evidence [nats]", "gap after")))
     for entry in ranking:
         if entry.get("claimed"):
-            show(field(entry["effect"], _values(entry)))
+            show(field(f"  {entry['effect']}:", _values(entry)))
     for group in document["indistinguishable"]:
-        show(field("alike", f"the data can't tell apart: {', '.join(group)}"))
-    show("\n" + field("next trial", document["next_trial"]))
-    effects = verdict["effects"]
-    follow = f"grounded adopt {effects[0]}" if effects else "grounded report --html"
-    show(f"\nnext: {follow}")
+        show(field("tied", f"the data can't tell apart: {', '.join(group)}"))
 
 
 def _gap(gap: dict[str, Any]) -> str:
@@ -92,6 +134,6 @@ def _ranked(entry: dict[str, Any]) -> tuple[str, str, str]:
 
 def _values(entry: dict[str, Any]) -> str:
     return ", ".join(
-        f"{name} = {number(p['value'], 3)} +- {number(p['std'], 2)} {p['unit']}"
+        with_unit(f"{name} = {number(p['value'], 3)} +- {number(p['std'], 2)}", p["unit"])
         for name, p in entry["params"].items()
     )

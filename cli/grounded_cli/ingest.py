@@ -9,10 +9,20 @@ import click
 
 from grounded_cli import completion as complete
 from grounded_cli.options import as_json, in_workspace, open_workspace
-from grounded_cli.terminal import number, progress, say, show, show_json, table
+from grounded_cli.terminal import field, number, progress, say, show, show_json, table
 
 if TYPE_CHECKING:
     from grounded_trials.ingest import Ingested
+
+# what a verdict means for the search
+VERDICTS = {
+    "first": ": what the search improves on",
+    "better": ": the best so far",
+    "no better": " than the best so far",
+    "waiting": ": more trials of it are needed ([search] repeats)",
+    "in doubt": ": it may be bad luck, the best so far is run once more",
+    "run again": ": its utility is the mean of its trials",
+}
 
 
 @click.command("ingest")
@@ -69,15 +79,9 @@ def _tell(name: str, one: Ingested) -> None:
     if not one.candidate:
         show(f"{name} {known} {one.trial}: data for fit and diagnose")
     else:
-        better = "the best so far" if one.base else "the first: what the search improves on"
-        verdict = {
-            True: better,
-            False: "no improvement",
-            None: "more trials of it are needed ([search] repeats)",
-        }[one.accepted]
-        show(
-            f"{name} {known} {one.trial}: {one.candidate}, utility {number(one.utility)}, {verdict}"
-        )
+        show(f"{name} {known} {one.trial}")
+        text = f"utility {number(one.utility)}, {one.verdict}{VERDICTS.get(one.verdict, '')}"
+        show(field(one.candidate, text, "  "))
     if one.signals:
         rows = [
             (

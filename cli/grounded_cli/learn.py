@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from grounded_cli.options import as_json, in_workspace, open_workspace
-from grounded_cli.status import as_document, summary
+from grounded_cli.status import as_document, next_line, summary
 from grounded_cli.terminal import number, progress, say, show, show_json
 
 if TYPE_CHECKING:
@@ -28,11 +28,8 @@ def command(trials: int | None, folder: str | None, json_: bool) -> None:
         show_json(as_document(standing))
         return
     show(summary(standing))
-    show(
-        "\nnext: grounded report --html"
-        if standing.phase != "propose"
-        else "\nnext: grounded learn"
-    )
+    ended = standing.phase != "propose"
+    show(f"\n{next_line(workspace, standing) if ended else 'next: grounded learn'}")
 
 
 def learn_in(workspace: Workspace, trials: int | None = None) -> Standing:
@@ -58,8 +55,8 @@ def learn_in(workspace: Workspace, trials: int | None = None) -> Standing:
         for warning in found.warnings:
             say(f"warning: {found.trial}: {warning}")
         say(
-            f"{found.trial}  {candidate.id}  iteration {candidate.iteration}  "
-            f"alpha {candidate.alpha:<8g} predicted {number(candidate.predicted_utility):>10}  "
-            f"real {number(found.utility):>10}{'  better' if found.accepted else ''}"
+            f"{found.trial} {candidate.id} iter {candidate.iteration:<3} "
+            f"alpha {candidate.alpha:<8g} predicted {number(candidate.predicted_utility):>10} "
+            f"real {number(found.utility):>10}  {found.verdict}"
         )
     return standing_in(workspace)

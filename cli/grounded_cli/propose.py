@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from grounded_cli.options import as_json, in_workspace, open_workspace
+from grounded_cli.status import next_line
 from grounded_cli.terminal import field, number, progress, say, show, show_json
+from grounded_trials.words import count, with_unit
 
 if TYPE_CHECKING:
     from grounded.search import Candidate, Standing
@@ -71,10 +74,13 @@ def _tell(workspace: Workspace, proposed: Proposed) -> None:
         say(f"note: the model is not compiled: {note}")
     if candidate is None:
         show(field("end", f"nothing to run: {standing.sentence}"))
-        show("\nnext: grounded diagnose")
+        show(f"\n{next_line(workspace, standing)}")
         return
+    ran = any(t.candidate.id == candidate.id and t.trials for t in standing.history)
     waiting = "" if proposed.proposal.is_new else " (proposed before, its trial is missing)"
-    show(f"Run {candidate.id}{waiting}: {proposed.file}")
+    show(f"Run {candidate.id}{' once more' if ran else waiting}: {proposed.file}")
+    if ran:
+        show(field("why", standing.sentence, "  "))
     show(field("what", _what(candidate, workspace.task), "  "))
     show(field("predicted", f"utility {number(candidate.predicted_utility)}", "  "))
     if standing.incumbent is not None:
@@ -83,9 +89,8 @@ def _tell(workspace: Workspace, proposed: Proposed) -> None:
     show(field("trust", _trust(standing), "  "))
     for name, text in _extent(candidate, workspace.task):
         show(field(name, text, "  "))
-    system = workspace.config.system
-    follow = "grounded run" if system.command or system.model else "grounded ingest TRIAL.mcap"
-    show(f"\nnext: {follow}")
+    can_run = workspace.config.system.command or workspace.config.system.model
+    show(f"\nnext: grounded {'run' if can_run else 'ingest TRIAL.mcap'}")
 
 
 def _what(candidate: Candidate, task: Task) -> str:
@@ -95,7 +100,7 @@ def _what(candidate: Candidate, task: Task) -> str:
         step = f"alpha = {candidate.alpha:g} from {candidate.base}"
         return f"iteration {candidate.iteration}: {step}, {seconds}"
     crashes = candidate.caution
-    gently = f", designed more gently after {crashes} crashes" * bool(crashes)
+    gently = f", designed more gently after {count(crashes, 'crash', 'crashes')}" * bool(crashes)
     return f"the model's own policy{gently}, {seconds}"
 
 
@@ -106,16 +111,20 @@ def _extent(candidate: Candidate, task: Task) -> list[tuple[str, str]]:
     for name in (position,) if isinstance(position, str) else position:
         if name in model.states:
             values = candidate.predicted_states[:, model.state_names.index(name)]
-            rows.append((name, f"{_span(values)} {model.states[name]}"))
-    for i, name in enumerate(model.input_names):
+            rows.append((name, with_unit(_span(values), model.states[name])))
+    for i, (name, unit) in enumerate(model.inputs.items()):
         low, high = float(task.low[i]), float(task.high[i])
         limits = f", limits {low:g} to {high:g}" * (high < float("inf"))
-        rows.append((name, f"{_span(candidate.predicted_inputs[:, i])}{limits}"))
+        rows.append((name, with_unit(_span(candidate.predicted_inputs[:, i]), unit) + limits))
     return rows
 
 
 def _span(values: Any) -> str:
-    return f"{values.min() + 0.0:.2f} to {values.max() + 0.0:.2f}".replace("-0.00", "0.00")
+    """From the lowest to the highest value, to a hundredth or finer where all are small."""
+    low, high = float(values.min()), float(values.max())
+    size = max(abs(low), abs(high))
+    digits = 2 if size >= 1 or not 0 < size < float("inf") else 2 - math.floor(math.log10(size))
+    return f"{round(low, digits) + 0.0:.{digits}f} to {round(high, digits) + 0.0:.{digits}f}"
 
 
 def _trust(standing: Standing) -> str:

@@ -27,6 +27,7 @@ def command(html: bool, png: bool, rrd: bool, folder: str | None, json_: bool) -
     """
     workspace = open_workspace(folder)
     from grounded_trials.gathering import gather
+    from grounded_trials.next_step import folded
     from grounded_trials.report_text import report_text
     from grounded_trials.reporting import save
 
@@ -39,7 +40,7 @@ def command(html: bool, png: bool, rrd: bool, folder: str | None, json_: bool) -
     elif paths:
         for path in paths:
             show(str(path))
-        show(f"\nnext: {findings.next_command}")
+        show(f"\n{folded(findings.next_command)}")
     else:
         show(report_text(findings, table, sparkline))
     if findings.lost:

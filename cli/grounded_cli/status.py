@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from grounded_cli.options import as_json, in_workspace, open_workspace
 from grounded_cli.terminal import field, number, progress, show, show_json, sparkline, table
+from grounded_trials.words import verdict
 
 if TYPE_CHECKING:
     from grounded.search import Standing, Tried
+    from grounded_trials.workspace import Workspace
+
+LEGEND = "damp: penalty on leaving the last trial's inputs; +-: standard error"
 
 
 @click.command("status")
@@ -27,8 +32,7 @@ def command(folder: str | None, json_: bool) -> None:
         show_json(as_document(standing))
         return
     show(summary(standing))
-    system, diagnosed = workspace.config.system, (workspace.reports / "diagnosis.json").exists()
-    show(f"\nnext: {next_command(standing, bool(system.command or system.model), diagnosed)}")
+    show(f"\n{next_line(workspace, standing)}")
 
 
 def as_document(standing: Standing) -> dict[str, Any]:
@@ -68,25 +72,36 @@ def summary(standing: Standing) -> str:
     lines = []
     if standing.history:
         header = ("id", "iter", "alpha", "damp", "predicted", "utility", "+-", "trials", "")
-        lines.append(table([_row(t) for t in standing.history], header))
+        last = standing.history[-1]
+        lines.append(table([_row(t, t is last) for t in standing.history], header))
+        lines.append(f"  {LEGEND}")
         bars = sparkline(spaced([t.utility for t in standing.history if t.utilities]))
         lines.append("\n" + field("utility", bars))
     if standing.incumbent is not None:
-        best, first = standing.incumbent, standing.utilities[0]
-        gain = 100 * (best.utility - first) / abs(first) if first else 0.0
-        better = f", {gain:.1f} % better than the model's own policy" * bool(standing.iteration)
-        lines.append(field("best", f"{best.candidate.id}, utility {number(best.utility)}{better}"))
+        best = standing.incumbent
+        text = f"{best.candidate.id}, utility {number(best.utility)}{gained(standing)}"
+        lines.append(field("best", text))
     if sure := certainty(standing):
         lines.append(field("certainty", sure))
     lines.append(field("phase", f"{standing.phase}: {standing.sentence}"))
     return "\n".join(lines)
 
 
-def _row(tried: Tried) -> tuple[str, ...]:
+def gained(standing: Standing) -> str:
+    """By how much the best candidate beats the model's own policy, as the end of a sentence."""
+    best, own = standing.incumbent, standing.history[0]
+    if best is None or best.candidate is own.candidate or own.candidate.base or not own.utilities:
+        return ""
+    if not math.isfinite(own.utility):
+        return "; the model's own policy failed"
+    if best.candidate.base == "" or not own.utility:
+        return ""
+    gain = 100 * (best.utility - own.utility) / abs(own.utility)
+    return f", {gain:.1f} % better than the model's own policy"
+
+
+def _row(tried: Tried, last: bool) -> tuple[str, ...]:
     error = tried.standard_error
-    verdict = {True: "better", False: "no better", None: "waiting"}[tried.accepted]
-    if not tried.candidate.base and tried.accepted:
-        verdict = "first"
     return (
         tried.candidate.id,
         str(tried.candidate.iteration),
@@ -96,7 +111,7 @@ def _row(tried: Tried) -> tuple[str, ...]:
         number(tried.utility),
         "-" if error != error else f"{error:.2g}",
         str(len(tried.trials)),
-        verdict,
+        verdict(tried, last),
     )
 
 
@@ -107,10 +122,14 @@ def certainty(standing: Standing) -> str:
     return last_improvement(standing.history)
 
 
-def next_command(standing: Standing, can_run: bool, diagnosed: bool = False) -> str:
-    """The command to type next."""
-    if standing.phase == "await-trial":
-        return "grounded run" if can_run else "grounded ingest TRIAL.mcap"
-    if standing.phase == "propose":
-        return "grounded propose"
-    return "grounded report --html" if diagnosed else "grounded diagnose"
+def next_line(workspace: Workspace, standing: Standing) -> str:
+    """The last line of an output: the command to type next."""
+    from grounded.errors import GroundedError
+    from grounded_trials.diagnosis_file import read_diagnosis
+    from grounded_trials.next_step import folded, next_command
+
+    try:
+        diagnosis = read_diagnosis(workspace.reports)
+    except GroundedError:  # a damaged one is made again
+        diagnosis = None
+    return folded(next_command(workspace, standing, diagnosis))

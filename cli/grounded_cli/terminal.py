@@ -78,11 +78,14 @@ def _clean(value: Any) -> Any:
 
 
 def field(label: str, text: str, indent: str = "") -> str:
-    """A label and its text, wrapped to 80 columns under itself."""
+    """A label and its text, wrapped to 80 columns under itself; a number keeps its %."""
     head = f"{indent}{label:<10} "
-    return textwrap.fill(
-        text, 80, initial_indent=head, subsequent_indent=" " * len(head), break_on_hyphens=False
+    under = " " * len(head)
+    whole = text.replace(" %", "\xa0%")
+    lines = textwrap.wrap(
+        whole, 80, initial_indent=head, subsequent_indent=under, break_on_hyphens=False
     )
+    return "\n".join(lines or [head.rstrip()]).replace("\xa0", " ")
 
 
 @contextmanager

@@ -1,17 +1,17 @@
-"""diagnose and adopt in a workspace: which trials, which model, where the result is kept."""
+"""diagnose in a workspace: which trials, which model, where the result is kept."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from grounded.errors import GroundedError, nearest
+from grounded_trials.diagnosis_file import FILE
 from grounded_trials.fitting import usable_trials
 from grounded_trials.store import write_atomically
-from grounded_trials.toml_edit import set_in_model
 from grounded_trials.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from grounded.effects import Library
     from grounded.task import Task
     from grounded.trial import Trial
-
-FILE = "diagnosis.json"
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +61,7 @@ def diagnose_in(
     document["diagnosed"] = {
         "trials": [trial.id for trial in used],
         "adopted": [dict(effect) for effect in workspace.config.model.effects],
+        "params": dict(workspace.config.model.params),
     }
     probe = _probe(workspace, subject, found, used, library)
     if probe:
@@ -130,50 +129,6 @@ def _probe(
     )
     workspace.save_candidate(candidate, workspace.task, kind="probe")
     return candidate.id, made.sentence
-
-
-def adopt_effect(
-    workspace: Workspace, name: str, *, parameters: bool = True
-) -> tuple[tuple[Mapping[str, Any], ...], dict[str, float]]:
-    """Adds a diagnosed effect to [model] effects: all that are adopted now, and new parameters.
-
-    Where the diagnosis calibrated the model's own parameters beside the effects, they are adopted
-    too: the effect's values hold beside them.
-
-    Raises:
-        GroundedError: if nothing was diagnosed, or the effect is not in its ranking.
-    """
-    path = workspace.reports / FILE
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-        ranking = {str(entry["effect"]): entry for entry in document["ranking"]}
-    except FileNotFoundError:
-        raise GroundedError("nothing was diagnosed yet: run `grounded diagnose` first") from None
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise GroundedError(
-            f"{path} can't be read ({error}): run `grounded diagnose` again"
-        ) from None
-    if name not in ranking:
-        raise GroundedError(
-            f"'{name}' is not among the effects of the last diagnosis: {nearest(name, ranking)}"
-        )
-    adopted = [dict(effect) for effect in workspace.config.model.effects]
-    if any(effect["name"] == name for effect in adopted):
-        raise GroundedError(f"'{name}' is adopted already; see [model] effects in grounded.toml")
-    entry = ranking[name]
-    values = {key: float(p["value"]) for key, p in entry["params"].items()}
-    values |= {key: float(value) for key, value in entry.get("fixed", {}).items()}
-    found = document.get("parameters", {}) if parameters else {}
-    params = {key: float(f"{p['value']:.8g}") for key, p in found.items()}
-    family, _, target = name.partition(":")
-    if family == "parameter":
-        nominal = workspace.base_model.params[target].value
-        params[target] = float(f"{nominal + values['d']:.8g}")
-    else:
-        adopted.append({"name": name, **{key: float(f"{v:.8g}") for key, v in values.items()}})
-    whole = dict(workspace.config.model.params) | params
-    set_in_model(workspace.config.file, params=whole if params else None, effects=adopted or None)
-    return tuple(adopted), params
 
 
 def _finite(value: Any) -> Any:

@@ -13,8 +13,21 @@ from pathlib import Path
 from typing import Any
 
 from grounded.errors import GroundedError
+from grounded_trials.diagnosis_error import (
+    Likeness,
+    Split,
+    UtilityPrediction,
+    likenesses,
+    number,
+    splits,
+    utility,
+    white,
+)
+from grounded_trials.words import with_unit
 
 FILE = "diagnosis.json"
+# what reading a document of another shape may raise
+MALFORMED = (ValueError, TypeError, AttributeError, KeyError, OverflowError, RecursionError)
 
 
 @dataclass(frozen=True)
@@ -92,6 +105,11 @@ class Diagnosis:
     leftover: tuple[Left, ...] = ()
     trials: tuple[str, ...] = ()  # that it was made from
     adopted: tuple[str, ...] = ()  # effects that were in the model then
+    model_params: tuple[tuple[str, float], ...] | None = None  # and its [model] params
+    split: tuple[Split, ...] = ()  # what the error is made of, by horizon
+    whiteness: tuple[tuple[str, float], ...] = ()  # p-value of what is left, by channel
+    utility_prediction: UtilityPrediction | None = None
+    lookalikes: tuple[Likeness, ...] = ()
 
 
 def read_diagnosis(folder: Path) -> Diagnosis | None:
@@ -108,35 +126,24 @@ def read_diagnosis(folder: Path) -> Diagnosis | None:
     except (OSError, UnicodeDecodeError) as error:
         raise GroundedError(f"{path} can't be read: {error}") from None
     try:
-        return _diagnosis(json.loads(text))
-    except (ValueError, TypeError, AttributeError, KeyError, RecursionError) as error:
+        return diagnosis_of(json.loads(text))
+    except MALFORMED as error:
         raise GroundedError(
             f"{path} is not what `grounded diagnose` writes ({error}); call it again"
         ) from None
 
 
-def _diagnosis(document: dict[str, Any]) -> Diagnosis:
+def diagnosis_of(document: dict[str, Any]) -> Diagnosis:
+    """The document of `grounded diagnose --json`, read."""
     verdict, where = document["verdict"], document.get("where") or {}
     gap, made = document.get("gap"), document.get("diagnosed") or {}
     return Diagnosis(
         kind=str(verdict["kind"]),
         effects=tuple(map(str, verdict.get("effects") or ())),
         sentence=str(verdict.get("sentence") or ""),
-        channels=tuple(
-            Share(
-                str(c["name"]), _number(c["share"]), f"{_number(c['rms']):.3g} {c.get('unit', '')}"
-            )
-            for c in where.get("channels") or ()
-        ),
+        channels=tuple(_channel(c) for c in where.get("channels") or ()),
         times=tuple(_time(t) for t in where.get("times") or ()),
-        regions=tuple(
-            Share(
-                str(r["when"]),
-                _number(r["share"]),
-                f"{100 * _number(r.get('occupancy')):.0f} % of the time",
-            )
-            for r in where.get("regions") or ()
-        ),
+        regions=tuple(_region(r) for r in where.get("regions") or ()),
         ranking=tuple(_ranked(r) for r in document.get("ranking") or ()),
         indistinguishable=tuple(
             tuple(map(str, group)) for group in document.get("indistinguishable") or ()
@@ -147,28 +154,49 @@ def _diagnosis(document: dict[str, Any]) -> Diagnosis:
         leftover=tuple(_left(one) for one in document.get("leftover") or ()),
         trials=tuple(map(str, made.get("trials") or ())),
         adopted=tuple(str(effect["name"]) for effect in made.get("adopted") or ()),
+        model_params=_params(made.get("params")),
+        split=splits(where.get("split")),
+        whiteness=white(where.get("whiteness")),
+        utility_prediction=utility(document.get("utility_prediction")),
+        lookalikes=likenesses(document.get("lookalikes")),
     )
 
 
+def _channel(entry: dict[str, Any]) -> Share:
+    rms = with_unit(f"{number(entry['rms']):.3g}", str(entry.get("unit", "")))
+    return Share(str(entry["name"]), number(entry["share"]), rms)
+
+
+def _region(entry: dict[str, Any]) -> Share:
+    note = f"{100 * number(entry.get('occupancy')):.0f} % of the time"
+    return Share(str(entry["when"]), number(entry["share"]), note)
+
+
+def _params(table: dict[str, Any] | None) -> tuple[tuple[str, float], ...] | None:
+    if table is None:
+        return None
+    return tuple((str(name), number(value)) for name, value in table.items())
+
+
 def _time(span: dict[str, Any]) -> Share:
-    start, end = _number(span["from"]), _number(span["to"])
-    return Share(f"{start:g} to {end:g} s", _number(span["share"]), "", start, end)
+    start, end = number(span["from"]), number(span["to"])
+    return Share(f"{start:g} to {end:g} s", number(span["share"]), "", start, end)
 
 
 def _ranked(row: dict[str, Any]) -> Ranked:
     return Ranked(
         effect=str(row["effect"]),
         params=_values(row.get("params")),
-        evidence=_number(row.get("evidence")),
-        gap_after=_number(row.get("gap_after")),
-        shrinkage=_number(row.get("shrinkage")),
-        fixed=tuple((str(k), _number(v)) for k, v in (row.get("fixed") or {}).items()),
+        evidence=number(row.get("evidence")),
+        gap_after=number(row.get("gap_after")),
+        shrinkage=number(row.get("shrinkage")),
+        fixed=tuple((str(k), number(v)) for k, v in (row.get("fixed") or {}).items()),
     )
 
 
 def _values(table: dict[str, Any] | None) -> tuple[Value, ...]:
     return tuple(
-        Value(str(name), _number(p["value"]), _number(p.get("std")), str(p.get("unit") or ""))
+        Value(str(name), number(p["value"]), number(p.get("std")), str(p.get("unit") or ""))
         for name, p in (table or {}).items()
     )
 
@@ -177,25 +205,20 @@ def _left(one: dict[str, Any]) -> Left:
     region = one.get("region") or {}
     return Left(
         channel=str(one["channel"]),
-        size=_number(one.get("size")),
+        size=number(one.get("size")),
         unit=str(one.get("unit") or ""),
         when=str(region.get("when") or ""),
-        share=_number(region.get("share")),
-        evidence=_number(one.get("evidence")),
+        share=number(region.get("share")),
+        evidence=number(one.get("evidence")),
     )
 
 
 def _gap(gap: dict[str, Any]) -> Gap:
     return Gap(
-        horizon_s=_number(gap.get("horizon_s")),
+        horizon_s=number(gap.get("horizon_s")),
         unit=str(gap.get("unit") or ""),
-        before=_number(gap.get("before")),
-        after=_number(gap.get("after")),
-        floor=_number(gap.get("floor")),
+        before=number(gap.get("before")),
+        after=number(gap.get("after")),
+        floor=number(gap.get("floor")),
         held_out=bool(gap.get("held_out")),
     )
-
-
-def _number(value: Any) -> float:
-    """A finite number, or NaN for null."""
-    return math.nan if value is None else float(value)

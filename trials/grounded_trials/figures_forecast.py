@@ -11,6 +11,7 @@ from grounded_trials.figures import Curve, Figure, Panel, legend
 from grounded_trials.figures_axis import fitted, without_astray
 from grounded_trials.findings import Findings
 from grounded_trials.forecast import SECONDS, forecast
+from grounded_trials.words import labelled, shown
 
 SPAN_S = 30.0  # of a long log that is drawn: the part with the largest errors
 LOGS = 2  # that are drawn; the table has all
@@ -52,8 +53,8 @@ def _figure(findings: Findings, name: str, title: str, trial: Trial) -> Figure |
             t, values = after.curve(i, trial.dt)
             curves.append(Curve(t + begin, values, "best", f"model {better.name}", 1.2))
         bounds = fitted(without_astray([curves[0].y], [c.y for c in curves[1:]]))
-        label = f"{state} [{unit}]"
-        panels.append(Panel(label, "time [s]", unit, tuple(curves), y_range=bounds))
+        label = labelled(state, unit)
+        panels.append(Panel(label, "time [s]", shown(unit), tuple(curves), y_range=bounds))
     caption = (
         f"Every {SECONDS:g} s the model starts from the measured state and gets the inputs that "
         "were sent: where the lines part, the model is wrong."

@@ -16,6 +16,7 @@ from grounded_trials.findings import (
     tracking_error,
 )
 from grounded_trials.scene import scene_of
+from grounded_trials.words import labelled, per_second, shown
 
 TIME = "time [s]"
 ITERATIONS = 5
@@ -50,7 +51,7 @@ def _plane(findings: Findings, a: int, b: int, plan: bool) -> Panel:
         width = {"best": 2.5, "desired": 1.0}.get(role, 1.5)
         curves.append(Curve(states[:, a], states[:, b], role, name, width, times[: len(states)]))
     names = list(task.model.states.items())
-    axis = [f"{name} [{unit}]" for name, unit in (names[a], names[b])]
+    axis = [labelled(name, unit) for name, unit in (names[a], names[b])]
     title, equal = f"{names[b][0]} over {names[a][0]}", plan and names[a][1] == names[b][1]
     return Panel(title, axis[0], axis[1], tuple(curves), equal=equal)
 
@@ -63,7 +64,7 @@ def _distance(findings: Findings, axes: list[int]) -> Panel:
     for role, run in _shown(findings):
         off = np.linalg.norm(tracking_error(task, run.trial)[:, axes], axis=1)
         curves.append(_over_time(off, task.dt, role, _name(role, run)))
-    return _timed(f"distance from the desired position [{unit}]", unit, curves, spare=50.0)
+    return _timed(labelled("distance from the desired position", unit), unit, curves, spare=50.0)
 
 
 def _shown(findings: Findings) -> list[tuple[str, Run]]:
@@ -100,7 +101,7 @@ def state_figure(findings: Findings) -> Figure | None:
             for role, words, states in _paths(findings)
             if role != "desired" or i in known
         ]
-        panels.append(_timed(f"{name} [{unit}]", unit, curves))
+        panels.append(_timed(labelled(name, unit), unit, curves))
     return Figure("states", "States over time", "", tuple(panels), legend(panels))
 
 
@@ -120,7 +121,7 @@ def error_figure(findings: Findings) -> Figure | None:
         gap = prediction_error(task, run)[:, i]
         words = f"real − predicted, {run.label}"
         curves.append(_over_time(gap, task.dt, "predicted", words, 1.0))
-        panels.append(_timed(f"{name} − target [{unit}]", unit, curves, spare=50.0))
+        panels.append(_timed(labelled(f"{name} − target", unit), unit, curves, spare=50.0))
     caption = "How far each run was from its target, and from what the model had predicted for it."
     return Figure("error", "Tracking error", caption, tuple(panels), legend(panels))
 
@@ -138,7 +139,7 @@ def input_figure(findings: Findings) -> Figure | None:
         ]
         limits = [v for v in (task.low[j], task.high[j]) if np.isfinite(v)]
         rules = [Rule(float(v), "limit", "limit") for v in limits]
-        panels.append(_timed(f"{name} [{unit}]", unit, curves, rules))
+        panels.append(_timed(labelled(name, unit), unit, curves, rules))
     return Figure("inputs", "Inputs", "", tuple(panels), legend(panels))
 
 
@@ -160,7 +161,7 @@ def bias_figure(findings: Findings) -> Figure | None:
             rest = best.explained[:, i] / task.dt
             words = f"left of the last, model {findings.better.name}"
             curves.append(_over_time(rest, task.dt, "predicted", words, 1.5))
-        panels.append(_timed(f"{name} [{unit} per s]", f"{unit} per s", curves))
+        panels.append(_timed(labelled(name, per_second(unit)), per_second(unit), curves))
     caption = (
         "What must be added to the crude model’s rate of change for it to replay the trial. A "
         "curve that keeps its shape over the iterations is a property of the system, not of a run."
@@ -185,4 +186,6 @@ def _timed(
     calm = [c.y for c in curves if c.role != "model"] + [np.array([r.y for r in rules])]
     wild = [c.y for c in curves if c.role == "model"]
     values = without_astray(calm, wild, spare) if any(len(v) for v in calm) else wild
-    return Panel(title, TIME, unit, tuple(curves), rules=tuple(rules), y_range=fitted(values))
+    return Panel(
+        title, TIME, shown(unit), tuple(curves), rules=tuple(rules), y_range=fitted(values)
+    )

@@ -10,7 +10,7 @@ import numpy as np
 from grounded.search import Tried
 from grounded_trials.figures import Band, Curve, Dot, Figure, Key, Panel, Rule
 from grounded_trials.findings import Findings, standard_error
-from grounded_trials.words import figure
+from grounded_trials.words import figure, verdict
 
 STEEP = 8.0  # worst over best utility from which on the axis is logarithmic
 NEAR = 4  # candidates from which on the better half has a panel of its own
@@ -26,8 +26,8 @@ def search_figure(findings: Findings) -> Figure | None:
     near = (_near(whole),) if whole.loss and len(tried) > NEAR else ()
     panels = (whole, *near, _steps(findings, number))
     key = [
-        Key("best", "accepted", "disc"),
-        Key("other", "not accepted", "ring"),
+        Key("best", "first or better", "disc"),
+        Key("other", "no better", "ring"),
         Key("predicted", "predicted by the model", "dash"),
         Key("best", "best so far"),
     ]
@@ -86,10 +86,10 @@ def _near(whole: Panel) -> Panel:
 def _dots(findings: Findings, tried: Tried, at: int) -> list[Dot]:
     candidate = tried.candidate
     real = figure(tried.utility)
-    verdict = {True: "accepted", False: "not accepted", None: "not decided"}[tried.accepted]
+    became = verdict(tried, tried is findings.history[-1])
     note = (
         f"{candidate.id}, iteration {candidate.iteration}, α = {candidate.alpha:g}\n"
-        f"utility {real}, predicted {figure(candidate.predicted_utility)}\n{verdict}"
+        f"utility {real}, predicted {figure(candidate.predicted_utility)}\n{became}"
     )
     error = standard_error(tried)
     if math.isfinite(error):

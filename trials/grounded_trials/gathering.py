@@ -27,6 +27,7 @@ from grounded_trials.better_model import Better, better_model
 from grounded_trials.diagnosis_file import Diagnosis, read_diagnosis
 from grounded_trials.findings import Findings, Log, Lost, Run
 from grounded_trials.mcap_log import read_trial
+from grounded_trials.next_step import next_command
 from grounded_trials.workspace import Workspace, candidate_of
 
 RUNAWAY = 1e15  # in any unit: the number of a run that diverged
@@ -60,7 +61,7 @@ def gather(workspace: Workspace) -> Findings:
         diagnosis=diagnosis,
         optimum=_optimum(workspace.reports),
         noise=utility_noise(now.history)[0],
-        next_command=_next(workspace, now, diagnosis),
+        next_command=next_command(workspace, now, diagnosis),
         better=better,
     )
 
@@ -213,19 +214,3 @@ def _method(workspace: Workspace) -> str:
         words.append("parameters refitted")
     words.append(f"{options.repeats} trial{'s' * (options.repeats > 1)} a candidate")
     return ", ".join(words)
-
-
-def _next(workspace: Workspace, now: Standing, diagnosis: Diagnosis | None) -> str:
-    """The command to type next."""
-    system = workspace.config.system
-    if now.phase == "await-trial":
-        return "grounded run" if system.command or system.model else "grounded ingest TRIAL.mcap"
-    if now.phase == "propose":
-        return "grounded propose"
-    if diagnosis is None:
-        return "grounded diagnose"
-    adopted = {str(effect["name"]) for effect in workspace.config.model.effects}
-    new = [effect for effect in diagnosis.effects if effect not in adopted]
-    if diagnosis.kind in ("effect", "several") and new:
-        return f"grounded adopt {new[0]}"
-    return "grounded export best --format npz"

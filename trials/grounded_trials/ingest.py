@@ -25,6 +25,7 @@ from grounded_trials.own_files import FILE_LIMIT, read_file
 from grounded_trials.proposing import standing_in
 from grounded_trials.signal_report import SignalReport
 from grounded_trials.trial_check import warnings_about
+from grounded_trials.words import verdict
 from grounded_trials.workspace import Workspace
 
 
@@ -37,10 +38,10 @@ class Ingested:
     known: bool  # it had been stored before
     candidate: str  # "" for data
     utility: float | None  # None for data; -inf for a run that failed
-    accepted: bool | None  # None: data, or more trials of the candidate are needed
+    accepted: bool | None  # None: data, or not decided yet
     warnings: tuple[str, ...]
     signals: tuple[SignalReport, ...]  # for a foreign log
-    base: str = ""  # the candidate that this one was to improve on, "" for the model's own policy
+    verdict: str = ""  # first, better, no better, waiting, in doubt, run again; "" for data
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +79,7 @@ def ingest_log(
     trial = replace(read.trial, id=added.id)
     warnings = (*read.warnings, *warnings_about(workspace, trial))
     tried = _tried(workspace, trial)
+    again = tried is not None and tried.accepted and trial.id != tried.trials[0].id
     return Ingested(
         trial=added.id,
         sha256=added.sha256,
@@ -87,7 +89,7 @@ def ingest_log(
         accepted=tried.accepted if tried else None,
         warnings=warnings,
         signals=read.signals,
-        base=tried.candidate.base if tried else "",
+        verdict="" if tried is None else "run again" if again else verdict(tried),
     )
 
 

@@ -12,9 +12,6 @@ import math
 from html import escape
 from importlib.resources import files
 
-from grounded_trials.diagnosis_file import Diagnosis
-from grounded_trials.figures_forecast import forecast_figures
-from grounded_trials.figures_gap import gap_figure
 from grounded_trials.figures_runs import (
     bias_figure,
     error_figure,
@@ -24,17 +21,15 @@ from grounded_trials.figures_runs import (
 )
 from grounded_trials.figures_search import search_figure
 from grounded_trials.findings import Findings
+from grounded_trials.page_diagnosis import gap_section, verdict_block
 from grounded_trials.page_parts import command, figure_block, role_styles
 from grounded_trials.page_tables import (
     candidate_table,
     channel_table,
-    effect_table,
     error_table,
-    forecast_table,
-    leftover_table,
     parameter_table,
 )
-from grounded_trials.words import figure
+from grounded_trials.words import count, figure
 
 
 def page(findings: Findings) -> str:
@@ -74,7 +69,7 @@ def _sections(findings: Findings) -> list[tuple[str, str]]:
         ("Tracking error", figure_block(error_figure(findings)) + error_table(findings)),
         ("Inputs", figure_block(input_figure(findings))),
         ("Bias", figure_block(bias_figure(findings))),
-        ("Gap", _gap(findings)),
+        ("Gap", gap_section(findings)),
         ("Task and model", _task(findings)),
         ("What to run next", _next(findings)),
     ]
@@ -87,7 +82,7 @@ def _head(findings: Findings) -> str:
         f"{'closed loop' if task.feedback else 'open loop'}; {findings.method}"
     )
     diagnosis = findings.diagnosis
-    verdict = f'<p class="verdict">{escape(diagnosis.sentence)}</p>' if diagnosis else ""
+    verdict = verdict_block(diagnosis) if diagnosis else ""
     return (
         f'<h1>{escape(findings.name)}</h1><p class="soft">{escape(about)}</p>'
         f"{_lost(findings)}{_tiles(findings)}{verdict}"
@@ -106,8 +101,8 @@ def _tiles(findings: Findings) -> str:
     if first is not None and best is not None and -math.inf < first.utility < 0:
         gain = 100 * (1 - best.utility / first.utility)
         tiles.append((f"{gain:.1f} %", "of the first policy’s loss is gone"))
-    iterations = findings.standing.iteration
-    tiles.append((str(findings.standing.trials), f"trials, {iterations} improvements"))
+    trials, better = findings.standing.trials, count(findings.standing.iteration, "improvement")
+    tiles.append((str(trials), f"trial{'s' * (trials != 1)}, {better}"))
     tiles.append((findings.standing.phase, "phase of the search"))
     inside = "".join(
         f'<div class="tile"><b>{escape(a)}</b><span>{escape(b)}</span></div>' for a, b in tiles
@@ -129,8 +124,8 @@ def _lost(findings: Findings) -> str:
 
 def _utility(findings: Findings) -> str:
     if not findings.history:
-        logs = len(findings.logs)
-        return f"<p>No candidate was proposed yet; {logs} log{'s' * (logs != 1)} of data.</p>"
+        logs = count(len(findings.logs), "log")
+        return f"<p>No candidate was proposed yet; {logs} of data.</p>"
     from grounded.certainty import last_improvement
 
     sure = last_improvement(findings.history)
@@ -140,41 +135,6 @@ def _utility(findings: Findings) -> str:
         f"{figure_block(search_figure(findings))}{sentence}"
         f"<details{opened}><summary>All candidates</summary>{candidate_table(findings)}</details>"
     )
-
-
-def _gap(findings: Findings) -> str:
-    diagnosis = findings.diagnosis
-    if diagnosis is None:
-        return (
-            "<p>Not diagnosed yet. This says where the model is wrong, and which effect makes it "
-            f"so: {command('grounded diagnose', 'c-diagnose')}</p>{_forecasts(findings)}"
-        )
-    stale = f"<p>{findings.stale} trials came after this diagnosis.</p>" if findings.stale else ""
-    return stale + _diagnosed(diagnosis) + _forecasts(findings)
-
-
-def _forecasts(findings: Findings) -> str:
-    parts = [
-        f"<h3>{escape(figure.title)}</h3>{figure_block(figure)}"
-        for figure in forecast_figures(findings)
-    ]
-    return "".join([*parts, forecast_table(findings)])
-
-
-def _diagnosed(diagnosis: Diagnosis) -> str:
-    parts = [f'<p class="verdict">{escape(diagnosis.sentence or diagnosis.kind)}</p>']
-    parts.append(figure_block(gap_figure(diagnosis)))
-    if diagnosis.ranking:
-        parts.append(f"<h3>Effects that were weighed</h3>{effect_table(diagnosis)}")
-    if diagnosis.leftover:
-        parts.append(f"<h3>What no known effect explains</h3>{leftover_table(diagnosis)}")
-    for group in diagnosis.indistinguishable:
-        parts.append(f"<p>These data can’t tell apart: {escape(', '.join(group))}.</p>")
-    gap = diagnosis.gap
-    if gap is not None:
-        held = "on trials that were held out" if gap.held_out else "on the trials that were fitted"
-        parts.append(f'<p class="soft">Gap: {escape(gap.unit)}, {held}.</p>')
-    return "".join(parts)
 
 
 def _task(findings: Findings) -> str:

@@ -18,14 +18,13 @@ from grounded_trials.findings import (
 )
 from grounded_trials.forecast import SECONDS, forecast_error
 from grounded_trials.page_parts import table
-from grounded_trials.words import figure
+from grounded_trials.words import figure, shown, verdict, with_unit
 
 INTERVAL = 1.96  # standard deviations of a 95 % interval
 
 
 def candidate_table(findings: Findings) -> str:
     """Every candidate with its trials."""
-    verdicts = {True: "accepted", False: "not accepted", None: "not decided"}
     rows: list[tuple[str, ...]] = []
     strong, best = -1, findings.standing.incumbent
     for tried in findings.history:
@@ -37,11 +36,11 @@ def candidate_table(findings: Findings) -> str:
                 c.id,
                 str(c.iteration),
                 f"{c.alpha:g}",
-                f"{c.damping:.2g}",
+                f"{c.damping:.2g}" if c.base else "-",
                 figure(c.predicted_utility),
                 figure(tried.utility),
                 figure(standard_error(tried), 2),
-                verdicts[tried.accepted],
+                verdict(tried, tried is findings.history[-1]),
                 " ".join(t.id for t in tried.trials) or "none",
             )
         )
@@ -74,7 +73,7 @@ def error_table(findings: Findings) -> str:
     ]
     columns = [(f"{what}, {run.candidate.id}", get(run)) for what, get in measures for run in runs]
     rows = [
-        (name, unit, *(figure(float(values[i]), 3) for _, values in columns))
+        (name, shown(unit), *(figure(float(values[i]), 3) for _, values in columns))
         for i, (name, unit) in enumerate(task.model.states.items())
     ]
     return table("errors", ("state", "unit", *(name for name, _ in columns)), rows)
@@ -94,7 +93,7 @@ def forecast_table(findings: Findings) -> str:
         name = trial.id or trial.candidate
         columns += [(f"{name}, {words}", forecast_error(p, trial)) for words, p in planners]
     rows = [
-        (state, unit, *(figure(float(values[i]), 3) for _, values in columns))
+        (state, shown(unit), *(figure(float(values[i]), 3) for _, values in columns))
         for i, (state, unit) in enumerate(findings.task.model.states.items())
     ]
     header = ("state", "unit", *(name for name, _ in columns))
@@ -124,7 +123,7 @@ def _params(ranked: Ranked) -> str:
 
 
 def _value(v: Value) -> str:
-    return f"{v.name} = {_interval(v)} {v.unit}"
+    return with_unit(f"{v.name} = {_interval(v)}", v.unit)
 
 
 def _interval(v: Value) -> str:
@@ -139,7 +138,7 @@ def leftover_table(diagnosis: Diagnosis) -> str:
     rows = [
         (
             left.channel,
-            f"{figure(left.size, 3)} {left.unit}",
+            with_unit(figure(left.size, 3), left.unit),
             left.when or "-",
             f"{100 * left.share:.0f} %" if math.isfinite(left.share) else "-",
             figure(left.evidence, 3),
@@ -161,7 +160,7 @@ def parameter_table(findings: Findings) -> str:
             "free" if param.low is None and param.high is None else _range(param.low, param.high)
         )
         found = _interval(estimated[name]) if name in estimated else "-"
-        rows.append((name, figure(param.value), param.unit, changed or "-", limits, found))
+        rows.append((name, figure(param.value), shown(param.unit), changed or "-", limits, found))
     if not rows:
         return "<p>The model has no parameters.</p>"
     header = ("parameter", "value", "unit", "in model.py", "bounds", "diagnosed, 95 %")
@@ -177,11 +176,11 @@ def channel_table(findings: Findings) -> str:
         weight = f"{reward.state[i]:g}" + (
             f", terminal {reward.terminal[i]:g}" if reward.terminal[i] else ""
         )
-        rows.append((name, "state", unit, weight, "-", "-"))
+        rows.append((name, "state", shown(unit), weight, "-", "-"))
     for j, (name, unit) in enumerate(task.model.inputs.items()):
         weight = f"{reward.input[j]:g}, change {reward.input_change[j]:g}"
         delay = f"{task.latency[j]:g} s" if task.latency[j] else "-"
-        rows.append((name, "input", unit, weight, _range(task.low[j], task.high[j]), delay))
+        rows.append((name, "input", shown(unit), weight, _range(task.low[j], task.high[j]), delay))
     return table("channels", ("name", "kind", "unit", "weight", "limits", "latency"), rows)
 
 

@@ -28,6 +28,7 @@ from grounded_trials.findings import Findings, Log, Run, selection, tracked
 from grounded_trials.recording_layout import blueprint
 from grounded_trials.recording_words import summary
 from grounded_trials.scene import Scene, scene_of
+from grounded_trials.words import labelled, per_second
 
 ITERATIONS = 4  # of the bias, in one plot
 FINE = 600  # steps; the bias of longer trials is averaged over a few steps, or files get large
@@ -176,7 +177,7 @@ def _trial(stream: Any, findings: Findings, scene: Scene, run: Run) -> None:
     marks.path(stream, f"{at}/predicted", predicted, "predicted", 1.0)
     _signals(stream, findings, at, run.trial, run.residual)
     if run.explained is not None:
-        rates = [f"{n} [{u} per s]" for n, u in task.model.states.items()]
+        rates = [labelled(n, per_second(u)) for n, u in task.model.states.items()]
         marks.columns(stream, f"{at}/explained", *rate(run.explained, task.dt), rates)
 
 
@@ -192,9 +193,9 @@ def _log(stream: Any, findings: Findings, scene: Scene, log: Log) -> None:
 def _signals(stream: Any, findings: Findings, at: str, trial: Trial, residual: Array) -> None:
     """States, inputs and bias, each as one entity with named columns."""
     model, dt = findings.task.model, findings.task.dt
-    states = [f"{n} [{u}]" for n, u in model.states.items()]
-    inputs = [f"{n} [{u}]" for n, u in model.inputs.items()]
-    rates = [f"{n} [{u} per s]" for n, u in model.states.items()]
+    states = [labelled(n, u) for n, u in model.states.items()]
+    inputs = [labelled(n, u) for n, u in model.inputs.items()]
+    rates = [labelled(n, per_second(u)) for n, u in model.states.items()]
     marks.columns(stream, f"{at}/state", trial.states, dt, states)
     marks.columns(stream, f"{at}/input", trial.inputs, dt, inputs)
     marks.columns(stream, f"{at}/bias", *rate(residual, dt), rates)

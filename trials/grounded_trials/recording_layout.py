@@ -10,6 +10,7 @@ import numpy as np
 from grounded.frozen import Array
 from grounded_trials.findings import Findings
 from grounded_trials.scene import Scene
+from grounded_trials.words import labelled, per_second
 
 TRIALS = 60  # that get a tab of their own
 NAMES = {"state": "states", "input": "inputs", "bias": "bias"}
@@ -21,9 +22,9 @@ def blueprint(findings: Findings, scene: Scene) -> Any:
     import rerun.blueprint as rrb
 
     model = findings.task.model
-    states = [_plot(f"/state/{n}", f"{n} [{u}]") for n, u in model.states.items()]
-    inputs = [_plot(f"/input/{n}", f"{n} [{u}]") for n, u in model.inputs.items()]
-    biases = [_plot(f"/bias/{n}", f"{n} [{u} per s]") for n, u in model.states.items()]
+    states = [_plot(f"/state/{n}", labelled(n, u)) for n, u in model.states.items()]
+    inputs = [_plot(f"/input/{n}", labelled(n, u)) for n, u in model.inputs.items()]
+    biases = [_plot(f"/bias/{n}", labelled(n, per_second(u))) for n, u in model.states.items()]
     tabs = [
         _overview(findings, scene),
         rrb.Grid(*states, name="States"),
@@ -47,8 +48,10 @@ def _overview(findings: Findings, scene: Scene) -> Any:
     model = findings.task.model
     chosen = _interesting(findings)
     named = [(f"/state/{n}", f"{n} [{model.states[n]}]") for n in chosen]
-    named += [(f"/input/{n}", f"{n} [{u}]") for n, u in list(model.inputs.items())[:2]]
-    named += [(f"/bias/{n}", f"bias of {n} [{model.states[n]} per s]") for n in chosen[:2]]
+    named += [(f"/input/{n}", labelled(n, u)) for n, u in list(model.inputs.items())[:2]]
+    named += [
+        (f"/bias/{n}", labelled(f"bias of {n}", per_second(model.states[n]))) for n in chosen[:2]
+    ]
     plots = [_plot(origin, name, legend=False) for origin, name in named]
     left = rrb.Vertical(
         _space(findings, scene, "/", ["/paths/**"], _axes(scene)),
@@ -68,7 +71,7 @@ def _overview(findings: Findings, scene: Scene) -> Any:
 
 
 def _axes(scene: Scene) -> str:
-    axes = [f"{name} [{unit}]" for name, unit in zip(scene.names, scene.units, strict=True)]
+    axes = [labelled(name, unit) for name, unit in zip(scene.names, scene.units, strict=True)]
     return "Paths: " + " over ".join(reversed(axes)) if len(axes) == 2 else "Paths"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from grounded_trials.findings import Findings
+from grounded_trials.words import count
 
 
 def summary(findings: Findings) -> str:
@@ -10,8 +11,8 @@ def summary(findings: Findings) -> str:
     task, best, first = findings.task, findings.best, findings.first
     lines = [
         f"# {findings.name}",
-        f"{task.model.name}: {task.horizon} steps of {task.dt:g} s, {len(findings.runs)} trials, "
-        f"{len(findings.logs)} logs of data",
+        f"{task.model.name}: {task.horizon} steps of {task.dt:g} s, "
+        f"{count(len(findings.runs), 'trial')}, {count(len(findings.logs), 'log')} of data",
         "",
         "| | candidate | utility |",
         "|---|---|---|",

@@ -10,6 +10,7 @@ import numpy as np
 
 from grounded.search import Tried
 from grounded_trials.diagnosis_file import Diagnosis, Value
+from grounded_trials.diagnosis_words import error_lines
 from grounded_trials.findings import (
     Findings,
     prediction_error,
@@ -19,12 +20,15 @@ from grounded_trials.findings import (
     tracking_error,
 )
 from grounded_trials.forecast import SECONDS, forecast_error
-from grounded_trials.words import figure
+from grounded_trials.next_step import folded
+from grounded_trials.words import count, figure, per_second, shown, verdict, with_unit
 
 WIDTH = 80
 ROWS = 12  # candidates in the table; the others are counted
 ITERATIONS = 5  # of the bias
 EFFECTS = 5
+VALUES = 34  # columns for an effect's parameters
+LEGEND = "alpha: the part of the step that was run; +-: standard error"
 
 Table = Callable[[Sequence[Sequence[str]], Sequence[str]], str]
 
@@ -42,7 +46,8 @@ def report_text(findings: Findings, table: Table, bars: Callable[[Sequence[float
         parts += [_trajectories(findings, table), _biases(findings, table)]
     parts.append(_diagnosis(findings.diagnosis, table))
     if findings.stale:
-        parts[-1] += f"\n  {findings.stale} trials came after this diagnosis: grounded diagnose"
+        after = f"{count(findings.stale, 'trial')} came after this diagnosis: grounded diagnose"
+        parts[-1] += f"\n  {after}"
     if findings.logs:
         parts.append(_logs(findings, table))
     if findings.lost:
@@ -50,7 +55,7 @@ def report_text(findings: Findings, table: Table, bars: Callable[[Sequence[float
         for one in findings.lost:
             lines += _wrapped(f"{one.file}: {one.reason}", "  ")
         parts.append("\n".join(lines))
-    parts.append(f"next: {findings.next_command}")
+    parts.append(folded(findings.next_command))
     return "\n\n".join(parts)
 
 
@@ -60,10 +65,10 @@ def _head(findings: Findings) -> str:
     text = (
         f"{findings.name}: {task.model.name}, {task.horizon} steps of {task.dt:g} s "
         f"({task.horizon * task.dt:g} s), {'closed loop' if task.feedback else 'open loop'}; "
-        f"{runs} trial{'' if runs == 1 else 's'}"
+        f"{count(runs, 'trial')}"
     )
     if findings.logs:
-        text += f", {len(findings.logs)} log{'' if len(findings.logs) == 1 else 's'} of data"
+        text += f", {count(len(findings.logs), 'log')} of data"
     if findings.effects:
         text += "; adopted: " + ", ".join(findings.effects)
     return "\n".join(wrap(text, WIDTH))
@@ -73,10 +78,10 @@ def _utilities(findings: Findings, table: Table, bars: Callable[[Sequence[float]
     history = findings.history
     if not history:
         return "utility\n  no candidate was proposed yet"
-    shown, left = _rows(history)
-    rows = [_candidate(t, t is history[-1]) for t in shown]
+    few, left = _rows(history)
+    rows = [_candidate(t, t is history[-1]) for t in few]
     header = ("candidate", "iter.", "alpha", "predicted", "real", "+-", "trials", "")
-    lines = ["utility", table(rows, header)]
+    lines = ["utility", table(rows, header), f"  {LEGEND}"]
     if left:
         lines.append(f"  ({left} more that did not improve, or between: grounded status)")
     spark = bars(spaced([t.utility for t in history if t.utilities][-WIDTH // 2 :]))
@@ -120,11 +125,6 @@ def _rows(history: Sequence[Tried]) -> tuple[list[Tried], int]:
 
 
 def _candidate(tried: Tried, last: bool) -> tuple[str, ...]:
-    verdict = {True: "better", False: "no better", None: "waiting" if last else "no trial"}[
-        tried.accepted
-    ]
-    if tried.accepted and not tried.candidate.base:
-        verdict = "first"
     error = standard_error(tried)
     return (
         tried.candidate.id,
@@ -134,7 +134,7 @@ def _candidate(tried: Tried, last: bool) -> tuple[str, ...]:
         figure(tried.utility),
         figure(error, 2),
         str(len(tried.trials)),
-        verdict,
+        verdict(tried, last),
     )
 
 
@@ -148,7 +148,7 @@ def _trajectories(findings: Findings, table: Table) -> str:
     columns = [rms(tracking_error(task, run.trial)) for run in runs]
     columns += [rms(prediction_error(task, run)) for run in runs]
     rows = [
-        (name, unit, *(figure(float(c[i]), 3) for c in columns))
+        (name, shown(unit), *(figure(float(c[i]), 3) for c in columns))
         for i, (name, unit) in enumerate(task.model.states.items())
     ]
     ids = [run.candidate.id for run in runs]
@@ -164,7 +164,7 @@ def _biases(findings: Findings, table: Table) -> str:
         return "bias\n  no whole trial yet"
     columns = [rms(run.residual) / task.dt for run in runs]
     rows = [
-        (name, f"{unit} per s", *(figure(float(c[i]), 3) for c in columns))
+        (name, per_second(unit), *(figure(float(c[i]), 3) for c in columns))
         for i, (name, unit) in enumerate(task.model.states.items())
     ]
     header = ("state", "unit", *(f"iter. {run.candidate.iteration}" for run in runs))
@@ -181,36 +181,50 @@ def _diagnosis(diagnosis: Diagnosis | None, table: Table) -> str:
             f"  {gap.horizon_s:g} s ahead: {figure(gap.before, 3)} before, {figure(gap.after, 3)} "
             f"after, floor {figure(gap.floor, 3)} ({gap.unit})"
         )
+    for title, text in error_lines(diagnosis):
+        lines += _wrapped(f"{title}: {text}", "  ")
     if diagnosis.ranking:
         rows = [
             (
                 r.effect[:30],
                 figure(r.evidence, 3),
                 figure(r.gap_after, 3),
-                ", ".join(map(_value, r.params))[:34].ljust(34),
+                _fitting(list(map(_value, r.params)), VALUES).ljust(VALUES),
             )
             for r in diagnosis.ranking[:EFFECTS]
         ]
-        lines.append(table(rows, ("effect", "nats", "gap after", "parameters".ljust(34))))
+        lines.append(table(rows, ("effect", "nats", "gap after", "parameters".ljust(VALUES))))
     return "\n".join(lines)
+
+
+def _fitting(values: list[str], width: int) -> str:
+    """As many of them as fit, and dots for the others: half a number would be a wrong one."""
+    for kept in range(len(values), 0, -1):
+        text = ", ".join(values[:kept]) + ", ..." * (kept < len(values))
+        if len(text) <= width:
+            return text
+    return "..." if values else ""
 
 
 def _logs(findings: Findings, table: Table) -> str:
     """How far the crude model is off 1 s ahead on logs that ran no candidate."""
-    shown = findings.logs[-ITERATIONS:]
-    columns = [forecast_error(findings.crude, log.trial) for log in shown]
+    logs = findings.logs[-ITERATIONS:]
+    columns = [forecast_error(findings.crude, log.trial) for log in logs]
     rows = [
-        (name, unit, *(figure(float(c[i]), 3) for c in columns))
+        (name, shown(unit), *(figure(float(c[i]), 3) for c in columns))
         for i, (name, unit) in enumerate(findings.task.model.states.items())
     ]
     title = f"data: error of the crude model {SECONDS:g} s ahead, rms\n"
-    return title + table(rows, ("state", "unit", *(log.trial.id for log in shown)))
+    return title + table(rows, ("state", "unit", *(log.trial.id for log in logs)))
 
 
 def _value(value: Value) -> str:
     spread = f" +- {value.std:.1g}" if math.isfinite(value.std) else ""
-    return f"{value.name} = {value.value:.3g}{spread}"
+    return with_unit(f"{value.name} = {value.value:.3g}{spread}", value.unit)
 
 
 def _wrapped(text: str, indent: str) -> list[str]:
-    return wrap(text, WIDTH, initial_indent=indent, subsequent_indent=indent + "  ")
+    """Lines of a text that do not part a number from its %."""
+    joined = text.replace(" %", "\xa0%")
+    lines = wrap(joined, WIDTH, initial_indent=indent, subsequent_indent=indent + "  ")
+    return [line.replace("\xa0", " ") for line in lines]

@@ -1,8 +1,12 @@
-"""Numbers in words for people."""
+"""Numbers, units and verdicts in words for people."""
 
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from grounded.search import Tried
 
 
 def figure(value: float | None, digits: int = 4) -> str:
@@ -15,3 +19,52 @@ def figure(value: float | None, digits: int = 4) -> str:
         return f"{value:.{digits - 1}e}"
     decimals = max(digits - 1 - math.floor(math.log10(abs(value))) if value else digits - 1, 0)
     return f"{value:,.{decimals}f}"
+
+
+def percent(share: float) -> str:
+    """A share as a percentage; a tenth of a percent where it is small or nearly all."""
+    if math.isnan(share):
+        return "-"
+    value = 100 * share
+    return f"{value:.0f} %" if 10 <= value <= 90 else f"{value:.1f} %"
+
+
+def count(number: int, word: str, many: str = "") -> str:
+    """`1 trial`, `2 trials`; `many` where the plural is another one."""
+    return f"{number} {word if number == 1 else many or word + 's'}"
+
+
+def shown(unit: str) -> str:
+    """A unit for a table: nothing where there is none, for a "1" beside a number is a digit."""
+    return "" if unit == "1" else unit
+
+
+def with_unit(text: str, unit: str) -> str:
+    """A number and its unit."""
+    return f"{text} {shown(unit)}".rstrip()
+
+
+def labelled(name: str, unit: str) -> str:
+    """`v [m/s]`; the name alone where there is no unit."""
+    return f"{name} [{unit}]" if shown(unit) else name
+
+
+def per_second(unit: str) -> str:
+    """The unit of a rate of change."""
+    return f"{unit} per s" if shown(unit) else "1/s"
+
+
+def verdict(tried: Tried, last: bool = True) -> str:
+    """What became of a candidate: first, better, no better; or why that is not decided.
+
+    Args:
+        tried: the candidate with its trials.
+        last: whether it is the latest one; an earlier one without a trial will get none.
+    """
+    if tried.in_doubt:
+        return "in doubt"
+    if tried.accepted is None:
+        return "waiting" if last or tried.trials else "no trial"
+    if not tried.accepted:
+        return "no better"
+    return "better" if tried.candidate.base else "first"

@@ -1,0 +1,91 @@
+"""The last line of an output is the command to type next, the same one wherever it is asked."""
+
+import json
+import shlex
+from pathlib import Path
+
+import pytest
+
+from cli import grounded
+from grounded_trials.next_step import folded
+from reported import DIAGNOSIS, cart, copied
+from workspaces import make
+
+__all__ = ["cart"]
+
+
+def last(done):
+    """The command of the `next:` line, a continued one in one piece."""
+    assert done.code == 0, done.err
+    text = done.out.replace(" \\\n", " ").rstrip().splitlines()[-1]
+    assert text.startswith("next: ")
+    return " ".join(text.removeprefix("next: ").split())
+
+
+def diagnosed(folder: Path, **changes):
+    document = {**DIAGNOSIS, **changes}
+    (folder / "reports" / "diagnosis.json").write_text(json.dumps(document))
+
+
+@pytest.mark.parametrize("command", ["status", "report", "learn", "propose"])
+def test_every_command_says_the_same_once_the_search_has_ended(cart, command):
+    assert last(grounded("-C", cart, command)) == "grounded adopt viscous_friction:v"
+
+
+def test_all_claimed_effects_are_adopted_at_once(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    names = ["viscous_friction:v", "delay:force"]
+    diagnosed(folder, verdict={"kind": "several", "effects": names, "sentence": "Two."})
+    command = last(grounded("-C", folder, "status"))
+    assert command == "grounded adopt viscous_friction:v delay:force"
+    done = grounded("-C", folder, *shlex.split(command)[1:], "--json").json
+    assert [effect["name"] for effect in done["effects"]] == names
+    assert done["params"] == {"mass": 1.4}
+    assert last(grounded("-C", folder, "status")) == "grounded propose"
+
+
+def test_nothing_is_adopted_where_one_name_is_wrong(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    before = (folder / "grounded.toml").read_text()
+    done = grounded("-C", folder, "adopt", "viscous_friction:v", "delay:forse")
+    assert done.code == 1 and "did you mean 'delay:force'" in done.err
+    assert (folder / "grounded.toml").read_text() == before
+
+
+def test_numbers_that_are_wrong_are_fitted(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    verdict = {"kind": "effect", "effects": ["parameter:mass"], "sentence": "One."}
+    diagnosed(folder, verdict=verdict)
+    assert last(grounded("-C", folder, "status")) == "grounded fit"
+
+
+def test_a_diagnosis_of_another_model_is_made_again(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    diagnosed(folder, diagnosed={"trials": [], "adopted": [], "params": {"mass": 9.0}})
+    assert last(grounded("-C", folder, "status")) == "grounded diagnose"
+
+
+def test_nothing_claimed_nothing_to_adopt(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    diagnosed(folder, verdict={"kind": "none", "effects": [], "sentence": "None."})
+    assert last(grounded("-C", folder, "status")) == "grounded export best --format npz"
+
+
+def test_a_damaged_diagnosis_is_made_again(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    (folder / "reports" / "diagnosis.json").write_text("[")
+    assert last(grounded("-C", folder, "status")) == "grounded diagnose"
+
+
+def test_a_new_workspace_begins_with_propose(tmp_path):
+    folder = make(tmp_path / "w").folder
+    assert last(grounded("-C", folder, "status")) == "grounded propose"
+
+
+def test_a_long_command_is_broken_where_a_shell_allows_it():
+    names = [f"first_order_lag:input_number_{k}" for k in range(6)]
+    command = " ".join(["grounded adopt", *names])
+    text = folded(command)
+    assert max(map(len, text.splitlines())) <= 80
+    assert shlex.split(text.removeprefix("next: ").replace("\\\n", " ")) == command.split()
+    assert folded("grounded run") == "next: grounded run"

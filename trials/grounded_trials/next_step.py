@@ -1,0 +1,54 @@
+"""The command to type next: one answer for every command and the page."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from grounded.search import Standing
+from grounded_trials.diagnosis_file import Diagnosis
+from grounded_trials.workspace import Workspace
+
+WIDTH = 80
+EXPORT = "grounded export best --format npz"
+
+
+def next_command(workspace: Workspace, now: Standing, diagnosis: Diagnosis | None) -> str:
+    """What a person does next, given where the search stands and what was diagnosed."""
+    if now.phase == "await-trial":
+        system = workspace.config.system
+        return "grounded run" if system.command or system.model else "grounded ingest TRIAL.mcap"
+    if now.phase == "propose":
+        return "grounded propose"
+    if diagnosis is None or _outdated(workspace, diagnosis):
+        return "grounded diagnose"
+    return after_diagnosis(workspace, diagnosis.kind, diagnosis.effects) or EXPORT
+
+
+def after_diagnosis(workspace: Workspace, kind: str, effects: Sequence[str]) -> str:
+    """What to do about the effects that a diagnosis claims, "" where there is nothing to do."""
+    adopted = {str(effect["name"]) for effect in workspace.config.model.effects}
+    new = [name for name in effects if name not in adopted]
+    if kind not in ("effect", "several") or not new:
+        return ""
+    if all(name.startswith("parameter:") for name in new):
+        return "grounded fit"  # the model's form is right: all of its numbers at once
+    return " ".join(["grounded adopt", *new])
+
+
+def folded(command: str, lead: str = "next: ") -> str:
+    """A command after its lead, broken as a shell allows where it is wider than a terminal."""
+    lines = [lead]
+    for word in command.split(" "):
+        if len(lines[-1]) + len(word) + 3 > WIDTH and lines[-1].strip():
+            lines[-1] = lines[-1].rstrip() + " \\"
+            lines.append("    ")
+        lines[-1] += word + " "
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def _outdated(workspace: Workspace, diagnosis: Diagnosis) -> bool:
+    """Whether it is about another model: effects or parameters were taken over since."""
+    model = workspace.config.model
+    adopted = tuple(str(effect["name"]) for effect in model.effects)
+    params = dict(diagnosis.model_params) if diagnosis.model_params is not None else None
+    return adopted != diagnosis.adopted or params not in (None, dict(model.params))
