@@ -8,8 +8,8 @@ Two numbers say which step is tried next on the real system:
 
 At lambda = 1 the step is the cautious one that a crude model deserves; at 0 it is the paper's, DDP
 to convergence. Neither is right for every robot: on a car with unmodelled effects converged steps
-stall, and on the aircraft, whose model keeps its promises to a per cent, damped ones are still 20
-to 40 % from the optimum after five iterations (docs/experiments.md). So the promise decides
+stall, and on the aircraft, whose model keeps its promises to a per cent, damped ones are still 4
+to 172 % from the optimum after five iterations (docs/experiments.md). So the promise decides
 (Levenberg 1944, Marquardt 1963; the ratio of Conn, Gould & Toint, *Trust-Region Methods*, 2000,
 section 6.1):
 
