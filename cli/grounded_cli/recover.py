@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from grounded_cli.options import as_json
-from grounded_cli.terminal import progress, say, show, show_json
+from grounded_cli.terminal import field, progress, say, show, show_json
+from grounded_trials.words import count
+
+if TYPE_CHECKING:
+    from grounded_trials.recover import Recovery
 
 
 @click.command("recover")
@@ -25,26 +30,83 @@ def command(log: str, output: str | None, json_: bool) -> None:
     target = Path(output) if output else source.with_name(f"{source.stem}-recovered.mcap")
     with progress(f"reading {log}"):
         found = recover_log(source, target)
-    saved = sum(found.messages.values())
     if json_:
-        show_json(
-            {
-                "file": str(found.target),
-                "messages": dict(found.messages),
-                "lost_messages": dict(found.lost_messages),
-                "losses": list(found.losses),
-                "unverified": found.unverified,
-                "complete": found.complete,
-            }
-        )
+        show_json(_document(found))
     else:
-        for loss in found.losses:
-            say(f"lost: {loss}")
-        show(f"{saved} messages are saved in {found.target}")
-        for topic, count in found.messages.items():
-            lost = found.lost_messages.get(topic, 0)
-            show(f"  {topic}: {count}" + (f", {lost} lost" if lost else ""))
-        if found.unverified:
-            show(f"  {found.unverified} of them carry no checksum that could vouch for them")
+        _tell(found)
     if not found.complete:
         click.get_current_context().exit(3)
+
+
+def _document(found: Recovery) -> dict[str, Any]:
+    document: dict[str, Any] = {
+        "file": str(found.target),
+        "messages": dict(found.messages),
+        "lost_messages": dict(found.lost_messages),
+        "losses": list(found.losses),
+        "unverified": found.unverified,
+        "duration_s": found.duration_s,
+        "complete": found.complete,
+    }
+    if _is_trial(found):
+        document |= {
+            "candidate": found.candidate or None,
+            "steps": found.steps,
+            "planned_steps": found.planned,
+            "hole": found.hole,
+        }
+    return document
+
+
+def _tell(found: Recovery) -> None:
+    for loss in found.losses:
+        say(field("lost", loss))
+    if found.complete:
+        show(f"{found.source} is not damaged; {found.target} is a copy")
+    saved = count(sum(found.messages.values()), "message")
+    show(field("saved", f"{saved} in {found.duration_s:.2f} s: {found.target}"))
+    for topic, number in found.messages.items():
+        lost = found.lost_messages.get(topic, 0)
+        show(f"  {topic}: {number}" + (f", {lost} lost" if lost else ""))
+    if found.unverified:
+        these = "1 message has" if found.unverified == 1 else f"{found.unverified} messages have"
+        show(field("unchecked", f"{these} no checksum that could vouch for the numbers"))
+    if _is_trial(found):
+        show(field("trial", _steps(found)))
+    show(f"\n{_next(found)}")
+
+
+def _is_trial(found: Recovery) -> bool:
+    from grounded_trials.own_files import TRIAL
+
+    return found.format == TRIAL
+
+
+def _steps(found: Recovery) -> str:
+    """How much of a trial of ours is there."""
+    ran = f"of {found.candidate}" if found.candidate else "that ran no candidate"
+    planned = f" of {found.planned}" if found.planned is not None else ""
+    return f"{found.steps}{planned} steps of a trial {ran}{', with a hole' * found.hole}"
+
+
+def _next(found: Recovery) -> str:
+    """What to do with the file."""
+    from grounded_trials.own_files import CANDIDATE
+
+    if found.format == CANDIDATE:
+        return (
+            f"a candidate is not for repair: remove {found.source}\n"
+            "next: grounded propose   writes the one that is waiting again"
+        )
+    if not _is_trial(found):
+        return f"next: grounded inspect {found.target}"
+    if found.hole:
+        again = f"\nnext: grounded run {found.candidate}" * bool(found.candidate)
+        return f"a trial with a hole can't be used: it has to be run again{again}"
+    short = found.planned is None or found.steps < found.planned
+    if found.complete or not (found.candidate and short):
+        return f"next: grounded ingest {found.target}"
+    return (
+        f"next: grounded ingest --data {found.target}   for fit and diagnose only;\n"
+        "without --data it counts as a run that failed, as one that ended early does"
+    )

@@ -82,9 +82,9 @@ def field(label: str, text: str, indent: str = "") -> str:
     head = f"{indent}{label:<10} "
     under = " " * len(head)
     whole = text.replace(" %", "\xa0%")
-    lines = textwrap.wrap(
-        whole, 80, initial_indent=head, subsequent_indent=under, break_on_hyphens=False
-    )
+    wrapper = textwrap.TextWrapper(80, initial_indent=head, subsequent_indent=under)
+    wrapper.break_on_hyphens = wrapper.break_long_words = False  # a path stays in one piece
+    lines = wrapper.wrap(whole)
     return "\n".join(lines or [head.rstrip()]).replace("\xa0", " ")
 
 

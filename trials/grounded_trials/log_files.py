@@ -78,5 +78,9 @@ def open_log(path: Path) -> BinaryIO:
     """
     try:
         return path.open("rb")
+    except FileNotFoundError:
+        raise GroundedError(f"{path} does not exist") from None
+    except IsADirectoryError:
+        raise GroundedError(f"{path} is a folder: name a file in it") from None
     except OSError as error:
         raise GroundedError(f"{path} can't be read: {error.strerror}") from None

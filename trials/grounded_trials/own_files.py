@@ -208,8 +208,8 @@ class OwnFile:
             k = int(np.argmax(off))
             raise GroundedError(
                 f"{self.name}: {topic} sample {k} is stamped {times[k]:.4f} s, its place on the "
-                f"grid of {dt} s is {k * dt:.4f} s: samples are missing, or came late. Map the log "
-                "with a [log] table, which resamples"
+                f"grid of {dt} s is {k * dt:.4f} s: samples are missing, or came late. A trial "
+                "needs one at every step: run it again"
             )
 
 

@@ -10,14 +10,15 @@ and channels are taken from wherever they still stand, the summary included.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO
 
 import numpy as np
 
 from grounded.errors import GroundedError
+from grounded_trials.candidate_file import read_candidate
 from grounded_trials.log_files import open_log
 from grounded_trials.mcap_records import (
     Attachment,
@@ -29,8 +30,10 @@ from grounded_trials.mcap_records import (
     Schema,
 )
 from grounded_trials.mcap_writer import LIBRARY, CopyWriter
+from grounded_trials.own_files import TRIAL
 from grounded_trials.recover_salvage import Salvage
 from grounded_trials.store import sync_folder
+from grounded_trials.words import count
 
 
 @dataclass(frozen=True)
@@ -43,6 +46,12 @@ class Recovery:
     lost_messages: Mapping[str, int]  # known to be lost, by topic
     losses: tuple[str, ...]  # sentences; empty: the file was not damaged
     unverified: int  # saved messages without a checksum that fits
+    duration_s: float  # from the first to the last saved message
+    format: str = ""  # of a file of ours: TRIAL or CANDIDATE; "" for any other log
+    candidate: str = ""  # that a trial of ours ran
+    steps: int = 0  # of it that are saved
+    planned: int | None = None  # steps of the policy that it ran, where that is saved too
+    hole: bool = False  # steps before the last one are missing: it can't be read as a trial
 
     @property
     def complete(self) -> bool:
@@ -78,12 +87,50 @@ def recover_log(source: str | Path, target: str | Path) -> Recovery:
     if not copy.anything:
         target.unlink()
         why = salvage.losses[0] if salvage.losses else "it is a log without messages"
-        raise GroundedError(f"{source}: nothing can be saved; {why}")
+        raise GroundedError(f"{source}: there is nothing to save: {why}")
     losses = list(salvage.losses)
     if copy.homeless:
-        losses.append(f"{copy.homeless} messages belong to channels whose definition is lost")
+        these = count(copy.homeless, "message")
+        losses.append(f"{these} of topics whose name and type are lost")
+    losses += copy.without(salvage.dropped)
     lost = Counter({copy.topic(c): n for c, n in salvage.lost_messages.items()})
-    return Recovery(source, target, copy.counts, lost, tuple(losses), salvage.unverified)
+    found = Recovery(
+        source, target, copy.counts, lost, tuple(losses), salvage.unverified, copy.duration_s
+    )
+    return _own(found, copy)
+
+
+def _own(found: Recovery, copy: _Copy) -> Recovery:
+    """What was saved of a file of ours, in steps."""
+    kind = copy.meta.get("format", "")
+    if kind != TRIAL:
+        return replace(found, format=kind)
+    states, inputs = (found.messages.get(topic, 0) for topic in ("/state", "/input"))
+    return replace(
+        found,
+        format=kind,
+        candidate=copy.meta.get("candidate", ""),
+        steps=max(0, min(states - 1, inputs)),
+        planned=_horizon(copy.policy) if copy.policy else None,
+        hole=_hole(copy, states),
+    )
+
+
+def _hole(copy: _Copy, states: int) -> bool:
+    """Whether the saved states do not follow each other from the start, step by step."""
+    try:
+        start, step = int(copy.meta["start_ns"]), float(copy.meta["dt"]) * 1e9
+        first, last = copy.span or (start, start)
+        return first - start > step / 2 or abs((last - first) / step - (states - 1)) > 0.5
+    except (KeyError, ValueError, ZeroDivisionError, OverflowError):
+        return True
+
+
+def _horizon(policy: bytes) -> int | None:
+    try:
+        return read_candidate(policy, "policy")[0].horizon
+    except GroundedError:
+        return None
 
 
 class _Copy:
@@ -99,6 +146,9 @@ class _Copy:
         self.counts: Counter[str] = Counter()
         self.homeless = 0
         self.anything = False
+        self.span: tuple[int, int] | None = None  # first and last log time [ns]
+        self.meta: dict[str, str] = {}  # our own table, if it has one
+        self.policy = b""  # the attached policy of a trial of ours
 
     def add(self, record: Record) -> None:
         """Takes over a record."""
@@ -113,9 +163,13 @@ class _Copy:
         elif isinstance(record, Metadata):
             self.start().metadata(record)
             self.anything = True
+            if record.name == "grounded":
+                self.meta = record.data
         elif isinstance(record, Attachment):
             self.start().attachment(record)
             self.anything = True
+            if record.name == "policy":
+                self.policy = record.data
 
     def start(self, header: Header | None = None) -> CopyWriter:
         """The writer, opened at the first record."""
@@ -142,11 +196,33 @@ class _Copy:
             self.start().messages(own, self.numbers[identity])
             self.counts[channel.topic] += len(own)
             self.anything = True
+            if len(own):
+                ends = (int(own.log_times.min()), int(own.log_times.max()))
+                first, last = self.span or ends
+                self.span = (min(first, ends[0]), max(last, ends[1]))
 
     def topic(self, channel: int) -> str:
         """The name of a channel's topic, if it is known."""
         known = self.channels.get(channel)
         return known.topic if known else f"channel {channel}"
+
+    @property
+    def duration_s(self) -> float:
+        """From the first to the last saved message."""
+        return 0.0 if self.span is None else (self.span[1] - self.span[0]) * 1e-9
+
+    def without(self, dropped: Sequence[tuple[int, int]]) -> list[str]:
+        """When the blocks were recorded that were dropped; what they state may be damaged too."""
+        if self.span is None:
+            return []
+        first, last = self.span
+        room = 10 * (last - first)
+        sane = [(a, b) for a, b in dropped if first - room <= a <= b <= last + room]
+        first = min([first, *(a for a, _ in sane)])
+        return [
+            f"second {(a - first) * 1e-9:.2f} to {(b - first) * 1e-9:.2f} of the log"
+            for a, b in sane
+        ]
 
     def finish(self) -> None:
         """Writes what waited, and ends the file."""

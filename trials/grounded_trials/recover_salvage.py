@@ -33,8 +33,9 @@ from grounded_trials.mcap_walk import (
 from grounded_trials.recover_search import is_chunk, next_chain, plausible, read_at
 
 _HEAD = Struct("<BQ")
-_NAMES = {1: "the header", 3: "a schema", 4: "a channel", 5: "a message", 6: "a chunk"}
-_NAMES |= {9: "an attachment", 12: "a metadata record"}
+_SPAN = Struct("<QQ")  # a chunk's first and last time
+_NAMES = {1: "the header", 3: "a schema", 4: "a channel", 5: "a message", 6: "a block of messages"}
+_NAMES |= {9: "an attached file", 12: "a table of metadata"}
 BATCH = 2**22  # [bytes] of messages outside chunks that are handed on together
 
 
@@ -42,7 +43,8 @@ class Salvage:
     """One pass over a damaged file.
 
     `losses` are sentences, `lost_messages` counts by channel what the indexes say was in dropped
-    chunks, `unverified` counts messages that no checksum vouches for.
+    chunks, `dropped` has the first and last time that such chunks state [ns], `unverified` counts
+    messages that no checksum vouches for.
     """
 
     def __init__(self, stream: BinaryIO, name: str) -> None:
@@ -50,9 +52,12 @@ class Salvage:
         self.size = stream.seek(0, 2)
         self.losses: list[str] = []
         self.lost_messages: Counter[int] = Counter()
+        self.dropped: list[tuple[int, int]] = []
         self.unverified = 0
         self._crc = 0
-        self._outside = 0  # records outside chunks, which only the data checksum covers
+        self._outside = 0  # messages outside checked chunks, which only the data checksum covers
+        self._tables = 0  # metadata and attached files, likewise
+        self._ended = False  # the data are over: what follows is an index
         self._pending: list[bytes] = []  # messages outside chunks
 
     def records(self) -> Iterator[Record]:
@@ -68,7 +73,9 @@ class Salvage:
                 if after is None:
                     yield from self._cut(pos)
                     return
-                self.losses.append(f"bytes {pos} to {after} can't be read as records")
+                self.losses.append(
+                    f"{after - pos} bytes can't be read, from byte {pos} on: what was there is lost"
+                )
                 pos = after
                 continue
             opcode, content = self._read(pos, end)
@@ -87,13 +94,18 @@ class Salvage:
                 dropped_chunk |= opcode == CHUNK and len(self.losses) > kept
             pos = end
         yield from self._flush()
-        self.losses.append("the file has no end: its footer is missing")
+        self.losses.append(self._ends_early())
+
+    def _ends_early(self) -> str:
+        if self._ended:
+            return "the index at the end of the file is missing; every message stands before it"
+        return f"the file is cut off at byte {self.size}: what came after that is lost"
 
     def _first(self) -> int | None:
         if read_at(self.stream, 0, 8) == MAGIC:
             self._crc = zlib.crc32(MAGIC)
             return len(MAGIC)
-        self.losses.append("it does not begin as an MCAP file does")
+        self.losses.append("the beginning of the file is not that of an MCAP file")
         return next_chain(self.stream, self.size, 0)
 
     def _read(self, pos: int, end: int) -> tuple[int, bytes]:
@@ -109,11 +121,13 @@ class Salvage:
                 yield from self._chunk(content)
             elif opcode in PARSERS:
                 record = PARSERS[opcode](Fields(content))
-                self._outside += opcode in (METADATA, ATTACHMENT)
+                self._tables += opcode in (METADATA, ATTACHMENT)
                 yield record
         except (BadChunk, Short, UnicodeDecodeError) as error:
             what = _NAMES.get(opcode, f"a record of type {opcode}")
-            self.losses.append(f"{what} at byte {pos} was dropped: {error}")
+            self.losses.append(f"{what} was dropped, at byte {pos}: {error}")
+            if opcode == CHUNK and len(content) >= 16:
+                self.dropped.append(_SPAN.unpack_from(content))
 
     def _chunk(self, content: bytes) -> Iterator[Record]:
         fields = Fields(content)
@@ -141,15 +155,16 @@ class Salvage:
 
     def _data_end(self, record: bytes) -> None:
         stated = int.from_bytes(record[9:13], "little")
-        if self._outside and not self.losses and stated and stated != self._crc:
+        wrong = bool(stated) and stated != self._crc
+        if wrong and not self.losses and (self._outside or self._tables):
+            these = f"its {self._outside} messages" if self._outside else "what it says of itself"
             self.losses.append(
-                "the checksum of the file does not fit; of what lies outside its chunks "
-                f"({self._outside} records) nobody knows which are right"
+                f"the checksum of the file does not fit: a number in {these} may be wrong, and "
+                "nobody knows which"
             )
+        if self.losses or not stated:
             self.unverified += self._outside
-        elif self._outside and (self.losses or not stated):
-            self.unverified += self._outside
-        self._outside = 0
+        self._outside, self._ended = 0, True
 
     def _count_lost(self, content: bytes) -> None:
         try:
@@ -175,8 +190,7 @@ class Salvage:
                 saved += len(record) if isinstance(record, Messages) else 0
                 yield record
         self.unverified += saved + self._outside
-        note = f"; {saved} messages before that were saved, unchecked" if saved else ""
-        self.losses.append(f"the file ends inside a record at byte {pos} of {self.size}{note}")
+        self.losses.append(self._ends_early())
 
     def _cut_chunk(self, content: bytes) -> Iterator[Record]:
         try:
