@@ -6,7 +6,7 @@ One pass over the file. A topic with very many messages has its ranges from ever
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from grounded.errors import GroundedError
 from grounded_trials.inspect_fields import number_paths
 from grounded_trials.inspect_twins import Twins, find_twins, kind_of
 from grounded_trials.log_files import log_files, open_log
-from grounded_trials.mcap_records import Channel, Header, Messages, Schema
+from grounded_trials.mcap_records import Channel, Header, Messages, Metadata, Schema
 from grounded_trials.mcap_walk import DamagedFile, read_records
 from grounded_trials.message_path import is_topic, parse_path
 from grounded_trials.message_types import Dynamic
@@ -73,6 +73,7 @@ class LogReport:
     topics: tuple[TopicReport, ...]
     twins: tuple[Twins, ...]  # signals of different topics with one motion
     damage: str = ""  # where reading it ended early, and why
+    meta: Mapping[str, str] = field(default_factory=dict)  # of a file of ours: its own table
 
     @property
     def remarks(self) -> tuple[str, ...]:
@@ -112,6 +113,7 @@ class _Look:
         self.headers: list[Header] = []
         self.topics: dict[str, _Topic] = {}
         self.damage = ""
+        self.meta: dict[str, str] = {}
         self.new_file()
 
     def new_file(self) -> None:
@@ -129,6 +131,8 @@ class _Look:
                 known = _Topic(record, self.schemas.get(record.schema_id))
                 self.topics[record.topic] = known
             self.channels[record.id] = known
+        elif isinstance(record, Metadata) and record.name == "grounded":
+            self.meta = record.data
         elif isinstance(record, Messages):
             for identity in np.unique(record.channels).tolist():
                 if identity in self.channels:
@@ -147,6 +151,7 @@ class _Look:
             topics=tuple(topic.report(start) for topic in self.topics.values()),
             twins=find_twins(self._samples()),
             damage=self.damage,
+            meta=self.meta if len(files) == 1 else {},
         )
 
     def _samples(self) -> dict[str, tuple[Ints, Floats]]:
