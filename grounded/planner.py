@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from grounded.effects.wrap import memory_of, memory_start
 from grounded.model import Model
 from grounded.policy import Policy
 from grounded.task import Task
@@ -33,6 +32,8 @@ class Planner:
         plan, base = self.plan.model, self.task.model
         if plan.n == base.n:
             return trial
+        from grounded.effects.wrap import memory_of
+
         if trial.start_inputs is None:
             trial = dataclasses.replace(trial, start_inputs=self.task.past)
         states = np.hstack([trial.states, memory_of(plan, base, trial)])
@@ -66,7 +67,11 @@ def planner_for(task: Task, model: Model, latency: np.ndarray) -> Planner:
         input_names=task.model.input_names,
         start_inputs=task.past,
     )
-    memory = memory_start(model, task.model, held) if extra else np.zeros(0)
+    memory = np.zeros(0)
+    if extra:  # effects take a while to import, and most models have none
+        from grounded.effects.wrap import memory_start
+
+        memory = memory_start(model, task.model, held)
     nothing, reward = np.zeros(extra), task.reward
     assert task.safety_low is not None and task.safety_high is not None
     plan = dataclasses.replace(

@@ -42,7 +42,7 @@ def trim(task: Task, x: Array, known: NDArray[np.bool_]) -> tuple[Array, Array]:
     """
     H, free = task.horizon, np.flatnonzero(~known)
     batch = _steps(task, x, known)
-    knots = np.unique(np.linspace(0, H - 1, min(H, KNOTS)).round().astype(int))
+    knots = np.linspace(0, H - 1, min(H, KNOTS)).round().astype(int)  # at least a step apart
     coarse = _from_scratch(task, batch, x[knots][:, free], knots)
     at = np.arange(H)
     w = np.column_stack([np.interp(at, knots, column) for column in coarse.w.T])

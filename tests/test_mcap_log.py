@@ -24,6 +24,7 @@ from grounded_trials.mcap_log import (
     write_candidate,
     write_trial,
 )
+from grounded_trials.mcap_writer import file_descriptor_set
 
 
 def a_trial(steps: int = 40, seed: int = 0) -> Trial:
@@ -115,6 +116,22 @@ def test_other_tools_read_named_fields() -> None:
     summary = reader.get_summary()
     assert summary is not None and summary.statistics is not None
     assert (summary.statistics.metadata_count, summary.statistics.attachment_count) == (1, 1)
+
+
+@pytest.mark.parametrize("repeated", [False, True])
+def test_a_schema_is_what_the_protobuf_package_writes(repeated: bool) -> None:
+    from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Field
+    from google.protobuf.descriptor_pb2 import FileDescriptorSet
+
+    names = [f"größe_{i}" * (1 + i % 40) for i in range(300)]
+    files = FileDescriptorSet()
+    file = files.file.add(name="grounded/State.proto", package="grounded", syntax="proto3")
+    message = file.message_type.add(name="State")
+    label = Field.LABEL_REPEATED if repeated else Field.LABEL_OPTIONAL
+    for number, name in enumerate(names, start=1):
+        message.field.add(name=name, number=number, label=label, type=Field.TYPE_DOUBLE)
+    mine = file_descriptor_set("State", names, repeated=repeated)
+    assert mine == files.SerializeToString(deterministic=True)
 
 
 def test_a_live_trial_that_is_cut_off_keeps_all_but_its_last_second(tmp_path: Path) -> None:

@@ -14,7 +14,6 @@ import contextlib
 import hashlib
 import os
 import sys
-import tempfile
 from pathlib import Path
 
 MAGIC = b"grounded kernel 1\n"
@@ -60,6 +59,8 @@ def read(digest: str) -> bytes | None:
 
 def write(digest: str, code: bytes) -> None:
     """Stores code, atomically; silently does nothing where it can't."""
+    import tempfile  # only a cold process needs it
+
     try:
         home = folder()
         if home is None:

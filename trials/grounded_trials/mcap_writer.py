@@ -111,18 +111,20 @@ class CopyWriter:
 
 
 def file_descriptor_set(message: str, names: Sequence[str], *, repeated: bool = False) -> bytes:
-    """A serialised FileDescriptorSet of one proto3 message of doubles, numbered from 1."""
-    from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorSet
+    """A serialised FileDescriptorSet of one proto3 message of doubles, numbered from 1.
 
-    files = FileDescriptorSet()
-    file = files.file.add(name=f"grounded/{message}.proto", package="grounded", syntax="proto3")
-    definition = file.message_type.add(name=message)
-    label = FieldDescriptorProto.LABEL_REPEATED if repeated else FieldDescriptorProto.LABEL_OPTIONAL
-    for number, name in enumerate(names, start=1):
-        definition.field.add(
-            name=name, number=number, label=label, type=FieldDescriptorProto.TYPE_DOUBLE
-        )
-    return bytes(files.SerializeToString(deterministic=True))
+    Written out here, by the numbers of google/protobuf/descriptor.proto: the protobuf package takes
+    longer to import than to say this.
+    """
+    label, double = (3 if repeated else 1), 1  # LABEL_REPEATED, LABEL_OPTIONAL; TYPE_DOUBLE
+    fields = [
+        _bytes(1, name.encode()) + _integer(3, number) + _integer(4, label) + _integer(5, double)
+        for number, name in enumerate(names, start=1)
+    ]
+    definition = _bytes(1, message.encode()) + b"".join(_bytes(2, field) for field in fields)
+    name = f"grounded/{message}.proto".encode()
+    file = _bytes(1, name) + _bytes(2, b"grounded") + _bytes(4, definition) + _bytes(12, b"proto3")
+    return _bytes(1, file)
 
 
 class DoublesEncoder:
@@ -151,6 +153,14 @@ def encode_lists(lists: Sequence[Array]) -> bytes:
         if data:
             parts += [_varint(number << 3 | 2), _varint(len(data)), data]
     return b"".join(parts)
+
+
+def _bytes(number: int, data: bytes) -> bytes:
+    return _varint(number << 3 | 2) + _varint(len(data)) + data
+
+
+def _integer(number: int, value: int) -> bytes:
+    return _varint(number << 3) + _varint(value)
 
 
 def _varint(value: int) -> bytes:

@@ -94,10 +94,10 @@ class ProtobufNode:
         """See `nodes.Node`."""
         assert isinstance(self.type, Number)
         values = np.full(len(self.rows), self.default)
-        for wire in np.unique(self.wire):
+        for wire in sorted(set(self.wire.tolist())):
             at = np.flatnonzero((self.wire == wire) & (self.start >= 0))
             if len(at):
-                values[at] = self._read(self.type, int(wire), at)
+                values[at] = self._read(self.type, wire, at)
         return values
 
     def _read(self, kind: Number, wire: int, at: Ints) -> Floats:
@@ -218,7 +218,7 @@ def _occurrences(node: ProtobufNode, number: int) -> tuple[Ints, Ints, Ints, Int
 def _content(buffer: bytes, wire: Ints, pos: Ints, limit: Ints, message: Ints) -> tuple[Ints, Ints]:
     """Start and end of the contents that follow tags of these wire types."""
     start, end = pos.copy(), pos.copy()
-    for kind in np.unique(wire):
+    for kind in sorted(set(wire.tolist())):
         at = wire == kind
         if kind == FIXED64:
             end[at] += 8
