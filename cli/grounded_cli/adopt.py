@@ -33,7 +33,7 @@ def command(effects: tuple[str, ...], effect_only: bool, folder: str | None, jso
     if json_:
         show_json({"effects": [dict(one) for one in adopted], "params": params})
         return
-    for name in effects:
+    for name in dict.fromkeys(effects):
         show(f"{name} is part of the model now ({workspace.config.file})")
     before = workspace.base_model.params
     changed = {n: v for n, v in params.items() if abs(v - before[n].value) > 1e-6 * abs(v)}

@@ -8,7 +8,7 @@ import click
 
 from grounded_cli import completion as complete
 from grounded_cli.options import as_json, in_workspace, library_of, open_workspace
-from grounded_cli.terminal import field, number, show, show_json, stages, table
+from grounded_cli.terminal import field, names_in, number, show, show_json, stages, table
 from grounded_trials.words import with_unit
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     metavar="K",
     help="Blame at most K effects at once, 1 to 6 (default: 3).",
 )
-@click.option("--without", multiple=True, metavar="FAMILY", help="Not to blame (repeatable).")
+@click.option("--without", multiple=True, metavar="F1,F2,...", help="Families not to blame.")
 @in_workspace
 @as_json
 def command(
@@ -45,8 +45,8 @@ def command(
     workspace = open_workspace(folder)
     from grounded_trials.diagnosing import diagnose_in
 
-    chosen = [name.strip() for name in trials.split(",")] if trials else []
-    library = library_of(without)
+    chosen = names_in(trials)
+    library = library_of(tuple(name for text in without for name in names_in(text)))
     with stages() as tell:
         found = diagnose_in(
             workspace, trials=chosen, max_effects=max_effects, library=library, progress=tell

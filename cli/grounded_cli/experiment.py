@@ -26,7 +26,7 @@ STUDIES = {
 
 
 @click.command("experiment")
-@click.argument("name", type=click.Choice(list(STUDIES)), metavar="NAME", required=False)
+@click.argument("name", type=click.Choice(list(STUDIES)), metavar="[NAME]", required=False)
 @click.option("--seeds", metavar="N|A-B|A,B,...", help="How many seeds, or which.")
 @click.option(
     "--jobs", type=click.IntRange(1), metavar="N", default=1, help="Processes on this machine."

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from grounded_cli.options import as_json, in_workspace, open_workspace
-from grounded_cli.terminal import number, progress, say, show, show_json, table
+from grounded_cli.terminal import names_in, number, progress, say, show, show_json, table
+from grounded_trials.words import count, shown
 
 if TYPE_CHECKING:
     from grounded.fit import Fit
@@ -30,7 +31,7 @@ def command(
     workspace = open_workspace(folder)
     from grounded_trials.fitting import apply_fit, fit_trials
 
-    names = [name.strip() for name in params.split(",")] if params else None
+    names = names_in(params) or None
     with progress("fitting"):
         found = fit_trials(workspace, names, latency=latency)
     if apply_:
@@ -41,7 +42,7 @@ def command(
     show(_parameters(found))
     if found.before is not None and found.after is not None:
         show(f"\n{_errors(found, workspace.base_model)}")
-    say(f"{found.sentence}; {found.samples} samples")
+    say(f"{found.sentence}; {count(found.samples, 'sample')}")
     if apply_:
         show("\nwritten to grounded.toml [model] params\nnext: grounded propose")
     else:
@@ -83,7 +84,7 @@ def _parameters(found: Fit) -> str:
     rows = []
     for name, e in found.params.items():
         interval = f"{number(e.low)} .. {number(e.high)}" if e.identified else "not identified"
-        rows.append((name, number(e.start), number(e.value), interval, e.unit))
+        rows.append((name, number(e.start), number(e.value), interval, shown(e.unit)))
     return table(rows, ("parameter", "before", "fitted", "95 % interval", "unit"))
 
 
@@ -98,7 +99,7 @@ def _errors(found: Fit, model: Model) -> str:
                 number(float(found.after.one_step[i]), 3),
                 number(float(found.before.ahead[i]), 3),
                 number(float(found.after.ahead[i]), 3),
-                model.states.get(name, ""),
+                shown(model.states.get(name, "")),
             )
         )
     ahead = f"{found.before.horizon_s:g} s"

@@ -21,6 +21,7 @@ VERDICTS = {
     "no better": " than the best so far",
     "waiting": ": more trials of it are needed ([search] repeats)",
     "in doubt": ": it may be bad luck, the best so far is run once more",
+    "probe": ", for the diagnosis: the search leaves it out",
     "run again": ": its utility is the mean of its trials",
 }
 
@@ -38,8 +39,9 @@ def command(
 ) -> None:
     """Check, resample and store trials: MCAP files or bag folders.
 
-    A file that was stored before is a success that says which trial it is. Trials of ours are taken
-    as they are; other logs are mapped by the [log] table (`grounded inspect LOG` writes one).
+    A file that was stored before is a success that says which trial it is. Trials that grounded
+    wrote are taken as they are; other logs are mapped by the [log] table (`grounded inspect LOG`
+    prints one).
     """
     workspace = open_workspace(folder)
     from grounded_trials.ingest import ingest_log
@@ -54,7 +56,8 @@ def command(
     if json_:
         show_json({"trials": [as_document(one) for one in done]})
     else:
-        show(f"\nnext: grounded {'propose' if done[-1].candidate else 'fit'}")
+        follow = "diagnose" if done[-1].verdict == "probe" else "propose"
+        show(f"\nnext: grounded {follow if done[-1].candidate else 'fit'}")
 
 
 def as_document(one: Ingested) -> dict[str, Any]:
@@ -67,6 +70,7 @@ def as_document(one: Ingested) -> dict[str, Any]:
         "utility": one.utility,
         "failed": one.utility == float("-inf"),
         "accepted": one.accepted,
+        "verdict": one.verdict or None,
         "warnings": list(one.warnings),
         "signals": [vars(signal) for signal in one.signals],
     }

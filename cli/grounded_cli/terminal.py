@@ -20,6 +20,7 @@ __all__ = [
     "bar",
     "field",
     "harmless",
+    "names_in",
     "number",
     "progress",
     "say",
@@ -86,6 +87,11 @@ def field(label: str, text: str, indent: str = "") -> str:
     wrapper.break_on_hyphens = wrapper.break_long_words = False  # a path stays in one piece
     lines = wrapper.wrap(whole)
     return "\n".join(lines or [head.rstrip()]).replace("\xa0", " ")
+
+
+def names_in(text: str | None) -> list[str]:
+    """The names of a list like `a,b`, each once."""
+    return [name for name in dict.fromkeys(n.strip() for n in (text or "").split(",")) if name]
 
 
 @contextmanager

@@ -31,7 +31,7 @@ def adopt_effects(
     adopted: list[Effect] = [dict(effect) for effect in workspace.config.model.effects]
     found = document.get("parameters", {}) if parameters else {}
     params = {key: _rounded(p["value"]) for key, p in found.items()}
-    for name in names:
+    for name in dict.fromkeys(names):
         if name not in ranking:
             raise GroundedError(
                 f"'{name}' is not among the effects of the last diagnosis: {nearest(name, ranking)}"

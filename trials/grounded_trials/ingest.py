@@ -16,11 +16,13 @@ from pathlib import Path
 from grounded.errors import GroundedError
 from grounded.search import Tried
 from grounded.trial import Trial
+from grounded_trials.config import FILE
 from grounded_trials.foreign import read_log
 from grounded_trials.kind import kind_of
-from grounded_trials.log_files import log_files
+from grounded_trials.log_files import log_files, open_log
 from grounded_trials.log_table import log_mapping
 from grounded_trials.mcap_log import CANDIDATE, TRIAL, read_trial, trial_bytes
+from grounded_trials.mcap_walk import read_records
 from grounded_trials.own_files import FILE_LIMIT, read_file
 from grounded_trials.proposing import standing_in
 from grounded_trials.signal_report import SignalReport
@@ -41,7 +43,7 @@ class Ingested:
     accepted: bool | None  # None: data, or not decided yet
     warnings: tuple[str, ...]
     signals: tuple[SignalReport, ...]  # for a foreign log
-    verdict: str = ""  # first, better, no better, waiting, in doubt, run again; "" for data
+    verdict: str = ""  # a word of `words.verdict`, run again, probe; "" for data
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,8 +91,14 @@ def ingest_log(
         accepted=tried.accepted if tried else None,
         warnings=warnings,
         signals=read.signals,
-        verdict="" if tried is None else "run again" if again else verdict(tried),
+        verdict="run again" if again else _verdict(trial, tried),
     )
+
+
+def _verdict(trial: Trial, tried: Tried | None) -> str:
+    if tried is not None:
+        return verdict(tried)
+    return "probe" if trial.candidate else ""
 
 
 def _bridged(trial: Trial) -> Trial:
@@ -181,9 +189,10 @@ def _foreign(workspace: Workspace, path: Path, candidate: str | None, data: bool
     files = log_files(path)
     mapping = log_mapping(workspace.config.log, model.state_names, model.input_names)
     if mapping is None:
+        _check_is_log(path, files)
         raise GroundedError(
-            f"{path} is not a trial of ours, and grounded.toml has no [log] table to map it: "
-            f"`grounded inspect {path}` prints one"
+            f"{path} is not a trial that grounded wrote, and grounded.toml has no [log] table to "
+            f"map it: `grounded inspect {path}` prints one"
         )
     chosen = "" if data else candidate or _outstanding(workspace, path)
     estimated: tuple[str, ...] = ()
@@ -230,6 +239,15 @@ def _foreign(workspace: Workspace, path: Path, candidate: str | None, data: bool
         _check_candidate(workspace, path, chosen, "", None)
     encoded = _encode(workspace, trial, about, chosen, found.start_ns)
     return _Read(trial, encoded, found.warnings, found.reports)
+
+
+def _check_is_log(path: Path, files: Sequence[Path]) -> None:
+    """Says of what is no log at all that it is none."""
+    if (path / FILE).is_file():
+        raise GroundedError(f"{path} is a workspace: name the log, or its folder, inside")
+    for file in files:
+        with open_log(file) as stream:
+            next(iter(read_records(stream, str(file))), None)
 
 
 def _hashed(files: Sequence[Path]) -> str:

@@ -57,6 +57,8 @@ def _bag(folder: Path) -> list[Path]:
 
 
 def _advice(folder: Path) -> str:
+    if (folder / "grounded.toml").is_file():
+        return "; it is a workspace: name the log, or its folder, inside"
     kinds = {path.suffix for path in folder.iterdir()}
     if ".db3" in kinds:
         return "; turn its .db3 into MCAP with `ros2 bag convert` or `mcap convert`"

@@ -265,7 +265,7 @@ def read_file(path: Path, limit: int) -> bytes:
     except OSError as error:
         raise GroundedError(f"{path} can't be read: {error.strerror}") from None
     if len(data) > limit:
-        raise GroundedError(f"{path} is larger than {limit} bytes; a file of ours never is")
+        raise GroundedError(f"{path} is larger than {limit} bytes: grounded writes no such file")
     return data
 
 

@@ -128,6 +128,10 @@ def read_toml(path: Path) -> Table:
             f"{path} does not exist: this is not a workspace; make one with "
             "'grounded init DIR --example car-turn' or name one with -C DIR"
         ) from None
+    except NotADirectoryError:
+        raise GroundedError(
+            f"{path.parent} is a file: -C takes the folder that holds grounded.toml"
+        ) from None
     except (OSError, UnicodeDecodeError) as error:
         raise GroundedError(f"{path} can't be read: {error}") from None
     try:
