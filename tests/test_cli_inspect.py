@@ -65,7 +65,5 @@ def test_a_foreign_log_ends_with_a_table_that_can_be_pasted(tmp_path):
 def test_outside_a_workspace_one_is_asked_for(tmp_path):
     log = data("dart_small_car", "dart_4_sept_random_driving_slow_ros2.mcap")
     done = grounded("-C", tmp_path, "inspect", log)
-    assert done.err == (
-        "note: no [log] table is guessed: this folder is not a workspace, -C DIR names one\n"
-    )
+    assert done.err == ("note: no [log] table is guessed outside a workspace (-C DIR names one)\n")
     assert last(done).startswith("next: grounded -C WORKSPACE inspect")

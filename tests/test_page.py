@@ -101,7 +101,7 @@ def test_page_shows_what_the_issue_lists(cart):
         "whole run (2 s)",
         "By state, 1 s ahead",
         "What is left of v is no white noise",
-        "off by 3.21, the diagnosed one off by 0.0456",
+        "by 3.21, the diagnosed one by 0.0456",
         "coulomb_friction:v",
         "96.0 %",
         "first or better",

@@ -55,7 +55,7 @@ def test_text_says_what_the_error_is_made_of(cart):
     out = " ".join(grounded("-C", cart, "report").out.split())
     assert "1 s ahead, 90.5 % of the squared error is explained, 0.4 % is not, 9.1 %" in out
     assert "what is left of v is no white noise" in out
-    assert "5 whole trials off by 3.21, the diagnosed one off by 0.0456" in out
+    assert "5 whole trials by 3.21, the diagnosed one by 0.0456" in out
     assert "quadratic_drag:v makes 96.0 %, coulomb_friction:v 80 % of the signal of" in out
 
 

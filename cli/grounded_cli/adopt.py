@@ -38,7 +38,7 @@ def command(effects: tuple[str, ...], effect_only: bool, folder: str | None, jso
     before = workspace.base_model.params
     changed = {n: v for n, v in params.items() if abs(v - before[n].value) > 1e-6 * abs(v)}
     if changed:
-        show("the model's own parameters, calibrated beside it:")
+        show("the model's own parameters, calibrated beside the effects:")
     for name, value in changed.items():
         text = with_unit(f"{number(before[name].value)} -> {number(value)}", before[name].unit)
         show(field(name, text, "  "))

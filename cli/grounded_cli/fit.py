@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from grounded_cli.options import as_json, in_workspace, open_workspace
-from grounded_cli.terminal import names_in, number, progress, say, show, show_json, table
+from grounded_cli.terminal import names_in, number, progress, remark, show, show_json, table
 from grounded_trials.words import count, shown
 
 if TYPE_CHECKING:
@@ -42,12 +42,13 @@ def command(
     show(_parameters(found))
     if found.before is not None and found.after is not None:
         show(f"\n{_errors(found, workspace.base_model)}")
-    say(f"{found.sentence}; {count(found.samples, 'sample')}")
+    remark("fit", f"{found.sentence}; {count(found.samples, 'sample')}")
     if apply_:
         show("\nwritten to grounded.toml [model] params\nnext: grounded propose")
     else:
         again = f" --params {params}" * bool(params) + " --latency" * latency
-        show(f"\nnext: grounded fit{again} --apply   writes the values to grounded.toml")
+        show("\n--apply writes the values to grounded.toml")
+        show(f"next: grounded fit{again} --apply")
 
 
 def as_document(found: Fit, applied: bool) -> dict[str, Any]:

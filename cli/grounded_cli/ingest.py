@@ -9,7 +9,7 @@ import click
 
 from grounded_cli import completion as complete
 from grounded_cli.options import as_json, in_workspace, open_workspace
-from grounded_cli.terminal import field, number, progress, say, show, show_json, table
+from grounded_cli.terminal import field, number, progress, remark, show, show_json, table
 
 if TYPE_CHECKING:
     from grounded_trials.ingest import Ingested
@@ -78,7 +78,7 @@ def as_document(one: Ingested) -> dict[str, Any]:
 
 def _tell(name: str, one: Ingested) -> None:
     for warning in one.warnings:
-        say(f"warning: {name}: {warning}")
+        remark("warning", f"{name}: {warning}")
     known = "was stored before as" if one.known else "is stored as"
     if not one.candidate:
         show(f"{name} {known} {one.trial}: data for fit and diagnose")

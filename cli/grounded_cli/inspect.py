@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from grounded_cli.options import as_json, in_workspace, open_workspace
-from grounded_cli.terminal import number, progress, say, show, show_json, table
+from grounded_cli.terminal import number, progress, remark, show, show_json, table
 from grounded_trials.words import count
 
 if TYPE_CHECKING:
@@ -41,8 +41,8 @@ def command(log: str, folder: str | None, json_: bool) -> None:
     )
     for topic in report.topics:
         _tell(topic)
-    for remark in report.remarks:
-        say(f"note: {remark}")
+    for one in report.remarks:
+        remark("note", one)
     if mapping:
         show(f"\n# for grounded.toml; look at what is marked unsure\n{mapping}")
     show(f"{'' if mapping else chr(10)}{_next(report, log, bool(mapping))}")
@@ -104,10 +104,10 @@ def _mapping(report: LogReport, folder: str | None) -> str:
     try:
         model = open_workspace(folder).base_model
     except GroundedError as error:
-        why = str(error)
+        why = f": {error}"
         if "does not exist: this is not a workspace" in why:
-            why = "this folder is not a workspace, -C DIR names one"
-        say(f"note: no [log] table is guessed: {why}")
+            why = " outside a workspace (-C DIR names one)"
+        remark("note", f"no [log] table is guessed{why}")
         return ""
     states, inputs = guess_mapping(report, model.state_names, model.input_names)
     return mapping_toml(states, inputs, simulated=is_simulated(report))

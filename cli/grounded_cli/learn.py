@@ -9,7 +9,7 @@ import click
 
 from grounded_cli.options import as_json, in_workspace, open_workspace
 from grounded_cli.status import as_document, next_line, summary
-from grounded_cli.terminal import number, progress, say, show, show_json
+from grounded_cli.terminal import number, progress, remark, say, show, show_json
 
 if TYPE_CHECKING:
     from grounded.search import Standing
@@ -45,7 +45,7 @@ def learn_in(workspace: Workspace, trials: int | None = None) -> Standing:
         candidate = proposed.proposal.candidate
         if candidate is None:
             for note in proposed.proposal.notes:
-                say(f"note: {note}")
+                remark("note", note)
             return proposed.proposal.standing
         with progress(f"running {candidate.id}"):
             path = run_candidate(workspace, candidate.id)
@@ -53,7 +53,7 @@ def learn_in(workspace: Workspace, trials: int | None = None) -> Standing:
         path.unlink()  # its bytes are in the store now
         done += 1
         for warning in found.warnings:
-            say(f"warning: {found.trial}: {warning}")
+            remark("warning", f"{found.trial}: {warning}")
         say(
             f"{found.trial} {candidate.id} iter {candidate.iteration:<3} "
             f"alpha {candidate.alpha:<8g} predicted {number(candidate.predicted_utility):>10} "

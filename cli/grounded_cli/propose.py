@@ -9,7 +9,7 @@ import click
 
 from grounded_cli.options import as_json, in_workspace, open_workspace
 from grounded_cli.status import next_line
-from grounded_cli.terminal import field, number, progress, say, show, show_json
+from grounded_cli.terminal import field, number, progress, remark, show, show_json
 from grounded_trials.words import count, with_unit
 
 if TYPE_CHECKING:
@@ -69,9 +69,9 @@ def as_document(workspace: Workspace, proposed: Proposed) -> dict[str, Any]:
 def _tell(workspace: Workspace, proposed: Proposed) -> None:
     standing, candidate = proposed.proposal.standing, proposed.proposal.candidate
     for note in proposed.proposal.notes:
-        say(f"note: {note}")
+        remark("note", note)
     if note := workspace.planner.plan.model.system.note:
-        say(f"note: the model is not compiled: {note}")
+        remark("note", f"the model is not compiled: {note}")
     if candidate is None:
         show(field("end", f"nothing to run: {standing.sentence}"))
         show(f"\n{next_line(workspace, standing)}")

@@ -1,4 +1,4 @@
-"""grounded report: what the trials say, as text, page, pictures and recording."""
+"""grounded report: what the trials as text, page, pictures and recording."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from grounded_cli.options import as_json, in_workspace, open_workspace
-from grounded_cli.terminal import progress, say, show, show_json, sparkline, table
+from grounded_cli.terminal import progress, remark, show, show_json, sparkline, table
 
 if TYPE_CHECKING:
     from grounded_trials.findings import Findings
@@ -45,7 +45,7 @@ def command(html: bool, png: bool, rrd: bool, folder: str | None, json_: bool) -
         show(report_text(findings, table, sparkline))
     if findings.lost:
         for one in findings.lost if paths or json_ else ():
-            say(f"left out: {one.file}: {one.reason}")
+            remark("left out", f"{one.file}: {one.reason}")
         click.get_current_context().exit(3)
 
 

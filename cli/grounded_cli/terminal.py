@@ -23,6 +23,7 @@ __all__ = [
     "names_in",
     "number",
     "progress",
+    "remark",
     "say",
     "show",
     "show_json",
@@ -87,6 +88,14 @@ def field(label: str, text: str, indent: str = "") -> str:
     wrapper.break_on_hyphens = wrapper.break_long_words = False  # a path stays in one piece
     lines = wrapper.wrap(whole)
     return "\n".join(lines or [head.rstrip()]).replace("\xa0", " ")
+
+
+def remark(kind: str, text: str) -> None:
+    """Narration with a word ahead, `note: ...`, wrapped to 80 columns."""
+    whole = text.replace(" %", "\xa0%")
+    wrapper = textwrap.TextWrapper(80, initial_indent=f"{kind}: ", subsequent_indent="  ")
+    wrapper.break_on_hyphens = wrapper.break_long_words = False
+    say("\n".join(wrapper.wrap(whole)).replace("\xa0", " "))
 
 
 def names_in(text: str | None) -> list[str]:

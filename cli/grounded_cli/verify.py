@@ -5,7 +5,7 @@ from __future__ import annotations
 import click
 
 from grounded_cli.options import as_json, in_workspace, open_workspace
-from grounded_cli.terminal import progress, say, show, show_json
+from grounded_cli.terminal import progress, remark, show, show_json
 
 
 @click.command("verify")
@@ -22,7 +22,7 @@ def command(folder: str | None, json_: bool) -> None:
         show_json({"checked": checked, "damaged": [{"file": f, "reason": r} for f, r in damaged]})
     else:
         for _, reason in damaged:
-            say(f"damaged: {reason}")
+            remark("damaged", reason)
         show(f"{checked} files checked, {len(damaged)} damaged")
     if damaged:
         click.get_current_context().exit(1)

@@ -66,10 +66,10 @@ def utility_sentence(diagnosis: Diagnosis) -> str:
     if found is None:
         return ""
     crude, better = (
-        f"off by {figure(value, 3)}" if math.isfinite(value) else "beyond all measure"
+        f"by {figure(value, 3)}" if math.isfinite(value) else "beyond all measure"
         for value in (found.before, found.after)
     )
-    text = f"the crude model predicts that of {count(found.trials, 'whole trial')} {crude}"
+    text = f"the crude model misses the utility of {count(found.trials, 'whole trial')} {crude}"
     if diagnosis.effects:
         text += f", the diagnosed one {better}"
     return f"{text} (rms; the trials themselves scatter by {figure(found.spread, 3)})"
