@@ -24,7 +24,7 @@ from grounded.compile import Backward, Descent, Options, Problem, Status
 from grounded.compile.descent import CEILING, FLOOR, GROWTH, LARGE_MU, LEAST, SEARCH_FLOOR
 from grounded.errors import GroundedError
 from grounded.frozen import Array
-from grounded.riccati import Sweep, input_scale, sweep
+from grounded.riccati import Sweep, sweep
 
 __all__ = [
     "Iteration", "Options", "Result", "damped_step", "descended", "natural_damping", "solve",
@@ -84,9 +84,8 @@ def solve(
     """
     options = options or Options()
     _check(problem, ubar, K, zbar)
-    start = (ubar, K, zbar)
-    found = problem.system.descend(problem, input_scale(problem), *start, options)
-    return _result(problem, found or descended(problem, *start, options))
+    found = problem.system.descend(problem, ubar, K, zbar, options)
+    return _result(problem, found or descended(problem, ubar, K, zbar, options))
 
 
 def damped_step(problem: Problem, z: Array, u: Array, damping: Array) -> Sweep:
@@ -107,7 +106,7 @@ def damped_step(problem: Problem, z: Array, u: Array, damping: Array) -> Sweep:
 
 def natural_damping(problem: Problem, factor: float = 1.0) -> Array:
     """Damping in the problem's own units (m,): factor times the inputs' curvature 2 (R + S)."""
-    return factor * input_scale(problem)
+    return factor * problem.input_scale
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +165,7 @@ def _search(
 
 
 def _result(problem: Problem, found: Descent) -> Result:
-    trace = tuple(Iteration(*(float(value) for value in line)) for line in found.lines)
+    trace = tuple(Iteration(*line) for line in found.lines.tolist())
     sentences: dict[Status, str] = {
         "converged": f"converged after {len(trace)} iterations",
         "max iterations": f"stopped after {len(trace)} iterations, still improving",

@@ -32,7 +32,6 @@ from grounded.compile.queue import queue_of
 from grounded.compile.sweep import Quadratic, quadratic
 from grounded.errors import GroundedError
 from grounded.frozen import Array
-from grounded.riccati import input_scale
 from grounded.rollout import simulate
 
 if TYPE_CHECKING:
@@ -123,7 +122,7 @@ def ascent(task: Task, policy: Policy, grounding: Grounding) -> Policy:
     """
     problem = grounding.on(task.problem())
     found = gradient(problem, grounding.z, grounding.inputs, policy)
-    scale = input_scale(problem)
+    scale = problem.input_scale
     d = -_descended(problem, grounding, found.inputs) / scale
     D = None if found.gain is None else -found.gain / scale[:, None]
 

@@ -41,16 +41,6 @@ class Sweep:
         return self.gains.failed_at < 0
 
 
-def input_scale(problem: Problem) -> Array:
-    """The natural unit of damping for each input (m,): the curvature 2 (R + S) of its own cost.
-
-    An input without a cost of its own takes the mean of the others, or 1.
-    """
-    scale = 2.0 * (problem.input_weight + problem.change_weight)
-    positive = scale[scale > 0]
-    return np.where(scale > 0, scale, positive.mean() if positive.size else 1.0)
-
-
 def sweep(
     problem: Problem,
     z: Array,
@@ -59,13 +49,13 @@ def sweep(
     mu: float = 0.0,
     into: Backward | None = None,
 ) -> Sweep:
-    """Sweeps back along z (H+1, nz), u (H, m) with damping (m,) + mu * input_scale.
+    """Sweeps back along z (H+1, nz), u (H, m) with damping (m,) + mu * problem.input_scale.
 
     mu grows tenfold after each failure; when it passes 1e10 the failed sweep is returned, with
     `ok` False: the trajectory or the model holds no finite numbers. `into`: see `System.backward`.
     """
     base = np.zeros(problem.system.m) if damping is None else np.asarray(damping, float)
-    scale = input_scale(problem)
+    scale = problem.input_scale
     gains = into
     while True:
         gains = problem.system.backward(problem, z, u, base + mu * scale, gains)

@@ -6,7 +6,6 @@ import pytest
 from grounded.compile import Problem, system_of
 from grounded.compile.memory import MOST, _shelf, empty
 from grounded.ddp import Options, descended
-from grounded.riccati import input_scale
 from problems import problem
 
 
@@ -34,7 +33,7 @@ def test_the_compiled_loop_takes_the_decisions_of_the_loop_in_numpy(halvings):
         H, m = task.horizon, task.system.m
         u = u0 * np.cos(np.arange(H * m) * 0.1).reshape(H, m)
         options = Options(max_iterations=most, halvings=halvings, accept=0.3)
-        fast = task.system.descend(task, input_scale(task), u, None, None, options)
+        fast = task.system.descend(task, u, None, None, options)
         slow = descended(task, u, None, None, options)
         assert (fast.status, fast.cost, fast.failed_at) == (slow.status, slow.cost, slow.failed_at)
         for one in ("lines", "z", "u", "k", "K"):

@@ -35,7 +35,7 @@ from grounded.compile.llvm_riccati import SWEEP, sweep_kernel
 from grounded.compile.llvm_rollout import LANES, ROLLOUT, Layout, rollout_kernel
 from grounded.compile.llvm_step import Dynamics, dynamics_of, jacobian_function, stage_tables
 from grounded.compile.llvm_text import declarations
-from grounded.compile.memory import empty
+from grounded.compile.memory import empty, side_by_side
 from grounded.compile.problem import Array, Problem
 from grounded.compile.system import Backward, Swarm
 from grounded.compile.traced import TracedSystem, Variant
@@ -195,7 +195,7 @@ class CompiledSystem(TracedSystem):
         z, u, cost = empty((runs, H + 1, nz)), empty((runs, H, self.m)), np.empty(runs)
         known, lanes = packed(problem), np.empty(LANES)
         values = _policy(ubar, K, zbar, k) | {"alphas": lanes}
-        kernel = self._search(problem)["rollout"]
+        kernel = self._search(problem)[0]["rollout"]
         for at in range(0, runs, LANES):
             some = min(LANES, runs - at)
             lanes[:some], lanes[some:] = steps[at : at + some], steps[at]
@@ -222,8 +222,9 @@ class CompiledSystem(TracedSystem):
             k, K = empty((H, self.m)), empty((H, self.m, nz))
         values = {"z_run": plain(z), "u_run": plain(u), "damping": plain(damping)}
         values |= {"k": k, "K": K, "expected": expected}
-        words = table(SWEEP, packed(problem).words | self._jacobian(problem), values)
-        failed = run(self._search(problem)["sweep"], words)
+        library, jacobian = self._search(problem)
+        words = table(SWEEP, packed(problem).words | {"jacobian": jacobian}, values)
+        failed = run(library["sweep"], words)
         if failed >= 0:
             k[: failed + 1], K[: failed + 1] = 0.0, 0.0
         elif not np.isfinite(K[0]).all():
@@ -233,7 +234,6 @@ class CompiledSystem(TracedSystem):
     def descend(
         self,
         problem: Problem,
-        scale: Array,
         ubar: Array,
         K: Array | None,
         zbar: Array | None,
@@ -242,37 +242,39 @@ class CompiledSystem(TracedSystem):
         """See `System.descend`."""
         if self.m > MAX_INPUTS:
             return None
-        H, nz, m = problem.horizon, problem.nz, self.m
-        z, u = [empty((H + 1, nz)) for _ in "01"], [empty((H, m)) for _ in "01"]
-        gains: dict[str, Any] = {
-            "k": empty((H, m)),
-            "K": empty((H, m, nz)),
-            "expected": np.zeros(2),
-        }
-        lanes, costs, damping = np.ones(LANES), np.empty(LANES), np.zeros(m)
-        lines, result = np.empty((max(options.max_iterations, 0) + 1, 4)), np.empty(4)
-        policy, known = _policy(ubar, K, zbar, None), packed(problem).words
-        first = {"alphas": lanes, "cost": costs, "runs": 1, "z": z[0], "u": u[0]}
-        rollout = table(ROLLOUT, known, policy | first)
-        sweep = table(SWEEP, known | self._jacobian(problem), gains | {"damping": damping})
-        values = gains | {"z0": z[0], "z1": z[1], "u0": u[0], "u1": u[1], "alphas": lanes}
-        values |= {"rollout": ctypes.addressof(rollout), "sweep": ctypes.addressof(sweep)}
-        values |= {"costs": costs, "scale": plain(scale), "damping": damping, "lines": lines}
-        values |= {"result": result, "halvings": options.halvings, "accept": float(options.accept)}
-        values |= {"max_iterations": options.max_iterations, "tolerance": float(options.tolerance)}
-        words = table(DESCENT, {}, values)
-        status = STATUSES[run(self._search(problem)["descent"], words)]
-        last, cost = int(result[TURN]), float(result[COST])
-        lines, failed = lines[: int(result[COUNT])], int(result[FAILED_AT])
-        return Descent(status, z[last], u[last], gains["k"], gains["K"], cost, failed, lines)
+        H, nz, m, known = problem.horizon, problem.nz, self.m, packed(problem).words
+        most = max(int(options.max_iterations), 0)
+        library, jacobian = self._search(problem)
+        results, at = side_by_side(
+            {"z0": (H + 1, nz), "z1": (H + 1, nz), "u0": (H, m), "u1": (H, m), "k": (H, m)}
+            | {"K": (H, m, nz), "damping": (m,), "alphas": (LANES,), "costs": (LANES,)}
+            | {"expected": (2,), "result": (4,), "lines": (most + 1, 4)}
+        )
+        results["alphas"][:] = 1.0
+        policy = _policy(ubar, K, zbar, None)
+        first = {"cost": at["costs"], "runs": 1, "z": at["z0"], "u": at["u0"]}
+        rollout = table(ROLLOUT, known, at | first | policy)
+        sweep = table(SWEEP, known | {"jacobian": jacobian}, at)
+        values = at | {"rollout": ctypes.addressof(rollout), "sweep": ctypes.addressof(sweep)}
+        values |= {"halvings": int(options.halvings), "max_iterations": most}
+        settings = {"accept": float(options.accept), "tolerance": float(options.tolerance)}
+        words = table(DESCENT, {}, values | settings | {"scale": plain(problem.input_scale)})
+        status = STATUSES[run(library["descent"], words)]
+        found = results["result"]
+        z, u = ("z1", "u1") if found[TURN] else ("z0", "u0")
+        lines = results["lines"][: int(found[COUNT])].copy()
+        gains, cost = (results["k"], results["K"]), float(found[COST])
+        return Descent(status, results[z], results[u], *gains, cost, int(found[FAILED_AT]), lines)
 
-    def _search(self, problem: Problem) -> jit.Library:
-        return self._compiled(problem.p, problem.dt).search(packed(problem).layout)
-
-    def _jacobian(self, problem: Problem) -> dict[str, int]:
-        """The word of the batch module's function that the sweep calls."""
-        library = self._compiled(problem.p, problem.dt).batch()
-        return {"jacobian": library.addresses["jacobian"]}
+    def _search(self, problem: Problem) -> tuple[jit.Library, int]:
+        """The kernels about a problem's layout, and the address of the Jacobian they call."""
+        known = packed(problem)
+        if self not in known.kernels:
+            kernels = self._compiled(problem.p, problem.dt)
+            search = kernels.search(known.layout)
+            known.kernels[self] = search, kernels.batch().addresses["jacobian"]
+        found: tuple[jit.Library, int] = known.kernels[self]
+        return found
 
 
 def _policy(ubar: Array, K: Array | None, zbar: Array | None, k: Array | None) -> dict[str, Any]:

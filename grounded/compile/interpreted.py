@@ -117,7 +117,6 @@ class Interpreted(ABC):
     def descend(
         self,
         problem: Problem,
-        scale: Array,
         ubar: Array,
         K: Array | None,
         zbar: Array | None,

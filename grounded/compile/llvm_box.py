@@ -53,22 +53,50 @@ def _substitute(m: int) -> str:
     """`void @substitute(L, inv, b)`: b becomes the solution of L D L' x = b."""
     f = Writer("internal void @substitute(ptr %L, ptr %inv, ptr %b)")
     b = [f.load("%b", i) for i in range(m)]
-    for i, value in enumerate(solved(f, b, "%L", "%inv", 1)):
+    for i, value in enumerate(solved(f, b, *loaded(f, m, "%L", "%inv"), 1)):
         f.store(value, "%b", i)
     f.do("ret void")
     return f.text()
 
 
-def solved(f: Writer, rows: list[str], L: str, inverse: str, width: int) -> list[str]:
+Lower = dict[tuple[int, int], str]  # L[i, j] below the diagonal, column by column
+
+
+def factored(f: Writer, H: list[list[str]]) -> tuple[Lower, list[str], str]:
+    """L, 1/D and whether H is positive definite, in registers and without a branch."""
+    m, L, LD, inverse, good = len(H), Lower(), Lower(), list[str](), "true"
+    for j in range(m):
+        for i in range(j, m):
+            value = H[i][j]
+            for s in range(j):
+                value = f.sub(value, f.mul(LD[i, s], L[j, s]))
+            if i > j:
+                LD[i, j], L[i, j] = value, f.mul(value, inverse[j])
+                continue
+            positive = f.compare("ogt", value, ZERO)
+            finite = f.compare("olt", value, number(float("inf")))
+            good = f.emit(f"and i1 {good}, {f.emit(f'and i1 {positive}, {finite}')}")
+            inverse.append(f.div(ONE, value))
+    return L, inverse, good
+
+
+def loaded(f: Writer, m: int, L: str, inverse: str) -> tuple[Lower, list[str]]:
+    """The factor that @factor left in memory."""
+    lower = {(i, j): f.load(L, i * m + j) for j in range(m) for i in range(j + 1, m)}
+    return lower, [f.load(inverse, i) for i in range(m)]
+
+
+def solved(f: Writer, rows: list[str], L: Lower, inverse: list[str], width: int) -> list[str]:
     """Rows of the solution X of L D L' X = rows, each W wide."""
     m, x = len(rows), list(rows)
+    wide = {at: f.spread(value, width) for at, value in L.items()}
     for i in range(m):
         for j in range(i):
-            x[i] = f.sub(x[i], f.mul(f.load_all(L, i * m + j, width), x[j], width), width)
-    x = [f.mul(x[i], f.load_all(inverse, i, width), width) for i in range(m)]
+            x[i] = f.sub(x[i], f.mul(wide[i, j], x[j], width), width)
+    x = [f.mul(x[i], f.spread(inverse[i], width), width) for i in range(m)]
     for i in reversed(range(m)):
         for j in range(i + 1, m):
-            x[i] = f.sub(x[i], f.mul(f.load_all(L, j * m + i, width), x[j], width), width)
+            x[i] = f.sub(x[i], f.mul(wide[j, i], x[j], width), width)
     return x
 
 

@@ -12,7 +12,7 @@ model is unstable that part grows from step to step, so it is taken out again an
 from __future__ import annotations
 
 from grounded.compile.llvm_batch import Words
-from grounded.compile.llvm_box import ONE, ZERO, clipped, solved
+from grounded.compile.llvm_box import ONE, ZERO, Lower, clipped, factored, loaded, solved
 from grounded.compile.llvm_product import (
     Linearised,
     padded,
@@ -48,7 +48,7 @@ def sweep_kernel(d: Dynamics, layout: Layout, width: int) -> str:
         writer.input_rows(t, slopes)
         writer.gains(t)
         writer.state_rows(t, slopes)
-        writer.value(t)
+        writer.value()
     f.store(f.load(writer.sums, 0), writer.words.pointer("expected"), 0)
     f.store(f.load(writer.sums, 1), writer.words.pointer("expected"), 1)
     f.do("ret i64 -1")
@@ -67,7 +67,7 @@ class _Sweep:
         self.V, self.v = f.room(self.P * self.P), f.room(self.P)
         self.M, self.T = f.room(self.C * self.P), f.room(self.P * self.C)
         self.U, self.G = f.room(m * self.C), f.room(m * self.C)  # rows of [Q_uz Q_uu], f_u'T
-        self.g_z, self.g_u = f.room(self.P), f.room(m)
+        self.g_u = f.room(m)
         self.H, self.L, self.inv = f.room(m * m), f.room(m * m), f.room(m)
         self.k, self.free, self.low, self.high = (f.room(m) for _ in range(4))
         self.K, self.F, self.sums = f.room(m * self.P), f.room(m * self.P), f.room(2)
@@ -78,8 +78,7 @@ class _Sweep:
     def end(self) -> None:
         """V and v of the last state; zeros in the padding."""
         f = self.f
-        rooms = ((self.V, self.P * self.P), (self.M, self.C * self.P), (self.v, self.P))
-        for room, size in (*rooms, (self.g_z, self.P)):
+        for room, size in ((self.V, self.P**2), (self.M, self.C * self.P), (self.v, self.P)):
             with f.loop(size // 4) as four:
                 f.store(splat(0.0, 4), room, f.integer("mul", four, 4), 4)
         f.store(splat(0.0, 2), self.sums, 0, 2)
@@ -138,7 +137,7 @@ class _Sweep:
             f.store(slope, self.g_u, j)
 
     def state_rows(self, t: str, slopes: list[str]) -> None:
-        """Q_zz into V, Q_z into g_z."""
+        """Q_zz into V, Q_z into v."""
         f, P, C = self.f, self.P, self.C
         cost = self._state_cost(t)
         for at, size in self.cut:
@@ -153,7 +152,7 @@ class _Sweep:
             for c in range(at, min(at + size, len(cost))):
                 own = cost[c]
                 slope.append(f.add(slopes[c], own[0]) if own else slopes[c])
-            f.store(row_of(f, slope, size), self.g_z, at, size)
+            f.store(row_of(f, slope, size), self.v, at, size)
 
     def _state_cost(self, t: str) -> list[tuple[str, str] | None]:
         """(l_z, l_zz) for each entry of z, None where it has no cost."""
@@ -169,54 +168,64 @@ class _Sweep:
 
     def gains(self, t: str) -> None:
         """Gains k and K of step t inside the limits; the promise d1, d2."""
-        f, layout = self.f, self.layout
+        f, layout, C = self.f, self.layout, self.C
         m, nz = layout.m, layout.nz
-        damping, u = self.words.pointer("damping"), self._row("u_run", t, m)
+        damping = [f.load(self.words.pointer("damping"), i) for i in range(m)]
+        H = [[f.load(self.U, i * C + nz + j) for j in range(m)] for i in range(m)]
         for i in range(m):
-            for j in range(m):
-                q = f.load(self.U, i * self.C + nz + j)
-                q = f.add(q, f.load(damping, i)) if i == j else q
-                f.store(q, self.H, i * m + j)
-            f.store(ONE, self.free, i)
-            f.store(f.neg(f.load(self.g_u, i)), self.k, i)
-            now = f.load(u, i)
-            f.store(f.sub(f.load(self.words.pointer("low"), i), now), self.low, i)
-            f.store(f.sub(f.load(self.words.pointer("high"), i), now), self.high, i)
-        good, infinity = self._factor(), number(float("inf"))
-        for i in range(m):
-            finite = f.compare("olt", f.call("fabs", [f.load(self.g_u, i)]), infinity)
+            H[i][i] = f.add(H[i][i], damping[i])
+        L, inverse, good = factored(f, H)
+        g, infinity = [f.load(self.g_u, i) for i in range(m)], number(float("inf"))
+        for value in g:
+            finite = f.compare("olt", f.call("fabs", [value]), infinity)
             good = f.emit(f"and i1 {good}, {finite}")
         f.return_if(f.emit(f"xor i1 {good}, true"), f"i64 {t}")
-        f.do(f"call void @substitute(ptr {self.L}, ptr {self.inv}, ptr {self.k})")
-        self._limit()
-        self._promise()
-        self._feedback(t)
+        inverse = [f.neg(value) for value in inverse]  # of -H: k and K are minus a solution
+        k = solved(f, g, L, inverse, 1)
+        L, inverse, k = self._limited(t, H, (L, inverse, k))
+        self._promise(k, g)
+        self._feedback(t, L, inverse, k)
 
-    def _factor(self) -> str:
-        return self.f.emit(
-            f"call i1 @factor(ptr {self.H}, ptr {self.free}, ptr {self.L}, ptr {self.inv})"
+    def _limited(
+        self, t: str, H: list[list[str]], usual: tuple[Lower, list[str], list[str]]
+    ) -> tuple[Lower, list[str], list[str]]:
+        """L, -1/D and k; of the box-limited programme where the unlimited k breaks a limit."""
+        f, m, u = self.f, self.layout.m, self._row("u_run", t, self.layout.m)
+        L, inverse, k = usual
+        low, high = (
+            [f.sub(f.load(self.words.pointer(name), i), f.load(u, i)) for i in range(m)]
+            for name in ("low", "high")
         )
+        broken = "false"
+        for value, lowest, highest in zip(k, low, high, strict=True):
+            outside = f.compare("une", clipped(f, value, lowest, highest), value)
+            broken = f.emit(f"or i1 {broken}, {outside}")
+        with f.unless([*L.values(), *inverse, *k], broken) as values:
+            rooms = (self.k, k), (self.low, low), (self.high, high), (self.free, [ONE] * m)
+            for room, row in (*rooms, (self.H, [value for line in H for value in line])):
+                for i, value in enumerate(row):
+                    f.store(value, room, i)
+            values[:] = self._boxed()
+        below, last = len(L), len(L) + m
+        return dict(zip(L, values[:below], strict=True)), values[below:last], values[last:]
 
-    def _limit(self) -> None:
-        """The box-limited programme where the unlimited k breaks a limit."""
-        f, broken = self.f, "false"
-        for i in range(self.layout.m):
-            k = f.load(self.k, i)
-            inside = clipped(f, k, f.load(self.low, i), f.load(self.high, i))
-            broken = f.emit(f"or i1 {broken}, {f.compare('une', inside, k)}")
-        with f.when(broken):
-            f.do(
-                f"call void @box(ptr {self.H}, ptr {self.g_u}, ptr {self.low}, ptr {self.high}, "
-                f"ptr {self.k}, ptr {self.free}, ptr {self.L}, ptr {self.inv})"
-            )
-            self._factor()
+    def _boxed(self) -> list[str]:
+        """The box-limited programme; clamped inputs get 0 for -1/D, and so no feedback."""
+        f, m = self.f, self.layout.m
+        f.do(
+            f"call void @box(ptr {self.H}, ptr {self.g_u}, ptr {self.low}, ptr {self.high}, "
+            f"ptr {self.k}, ptr {self.free}, ptr {self.L}, ptr {self.inv})"
+        )
+        f.emit(f"call i1 @factor(ptr {self.H}, ptr {self.free}, ptr {self.L}, ptr {self.inv})")
+        L, inverse = loaded(f, m, self.L, self.inv)
+        inverse = [f.mul(f.neg(value), f.load(self.free, i)) for i, value in enumerate(inverse)]
+        return [*L.values(), *inverse, *(f.load(self.k, i) for i in range(m))]
 
-    def _promise(self) -> None:
+    def _promise(self, k: list[str], g: list[str]) -> None:
         f, m, nz = self.f, self.layout.m, self.layout.nz
-        k = [f.load(self.k, i) for i in range(m)]
         d1, d2 = f.load(self.sums, 0), ZERO
         for i in range(m):
-            d1 = f.fma(k[i], f.load(self.g_u, i), d1)
+            d1 = f.fma(k[i], g[i], d1)
             row = f.mul(f.load(self.U, i * self.C + nz), k[0])
             for j in range(1, m):
                 row = f.fma(f.load(self.U, i * self.C + nz + j), k[j], row)
@@ -224,41 +233,51 @@ class _Sweep:
         f.store(d1, self.sums, 0)
         f.store(f.fma(d2, number(0.5), f.load(self.sums, 1)), self.sums, 1)
 
-    def _feedback(self, t: str) -> None:
-        """K = -Q_uu^-1 Q_uz on the free inputs, to memory; F = Q_uz - damping K."""
+    def _feedback(self, t: str, L: Lower, inverse: list[str], k: list[str]) -> None:
+        """K = -Q_uu^-1 Q_uz on the free inputs, k and K to memory."""
         f, m, nz, P = self.f, self.layout.m, self.layout.nz, self.P
         for at, size in self.cut:
             Q_uz = [f.load(self.U, j * self.C + at, size) for j in range(m)]
-            sides = [
-                f.mul(f.load_all(self.free, j, size), f.neg(Q, size), size)
-                for j, Q in enumerate(Q_uz)
-            ]
-            for j, row in enumerate(solved(f, sides, self.L, self.inv, size)):
-                damping = f.load_all(self.words.pointer("damping"), j, size)
+            for j, row in enumerate(solved(f, Q_uz, L, inverse, size)):
                 f.store(row, self.K, j * P + at, size)
-                rest = f.sub(Q_uz[j], f.mul(damping, row, size), size)
-                f.store(rest, self.F, j * P + at, size)
         to_K, to_k = self._row("K", t, m * nz), self._row("k", t, m)
         for j in range(m):
-            f.store(f.load(self.k, j), to_k, j)
+            f.store(k[j], self.k, j)
+            f.store(k[j], to_k, j)
             for i in range(0, nz - nz % 4, 4):
                 f.store(f.load(self.K, j * P + i, 4), to_K, j * nz + i, 4)
             for i in range(nz - nz % 4, nz):
                 f.store(f.load(self.K, j * P + i), to_K, j * nz + i)
 
-    def value(self, t: str) -> None:
-        """V = Q_zz + F'K, v = Q_z + F'k."""
+    def value(self) -> None:
+        """V = Q_zz + Q_uz'K - K'diag(damping)K, v = Q_z + Q_uz'k - K'diag(damping)k."""
+        self._add(self.U, self.C, "fadd")
+        f, m, P = self.f, self.layout.m, self.P
+        damping = [f.load(self.words.pointer("damping"), j) for j in range(m)]
+        damped = "false"
+        for value in damping:
+            damped = f.emit(f"or i1 {damped}, {f.compare('une', value, ZERO)}")
+        with f.when(damped):
+            for at, size in self.cut:
+                for j in range(m):
+                    row = f.mul(f.spread(damping[j], size), f.load(self.K, j * P + at, size), size)
+                    f.store(row, self.F, j * P + at, size)
+            self._add(self.F, P, "fsub")
+
+    def _add(self, F: str, stride: int, op: str) -> None:
+        """V += F'K, v += F'k, or -=, for rows F_j."""
         f, m, P = self.f, self.layout.m, self.P
         for at, size in self.cut:
             K = [f.load(self.K, j * P + at, size) for j in range(m)]
-            v = f.load(self.g_z, at, size)
+            v = f.load(self.v, at, size)
             for j in range(m):
-                F = f.load(self.F, j * P + at, size)
-                v = f.fma(f.load_all(self.k, j, size), F, v, size)
+                k = f.load_all(self.k, j, size)
+                v = f.op(op, v, f.mul(k, f.load(F, j * stride + at, size), size), size)
             f.store(v, self.v, at, size)
             with f.loop(self.layout.nz) as c:
                 place = f.integer("add", f.integer("mul", c, P), at)
-                row, column = f.load(self.V, place, size), f.at(self.F, c)
+                row, column = f.load(self.V, place, size), f.at(F, c)
                 for j in range(m):
-                    row = f.fma(f.load_all(column, j * P, size), K[j], row, size)
+                    product = f.mul(f.load_all(column, j * stride, size), K[j], size)
+                    row = f.op(op, row, product, size)
                 f.store(row, self.V, place, size)

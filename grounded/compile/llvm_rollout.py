@@ -203,10 +203,9 @@ class _Rollout:
                     layout.slot(j, i) * LANES,
                     LANES,
                 )
-        step.step()
         bias = self._row("bias", t, layout.n)
-        for i in range(layout.n):
-            x = f.add(f.load(step.next, i * LANES, LANES), f.load_all(bias, i, LANES), LANES)
+        for i, value in enumerate(step.step()):
+            x = f.add(value, f.load_all(bias, i, LANES), LANES)
             f.store(x, self.z, i * LANES, LANES)
 
     def finish(self) -> None:

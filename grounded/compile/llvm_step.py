@@ -20,6 +20,7 @@ from grounded.compile.llvm_text import Writer, doubles, integers, number, splat
 from grounded.compile.traced import STAGES, Variant
 
 Place = tuple[int, int]  # row, column of a Jacobian
+FLAT = 120  # operations of a model whose stages are written out: nothing waits for memory then
 UNROLLED = 2000  # products of the chain rule that are written out; more are a loop over indices
 
 
@@ -97,34 +98,60 @@ class StepWriter:
 
         return Body(f, w, d.graph, leaf, self.table, d.uniforms.slot, self.held)
 
-    def step(self) -> None:
-        """From x and u to next."""
+    def step(self) -> list[str]:
+        """From x and u to next, whose values are returned too."""
         f, d, w = self.f, self.d, self.width
         if not d.stages:
-            values = self._body(lambda i: f.load(self.x, i * w, w)).values(d.outputs)
-            for i, value in enumerate(values):
-                f.store(value, self.next, i * w, w)
-            return
-        self._start(d.outputs)
-        with f.loop(len(d.stages)) as stage:
-            self._rates(stage)
-        self._finish()
+            following = self._body(lambda i: f.load(self.x, i * w, w)).values(d.outputs)
+        elif len(d.graph.live(d.outputs)) <= FLAT:
+            following = self._flat()
+        else:
+            self._start(d.outputs)
+            with f.loop(len(d.stages)) as stage:
+                self._rates(stage)
+            return self._finish()
+        for i, value in enumerate(following):
+            f.store(value, self.next, i * w, w)
+        return following
+
+    def _flat(self) -> list[str]:
+        """The stages one after the other, the sums of `_rates` and `_finish` in registers."""
+        f, d, w = self.f, self.d, self.width
+        self._hold(d.outputs)
+        dt, x = f.load(self.table, DT), [f.load(self.x, i * w, w) for i in range(d.n)]
+        now, k, total = x, list[str](), list[str]()
+        for c, b in d.stages:
+            if k:
+                c_dt = f.spread(f.mul(dt, number(c)), w)
+                now = [f.fma(c_dt, k, value, w) for k, value in zip(k, x, strict=True)]
+            k = self._body(now.__getitem__).values(d.outputs)
+            b_dt = f.spread(f.mul(dt, number(b)), w)
+            total = [
+                f.fma(b_dt, rate, total[i], w) if total else f.mul(b_dt, rate, w)
+                for i, rate in enumerate(k)
+            ]
+        return [f.add(a, b, w) for a, b in zip(x, total, strict=True)]
+
+    def _hold(self, outputs: Sequence[int]) -> None:
+        held = self.d.uniforms.held(outputs)
+        self.held = {}
+        self.held = dict(zip(held, self._body(lambda i: "").values(held), strict=True))
 
     def _start(self, outputs: Sequence[int]) -> None:
         f, d, w = self.f, self.d, self.width
-        held = d.uniforms.held(outputs)
-        self.held = {}
-        self.held = dict(zip(held, self._body(lambda i: "").values(held), strict=True))
+        self._hold(outputs)
         zero = splat(0.0, w)
         for i in range(d.n):
             f.store(zero, self.next, i * w, w)
             f.store(zero, self.k, i * w, w)
 
-    def _finish(self) -> None:
-        f, w = self.f, self.width
+    def _finish(self) -> list[str]:
+        f, w, following = self.f, self.width, []
         for i in range(self.d.n):
             x = f.add(f.load(self.x, i * w, w), f.load(self.next, i * w, w), w)
             f.store(x, self.next, i * w, w)
+            following.append(x)
+        return following
 
     def _rates(self, stage: str) -> tuple[Body, str]:
         """One stage: k = f(x + c dt k), next += b dt k; next starts at zero."""

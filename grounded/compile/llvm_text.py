@@ -226,6 +226,26 @@ class Writer:
         self.do(f"br label %after{tag}")
         self.lines.append(f"after{tag}:")
 
+    @contextmanager
+    def unless(self, usual: list[str], condition: str) -> Iterator[list[str]]:
+        """Values of W = 1 that are `usual`, or where the i1 is true what the block leaves in them.
+
+        The yielded list holds names; the block replaces them by its own, and afterwards they are
+        the names to go on with.
+        """
+        before = self._block()
+        values = list(usual)
+        with self.when(condition):
+            yield values
+            after = self._block()
+        for i, (a, b) in enumerate(zip(usual, list(values), strict=True)):
+            values[i] = self.emit(f"phi double [ {a}, %{before} ], [ {b}, %{after} ]")
+
+    def _block(self) -> str:
+        """The label of the block that is being written."""
+        labels = (line for line in reversed(self.lines) if not line.startswith(" "))
+        return next(line for line in labels if line.endswith(":"))[:-1]
+
     def return_if(self, condition: str, result: str) -> None:
         """Returns early."""
         with self.when(condition):

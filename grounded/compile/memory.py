@@ -8,6 +8,7 @@ to a shelf when the last array made of it is gone, and the next result of that s
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,19 @@ def empty(shape: tuple[int, ...]) -> Array:
     if size < SMALL:
         return np.empty(shape)
     return np.asarray(_Block(1 << (size - 1).bit_length(), shape), np.float64)
+
+
+def side_by_side(shapes: Mapping[str, tuple[int, ...]]) -> tuple[dict[str, Array], dict[str, int]]:
+    """Arrays of these shapes in one block, each on a cache line of its own, and their addresses."""
+    places, size = dict[str, tuple[int, int]](), 0
+    for name, shape in shapes.items():
+        end = size + math.prod(shape)
+        places[name] = (size, end)
+        size = (end + 7) & -8
+    block = empty((size,))
+    start = int(block.__array_interface__["data"][0])
+    arrays = {name: block[a:b].reshape(shapes[name]) for name, (a, b) in places.items()}
+    return arrays, {name: start + 8 * first for name, (first, _) in places.items()}
 
 
 class _Block:

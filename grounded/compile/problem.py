@@ -67,6 +67,16 @@ class Problem:
         """Past inputs in z for each input."""
         return history_depths(self.delay)
 
+    @cached_property
+    def input_scale(self) -> Array:
+        """The natural unit of damping for each input (m,): the curvature 2 (R + S) of its own cost.
+
+        An input without a cost of its own takes the mean of the others, or 1.
+        """
+        scale = 2.0 * (self.input_weight + self.change_weight)
+        positive = scale[scale > 0]
+        return np.where(scale > 0, scale, positive.mean() if positive.size else 1.0)
+
     @property
     def nz(self) -> int:
         """Size of the augmented state z."""

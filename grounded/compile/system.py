@@ -109,7 +109,6 @@ class System(Protocol):
     def descend(
         self,
         problem: Problem,
-        scale: Array,
         ubar: Array,
         K: Array | None,
         zbar: Array | None,
@@ -117,6 +116,6 @@ class System(Protocol):
     ) -> Descent | None:
         """The loop of `ddp.solve` in one piece; None where it is left to `ddp`.
 
-        From the rollout of ubar (H, m) or of ubar + K (z - zbar); scale (m,) times mu regularises.
+        From the rollout of ubar (H, m) or of ubar + K (z - zbar).
         """
         ...

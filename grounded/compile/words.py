@@ -8,7 +8,7 @@ from __future__ import annotations
 import ctypes
 import struct
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -27,6 +27,7 @@ class Packed:
     words: dict[str, int]
     kept: tuple[Array, ...]
     layout: Layout
+    kernels: dict[Any, Any] = field(default_factory=dict)  # by system, see `CompiledSystem`
 
 
 def packed(problem: Problem) -> Packed:
