@@ -82,6 +82,15 @@ def test_a_new_workspace_begins_with_propose(tmp_path):
     assert last(grounded("-C", folder, "status")) == "grounded propose"
 
 
+def test_what_logs_have_shown_is_adopted_before_the_first_candidate(cart, tmp_path):
+    folder = make(tmp_path / "w").folder
+    (folder / "reports").mkdir()
+    diagnosed(folder)
+    assert last(grounded("-C", folder, "status")) == "grounded adopt viscous_friction:v"
+    assert grounded("-C", folder, "adopt", "viscous_friction:v").code == 0
+    assert last(grounded("-C", folder, "status")) == "grounded propose"
+
+
 def test_a_long_command_is_broken_where_a_shell_allows_it():
     names = [f"first_order_lag:input_number_{k}" for k in range(6)]
     command = " ".join(["grounded adopt", *names])

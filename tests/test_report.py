@@ -40,7 +40,7 @@ def test_text_without_a_diagnosis_says_how_to_get_one(car):
 def test_text_shows_the_diagnosis(cart):
     out = grounded("-C", cart, "report").out
     assert "explains 90 % of the gap" in out
-    assert "k = 0.3 +- 0.01" in out
+    assert "k = 0.3 +- 0.01 1/s" in out
     assert "4.10 before, 1.10 after, floor 1.00" in out
 
 

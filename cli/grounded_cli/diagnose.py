@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -134,6 +135,10 @@ def _ranked(entry: dict[str, Any]) -> tuple[str, str, str]:
 
 def _values(entry: dict[str, Any]) -> str:
     return ", ".join(
-        with_unit(f"{name} = {number(p['value'], 3)} +- {number(p['std'], 2)}", p["unit"])
+        with_unit(f"{name} = {number(p['value'], 3)}{_spread(p['std'])}", p["unit"])
         for name, p in entry["params"].items()
     )
+
+
+def _spread(std: float | None) -> str:
+    return f" +- {number(std, 2)}" if std and math.isfinite(std) else ""

@@ -52,7 +52,7 @@ def whiteness_sentence(whiteness: tuple[tuple[str, float], ...]) -> str:
     """Whether what the effects leave of each state is noise, or still has a pattern."""
     names, total = coloured(whiteness), len(whiteness)
     if not names:
-        return "what is left of every state looks like white noise: nothing more to predict"
+        return "what is left of every state looks like white noise (Ljung-Box, p >= 0.01)"
     which = "every state" if len(names) == total else f"{', '.join(names)}"
     return (
         f"what is left of {which} is no white noise (Ljung-Box, p < 0.01): "

@@ -27,15 +27,7 @@ def load_module(
         GroundedError: if it isn't there, lies outside the workspace, or fails while it runs.
     """
     if module:
-        try:
-            return importlib.import_module(module)
-        except ModuleNotFoundError as error:
-            raise GroundedError(
-                f"[model] module = '{module}' can't be imported: {error}; install its package in "
-                "this environment or give file = 'model.py'"
-            ) from None
-        except Exception as error:
-            raise GroundedError(_where(error, module)) from None
+        return _installed(module)
     path = (folder / file).resolve()
     if not path.is_relative_to(folder.resolve()):
         raise GroundedError(
@@ -59,6 +51,26 @@ def load_module(
         sys.path.remove(str(folder))
         _forget_neighbours(folder, before)
     return found
+
+
+def _installed(name: str) -> ModuleType:
+    """A module by its import name, or a model by its name among the entry points."""
+    from importlib.metadata import entry_points
+
+    registered = {point.name: point for point in entry_points(group="grounded.models")}
+    try:
+        if name in registered and importlib.util.find_spec(name) is None:
+            found = ModuleType(name)
+            vars(found)["model"] = registered[name].load()
+            return found
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        raise GroundedError(
+            f"[model] module = '{name}' can't be imported: {error}; install its package in this "
+            f"environment, give file = 'model.py', or name one of {', '.join(sorted(registered))}"
+        ) from None
+    except Exception as error:
+        raise GroundedError(_where(error, name)) from None
 
 
 def _forget_neighbours(folder: Path, before: set[str]) -> None:

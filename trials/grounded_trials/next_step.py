@@ -17,11 +17,13 @@ def next_command(workspace: Workspace, now: Standing, diagnosis: Diagnosis | Non
     if now.phase == "await-trial":
         system = workspace.config.system
         return "grounded run" if system.command or system.model else "grounded ingest TRIAL.mcap"
-    if now.phase == "propose":
-        return "grounded propose"
-    if diagnosis is None or _outdated(workspace, diagnosis):
-        return "grounded diagnose"
-    return after_diagnosis(workspace, diagnosis.kind, diagnosis.effects) or EXPORT
+    known = diagnosis is not None and not _outdated(workspace, diagnosis)
+    follow = ""
+    if known and diagnosis is not None:
+        follow = after_diagnosis(workspace, diagnosis.kind, diagnosis.effects)
+    if now.phase == "propose":  # what logs have shown is adopted before the first candidate
+        return follow * (not now.history) or "grounded propose"
+    return follow or EXPORT if known else "grounded diagnose"
 
 
 def after_diagnosis(workspace: Workspace, kind: str, effects: Sequence[str]) -> str:

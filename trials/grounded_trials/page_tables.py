@@ -128,7 +128,7 @@ def _value(v: Value) -> str:
 
 def _interval(v: Value) -> str:
     half = INTERVAL * v.std
-    if not math.isfinite(half):
+    if not 0 < half < math.inf:
         return figure(v.value)
     return f"{figure(v.value)} ({figure(v.value - half, 3)} to {figure(v.value + half, 3)})"
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from grounded.search import Tried
 from grounded_trials.diagnosis_file import Diagnosis, Value
-from grounded_trials.diagnosis_words import error_lines
+from grounded_trials.diagnosis_words import error_lines, sentences
 from grounded_trials.findings import (
     Findings,
     prediction_error,
@@ -174,7 +174,9 @@ def _biases(findings: Findings, table: Table) -> str:
 def _diagnosis(diagnosis: Diagnosis | None, table: Table) -> str:
     if diagnosis is None:
         return "gap to the model\n  not diagnosed yet: grounded diagnose"
-    lines = ["gap to the model", *_wrapped(diagnosis.sentence or diagnosis.kind, "  ")]
+    lines = ["gap to the model"]
+    for sentence in sentences(diagnosis.sentence or diagnosis.kind):
+        lines += _wrapped(sentence, "  ")
     gap = diagnosis.gap
     if gap is not None:
         lines.append(
@@ -219,7 +221,7 @@ def _logs(findings: Findings, table: Table) -> str:
 
 
 def _value(value: Value) -> str:
-    spread = f" +- {value.std:.1g}" if math.isfinite(value.std) else ""
+    spread = f" +- {value.std:.2g}" if 0 < value.std < math.inf else ""
     return with_unit(f"{value.name} = {value.value:.3g}{spread}", value.unit)
 
 

@@ -26,6 +26,8 @@ def percent(share: float) -> str:
     if math.isnan(share):
         return "-"
     value = 100 * share
+    if 0 < value < 0.05 or 99.95 <= value < 100:
+        return "< 0.1 %" if value < 50 else "> 99.9 %"
     return f"{value:.0f} %" if 10 <= value <= 90 else f"{value:.1f} %"
 
 
