@@ -75,17 +75,23 @@ def _explore(search: Search) -> Fit:
         # a large effect has a long way from its first look
         search.refined([f for f in singles[:SHORTLIST] if f.noise.structure == kind], 8)
     best = search.of_size(1)[0]
-    for _ in range(2):  # with the noise that the best one leaves, others may look better
+    for _ in range(3):  # with the noise that the best one leaves, others may look better
         search.extended(_without_last(best))
         search.structures(best)
         search.calibrated(best)
         again = search.of_size(1)[0]
-        same = again.hypothesis.names == best.hypothesis.names
+        same = _kind(again) == _kind(best)
         best = again
         if same:
             break
     search.fair(best)
     return max([best, search.best_null()], key=search.score)
+
+
+def _kind(fit: Fit) -> tuple[object, ...]:
+    """What rivals have to be given too: the effects beside, the noise's structure, the prior."""
+    h = fit.hypothesis
+    return h.names, fit.noise.structure, h.spread
 
 
 def outliers(fit: Fit) -> bool:

@@ -27,6 +27,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from grounded.diagnosis import kernels
 from grounded.frozen import Array
 
 UNKNOWN = 1e6  # standard deviations: how little is known of a state that was not measured at t = 0
@@ -77,11 +78,13 @@ def gains(A: Array, Q: Array, R: Array, seen: Array, start: Array, G: Array | No
     L, B, N, _ = A.shape
     n = seen.shape[-1]
     Q, R = np.broadcast_to(Q, (L, B, N)), np.broadcast_to(R, (L + 1, B, n))
+    first = np.concatenate([R[0] * np.where(seen[0] > 0, 1.0, UNKNOWN), start], axis=1)
+    if kernels.available(n):
+        return _compiled_gains(A, Q, R, seen, first, G)
     K, whiten, logdet = np.empty((L, B, N, n)), np.empty((L, B, n, n)), np.empty((L, B))
     i, k = np.arange(n), np.arange(N)
     P = np.zeros((B, N, N))
-    P[:, i, i] = R[0] * np.where(seen[0] > 0, 1.0, UNKNOWN)
-    P[:, k[n:], k[n:]] = start
+    P[:, k, k] = first
     whole = bool(seen.all())
     for t in range(L):
         P = A[t] @ P @ A[t].swapaxes(1, 2)
@@ -108,6 +111,23 @@ def gains(A: Array, Q: Array, R: Array, seen: Array, start: Array, G: Array | No
     return Gains(A, K, whiten, logdet, seen, G)
 
 
+def _compiled_gains(
+    A: Array, Q: Array, R: Array, seen: Array, first: Array, G: Array | None
+) -> Gains:
+    L, B, N, _ = A.shape
+    n = seen.shape[-1]
+    K, whiten = np.empty((L, B, N, n)), np.zeros((L, B, n, n))
+    A, seen = np.ascontiguousarray(A), np.ascontiguousarray(seen, float)
+    G = None if G is None else np.ascontiguousarray(G)
+    values = {"A": A, "Q": np.ascontiguousarray(Q), "R": np.ascontiguousarray(R), "seen": seen}
+    values |= {"start": np.ascontiguousarray(first), "G": 0 if G is None else G}
+    kernels.run("gains", n, N, G is not None, {**values, "L": L, "B": B, "K": K, "W": whiten})
+    diagonal = np.einsum("tbii->tbi", whiten)
+    if not np.isfinite(diagonal).all():
+        raise np.linalg.LinAlgError("a covariance is not finite")
+    return Gains(A, K, whiten, -2 * np.log(diagonal).sum(axis=-1), seen, G)
+
+
 def innovations(g: Gains, d: Array, r: Array, *, track: bool = False) -> tuple[Array, Array | None]:
     """Filters columns: whitened innovations (L, B, n, C), and the filtered e (L + 1, B, n, C).
 
@@ -119,6 +139,8 @@ def innovations(g: Gains, d: Array, r: Array, *, track: bool = False) -> tuple[A
     """
     L, B, n, C = d.shape
     N = g.A.shape[-1]
+    if kernels.available(n):
+        return _compiled_innovations(g, d, r, track=track)
     out = np.empty((L, B, n, C))
     filtered = np.empty((L + 1, B, n, C)) if track else None
     M = np.zeros((B, N, C))
@@ -139,6 +161,31 @@ def innovations(g: Gains, d: Array, r: Array, *, track: bool = False) -> tuple[A
     return out, filtered
 
 
+def _compiled_innovations(
+    g: Gains, d: Array, r: Array, *, track: bool
+) -> tuple[Array, Array | None]:
+    L, B, n, C = d.shape
+    lanes = kernels.lanes(n)
+    wide = -(-C // lanes) * lanes
+    d, r = _widened(d, (L, B, n, wide)), _widened(r, (L + 1, B, n, wide))
+    out = np.empty((L, B, n, wide))
+    filtered = np.empty((L + 1, B, n, wide)) if track else None
+    values = {"A": g.A, "K": g.K, "W": g.whiten, "d": d, "r": r, "seen": g.seen, "L": L, "B": B}
+    values |= {"blocks": wide // lanes, "C": wide, "out": out}
+    values |= {"track": 0 if filtered is None else filtered}
+    kernels.run("innovations", n, g.A.shape[-1], g.G is not None, values)
+    return out[..., :C], None if filtered is None else filtered[..., :C]
+
+
+def _widened(columns: Array, shape: tuple[int, ...]) -> Array:
+    """Contiguous, with columns of zeros up to a shape."""
+    if columns.shape == shape:
+        return np.ascontiguousarray(columns)
+    whole = np.zeros(shape)
+    whole[..., : columns.shape[-1]] = columns
+    return whole
+
+
 @dataclass(frozen=True, eq=False)
 class Adjoint:
     """What the likelihood says of each disturbance: u, D (L, B, n) of v; r, N (L, B, N) of w."""
@@ -155,6 +202,12 @@ def smoother(g: Gains, white: Array) -> Adjoint:
     n = white.shape[-1]
     u, D = np.empty((L, B, n)), np.empty((L, B, n))
     r, Nd = np.empty((L, B, N)), np.empty((L, B, N))
+    if kernels.available(n):
+        values = {"A": g.A, "K": g.K, "W": g.whiten, "white": np.ascontiguousarray(white)}
+        values |= {"seen": g.seen, "G": 0 if g.G is None else g.G, "L": L, "B": B}
+        values |= {"u": u, "D": D, "r": r, "N": Nd}
+        kernels.run("smoother", n, N, g.G is not None, values)
+        return Adjoint(u, D, r, Nd)
     q, Nq = np.zeros((B, N)), np.zeros((B, N, N))
     for t in range(L - 1, -1, -1):
         W, K = g.whiten[t], g.K[t]
@@ -179,4 +232,5 @@ def smoother(g: Gains, white: Array) -> Adjoint:
         At = g.A[t].swapaxes(1, 2)
         q = (At @ q[:, :, None])[:, :, 0]
         Nq = At @ Nr @ g.A[t]
+        Nq = 0.5 * (Nq + Nq.swapaxes(1, 2))  # what is not symmetric would grow, step by step
     return Adjoint(u, D, r, Nd)

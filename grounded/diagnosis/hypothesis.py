@@ -161,17 +161,28 @@ class Predictor:
         ]
         if not rates:
             return self.step(x, u, p)
-        before = self.added_rate(rates, x, u, p, t)
-        after = self.step(x + 0.5 * dt * before, u, p)
-        later = self.added_rate(rates, after, u, p, t + dt)
-        result = after + 0.5 * dt * later
+        needs_own = any(effect.family.needs_own for effect, _ in rates)
+        own = self.named((self.step(x, u, p) - x) / dt) if needs_own else {}
+        start = x + 0.5 * dt * self.added_rate(rates, x, u, t, own)
+        after = self.step(start, u, p)
+        if needs_own:  # the mean over the very step: second order, steady where the model is stiff
+            own = self.named((after - start) / dt)
+        result = after + 0.5 * dt * self.added_rate(rates, after, u, t + dt, own)
         for i, j in self.tied():  # a carried heading rate is the heading's rate, effects and all
-            rise = self.instant(result, u, p, i) - self.instant(x, u, p, i)
-            result[..., j] = x[..., j] + rise + later[..., i] - before[..., i]
+            found = []
+            for s, when in ((x, t), (result, t + dt)):
+                rate = self.instant(s, u, p)
+                own = self.named(rate) if needs_own else {}
+                found.append(rate[..., i] + self.added_rate(rates, s, u, when, own)[..., i])
+            result[..., j] = x[..., j] + found[1] - found[0]
         return result
 
-    def instant(self, x: Array, u: Array, p: Array, i: int) -> Array:
-        """The model's own rate of state i at x, by a very short step."""
+    def named(self, rate: Array) -> Named:
+        """Rates (..., n) by name."""
+        return Named("state", self.data.model.state_names, list(np.moveaxis(rate, -1, 0)))
+
+    def instant(self, x: Array, u: Array, p: Array) -> Array:
+        """The model's own rates at x (..., n), by a very short step."""
         model, short = self.data.model, 1e-3 * self.data.dt
         flat = model.system.step(
             np.ascontiguousarray(x.reshape(-1, model.n)),
@@ -179,7 +190,7 @@ class Predictor:
             p,
             short,
         )
-        return (flat[:, i].reshape(x.shape[:-1]) - x[..., i]) / short
+        return np.asarray((flat.reshape(x.shape) - x) / short)
 
     def tied(self) -> list[tuple[int, int]]:
         """(heading, heading rate) where the rate is only carried along."""
@@ -190,16 +201,14 @@ class Predictor:
             self._inputs[key] = np.array([(i, names.index(k)) for i, k in found]).reshape(-1, 2)
         return [(int(i), int(j)) for i, j in self._inputs[key]]
 
-    def added_rate(self, rates: Any, x: Array, u: Array, p: Array, t: Array) -> Array:
-        """Sum of the rates of (effect, values) pairs at x (..., n), (..., n) per second."""
-        model, dt = self.data.model, self.data.dt
-        names = model.state_names
+    def added_rate(self, rates: Any, x: Array, u: Array, t: Array, own: Any) -> Array:
+        """Sum of the rates of (effect, values) pairs at x (..., n), (..., n) per second.
+
+        `own` are the model's own rates by name, for families that need them.
+        """
+        names = self.data.model.state_names
         s = Named("state", names, list(np.moveaxis(x, -1, 0)))
-        a = Named("input", model.input_names, list(np.moveaxis(u, -1, 0)))
-        own: Any = {}
-        if any(effect.family.needs_own for effect, _ in rates):
-            rate = model.difference(self.step(x, u, p), x) / dt
-            own = Named("state", names, list(np.moveaxis(rate, -1, 0)))
+        a = Named("input", self.data.model.input_names, list(np.moveaxis(u, -1, 0)))
         total = np.zeros_like(x)
         for effect, values in rates:
             added = effect.family.rate(s, a, own, t, values, effect.site)

@@ -11,7 +11,9 @@ which real noise differs from the textbook's, allowed before an effect is claime
                the same ones, so that outliers count for little and favour nobody.
 
 Variances climb the likelihood by scoring: with the smoother's adjoint r and its covariance N,
-d loglik / d log q = q sum(r^2 - N) / 2; the information is that of a channel by itself (`climbed`).
+d loglik / d log q = q sum(r^2 - N) / 2. The information is first that of each channel by itself,
+then measured: the slope's own differences (`information.py`), since what is a disturbance of one
+channel can pass for measurement noise of another.
 """
 
 from __future__ import annotations
@@ -25,6 +27,7 @@ from grounded.diagnosis.filter import Adjoint
 from grounded.frozen import Array
 
 DOF = 4.0
+NOTHING = 1e-4  # part of a channel's one-step variance below which a variance is nil
 
 
 @dataclass(frozen=True)
@@ -57,7 +60,7 @@ class Noise:
     floor: Array  # (n,) log variance below which nothing is resolved
     weight_w: Array | float = 1.0
     weight_v: Array | float = 1.0
-    last: Array | None = None  # the steps that were taken last, (2 or 3, n)
+    info: Array | None = None  # information of the log variances, (K, K), where it was measured
 
     def process(self, dt: float) -> Array:
         """Q for the filter: (L, B, N) or (N,)."""
@@ -84,11 +87,21 @@ class Noise:
     def allowing(self, structure: Structure, dt: float) -> Noise:
         """The same noise, free to be coloured (or not): where its fit starts."""
         if structure.tau is None:
-            return replace(self, structure=structure, last=None)
+            return replace(self, structure=structure, info=None)
         # a tenth of the low-frequency power: summed over time c has about 2 tau / dt times its own
         share = math.log(0.1 * dt / (2 * structure.tau))
         log_c = np.maximum(self.log_q + share, self.floor)
-        return replace(self, structure=structure, log_c=log_c, last=None)
+        return replace(self, structure=structure, log_c=log_c, info=None)
+
+    def towards(self, other: Noise, part: float) -> Noise:
+        """Part of the way to another noise of the same structure."""
+        if part == 1.0 or other is self:
+            return other
+        logs = {
+            name: getattr(self, name) + part * (getattr(other, name) - getattr(self, name))
+            for name in ("log_q", "log_r", "log_c")
+        }
+        return replace(self, **logs)
 
 
 def first_guess(residual: Array, seen: Array, scale: Array) -> Noise:
@@ -110,32 +123,32 @@ def first_guess(residual: Array, seen: Array, scale: Array) -> Noise:
         lagged = float(np.mean((clipped[1:] * clipped[:-1])[both])) if both.any() else 0.0
         r = min(max(-lagged, 0.02 * total), 0.45 * total)
         log_r[i], log_q[i] = math.log(r), math.log(max(total - 2 * r, 0.05 * total))
+        floor[i] = max(floor[i], math.log(NOTHING * total))
     return Noise(
         Structure(), np.maximum(log_q, floor), np.maximum(log_r, floor), log_q.copy(), floor
     )
 
 
-def climbed(
-    noise: Noise, adjoint: Adjoint, memory: Array, dt: float, boldness: float = 1.0
-) -> Noise:
-    """One scoring step up the likelihood, all variances of a channel together.
-
-    The slope is exact. The information is that of a channel by itself with x_{t+1} = m x_t + w: its
-    measured differences have the spectrum f = q + r |1 - m e^{i omega}|^2 + coloured part, and the
-    information of log a and log b, two parts of f, is T/2 mean_omega((a / f) (b / f)).
-
-    Args:
-        noise: as it is.
-        adjoint: what the smoother says of every disturbance.
-        memory: m of each channel (n,), the mean diagonal of the Jacobian.
-        dt: [s].
-        boldness: scales the step.
-    """
-    n, count = len(noise.log_q), adjoint.u.shape[0] * adjoint.u.shape[1]
+def slopes(noise: Noise, adjoint: Adjoint, dt: float) -> Array:
+    """d loglik / d log variance: (2 or 3, n) for w, v and, if there is one, the coloured part."""
+    n = len(noise.log_q)
+    q, r = np.exp(noise.log_q) / noise.weight_w, np.exp(noise.log_r) / noise.weight_v
+    parts = [(q, adjoint.r[..., :n], adjoint.N[..., :n]), (r, adjoint.u, adjoint.D)]
     phi = noise.structure.phi(dt)
-    logs = [noise.log_q, noise.log_r] + ([noise.log_c] if phi is not None else [])
-    scores = [(adjoint.r[..., :n], adjoint.N[..., :n]), (adjoint.u, adjoint.D)]
-    variances = [np.exp(noise.log_q) / noise.weight_w, np.exp(noise.log_r) / noise.weight_v]
+    if phi is not None:
+        eta = np.exp(noise.log_c) * (1 - phi**2)
+        parts.append((eta, adjoint.r[..., n:], adjoint.N[..., n:]))
+    return np.stack([0.5 * (v * (s**2 - c)).sum(axis=(0, 1)) for v, s, c in parts])
+
+
+def channel_information(noise: Noise, memory: Array, dt: float, count: int) -> Array:
+    """Information of the log variances with each channel by itself, (K, K), K = 2 n or 3 n.
+
+    With x_{t+1} = m x_t + w a channel's measured differences have the spectrum
+    f = q + r |1 - m e^{i omega}|^2 + coloured part, and the information of log a and log b, two
+    parts of f, is T/2 mean_omega((a / f) (b / f)).
+    """
+    n, phi = len(noise.log_q), noise.structure.phi(dt)
     omega = np.linspace(0.02, np.pi, 40)[:, None]
     parts = [
         np.broadcast_to(np.exp(noise.log_q), (40, n)),
@@ -143,35 +156,36 @@ def climbed(
     ]
     if phi is not None:
         eta = np.exp(noise.log_c) * (1 - phi**2)
-        scores.append((adjoint.r[..., n:], adjoint.N[..., n:]))
-        variances.append(eta)
         parts.append(eta / (1 - 2 * phi * np.cos(omega) + phi**2))
     whole = np.sum(parts, axis=0)
     share = np.stack([part / whole for part in parts])  # (2 or 3, 40, n)
-    info = 0.5 * count * np.einsum("afn,bfn->nab", share, share) / len(omega)
-    slope = np.stack(
-        [
-            0.5 * (v * (s**2 - c)).sum(axis=(0, 1))
-            for v, (s, c) in zip(variances, scores, strict=True)
-        ]
-    )
-    info += 1e-3 * count * np.eye(len(logs))
-    step = np.linalg.solve(info, slope.T[:, :, None])[:, :, 0].T
-    step = np.clip(boldness * step, -1.5, 1.5)
-    if noise.last is not None and noise.last.shape == step.shape:
-        # a variance on its way to zero shrinks by a constant factor: Aitken's extrapolation
-        ratio = step / np.where(noise.last == 0, 1.0, noise.last)
-        steady = (ratio > 0.3) & (ratio < 1.2) & (noise.last != 0)
-        step = np.where(steady, step / np.maximum(1 - ratio, 0.2), step)
-        step = np.clip(step, -2.0, 2.0)
+    info = 0.5 * count * np.einsum("afn,bfn->abn", share, share) / len(omega)
+    found = np.zeros((len(parts), n, len(parts), n))
+    i = np.arange(n)
+    found[:, i, :, i] = np.moveaxis(info, -1, 0)
+    return found.reshape(len(parts) * n, -1)
+
+
+def climbed(noise: Noise, slope: Array, info: Array, count: int) -> Noise:
+    """One scoring step up the likelihood, all variances together.
+
+    Along each principal direction of the information by itself, bounded there: so the step goes up
+    even where the information is poor.
+
+    Args:
+        noise: as it is.
+        slope: from `slopes`, (2 or 3, n).
+        info: (K, K) of all log variances.
+        count: time steps in all.
+    """
+    size, axes = np.linalg.eigh(0.5 * (info + info.T))
+    along = axes.T @ slope.reshape(-1)
+    along = np.clip(along / np.maximum(np.abs(size), 2e-5 * count), -2.5, 2.5)
+    step = (axes @ along).reshape(slope.shape)
+    logs = [noise.log_q, noise.log_r, noise.log_c][: len(slope)]
     moved = np.maximum(np.stack(logs) + step, noise.floor)
-    return replace(
-        noise,
-        log_q=moved[0],
-        log_r=moved[1],
-        log_c=moved[2] if phi is not None else noise.log_c,
-        last=moved - np.stack(logs),
-    )
+    log_c = moved[2] if len(slope) > 2 else noise.log_c
+    return replace(noise, log_q=moved[0], log_r=moved[1], log_c=log_c)
 
 
 def cleaned(noise: Noise, adjoint: Adjoint) -> Noise:
@@ -190,7 +204,7 @@ def cleaned(noise: Noise, adjoint: Adjoint) -> Noise:
         log_r=log_r,
         weight_w=(DOF + 1) / (DOF + w2 / np.exp(log_q)),
         weight_v=(DOF + 1) / (DOF + v2 / np.exp(log_r)),
-        last=None,
+        info=None,
     )
 
 

@@ -24,10 +24,23 @@ from grounded.diagnosis.columns import linearised, noise_entry, step_sizes
 from grounded.diagnosis.data import Data
 from grounded.diagnosis.fitted import Fit, calibrated, shift_precision
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor, param_scale
-from grounded.diagnosis.noise import Noise, cleaned, climbed
+from grounded.diagnosis.information import information
+from grounded.diagnosis.noise import Noise, channel_information, cleaned, climbed, slopes
 from grounded.frozen import Array
 
-MOST_NUMBERS = 1.2e7  # of one (L, B, N, N) array
+MOST_NUMBERS = 2e6  # of one (L, B, N, N) array: what fits in the cache goes fastest
+MEASURED = (2, 7, 14)  # ages at which the noise's information is measured
+SHORTEST = 0.02  # part of a step that is still tried
+
+
+@dataclass(eq=False)
+class _Step:
+    """A step that was proposed at the best point: of values, shifts, track; the noise it leads to."""
+
+    theta: Array
+    shift: Array  # in units of param_scale
+    track: Array
+    noise: Noise
 
 
 @dataclass(eq=False)
@@ -38,11 +51,36 @@ class _Work:
     noise: Noise
     track: Array
     best: Fit | None = None
-    boldness: float = 1.0
+    step: _Step | None = None
+    part: float = 1.0  # of the step that is taken
     still: int = 0
+    age: int = 0  # points that were better than all before
 
     def done(self) -> bool:
-        return self.still >= 2
+        return self.still >= 1
+
+    def shorten(self, data: Data) -> None:
+        """Half the step, or the end where it is too short to matter."""
+        self.part *= 0.4
+        if self.best is None or self.part < SHORTEST:
+            self.still = 1
+        else:
+            self.go(data)
+
+    def go(self, data: Data) -> None:
+        """From the best point by a part of the step."""
+        assert self.best is not None
+        assert self.step is not None
+        best, step, part = self.best, self.step, self.part
+        h = best.hypothesis
+        self.h = h.with_theta(h.theta + part * step.theta)
+        if len(step.shift):
+            which = calibrated(data)
+            shift = np.zeros(data.model.system.k) if h.shift is None else h.shift.copy()
+            shift[which] += part * step.shift * param_scale(data.model)[which]
+            self.h = replace(self.h, shift=_inside(data, shift))
+        self.noise = best.noise.towards(step.noise, part)
+        self.track = best.track + part * step.track
 
 
 def refine(
@@ -100,7 +138,7 @@ def _iterate(predictor: Predictor, works: list[_Work], fixed_noise: bool) -> Non
         g = kalman.gains(kalman.transition(F, phi, G), Q, R, seen, start, G)
     except np.linalg.LinAlgError:
         for work in works:
-            work.still = 2
+            work.still = 1
         if len(works) > 1:  # one of them diverged: each alone
             for work in works:
                 work.still = 0
@@ -176,42 +214,82 @@ def _update(
     memory: Array | None,
 ) -> None:
     """Scores the point where the work stands, keeps it if it is the best, and moves on."""
-    data, h = predictor.data, work.h
+    data = predictor.data
     residual, columns = white[..., 0], white[..., 1:]
     fit = _scored(predictor, work, residual, columns, logdet, filtered[..., 0])
     rise = np.inf if work.best is None else fit.evidence - work.best.evidence
-    if not np.isfinite(fit.evidence):
-        work.still = 2
+    if not rise > 0:  # too far, or not finite: part of the way from the best point
+        work.shorten(data)
         return
-    work.still = 0 if rise > 0.05 else work.still + 1
-    if rise > 0:
-        work.best = fit
-    elif work.best is not None and rise < -1.0:  # overshot: back to the best, more carefully
-        work.boldness *= 0.5
-        best = work.best
-        middle = 0.5 * (best.hypothesis.theta + h.theta)
-        work.h = replace(best.hypothesis.with_theta(middle), shift=best.hypothesis.shift)
-        work.noise, work.track = best.noise, best.track
-        return
-    prior = fit.prior
-    G = fit.gram.sum(axis=0) + np.diag(prior)
+    work.still = 0 if rise > 0.03 else 1
+    work.age += 1
+    if memory is not None and work.age in MEASURED and (fit.noise.info is None or work.age > 4):
+        work.noise = _measured(predictor, fit)
+        fit = replace(fit, noise=work.noise)
+    work.best = fit
+    work.part = min(1.0, 2 * work.part)
+    work.step = _proposed(data, fit, filtered, adjoint, memory)
+    work.go(data)
+
+
+def _proposed(
+    data: Data, fit: Fit, filtered: Array, adjoint: kalman.Adjoint, memory: Array | None
+) -> _Step:
+    """Gauss-Newton in values and shifts, scoring in the noise, the filtered track as the track."""
+    h = fit.hypothesis
+    G = fit.gram.sum(axis=0) + np.diag(fit.prior)
     slope = fit.score.sum(axis=0) + fit.prior_pull(data)
-    k = len(h.theta)
+    k, track = len(h.theta), filtered[..., 0]
+    theta, shift = np.zeros(k), np.zeros(len(slope) - k)
     if len(slope):
         scale = 1 / np.sqrt(np.maximum(np.diag(G), 1e-300))
         delta = -scale * np.linalg.lstsq(G * np.outer(scale, scale), scale * slope, rcond=1e-10)[0]
         delta[:k] = _limited(h, delta[:k])
-        work.h = h.with_theta(h.theta + delta[:k])
-        if len(slope) > k:
-            which = calibrated(data)
-            shift = np.zeros(data.model.system.k) if h.shift is None else h.shift.copy()
-            shift[which] += np.clip(delta[k:], -0.3, 0.3) * param_scale(data.model)[which]
-            work.h = replace(work.h, shift=_inside(data, shift))
-        work.track = work.track + filtered[..., 0] + filtered[..., 1:] @ delta
-    else:
-        work.track = work.track + filtered[..., 0]
-    if memory is not None:
-        work.noise = climbed(work.noise, adjoint, memory, data.dt, work.boldness)
+        delta[k:] = np.clip(delta[k:], -0.3, 0.3)
+        theta, shift = delta[:k], delta[k:]
+        track = track + filtered[..., 1:] @ delta
+    noise = fit.noise if memory is None else _climbed(data, fit.noise, adjoint, memory)
+    return _Step(theta, shift, track, noise)
+
+
+def _climbed(data: Data, noise: Noise, adjoint: kalman.Adjoint, memory: Array) -> Noise:
+    count = int(data.valid.sum())
+    info = noise.info
+    if info is None:
+        info = channel_information(noise, memory, data.dt, count)
+    return climbed(noise, slopes(noise, adjoint, data.dt), info, count)
+
+
+def _measured(predictor: Predictor, fit: Fit) -> Noise:
+    """A fit's noise with the information of its variances measured."""
+    data = predictor.data
+    L, B = data.time.shape
+    F, d, r = linearised(predictor, fit.hypothesis, fit.track)
+    G = noise_entry(predictor, fit.hypothesis, fit.track)
+
+    def adjoints(noises: list[Noise]) -> list[kalman.Adjoint]:
+        H = len(noises)
+        many = None if G is None else np.tile(G, (1, H, 1, 1))
+        phi = fit.noise.structure.phi(data.dt)
+        g = kalman.gains(
+            kalman.transition(np.tile(F, (1, H, 1, 1)), phi, many),
+            np.concatenate([_spread(w.process(data.dt), (L, B)) for w in noises], axis=1),
+            np.concatenate([_spread(w.measurement(L), (L + 1, B)) for w in noises], axis=1),
+            np.tile(data.seen, (1, H, 1)),
+            np.concatenate([w.start(B) for w in noises]),
+            many,
+        )
+        column, of_log = np.tile(d[..., :1], (1, H, 1, 1)), np.tile(r[..., :1], (1, H, 1, 1))
+        white, _ = kalman.innovations(g, column, of_log)
+        back = kalman.smoother(g, white[..., 0])
+        parts = [slice(i * B, (i + 1) * B) for i in range(H)]
+        return [kalman.Adjoint(back.u[:, p], back.D[:, p], back.r[:, p], back.N[:, p]) for p in parts]
+
+    try:
+        info = information(fit.noise, adjoints, data.dt)
+    except np.linalg.LinAlgError:
+        return fit.noise
+    return replace(fit.noise, info=info) if np.isfinite(info).all() else fit.noise
 
 
 def _limited(h: Hypothesis, delta: Array) -> Array:
@@ -264,6 +342,6 @@ def _scored(
         score=score,
         rss=rss,
         logdet=run_logdet,
-        white=residual,
-        residual=error[1:],
+        white=residual.copy(),  # not a view: it would keep all columns
+        residual=error[1:].copy(),
     )

@@ -37,7 +37,7 @@ from grounded.effects import (
 from grounded.frozen import Array
 
 BLOCK = 160  # columns filtered at once
-MOST_NUMBERS = 1.2e7  # of one block of whitened columns
+MOST_NUMBERS = 3e6  # of one block of whitened columns
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,34 +152,38 @@ class _Context:
                 assert self.G is not None
                 slope = self.G[..., b, :].copy()
                 slope[..., b] = 0.0
+                if effect.family.needs_own:  # type: ignore[attr-defined]
+                    before = self._rates_at(effect, values, 0, instant=True)
+                    later = self._rates_at(effect, values, 1, instant=True)
                 d[..., b] = (slope * d).sum(axis=-1) + later[..., a] - before[..., a]
             found.append(_Column(i, point, name, d / amount, _EMPTY))
         return found
 
-    def _rates_at(self, effect: Effect, values: dict[str, float], when: int) -> Array:
-        """The added rate at the start (0) or the end (1) of every step; own rates computed once."""
+    def _rates_at(
+        self, effect: Effect, values: dict[str, float], when: int, instant: bool = False
+    ) -> Array:
+        """The added rate at the start (0) or the end (1) of every step."""
         data = self.predictor.data
         x = self.x if when == 0 else self.after
         t = data.time if when == 0 else data.time + data.dt
-        model = data.model
-        names = model.state_names
-        s = Named("state", names, list(np.moveaxis(x, -1, 0)))
-        a = Named("input", model.input_names, list(np.moveaxis(self.u, -1, 0)))
-        own = self._own(when) if effect.family.needs_own else {}  # type: ignore[attr-defined]
-        total = np.zeros_like(x)
-        rate = effect.family.rate(s, a, own, t, values, effect.site)  # type: ignore[attr-defined]
-        for name, value in rate.items():
-            total[..., names.index(name)] += value
-        return total
+        own: Any = {}
+        if effect.family.needs_own:  # type: ignore[attr-defined]
+            own = self._instant(when) if instant else self._mean()
+        return self.predictor.added_rate([(effect, values)], x, self.u, t, own)
 
-    def _own(self, when: int) -> Named:
-        cache = self.__dict__.setdefault("own_rates", {})
+    def _mean(self) -> Named:
+        """The model's own rates, mean over every step; computed once."""
+        if "mean" not in self.__dict__:
+            ahead = self.predictor.step(self.x, self.u, self.p)
+            self.mean = self.predictor.named((ahead - self.x) / self.predictor.data.dt)
+        return self.mean
+
+    def _instant(self, when: int) -> Named:
+        """The same at the start or the end of every step."""
+        cache = self.__dict__.setdefault("instants", {})
         if when not in cache:
-            data = self.predictor.data
             x = self.x if when == 0 else self.after
-            ahead = self.after if when == 0 else self.predictor.step(x, self.u, self.p)
-            rate = data.model.difference(ahead, x) / data.dt
-            cache[when] = Named("state", data.model.state_names, list(np.moveaxis(rate, -1, 0)))
+            cache[when] = self.predictor.named(self.predictor.instant(x, self.u, self.p))
         found: Named = cache[when]
         return found
 
@@ -276,7 +280,9 @@ class _Context:
             gram = gram - cross @ self.base @ cross.T
             size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
             if names == [""]:
-                looks.append((-float(score[0]) - 0.5 * float(gram[0, 0]), dict(grid)))
+                part = _faint(effect, grid, float(score[0]), float(gram[0, 0]))
+                gain = -part * float(score[0]) - 0.5 * part**2 * float(gram[0, 0])
+                looks.append((gain, {name: part * value for name, value in grid.items()}))
                 continue
             if not np.isfinite(size).all() or (size < 1e-8).any():
                 looks.append((0.0, {**grid, **dict.fromkeys(names, 0.0)}))
@@ -290,6 +296,14 @@ class _Context:
         looks.sort(key=lambda look: -look[0])
         second = looks[1][1] if len(looks) > 1 and looks[1][0] > looks[0][0] - 3 else None
         return Look(effect, looks[0][1], looks[0][0], second)
+
+
+def _faint(effect: Effect, grid: dict[str, float], score: float, gram: float) -> float:
+    """How much of the smallest grid value: below it an effect that is absent at zero is linear."""
+    (scanned,) = (q for q in effect.free if q.grid)
+    if scanned.start != 0 or grid[scanned.name] > min(scanned.grid) or gram <= 0:
+        return 1.0
+    return float(np.clip(-score / gram, 0.05, 1.0))
 
 
 _EMPTY: Array = np.zeros(0)

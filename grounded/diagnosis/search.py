@@ -172,14 +172,14 @@ class Search:
                 weights if fit.noise.structure == weights.structure else fit.noise,
                 weight_w=weights.weight_w,
                 weight_v=weights.weight_v,
-                last=None,
+                info=None,
             )
             starts.append((fit.hypothesis, noise, fit.track))
         for structure in {s[1].structure for s in starts}:
             other.refined([s for s in starts if s[1].structure == structure], 8)
         plain = [f for f in other.fits.values() if not f.hypothesis.effects]
         if not any(f.noise.structure == Structure() and not f.hypothesis.spread for f in plain):
-            noise = replace(weights, structure=Structure(), last=None)
+            noise = replace(weights, structure=Structure(), info=None)
             other.refined([(Hypothesis(), noise, clean_fit.track)], 12)
         return other
 

@@ -3,7 +3,7 @@
 One control step of the wrapped model, for commands held over the step:
 
     u_eff  = effect(u, z, t)                      input and memory families
-    own    = (f(s, u_eff) - s) / dt               the model's own rate
+    own    = (f(s, u_eff) - s) / dt               the model's own rate, its mean over the step
     s1     = f(s + dt/2 rate(s), u_eff)           half of an added rate before the step ...
     s+     = s1 + dt/2 rate(s1)                   ... and half after it (Strang): second order in dt
     y+     = measure(s+),  s = recover(y)         sensor families
@@ -176,16 +176,27 @@ def _rate_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str
     def step(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
         c = _quantities(effect, p)
         t = s[clock] if timed else 0.0
-        state = _own_state(model, s)
-        added, state = _kick(family, effect, base, state, a, p, dt, t, c)
+        start = _own_state(model, s)
+        own: Any = {}
+        if family.needs_own:
+            ahead = base(start, a, p, dt)
+            own = {n: (ahead[n] - start[n]) / dt for n in start}
+        added = family.rate(start, a, own, t, c, effect.site)
+        state = _kicked(start, added, dt)
         after = Named("state", model.state_names, list(_in_order(model, base(state, a, p, dt))))
         t = t + dt if timed else 0.0
-        later, final = _kick(family, effect, base, after, a, p, dt, t, c)
+        if family.needs_own:  # the mean over the very step
+            own = {n: (after[n] - state[n]) / dt for n in start}
+        later = family.rate(after, a, own, t, c, effect.site)
+        final = _kicked(after, later, dt)
         result = dict(final)
         for n, k in tied.items():  # a carried heading rate is the heading's rate, effects and all
             if model.derivative is not None:
-                start = _own_state(model, s)
-                rise = model.derivative(final, a, p)[n] - model.derivative(start, a, p)[n]
+                first, last = model.derivative(start, a, p), model.derivative(final, a, p)
+                if family.needs_own:
+                    added = family.rate(start, a, first, t - dt if timed else 0.0, c, effect.site)
+                    later = family.rate(final, a, last, t, c, effect.site)
+                rise = last[n] - first[n]
                 result[k] = s[k] + rise + later.get(n, 0.0) - added.get(n, 0.0)
             elif n in added:
                 result[k] = result[k] + later[n] - added[n]
@@ -198,25 +209,10 @@ def _in_order(model: Model, values: Mapping[str, Any]) -> list[Any]:
     return [values[n] for n in model.state_names]
 
 
-def _kick(
-    family: RateFamily,
-    effect: Effect,
-    base: Step,
-    s: Named,
-    a: Any,
-    p: Any,
-    dt: Any,
-    t: Any,
-    c: Any,
-) -> tuple[Values, Named]:
-    """Half a step of the added rate alone: the rate, and the state after it."""
-    own: Any = {}
-    if family.needs_own:
-        ahead = base(s, a, p, dt)
-        own = {n: (ahead[n] - s[n]) / dt for n in s}
-    rate = family.rate(s, a, own, t, c, effect.site)
+def _kicked(s: Named, rate: Values, dt: Any) -> Named:
+    """Half a step of an added rate alone."""
     moved = [s[n] + 0.5 * dt * rate[n] if n in rate else s[n] for n in s]
-    return rate, Named("state", tuple(s), moved)
+    return Named("state", tuple(s), moved)
 
 
 def _sensor_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str, str]]:

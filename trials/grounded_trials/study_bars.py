@@ -105,16 +105,16 @@ def fit_car_figure(result: FitCarResult) -> Figure:
             float(np.sqrt(np.mean([(p[key] - p["true"]) ** 2 for p in each])))
             for key in ("first", "value")
         )
-        stated = float(np.mean([p["std"] for p in each]))
+        z = float(np.sqrt(np.mean([((p["value"] - p["true"]) / p["std"]) ** 2 for p in each])))
         held.append(Bar(name, share, f"{round(share * count)} of {count}"))
         ratio = last / first if first > 0 else np.nan
         text = f"{last:.2g} {each[0]['unit']}".removesuffix(" 1")
         gained.append(Bar(name, ratio, f"{ratio:.1%}: {text}"))
-        honest.append(Bar(name, last / stated, f"{last / stated:.2f}"))
+        honest.append(Bar(name, z, f"{z:.2f}"))
     panels = (
         Bars("Cars whose 95 % interval holds the true value", tuple(held)),
         Bars("Rms error of the fit, as a share of the first value’s", tuple(gained)),
-        Bars("Rms error of the fit, in stated standard deviations", tuple(honest)),
+        Bars("Error of each fit in its own stated standard deviations, rms", tuple(honest)),
     )
     title = f"Parameters from {result.minutes:g} minutes of driving, {count} cars"
     return Figure("fit-car", title, "", panels)
