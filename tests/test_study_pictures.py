@@ -54,7 +54,7 @@ def results():
         Line("differences", "turn", "noise", 0, (125, 300, 600, 850), 0.99, 850),
     ]
     outcomes = [
-        Outcome(rule, "turn", level, 0, 3, 1, 0.9 - 0.1 * level, 0.1, 9)
+        Outcome(rule, "turn", level, 0, 3, 1, 0.9 - 0.1 * level, 0.8, 0.1, 9)
         for rule in ("single", "three")
         for level in (1.0, 2.0)
     ]

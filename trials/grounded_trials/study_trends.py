@@ -12,7 +12,7 @@ from grounded.experiments.theorem1 import Theorem1Result, Theorem1Row
 from grounded.frozen import Array
 from grounded_trials.figures import Curve, Dot, Figure, Key, Panel, legend
 
-RULE_ROLES = ("best", "step2", "accepted", "model", "other", "predicted")
+RULE_ROLES = ("model", "step2", "accepted", "best", "other", "predicted", "desired")
 SMALLEST = 1e-300  # instead of the logarithm of nothing
 
 
@@ -79,7 +79,7 @@ def noise_figure(result: NoiseResult) -> Figure:
         panels.append(_shares(own, f"{name}: gap closed, median of the seeds", np.median))
         if len({o.seed for o in own}) > 1:
             panels.append(_shares(own, f"{name}: gap closed, the worst seed", np.min))
-    title = f"The line search under noise; best on the whole: {result.recommended}"
+    title = f"The line search under noise; recommended: {result.recommended}"
     return Figure("noise", title, "", tuple(panels), legend(panels))
 
 
