@@ -28,7 +28,7 @@ def candidate_bytes(
     input_units: Units | None = None,
 ) -> bytes:
     """A candidate as the bytes of a file; equal arguments give equal bytes."""
-    from grounded_trials.mcap_writer import DoublesEncoder, LogWriter, encode_lists
+    from grounded_trials.mcap_writer import LogWriter, encode_doubles, encode_lists
 
     _refuse_unfinite(policy)
     states = rows(predicted_states, policy.horizon + 1, len(policy.state_names))
@@ -48,16 +48,13 @@ def candidate_bytes(
     topic = log.channel("/policy", "Policy", ["feedforward", "gain", "reference"], repeated=True)
     state = log.channel("/predicted_state", "State", policy.state_names)
     input = log.channel("/predicted_input", "Input", policy.input_names)
-    encode_x, encode_u = DoublesEncoder(states.shape[1]), DoublesEncoder(inputs.shape[1])
-    none = np.zeros(0)
-    for k in range(policy.horizon + 1):
+    controls, moves = encode_lists(_controls(policy)), encode_doubles(inputs)
+    for k, reached in enumerate(encode_doubles(states)):
         time = round(k * policy.dt * 1e9)
         if k < policy.horizon:
-            gain = none if policy.gain is None else policy.gain[k].ravel()
-            reference = none if policy.reference is None else policy.reference[k]
-            log.message(topic, time, encode_lists([policy.feedforward[k], gain, reference]))
-            log.message(input, time, encode_u(inputs[k]))
-        log.message(state, time, encode_x(states[k]))
+            log.message(topic, time, controls[k])
+            log.message(input, time, moves[k])
+        log.message(state, time, reached)
     log.finish()
     return stream.getvalue()
 
@@ -152,6 +149,13 @@ z = the measured states, then for each input its depths[j] last sent values, new
 Differences of states marked in `angles` are wrapped to [-pi, pi]. Names, units, limits: see the
 metadata record `grounded`.
 """
+
+
+def _controls(policy: Policy) -> list[Array]:
+    """Feed-forward, gain and reference, a row a step; the last two are empty without feedback."""
+    H, none = policy.horizon, np.zeros((policy.horizon, 0))
+    gain = none if policy.gain is None else policy.gain.reshape(H, -1)
+    return [policy.feedforward, gain, none if policy.reference is None else policy.reference]
 
 
 def _depths(own: OwnFile, depths: Array) -> tuple[int, ...]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Mapping, Sequence
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 
@@ -145,14 +145,32 @@ class DoublesEncoder:
         return self._form.pack(*self._parts)
 
 
-def encode_lists(lists: Sequence[Array]) -> bytes:
-    """One protobuf message of packed repeated doubles, numbered from 1; an empty list is absent."""
-    parts = []
-    for number, values in enumerate(lists, start=1):
-        data = np.ascontiguousarray(values, dtype="<f8").tobytes()
-        if data:
-            parts += [_varint(number << 3 | 2), _varint(len(data)), data]
-    return b"".join(parts)
+def encode_doubles(values: Array) -> list[bytes]:
+    """The messages of `DoublesEncoder` for many rows, (N, count)."""
+    tags = [_varint(number << 3 | 1) for number in range(1, values.shape[1] + 1)]
+    return _encoded(list(zip(tags, values.T[:, :, None], strict=True)), len(values))
+
+
+def encode_lists(lists: Sequence[Array]) -> list[bytes]:
+    """Messages of packed repeated doubles, numbered from 1; an empty list is absent.
+
+    Each list has a row for each message, (N, count).
+    """
+    fields = [
+        (_varint(number << 3 | 2) + _varint(8 * values.shape[1]), values)
+        for number, values in enumerate(lists, start=1)
+        if values.shape[1]
+    ]
+    return _encoded(fields, len(lists[0]))
+
+
+def _encoded(fields: Sequence[tuple[bytes, Array]], count: int) -> list[bytes]:
+    """Rows of fields, each the same prefix and then the row's doubles (N, ...)."""
+    parts = list[np.ndarray[Any, np.dtype[np.uint8]]]()
+    for prefix, values in fields:
+        data = np.ascontiguousarray(values, dtype="<f8").view(np.uint8)
+        parts += [np.tile(np.frombuffer(prefix, np.uint8), (count, 1)), data]
+    return [row.tobytes() for row in np.hstack(parts)]
 
 
 def _bytes(number: int, data: bytes) -> bytes:

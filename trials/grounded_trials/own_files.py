@@ -272,7 +272,7 @@ def read_file(path: Path, limit: int) -> bytes:
 def _sort(
     batch: Messages, channels: dict[int, Channel], messages: dict[str, list[Messages]], name: str
 ) -> None:
-    for identity in np.unique(batch.channels).tolist():
+    for identity in sorted(set(batch.channels.tolist())):  # np.unique would import numpy.ma
         if identity not in channels:
             raise DamagedFile(
                 name, 0, f"a message belongs to channel {identity}, which is not defined"
