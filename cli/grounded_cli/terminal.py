@@ -16,6 +16,8 @@ import click
 
 from grounded_trials.words import figure as number
 
+WIDTH = 80  # columns of a terminal
+
 __all__ = [
     "bar",
     "field",
@@ -84,7 +86,7 @@ def field(label: str, text: str, indent: str = "") -> str:
     head = f"{indent}{label:<10} "
     under = " " * len(head)
     whole = text.replace(" %", "\xa0%")
-    wrapper = textwrap.TextWrapper(80, initial_indent=head, subsequent_indent=under)
+    wrapper = textwrap.TextWrapper(WIDTH, initial_indent=head, subsequent_indent=under)
     wrapper.break_on_hyphens = wrapper.break_long_words = False  # a path stays in one piece
     lines = wrapper.wrap(whole)
     return "\n".join(lines or [head.rstrip()]).replace("\xa0", " ")
@@ -93,7 +95,7 @@ def field(label: str, text: str, indent: str = "") -> str:
 def remark(kind: str, text: str) -> None:
     """Narration with a word ahead, `note: ...`, wrapped to 80 columns."""
     whole = text.replace(" %", "\xa0%")
-    wrapper = textwrap.TextWrapper(80, initial_indent=f"{kind}: ", subsequent_indent="  ")
+    wrapper = textwrap.TextWrapper(WIDTH, initial_indent=f"{kind}: ", subsequent_indent="  ")
     wrapper.break_on_hyphens = wrapper.break_long_words = False
     say("\n".join(wrapper.wrap(whole)).replace("\xa0", " "))
 
@@ -151,18 +153,36 @@ def bar(text: str) -> Iterator[Callable[[int, int], None]]:
 
 
 def table(rows: Sequence[Sequence[str]], header: Sequence[str]) -> str:
-    """Aligned columns: the first to the left, numbers to the right, two blanks between."""
-    lines = [list(header), *[list(row) for row in rows]]
-    widths = [max(len(line[i]) for line in lines) for i in range(len(header))]
+    """Aligned columns: the first to the left, numbers to the right, two blanks between.
+
+    Where it is wider than a terminal, names of columns are broken at their blanks.
+    """
+    heads = [[name] for name in header]
+    if sum(_widths(rows, heads)) + 2 * (len(header) - 1) > WIDTH:
+        widths = [
+            max(max((len(row[i]) for row in rows), default=0), *map(len, name.split() or [""]))
+            for i, name in enumerate(header)
+        ]
+        heads = [textwrap.wrap(n, w) or [""] for n, w in zip(header, widths, strict=True)]
+    widths, tall = _widths(rows, heads), max(map(len, heads))
+    top = [[""] * (tall - len(lines)) + lines for lines in heads]
+    lines = [list(line) for line in zip(*top, strict=True)] + [list(row) for row in rows]
     out = []
-    for row, line in enumerate(lines):
+    for k, line in enumerate(lines):
         cells = [
             cell.ljust(width) if i == 0 else cell.rjust(width)
             for i, (cell, width) in enumerate(zip(line, widths, strict=True))
         ]
         text = "  ".join(cells).rstrip()
-        out.append(style(text, bold=True) if row == 0 else text)
+        out.append(style(text, bold=True) if k < tall else text)
     return "\n".join(out)
+
+
+def _widths(rows: Sequence[Sequence[str]], heads: Sequence[Sequence[str]]) -> list[int]:
+    return [
+        max([len(row[i]) for row in rows] + [len(line) for line in lines])
+        for i, lines in enumerate(heads)
+    ]
 
 
 def sparkline(values: Sequence[float]) -> str:
