@@ -139,3 +139,15 @@ def test_a_mistake_is_named(here, words, holds):
 def test_a_file_says_its_format_and_must_not_contradict(here):
     done = process("export", "best", "--format", "csv", "-o", "x.npz", cwd=here)
     assert done.code == 2 and "is named as npz, --format says csv" in done.err
+
+
+def test_the_best_one_is_run_again_by_that_name(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    best = grounded("-C", folder, "status", "--json").json["best"]["candidate"]
+    done = grounded("-C", folder, "run", "best", "--json").json
+    assert done["candidate"] == best
+    out = grounded("-C", folder, "ingest", done["trial_file"]).out
+    assert "run again: its utility is the mean of its trials" in " ".join(out.split())
+    empty = make(tmp_path / "empty").folder
+    refused = grounded("-C", empty, "run", "best")
+    assert refused.code == 1 and "there is no best candidate yet" in refused.err

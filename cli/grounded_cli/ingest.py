@@ -45,11 +45,13 @@ def command(
     """
     workspace = open_workspace(folder)
     from grounded_trials.ingest import ingest_log
+    from grounded_trials.proposing import candidate_named
 
     done: list[Ingested] = []
     for name in files:
         with progress(f"reading {name}"):
-            found = ingest_log(workspace, Path(name), candidate, data=data)
+            ran = candidate and candidate_named(workspace, candidate)
+            found = ingest_log(workspace, Path(name), ran, data=data)
         done.append(found)
         if not json_:
             _tell(name, found)

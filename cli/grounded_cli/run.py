@@ -16,12 +16,12 @@ from grounded_cli.terminal import progress, show, show_json
 def command(candidate: str | None, folder: str | None, json_: bool) -> None:
     """Run the candidate on [system] and write a trial file for `grounded ingest`.
 
-    CANDIDATE is the outstanding one by default; any candidate may be run again (its utilities are
-    averaged).
+    CANDIDATE is the outstanding one by default; any candidate, `best` too, may be run again (its
+    utilities are averaged).
     """
     workspace = open_workspace(folder)
     from grounded.errors import GroundedError
-    from grounded_trials.proposing import standing_in
+    from grounded_trials.proposing import candidate_named, standing_in
     from grounded_trials.running import run_candidate
 
     if candidate is None:
@@ -32,6 +32,7 @@ def command(candidate: str | None, folder: str | None, json_: bool) -> None:
                 "that the search has ended; name a candidate to run it again"
             )
         candidate = standing.outstanding.id
+    candidate = candidate_named(workspace, candidate)
     with progress(f"running {candidate}"):
         path = run_candidate(workspace, candidate)
     if json_:

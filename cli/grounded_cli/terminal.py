@@ -14,9 +14,8 @@ from typing import Any
 
 import click
 
+from grounded_trials.words import WIDTH, wrapped
 from grounded_trials.words import figure as number
-
-WIDTH = 80  # columns of a terminal
 
 __all__ = [
     "bar",
@@ -84,20 +83,12 @@ def _clean(value: Any) -> Any:
 def field(label: str, text: str, indent: str = "") -> str:
     """A label and its text, wrapped to 80 columns under itself; a number keeps its %."""
     head = f"{indent}{label:<10} "
-    under = " " * len(head)
-    whole = text.replace(" %", "\xa0%")
-    wrapper = textwrap.TextWrapper(WIDTH, initial_indent=head, subsequent_indent=under)
-    wrapper.break_on_hyphens = wrapper.break_long_words = False  # a path stays in one piece
-    lines = wrapper.wrap(whole)
-    return "\n".join(lines or [head.rstrip()]).replace("\xa0", " ")
+    return "\n".join(wrapped(text, head, " " * len(head)) or [head.rstrip()])
 
 
 def remark(kind: str, text: str) -> None:
     """Narration with a word ahead, `note: ...`, wrapped to 80 columns."""
-    whole = text.replace(" %", "\xa0%")
-    wrapper = textwrap.TextWrapper(WIDTH, initial_indent=f"{kind}: ", subsequent_indent="  ")
-    wrapper.break_on_hyphens = wrapper.break_long_words = False
-    say("\n".join(wrapper.wrap(whole)).replace("\xa0", " "))
+    say("\n".join(wrapped(text, f"{kind}: ", "  ")))
 
 
 def names_in(text: str | None) -> list[str]:

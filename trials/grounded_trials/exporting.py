@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from grounded.errors import GroundedError
 from grounded.policy import Policy, to_arrays
+from grounded_trials.proposing import candidate_named
 from grounded_trials.store import write_atomically
 from grounded_trials.workspace import Workspace
 
@@ -31,13 +31,7 @@ def export_candidate(workspace: Workspace, identity: str, form: str, path: Path)
     Raises:
         GroundedError: for an unknown candidate, or a place that can't be written.
     """
-    if identity == "best":
-        from grounded_trials.proposing import standing_in
-
-        best = standing_in(workspace).incumbent
-        if best is None:
-            raise GroundedError("there is no best candidate yet: no trial was ingested")
-        identity = best.candidate.id
+    identity = candidate_named(workspace, identity)
     candidate, meta = workspace.candidate(identity)
     about = {"candidate": identity, "task": meta["task"], "model": meta["model"]}
     about["created_by"] = "grounded"

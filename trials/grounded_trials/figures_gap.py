@@ -31,8 +31,8 @@ def gap_figure(diagnosis: Diagnosis | None) -> Figure | None:
     if not panels:
         return None
     caption = (
-        "Evidence is the gain in log-likelihood less its price; 5 nats more than without it make a "
-        "claim. The floor is what noise alone would leave."
+        "Evidence is the gain in log-likelihood less its price; an effect is claimed from 5 nats. "
+        "The floor is what noise alone would leave."
     )
     return Figure("gap", "Gap between model and reality", caption, tuple(panels))
 

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 from grounded.search import Standing
 from grounded_trials.diagnosis_file import Diagnosis
+from grounded_trials.words import WIDTH
 from grounded_trials.workspace import Workspace
 
-WIDTH = 80
 EXPORT = "grounded export best --format npz"
 
 

@@ -82,7 +82,7 @@ def _head(findings: Findings) -> str:
         f"{'closed loop' if task.feedback else 'open loop'}; {findings.method}"
     )
     diagnosis = findings.diagnosis
-    verdict = verdict_block(diagnosis) if diagnosis else ""
+    verdict = verdict_block(diagnosis, short=True) if diagnosis else ""
     return (
         f'<h1>{escape(findings.name)}</h1><p class="soft">{escape(about)}</p>'
         f"{_lost(findings)}{_tiles(findings)}{verdict}"
@@ -102,7 +102,11 @@ def _tiles(findings: Findings) -> str:
         gain = 100 * (1 - best.utility / first.utility)
         tiles.append((f"{gain:.1f} %", "of the first policy’s loss is gone"))
     trials, better = findings.standing.trials, count(findings.standing.iteration, "improvement")
-    tiles.append((str(trials), f"trial{'s' * (trials != 1)}, {better}"))
+    if findings.history or not findings.logs:
+        tiles.append((str(trials), f"trial{'s' * (trials != 1)}, {better}"))
+    if findings.logs:
+        logs = len(findings.logs)
+        tiles.append((str(logs), f"log{'s' * (logs != 1)} of data"))
     tiles.append((findings.standing.phase, "phase of the search"))
     inside = "".join(
         f'<div class="tile"><b>{escape(a)}</b><span>{escape(b)}</span></div>' for a, b in tiles

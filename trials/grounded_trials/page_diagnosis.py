@@ -58,9 +58,10 @@ def _diagnosed(diagnosis: Diagnosis) -> str:
     return "".join(parts)
 
 
-def verdict_block(diagnosis: Diagnosis) -> str:
-    """The verdict, a line for each of its sentences."""
+def verdict_block(diagnosis: Diagnosis, *, short: bool = False) -> str:
+    """The verdict, a line for each of its sentences; the first two of them where `short`."""
     texts = sentences(diagnosis.sentence or diagnosis.kind)
+    texts = texts[:2] if short else texts
     lines = " ".join(f"<span>{escape(text)}</span>" for text in texts)
     return f'<p class="verdict">{lines}</p>'
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from grounded.errors import GroundedError
 from grounded_trials.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -65,6 +66,20 @@ def standing_in(workspace: Workspace, *, ahead: bool = False) -> Standing:
         options_ = {"planner": planner, "refit": refitted}
         return propose(task, candidates, trials, options, **options_).standing  # type: ignore[arg-type]
     return now
+
+
+def candidate_named(workspace: Workspace, name: str) -> str:
+    """The id of a candidate: itself, or that of the best one so far for `best`.
+
+    Raises:
+        GroundedError: if there is no best one yet.
+    """
+    if name != "best":
+        return name
+    best = standing_in(workspace).incumbent
+    if best is None:
+        raise GroundedError("there is no best candidate yet: no trial was ingested")
+    return best.candidate.id
 
 
 def refitted(task: Task, trials: Sequence[Trial]) -> Model:

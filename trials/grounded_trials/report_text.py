@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from textwrap import wrap
 
 import numpy as np
 
@@ -21,9 +20,17 @@ from grounded_trials.findings import (
 )
 from grounded_trials.forecast import SECONDS, forecast_error
 from grounded_trials.next_step import folded
-from grounded_trials.words import count, figure, per_second, shown, verdict, with_unit
+from grounded_trials.words import (
+    WIDTH,
+    count,
+    figure,
+    per_second,
+    shown,
+    verdict,
+    with_unit,
+    wrapped,
+)
 
-WIDTH = 80
 ROWS = 12  # candidates in the table; the others are counted
 ITERATIONS = 5  # of the bias
 EFFECTS = 5
@@ -71,7 +78,7 @@ def _head(findings: Findings) -> str:
         text += f", {count(len(findings.logs), 'log')} of data"
     if findings.effects:
         text += "; adopted: " + ", ".join(findings.effects)
-    return "\n".join(wrap(text, WIDTH))
+    return "\n".join(wrapped(text, "", ""))
 
 
 def _utilities(findings: Findings, table: Table, bars: Callable[[Sequence[float]], str]) -> str:
@@ -226,7 +233,4 @@ def _value(value: Value) -> str:
 
 
 def _wrapped(text: str, indent: str) -> list[str]:
-    """Lines of a text that do not part a number from its %."""
-    joined = text.replace(" %", "\xa0%")
-    lines = wrap(joined, WIDTH, initial_indent=indent, subsequent_indent=indent + "  ")
-    return [line.replace("\xa0", " ") for line in lines]
+    return wrapped(text, indent, indent + "  ")

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import math
+import re
+from textwrap import TextWrapper
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from grounded.search import Tried
+
+WIDTH = 80  # columns of a terminal
 
 
 def figure(value: float | None, digits: int = 4) -> str:
@@ -54,6 +58,17 @@ def labelled(name: str, unit: str) -> str:
 def per_second(unit: str) -> str:
     """The unit of a rate of change."""
     return f"{unit} per s" if shown(unit) else "1/s"
+
+
+def wrapped(text: str, first: str, rest: str) -> list[str]:
+    """Lines of a terminal's width, the first and the others begun as said.
+
+    A number keeps its %, a bound its number, a path its parts.
+    """
+    whole = re.sub(r"(?<=[<>]) (?=[\d.])| (?=%)", "\xa0", text)
+    wrapper = TextWrapper(WIDTH, initial_indent=first, subsequent_indent=rest)
+    wrapper.break_on_hyphens = wrapper.break_long_words = False
+    return [line.replace("\xa0", " ") for line in wrapper.wrap(whole)]
 
 
 def verdict(tried: Tried, last: bool = True) -> str:
