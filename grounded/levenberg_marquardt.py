@@ -50,18 +50,20 @@ class Solution:
 
 def solve(batch: Batch, w: Array, rows: Rows, iterations: int) -> Solution:
     """Solves the given rows from w (len(rows), q)."""
-    now = Solution(np.clip(w, batch.low, batch.high), np.empty(len(rows)))
-    now = Solution(now.w, _error(batch.residual(now.w, rows)))
+    w = np.clip(w, batch.low, batch.high)
+    r = batch.residual(w, rows)
+    now = Solution(w, _error(r))
     damping, settled = np.full(len(rows), 1e-3), np.zeros(len(rows), dtype=bool)
     for _ in range(iterations):
         open_ = np.flatnonzero((now.error > batch.solved) & ~settled & (damping < STUCK))
         if not len(open_):
             break
-        step = _step(batch, now.w[open_], rows[open_], damping[open_])
-        moved = np.clip(now.w[open_] + step, batch.low, batch.high)
-        error = _error(batch.residual(moved, rows[open_]))
-        before = now.error[open_]
+        J = batch.jacobian(now.w[open_], rows[open_])
+        moved = np.clip(now.w[open_] + _step(r[open_], J, damping[open_]), batch.low, batch.high)
+        r_moved = batch.residual(moved, rows[open_])
+        error, before = _error(r_moved), now.error[open_]
         better = error < before
+        r[open_[better]] = r_moved[better]
         settled[open_] = better & (error > (1 - SETTLED) * before) & np.isfinite(before)
         now = now.better_of(Solution(moved, error), open_)
         damping[open_] = np.clip(damping[open_] * np.where(better, 0.2, 5.0), 1e-9, 1e6)
@@ -73,8 +75,7 @@ def _error(r: Array) -> Array:
     return np.where(np.isfinite(square), square, np.inf)
 
 
-def _step(batch: Batch, w: Array, rows: Rows, damping: Array) -> Array:
-    r, J = batch.residual(w, rows), batch.jacobian(w, rows)
+def _step(r: Array, J: Array, damping: Array) -> Array:
     usable: NDArray[np.bool_] = np.asarray(
         np.isfinite(J).all(axis=(1, 2)) & np.isfinite(r).all(axis=1)
     )

@@ -35,7 +35,7 @@ from grounded.compile.llvm_riccati import SWEEP, sweep_kernel
 from grounded.compile.llvm_rollout import LANES, ROLLOUT, Layout, rollout_kernel
 from grounded.compile.llvm_step import Dynamics, dynamics_of, jacobian_function, stage_tables
 from grounded.compile.llvm_text import declarations
-from grounded.compile.memory import empty, side_by_side
+from grounded.compile.memory import empty, side_by_side, zeros
 from grounded.compile.problem import Array, Problem
 from grounded.compile.system import Backward, Swarm
 from grounded.compile.traced import TracedSystem, Variant
@@ -144,7 +144,7 @@ class CompiledSystem(TracedSystem):
 
     def step(self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0) -> Array:
         """See `System.step`."""
-        out = np.empty((len(x), self.n))
+        out = empty((len(x), self.n))
         library = self._compiled(p, dt).batch()
         self._batch(library["step"], (x, u, p, dt, smoothing), {"out": out})
         return out
@@ -154,7 +154,7 @@ class CompiledSystem(TracedSystem):
     ) -> tuple[Array, Array]:
         """See `System.linearise`."""
         N, n = len(x), self.n
-        f_x, f_u = np.zeros((N, n, n)), np.zeros((N, n, self.m))
+        f_x, f_u = zeros((N, n, n)), zeros((N, n, self.m))
         library = self._compiled(p, dt).batch()
         self._batch(library["linearise"], (x, u, p, dt, smoothing), {"f_x": f_x, "f_u": f_u})
         return f_x, f_u
@@ -166,7 +166,7 @@ class CompiledSystem(TracedSystem):
         if self.n * (self.n + self.m + self.k) > MAX_PLACES:
             return super().sensitivities(x, u, p, dt, smoothing)
         N, n = len(x), self.n
-        f_x, f_u, f_p = np.zeros((N, n, n)), np.zeros((N, n, self.m)), np.zeros((N, n, self.k))
+        f_x, f_u, f_p = zeros((N, n, n)), zeros((N, n, self.m)), zeros((N, n, self.k))
         out = {"f_x": f_x, "f_u": f_u, "f_p": f_p}
         self._batch(self._compiled(p, dt).full()["linearise"], (x, u, p, dt, smoothing), out)
         return f_x, f_u, f_p

@@ -29,6 +29,13 @@ def empty(shape: tuple[int, ...]) -> Array:
     return np.asarray(_Block(1 << (size - 1).bit_length(), shape), np.float64)
 
 
+def zeros(shape: tuple[int, ...]) -> Array:
+    """An array of zeros, float64 and C-contiguous."""
+    array = empty(shape)
+    array.fill(0.0)
+    return array
+
+
 def side_by_side(shapes: Mapping[str, tuple[int, ...]]) -> tuple[dict[str, Array], dict[str, int]]:
     """Arrays of these shapes in one block, each on a cache line of its own, and their addresses."""
     places, size = dict[str, tuple[int, int]](), 0
