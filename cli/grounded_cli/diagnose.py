@@ -77,7 +77,8 @@ def _tell(document: dict[str, Any]) -> None:
     verdict = document["verdict"]
     show(_verdict(verdict["kind"], verdict["sentence"]))
     for text in document.get("unknowable", []):
-        show(field("unknown", text))
+        if text not in verdict["sentence"]:
+            show(field("unknown", text))
     show(field("gap", _gap(document["gap"])))
     for title, text in error_lines(diagnosis_of(document)):
         show(field(title, text))

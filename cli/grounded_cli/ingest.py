@@ -82,10 +82,10 @@ def _tell(name: str, one: Ingested) -> None:
     for warning in one.warnings:
         remark("warning", f"{name}: {warning}")
     known = "was stored before as" if one.known else "is stored as"
+    show(f"{name} {known} {one.trial}")
     if not one.candidate:
-        show(f"{name} {known} {one.trial}: data for fit and diagnose")
+        show(field("data", "for fit and diagnose: it ran no candidate", "  "))
     else:
-        show(f"{name} {known} {one.trial}")
         text = f"utility {number(one.utility)}, {one.verdict}{VERDICTS.get(one.verdict, '')}"
         show(field(one.candidate, text, "  "))
     if one.signals:

@@ -90,7 +90,7 @@ def _utilities(findings: Findings, table: Table, bars: Callable[[Sequence[float]
     header = ("candidate", "iter.", "alpha", "predicted", "real", "+-", "trials", "")
     lines = ["utility", table(rows, header), f"  {LEGEND}"]
     if left:
-        lines.append(f"  ({left} more that did not improve, or between: grounded status)")
+        lines.append(f"  ({left} more between them: grounded status shows all)")
     spark = bars(spaced([t.utility for t in history if t.utilities][-WIDTH // 2 :]))
     if spark:
         lines.append(f"\n  {spark}  by candidate, higher is better")
