@@ -24,6 +24,7 @@ columns. A missing measurement is a False in `seen`.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -119,7 +120,12 @@ def _compiled_gains(
     K, whiten = np.empty((L, B, N, n)), np.zeros((L, B, n, n))
     A, seen = np.ascontiguousarray(A), np.ascontiguousarray(seen, float)
     G = None if G is None else np.ascontiguousarray(G)
-    values = {"A": A, "Q": np.ascontiguousarray(Q), "R": np.ascontiguousarray(R), "seen": seen}
+    values: dict[str, Any] = {
+        "A": A,
+        "Q": np.ascontiguousarray(Q),
+        "R": np.ascontiguousarray(R),
+        "seen": seen,
+    }
     values |= {"start": np.ascontiguousarray(first), "G": 0 if G is None else G}
     kernels.run("gains", n, N, G is not None, {**values, "L": L, "B": B, "K": K, "W": whiten})
     diagonal = np.einsum("tbii->tbi", whiten)
@@ -170,7 +176,16 @@ def _compiled_innovations(
     d, r = _widened(d, (L, B, n, wide)), _widened(r, (L + 1, B, n, wide))
     out = np.empty((L, B, n, wide))
     filtered = np.empty((L + 1, B, n, wide)) if track else None
-    values = {"A": g.A, "K": g.K, "W": g.whiten, "d": d, "r": r, "seen": g.seen, "L": L, "B": B}
+    values: dict[str, Any] = {
+        "A": g.A,
+        "K": g.K,
+        "W": g.whiten,
+        "d": d,
+        "r": r,
+        "seen": g.seen,
+        "L": L,
+        "B": B,
+    }
     values |= {"blocks": wide // lanes, "C": wide, "out": out}
     values |= {"track": 0 if filtered is None else filtered}
     kernels.run("innovations", n, g.A.shape[-1], g.G is not None, values)
@@ -203,7 +218,12 @@ def smoother(g: Gains, white: Array) -> Adjoint:
     u, D = np.empty((L, B, n)), np.empty((L, B, n))
     r, Nd = np.empty((L, B, N)), np.empty((L, B, N))
     if kernels.available(n):
-        values = {"A": g.A, "K": g.K, "W": g.whiten, "white": np.ascontiguousarray(white)}
+        values: dict[str, Any] = {
+            "A": g.A,
+            "K": g.K,
+            "W": g.whiten,
+            "white": np.ascontiguousarray(white),
+        }
         values |= {"seen": g.seen, "G": 0 if g.G is None else g.G, "L": L, "B": B}
         values |= {"u": u, "D": D, "r": r, "N": Nd}
         kernels.run("smoother", n, N, g.G is not None, values)

@@ -161,7 +161,7 @@ class Predictor:
         ]
         if not rates:
             return self.step(x, u, p)
-        needs_own = any(effect.family.needs_own for effect, _ in rates)
+        needs_own = any(e.family.needs_own for e in h.effects if isinstance(e.family, RateFamily))
         own = self.named((self.step(x, u, p) - x) / dt) if needs_own else {}
         start = x + 0.5 * dt * self.added_rate(rates, x, u, t, own)
         after = self.step(start, u, p)

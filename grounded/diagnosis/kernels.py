@@ -1,8 +1,8 @@
-"""The Kalman filter's three passes as compiled kernels: the twin of `filter.py`, several times faster.
+"""The Kalman filter's three passes as compiled kernels: the twin of `filter.py`, but faster.
 
 A run's covariance is a few dozen numbers: NumPy spends its time on calls. Here all runs go through
-time together (memory is read in order), matrices with rows padded to whole vectors. Everything is built from one
-loop, out[i, :] += sum_k left[i, k] right[k, :] (`_Pen.product`).
+time together (memory is read in order), matrices with rows padded to whole vectors. Everything is
+built from one loop, out[i, :] += sum_k left[i, k] right[k, :] (`Pen.product`).
 
     gains        A, Q, R -> K, whitener
     innovations  columns of d and r -> whitened innovations, filtered errors
@@ -19,16 +19,10 @@ import numpy as np
 
 from grounded.compile import jit
 from grounded.compile.compiled import call
-from grounded.compile.llvm_batch import Words
-from grounded.compile.llvm_text import Writer, declarations, number, splat
+from grounded.compile.llvm_text import declarations, number, splat
+from grounded.diagnosis.kernel_pen import NAMES, Pen
 
 LARGEST = 16  # states whose factorisation is written out
-
-GAINS = ("A", "Q", "R", "seen", "start", "G", "L", "B", "K", "W", "state")
-INNOVATIONS = ("A", "K", "W", "d", "r", "seen", "L", "B", "blocks", "C", "out", "track", "state")
-SMOOTHER = ("A", "K", "W", "white", "seen", "G", "L", "B", "u", "D", "r", "N", "state")
-INTEGERS = ("L", "B", "C", "blocks")
-NAMES = {"gains": GAINS, "innovations": INNOVATIONS, "smoother": SMOOTHER}
 
 
 def available(n: int) -> bool:
@@ -73,97 +67,8 @@ def _version() -> str:
     return hashlib.sha256(Path(__file__).read_bytes()).hexdigest()[:16] + jit.writers()
 
 
-class _Pen:
-    """A kernel being written: sizes, rooms, and the loops all three share."""
-
-    def __init__(self, name: str, n: int, N: int, width: int) -> None:
-        self.f = Writer(f"i64 @{name}(ptr %words)")
-        self.words = Words(self.f, NAMES[name])
-        self.n, self.N, self.width = n, N, width
-        self.wide, self.short = self.padded(N), self.padded(n)
-        self.inputs = {w: self.words.pointer(w) for w in NAMES[name] if w not in INTEGERS}
-        self.L, self.B = self.words.integer("L"), self.words.integer("B")
-
-    def padded(self, size: int) -> int:
-        """Whole vectors."""
-        return -(-size // self.width) * self.width
-
-    def room(self, rows: int, columns: int) -> str:
-        """Rows of whole vectors, zero."""
-        size = rows * columns
-        found = self.f.room(size)
-        with self.f.loop(size // self.width) as i:
-            at = self.f.integer("mul", i, self.width)
-            self.f.store(splat(0.0, self.width), found, at, self.width)
-        return found
-
-    def at(self, name: str, t: str, b: str, size: int) -> str:
-        """Where an array (time, run, size) has its part."""
-        f = self.f
-        place = f.integer("add", f.integer("mul", t, self.B), b)
-        return f.at(self.inputs[name], f.integer("mul", place, size))
-
-    def product(
-        self,
-        out: tuple[str, int, int],
-        left: tuple[str, int, int],
-        right: tuple[str, int],
-        inner: int,
-        *,
-        onto: str = "",
-    ) -> None:
-        """out (address, rows, columns) = [onto +] left (address, row step, column step) right.
-
-        `right` is (address, row step); `onto` has the shape of out or is empty.
-        """
-        f, w = self.f, self.width
-        address, rows, columns = out
-        with f.loop(rows) as i:
-            to = f.at(address, f.integer("mul", i, columns))
-            base = f.at(left[0], f.integer("mul", i, left[1]))
-            start = f.at(onto, f.integer("mul", i, columns)) if onto else ""
-            for c in range(0, columns, w):
-                total = f.load(start, c, w) if onto else splat(0.0, w)
-                for k in range(inner):
-                    a = f.load_all(base, k * left[2], w)
-                    total = f.fma(a, f.load(right[0], k * right[1] + c, w), total, w)
-                f.store(total, to, c, w)
-
-    def copied(self, source: str, rows: int, columns: int, to: str, step: int) -> None:
-        """A plain matrix into padded rows."""
-        f = self.f
-        with f.loop(rows) as i:
-            a, b = f.at(source, f.integer("mul", i, columns)), f.at(to, f.integer("mul", i, step))
-            for c in range(columns):
-                f.store(f.load(a, c), b, c)
-
-    def turned(
-        self, source: str, size: tuple[int, int], step: int, to: str, wide: int, minus: bool = False
-    ) -> None:
-        """A matrix (rows, columns) with rows `step` apart, transposed into rows of `wide`."""
-        f = self.f
-        with f.loop(size[0]) as i:
-            a, b = f.at(source, f.integer("mul", i, step)), f.at(to, i)
-            for c in range(size[1]):
-                value = f.load(a, c)
-                f.store(f.neg(value) if minus else value, b, c * wide)
-
-    def unpadded(self, source: str, rows: int, columns: int, step: int, to: str) -> None:
-        """Padded rows into a plain matrix."""
-        f = self.f
-        with f.loop(rows) as i:
-            a, b = f.at(source, f.integer("mul", i, step)), f.at(to, f.integer("mul", i, columns))
-            for c in range(columns):
-                f.store(f.load(a, c), b, c)
-
-    def end(self) -> str:
-        """The finished kernel."""
-        self.f.do("ret i64 0")
-        return self.f.text()
-
-
 def _gains(n: int, N: int, through: bool, width: int) -> str:
-    pen = _Pen("gains", n, N, width)
+    pen = Pen("gains", n, N, width)
     f, wide, short = pen.f, pen.wide, pen.short
     T, AT = pen.room(N, wide), pen.room(N, wide)
     W, WT, GT, half = pen.room(n, short), pen.room(n, short), pen.room(n, short), pen.room(N, short)
@@ -173,39 +78,38 @@ def _gains(n: int, N: int, through: bool, width: int) -> str:
         P = f.at(pen.inputs["state"], f.integer("mul", b, N * wide))
         for i in range(N):
             f.store(f.load(start, i), P, i * wide + i)
-    with f.loop(pen.L) as t:
-        with f.loop(pen.B) as b:
-            P = f.at(pen.inputs["state"], f.integer("mul", b, N * wide))
-            later = f.integer("add", t, 1)
-            A, q = pen.at("A", t, b, N * N), pen.at("Q", t, b, N)
-            R, seen = pen.at("R", later, b, n), pen.at("seen", later, b, n)
-            pen.turned(A, (N, N), N, AT, wide)
-            pen.product((T, N, wide), (A, N, 1), (P, wide), N)
-            pen.product((P, N, wide), (T, wide, 1), (AT, wide), N)
-            if through:
-                _entered(pen, pen.at("G", t, b, n * n), q, GT, P)
-            for i in range(n if through else 0, N):
-                place = i * wide + i
-                f.store(f.add(f.load(P, place), f.load(q, i)), P, place)
-            _factorised(pen, P, R, seen, W, WT)
-            pen.unpadded(W, n, n, short, pen.at("W", t, b, n * n))
-            pen.product((half, N, short), (P, wide, 1), (WT, short), n)
-            pen.product((K, N, short), (half, short, 1), (W, short), n)
-            pen.unpadded(K, N, n, short, pen.at("K", t, b, N * n))
-            pen.turned(half, (N, n), short, turned, wide, minus=True)
-            pen.product((P, N, wide), (half, short, 1), (turned, wide), n, onto=P)
+    with f.loop(pen.L) as t, f.loop(pen.B) as b:
+        P = f.at(pen.inputs["state"], f.integer("mul", b, N * wide))
+        later = f.integer("add", t, 1)
+        A, q = pen.at("A", t, b, N * N), pen.at("Q", t, b, N)
+        R, seen = pen.at("R", later, b, n), pen.at("seen", later, b, n)
+        pen.turned(A, (N, N), N, AT, wide)
+        pen.product((T, N, wide), (A, N, 1), (P, wide), N)
+        pen.product((P, N, wide), (T, wide, 1), (AT, wide), N)
+        if through:
+            _entered(pen, pen.at("G", t, b, n * n), q, GT, P)
+        for i in range(n if through else 0, N):
+            place = i * wide + i
+            f.store(f.add(f.load(P, place), f.load(q, i)), P, place)
+        _factorised(pen, P, R, seen, W, WT)
+        pen.unpadded(W, n, n, short, pen.at("W", t, b, n * n))
+        pen.product((half, N, short), (P, wide, 1), (WT, short), n)
+        pen.product((K, N, short), (half, short, 1), (W, short), n)
+        pen.unpadded(K, N, n, short, pen.at("K", t, b, N * n))
+        pen.turned(half, (N, n), short, turned, wide, minus=True)
+        pen.product((P, N, wide), (half, short, 1), (turned, wide), n, onto=P)
     return pen.end()
 
 
-def _entered(pen: _Pen, G: str, q: str, GT: str, P: str) -> None:
+def _entered(pen: Pen, G: str, q: str, GT: str, P: str) -> None:
     """P[:n, :n] += G diag(q) G'."""
     f, n, w = pen.f, pen.n, pen.width
     for k in range(n):
         scale = f.load(q, k)
         for i in range(n):
             f.store(f.mul(f.load(G, i * n + k), scale), GT, k * pen.short + i)
-    with f.loop(n) as i:
-        row, base = f.at(P, f.integer("mul", i, pen.wide)), f.at(G, f.integer("mul", i, n))
+    with f.loop(n) as j:
+        row, base = f.at(P, f.integer("mul", j, pen.wide)), f.at(G, f.integer("mul", j, n))
         for c in range(0, pen.short, w):
             total = f.load(row, c, w)
             for k in range(n):
@@ -214,7 +118,7 @@ def _entered(pen: _Pen, G: str, q: str, GT: str, P: str) -> None:
             f.store(total, row, c, w)
 
 
-def _factorised(pen: _Pen, P: str, R: str, seen: str, W: str, WT: str) -> None:
+def _factorised(pen: Pen, P: str, R: str, seen: str, W: str, WT: str) -> None:
     """W = L^-1 of S = L L', what was not seen left out; WT = W' with those rows zero."""
     f, n = pen.f, pen.n
     one = number(1.0)
@@ -244,7 +148,7 @@ def _factorised(pen: _Pen, P: str, R: str, seen: str, W: str, WT: str) -> None:
 
 
 def _innovations(n: int, N: int, through: bool, width: int) -> str:
-    pen = _Pen("innovations", n, N, width)
+    pen = Pen("innovations", n, N, width)
     f, w = pen.f, width
     C = pen.words.integer("C")
     M2, nu = pen.room(N, w), pen.room(n, w)
@@ -252,7 +156,9 @@ def _innovations(n: int, N: int, through: bool, width: int) -> str:
 
     def column(name: str, t: str, b: str, c: str) -> str:
         place = f.integer("add", f.integer("mul", t, pen.B), b)
-        return f.at(pen.inputs[name], f.integer("add", f.integer("mul", f.integer("mul", place, n), C), c))
+        return f.at(
+            pen.inputs[name], f.integer("add", f.integer("mul", f.integer("mul", place, n), C), c)
+        )
 
     blocks = pen.words.integer("blocks")
     follow = f.emit(f"icmp ne ptr {pen.inputs['track']}, null")
@@ -273,80 +179,78 @@ def _innovations(n: int, N: int, through: bool, width: int) -> str:
             to = column("track", "0", b, c)
             for i in range(n):
                 f.store(f.load(M, i * w, w), to, rows[i], w)
-    with f.loop(pen.L) as t, f.loop(pen.B) as b:
-        with f.loop(blocks) as block:
-            c, M = f.integer("mul", block, w), state(b, block)
-            later = f.integer("add", t, 1)
-            A, K = pen.at("A", t, b, N * N), pen.at("K", t, b, N * n)
-            seen, W = pen.at("seen", later, b, n), pen.at("W", t, b, n * n)
-            d, r, out = column("d", t, b, c), column("r", later, b, c), column("out", t, b, c)
-            pen.product((M2, N, w), (A, N, 1), (M, w), N)
+    with f.loop(pen.L) as t, f.loop(pen.B) as b, f.loop(blocks) as block:
+        c, M = f.integer("mul", block, w), state(b, block)
+        later = f.integer("add", t, 1)
+        A, K = pen.at("A", t, b, N * N), pen.at("K", t, b, N * n)
+        seen, W = pen.at("seen", later, b, n), pen.at("W", t, b, n * n)
+        d, r, out = column("d", t, b, c), column("r", later, b, c), column("out", t, b, c)
+        pen.product((M2, N, w), (A, N, 1), (M, w), N)
+        for i in range(n):
+            ahead = f.add(f.load(M2, i * w, w), f.load(d, rows[i], w), w)
+            f.store(ahead, M2, i * w, w)
+            missed = f.sub(f.load(r, rows[i], w), ahead, w)
+            f.store(f.mul(missed, f.load_all(seen, i, w), w), nu, i * w, w)
+        pen.product((M, N, w), (K, n, 1), (nu, w), n, onto=M2)
+        for i in range(n):
+            total = splat(0.0, w)
+            for k in range(i + 1):
+                total = f.fma(f.load_all(W, i * n + k, w), f.load(nu, k * w, w), total, w)
+            f.store(total, out, rows[i], w)
+        with f.when(follow):
+            to = column("track", later, b, c)
             for i in range(n):
-                ahead = f.add(f.load(M2, i * w, w), f.load(d, rows[i], w), w)
-                f.store(ahead, M2, i * w, w)
-                missed = f.sub(f.load(r, rows[i], w), ahead, w)
-                f.store(f.mul(missed, f.load_all(seen, i, w), w), nu, i * w, w)
-            pen.product((M, N, w), (K, n, 1), (nu, w), n, onto=M2)
-            for i in range(n):
-                total = splat(0.0, w)
-                for k in range(i + 1):
-                    total = f.fma(f.load_all(W, i * n + k, w), f.load(nu, k * w, w), total, w)
-                f.store(total, out, rows[i], w)
-            with f.when(follow):
-                to = column("track", later, b, c)
-                for i in range(n):
-                    f.store(f.load(M, i * w, w), to, rows[i], w)
+                f.store(f.load(M, i * w, w), to, rows[i], w)
     return pen.end()
 
 
 def _smoother(n: int, N: int, through: bool, width: int) -> str:
-    pen = _Pen("smoother", n, N, width)
+    pen = Pen("smoother", n, N, width)
     f, wide, short = pen.f, pen.wide, pen.short
     NK, D = pen.room(N, short), pen.room(n, short)
     A, K, W, G = pen.room(N, wide), pen.room(N, short), pen.room(n, short), pen.room(n, short)
     X, ut, spare = pen.room(N, wide), pen.room(1, short), pen.room(1, wide)
-    with f.loop(pen.L, down=True) as t:
-        with f.loop(pen.B) as b:
-            q = f.at(pen.inputs["state"], f.integer("mul", b, (N + 1) * wide))
-            Nq = f.at(q, wide)
-            raw = pen.at("K", t, b, N * n)
-            rawW, white = pen.at("W", t, b, n * n), pen.at("white", t, b, n)
-            seen = pen.at("seen", f.integer("add", t, 1), b, n)
-            pen.copied(pen.at("A", t, b, N * N), N, N, A, wide)
-            pen.copied(raw, N, n, K, short)
-            pen.copied(rawW, n, n, W, short)
-            pen.product((NK, N, short), (Nq, wide, 1), (K, short), N)
-            pen.product((D, n, short), (W, 1, short), (W, short), n)
-            pen.product((D, n, short), (K, 1, short), (NK, short), N, onto=D)
-            # u = W' white - K' q, as rows
-            pen.product((ut, 1, short), (white, n, 1), (W, short), n)
-            for i in range(N):
-                f.store(f.neg(f.load(q, i)), spare, i)
-            pen.product((ut, 1, short), (spare, wide, 1), (K, short), N, onto=ut)
-            u_out, D_out = pen.at("u", t, b, n), pen.at("D", t, b, n)
-            mask = [f.load(seen, i) for i in range(n)]
-            for i in range(n):
-                value = f.mul(f.load(ut, i), mask[i])
-                f.store(value, u_out, i)
-                f.store(f.mul(f.load(D, i * short + i), mask[i]), D_out, i)
-                f.store(f.add(f.load(q, i), value), q, i)
-            _measured(pen, Nq, NK, D, mask)
-            _answer(pen, through, t, b, (q, Nq, G, X, ut))
-            pen.product((X, N, wide), (Nq, wide, 1), (A, wide), N)
-            pen.product((Nq, N, wide), (A, 1, wide), (X, wide), N)
-            for i in range(N):  # what is not symmetric would grow, step by step
-                for j in range(i):
-                    one, other = i * wide + j, j * wide + i
-                    mean = f.mul(f.add(f.load(Nq, one), f.load(Nq, other)), number(0.5))
-                    f.store(mean, Nq, one)
-                    f.store(mean, Nq, other)
-            pen.product((spare, 1, wide), (q, wide, 1), (A, wide), N)
-            for i in range(N):
-                f.store(f.load(spare, i), q, i)
+    with f.loop(pen.L, down=True) as t, f.loop(pen.B) as b:
+        q = f.at(pen.inputs["state"], f.integer("mul", b, (N + 1) * wide))
+        Nq = f.at(q, wide)
+        raw = pen.at("K", t, b, N * n)
+        rawW, white = pen.at("W", t, b, n * n), pen.at("white", t, b, n)
+        seen = pen.at("seen", f.integer("add", t, 1), b, n)
+        pen.copied(pen.at("A", t, b, N * N), N, N, A, wide)
+        pen.copied(raw, N, n, K, short)
+        pen.copied(rawW, n, n, W, short)
+        pen.product((NK, N, short), (Nq, wide, 1), (K, short), N)
+        pen.product((D, n, short), (W, 1, short), (W, short), n)
+        pen.product((D, n, short), (K, 1, short), (NK, short), N, onto=D)
+        # u = W' white - K' q, as rows
+        pen.product((ut, 1, short), (white, n, 1), (W, short), n)
+        for i in range(N):
+            f.store(f.neg(f.load(q, i)), spare, i)
+        pen.product((ut, 1, short), (spare, wide, 1), (K, short), N, onto=ut)
+        u_out, D_out = pen.at("u", t, b, n), pen.at("D", t, b, n)
+        mask = [f.load(seen, i) for i in range(n)]
+        for i in range(n):
+            value = f.mul(f.load(ut, i), mask[i])
+            f.store(value, u_out, i)
+            f.store(f.mul(f.load(D, i * short + i), mask[i]), D_out, i)
+            f.store(f.add(f.load(q, i), value), q, i)
+        _measured(pen, Nq, NK, D, mask)
+        _answer(pen, through, t, b, (q, Nq, G, X, ut))
+        pen.product((X, N, wide), (Nq, wide, 1), (A, wide), N)
+        pen.product((Nq, N, wide), (A, 1, wide), (X, wide), N)
+        for i in range(N):  # what is not symmetric would grow, step by step
+            for j in range(i):
+                one, other = i * wide + j, j * wide + i
+                mean = f.mul(f.add(f.load(Nq, one), f.load(Nq, other)), number(0.5))
+                f.store(mean, Nq, one)
+                f.store(mean, Nq, other)
+        pen.product((spare, 1, wide), (q, wide, 1), (A, wide), N)
+        for i in range(N):
+            f.store(f.load(spare, i), q, i)
     return pen.end()
 
 
-def _measured(pen: _Pen, Nq: str, NK: str, D: str, mask: list[str]) -> None:
+def _measured(pen: Pen, Nq: str, NK: str, D: str, mask: list[str]) -> None:
     """Nq <- Nq - NK H - H' NK' + H' D H in place, of what was seen."""
     f, n, wide, short = pen.f, pen.n, pen.wide, pen.short
     for j in range(n):
@@ -367,9 +271,7 @@ def _measured(pen: _Pen, Nq: str, NK: str, D: str, mask: list[str]) -> None:
             f.store(f.add(f.load(Nq, place), both), Nq, place)
 
 
-def _answer(
-    pen: _Pen, through: bool, t: str, b: str, rooms: tuple[str, str, str, str, str]
-) -> None:
+def _answer(pen: Pen, through: bool, t: str, b: str, rooms: tuple[str, str, str, str, str]) -> None:
     """Stores r and the diagonal of N; through G, G' r and diag(G' N G)."""
     f, n, N, wide, short, w = pen.f, pen.n, pen.N, pen.wide, pen.short, pen.width
     q, Nq, G, X, spare = rooms

@@ -130,7 +130,7 @@ def first_guess(residual: Array, seen: Array, scale: Array) -> Noise:
 
 
 def slopes(noise: Noise, adjoint: Adjoint, dt: float) -> Array:
-    """d loglik / d log variance: (2 or 3, n) for w, v and, if there is one, the coloured part."""
+    """Slope d loglik / d log variance, (2 or 3, n): of w, v and, if any, the coloured part."""
     n = len(noise.log_q)
     q, r = np.exp(noise.log_q) / noise.weight_w, np.exp(noise.log_r) / noise.weight_v
     parts = [(q, adjoint.r[..., :n], adjoint.N[..., :n]), (r, adjoint.u, adjoint.D)]

@@ -15,72 +15,20 @@ All hypotheses of one noise structure step through time together, along the batc
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from grounded.diagnosis import filter as kalman
-from grounded.diagnosis.columns import linearised, noise_entry, step_sizes
-from grounded.diagnosis.data import Data
+from grounded.diagnosis.climb import Work, measured, proposed, spread_over
+from grounded.diagnosis.columns import linearised, noise_entry
 from grounded.diagnosis.fitted import Fit, calibrated, shift_precision
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor, param_scale
-from grounded.diagnosis.information import information
-from grounded.diagnosis.noise import Noise, channel_information, cleaned, climbed, slopes
+from grounded.diagnosis.noise import Noise, cleaned
 from grounded.frozen import Array
 
 MOST_NUMBERS = 2e6  # of one (L, B, N, N) array: what fits in the cache goes fastest
 MEASURED = (2, 7, 14)  # ages at which the noise's information is measured
-SHORTEST = 0.02  # part of a step that is still tried
-
-
-@dataclass(eq=False)
-class _Step:
-    """A step that was proposed at the best point: of values, shifts, track; the noise it leads to."""
-
-    theta: Array
-    shift: Array  # in units of param_scale
-    track: Array
-    noise: Noise
-
-
-@dataclass(eq=False)
-class _Work:
-    """One hypothesis on its way: mutable, private to this module."""
-
-    h: Hypothesis
-    noise: Noise
-    track: Array
-    best: Fit | None = None
-    step: _Step | None = None
-    part: float = 1.0  # of the step that is taken
-    still: int = 0
-    age: int = 0  # points that were better than all before
-
-    def done(self) -> bool:
-        return self.still >= 1
-
-    def shorten(self, data: Data) -> None:
-        """Half the step, or the end where it is too short to matter."""
-        self.part *= 0.4
-        if self.best is None or self.part < SHORTEST:
-            self.still = 1
-        else:
-            self.go(data)
-
-    def go(self, data: Data) -> None:
-        """From the best point by a part of the step."""
-        assert self.best is not None
-        assert self.step is not None
-        best, step, part = self.best, self.step, self.part
-        h = best.hypothesis
-        self.h = h.with_theta(h.theta + part * step.theta)
-        if len(step.shift):
-            which = calibrated(data)
-            shift = np.zeros(data.model.system.k) if h.shift is None else h.shift.copy()
-            shift[which] += part * step.shift * param_scale(data.model)[which]
-            self.h = replace(self.h, shift=_inside(data, shift))
-        self.noise = best.noise.towards(step.noise, part)
-        self.track = best.track + part * step.track
 
 
 def refine(
@@ -102,7 +50,7 @@ def refine(
     """
     data = predictor.data
     works = [
-        _Work(s.hypothesis, s.noise, s.track) if isinstance(s, Fit) else _Work(*s) for s in starts
+        Work(s.hypothesis, s.noise, s.track) if isinstance(s, Fit) else Work(*s) for s in starts
     ]
     if not works:
         return []
@@ -118,7 +66,7 @@ def refine(
     return [work.best for work in works if work.best is not None]
 
 
-def _iterate(predictor: Predictor, works: list[_Work], fixed_noise: bool) -> None:
+def _iterate(predictor: Predictor, works: list[Work], fixed_noise: bool) -> None:
     data = predictor.data
     L, B = data.time.shape
     parts = [linearised(predictor, work.h, work.track) for work in works]
@@ -130,8 +78,8 @@ def _iterate(predictor: Predictor, works: list[_Work], fixed_noise: bool) -> Non
     entries = [entry for entry in carried if entry is not None]
     G = np.concatenate(entries, axis=1) if entries else None
     phi = works[0].noise.structure.phi(data.dt)
-    Q = np.concatenate([_spread(w.noise.process(data.dt), (L, B)) for w in works], axis=1)
-    R = np.concatenate([_spread(w.noise.measurement(L), (L + 1, B)) for w in works], axis=1)
+    Q = np.concatenate([spread_over(w.noise.process(data.dt), (L, B)) for w in works], axis=1)
+    R = np.concatenate([spread_over(w.noise.measurement(L), (L + 1, B)) for w in works], axis=1)
     start = np.concatenate([w.noise.start(B) for w in works])
     seen = np.tile(data.seen, (1, len(works), 1))
     try:
@@ -167,7 +115,7 @@ def clean(predictor: Predictor, fit: Fit, rounds: int = 8) -> Fit:
     """The same hypothesis with outliers weighed down, its noise fitted to the rest."""
     data = predictor.data
     L, B = data.time.shape
-    work = _Work(fit.hypothesis, fit.noise, fit.track)
+    work = Work(fit.hypothesis, fit.noise, fit.track)
     for _ in range(rounds):
         if not np.isfinite(work.track).all():
             return fit
@@ -194,11 +142,6 @@ def clean(predictor: Predictor, fit: Fit, rounds: int = 8) -> Fit:
     return found[0] if found else fit
 
 
-def _spread(values: Array | float, shape: tuple[int, int]) -> Array:
-    array = np.asarray(values)
-    return np.broadcast_to(array, (*shape, array.shape[-1]))
-
-
 def _padded(columns: Array, width: int) -> Array:
     missing = width - columns.shape[-1]
     return np.pad(columns, [(0, 0)] * (columns.ndim - 1) + [(0, missing)]) if missing else columns
@@ -206,7 +149,7 @@ def _padded(columns: Array, width: int) -> Array:
 
 def _update(
     predictor: Predictor,
-    work: _Work,
+    work: Work,
     white: Array,
     logdet: Array,
     filtered: Array,
@@ -218,101 +161,22 @@ def _update(
     residual, columns = white[..., 0], white[..., 1:]
     fit = _scored(predictor, work, residual, columns, logdet, filtered[..., 0])
     rise = np.inf if work.best is None else fit.evidence - work.best.evidence
-    if not rise > 0:  # too far, or not finite: part of the way from the best point
+    if not (rise > 0 and np.isfinite(fit.evidence)):
         work.shorten(data)
         return
     work.still = 0 if rise > 0.03 else 1
+    work.part = min(1.0, 2 * work.part)
     work.age += 1
     if memory is not None and work.age in MEASURED and (fit.noise.info is None or work.age > 4):
-        work.noise = _measured(predictor, fit)
+        work.noise = measured(predictor, fit)
         fit = replace(fit, noise=work.noise)
     work.best = fit
-    work.part = min(1.0, 2 * work.part)
-    work.step = _proposed(data, fit, filtered, adjoint, memory)
+    work.step = proposed(data, fit, filtered, adjoint, memory)
     work.go(data)
 
 
-def _proposed(
-    data: Data, fit: Fit, filtered: Array, adjoint: kalman.Adjoint, memory: Array | None
-) -> _Step:
-    """Gauss-Newton in values and shifts, scoring in the noise, the filtered track as the track."""
-    h = fit.hypothesis
-    G = fit.gram.sum(axis=0) + np.diag(fit.prior)
-    slope = fit.score.sum(axis=0) + fit.prior_pull(data)
-    k, track = len(h.theta), filtered[..., 0]
-    theta, shift = np.zeros(k), np.zeros(len(slope) - k)
-    if len(slope):
-        scale = 1 / np.sqrt(np.maximum(np.diag(G), 1e-300))
-        delta = -scale * np.linalg.lstsq(G * np.outer(scale, scale), scale * slope, rcond=1e-10)[0]
-        delta[:k] = _limited(h, delta[:k])
-        delta[k:] = np.clip(delta[k:], -0.3, 0.3)
-        theta, shift = delta[:k], delta[k:]
-        track = track + filtered[..., 1:] @ delta
-    noise = fit.noise if memory is None else _climbed(data, fit.noise, adjoint, memory)
-    return _Step(theta, shift, track, noise)
-
-
-def _climbed(data: Data, noise: Noise, adjoint: kalman.Adjoint, memory: Array) -> Noise:
-    count = int(data.valid.sum())
-    info = noise.info
-    if info is None:
-        info = channel_information(noise, memory, data.dt, count)
-    return climbed(noise, slopes(noise, adjoint, data.dt), info, count)
-
-
-def _measured(predictor: Predictor, fit: Fit) -> Noise:
-    """A fit's noise with the information of its variances measured."""
-    data = predictor.data
-    L, B = data.time.shape
-    F, d, r = linearised(predictor, fit.hypothesis, fit.track)
-    G = noise_entry(predictor, fit.hypothesis, fit.track)
-
-    def adjoints(noises: list[Noise]) -> list[kalman.Adjoint]:
-        H = len(noises)
-        many = None if G is None else np.tile(G, (1, H, 1, 1))
-        phi = fit.noise.structure.phi(data.dt)
-        g = kalman.gains(
-            kalman.transition(np.tile(F, (1, H, 1, 1)), phi, many),
-            np.concatenate([_spread(w.process(data.dt), (L, B)) for w in noises], axis=1),
-            np.concatenate([_spread(w.measurement(L), (L + 1, B)) for w in noises], axis=1),
-            np.tile(data.seen, (1, H, 1)),
-            np.concatenate([w.start(B) for w in noises]),
-            many,
-        )
-        column, of_log = np.tile(d[..., :1], (1, H, 1, 1)), np.tile(r[..., :1], (1, H, 1, 1))
-        white, _ = kalman.innovations(g, column, of_log)
-        back = kalman.smoother(g, white[..., 0])
-        parts = [slice(i * B, (i + 1) * B) for i in range(H)]
-        return [kalman.Adjoint(back.u[:, p], back.D[:, p], back.r[:, p], back.N[:, p]) for p in parts]
-
-    try:
-        info = information(fit.noise, adjoints, data.dt)
-    except np.linalg.LinAlgError:
-        return fit.noise
-    return replace(fit.noise, info=info) if np.isfinite(info).all() else fit.noise
-
-
-def _limited(h: Hypothesis, delta: Array) -> Array:
-    """Scanned values move by at most two grid gaps at once: between grid points anything may be."""
-    limits = [
-        20 * s if q.grid else np.inf
-        for s, q in zip(step_sizes(h), [q for e in h.effects for q in e.free], strict=True)
-    ]
-    return np.clip(delta, -np.array(limits), np.array(limits))
-
-
-def _inside(data: Data, shift: Array) -> Array:
-    """Keeps parameters inside their bounds, and positive ones positive."""
-    values = data.model.values
-    low = [-np.inf if p.low is None else p.low for p in data.model.params.values()]
-    high = [np.inf if p.high is None else p.high for p in data.model.params.values()]
-    low = [max(b, 0.2 * v) if v > 0 else b for b, v in zip(low, values, strict=True)]
-    high = [min(b, 0.2 * v) if v < 0 else b for b, v in zip(high, values, strict=True)]
-    return np.clip(values + shift, low, high) - values
-
-
 def _scored(
-    predictor: Predictor, work: _Work, residual: Array, columns: Array, logdet: Array, error: Array
+    predictor: Predictor, work: Work, residual: Array, columns: Array, logdet: Array, error: Array
 ) -> Fit:
     data, h = predictor.data, work.h
     L, B, n, C = columns.shape

@@ -17,6 +17,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -37,6 +38,9 @@ from grounded.effects import (
 from grounded.frozen import Array
 
 BLOCK = 160  # columns filtered at once
+NEAR = 3.0  # nats within which another grid point is tried too
+NEARLY = 0.7  # or part of the best one's gain
+MOST_OTHERS = 2
 MOST_NUMBERS = 3e6  # of one block of whitened columns
 
 
@@ -47,7 +51,7 @@ class Look:
     effect: Effect
     values: dict[str, float]
     gain: float
-    second: dict[str, float] | None = None  # another grid point that is nearly as good
+    others: tuple[dict[str, float], ...] = ()  # other places that are nearly as good
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,8 +298,33 @@ class _Context:
         if not looks:
             return Look(effect, {}, 0.0)
         looks.sort(key=lambda look: -look[0])
-        second = looks[1][1] if len(looks) > 1 and looks[1][0] > looks[0][0] - 3 else None
-        return Look(effect, looks[0][1], looks[0][0], second)
+        return Look(effect, looks[0][1], looks[0][0], _elsewhere(effect, looks))
+
+
+def _elsewhere(
+    effect: Effect, looks: list[tuple[float, dict[str, float]]]
+) -> tuple[dict[str, float], ...]:
+    """Grid points that gain nearly as much and are neighbours of none that was taken."""
+    best = looks[0][0]
+    enough = min(best - NEAR, NEARLY * best)
+    taken = [looks[0][1]]
+    for gain, values in looks[1:]:
+        if gain < enough or len(taken) > MOST_OTHERS:
+            break
+        if all(_apart(effect, values, other) for other in taken):
+            taken.append(values)
+    return tuple(taken[1:])
+
+
+def _apart(effect: Effect, one: dict[str, float], other: dict[str, float]) -> bool:
+    """Whether two grid points are no neighbours."""
+    for q in effect.free:
+        if q.grid:
+            grid = np.sort(np.array(q.grid))
+            i, j = (int(np.argmin(np.abs(grid - v[q.name]))) for v in (one, other))
+            if abs(i - j) > 1:
+                return True
+    return False
 
 
 def _faint(effect: Effect, grid: dict[str, float], score: float, gram: float) -> float:

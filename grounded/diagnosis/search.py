@@ -24,12 +24,14 @@ from grounded.diagnosis.refine import refine
 from grounded.diagnosis.scan import Look, scan
 from grounded.effects import Effect, ParamFamily
 
-CLAIM = 5.0  # nats from which an effect is claimed
+CLAIM = 3.0  # nats from which an effect is claimed
 TIE = 3.0  # nats within which two explanations are not told apart
 SPREADS = (0.03, 0.1)  # prior relative errors of the model's parameters when they are calibrated
 PARAM_PRIOR = 0.2  # prior relative error of one parameter that is blamed
 SHORTLIST = 14  # effects that are refined of a scan, and half as many parameters
 TAUS = (0.05, 0.1, 0.3)  # [s] of coloured noise
+BRIEF = 0.1  # of a control step: shorter delays and lags are a matter of time stamps
+TIMES = {"delay": "d", "sensor_delay": "d", "first_order_lag": "tau"}
 LARGE = 8  # states, above which one correlation time and half the shortlist have to do
 
 
@@ -57,6 +59,8 @@ class Search:
         """What an effect pays beside its likelihood, in nats."""
         if isinstance(effect.family, ParamFamily):
             return math.log(self.crowd.get(effect.name, 1)) + self._param_price(effect, values)
+        if values.get(TIMES.get(effect.family.name, ""), math.inf) < BRIEF * self.data.dt:
+            return math.inf
         k = len(effect.free)
         cost = 0.5 * k * math.log(self.N) + math.log(effect.places) + effect.family.vague
         return cost + math.log(self.crowd.get(effect.name, 1))
@@ -208,25 +212,11 @@ class Search:
         starts: list[Fit | tuple] = [fit]  # type: ignore[type-arg]
         for look in self.shortlist(fit, count or self.most):
             h = fit.hypothesis
-            starts.append((h.plus(look.effect, look.values), fit.noise, fit.track))
-            if look.second is not None and self.far(look):
-                starts.append((h.plus(look.effect, look.second), fit.noise, fit.track))
+            starts += [
+                (h.plus(look.effect, values), fit.noise, fit.track)
+                for values in (look.values, *look.others)
+            ]
         return self.refined(starts, iterations)[1:]
-
-    @staticmethod
-    def far(look: Look) -> bool:
-        """Whether the second grid point is not the first one's neighbour."""
-        assert look.second is not None
-        for q in look.effect.free:
-            if q.grid:
-                grid = list(q.grid)
-                i, j = (
-                    int(np.argmin(np.abs(np.array(grid) - v[q.name])))
-                    for v in (look.values, look.second)
-                )
-                if abs(i - j) > 1:
-                    return True
-        return False
 
     def of_size(self, count: int) -> list[Fit]:
         """All fits with that many effects, best first, one a set of effects."""

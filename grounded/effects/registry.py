@@ -87,11 +87,13 @@ class Library:
     def candidates(self, model: Model, scales: Scales | None = None) -> tuple[Effect, ...]:
         """Every effect that can apply to a model, in the library's order."""
         found = []
-        idle = derived_states(model)
+        idle, outright = derived_states(model), outright_states(model)
         for family in self.families:
             for target in family.targets(model):
                 driven = target.partition("<-")
                 if isinstance(family, RateFamily) and {driven[0], driven[2]} & idle:
+                    continue
+                if isinstance(family, RateFamily) and family.needs_own and target in outright:
                     continue
                 found.append(_build(family, target, model, scales or Scales()))
         return tuple(found)
@@ -117,6 +119,15 @@ def derived_states(model: Model) -> set[str]:
     i = model.state_names.index(named[0])
     others = np.delete(f_x[:, :, i], i, axis=1)
     return {named[0]} if float(np.abs(others).max()) < 1e-12 else set()
+
+
+def outright_states(model: Model) -> set[str]:
+    """States that the model sets outright, whatever they were: they have no rate of their own."""
+    rng = np.random.default_rng(0)
+    x, u = rng.uniform(0.2, 1.0, (3, model.n)), rng.uniform(0.2, 1.0, (3, model.m))
+    f_x, _ = model.system.linearise(x, u, model.values, 0.01)
+    own = np.abs(f_x[:, np.arange(model.n), np.arange(model.n)]).max(axis=0)
+    return {name for name, size in zip(model.state_names, own, strict=True) if size < 1e-9}
 
 
 def partner(model: Model, target: str) -> str | None:

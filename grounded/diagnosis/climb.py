@@ -1,0 +1,167 @@
+"""One hypothesis on its way up: the step that is proposed, the part of it that is taken.
+
+Gauss-Newton in the effects' values and the parameters' shifts, scoring in the noise, the filtered
+track as the new track: together, from the best point so far. A step that does not rise is taken in
+part, so that nothing is lost by boldness.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from grounded.diagnosis import filter as kalman
+from grounded.diagnosis.columns import linearised, noise_entry, step_sizes
+from grounded.diagnosis.data import Data
+from grounded.diagnosis.fitted import Fit, calibrated
+from grounded.diagnosis.hypothesis import Hypothesis, Predictor, param_scale
+from grounded.diagnosis.information import information
+from grounded.diagnosis.noise import Noise, channel_information, climbed, slopes
+from grounded.frozen import Array
+
+SHORTEST = 0.05  # part of a step that is still tried
+
+
+@dataclass(eq=False)
+class Step:
+    """A step proposed at the best point: of values, shifts, track; the noise it leads to."""
+
+    theta: Array
+    shift: Array  # in units of param_scale
+    track: Array
+    noise: Noise
+
+
+@dataclass(eq=False)
+class Work:
+    """One hypothesis on its way: mutable, private to this module."""
+
+    h: Hypothesis
+    noise: Noise
+    track: Array
+    best: Fit | None = None
+    step: Step | None = None
+    part: float = 1.0  # of the step that is taken
+    still: int = 0
+    age: int = 0  # points that were better than all before
+    moving: bool = (
+        True  # whether the track is updated too: where the model has kinks it may not help
+    )
+
+    def done(self) -> bool:
+        """Whether it no longer rises."""
+        return self.still >= 1
+
+    def shorten(self, data: Data) -> None:
+        """The same step about the track as it was; then parts of it; then the end."""
+        if self.moving:
+            self.moving = False
+        else:
+            self.part *= 0.4
+        if self.best is None or self.part < SHORTEST:
+            self.still = 1
+        else:
+            self.go(data)
+
+    def go(self, data: Data) -> None:
+        """From the best point by a part of the step."""
+        assert self.best is not None
+        assert self.step is not None
+        best, step, part = self.best, self.step, self.part
+        h = best.hypothesis
+        self.h = h.with_theta(h.theta + part * step.theta)
+        if len(step.shift):
+            which = calibrated(data)
+            shift = np.zeros(data.model.system.k) if h.shift is None else h.shift.copy()
+            shift[which] += part * step.shift * param_scale(data.model)[which]
+            self.h = replace(self.h, shift=_inside(data, shift))
+        self.noise = best.noise.towards(step.noise, part)
+        self.track = best.track + step.track if self.moving else best.track
+
+
+def proposed(
+    data: Data, fit: Fit, filtered: Array, adjoint: kalman.Adjoint, memory: Array | None
+) -> Step:
+    """Gauss-Newton in values and shifts, scoring in the noise, the filtered track as the track."""
+    h = fit.hypothesis
+    G = fit.gram.sum(axis=0) + np.diag(fit.prior)
+    slope = fit.score.sum(axis=0) + fit.prior_pull(data)
+    k, track = len(h.theta), filtered[..., 0]
+    theta, shift = np.zeros(k), np.zeros(len(slope) - k)
+    if len(slope):
+        scale = 1 / np.sqrt(np.maximum(np.diag(G), 1e-300))
+        delta = -scale * np.linalg.lstsq(G * np.outer(scale, scale), scale * slope, rcond=1e-10)[0]
+        delta[:k] = _limited(h, delta[:k])
+        delta[k:] = np.clip(delta[k:], -0.3, 0.3)
+        theta, shift = delta[:k], delta[k:]
+        track = track + filtered[..., 1:] @ delta
+    noise = fit.noise if memory is None else _climbed(data, fit.noise, adjoint, memory)
+    return Step(theta, shift, track, noise)
+
+
+def _climbed(data: Data, noise: Noise, adjoint: kalman.Adjoint, memory: Array) -> Noise:
+    count = int(data.valid.sum())
+    info = noise.info
+    if info is None:
+        info = channel_information(noise, memory, data.dt, count)
+    return climbed(noise, slopes(noise, adjoint, data.dt), info, count)
+
+
+def measured(predictor: Predictor, fit: Fit) -> Noise:
+    """A fit's noise with the information of its variances measured."""
+    data = predictor.data
+    L, B = data.time.shape
+    F, d, r = linearised(predictor, fit.hypothesis, fit.track)
+    G = noise_entry(predictor, fit.hypothesis, fit.track)
+
+    def adjoints(noises: list[Noise]) -> list[kalman.Adjoint]:
+        H = len(noises)
+        many = None if G is None else np.tile(G, (1, H, 1, 1))
+        phi = fit.noise.structure.phi(data.dt)
+        g = kalman.gains(
+            kalman.transition(np.tile(F, (1, H, 1, 1)), phi, many),
+            np.concatenate([spread_over(w.process(data.dt), (L, B)) for w in noises], axis=1),
+            np.concatenate([spread_over(w.measurement(L), (L + 1, B)) for w in noises], axis=1),
+            np.tile(data.seen, (1, H, 1)),
+            np.concatenate([w.start(B) for w in noises]),
+            many,
+        )
+        column, of_log = np.tile(d[..., :1], (1, H, 1, 1)), np.tile(r[..., :1], (1, H, 1, 1))
+        white, _ = kalman.innovations(g, column, of_log)
+        back = kalman.smoother(g, white[..., 0])
+        parts = [slice(i * B, (i + 1) * B) for i in range(H)]
+        return [
+            kalman.Adjoint(back.u[:, p], back.D[:, p], back.r[:, p], back.N[:, p]) for p in parts
+        ]
+
+    try:
+        info = information(fit.noise, adjoints, data.dt)
+    except np.linalg.LinAlgError:
+        return fit.noise
+    return replace(fit.noise, info=info) if np.isfinite(info).all() else fit.noise
+
+
+def _limited(h: Hypothesis, delta: Array) -> Array:
+    """Scanned values move by at most two grid gaps at once: between grid points anything may be."""
+    limits = [
+        20 * s if q.grid else np.inf
+        for s, q in zip(step_sizes(h), [q for e in h.effects for q in e.free], strict=True)
+    ]
+    return np.clip(delta, -np.array(limits), np.array(limits))
+
+
+def _inside(data: Data, shift: Array) -> Array:
+    """Keeps parameters inside their bounds, and positive ones positive."""
+    values = data.model.values
+    low = [-np.inf if p.low is None else p.low for p in data.model.params.values()]
+    high = [np.inf if p.high is None else p.high for p in data.model.params.values()]
+    low = [max(b, 0.2 * v) if v > 0 else b for b, v in zip(low, values, strict=True)]
+    high = [min(b, 0.2 * v) if v < 0 else b for b, v in zip(high, values, strict=True)]
+    return np.clip(values + shift, low, high) - values
+
+
+def spread_over(values: Array | float, shape: tuple[int, int]) -> Array:
+    """Variances at every step of every run, (*shape, n)."""
+    array = np.asarray(values)
+    return np.broadcast_to(array, (*shape, array.shape[-1]))
