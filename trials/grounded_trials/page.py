@@ -133,7 +133,8 @@ def _utility(findings: Findings) -> str:
     from grounded.certainty import last_improvement
 
     sure = last_improvement(findings.history)
-    sentence = f"<p>{escape(sure[:1].upper() + sure[1:])}.</p>" if sure else ""
+    begun = (sure[:1].upper() + sure[1:]).replace("+-", "±")
+    sentence = f"<p>{escape(begun)}.</p>" if sure else ""
     opened = " open" if len(findings.history) <= 12 else ""
     return (
         f"{figure_block(search_figure(findings))}{sentence}"
