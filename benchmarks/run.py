@@ -48,7 +48,10 @@ def our_solve(case, iterations, tolerance=0.0):
 
 
 def our_row(case):
-    """Our time, iterations and cost; an iteration is one linearisation, sweep and rollout."""
+    """Our time, iterations and cost; an iteration is one linearisation, sweep and rollout.
+
+    It is measured inside a solve: what that takes beyond its first rollout and its last sweep.
+    """
     from peer_data import CLOSE
 
     from grounded.ddp import Options, solve
