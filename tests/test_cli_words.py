@@ -141,6 +141,13 @@ def test_a_file_says_its_format_and_must_not_contradict(here):
     assert done.code == 2 and "is named as npz, --format says csv" in done.err
 
 
+def test_a_document_says_the_same_words(cart):
+    history = grounded("-C", cart, "status", "--json").json["history"]
+    shown = grounded("-C", cart, "status").out.splitlines()[1 : len(history) + 1]
+    for entry, line in zip(history, shown, strict=True):
+        assert line.startswith(entry["candidate"]) and line.endswith(entry["verdict"])
+
+
 def test_the_best_one_is_run_again_by_that_name(cart, tmp_path):
     folder = copied(cart, tmp_path / "w")
     best = grounded("-C", folder, "status", "--json").json["best"]["candidate"]

@@ -36,7 +36,10 @@ def command(folder: str | None, name: str | None, list_: bool, json_: bool) -> N
             show("\n".join(f"{key:15} {value.text}" for key, value in EXAMPLES.items()))
         return
     if folder is None or name is None:
-        raise click.UsageError("give a folder and an example: grounded init DIR --example car-turn")
+        raise click.UsageError(
+            "give a folder and an example: grounded init DIR --example car-turn; "
+            "`grounded init --list` names them"
+        )
     write_example(Path(folder), name)
     if json_:
         show_json({"workspace": folder, "example": name})

@@ -59,6 +59,7 @@ def as_document(standing: Standing) -> dict[str, Any]:
                 "standard_error": t.standard_error,
                 "trials": [trial.id for trial in t.trials],
                 "accepted": t.accepted,
+                "verdict": verdict(t, t is standing.history[-1]),
             }
             for t in standing.history
         ],
