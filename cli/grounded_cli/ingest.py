@@ -86,7 +86,10 @@ def _tell(name: str, one: Ingested) -> None:
     if not one.candidate:
         show(field("data", "for fit and diagnose: it ran no candidate", "  "))
     else:
-        text = f"utility {number(one.utility)}, {one.verdict}{VERDICTS.get(one.verdict, '')}"
+        meaning = VERDICTS.get(one.verdict, "")
+        if one.utility == float("-inf"):
+            meaning = ": it did not run to the end" * (one.verdict == "no better")
+        text = f"utility {number(one.utility)}, {one.verdict}{meaning}"
         show(field(one.candidate, text, "  "))
     if one.signals:
         rows = [
