@@ -60,10 +60,10 @@ class _Block:
         self.__array_interface__: dict[str, Any] = dict(self._memory.__array_interface__)
         self.__array_interface__["shape"] = shape
 
-    def __del__(self, shelf: dict[int, list[Array]] = _shelf) -> None:
+    def __del__(self, shelf: dict[int, list[Array]] = _shelf, most: int = MOST) -> None:
         memory = getattr(self, "_memory", None)
         if memory is None:
             return
         blocks = shelf.setdefault(memory.size, [])
-        if sum(size * len(kept) for size, kept in tuple(shelf.items())) + memory.size <= MOST:
+        if sum(size * len(kept) for size, kept in tuple(shelf.items())) + memory.size <= most:
             blocks.append(memory)
