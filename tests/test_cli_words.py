@@ -114,6 +114,8 @@ def test_repeats_say_what_is_waited_for(tmp_path):
     assert "waiting: more trials of it are needed" in " ".join(out.split())
     text = " ".join(grounded("-C", folder, "propose").out.split())
     assert "Run c0001 once more" in text and "is waiting for 1 trial" in text
+    path = grounded("-C", folder, "run", "--json").json["trial_file"]
+    assert grounded("-C", folder, "ingest", path, "--json").json["trials"][0]["verdict"] == "first"
 
 
 # mistakes

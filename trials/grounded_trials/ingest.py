@@ -81,7 +81,6 @@ def ingest_log(
     trial = replace(read.trial, id=added.id)
     warnings = (*read.warnings, *warnings_about(workspace, trial))
     tried = _tried(workspace, trial)
-    again = tried is not None and tried.accepted and trial.id != tried.trials[0].id
     return Ingested(
         trial=added.id,
         sha256=added.sha256,
@@ -91,14 +90,15 @@ def ingest_log(
         accepted=tried.accepted if tried else None,
         warnings=warnings,
         signals=read.signals,
-        verdict="run again" if again else _verdict(trial, tried),
+        verdict=_verdict(trial, tried, workspace.config.search.repeats),
     )
 
 
-def _verdict(trial: Trial, tried: Tried | None) -> str:
-    if tried is not None:
-        return verdict(tried)
-    return "probe" if trial.candidate else ""
+def _verdict(trial: Trial, tried: Tried | None, repeats: int) -> str:
+    if tried is None:
+        return "probe" if trial.candidate else ""
+    ran = [one.id for one in tried.trials[:repeats]]
+    return "run again" if tried.accepted and trial.id not in ran else verdict(tried)
 
 
 def _bridged(trial: Trial) -> Trial:
