@@ -117,9 +117,9 @@ def test_the_servo_has_a_rate_limit_and_a_delay():
 @needs_data
 def test_the_dart_steers_late():
     found = diagnose(*dart_steering())
-    late = ("first_order_lag:steering", "delay:steering")
-    assert found.effects and found.ranking[0].effect in late
-    assert 0.05 < next(iter(found.values(found.ranking[0].effect).values())) < 0.18
+    late = [e for e in found.effects if e in ("first_order_lag:steering", "delay:steering")]
+    assert len(late) == 1  # beside a response that saturates
+    assert 0.05 < next(iter(found.values(late[0]).values())) < 0.18
 
 
 @needs_data

@@ -20,6 +20,7 @@ from grounded.diagnosis.information import information
 from grounded.diagnosis.noise import Noise, channel_information, climbed, slopes
 from grounded.frozen import Array
 
+MOST_NUMBERS = 2e6  # of one (L, B, N, N) array
 SHORTEST = 0.05  # part of a step that is still tried
 
 
@@ -115,25 +116,26 @@ def measured(predictor: Predictor, fit: Fit) -> Noise:
     F, d, r = linearised(predictor, fit.hypothesis, fit.track)
     G = noise_entry(predictor, fit.hypothesis, fit.track)
 
-    def adjoints(noises: list[Noise]) -> list[kalman.Adjoint]:
+    phi = fit.noise.structure.phi(data.dt)
+    A = kalman.transition(F, phi, G)
+    each = max(1, int(MOST_NUMBERS / A.size))  # noises at once: what fits in the cache goes fastest
+
+    def some(noises: list[Noise]) -> list[kalman.Adjoint]:
         H = len(noises)
-        many = None if G is None else np.tile(G, (1, H, 1, 1))
-        phi = fit.noise.structure.phi(data.dt)
         g = kalman.gains(
-            kalman.transition(np.tile(F, (1, H, 1, 1)), phi, many),
+            np.tile(A, (1, H, 1, 1)),
             np.concatenate([spread_over(w.process(data.dt), (L, B)) for w in noises], axis=1),
             np.concatenate([spread_over(w.measurement(L), (L + 1, B)) for w in noises], axis=1),
             np.tile(data.seen, (1, H, 1)),
             np.concatenate([w.start(B) for w in noises]),
-            many,
+            None if G is None else np.tile(G, (1, H, 1, 1)),
         )
         column, of_log = np.tile(d[..., :1], (1, H, 1, 1)), np.tile(r[..., :1], (1, H, 1, 1))
         white, _ = kalman.innovations(g, column, of_log)
-        back = kalman.smoother(g, white[..., 0])
-        parts = [slice(i * B, (i + 1) * B) for i in range(H)]
-        return [
-            kalman.Adjoint(back.u[:, p], back.D[:, p], back.r[:, p], back.N[:, p]) for p in parts
-        ]
+        return kalman.smoother(g, white[..., 0]).parts(B)
+
+    def adjoints(noises: list[Noise]) -> list[kalman.Adjoint]:
+        return [one for i in range(0, len(noises), each) for one in some(noises[i : i + each])]
 
     try:
         info = information(fit.noise, adjoints, data.dt)

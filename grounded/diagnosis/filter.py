@@ -171,8 +171,7 @@ def _compiled_innovations(
     g: Gains, d: Array, r: Array, *, track: bool
 ) -> tuple[Array, Array | None]:
     L, B, n, C = d.shape
-    lanes = kernels.lanes(n)
-    wide = -(-C // lanes) * lanes
+    lanes, wide = kernels.lanes(n), whole(C, n)
     d, r = _widened(d, (L, B, n, wide)), _widened(r, (L + 1, B, n, wide))
     out = np.empty((L, B, n, wide))
     filtered = np.empty((L + 1, B, n, wide)) if track else None
@@ -192,6 +191,13 @@ def _compiled_innovations(
     return out[..., :C], None if filtered is None else filtered[..., :C]
 
 
+def whole(count: int, n: int) -> int:
+    """So many columns that they are filtered without being copied."""
+    if not kernels.available(n):
+        return count
+    return -(-count // kernels.lanes(n)) * kernels.lanes(n)
+
+
 def _widened(columns: Array, shape: tuple[int, ...]) -> Array:
     """Contiguous, with columns of zeros up to a shape."""
     if columns.shape == shape:
@@ -209,6 +215,11 @@ class Adjoint:
     D: Array
     r: Array
     N: Array
+
+    def parts(self, runs: int) -> list[Adjoint]:
+        """Cut along the runs, `runs` to each part."""
+        cuts = [slice(i, i + runs) for i in range(0, self.u.shape[1], runs)]
+        return [Adjoint(self.u[:, c], self.D[:, c], self.r[:, c], self.N[:, c]) for c in cuts]
 
 
 def smoother(g: Gains, white: Array) -> Adjoint:

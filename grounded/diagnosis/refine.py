@@ -70,7 +70,7 @@ def _iterate(predictor: Predictor, works: list[Work], fixed_noise: bool) -> None
     data = predictor.data
     L, B = data.time.shape
     parts = [linearised(predictor, work.h, work.track) for work in works]
-    width = max(part[1].shape[-1] for part in parts)
+    width = kalman.whole(max(part[1].shape[-1] for part in parts), data.model.n)
     d = np.concatenate([_padded(part[1], width) for part in parts], axis=1)
     r = np.concatenate([_padded(part[2], width) for part in parts], axis=1)
     F = np.concatenate([part[0] for part in parts], axis=1)

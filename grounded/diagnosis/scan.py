@@ -229,15 +229,15 @@ class _Context:
     ) -> None:
         """Whitens a block of columns, keeps their products with residual, base, each other."""
         L, B, n = self.white.shape
-        d = np.zeros((L, B, n, len(block)))
-        r = np.zeros((L + 1, B, n, len(block)))
+        wide = kalman.whole(len(block), n)
+        d, r = np.zeros((L, B, n, wide)), np.zeros((L + 1, B, n, wide))
         for j, column in enumerate(block):
             if column.d.size:
                 d[..., j] = column.d
             if column.r.size:
                 r[..., j] = column.r
         white, _ = kalman.innovations(self.gains, d, r)
-        flat = white.reshape(-1, len(block))
+        flat = white.reshape(-1, wide)
         against = flat.T @ self.white.reshape(-1)
         base = self._base_white()
         cross = flat.T @ base
