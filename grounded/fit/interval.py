@@ -75,7 +75,8 @@ def inflation(slopes: Linear, free: NDArray[np.bool_]) -> float:
         return 1.0
     N = (slopes.W.T @ slopes.W)[np.ix_(use, use)]
     inverse = np.linalg.pinv(N, rcond=NULL, hermitian=True)
-    return max(1.0, float(np.trace(inverse @ _meat(slopes, use))) / np.linalg.matrix_rank(N))
+    each = float(np.trace(inverse @ _meat(slopes, use))) / int(np.linalg.matrix_rank(N))
+    return max(1.0, each)
 
 
 def _meat(slopes: Linear, use: NDArray[np.int64]) -> Array:
