@@ -18,8 +18,10 @@ from grounded.diagnosis.fitted import Fit
 from grounded.diagnosis.hypothesis import Hypothesis
 from grounded.diagnosis.noise import Structure
 from grounded.diagnosis.refine import clean
-from grounded.diagnosis.search import CLAIM, SHORTLIST, Search, parametric
+from grounded.diagnosis.search import CLAIM, LARGE, SHORTLIST, Search, parametric
 from grounded.effects import Effect
+
+RESTARTED = 3  # large effects that are also fitted from a start of their own
 
 
 def attribute(
@@ -74,6 +76,7 @@ def _explore(search: Search) -> Fit:
     for kind in {fit.noise.structure for fit in singles[:SHORTLIST]}:
         # a large effect has a long way from its first look
         search.refined([f for f in singles[:SHORTLIST] if f.noise.structure == kind], 8)
+    search.again(search.of_size(1)[: RESTARTED if search.data.model.n <= LARGE else 2])
     best = search.of_size(1)[0]
     for _ in range(3):  # with the noise that the best one leaves, others may look better
         search.extended(_without_last(best))

@@ -19,10 +19,11 @@ import numpy as np
 from grounded.diagnosis.data import Data
 from grounded.diagnosis.fitted import Fit
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor
-from grounded.diagnosis.noise import Structure, first_guess
+from grounded.diagnosis.noise import Noise, Structure, first_guess
 from grounded.diagnosis.refine import refine
 from grounded.diagnosis.scan import Look, scan
 from grounded.effects import Effect, ParamFamily
+from grounded.frozen import Array
 
 CLAIM = 3.0  # nats from which an effect is claimed
 TIE = 3.0  # nats within which two explanations are not told apart
@@ -32,6 +33,7 @@ SHORTLIST = 14  # effects that are refined of a scan, and half as many parameter
 TAUS = (0.05, 0.1, 0.3)  # [s] of coloured noise
 BRIEF = 0.1  # of a control step: shorter delays and lags are a matter of time stamps
 TIMES = {"delay": "d", "sensor_delay": "d", "first_order_lag": "tau"}
+LARGE_GAIN = 50.0  # nats from which a hypothesis is also started by itself
 LARGE = 8  # states, above which one correlation time and half the shortlist have to do
 
 
@@ -99,17 +101,33 @@ class Search:
 
     def nulls(self) -> Fit:
         """The model alone under every noise structure, and with its parameters calibrated."""
-        data = self.data
-        h, track = Hypothesis(), data.y.copy()
-        residual = data.model.difference(self.predictor.next(h, track[:-1]), track[1:])
-        scale = np.array([data.scales.spread(n) for n in data.model.state_names])
-        noise = first_guess(residual, data.seen, scale)
-        (plain,) = self.refined([(h, noise, track)], iterations=20)
+        (plain,) = self.refined([self.fresh(Hypothesis())], iterations=20)
         self.structures(plain)
         self.calibrated(plain)
         if self.best_null() is not plain:
             self.calibrated(self.best_null())
         return self.best_null()
+
+    def fresh(self, h: Hypothesis) -> tuple[Hypothesis, Noise, Array]:
+        """Where a hypothesis starts by itself: about the log, with the noise it leaves there."""
+        data, track = self.data, self.data.y.copy()
+        predicted = self.predictor.next(h, track[:-1])
+        residual = data.model.difference(predicted, track[1:])
+        scale = np.array([data.scales.spread(n) for n in data.model.state_names])
+        return h, first_guess(residual, data.seen, scale), track
+
+    def again(self, fits: Sequence[Fit]) -> list[Fit]:
+        """Large effects from a start of their own: the noise without them is far away."""
+        floor = self.score(self.best_null()) + LARGE_GAIN
+        far = [f for f in fits if self.score(f) > floor]
+        tried = [f.hypothesis for f in far]
+        tried += [replace(h, shift=None, spread=0.0) for h in tried[:1] if h.spread > 0]
+        starts = []
+        for h in tried:
+            start, noise, track = self.fresh(h)
+            weight_w, weight_v = far[0].noise.weight_w, far[0].noise.weight_v
+            starts.append((start, replace(noise, weight_w=weight_w, weight_v=weight_v), track))
+        return self.refined(starts, iterations=12)
 
     def fair(self, best: Fit) -> None:
         """The model alone, starting from the noise and the shifts that the best hypothesis has.

@@ -55,8 +55,9 @@ def oracle(
         h = Hypothesis()
         for i in which:
             h = h.plus(effects[i], values[i])
-        for start in list(search.of_size(0)) + list(_plain(search)):
-            fits = search.refined([(h, start.noise, start.track)], 12)
+        starts = [(h, f.noise, f.track) for f in (*search.of_size(0), *_plain(search))]
+        for start in [*starts, search.fresh(h)]:
+            fits = search.refined([start], 12)
             for fit in fits:
                 search.calibrated(fit)
         names = tuple(sorted(h.names))
