@@ -120,13 +120,31 @@ def _bare(fit: Fit, h: Hypothesis) -> Fit:
     )
 
 
+def _starts(search: Search, size: int, best: Fit) -> list[Fit]:
+    """What a further effect is sought beside: the likeliest, and the same under plain noise.
+
+    What the further effect does may so far have passed for coloured noise or for parameters.
+    """
+    likely = [
+        f
+        for f in search.of_size(size)[: 3 if size == 1 else 1]
+        if search.score(f) > search.score(best) - 25
+    ]
+    found = list(likely)
+    for fit in likely[:2]:
+        plain = search.fits.get((Structure(), 0.0, tuple(sorted(fit.hypothesis.names))))
+        if plain is not None and plain is not fit:
+            found.append(plain)
+    return found
+
+
 def _grow(search: Search, best: Fit, most: int) -> None:
     """Second and further effects: add, then swap each for what goes better with the others."""
     size = len(best.hypothesis.effects)
     while 1 <= size < most:
-        for start in search.of_size(size)[: 3 if size == 1 else 1]:
-            if search.score(start) > search.score(best) - 25:
-                search.extended(start, 8)
+        for start in _starts(search, size, best):
+            search.extended(start, 8)
+        search.again(search.of_size(size + 1)[:2])
         larger = search.of_size(size + 1)
         if not larger or search.score(larger[0]) < search.score(best) + CLAIM:
             return
