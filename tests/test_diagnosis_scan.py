@@ -7,7 +7,7 @@ import pytest
 
 from grounded import Model, Param
 from grounded.diagnosis.data import prepare
-from grounded.diagnosis.scan import _elsewhere, _faint
+from grounded.diagnosis.grid import elsewhere, faint
 from grounded.diagnosis.search import Search
 from grounded.effects import Library
 from grounded.models.car import model as car
@@ -19,18 +19,18 @@ def test_below_the_smallest_grid_value_an_effect_is_linear():
     effect = Library().effect("sensor_delay:v", car)
     (d,) = (q for q in effect.free)
     first, second = sorted(d.grid)[:2]
-    assert _faint(effect, {"d": first}, -30.0, 100.0) == pytest.approx(0.3)
-    assert _faint(effect, {"d": first}, -300.0, 100.0) == 1.0
-    assert _faint(effect, {"d": second}, -30.0, 100.0) == 1.0
+    assert faint(effect, {"d": first}, -30.0, 100.0) == pytest.approx(0.3)
+    assert faint(effect, {"d": first}, -300.0, 100.0) == 1.0
+    assert faint(effect, {"d": second}, -30.0, 100.0) == 1.0
     limit = Library().effect("saturation:throttle", car)  # absent at infinity, not at zero
-    assert _faint(limit, {"c": min(limit.free[0].grid)}, -30.0, 100.0) == 1.0
+    assert faint(limit, {"c": min(limit.free[0].grid)}, -30.0, 100.0) == 1.0
 
 
 def test_other_places_are_kept_where_they_are_no_neighbours():
     effect = Library().effect("delay:throttle", car)
     grid = sorted(effect.free[0].grid)
     looks = [(100.0, {"d": grid[3]}), (99.0, {"d": grid[4]}), (80.0, {"d": grid[7]})]
-    assert _elsewhere(effect, [*looks, (10.0, {"d": grid[0]})]) == ({"d": grid[7]},)
+    assert elsewhere(effect, [*looks, (10.0, {"d": grid[0]})]) == ({"d": grid[7]},)
 
 
 def test_a_delay_of_a_hundredth_of_a_step_is_a_matter_of_time_stamps():

@@ -14,7 +14,6 @@ that a candidate is credited only with what they can't explain.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -25,6 +24,7 @@ from grounded.compile import Named
 from grounded.diagnosis import filter as kalman
 from grounded.diagnosis.columns import base_columns, noise_entry
 from grounded.diagnosis.fitted import Fit
+from grounded.diagnosis.grid import elsewhere, faint, grid_points
 from grounded.diagnosis.hypothesis import Predictor, sensor_offset, transformed
 from grounded.effects import (
     Effect,
@@ -38,9 +38,6 @@ from grounded.effects import (
 from grounded.frozen import Array
 
 BLOCK = 160  # columns filtered at once
-NEAR = 3.0  # nats within which another grid point is tried too
-NEARLY = 0.7  # or part of the best one's gain
-MOST_OTHERS = 2
 MOST_NUMBERS = 3e6  # of one block of whitened columns
 
 
@@ -79,14 +76,6 @@ def scan(predictor: Predictor, fit: Fit, candidates: Sequence[Effect]) -> list[L
     if pending:
         context.filter(pending, results)
     return [context.best(i, effect, results) for i, effect in enumerate(candidates)]
-
-
-def grid_points(effect: Effect) -> list[dict[str, float]]:
-    """All combinations of scanned values; one empty point for an effect that is all linear."""
-    scanned = [q for q in effect.free if q.grid]
-    grids = [q.grid for q in scanned]
-    names = [q.name for q in scanned]
-    return [dict(zip(names, point, strict=True)) for point in itertools.product(*grids)]
 
 
 class _Context:
@@ -284,7 +273,7 @@ class _Context:
             gram = gram - cross @ self.base @ cross.T
             size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
             if names == [""]:
-                part = _faint(effect, grid, float(score[0]), float(gram[0, 0]))
+                part = faint(effect, grid, float(score[0]), float(gram[0, 0]))
                 gain = -part * float(score[0]) - 0.5 * part**2 * float(gram[0, 0])
                 looks.append((gain, {name: part * value for name, value in grid.items()}))
                 continue
@@ -298,41 +287,7 @@ class _Context:
         if not looks:
             return Look(effect, {}, 0.0)
         looks.sort(key=lambda look: -look[0])
-        return Look(effect, looks[0][1], looks[0][0], _elsewhere(effect, looks))
-
-
-def _elsewhere(
-    effect: Effect, looks: list[tuple[float, dict[str, float]]]
-) -> tuple[dict[str, float], ...]:
-    """Grid points that gain nearly as much and are neighbours of none that was taken."""
-    best = looks[0][0]
-    enough = min(best - NEAR, NEARLY * best)
-    taken = [looks[0][1]]
-    for gain, values in looks[1:]:
-        if gain < enough or len(taken) > MOST_OTHERS:
-            break
-        if all(_apart(effect, values, other) for other in taken):
-            taken.append(values)
-    return tuple(taken[1:])
-
-
-def _apart(effect: Effect, one: dict[str, float], other: dict[str, float]) -> bool:
-    """Whether two grid points are no neighbours."""
-    for q in effect.free:
-        if q.grid:
-            grid = np.sort(np.array(q.grid))
-            i, j = (int(np.argmin(np.abs(grid - v[q.name]))) for v in (one, other))
-            if abs(i - j) > 1:
-                return True
-    return False
-
-
-def _faint(effect: Effect, grid: dict[str, float], score: float, gram: float) -> float:
-    """How much of the smallest grid value: below it an effect that is absent at zero is linear."""
-    (scanned,) = (q for q in effect.free if q.grid)
-    if scanned.start != 0 or grid[scanned.name] > min(scanned.grid) or gram <= 0:
-        return 1.0
-    return float(np.clip(-score / gram, 0.05, 1.0))
+        return Look(effect, looks[0][1], looks[0][0], elsewhere(effect, looks))
 
 
 _EMPTY: Array = np.zeros(0)
