@@ -58,7 +58,14 @@ class Footnote9Result:
 
     def tables(self) -> list[Table]:
         """Shares of the optimum by b."""
-        head = ("b", "model-based", "solved, 1 iteration", "trials", "policy gradient", "its trials")
+        head = (
+            "b",
+            "model-based",
+            "solved, 1 iteration",
+            "trials",
+            "policy gradient",
+            "its trials",
+        )
         rows = tuple(
             (
                 f"{row.b:g}",
