@@ -91,14 +91,48 @@ def proposed(
     k, track = len(h.theta), filtered[..., 0]
     theta, shift = np.zeros(k), np.zeros(len(slope) - k)
     if len(slope):
-        scale = 1 / np.sqrt(np.maximum(np.diag(G), 1e-300))
-        delta = -scale * np.linalg.lstsq(G * np.outer(scale, scale), scale * slope, rcond=1e-10)[0]
+        delta = _bounded(G, slope, *_room(data, h, k, len(slope)))
         delta[:k] = _limited(h, delta[:k])
         delta[k:] = np.clip(delta[k:], -0.3, 0.3)
         theta, shift = delta[:k], delta[k:]
         track = track + filtered[..., 1:] @ delta
     noise = fit.noise if memory is None else _climbed(data, fit.noise, adjoint, memory)
     return Step(theta, shift, track, noise)
+
+
+def _bounded(G: Array, slope: Array, low: Array, high: Array) -> Array:
+    """The Gauss-Newton step -G^-1 slope within low <= step <= high, (K,) each.
+
+    An unknown that would leave its bounds stops there, and the others step as is best with it
+    there: clipped afterwards, they would rely on a move that is not made.
+    """
+    delta, free = np.zeros(len(slope)), np.ones(len(slope), dtype=bool)
+    scale = 1 / np.sqrt(np.maximum(np.diag(G), 1e-300))
+    for _ in range(len(slope)):
+        left = slope[free] + G[np.ix_(free, ~free)] @ delta[~free]
+        scaled = G[np.ix_(free, free)] * np.outer(scale[free], scale[free])
+        step = -scale[free] * np.linalg.lstsq(scaled, scale[free] * left, rcond=1e-10)[0]
+        delta[free] = np.clip(step, low[free], high[free])
+        stopped = delta[free] != step
+        if not stopped.any():
+            break
+        free[np.flatnonzero(free)[stopped]] = False
+        if not free.any():
+            break
+    return delta
+
+
+def _room(data: Data, h: Hypothesis, k: int, size: int) -> tuple[Array, Array]:
+    """How far each unknown may step down and up: values freely, shifts inside their bounds."""
+    low, high = np.full(size, -np.inf), np.full(size, np.inf)
+    if size > k:
+        which = calibrated(data)
+        shift = np.zeros(data.model.system.k) if h.shift is None else h.shift
+        lowest, highest = _bounds(data)
+        at, unit = data.model.values + shift, param_scale(data.model)
+        low[k:] = np.minimum((lowest - at) / unit, 0.0)[which]
+        high[k:] = np.maximum((highest - at) / unit, 0.0)[which]
+    return low, high
 
 
 def _climbed(data: Data, noise: Noise, adjoint: kalman.Adjoint, memory: Array) -> Noise:
@@ -154,13 +188,19 @@ def _limited(h: Hypothesis, delta: Array) -> Array:
 
 
 def _inside(data: Data, shift: Array) -> Array:
-    """Keeps parameters inside their bounds, and positive ones positive."""
+    """Keeps parameters inside their bounds."""
+    values = data.model.values
+    return np.asarray(np.clip(values + shift, *_bounds(data)) - values)
+
+
+def _bounds(data: Data) -> tuple[Array, Array]:
+    """Bounds of the model's parameters, (k,) each; positive ones stay positive."""
     values = data.model.values
     low = [-np.inf if p.low is None else p.low for p in data.model.params.values()]
     high = [np.inf if p.high is None else p.high for p in data.model.params.values()]
     low = [max(b, 0.2 * v) if v > 0 else b for b, v in zip(low, values, strict=True)]
     high = [min(b, 0.2 * v) if v < 0 else b for b, v in zip(high, values, strict=True)]
-    return np.clip(values + shift, low, high) - values
+    return np.array(low), np.array(high)
 
 
 def spread_over(values: Array | float, shape: tuple[int, int]) -> Array:

@@ -30,9 +30,17 @@ HINTS = {
     "slope": "drive the same way in several headings",
 }
 
+GREEK = (
+    "alpha|beta|gamma|delta|epsilon|zeta|eta|theta|iota|kappa|lambda|mu|nu|xi|omicron|pi|rho|sigma"
+    "|tau|upsilon|phi|chi|psi|omega"
+)
+
 
 def called(model: Model, name: str) -> str:
-    """A state or an input in a sentence: `the speed v`, `the input u`, `the throttle`."""
+    """A state or an input in a sentence: `the speed v`, `the state delta`, `the throttle`.
+
+    Symbols get a word before them: what is short, Greek, or not letters alone.
+    """
     roles = {
         "speed": (places.speed(model),),
         "heading": places.role(model, "heading"),
@@ -41,7 +49,7 @@ def called(model: Model, name: str) -> str:
         "angle": model.angles,
     }
     word = next((role for role, played in roles.items() if name in played), "")
-    if not word and len(name) <= 3:
+    if not word and (len(name) <= 3 or re.fullmatch(GREEK, name) or not name.isalpha()):
         word = "input" if name in model.input_names else "state"
     return f"the {name}" if not word or name == word else f"the {word} {name}"
 

@@ -88,6 +88,7 @@ class Library:
         """Every effect that can apply to a model, in the library's order."""
         found = []
         idle, outright = derived_states(model), outright_states(model)
+        integrals = integrated_states(model)
         for family in self.families:
             for target in family.targets(model):
                 driven = target.partition("<-")
@@ -95,6 +96,8 @@ class Library:
                     continue
                 if isinstance(family, RateFamily) and family.needs_own and target in outright:
                     continue
+                if driven[2] and integrals.get(driven[0]) == driven[2]:
+                    continue  # it would be rate_gain under another name
                 found.append(_build(family, target, model, scales or Scales()))
         return tuple(found)
 
@@ -119,6 +122,26 @@ def derived_states(model: Model) -> set[str]:
     i = model.state_names.index(named[0])
     others = np.delete(f_x[:, :, i], i, axis=1)
     return {named[0]} if float(np.abs(others).max()) < 1e-12 else set()
+
+
+def integrated_states(model: Model) -> dict[str, str]:
+    """States whose rate is another state, times a constant: an angle and its angular velocity."""
+    rng, dt = np.random.default_rng(0), 1e-6
+    x, u = rng.uniform(0.2, 1.0, (3, model.n)), rng.uniform(0.2, 1.0, (3, model.m))
+    f_x, f_u = model.system.linearise(x, u, model.values, dt)
+    rates = (f_x - np.eye(model.n)) / dt
+    moved = (model.system.step(x, u, model.values, dt) - x) / dt
+    found = {}
+    for i, name in enumerate(model.state_names):
+        j = int(np.argmax(np.abs(rates[0, i])))
+        c = rates[0, i, j]
+        small = 1e-4 * abs(c)
+        alone = np.abs(np.delete(rates[:, i], j, axis=1)).max(initial=0.0) < small
+        steady = np.abs(rates[:, i, j] - c).max() < small and np.abs(f_u[:, i]).max() / dt < small
+        straight = np.allclose(moved[:, i], c * x[:, j], rtol=1e-4)
+        if i != j and c != 0 and alone and steady and straight:
+            found[name] = model.state_names[j]
+    return found
 
 
 def outright_states(model: Model) -> set[str]:

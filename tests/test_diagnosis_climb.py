@@ -1,0 +1,53 @@
+"""The climb of one hypothesis: steps inside bounds, and what hangs on them."""
+
+import numpy as np
+import pytest
+
+from grounded.diagnosis.climb import _bounded
+from grounded.diagnosis.diagnose import diagnose
+from grounded.effects import Library
+from grounded.experiments.pendulum_task import pendulum_task
+from grounded.experiments.real_pendulum import model as real_pendulum
+from grounded.improve import learn
+from grounded.models.car import model as car
+from grounded.models.pendulum import model as pendulum
+from grounded.plant import Noise, Plant
+from grounded.search import Options
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_bounded_step_is_the_best_one_inside(seed):
+    """With the unknowns that stopped held where they are, nothing else wants to move."""
+    rng = np.random.default_rng(seed)
+    A = rng.standard_normal((12, 4))
+    G, slope = A.T @ A, 3 * rng.standard_normal(4)
+    low, high = -rng.uniform(0, 0.2, 4), rng.uniform(0, 0.2, 4)
+    low[3], high[3] = -np.inf, np.inf
+    step = _bounded(G, slope, low, high)
+    assert (step >= low).all() and (step <= high).all()
+    inside = (step > low) & (step < high)
+    assert np.abs((G @ step + slope)[inside]).max(initial=0.0) < 1e-9
+    np.testing.assert_allclose(
+        _bounded(G, slope, low - np.inf, high + np.inf), -np.linalg.solve(G, slope)
+    )
+
+
+def test_a_parameter_at_its_bound_does_not_hold_up_the_others():
+    """A pendulum 30 % too heavy with dry friction; its g may move by 1 % only."""
+    task = pendulum_task(pendulum)
+    noise = Noise(process={"omega": 0.01}, measurement={"theta": 0.002, "omega": 0.01})
+    plant, rng = Plant(real_pendulum, noise=noise), np.random.default_rng(0)
+
+    def run(candidate):
+        return plant.run(candidate.policy, {}, rng)
+
+    _, _, trials = learn(task, run, Options(max_trials=4))
+    found = diagnose(task, trials)
+    assert found.effects == ("coulomb_friction:omega",)
+    assert found.gap["after"] < 1.5 < 10 < found.gap["before"]
+
+
+def test_a_rate_that_is_another_state_has_one_name():
+    offered = {effect.name for effect in Library().candidates(pendulum)}
+    assert "rate_gain:theta" in offered and "coupling:theta<-omega" not in offered
+    assert any(effect.name.startswith("coupling:") for effect in Library().candidates(car))
