@@ -41,7 +41,7 @@ def parallel(function: Any) -> Any:
     return function
 
 
-@command.command("make")
+@command.command("make", short_help="Write cases, and their labels, sealed, elsewhere.")
 @click.argument("folder", metavar="DIR")
 @click.option("--kind", type=click.Choice(["single", "double", "none", "withheld"]), required=True)
 @click.option("--cases", type=click.IntRange(1), required=True, metavar="N", help="How many.")
@@ -73,7 +73,7 @@ def make_cases(
     show(f"\nnext: grounded challenge run {folder}")
 
 
-@command.command("run")
+@command.command("run", short_help="Diagnose the cases that were not yet.")
 @click.argument("folder", metavar="DIR")
 @click.option("--without", multiple=True, metavar="FAMILY", help="Not to blame (repeatable).")
 @click.option("--again", is_flag=True, help="Those that were diagnosed before too.")
@@ -105,7 +105,7 @@ def run_cases(
     show(f"\nnext: grounded challenge score {folder}")
 
 
-@command.command("score")
+@command.command("score", short_help="Open the labels, mark the diagnoses.")
 @click.argument("folder", metavar="DIR")
 @click.option("--labels", metavar="DIR", help="Where the labels are (default: DIR-labels).")
 @parallel

@@ -183,7 +183,7 @@ class _Writer:
         data = self.data
         excess = np.maximum(gain.sum(axis=(0, 1)), 0.0)
         share = excess / max(float(excess.sum()), 1e-12)
-        rms = np.sqrt(np.nanmean(error**2, axis=0))
+        rms = _rms(error)
         rows = [
             {
                 "name": name,
@@ -200,9 +200,7 @@ class _Writer:
         """The gap of each state, noise-normalised."""
         found = {}
         for i, name in enumerate(self.data.model.state_names):
-            b, a = (
-                float(np.sqrt(np.nanmean((e[:, i] / spread[:, i]) ** 2))) for e in (before, after)
-            )
+            b, a = (float(_rms(e[:, i] / spread[:, i])) for e in (before, after))
             found[name] = {"before": b, "after": a}
         return found
 
@@ -252,3 +250,10 @@ class _Writer:
         self.tick("utility")
         found = utility_prediction(self.predictor, self.best, track, self.task, self.trials)
         return found.to_dict()
+
+
+def _rms(error: Any) -> Any:
+    """Root mean square along the first axis; nan for a state that was never measured."""
+    count = np.isfinite(error).sum(axis=0)
+    total = np.nansum(error**2, axis=0)
+    return np.where(count > 0, np.sqrt(total / np.maximum(count, 1)), np.nan)

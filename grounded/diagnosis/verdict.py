@@ -85,7 +85,8 @@ def next_trial(
     if claims.known.no_cause:
         return "Run two or more trials in which every input changes."
     if groups:
-        return " ".join([f"Run a probe that tells {tied(groups[0])}.", *distinguishing(groups[0])])
+        made = f"A trial made for it would tell {tied(groups[0])}."
+        return " ".join([made, *distinguishing(groups[0])])
     if not claims.names and left:
         return (
             f"Repeat a trial twice with the same inputs to see whether the leftover in "
@@ -93,4 +94,5 @@ def next_trial(
         )
     if not claims.names and not claims.blamed:
         return "Nothing is tied and nothing to adopt: go on with the search."
-    return "Nothing is tied: go on with the search, or adopt the effect first."
+    them = "them" if len(claims.names) > 1 else "it"
+    return f"Nothing is tied: adopt {them}, or go on with the search."

@@ -109,17 +109,22 @@ class Theorem1Result:
         )
         found = self.slopes()
         slopes = tuple(
-            (name, f"{found[key][0]:.3f} (±{found[key][1]:.3f})", paper)
+            (name, _with_error(*found[key]), paper)
             for name, key, paper in (
                 ("gradient error over epsilon", "gradient_error", "1"),
                 ("squared gradient over epsilon", "squared_gradient", "2"),
             )
         )
-        title = f"Theorem 1: medians of {len(self.rows) // max(len(rows), 1)} seeds"
+        seeds = len(self.rows) // max(len(rows), 1)
+        title = f"Theorem 1: medians of {seeds} seeds" if seeds > 1 else "Theorem 1: one seed"
         return [
             Table(title, head, tuple(rows)),
             Table("Slopes (± one standard error)", ("", "here", "theorem"), slopes),
         ]
+
+
+def _with_error(value: float, error: float) -> str:
+    return f"{value:.3f} (±{error:.3f})" if math.isfinite(error) else f"{value:.3f}"
 
 
 def run(
