@@ -113,20 +113,22 @@ def _stalling(s, a, p):
     return {"v": (p.gain * drive - s.v) / p.tau}
 
 
+STALLING = Model(
+    states={"v": "m/s"},
+    inputs={"throttle": "1"},
+    params={
+        "gain": Param(2.0, "m/s", 0.1, 10.0),
+        "tau": Param(0.4, "s", 0.05, 3.0),
+        "stall": Param(0.31, "1", 0.0, 0.8),
+    },
+    derivative=_stalling,
+)
+
+
 def test_a_threshold_is_found_by_scanning():
-    stalling = Model(
-        states={"v": "m/s"},
-        inputs={"throttle": "1"},
-        params={
-            "gain": Param(2.0, "m/s", 0.1, 10.0),
-            "tau": Param(0.4, "s", 0.05, 3.0),
-            "stall": Param(0.31, "1", 0.0, 0.8),
-        },
-        derivative=_stalling,
-    )
     noise = Noise(np.array([0.005]), np.array([0.02]), DT)
-    trials = simulated(stalling, np.random.default_rng(3), noise, B=8, low=0.0)
-    found = fit(stalling.with_values({"stall": 0.1, "gain": 1.5}), trials, hold_out=0.0)
+    trials = simulated(STALLING, np.random.default_rng(3), noise, B=8, low=0.0)
+    found = fit(STALLING.with_values({"stall": 0.1, "gain": 1.5}), trials, hold_out=0.0)
     stall = found.params["stall"]
     assert stall.identified
     assert stall.low <= 0.31 <= stall.high
@@ -136,30 +138,20 @@ def test_a_threshold_is_found_by_scanning():
 
 def test_correlated_disturbances_widen_intervals_of_thresholds_too():
     """A wind that the model knows nothing of: nats of white noise would be far too sure."""
-    stalling = Model(
-        states={"v": "m/s"},
-        inputs={"throttle": "1"},
-        params={
-            "gain": Param(2.0, "m/s", 0.1, 10.0),
-            "tau": Param(0.4, "s", 0.05, 3.0),
-            "stall": Param(0.31, "1", 0.0, 0.8),
-        },
-        derivative=_stalling,
-    )
     calm = Noise(np.array([0.005]), np.array([0.02]), DT)
     widths = {}
     for wind in (0.0, 0.15):
         covered, each = 0, []
         for seed in range(4):
             rng = np.random.default_rng(seed)
-            trials = simulated(stalling, rng, calm, B=4, low=0.0)
+            trials = simulated(STALLING, rng, calm, B=4, low=0.0)
             t = np.arange(len(trials[0].states)) * DT
             gusts = [wind * np.sin(2 * np.pi * t / 2.0 + rng.uniform(0, 6)) for _ in trials]
             trials = [
                 dataclasses.replace(trial, states=trial.states + gust[:, None])
                 for trial, gust in zip(trials, gusts, strict=True)
             ]
-            stall = fit(stalling, trials, ["stall", "gain"], hold_out=0.0).params["stall"]
+            stall = fit(STALLING, trials, ["stall", "gain"], hold_out=0.0).params["stall"]
             covered += stall.low <= 0.31 <= stall.high
             each.append(stall.high - stall.low)
         widths[wind] = np.median(each)
