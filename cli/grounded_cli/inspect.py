@@ -12,7 +12,7 @@ from grounded_cli.terminal import number, progress, remark, show, show_json, tab
 from grounded_trials.words import count
 
 if TYPE_CHECKING:
-    from grounded_trials.inspect_log import LogReport, TopicReport
+    from grounded_trials.inspect_report import LogReport, TopicReport
 
 
 @click.command("inspect")

@@ -6,7 +6,7 @@ One pass over the file. A topic with very many messages has its ranges from ever
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,7 +14,8 @@ import numpy as np
 
 from grounded.errors import GroundedError
 from grounded_trials.inspect_fields import number_paths
-from grounded_trials.inspect_twins import Twins, find_twins, kind_of
+from grounded_trials.inspect_report import FieldReport, LogReport, TopicReport
+from grounded_trials.inspect_twins import find_twins, kind_of
 from grounded_trials.log_files import log_files, open_log
 from grounded_trials.mcap_records import Channel, Header, Messages, Metadata, Schema
 from grounded_trials.mcap_walk import DamagedFile, read_records
@@ -25,60 +26,8 @@ from grounded_trials.path_walk import Bound, bind, evaluate
 from grounded_trials.protobuf_schema import BadSchema
 from grounded_trials.signals import Decoder, decoder_of
 
-GAP = 10.0  # intervals; a longer gap is remarked on
-SKEW_S = 0.1  # a header stamp further from the log's clock is remarked on
 NOISE_SAMPLES = 10  # in a batch, to tell a signal's noise
 DECODED = 20_000  # messages of a topic whose numbers are looked at
-
-
-@dataclass(frozen=True)
-class FieldReport:
-    """A number in a topic's messages, by its message path."""
-
-    path: str
-    low: float | None  # smallest and largest finite value; None if there is none
-    high: float | None
-    not_finite: int
-    noise: float = 0.0  # standard deviation of what changes from sample to sample
-
-
-@dataclass(frozen=True)
-class TopicReport:
-    """A topic: how its messages come, and what is in them."""
-
-    topic: str
-    type: str
-    encoding: str
-    messages: int
-    rate_hz: float  # 1 / median interval of the log times; 0 for fewer than two messages
-    jitter_s: float  # half the width that holds 90 % of the intervals
-    largest_gap_s: float
-    first_s: float | None  # after the log's first message; None without messages
-    last_s: float | None
-    stamped: bool  # messages have a header stamp
-    skew_s: float | None  # median of header stamp minus log time
-    fields: tuple[FieldReport, ...]
-    problem: str = ""  # why its numbers can't be read
-
-
-@dataclass(frozen=True)
-class LogReport:
-    """A log: its files, its length, its topics, and whether it is damaged."""
-
-    files: tuple[Path, ...]
-    library: str  # who wrote it
-    start_ns: int
-    duration_s: float
-    messages: int
-    topics: tuple[TopicReport, ...]
-    twins: tuple[Twins, ...]  # signals of different topics with one motion
-    damage: str = ""  # where reading it ended early, and why
-    meta: Mapping[str, str] = field(default_factory=dict)  # of a file of ours: its own table
-
-    @property
-    def remarks(self) -> tuple[str, ...]:
-        """Sentences about what a person should know before using the log."""
-        return _remarks(self)
 
 
 def inspect_log(paths: str | Path | Sequence[str | Path]) -> LogReport:
@@ -271,34 +220,6 @@ class _Topic:
             fields=tuple(_field(path, r) for path, r in self.ranges.items() if r.count),
             problem=self.problem,
         )
-
-
-def _remarks(log: LogReport) -> tuple[str, ...]:
-    found = [log.damage] if log.damage else []
-    for topic in log.topics:
-        if topic.problem:
-            found.append(f"{topic.topic} ({topic.type}) can't be read: {topic.problem}")
-        if topic.messages == 0:
-            found.append(f"{topic.topic} has no messages")
-        elif topic.messages == 1:
-            found.append(f"{topic.topic} has a single message, {topic.first_s:.3f} s into the log")
-        elif topic.rate_hz and topic.largest_gap_s > GAP / topic.rate_hz:
-            found.append(f"{topic.topic} has a gap of {topic.largest_gap_s:.3f} s")
-        if topic.skew_s is not None and abs(topic.skew_s) > SKEW_S:
-            found.append(
-                f"{topic.topic} is stamped {topic.skew_s:.3f} s from the log's clock "
-                "(simulation time, or an unset clock?)"
-            )
-        bad = [f.path for f in topic.fields if f.not_finite]
-        if bad:
-            found.append(f"{topic.topic} has values that are no numbers, first in {bad[0]}")
-    for twins in log.twins:
-        if twins.opposite:
-            found.append(
-                f"{twins.first} and {twins.second} show the same motion with OPPOSITE SIGN "
-                f"(correlation {twins.correlation:.3f})"
-            )
-    return tuple(found)
 
 
 def _field(path: str, found: _Range) -> FieldReport:
