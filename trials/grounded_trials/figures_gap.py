@@ -31,7 +31,7 @@ def gap_figure(diagnosis: Diagnosis | None) -> Figure | None:
     if not panels:
         return None
     caption = (
-        "Evidence is the gain in log-likelihood less its price; an effect is claimed from 5 nats. "
+        "Evidence is the gain in log-likelihood less its price; an effect is claimed from 3 nats. "
         "The floor is what noise alone would leave."
     )
     return Figure("gap", "Gap between model and reality", caption, tuple(panels))
