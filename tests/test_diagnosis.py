@@ -189,6 +189,10 @@ def test_parameters_that_are_off_are_named_most_important_first():
     assert evidences == sorted(evidences, reverse=True)
     for row in claimed:
         assert f"{row.effect.partition(':')[2]} " in found.sentence
+    # a gain of the input and the parameter behind it are one thing, and that is said
+    same = {group[0]: group[1:] for group in found.indistinguishable}
+    assert "input_gain:u" in same.get("parameter:k", ()), found.sentence
+    assert "viscous_friction:v" in same.get("parameter:tau", ()), found.sentence
 
 
 def test_of_two_parameters_that_are_one_only_one_is_blamed():

@@ -10,7 +10,7 @@ from grounded.diagnosis.gap import normalised
 from grounded.diagnosis.hypothesis import param_scale
 from grounded.diagnosis.intervals import standard_deviations
 from grounded.diagnosis.limits import Limits
-from grounded.diagnosis.lookalike import Likeness, lookalikes
+from grounded.diagnosis.lookalike import Likeness, lookalikes, of_parameters
 from grounded.diagnosis.report import (
     Estimate,
     Ranked,
@@ -19,6 +19,7 @@ from grounded.diagnosis.search import TIE, Search, parametric
 from grounded.diagnosis.shrinkage import gaps_of, held_out
 
 RANKED = 12  # explanations that are listed
+SAME = 0.95  # share of a parameter's signal from which an effect is the same thing
 
 
 class Claims:
@@ -32,6 +33,11 @@ class Claims:
         self.base = search.score(search.exact_null() if parametric(best) else self.null)
         calibrating = not self.names and not left and search.calibrates()
         self.blamed = blamed(self.data, self.null) if calibrating else ()
+        off = [blame.index for blame in self.blamed[:2]]
+        candidates = search.candidates
+        self.like_parameters = (
+            of_parameters(self.predictor, self.null, off, candidates) if off else ()
+        )
 
     def ranking(self, track: Any, where: Any, before: float) -> tuple[Ranked, ...]:
         """The claimed effects first (by what would be lost without each), then what lost."""
@@ -114,8 +120,15 @@ class Claims:
         return found
 
     def groups(self) -> tuple[tuple[str, ...], ...]:
-        """For each claimed effect, what could stand in its place within a few nats."""
+        """For each claimed effect, what could stand in its place within a few nats.
+
+        For parameters that are off: the effects that are the same thing.
+        """
         found = []
+        for name in dict.fromkeys(one.effect for one in self.like_parameters):
+            same = [o for o in self.like_parameters if o.effect == name and o.share > SAME]
+            if same:
+                found.append((name, *(one.like for one in same[:2])))
         whole = self.search.score(self.best)
         for name in self.names:
             rest = set(self.names) - {name}
@@ -136,6 +149,7 @@ class Claims:
             return ()
         tied = {(group[0], other) for group in groups for other in group[1:]}
         found = lookalikes(self.predictor, self.best, self.search.candidates)
+        found += self.like_parameters
         return tuple(one for one in found if (one.effect, one.like) not in tied)
 
     def parameters(self) -> dict[str, Estimate]:

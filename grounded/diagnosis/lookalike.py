@@ -21,7 +21,7 @@ import numpy as np
 from grounded.diagnosis import filter as kalman
 from grounded.diagnosis.columns import base_columns
 from grounded.diagnosis.fitted import Fit
-from grounded.diagnosis.hypothesis import Predictor
+from grounded.diagnosis.hypothesis import Hypothesis, Predictor
 from grounded.diagnosis.leftover import filter_of
 from grounded.diagnosis.scan import scan
 from grounded.effects import Effect, ParamFamily
@@ -56,6 +56,44 @@ def lookalikes(
         likely = [Likeness(effect.name, c.name, s) for c, s in zip(own, shares, strict=True)]
         near = sorted((one for one in likely if one.share > nearly), key=lambda one: -one.share)
         found += near[:MOST]
+    return tuple(found)
+
+
+def of_parameters(
+    predictor: Predictor,
+    null: Fit,
+    off: Sequence[int],
+    candidates: Sequence[Effect],
+    nearly: float = NEARLY,
+) -> tuple[Likeness, ...]:
+    """Effects that act like a parameter of a calibrated model being off, most first.
+
+    Each parameter by itself, the others as they were calibrated: a gain of an actuator and the
+    parameter behind it are one thing.
+
+    Args:
+        predictor: the data.
+        null: the calibrated fit without effects.
+        off: indices of the parameters.
+        candidates: what may act alike.
+        nearly: share of its signal from which an effect is named.
+    """
+    assert null.hypothesis.shift is not None
+    model, found = predictor.data.model, list[Likeness]()
+    for index in off:
+        name = f"parameter:{model.param_names[index]}"
+        effect = next((c for c in candidates if c.name == name), None)
+        if effect is None:
+            continue
+        others = null.hypothesis.shift.copy()
+        others[index] = 0.0
+        moved = dict(zip(model.param_names, model.values + others, strict=True))
+        there = Predictor(replace(predictor.data, model=model.with_values(moved)))
+        h = Hypothesis().plus(effect, {"d": float(null.hypothesis.shift[index])})
+        own = [c for c in candidates if related(effect, c) and not c.name.startswith("parameter:")]
+        shares = _shares(there, replace(null, hypothesis=h), effect, own) if own else []
+        likely = [Likeness(name, c.name, s) for c, s in zip(own, shares, strict=True)]
+        found += sorted((o for o in likely if o.share > nearly), key=lambda o: -o.share)[:MOST]
     return tuple(found)
 
 

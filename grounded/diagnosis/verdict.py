@@ -42,7 +42,7 @@ def verdict(
     if claims.known.no_cause:
         return "unknown", f"No cause is named: {claims.known.sentences[0]}."
     if claims.blamed:
-        return _calibration(claims, before, after, ranking)
+        return _calibration(claims, before, after, ranking, groups, alike)
     if not claims.names and not remainder:
         return "none", (
             f"The model explains the data down to the noise (predictions "
@@ -63,7 +63,12 @@ def verdict(
 
 
 def _calibration(
-    claims: Claims, before: float, after: float, ranking: Sequence[Ranked]
+    claims: Claims,
+    before: float,
+    after: float,
+    ranking: Sequence[Ranked],
+    groups: tuple[tuple[str, ...], ...],
+    alike: tuple[Likeness, ...],
 ) -> tuple[Kind, str]:
     """The model's form is right, its numbers are not."""
     model, listed = claims.data.model, []
@@ -75,6 +80,8 @@ def _calibration(
         listed.append(f"{name} should be {new}{part}")
     text = sentence(["the model's form explains the data, its numbers don't", *listed])
     words = [text, improvement(before, after), "`grounded fit` fits them all."]
+    words += [f"The data can't tell {tied(group)}." for group in groups]
+    words += [nearly(alike)] if alike else []
     return ("effect" if len(listed) == 1 else "several"), " ".join(words)
 
 
