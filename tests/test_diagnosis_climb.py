@@ -32,6 +32,15 @@ def test_a_bounded_step_is_the_best_one_inside(seed):
     )
 
 
+def test_an_unknown_whose_slope_is_no_number_stays_where_it_is():
+    G = np.diag([2.0, np.nan, 1.0])
+    G[1, 0] = G[0, 1] = np.nan
+    wide = np.full(3, np.inf)
+    step = _bounded(G, np.array([2.0, np.nan, 3.0]), -wide, wide)
+    np.testing.assert_allclose(step, [-1.0, 0.0, -3.0])
+    assert not _bounded(np.full((2, 2), np.nan), np.full(2, np.nan), -wide[:2], wide[:2]).any()
+
+
 def test_a_parameter_at_its_bound_does_not_hold_up_the_others():
     """A pendulum 30 % too heavy with dry friction; its g may move by 1 % only."""
     task = pendulum_task(pendulum)

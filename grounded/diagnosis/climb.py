@@ -95,7 +95,8 @@ def proposed(
         delta[:k] = _limited(h, delta[:k])
         delta[k:] = np.clip(delta[k:], -0.3, 0.3)
         theta, shift = delta[:k], delta[k:]
-        track = track + filtered[..., 1:] @ delta
+        moved = delta != 0
+        track = track + filtered[..., 1:][..., moved] @ delta[moved]
     noise = fit.noise if memory is None else _climbed(data, fit.noise, adjoint, memory)
     return Step(theta, shift, track, noise)
 
@@ -104,9 +105,13 @@ def _bounded(G: Array, slope: Array, low: Array, high: Array) -> Array:
     """The Gauss-Newton step -G^-1 slope within low <= step <= high, (K,) each.
 
     An unknown that would leave its bounds stops there, and the others step as is best with it
-    there: clipped afterwards, they would rely on a move that is not made.
+    there: clipped afterwards, they would rely on a move that is not made. One whose slope is no
+    number (a value at which the effect overflows) does not move.
     """
-    delta, free = np.zeros(len(slope)), np.ones(len(slope), dtype=bool)
+    delta, free = np.zeros(len(slope)), np.isfinite(np.diag(G)) & np.isfinite(slope)
+    if not free.any():
+        return delta
+    G, slope = np.where(np.outer(free, free), G, 0.0), np.where(free, slope, 0.0)
     scale = 1 / np.sqrt(np.maximum(np.diag(G), 1e-300))
     for _ in range(len(slope)):
         left = slope[free] + G[np.ix_(free, ~free)] @ delta[~free]
