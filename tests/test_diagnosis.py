@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from grounded import GroundedError, Model, Param, Trial
+from grounded.diagnosis import confirm
 from grounded.diagnosis import filter as kalman
+from grounded.diagnosis.attribution import attribute
 from grounded.diagnosis.calibration import loss
 from grounded.diagnosis.challenge import judge, make, oracle, sealed, summary
 from grounded.diagnosis.data import prepare, shifted
@@ -361,3 +363,23 @@ def test_the_diagnosis_does_not_reach_the_simulated_truth():
         " 'grounded.experiments', 'grounded.diagnosis.challenge'))]; assert not bad, bad"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_a_hypothesis_whose_held_out_predictions_run_away_gives_way(monkeypatch):
+    model, trials = cart(friction=0.4)
+    data = prepare(model, trials, np.zeros(1))
+    search, best = attribute(data, Library().candidates(model, data.scales))
+    assert best.hypothesis.effects and confirm.confirmed(search, best, 1.0) is best
+
+    class Gap:
+        gap_before = 2.0
+
+        def __init__(self, after):
+            self.gap_after = after
+
+    monkeypatch.setattr(confirm, "shrinkage", lambda *a: Gap(1e6))
+    assert not confirm.confirmed(search, best, 1.0).hypothesis.effects
+    monkeypatch.setattr(confirm, "shrinkage", lambda p, f, t, w: Gap(1e6 if f is best else 1.0))
+    other = confirm.confirmed(search, best, 1.0)
+    assert other is not best and other.hypothesis.effects
+    assert search.score(other) > search.score(search.best_null())

@@ -21,6 +21,7 @@ import numpy as np
 
 from grounded.diagnosis.attribution import attribute
 from grounded.diagnosis.claims import Claims
+from grounded.diagnosis.confirm import confirmed
 from grounded.diagnosis.data import prepare, usable
 from grounded.diagnosis.fitted import Fit
 from grounded.diagnosis.gap import Horizon, by_region, by_time, explained, horizon
@@ -83,6 +84,7 @@ def diagnose(
     search, best = attribute(data, candidates, max_effects=options.max_effects, tick=tick)
     tick("leftover")
     with np.errstate(all="ignore"):
+        best = confirmed(search, best, options.horizon)
         left = leftovers(search.predictor, best)
         task = subject if isinstance(subject, Task) else None
         used = [trial for trial in trials if usable(trial) >= 2]
