@@ -114,14 +114,15 @@ def score(
     folder: str, labels: str | None, jobs: int, engine: str, address: str | None, json_: bool
 ) -> None:
     """Open the labels and mark the diagnoses of DIR, beside an oracle that knows the effects."""
+    from grounded.diagnosis.challenge import summary
     from grounded.experiments.jobs import Engine
-    from grounded_trials.challenge_jobs import figures, score_cases
+    from grounded_trials.challenge_jobs import score_cases
 
     sealed = Path(labels or f"{folder}-labels")
     where = Engine(jobs=jobs, name=engine, address=address)
     with bar("cases") as progress:
         marks = score_cases(Path(folder), sealed, engine=where, progress=progress)
-    found = figures(marks)
+    found = summary(marks)
     if json_:
         show_json({"summary": found, "cases": marks})
         return

@@ -20,7 +20,7 @@ from grounded.diagnosis.information import information
 from grounded.diagnosis.noise import Noise, channel_information, climbed, slopes
 from grounded.frozen import Array
 
-MOST_NUMBERS = 2e6  # of one (L, B, N, N) array
+MOST_NUMBERS = 2e6  # of one (L, B, N, N) array: what fits in the cache goes fastest
 SHORTEST = 0.05  # part of a step that is still tried
 
 
@@ -109,11 +109,9 @@ def _bounded(G: Array, slope: Array, low: Array, high: Array) -> Array:
     number (a value at which the effect overflows) does not move.
     """
     delta, free = np.zeros(len(slope)), np.isfinite(np.diag(G)) & np.isfinite(slope)
-    if not free.any():
-        return delta
     G, slope = np.where(np.outer(free, free), G, 0.0), np.where(free, slope, 0.0)
     scale = 1 / np.sqrt(np.maximum(np.diag(G), 1e-300))
-    for _ in range(len(slope)):
+    while free.any():
         left = slope[free] + G[np.ix_(free, ~free)] @ delta[~free]
         scaled = G[np.ix_(free, free)] * np.outer(scale[free], scale[free])
         step = -scale[free] * np.linalg.lstsq(scaled, scale[free] * left, rcond=1e-10)[0]
@@ -122,8 +120,6 @@ def _bounded(G: Array, slope: Array, low: Array, high: Array) -> Array:
         if not stopped.any():
             break
         free[np.flatnonzero(free)[stopped]] = False
-        if not free.any():
-            break
     return delta
 
 

@@ -52,10 +52,7 @@ def lookalikes(
         own = [c for c in candidates if related(effect, c) and c.name not in fit.hypothesis.names]
         if fit.hypothesis.spread > 0:
             own = [c for c in own if not isinstance(c.family, ParamFamily)]
-        shares = _shares(predictor, fit, effect, own) if own else []
-        likely = [Likeness(effect.name, c.name, s) for c, s in zip(own, shares, strict=True)]
-        near = sorted((one for one in likely if one.share > nearly), key=lambda one: -one.share)
-        found += near[:MOST]
+        found += _likely(predictor, fit, effect, own, nearly)
     return tuple(found)
 
 
@@ -91,9 +88,7 @@ def of_parameters(
         there = Predictor(replace(predictor.data, model=model.with_values(moved)))
         h = Hypothesis().plus(effect, {"d": float(null.hypothesis.shift[index])})
         own = [c for c in candidates if related(effect, c) and not c.name.startswith("parameter:")]
-        shares = _shares(there, replace(null, hypothesis=h), effect, own) if own else []
-        likely = [Likeness(name, c.name, s) for c, s in zip(own, shares, strict=True)]
-        found += sorted((o for o in likely if o.share > nearly), key=lambda o: -o.share)[:MOST]
+        found += _likely(there, replace(null, hypothesis=h), effect, own, nearly)
     return tuple(found)
 
 
@@ -101,6 +96,16 @@ def related(one: Effect, other: Effect) -> bool:
     """Whether one of two families lists the other among its look-alikes."""
     a, b = one.family, other.family
     return b.name in a.lookalikes or a.name in b.lookalikes
+
+
+def _likely(
+    predictor: Predictor, fit: Fit, effect: Effect, own: Sequence[Effect], nearly: float
+) -> list[Likeness]:
+    """The candidates that reproduce more than `nearly` of an effect's signal, most first."""
+    shares = _shares(predictor, fit, effect, own) if own else []
+    likely = [Likeness(effect.name, c.name, s) for c, s in zip(own, shares, strict=True)]
+    near = sorted((one for one in likely if one.share > nearly), key=lambda one: -one.share)
+    return near[:MOST]
 
 
 def _shares(predictor: Predictor, fit: Fit, effect: Effect, own: Sequence[Effect]) -> list[float]:

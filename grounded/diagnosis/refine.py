@@ -20,14 +20,13 @@ from dataclasses import replace
 import numpy as np
 
 from grounded.diagnosis import filter as kalman
-from grounded.diagnosis.climb import Work, measured, proposed, spread_over
+from grounded.diagnosis.climb import MOST_NUMBERS, Work, measured, proposed, spread_over
 from grounded.diagnosis.columns import linearised, noise_entry
 from grounded.diagnosis.fitted import Fit, calibrated, shift_precision
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor, param_scale
 from grounded.diagnosis.noise import Noise, cleaned
 from grounded.frozen import Array
 
-MOST_NUMBERS = 2e6  # of one (L, B, N, N) array: what fits in the cache goes fastest
 MEASURED = (2, 7, 14)  # ages at which the noise's information is measured
 
 

@@ -25,7 +25,7 @@ import numpy as np
 from grounded.experiments.bench import bench, optimum
 from grounded.experiments.jobs import Engine, Job, Progress, run_jobs
 from grounded.experiments.scatter import scaled, true_utility
-from grounded.experiments.summary import Table
+from grounded.experiments.summary import Table, mean_se
 from grounded.frozen import Array
 from grounded.improve import propose
 from grounded.policy import Policy
@@ -98,9 +98,8 @@ class NoiseResult:
         best = closed[max(closed, key=lambda rule: float(closed[rule].mean()))]
 
         def as_good(rule: str) -> bool:
-            short = best - closed[rule]
-            error = short.std(ddof=1) / np.sqrt(len(short)) if len(short) > 1 else 0.0
-            return bool(short.mean() <= error)
+            short, error = mean_se((best - closed[rule]).tolist())
+            return short <= (error if np.isfinite(error) else 0.0)
 
         good = [rule for rule in self._rules if as_good(rule)]
         return min(good, key=lambda rule: float(self._over_cases(rule, "trials").mean()))
@@ -119,17 +118,17 @@ class NoiseResult:
         return np.array([values[-1] for values in own])
 
     def _summary(self) -> Table:
-        rows = []
+        rows, recommended = [], self.recommended
         for rule in self._rules:
             closed, early, trials = (
                 self._over_cases(rule, k) for k in ("closed", "early", "trials")
             )
-            error = closed.std(ddof=1) / np.sqrt(len(closed)) if len(closed) > 1 else float("nan")
-            mark = "* " if rule == self.recommended else "  "
+            mean, error = mean_se(closed.tolist())
+            mark = "* " if rule == recommended else "  "
             rows.append(
                 (
                     mark + rule,
-                    f"{closed.mean():.1%} (±{error:.1%})",
+                    f"{mean:.1%} (±{error:.1%})",
                     f"{closed.min():.1%}",
                     f"{early.mean():.1%}",
                     f"{trials.mean():.1f}",
@@ -150,7 +149,7 @@ class NoiseResult:
 
     def _table(self, manoeuvre: str, level: float) -> Table:
         rows = []
-        for rule in dict.fromkeys(o.rule for o in self.outcomes):
+        for rule in self._rules:
             own = self._of(rule, manoeuvre, level)
             if not own:
                 continue

@@ -100,17 +100,6 @@ def score_one(folder: str, labels: str, name: str, entry: dict[str, Any]) -> dic
     return score_case(Path(folder), Path(labels), name, entry)
 
 
-def figures(marks: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """The figures of `grounded.diagnosis.challenge.summary`, with the mean CPU time [s]."""
-    from grounded.diagnosis.challenge import summary
-
-    found = summary(marks)
-    for kind, row in found.items():
-        times = [m["cpu_s"] for m in marks if m["kind"] == kind and "cpu_s" in m]
-        row["cpu_s_mean"] = sum(times) / len(times) if times else None
-    return found
-
-
 def read_times(folder: Path) -> dict[str, float]:
     """CPU seconds by case; nothing where the file is missing or can't be read."""
     try:

@@ -182,6 +182,8 @@ def summary(marks: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
             row["misleading"] = float(np.mean(bad))
             row["claimed"] = _part(some, "false_effect")
             row["leftover"] = _part(some, "leftover")
+        times = [m["cpu_s"] for m in some if "cpu_s" in m]
+        row["cpu_s_mean"] = float(np.mean(times)) if times else None
         found[kind] = row
     return found
 

@@ -63,7 +63,4 @@ def study(
         marks.append({**judge(case.label, found, known), "cpu_s": spent})
         if progress is not None:
             progress(marks[-1])
-    figures = summary(marks)
-    for name, row in figures.items():
-        row["cpu_s_mean"] = float(np.mean([m["cpu_s"] for m in marks if m["kind"] == name]))
-    return figures
+    return summary(marks)
