@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from grounded.diagnosis import filter as kalman
-from grounded.diagnosis.columns import linearised, noise_entry, step_sizes
+from grounded.diagnosis.columns import linearised, step_sizes, system_of
 from grounded.diagnosis.data import Data
+from grounded.diagnosis.delays import delays_of
 from grounded.diagnosis.fitted import Fit, calibrated
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor, param_scale
 from grounded.diagnosis.information import information
@@ -146,28 +147,28 @@ def _climbed(data: Data, noise: Noise, adjoint: kalman.Adjoint, memory: Array) -
 
 def measured(predictor: Predictor, fit: Fit) -> Noise:
     """A fit's noise with the information of its variances measured."""
-    data = predictor.data
-    L, B = data.time.shape
-    F, d, r = linearised(predictor, fit.hypothesis, fit.track)
-    G = noise_entry(predictor, fit.hypothesis, fit.track)
-
-    phi = fit.noise.structure.phi(data.dt)
-    A = kalman.transition(F, phi, G)
+    data, h = predictor.data, fit.hypothesis
+    F, d, r = linearised(predictor, h, fit.track)
+    (L, B), delays = data.time.shape, delays_of(h, data)
+    (A, _, _, seen, _, G), late = system_of(predictor, h, fit.noise, fit.track, F)
     each = max(1, int(MOST_NUMBERS / A.size))  # noises at once: what fits in the cache goes fastest
 
     def some(noises: list[Noise]) -> list[kalman.Adjoint]:
         H = len(noises)
+        by_state = noises if delays is None else [delays.noise(w) for w in noises]
         g = kalman.gains(
             np.tile(A, (1, H, 1, 1)),
             np.concatenate([spread_over(w.process(data.dt), (L, B)) for w in noises], axis=1),
-            np.concatenate([spread_over(w.measurement(L), (L + 1, B)) for w in noises], axis=1),
-            np.tile(data.seen, (1, H, 1)),
+            np.concatenate([spread_over(w.measurement(L), (L + 1, B)) for w in by_state], axis=1),
+            np.tile(seen, (1, H, 1)),
             np.concatenate([w.start(B) for w in noises]),
             None if G is None else np.tile(G, (1, H, 1, 1)),
+            None if late is None else late.tiled(H),
         )
         column, of_log = np.tile(d[..., :1], (1, H, 1, 1)), np.tile(r[..., :1], (1, H, 1, 1))
         white, _ = kalman.innovations(g, column, of_log)
-        return kalman.smoother(g, white[..., 0]).parts(B)
+        found = kalman.smoother(g, white[..., 0]).parts(B)
+        return found if delays is None else [delays.restored(adjoint) for adjoint in found]
 
     def adjoints(noises: list[Noise]) -> list[kalman.Adjoint]:
         return [one for i in range(0, len(noises), each) for one in some(noises[i : i + each])]

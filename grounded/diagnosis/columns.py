@@ -2,15 +2,20 @@
 
     e_{t+1} = F_t e_t + d_t,   r_t = y_t - x_t - offset_t
 
-d and r as columns: the residual first, then the derivative by each value and each shift.
+d and r as columns: the residual first, then the derivative by each value and each shift. Where a
+sensor is late, r_t is that of the sample that shows the state at t (`delays.py`).
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+from grounded.diagnosis import filter as kalman
+from grounded.diagnosis.delays import delays_of
 from grounded.diagnosis.fitted import Fit, calibrated
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor, param_scale
+from grounded.diagnosis.late import Late, System
+from grounded.diagnosis.noise import Noise
 from grounded.frozen import Array
 
 
@@ -23,9 +28,13 @@ def linearised(predictor: Predictor, h: Hypothesis, track: Array) -> tuple[Array
     u = predictor.inputs(h)
     after = predictor.advance(h, x, u, data.time)
     ahead = np.concatenate([track[:1], after])  # predicted: a measurement must not explain itself
-    offset = predictor.offset(h, ahead)
+    delays = delays_of(h, data)
+    y, here, shown = data.y, track, ahead
+    if delays is not None:
+        y, here, shown = delays.samples()[0], delays.shown(track, track), delays.shown(ahead, track)
+    offset = predictor.standing(h, shown)
     columns_d = [model.difference(after, track[1:])]
-    columns_r = [model.difference(data.y - track, np.asarray(offset))]
+    columns_r = [model.difference(y - here, np.asarray(offset))]
     theta = h.theta
     for j, size in enumerate(step_sizes(h)):
         other, moved = _nudged(h, theta, j, size)
@@ -37,8 +46,9 @@ def linearised(predictor: Predictor, h: Hypothesis, track: Array) -> tuple[Array
             model.difference(predictor.advance(other, x, predictor.inputs(other), data.time), after)
             / moved
         )
-        shifted = predictor.offset(other, ahead)
-        columns_r.append((np.zeros_like(track) + offset - shifted) / moved)
+        other_shown = shown if delays is None else delays.moved(other).shown(ahead, track)
+        shifted = predictor.standing(other, other_shown)
+        columns_r.append((shown - other_shown + offset - shifted) / moved)
     d, r = np.stack(columns_d, axis=-1), np.stack(columns_r, axis=-1)
     flat = (
         np.ascontiguousarray(x.reshape(-1, model.n)),
@@ -74,6 +84,30 @@ def noise_entry(predictor: Predictor, h: Hypothesis, track: Array) -> Array | No
         slope[:, [heading, rate]] = 0.0
         G[:, rate, :] += slope
     return G.reshape(L, B, model.n, model.n)
+
+
+def system_of(
+    predictor: Predictor, h: Hypothesis, noise: Noise, track: Array, F: Array
+) -> tuple[System, Late | None]:
+    """What the filter of a hypothesis is made of; F (L, B, n, n)."""
+    data = predictor.data
+    (L, B, n, _), delays = F.shape, delays_of(h, data)
+    seen, late = data.seen, None
+    if delays is not None:
+        noise, seen, late = delays.noise(noise), delays.samples()[1], delays.late()
+    G = noise_entry(predictor, h, track)
+    A = kalman.transition(F, noise.structure.phi(data.dt), G)
+    Q = np.broadcast_to(noise.process(data.dt), (L, B, A.shape[-1]))
+    R = np.broadcast_to(noise.measurement(L), (L + 1, B, n))
+    return System(A, Q, R, seen, noise.start(B), G), late
+
+
+def gains_of(
+    predictor: Predictor, h: Hypothesis, noise: Noise, track: Array, F: Array
+) -> kalman.Gains:
+    """The gains of a hypothesis' filter; F (L, B, n, n)."""
+    system, late = system_of(predictor, h, noise, track, F)
+    return kalman.gains(*system, late)
 
 
 def base_columns(predictor: Predictor, fit: Fit) -> tuple[Array, Array]:

@@ -58,9 +58,14 @@ class Data:
         return int(self.valid.sum())
 
     @cached_property
+    def filled(self) -> Array:
+        """Measured states, flat; NaN replaced by the last value."""
+        return _filled(self.states)
+
+    @cached_property
     def y(self) -> Array:
-        """Measured states by run, time-major (L + 1, B, n); NaN replaced by the last value."""
-        return np.ascontiguousarray(_filled(self.states)[self.state_at].swapaxes(0, 1))
+        """The same by run, time-major (L + 1, B, n)."""
+        return np.ascontiguousarray(self.filled[self.state_at].swapaxes(0, 1))
 
     @cached_property
     def seen(self) -> Array:

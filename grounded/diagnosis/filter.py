@@ -17,18 +17,22 @@ N_t their covariances, d loglik / d R = (u u' - D) / 2 and d loglik / d Q = (r r
 Where a state is only carried along (a heading rate that is a function of steering and speed), what
 disturbs those disturbs it too: the noises enter through G_t (n, n), c + w -> G (c + w).
 
+A measurement that is late (`late.py`) shows the state of an earlier moment; one more state each
+remembers it. Callers see none of that: arrays go in and come out as without.
+
 Arrays are time-major: L steps, B runs, N states of the filter (n, or 2 n with coloured noise), C
 columns. A missing measurement is a False in `seen`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from grounded.diagnosis import kernels
+from grounded.diagnosis.late import Late, System
 from grounded.frozen import Array
 
 UNKNOWN = 1e6  # standard deviations: how little is known of a state that was not measured at t = 0
@@ -36,7 +40,10 @@ UNKNOWN = 1e6  # standard deviations: how little is known of a state that was no
 
 @dataclass(frozen=True, eq=False)
 class Gains:
-    """What does not depend on the data: A (L, B, N, N), K (L, B, N, n), whitener (L, B, n, n)."""
+    """What does not depend on the data: A (L, B, N, N), K (L, B, N, n), whitener (L, B, n, n).
+
+    Where measurements are late, all of them are those of the widened state.
+    """
 
     A: Array
     K: Array
@@ -44,6 +51,7 @@ class Gains:
     logdet: Array  # (L, B) log det S over what was seen
     seen: Array  # (L + 1, B, n) 1.0 or 0.0
     G: Array | None = None  # (L, B, n, n) how noise enters; None: as it is
+    late: Late | None = None  # which measurements are late
 
 
 def transition(F: Array, phi: float | None, G: Array | None = None) -> Array:
@@ -62,7 +70,15 @@ def transition(F: Array, phi: float | None, G: Array | None = None) -> Array:
     return A
 
 
-def gains(A: Array, Q: Array, R: Array, seen: Array, start: Array, G: Array | None = None) -> Gains:
+def gains(
+    A: Array,
+    Q: Array,
+    R: Array,
+    seen: Array,
+    start: Array,
+    G: Array | None = None,
+    late: Late | None = None,
+) -> Gains:
     """The covariance recursion.
 
     Args:
@@ -72,13 +88,22 @@ def gains(A: Array, Q: Array, R: Array, seen: Array, start: Array, G: Array | No
         seen: (L + 1, B, n), 1.0 where a measurement is there.
         start: (B, N - n) variance of the coloured noise at t = 0.
         G: (L, B, n, n) how the noise enters, None for the identity.
+        late: channels whose measurement is late.
 
     Raises:
         numpy.linalg.LinAlgError: when a covariance is not finite.
     """
     L, B, N, _ = A.shape
-    n = seen.shape[-1]
-    Q, R = np.broadcast_to(Q, (L, B, N)), np.broadcast_to(R, (L + 1, B, n))
+    Q, R = np.broadcast_to(Q, (L, B, N)), np.broadcast_to(R, (L + 1, B, seen.shape[-1]))
+    given = System(A, Q, R, seen, start, G)
+    if late is None:
+        return _gains(given)
+    return replace(_gains(late.system(given)), late=late)
+
+
+def _gains(given: System) -> Gains:
+    A, Q, R, seen, start, G = given
+    (L, B, N, _), n = A.shape, seen.shape[-1]
     first = np.concatenate([R[0] * np.where(seen[0] > 0, 1.0, UNKNOWN), start], axis=1)
     if kernels.available(n):
         return _compiled_gains(A, Q, R, seen, first, G)
@@ -120,12 +145,8 @@ def _compiled_gains(
     K, whiten = np.empty((L, B, N, n)), np.zeros((L, B, n, n))
     A, seen = np.ascontiguousarray(A), np.ascontiguousarray(seen, float)
     G = None if G is None else np.ascontiguousarray(G)
-    values: dict[str, Any] = {
-        "A": A,
-        "Q": np.ascontiguousarray(Q),
-        "R": np.ascontiguousarray(R),
-        "seen": seen,
-    }
+    values: dict[str, Any] = {"A": A, "seen": seen}
+    values |= {"Q": np.ascontiguousarray(Q), "R": np.ascontiguousarray(R)}
     values |= {"start": np.ascontiguousarray(first), "G": 0 if G is None else G}
     kernels.run("gains", n, N, G is not None, {**values, "L": L, "B": B, "K": K, "W": whiten})
     diagonal = np.einsum("tbii->tbi", whiten)
@@ -143,6 +164,14 @@ def innovations(g: Gains, d: Array, r: Array, *, track: bool = False) -> tuple[A
         r: what each column adds to a measurement (L + 1, B, n, C), or (L + 1, 1, 1, 1) of zeros.
         track: also return the filtered errors.
     """
+    if g.late is None:
+        return _innovations(g, d, r, track=track)
+    white, filtered = _innovations(g, *g.late.columns(d, r), track=track)
+    own = np.ascontiguousarray(white[:, :, : d.shape[2]])
+    return own, None if filtered is None else g.late.errors(filtered)
+
+
+def _innovations(g: Gains, d: Array, r: Array, *, track: bool) -> tuple[Array, Array | None]:
     L, B, n, C = d.shape
     N = g.A.shape[-1]
     if kernels.available(n):
@@ -175,17 +204,8 @@ def _compiled_innovations(
     d, r = _widened(d, (L, B, n, wide)), _widened(r, (L + 1, B, n, wide))
     out = np.empty((L, B, n, wide))
     filtered = np.empty((L + 1, B, n, wide)) if track else None
-    values: dict[str, Any] = {
-        "A": g.A,
-        "K": g.K,
-        "W": g.whiten,
-        "d": d,
-        "r": r,
-        "seen": g.seen,
-        "L": L,
-        "B": B,
-    }
-    values |= {"blocks": wide // lanes, "C": wide, "out": out}
+    values: dict[str, Any] = {"A": g.A, "K": g.K, "W": g.whiten, "d": d, "r": r, "seen": g.seen}
+    values |= {"L": L, "B": B, "blocks": wide // lanes, "C": wide, "out": out}
     values |= {"track": 0 if filtered is None else filtered}
     kernels.run("innovations", n, g.A.shape[-1], g.G is not None, values)
     return out[..., :C], None if filtered is None else filtered[..., :C]
@@ -224,6 +244,15 @@ class Adjoint:
 
 def smoother(g: Gains, white: Array) -> Adjoint:
     """The backward pass for one column of whitened innovations, (L, B, n)."""
+    if g.late is None:
+        return _smoother(g, white)
+    n, late = white.shape[-1], g.late
+    found = _smoother(g, np.pad(white, [(0, 0), (0, 0), (0, late.count)]))
+    r, N = late.disturbances(found.r, n), late.disturbances(found.N, n)
+    return Adjoint(found.u[..., :n], found.D[..., :n], r, N)
+
+
+def _smoother(g: Gains, white: Array) -> Adjoint:
     L, B, N, _ = g.A.shape
     n = white.shape[-1]
     u, D = np.empty((L, B, n)), np.empty((L, B, n))

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis import filter as kalman
-from grounded.diagnosis.columns import noise_entry
 from grounded.diagnosis.data import Data
+from grounded.diagnosis.delays import delays_of
 from grounded.diagnosis.fitted import Fit
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor
 from grounded.diagnosis.leftover import filter_of
@@ -49,7 +49,7 @@ def horizon(predictor: Predictor, fit: Fit, seconds: float) -> Horizon:
         seconds: how far; shorter where runs are.
     """
     data = predictor.data
-    L, B = data.time.shape
+    B = len(data.valid)
     lengths = data.valid.sum(axis=1).astype(int)
     longest = max(int(np.median(lengths)) - 2, 1)
     steps = max(1, round(min(seconds / data.dt, longest)))
@@ -59,27 +59,59 @@ def horizon(predictor: Predictor, fit: Fit, seconds: float) -> Horizon:
         pairs = [(t, b) for b in range(B) for t in range(1, lengths[b] - steps + 1)] or [(0, 0)]
     stride = max(1, len(pairs) // MOST_STARTS)
     at, run = np.array(pairs[::stride]).T
-    g = filter_of(predictor, fit)
-    n = data.model.n
-    R = np.broadcast_to(fit.noise.measurement(L), (L + 1, B, n))
-    Q = np.broadcast_to(fit.noise.process(data.dt), (L, B, g.A.shape[-1]))
-    N = g.A.shape[-1]
+    return Horizon(steps, at, run, _spread(predictor, fit, at, run, steps))
+
+
+def _spread(predictor: Predictor, fit: Fit, at: Any, run: Any, steps: int) -> Array:
+    """Standard deviation that noise alone gives the log `steps` after the moments (M,), (M, n)."""
+    data, noise = predictor.data, fit.noise
+    (L, B), n = data.time.shape, data.model.n
+    g, delays = filter_of(predictor, fit), delays_of(fit.hypothesis, data)
+    R = np.broadcast_to(noise.measurement(L), (L + 1, B, n))
+    Q = noise.process(data.dt)
+    Q, wide, N = Q if g.late is None else g.late.noises(Q, n), g.seen.shape[-1], g.A.shape[-1]
+    Q = np.broadcast_to(Q, (L, B, N))
     P = np.zeros((len(at), N, N))
-    P[:, :n, :n] = g.K[np.maximum(at - 1, 0), run][:, :n] * R[at, run][:, None, :]
-    k = np.arange(n, N)
-    P[:, k, k] = fit.noise.start(1)[0] if n < N else 0.0
-    G = noise_entry(predictor, fit.hypothesis, fit.track)
+    if delays is None:
+        P[:, :n, :n] = g.K[np.maximum(at - 1, 0), run][:, :n] * R[at, run][:, None, :]
+    else:
+        P[:, :wide, :wide] = _covariances(g, Q, R)[np.maximum(at - 1, 0), run]
+    k = np.arange(wide, wide + n if wide < N else wide)
+    P[:, k, k] = noise.start(1)[0] if wide < N else 0.0
+    late = {} if delays is None else dict(zip(delays.channel, delays.whole, strict=True))
+    # what a late channel shows at the horizon is that much nearer
+    found = {i: P[:, i, i] for i, whole in late.items() if whole >= steps}
     for j in range(steps):
         A, q = g.A[at + j, run], Q[at + j, run]
         P = A @ P @ A.swapaxes(1, 2)
         entry = np.zeros((len(at), N, N))
         entry[:, np.arange(N), np.arange(N)] = q
-        if G is not None:
-            Gt = G[at + j, run]
-            entry[:, :n, :n] = (Gt * q[:, None, :n]) @ Gt.swapaxes(1, 2)
+        if g.G is not None:
+            Gt = g.G[at + j, run]
+            entry[:, :wide, :wide] = (Gt * q[:, None, :wide]) @ Gt.swapaxes(1, 2)
         P = P + entry
-    spread = np.sqrt(np.einsum("bii->bi", P[:, :n, :n]) + R[at + steps, run])
-    return Horizon(steps, at, run, spread)
+        found |= {i: P[:, i, i] for i, whole in late.items() if whole == steps - 1 - j}
+    variance = np.einsum("bii->bi", P[:, :n, :n]).copy()
+    for i, of_late in found.items():
+        variance[:, i] = of_late
+    return np.asarray(np.sqrt(variance + R[at + steps, run]))
+
+
+def _covariances(g: kalman.Gains, Q: Array, R: Array) -> Array:
+    """Covariance of a widened state after each step, its noise's colour aside, (L, B, n', n')."""
+    assert g.late is not None and g.G is not None
+    (L, B, N, _), wide = g.A.shape, g.seen.shape[-1]
+    found, P = np.empty((L, B, wide, wide)), np.zeros((B, N, N))
+    first = np.concatenate([R[0], np.take_along_axis(R[0], g.late.channel, axis=1)], axis=1)
+    P[:, np.arange(wide), np.arange(wide)] = first
+    for t in range(L):
+        P = g.A[t] @ P @ g.A[t].swapaxes(1, 2)
+        P[:, :wide, :wide] += (g.G[t] * Q[t][:, None, :wide]) @ g.G[t].swapaxes(1, 2)
+        P[:, np.arange(wide, N), np.arange(wide, N)] += Q[t][:, wide:]
+        P = P - g.K[t] @ P[:, :wide]
+        P = 0.5 * (P + P.swapaxes(1, 2))
+        found[t] = P[:, :wide, :wide]
+    return found
 
 
 def errors(predictor: Predictor, h: Hypothesis, track: Array, where: Horizon) -> Array:
@@ -87,7 +119,9 @@ def errors(predictor: Predictor, h: Hypothesis, track: Array, where: Horizon) ->
     data = predictor.data
     x = track[where.at, where.run]
     u, t = predictor.inputs(h), data.time
-    path = [x]
+    delays = delays_of(h, data)
+    oldest = 0 if delays is None else max(delays.whole) + 1  # what late sensors may still show
+    path = [track[np.maximum(where.at - j, 0), where.run] for j in range(oldest, -1, -1)]
     for j in range(where.steps):
         index = (where.at + j, where.run)
         x = predictor.advance(h, x, u[index], t[index])
@@ -118,6 +152,8 @@ def explained(predictor: Predictor, null: Hypothesis, best: Fit) -> Array:
     after = predictor.advance(null, x, predictor.inputs(null), data.time)
     d = data.model.difference(after, track[1:])
     r = data.model.difference(data.y - track, np.zeros_like(track))
+    delays = delays_of(best.hypothesis, data)
+    r = r if delays is None else delays.aligned(r)
     white, _ = kalman.innovations(g, d[..., None], r[..., None])
     return np.asarray(0.5 * (white[..., 0] ** 2 - best.white**2))
 

@@ -218,17 +218,27 @@ class Predictor:
 
     def offset(self, h: Hypothesis, track: Array) -> Array | float:
         """The log minus the state along a track (L + 1, B, n); 0.0 where sensors are right."""
+        names, dt, old = self.data.model.state_names, self.data.dt, track
+        for effect, values in zip(h.effects, h.values, strict=True):
+            if isinstance(effect.family, SensorDelayFamily):
+                i, old = names.index(effect.site.target), old.copy()
+                old[..., i] += sensor_offset(effect, values, track[..., i], dt)
+        standing = self.standing(h, old)
+        return standing if old is track else standing + old - track
+
+    def standing(self, h: Hypothesis, shown: Array) -> Array | float:
+        """What sensors add to what they are shown (..., n), however old it is; 0.0 if nothing."""
         sensors = [
             (e, v)
             for e, v in zip(h.effects, h.values, strict=True)
-            if isinstance(e.family, SensorFamily | SensorDelayFamily)
+            if isinstance(e.family, SensorFamily)
         ]
         if not sensors:
             return 0.0
-        names, total = self.data.model.state_names, np.zeros_like(track)
+        names, total = self.data.model.state_names, np.zeros_like(shown)
         for effect, values in sensors:
             i = names.index(effect.site.target)
-            total[..., i] += sensor_offset(effect, values, track[..., i], self.data.dt)
+            total[..., i] += sensor_offset(effect, values, shown[..., i], self.data.dt)
         return total
 
 

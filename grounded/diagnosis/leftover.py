@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from grounded.diagnosis import filter as kalman
-from grounded.diagnosis.columns import noise_entry
+from grounded.diagnosis.columns import gains_of
 from grounded.diagnosis.fitted import Fit
 from grounded.diagnosis.hypothesis import Predictor
 from grounded.effects import places
@@ -159,12 +159,7 @@ def filter_of(predictor: Predictor, fit: Fit) -> kalman.Gains:
     flat_x = np.ascontiguousarray(fit.track[:-1].reshape(-1, n))
     flat_u = np.ascontiguousarray(predictor.inputs(fit.hypothesis).reshape(-1, data.model.m))
     F, _ = data.model.system.linearise(flat_x, flat_u, predictor.params(fit.hypothesis), data.dt)
-    G = noise_entry(predictor, fit.hypothesis, fit.track)
-    A = kalman.transition(F.reshape(L, B, n, n), fit.noise.structure.phi(data.dt), G)
-    noise = fit.noise
-    return kalman.gains(
-        A, noise.process(data.dt), noise.measurement(L), data.seen, noise.start(B), G
-    )
+    return gains_of(predictor, fit.hypothesis, fit.noise, fit.track, F.reshape(L, B, n, n))
 
 
 def whiteness(fit: Fit, seen: Array) -> dict[str, float]:

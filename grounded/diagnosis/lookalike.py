@@ -20,11 +20,12 @@ import numpy as np
 
 from grounded.diagnosis import filter as kalman
 from grounded.diagnosis.columns import base_columns
+from grounded.diagnosis.delays import delays_of
 from grounded.diagnosis.fitted import Fit
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor
 from grounded.diagnosis.leftover import filter_of
 from grounded.diagnosis.scan import scan
-from grounded.effects import Effect, ParamFamily
+from grounded.effects import Effect, ParamFamily, SensorDelayFamily
 
 NEARLY = 0.75  # share of an effect's signal from which a look-alike is named
 MOST = 3  # that are named for one effect
@@ -110,8 +111,10 @@ def _likely(
 
 def _shares(predictor: Predictor, fit: Fit, effect: Effect, own: Sequence[Effect]) -> list[float]:
     """Share of an effect's signal that the best values of each candidate reproduce."""
-    h, gains = fit.hypothesis, filter_of(predictor, fit)
-    data = predictor.data
+    h, data = fit.hypothesis, predictor.data
+    late = isinstance(effect.family, SensorDelayFamily)  # then its look-alikes see the log as it is
+    seen_by = replace(fit, hypothesis=h.minus(effect.name)) if late else fit
+    gains, delays = filter_of(predictor, seen_by), delays_of(seen_by.hypothesis, data)
     if h.shift is not None:  # around the calibrated model, so that the prior doesn't pull
         moved = dict(zip(data.model.param_names, data.model.values + h.shift, strict=True))
         data = replace(data, model=data.model.with_values(moved))
@@ -122,6 +125,7 @@ def _shares(predictor: Predictor, fit: Fit, effect: Effect, own: Sequence[Effect
     d = model.difference(bare, full)
     track = np.concatenate([fit.track[:1], full])
     r = np.zeros_like(track) + predictor.offset(h, track) - predictor.offset(without, track)
+    r = r if delays is None else delays.aligned(r)
     signal = kalman.innovations(gains, d[..., None], r[..., None])[0][..., 0]
     other = replace(fit, hypothesis=without, white=signal)
     columns, of_log = base_columns(predictor, other)

@@ -21,10 +21,12 @@ import numpy as np
 
 from grounded.diagnosis import filter as kalman
 from grounded.diagnosis.climb import MOST_NUMBERS, Work, measured, proposed, spread_over
-from grounded.diagnosis.columns import linearised, noise_entry
+from grounded.diagnosis.columns import gains_of, linearised, noise_entry
+from grounded.diagnosis.delays import delays_of, joined
 from grounded.diagnosis.fitted import Fit, calibrated, shift_precision
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor, param_scale
 from grounded.diagnosis.noise import Noise, cleaned
+from grounded.effects import SensorDelayFamily
 from grounded.frozen import Array
 
 MEASURED = (2, 7, 14)  # ages at which the noise's information is measured
@@ -57,17 +59,27 @@ def refine(
     wide = n if works[0].noise.structure.tau is None else 2 * n
     size = max(1, int(MOST_NUMBERS / (L * B * wide * wide)))
     for _ in range(iterations):
-        active = [work for work in works if not work.done()]
-        for at in range(0, len(active), size):
-            _iterate(predictor, active[at : at + size], fixed_noise)
+        for alike in _of_one_shape([work for work in works if not work.done()]):
+            for at in range(0, len(alike), size):
+                _iterate(predictor, alike[at : at + size], fixed_noise)
         if tick is not None:
             tick()
     return [work.best for work in works if work.best is not None]
 
 
+def _of_one_shape(works: list[Work]) -> list[list[Work]]:
+    """Works whose filters have states of one size: as many sensors are late."""
+    late = [sum(isinstance(e.family, SensorDelayFamily) for e in work.h.effects) for work in works]
+    return [
+        [work for work, n in zip(works, late, strict=True) if n == count]
+        for count in sorted(set(late))
+    ]
+
+
 def _iterate(predictor: Predictor, works: list[Work], fixed_noise: bool) -> None:
     data = predictor.data
     L, B = data.time.shape
+    late = [delays_of(work.h, data) for work in works]
     parts = [linearised(predictor, work.h, work.track) for work in works]
     width = kalman.whole(max(part[1].shape[-1] for part in parts), data.model.n)
     d = np.concatenate([_padded(part[1], width) for part in parts], axis=1)
@@ -78,11 +90,13 @@ def _iterate(predictor: Predictor, works: list[Work], fixed_noise: bool) -> None
     G = np.concatenate(entries, axis=1) if entries else None
     phi = works[0].noise.structure.phi(data.dt)
     Q = np.concatenate([spread_over(w.noise.process(data.dt), (L, B)) for w in works], axis=1)
-    R = np.concatenate([spread_over(w.noise.measurement(L), (L + 1, B)) for w in works], axis=1)
+    moved = zip(works, late, strict=True)
+    by_state = [work.noise if s is None else s.noise(work.noise) for work, s in moved]
+    R = np.concatenate([spread_over(w.measurement(L), (L + 1, B)) for w in by_state], axis=1)
     start = np.concatenate([w.noise.start(B) for w in works])
-    seen = np.tile(data.seen, (1, len(works), 1))
+    seen = np.concatenate([data.seen if s is None else s.samples()[1] for s in late], axis=1)
     try:
-        g = kalman.gains(kalman.transition(F, phi, G), Q, R, seen, start, G)
+        g = kalman.gains(kalman.transition(F, phi, G), Q, R, seen, start, G, joined(late))
     except np.linalg.LinAlgError:
         for work in works:
             work.still = 1
@@ -96,8 +110,11 @@ def _iterate(predictor: Predictor, works: list[Work], fixed_noise: bool) -> None
     back = kalman.smoother(g, white[..., 0])
     for i, work in enumerate(works):
         own = slice(i * B, (i + 1) * B)
-        adjoint = kalman.Adjoint(back.u[:, own], back.D[:, own], back.r[:, own], back.N[:, own])
-        columns = parts[i][1].shape[-1]
+        adjoint, delays = back.parts(B)[i], late[i]
+        columns, before = parts[i][1].shape[-1], 0.0
+        if delays is not None:
+            entry, residual = carried[i], white[:, own, :, 0]
+            before = delays.before(work.noise, entry, work.track, residual, g.whiten[:, own])
         memory = np.einsum("tbii->i", parts[i][0]) / (L * B)
         _update(
             predictor,
@@ -105,35 +122,27 @@ def _iterate(predictor: Predictor, works: list[Work], fixed_noise: bool) -> None
             white[:, own, :, :columns],
             g.logdet[:, own],
             filtered[:, own, :, :columns],
-            adjoint,
+            adjoint if delays is None else delays.restored(adjoint),
             None if fixed_noise else memory,
+            before,
         )
 
 
 def clean(predictor: Predictor, fit: Fit, rounds: int = 8) -> Fit:
     """The same hypothesis with outliers weighed down, its noise fitted to the rest."""
-    data = predictor.data
-    L, B = data.time.shape
     work = Work(fit.hypothesis, fit.noise, fit.track)
     for _ in range(rounds):
         if not np.isfinite(work.track).all():
             return fit
         F, d, r = linearised(predictor, work.h, work.track)
-        G = noise_entry(predictor, work.h, work.track)
         try:
-            g = kalman.gains(
-                kalman.transition(F, work.noise.structure.phi(data.dt), G),
-                work.noise.process(data.dt),
-                work.noise.measurement(L),
-                data.seen,
-                work.noise.start(B),
-                G,
-            )
+            g = gains_of(predictor, work.h, work.noise, work.track, F)
         except np.linalg.LinAlgError:
             return fit
         white, filtered = kalman.innovations(g, d[..., :1], r[..., :1], track=True)
         assert filtered is not None
-        work.noise = cleaned(work.noise, kalman.smoother(g, white[..., 0]))
+        adjoint, delays = kalman.smoother(g, white[..., 0]), delays_of(work.h, predictor.data)
+        work.noise = cleaned(work.noise, adjoint if delays is None else delays.restored(adjoint))
         work.track = work.track + filtered[..., 0]
         if not all(np.isfinite(a).all() for a in (work.track, work.noise.log_q, work.noise.log_r)):
             return fit
@@ -154,11 +163,12 @@ def _update(
     filtered: Array,
     adjoint: kalman.Adjoint,
     memory: Array | None,
+    before: float,
 ) -> None:
     """Scores the point where the work stands, keeps it if it is the best, and moves on."""
     data = predictor.data
     residual, columns = white[..., 0], white[..., 1:]
-    fit = _scored(predictor, work, residual, columns, logdet, filtered[..., 0])
+    fit = _scored(predictor, work, residual, columns, logdet, filtered[..., 0], before)
     rise = np.inf if work.best is None else fit.evidence - work.best.evidence
     if not (rise > 0 and np.isfinite(fit.evidence)):
         work.shorten(data)
@@ -175,7 +185,13 @@ def _update(
 
 
 def _scored(
-    predictor: Predictor, work: Work, residual: Array, columns: Array, logdet: Array, error: Array
+    predictor: Predictor,
+    work: Work,
+    residual: Array,
+    columns: Array,
+    logdet: Array,
+    error: Array,
+    before: float,
 ) -> Fit:
     data, h = predictor.data, work.h
     L, B, n, C = columns.shape
@@ -186,7 +202,7 @@ def _scored(
     rss = (flat**2).sum(axis=1)
     run_logdet = logdet.sum(axis=0)
     count = data.seen[1:].sum()
-    loglik = -0.5 * float(rss.sum() + run_logdet.sum() + count * np.log(2 * np.pi))
+    loglik = -0.5 * float(rss.sum() + run_logdet.sum() + count * np.log(2 * np.pi)) + before
     evidence, k = loglik, len(h.theta)
     if k < C:
         precision = shift_precision(h, C - k)

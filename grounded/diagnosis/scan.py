@@ -22,7 +22,8 @@ import numpy as np
 
 from grounded.compile import Named
 from grounded.diagnosis import filter as kalman
-from grounded.diagnosis.columns import base_columns, noise_entry
+from grounded.diagnosis.columns import base_columns, system_of
+from grounded.diagnosis.delays import delays_of
 from grounded.diagnosis.fitted import Fit
 from grounded.diagnosis.grid import elsewhere, faint, grid_points
 from grounded.diagnosis.hypothesis import Predictor, sensor_offset, transformed
@@ -98,17 +99,9 @@ class _Context:
         f_x, _, f_p = model.system.sensitivities(*flat, self.p, data.dt)
         self.F = f_x.reshape(L, B, model.n, model.n)
         self.f_p = f_p.reshape(L, B, model.n, -1)
-        noise = fit.noise
-        phi = noise.structure.phi(data.dt)
-        self.G = G = noise_entry(predictor, h, fit.track)
-        self.gains = kalman.gains(
-            kalman.transition(self.F, phi, G),
-            noise.process(data.dt),
-            noise.measurement(L),
-            data.seen,
-            noise.start(B),
-            G,
-        )
+        system, late = system_of(predictor, h, fit.noise, fit.track, self.F)
+        self.G, self.gains = system.G, kalman.gains(*system, late)
+        self.delays = delays_of(h, data)
         self.white = fit.white
         self.base = fit.covariance if fit.gram.shape[-1] else np.zeros((0, 0))
 
@@ -208,6 +201,7 @@ class _Context:
                 values[name] = amount
             r = np.zeros_like(self.fit.track)
             r[..., k] = -sensor_offset(effect, values, self.ahead[..., k], data.dt) / amount
+            r = r if self.delays is None else self.delays.aligned(r)
             found.append(_Column(i, point, name, _EMPTY, r))
         return found
 

@@ -1,0 +1,205 @@
+"""A sensor's delay: which sample of the log shows which state.
+
+    y_i(t) = x_i(t - d),   d = (k + p) dt
+    y_i(s + k) = (1 - p) x_i(s) + p x_i(s - 1)
+
+So under a hypothesis with a delay the log of its channel is moved by k steps, and the filter takes
+care of p (`late.py`). The first k samples of a trial show what was before it, which no model
+predicts. All hypotheses are judged by the same data, so they count too (`before`): as samples of a
+state that drifted into the trial at rest, or at the pace of its beginning, whichever is likelier.
+
+Noise (its weights) and adjoints belong to samples: outside the filter they stay in the log's order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from grounded.diagnosis.data import Data
+from grounded.diagnosis.filter import UNKNOWN, Adjoint
+from grounded.diagnosis.hypothesis import Hypothesis
+from grounded.diagnosis.late import Late
+from grounded.diagnosis.noise import Noise
+from grounded.effects import SensorDelayFamily
+from grounded.frozen import Array
+
+UNLIKE = 1.0  # nats that a sample of what was before a trial costs at most more than others
+
+
+@dataclass(frozen=True, eq=False)
+class Delays:
+    """The late channels of a hypothesis, D of them: which, k and p of each."""
+
+    data: Data
+    channel: tuple[int, ...]
+    whole: tuple[int, ...]
+    part: Array  # (D,)
+
+    def late(self) -> Late:
+        """For the filter, every run the same."""
+        B = len(self.data.valid)
+        return Late(np.tile(self.channel, (B, 1)), np.tile(self.part, (B, 1)))
+
+    def moved(self, h: Hypothesis) -> Delays:
+        """With the delays of another hypothesis but the samples of this one: p may leave 0 .. 1."""
+        steps = [d / self.data.dt for _, d in _named(h, self.data)]
+        return replace(self, part=np.array(steps) - np.array(self.whole))
+
+    def shown(self, now: Array, track: Array) -> Array:
+        """(1 - p) now + p before, (L + 1, B, n): before each state comes that of the track."""
+        found = now.copy()
+        for i, p in zip(self.channel, self.part, strict=True):
+            first = 2 * track[:1, :, i] - track[1:2, :, i]  # as if it came so
+            before = np.concatenate([first, track[:-1, :, i]])
+            found[..., i] = (1 - p) * now[..., i] + p * before
+        return found
+
+    def samples(self) -> tuple[Array, Array]:
+        """The log and what is seen of it, moved to the states it shows, (L + 1, B, n) each."""
+        data = self.data
+        y, seen = data.y.copy(), data.seen.copy()
+        for i, k in zip(self.channel, self.whole, strict=True):
+            at, there = self._source(k)
+            y[..., i] = data.filled[at, i]
+            seen[..., i] = there * np.isfinite(data.states[at, i])
+        return y, seen
+
+    def aligned(self, values: Array, missing: float = 0.0) -> Array:
+        """Values of each sample, (L + 1, B, n, ...) or (L, B, n, ...), moved to the states."""
+        found, skip = values.copy(), len(self.data.state_at.T) - len(values)
+        own, run = self.data.state_at.T[skip:], self._run()[skip:]
+        for i, k in zip(self.channel, self.whole, strict=True):
+            at, there = (a[skip:] for a in self._source(k))
+            found[:, :, i] = self._carried(values[:, :, i], (own, run), (at, there), missing)
+        return found
+
+    def restored(self, adjoint: Adjoint) -> Adjoint:
+        """An adjoint of the moved samples, back in the log's order."""
+        found = {"u": adjoint.u.copy(), "D": adjoint.D.copy()}
+        own, run = self.data.state_at.T[1:], self._run()[1:]
+        for i, k in zip(self.channel, self.whole, strict=True):
+            at, there = (a[1:] for a in self._source(k))
+            for values in found.values():
+                values[..., i] = self._carried(values[..., i], (at, there), (own, run), 0.0)
+        return replace(adjoint, **found)
+
+    def noise(self, noise: Noise) -> Noise:
+        """The same noise with the weights of the moved samples."""
+        if isinstance(noise.weight_v, float):
+            return noise
+        return replace(noise, weight_v=self.aligned(noise.weight_v, 1.0))
+
+    def before(
+        self, noise: Noise, entry: Array | None, track: Array, white: Array, whiten: Array
+    ) -> float:
+        """Log density of the samples that show what was before the trials; without log 2 pi [nats].
+
+        At most UNLIKE nats a sample below what the others have: it may have moved in any way.
+
+        Args:
+            noise: of the hypothesis.
+            entry: how noise enters (L, B, n, n); None: as it is.
+            track: (L + 1, B, n).
+            white: whitened innovations (L, B, n) of all other samples.
+            whiten: what whitened them, (L, B, n or more, n or more).
+        """
+        L, B, n = white.shape
+        seen, colour = self.samples()[1][1:], noise.structure.tau is not None
+        power = noise.process(self.data.dt)[..., :n] + (np.exp(noise.log_c) if colour else 0.0)
+        power, total = np.broadcast_to(power, (L, B, n)), 0.0
+        for i, k in zip(self.channel, self.whole, strict=True):
+            k = min(k, L)
+            through = np.eye(n)[i] if entry is None else entry[:k, :, i]
+            drift = (through**2 * power[:k]).sum(axis=-1)
+            pace = (track[k] - track[0])[:, i] / max(k, 1)
+            log = np.log(whiten[..., i, i]) - 0.5 * white[..., i] ** 2
+            mean = float((log * seen[..., i]).sum()) / max(float(seen[..., i].sum()), 1.0)
+            least = (mean - UNLIKE) * float(self.data.seen[1 : k + 1, self.first, i].sum())
+            total += max(least, *(self._drifted(noise, i, drift, p * pace) for p in (0.0, 1.0)))
+        return total
+
+    def _drifted(self, noise: Noise, i: int, drift: Array, pace: Array) -> float:
+        """Log density of the first samples, the state going `pace` (B,) a step, spread by `drift`.
+
+        A Kalman filter of one state; drift (k, B) are the variances of its steps.
+        """
+        data = self.data
+        L, runs = len(data.time), self.first
+        R = np.broadcast_to(noise.measurement(L), (L + 1, *data.seen.shape[1:]))[:, runs, i]
+        y, seen, total = data.y[:, runs, i], data.seen[:, runs, i], 0.0
+        x, P = y[0], R[0] * np.where(seen[0] > 0, 1.0, UNKNOWN)
+        for t in range(1, len(drift) + 1):
+            x, P = x + pace[runs], P + drift[t - 1, runs]
+            S, missed = P + R[t], y[t] - x
+            total -= 0.5 * float((seen[t] * (missed**2 / S + np.log(S))).sum())
+            K = seen[t] * P / S
+            x, P = x + K * missed, P - K * P
+        return total
+
+    @cached_property
+    def first(self) -> Any:
+        """Runs that no other run goes before, as indices."""
+        ends = self.data.state_at[:, -1]
+        return np.flatnonzero(~np.isin(self.data.state_at[:, 0], ends))
+
+    @cached_property
+    def kept(self) -> Any:
+        """Which flat states a run holds, of bool."""
+        found = np.zeros(len(self.data.states), bool)
+        found[self.data.state_at] = True
+        return found
+
+    def _run(self) -> Any:
+        """Which states of a run are its own, (L + 1, B) of bool."""
+        valid = self.data.valid.T > 0
+        return np.concatenate([np.ones_like(valid[:1]), valid])
+
+    def _source(self, k: int) -> tuple[Any, Any]:
+        """Where in the flat states the sample of every state is, whether there is one."""
+        data = self.data
+        last = (np.cumsum(np.asarray(data.lengths) + 1) - 1)[data.trial_of]
+        at = data.state_at.T + k
+        there = (at <= last) & self._run()
+        at = np.minimum(at, last)
+        return at, there & self.kept[at]
+
+    def _carried(self, values: Array, source: Any, target: Any, missing: float) -> Array:
+        """Values (L, B, ...) from one place in the flat states to another: (index, whether)."""
+        flat = np.full((len(self.data.states), *values.shape[2:]), missing)
+        flat[source[0][source[1]]] = values[source[1]]
+        there = target[1].reshape(*target[1].shape, *[1] * (values.ndim - 2))
+        return np.where(there, flat[target[0]], missing)
+
+
+def delays_of(h: Hypothesis, data: Data) -> Delays | None:
+    """The delays of a hypothesis' sensors; None where it has none."""
+    named = _named(h, data)
+    if not named:
+        return None
+    steps = np.array([d / data.dt for _, d in named])
+    whole = np.floor(steps + 1e-9)
+    part = np.maximum(steps - whole, 0.0)
+    return Delays(data, tuple(i for i, _ in named), tuple(int(k) for k in whole), part)
+
+
+def joined(delays: Sequence[Delays | None]) -> Late | None:
+    """For a batch of hypotheses, each with as many late channels."""
+    each = [one.late() for one in delays if one is not None]
+    if not each:
+        return None
+    channel, part = [late.channel for late in each], [late.part for late in each]
+    return Late(np.concatenate(channel), np.concatenate(part))
+
+
+def _named(h: Hypothesis, data: Data) -> list[tuple[int, float]]:
+    """Channels and delays [s]."""
+    return [
+        (data.model.state_names.index(effect.site.target), float(values["d"]))
+        for effect, values in zip(h.effects, h.values, strict=True)
+        if isinstance(effect.family, SensorDelayFamily)
+    ]

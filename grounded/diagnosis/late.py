@@ -1,0 +1,127 @@
+"""A late measurement in the filter: one state more, and its three passes stay as they are.
+
+    r_i(s) = (1 - p) e_i(s) + p e_i(s - 1) + v(s)         of a late channel i, 0 <= p < 1
+
+Slot i of the widened state is what is measured, z_i(s) = (1 - p) e_i(s) + p e_i(s - 1); slot n + j
+is e_i(s) itself, as a channel that is never measured. So H stays the identity of what is seen, and
+
+    e_i(s + 1) = (F e + d + G w)_i        into slot n + j
+    z_i(s + 1) = (1 - p) (F e + d + G w)_i + p e_i(s)        into slot i
+
+where F takes e_i from slot n + j. Noise enters by G of n + D rows. Coloured noise follows, as ever.
+
+Shapes: L steps, B runs, n channels, D late ones, n' = n + D, N' = n' or 2 n'.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from grounded.frozen import Array
+
+
+class System(NamedTuple):
+    """What `filter.gains` takes."""
+
+    A: Array  # (L, B, N, N)
+    Q: Array  # (L, B, N)
+    R: Array  # (L + 1, B, n)
+    seen: Array  # (L + 1, B, n)
+    start: Array  # (B, N - n)
+    G: Array | None  # (L, B, n, n)
+
+
+@dataclass(frozen=True, eq=False)
+class Late:
+    """Late channels of every run: which (B, D) of int, and p (B, D)."""
+
+    channel: Any
+    part: Array
+
+    @property
+    def count(self) -> int:
+        """D."""
+        return int(self.channel.shape[1])
+
+    def tiled(self, times: int) -> Late:
+        """The same for every run of a batch that holds the runs several times."""
+        return Late(np.tile(self.channel, (times, 1)), np.tile(self.part, (times, 1)))
+
+    def system(self, of: System) -> System:
+        """The widened system."""
+        n, D = of.seen.shape[-1], self.count
+        G = self._entry(of)
+        still = np.zeros((*of.seen.shape[:-1], D))
+        seen, R = np.concatenate([of.seen, still], axis=-1), np.concatenate([of.R, still], axis=-1)
+        mine = self.channel[None]
+        seen[:1, :, n:] = np.take_along_axis(of.seen[:1], mine, axis=-1)
+        R[:, :, n:] = np.take_along_axis(of.R, mine, axis=-1)
+        # the first measurement shows x(-p): since then a part of a step's noise has come
+        power = of.Q[0, :, :n] if of.start.shape[1] == 0 else of.Q[0, :, :n] + of.start
+        since = np.einsum("bdk,bk->bd", G[0, :, n:, :n] ** 2, power)
+        R[0, :, n:] += self.part**2 * since
+        start = of.start if of.start.shape[1] == 0 else np.pad(of.start, [(0, 0), (0, D)])
+        return System(self._transition(of, G), self.noises(of.Q, n), R, seen, start, G)
+
+    def _entry(self, of: System) -> Array:
+        """How noise enters, (L, B, n', n')."""
+        L, B, n, D = *of.A.shape[:2], of.seen.shape[-1], self.count
+        G = np.zeros((L, B, n + D, n + D))
+        G[:, :, :n, :n] = np.eye(n) if of.G is None else of.G
+        return self._led(G, n)
+
+    def _transition(self, of: System, G: Array) -> Array:
+        """A of the widened state, (L, B, N', N')."""
+        (L, B, N, _), n, D = of.A.shape, of.seen.shape[-1], self.count
+        wide, run = n + D, np.arange(B)
+        A = np.zeros((L, B, wide if n == N else 2 * wide, wide if n == N else 2 * wide))
+        A[:, :, :n, :n] = of.A[:, :, :n, :n]
+        A[:, :, :n, n:wide] = np.take_along_axis(A[:, :, :n, :n], self.channel[None, :, None], 3)
+        for j in range(D):
+            A[:, run, :, self.channel[:, j]] = 0.0
+        A[:, :, :wide, :wide] = self._led(A[:, :, :wide, :wide], n)
+        for j in range(D):
+            A[:, run, self.channel[:, j], n + j] += self.part[:, j]
+        if n < N:
+            A[:, :, :wide, wide:] = G
+            A[:, :, wide : wide + n, wide : wide + n] = of.A[:, :, n:, n:]
+        return A
+
+    def _led(self, rows: Array, n: int) -> Array:
+        """Rows of e (L, B, n', C), those of late channels led to slot n + j and, by 1 - p, to i."""
+        found, run = rows.copy(), np.arange(rows.shape[1])
+        found[:, :, n:] = np.take_along_axis(rows, self.channel[None, :, :, None], 2)
+        for j in range(self.count):
+            found[:, run, self.channel[:, j]] *= (1 - self.part[:, j])[:, None]
+        return found
+
+    def columns(self, d: Array, r: Array) -> tuple[Array, Array]:
+        """Columns of d (L, B, n, C) and r (L + 1, B, n, C) for the widened state."""
+        L, B, n, C = d.shape
+        r = np.broadcast_to(r, (L + 1, B, n, C))
+        more = np.zeros((L + 1, B, self.count, C))
+        more[0] = np.take_along_axis(r[0], self.channel[:, :, None], axis=1)
+        wide = np.concatenate([d, np.zeros((L, B, self.count, C))], axis=2)
+        return self._led(wide, n), np.concatenate([r, more], axis=2)
+
+    def errors(self, wide: Array) -> Array:
+        """The errors e themselves (L + 1, B, n, C) of the widened state's (L + 1, B, n', C)."""
+        n, run = wide.shape[2] - self.count, np.arange(wide.shape[1])
+        found = wide[:, :, :n].copy()
+        for j in range(self.count):
+            found[:, run, self.channel[:, j]] = wide[:, :, n + j]
+        return found
+
+    def noises(self, Q: Array, n: int) -> Array:
+        """Variances of w and c (..., N) for the widened state (..., N')."""
+        still = np.zeros((*Q.shape[:-1], self.count))
+        parts = [Q[..., :n], still] + ([Q[..., n:], still] if Q.shape[-1] > n else [])
+        return np.concatenate(parts, axis=-1)
+
+    def disturbances(self, values: Array, n: int) -> Array:
+        """Of values for each slot (L, B, N'), those of w and c, which have noise, (L, B, N)."""
+        wide = n + self.count
+        return np.concatenate([values[..., :n], values[..., wide : wide + n]], axis=-1)
