@@ -39,11 +39,11 @@ class Claims:
             of_parameters(self.predictor, self.null, off, candidates) if off else ()
         )
 
-    def ranking(self, track: Any, where: Any, before: float) -> tuple[Ranked, ...]:
+    def ranking(self, where: Any, before: float) -> tuple[Ranked, ...]:
         """The claimed effects first (by what would be lost without each), then what lost."""
         search, rows = self.search, []
         parts = self.parts()
-        after = normalised(held_out(self.predictor, self.best, track, where), where)
+        after = normalised(held_out(self.predictor, self.best, self.best.track, where), where)
         for name in sorted(self.names, key=lambda n: -parts[n]):
             claimed = not self.known.no_cause
             rows.append(self._row(self.best, name, parts[name], after, before, claimed=claimed))
@@ -51,7 +51,7 @@ class Claims:
         listed = [row.effect for row in rows]
         singles = [f for f in search.of_size(1) if f.hypothesis.names[0] not in listed]
         singles = singles[: max(RANKED - len(rows), 3)]
-        gaps = gaps_of(self.predictor, singles, track, where)
+        gaps = gaps_of(self.predictor, singles, where)
         for fit, gap in zip(singles, gaps, strict=True):
             name = fit.hypothesis.names[0]
             evidence = search.score(fit) - self.base

@@ -32,7 +32,7 @@ def confirmed(search: Search, best: Fit, seconds: float) -> Fit:
     rivals.sort(key=lambda f: -score(f))
     for fit in [best, *rivals[: TRIES - 1]]:
         where = horizon(search.predictor, fit, seconds)
-        found = shrinkage(search.predictor, fit, fit.track, where)
+        found = shrinkage(search.predictor, fit, null.track, where)
         if not found.gap_after > RUNAWAY * found.gap_before:
             return fit
     return null

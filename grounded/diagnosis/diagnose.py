@@ -23,6 +23,7 @@ from grounded.diagnosis.attribution import attribute
 from grounded.diagnosis.claims import Claims
 from grounded.diagnosis.confirm import confirmed
 from grounded.diagnosis.data import prepare, usable
+from grounded.diagnosis.delays import delays_of
 from grounded.diagnosis.fitted import Fit
 from grounded.diagnosis.gap import Horizon, by_region, by_time, explained, horizon
 from grounded.diagnosis.hypothesis import Hypothesis
@@ -34,7 +35,7 @@ from grounded.diagnosis.shrinkage import shrinkage, whole_runs
 from grounded.diagnosis.split import repeated, split
 from grounded.diagnosis.utility_prediction import utility_prediction
 from grounded.diagnosis.verdict import next_trial, verdict
-from grounded.effects import Library, SensorDelayFamily, SensorFamily
+from grounded.effects import Library
 from grounded.model import Model
 from grounded.task import Task
 from grounded.trial import Trial
@@ -115,14 +116,14 @@ class _Writer:
         data, predictor = self.data, self.predictor
         self.tick("gap")
         where = horizon(predictor, self.best, self.options.horizon)
-        track = self.track()
-        shrunk = shrinkage(predictor, self.best, track, where)
+        bare = self.claims.null.track  # a prediction starts from its own hypothesis' states
+        shrunk = shrinkage(predictor, self.best, bare, where)
         gain = explained(predictor, Hypothesis(), self.best)
         if self.left:
             i = data.model.state_names.index(self.left[0].channel)
             gain = gain.copy()
             gain[..., i] += self.left[0].improvement
-        ranking = self.claims.ranking(track, where, shrunk.gap_before)
+        ranking = self.claims.ranking(where, shrunk.gap_before)
         groups = self.claims.groups()
         alike = self.claims.nearly(groups)
         remainder = tuple(self.remainder(left) for left in self.left)
@@ -152,25 +153,16 @@ class _Writer:
             next_trial=next_trial(self.claims, self.left, groups),
             unknowable=self.known.sentences,
             noise=self.noise(),
-            whole_run=self.whole_run(track),
+            whole_run=self.whole_run(bare),
             parameters=self.claims.parameters(),
             lookalikes=alike,
-            split=self.split(track, where),
+            split=self.split(bare, where),
             whiteness=self.whiteness(),
-            utility_prediction=self.utility_prediction(track),
+            utility_prediction=self.utility_prediction(bare),
             trials=data.count,
             steps=data.steps,
             candidates=len(self.search.candidates),
         )
-
-    def track(self) -> Any:
-        """Filtered states that predictions start from: the best hypothesis', as logged."""
-        sensors = [
-            e
-            for e in self.best.hypothesis.effects
-            if isinstance(e.family, SensorFamily | SensorDelayFamily)
-        ]
-        return self.claims.null.track if sensors else self.best.track
 
     def remainder(self, left: Leftover) -> Remainder:
         """A leftover with the region where it acts."""
@@ -217,17 +209,17 @@ class _Writer:
             "outliers": not isinstance(noise.weight_v, float),
         }
 
-    def whole_run(self, track: Any) -> dict[str, Any]:
+    def whole_run(self, bare: Any) -> dict[str, Any]:
         """Errors of predictions from the first state to the end of each run."""
         names = self.data.model.state_names
-        before = whole_runs(self.predictor, Hypothesis(), track)
-        after = whole_runs(self.predictor, self.best.hypothesis, track)
+        before = whole_runs(self.predictor, Hypothesis(), bare)
+        after = whole_runs(self.predictor, self.best.hypothesis, self.best.track)
         return {
             n: {"before": float(b), "after": float(a), "unit": self.data.model.states[n]}
             for n, b, a in zip(names, before, after, strict=True)
         }
 
-    def split(self, track: Any, where: Horizon) -> dict[str, Any]:
+    def split(self, bare: Any, where: Horizon) -> dict[str, Any]:
         """Explained, unexplained, irreducible: one step, the horizon, a whole run."""
         repeats = repeated([trial.candidate for trial in self.trials])
         horizons = {
@@ -236,21 +228,23 @@ class _Writer:
             "whole_run": horizon(self.predictor, self.best, np.inf),
         }
         return {
-            name: split(self.predictor, self.best, track, one, repeats).to_dict(self.data)
+            name: split(self.predictor, self.best, bare, one, repeats).to_dict(self.data)
             for name, one in horizons.items()
         }
 
     def whiteness(self) -> dict[str, float]:
         """The chance that white noise leaves innovations as correlated as these, by channel."""
-        found = whiteness(self.best, self.data.seen)
+        delays = delays_of(self.best.hypothesis, self.data)
+        seen = self.data.seen if delays is None else delays.samples()[1]
+        found = whiteness(self.best, seen)
         return {name: found[str(i)] for i, name in enumerate(self.data.model.state_names)}
 
-    def utility_prediction(self, track: Any) -> dict[str, Any] | None:
+    def utility_prediction(self, bare: Any) -> dict[str, Any] | None:
         """Rms errors of predicted utilities, held out; None for a bare model."""
         if self.task is None:
             return None
         self.tick("utility")
-        found = utility_prediction(self.predictor, self.best, track, self.task, self.trials)
+        found = utility_prediction(self.predictor, self.best, bare, self.task, self.trials)
         return found.to_dict()
 
 

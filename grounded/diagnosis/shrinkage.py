@@ -38,10 +38,10 @@ class Shrinkage:
         return normalised(self.after, self.where)
 
 
-def shrinkage(predictor: Predictor, fit: Fit, track: Array, where: Horizon) -> Shrinkage:
-    """Held-out errors before and after."""
-    before = errors(predictor, Hypothesis(), track, where)
-    return Shrinkage(where, before, held_out(predictor, fit, track, where))
+def shrinkage(predictor: Predictor, fit: Fit, bare: Array, where: Horizon) -> Shrinkage:
+    """Held-out errors before, from the states `bare` (L + 1, B, n), and after, from its own."""
+    before = errors(predictor, Hypothesis(), bare, where)
+    return Shrinkage(where, before, held_out(predictor, fit, fit.track, where))
 
 
 def held_out(predictor: Predictor, fit: Fit, track: Array, where: Horizon) -> Array:
@@ -89,6 +89,6 @@ def whole_runs(predictor: Predictor, h: Hypothesis, track: Array) -> Array:
     return np.asarray(np.sqrt(total / np.maximum(count, 1)))
 
 
-def gaps_of(predictor: Predictor, fits: Sequence[Fit], track: Array, where: Horizon) -> list[float]:
+def gaps_of(predictor: Predictor, fits: Sequence[Fit], where: Horizon) -> list[float]:
     """The gap that each of several hypotheses leaves, held out."""
-    return [normalised(held_out(predictor, fit, track, where), where) for fit in fits]
+    return [normalised(held_out(predictor, fit, fit.track, where), where) for fit in fits]

@@ -79,25 +79,25 @@ def _named(shares: Array) -> dict[str, float]:
 
 
 def split(
-    predictor: Predictor, fit: Fit, track: Array, where: Horizon, repeats: Sequence[Sequence[int]]
+    predictor: Predictor, fit: Fit, bare: Array, where: Horizon, repeats: Sequence[Sequence[int]]
 ) -> Split:
     """The parts of the error at one horizon.
 
     Args:
         predictor: the data.
         fit: the best hypothesis.
-        track: filtered states that predictions start from.
+        bare: filtered states that the bare model's predictions start from; the fit has its own.
         where: the horizon (`gap.horizon`).
         repeats: groups of trials (indices) that ran the same candidate.
     """
-    before = errors(predictor, Hypothesis(), track, where)
-    after = held_out(predictor, fit, track, where)
+    before = errors(predictor, Hypothesis(), bare, where)
+    after = held_out(predictor, fit, fit.track, where)
     return Split(
         where.steps * predictor.data.dt,
         _mean_square(before),
         _mean_square(after),
         (where.spread**2).mean(axis=0),
-        scatter(predictor, fit, track, where.steps, repeats),
+        scatter(predictor, fit, where.steps, repeats),
     )
 
 
@@ -108,7 +108,7 @@ def _mean_square(error: Array) -> Array:
 
 
 def scatter(
-    predictor: Predictor, fit: Fit, track: Array, steps: int, repeats: Sequence[Sequence[int]]
+    predictor: Predictor, fit: Fit, steps: int, repeats: Sequence[Sequence[int]]
 ) -> Array | None:
     """Variance of prediction errors among repeats of one candidate, (n,); None without repeats."""
     data = predictor.data
@@ -124,7 +124,7 @@ def scatter(
                 continue
             at, run = np.tile(moments, len(runs)), np.repeat(runs, len(moments))
             where = Horizon(steps, at, run, np.ones((len(at), data.model.n)))
-            error = errors(predictor, fit.hypothesis, track, where)
+            error = errors(predictor, fit.hypothesis, fit.track, where)
             error = error.reshape(len(runs), len(moments), -1)
             whole = np.isfinite(error).all(axis=0)
             variance = np.where(whole, np.nan_to_num(error).var(axis=0, ddof=1), 0.0)

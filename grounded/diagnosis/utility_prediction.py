@@ -52,14 +52,14 @@ def _rms(error: Array) -> float | None:
 
 
 def utility_prediction(
-    predictor: Predictor, fit: Fit, track: Array, task: Task, trials: Sequence[Trial]
+    predictor: Predictor, fit: Fit, bare: Array, task: Task, trials: Sequence[Trial]
 ) -> UtilityPrediction:
     """Real and predicted utilities of the trials that ran to the horizon.
 
     Args:
         predictor: the data that were made from `trials`.
         fit: the best hypothesis.
-        track: filtered states that predictions start from.
+        bare: filtered states that the bare model starts from; the fit has its own.
         task: whose reward it is.
         trials: those of the data, in its order.
     """
@@ -73,8 +73,9 @@ def utility_prediction(
         if not np.isfinite(real) or i not in groups:
             continue
         own = h if shifts is None else moved(predictor, h, shifts[groups.index(i)])
-        start = track[0, int(np.flatnonzero(data.trial_of == i)[0])]
-        parts = [task.utility(_again(predictor, g, trial, start, i)) for g in (Hypothesis(), own)]
+        first = int(np.flatnonzero(data.trial_of == i)[0])
+        pairs = [(Hypothesis(), bare[0, first]), (own, fit.track[0, first])]
+        parts = [task.utility(_again(predictor, g, trial, start, i)) for g, start in pairs]
         rows.append([real, *parts])
     found = np.array(rows).reshape(-1, 3)
     return UtilityPrediction(found[:, 0], found[:, 1], found[:, 2])
