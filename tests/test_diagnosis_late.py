@@ -7,9 +7,12 @@ from grounded.diagnosis import kernels
 from grounded.diagnosis.data import prepare
 from grounded.diagnosis.delays import delays_of
 from grounded.diagnosis.filter import UNKNOWN, Adjoint, gains, innovations, smoother, transition
+from grounded.diagnosis.gap import horizon, normalised
 from grounded.diagnosis.hypothesis import Hypothesis
 from grounded.diagnosis.late import Late
 from grounded.diagnosis.noise import Noise, Structure
+from grounded.diagnosis.search import Search
+from grounded.diagnosis.shrinkage import held_out
 from grounded.effects import Library
 from grounded.models.pendulum import model as pendulum
 from grounded.trial import Trial
@@ -200,3 +203,34 @@ def test_samples_of_what_was_before_a_trial_count_like_those_of_a_state_that_dri
     assert delays.before(noise, None, still, white, certain) == pytest.approx(
         max(exact, -1.0 * whole * 2)
     )
+
+
+def test_a_delay_is_found_where_the_state_is_disturbed_and_predictions_reach_the_noise():
+    rng, dt, late = np.random.default_rng(3), 0.02, 2.4
+    trials = []
+    for _ in range(4):
+        T = 260
+        u = 1.5 * np.sin(np.arange(T) * dt * rng.uniform(2, 6) + rng.uniform(0, 6))[:, None]
+        x = [np.array([0.5, 0.0])]
+        for t in range(T):
+            after = pendulum.system.step(x[-1][None], u[t][None], pendulum.values, dt)[0]
+            x.append(after + [0.0, 0.03] * rng.standard_normal(2))
+        log, at = np.array(x), np.maximum(np.arange(T + 1) - late, 0.0)
+        log[:, 1] = np.interp(at, np.arange(T + 1), log[:, 1])
+        log += [0.002, 0.01] * rng.standard_normal(log.shape)
+        trials.append(Trial(log, u, dt, pendulum.state_names, pendulum.input_names))
+    data = prepare(pendulum, trials)
+    search, found = Search(data, ()), {}
+    (null,) = search.refined([search.fresh(Hypothesis())], 20)
+    for name, values in (("sensor_delay", {"d": 0.03}), ("viscous_friction", {"k": 0.1})):
+        effect = Library().effect(f"{name}:omega", pendulum, data.scales)
+        h = null.hypothesis.plus(effect, values)
+        (found[name],) = search.refined([(h, null.noise, null.track)], 25)
+    fit = found["sensor_delay"]
+    assert fit.hypothesis.values[0]["d"] == pytest.approx(late * dt, abs=0.05 * dt)
+    assert fit.loglik > max(null.loglik, found["viscous_friction"].loglik) + 300
+    assert np.exp(0.5 * fit.noise.log_q[1]) == pytest.approx(0.03, rel=0.1)
+    where = horizon(search.predictor, fit, 0.5)
+    error = held_out(search.predictor, fit, fit.track, where)
+    of_late = float(np.sqrt((error[:, 1] ** 2 / where.spread[:, 1] ** 2).mean()))
+    assert 0.85 < of_late < 1.15 and 0.85 < normalised(error, where) < 1.15

@@ -23,7 +23,6 @@ def linearised(predictor: Predictor, h: Hypothesis, track: Array) -> tuple[Array
     """F (L, B, n, n); columns of d and r: the residual first, then each value, then each shift."""
     data = predictor.data
     model = data.model
-    L, B = data.time.shape
     x = track[:-1]
     u = predictor.inputs(h)
     after = predictor.advance(h, x, u, data.time)
@@ -49,21 +48,27 @@ def linearised(predictor: Predictor, h: Hypothesis, track: Array) -> tuple[Array
         other_shown = shown if delays is None else delays.moved(other).shown(ahead, track)
         shifted = predictor.standing(other, other_shown)
         columns_r.append((shown - other_shown + offset - shifted) / moved)
-    d, r = np.stack(columns_d, axis=-1), np.stack(columns_r, axis=-1)
+    F, of_shifts = _sensitivities(predictor, h, x, u)
+    more = np.zeros((*track.shape, of_shifts.shape[-1]))
+    d = np.concatenate([np.stack(columns_d, axis=-1), of_shifts], axis=-1)
+    return F, d, np.concatenate([np.stack(columns_r, axis=-1), more], axis=-1)
+
+
+def _sensitivities(predictor: Predictor, h: Hypothesis, x: Array, u: Array) -> tuple[Array, Array]:
+    """F (L, B, n, n) and what each shift adds to a step, (L, B, n, k); k = 0 without shifts."""
+    data, p = predictor.data, predictor.params(h)
+    model, (L, B) = data.model, data.time.shape
     flat = (
         np.ascontiguousarray(x.reshape(-1, model.n)),
         np.ascontiguousarray(u.reshape(-1, model.m)),
     )
-    p = predictor.params(h)
-    if h.spread > 0:
-        which = calibrated(data)
-        f_x, _, f_p = model.system.sensitivities(*flat, p, data.dt)
-        scaled = f_p[:, :, which] * param_scale(model)[which]
-        d = np.concatenate([d, scaled.reshape(L, B, model.n, -1)], axis=-1)
-        r = np.concatenate([r, np.zeros((L + 1, B, model.n, len(which)))], axis=-1)
-    else:
+    if h.spread == 0:
         f_x, _ = model.system.linearise(*flat, p, data.dt)
-    return f_x.reshape(L, B, model.n, model.n), d, r
+        return f_x.reshape(L, B, model.n, model.n), np.zeros((L, B, model.n, 0))
+    which = calibrated(data)
+    f_x, _, f_p = model.system.sensitivities(*flat, p, data.dt)
+    scaled = f_p[:, :, which] * param_scale(model)[which]
+    return f_x.reshape(L, B, model.n, model.n), scaled.reshape(L, B, model.n, -1)
 
 
 def noise_entry(predictor: Predictor, h: Hypothesis, track: Array) -> Array | None:

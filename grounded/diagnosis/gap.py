@@ -79,7 +79,8 @@ def _spread(predictor: Predictor, fit: Fit, at: Any, run: Any, steps: int) -> Ar
     k = np.arange(wide, wide + n if wide < N else wide)
     P[:, k, k] = noise.start(1)[0] if wide < N else 0.0
     late = {} if delays is None else dict(zip(delays.channel, delays.whole, strict=True))
-    # what a late channel shows at the horizon is that much nearer
+    # what a late channel shows at the horizon is that much nearer; what lies before the moment has
+    # been filtered already, and this is more than its error
     found = {i: P[:, i, i] for i, whole in late.items() if whole >= steps}
     for j in range(steps):
         A, q = g.A[at + j, run], Q[at + j, run]

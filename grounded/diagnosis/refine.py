@@ -22,7 +22,8 @@ import numpy as np
 from grounded.diagnosis import filter as kalman
 from grounded.diagnosis.climb import MOST_NUMBERS, Work, measured, proposed, spread_over
 from grounded.diagnosis.columns import gains_of, linearised, noise_entry
-from grounded.diagnosis.delays import delays_of, joined
+from grounded.diagnosis.data import Data
+from grounded.diagnosis.delays import Delays, delays_of, joined
 from grounded.diagnosis.fitted import Fit, calibrated, shift_precision
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor, param_scale
 from grounded.diagnosis.noise import Noise, cleaned
@@ -84,19 +85,9 @@ def _iterate(predictor: Predictor, works: list[Work], fixed_noise: bool) -> None
     width = kalman.whole(max(part[1].shape[-1] for part in parts), data.model.n)
     d = np.concatenate([_padded(part[1], width) for part in parts], axis=1)
     r = np.concatenate([_padded(part[2], width) for part in parts], axis=1)
-    F = np.concatenate([part[0] for part in parts], axis=1)
     carried = [noise_entry(predictor, work.h, work.track) for work in works]
-    entries = [entry for entry in carried if entry is not None]
-    G = np.concatenate(entries, axis=1) if entries else None
-    phi = works[0].noise.structure.phi(data.dt)
-    Q = np.concatenate([spread_over(w.noise.process(data.dt), (L, B)) for w in works], axis=1)
-    moved = zip(works, late, strict=True)
-    by_state = [work.noise if s is None else s.noise(work.noise) for work, s in moved]
-    R = np.concatenate([spread_over(w.measurement(L), (L + 1, B)) for w in by_state], axis=1)
-    start = np.concatenate([w.noise.start(B) for w in works])
-    seen = np.concatenate([data.seen if s is None else s.samples()[1] for s in late], axis=1)
     try:
-        g = kalman.gains(kalman.transition(F, phi, G), Q, R, seen, start, G, joined(late))
+        g = _gains(data, works, late, [part[0] for part in parts], carried)
     except np.linalg.LinAlgError:
         for work in works:
             work.still = 1
@@ -126,6 +117,28 @@ def _iterate(predictor: Predictor, works: list[Work], fixed_noise: bool) -> None
             None if fixed_noise else memory,
             before,
         )
+
+
+def _gains(
+    data: Data,
+    works: list[Work],
+    late: list[Delays | None],
+    jacobians: list[Array],
+    carried: list[Array | None],
+) -> kalman.Gains:
+    """The gains of all works' filters, one after the other along the runs."""
+    L, B = data.time.shape
+    entries = [entry for entry in carried if entry is not None]
+    G = np.concatenate(entries, axis=1) if entries else None
+    phi = works[0].noise.structure.phi(data.dt)
+    Q = np.concatenate([spread_over(w.noise.process(data.dt), (L, B)) for w in works], axis=1)
+    moved = zip(works, late, strict=True)
+    by_state = [work.noise if s is None else s.noise(work.noise) for work, s in moved]
+    R = np.concatenate([spread_over(w.measurement(L), (L + 1, B)) for w in by_state], axis=1)
+    start = np.concatenate([w.noise.start(B) for w in works])
+    seen = np.concatenate([data.seen if s is None else s.samples()[1] for s in late], axis=1)
+    A = kalman.transition(np.concatenate(jacobians, axis=1), phi, G)
+    return kalman.gains(A, Q, R, seen, start, G, joined(late))
 
 
 def clean(predictor: Predictor, fit: Fit, rounds: int = 8) -> Fit:
