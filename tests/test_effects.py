@@ -136,7 +136,7 @@ def test_the_contract_names_every_family():
     named = (
         "input_bias input_gain delay first_order_lag dead_zone stall saturation rate_limit "
         "backlash input_fade offset rate_gain viscous_friction coulomb_friction quadratic_drag "
-        "stiction "
+        "stiction slew_limit "
         "coupling periodic patch drift_world drift_body side_slip understeer slope trend "
         "odometry_scale sensor_bias sensor_scale sensor_delay parameter"
     )

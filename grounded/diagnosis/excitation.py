@@ -23,7 +23,7 @@ from grounded.diagnosis.hypothesis import Hypothesis, Predictor
 from grounded.diagnosis.noise import Noise, Structure
 from grounded.diagnosis.refine import refine
 from grounded.diagnosis.report import Diagnosis
-from grounded.effects import Effect, Library, scales_of, wrap
+from grounded.effects import Effect, Library, scales_of, wrap, wrapping_order
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.policy import Policy, Runner
@@ -163,10 +163,7 @@ def _noise(model: Model, diagnosis: Diagnosis) -> Noise:
 
 def _run(task: Task, h: Hypothesis, policy: Policy) -> Trial | None:
     """A run of the policy in the model with a hypothesis, without noise; None if it diverges."""
-    model = task.model
-    for effect, values in zip(h.effects, h.values, strict=True):
-        current = Library((effect.family,)).effect(effect.name, model, effect.site.scales)
-        model = wrap(current, values, task.dt)
+    model = _wrapped(task, h)
     assert task.latency is not None
     start = Trial(
         task.start[None],
@@ -201,6 +198,16 @@ def _run(task: Task, h: Hypothesis, policy: Policy) -> Trial | None:
         task.model.input_names,
         start_inputs=task.past,
     )
+
+
+def _wrapped(task: Task, h: Hypothesis) -> Model:
+    """The model with a hypothesis' effects in it."""
+    model = task.model
+    for i in wrapping_order([effect.family for effect in h.effects]):
+        effect = h.effects[i]
+        current = Library((effect.family,)).effect(effect.name, model, effect.site.scales)
+        model = wrap(current, h.values[i], task.dt)
+    return model
 
 
 def _memory_start(wrapped: Model, base: Model, trial: Trial) -> Array:

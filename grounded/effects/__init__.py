@@ -16,8 +16,10 @@ from grounded.effects.family import (
     Site,
     scales_of,
 )
+from grounded.effects.order import acting_order, wrapping_order
+from grounded.effects.recall import memory_of, memory_start
 from grounded.effects.registry import Library
-from grounded.effects.wrap import memory_of, memory_start, param_name, wrap
+from grounded.effects.wrap import param_name, wrap
 
 __all__ = [
     "Effect",
@@ -32,9 +34,11 @@ __all__ = [
     "SensorDelayFamily",
     "SensorFamily",
     "Site",
+    "acting_order",
     "memory_of",
     "memory_start",
     "param_name",
     "scales_of",
     "wrap",
+    "wrapping_order",
 ]

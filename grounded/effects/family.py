@@ -150,22 +150,31 @@ class MemoryFamily(Family):
     """advance(u, z, c, dt) -> (mean input over the step, next memory); z has `depth` entries.
 
     `depth(values, dt)`: how many memory states the effect needs, all starting at the input that
-    was held before t = 0.
+    was held before t = 0. `transport`: a pure delay, which acts after all others (`order.py`).
     """
 
     advance: Callable[[Any, tuple[Any, ...], Any, Any], tuple[Any, tuple[Any, ...]]] = (
         lambda u, z, c, dt: (u, z)
     )
     depth: Callable[[Mapping[str, float], float], int] = lambda values, dt: 1
+    transport: bool = False
 
 
 @dataclass(frozen=True)
 class RateFamily(Family):
-    """rate(s, a, own, t, c, site) -> {state: added rate}; `own` are the model's own rates."""
+    """rate(s, a, own, t, c, site) -> {state: added rate}; `own` are the model's own rates.
+
+    `parts`: it acts on the mean rate of so many parts of the step, not half before and half after:
+
+        x+ = x + h (own + rate(x)),   own = (f(x, h) - x) / h,   h = dt / parts
+
+    right where it limits a rate whose own time constant may be shorter than the step.
+    """
 
     rate: Callable[[Any, Any, Any, Any, Any, Site], Values] = lambda s, a, own, t, c, site: {}
     timed: bool = False
     needs_own: bool = False
+    parts: int = 0
 
 
 @dataclass(frozen=True)

@@ -22,9 +22,9 @@ def _gain(site: Site) -> tuple[Quantity, ...]:
 
 
 def _threshold(site: Site) -> tuple[Quantity, ...]:
-    """A threshold below which something differs: scanned over the values that were commanded."""
+    """A threshold below which something differs: scanned, the small ones closely."""
     peak = site.scales.peak(site.target)
-    grid = tuple(float(v) for v in np.linspace(0.03, 0.75, 14) * peak)
+    grid = tuple(float(v) for v in np.linspace(0.15, 0.87, 20) ** 2 * peak)
     return (Quantity("c", site.unit(site.target), grid, 0.0, peak, places=8),)
 
 
@@ -45,7 +45,8 @@ input_bias = InputFamily(
     sentence="{target} has an offset of {b}",
     targets=places.inputs,
     quantities=_bias,
-    lookalikes=("offset", "input_fade"),
+    lookalikes=("offset", "input_fade", "dead_zone"),
+    vague=0.7,  # ln 2: it may have either sign
     effect=lambda u, t, c: u + c["b"],
 )
 
@@ -85,7 +86,7 @@ saturation = InputFamily(
     sentence="{target} saturates at {c}",
     targets=places.inputs,
     quantities=_limit,
-    lookalikes=("rate_limit", "input_gain", "quadratic_drag"),
+    lookalikes=("rate_limit", "slew_limit", "input_gain", "quadratic_drag"),
     effect=lambda u, t, c: np.minimum(np.maximum(u, -c["c"]), c["c"]),
 )
 

@@ -99,6 +99,7 @@ delay = MemoryFamily(
     lookalikes=("first_order_lag", "rate_limit", "sensor_delay"),
     advance=_advance_delay,
     depth=_queue_length,
+    transport=True,
 )
 
 first_order_lag = MemoryFamily(
@@ -107,7 +108,7 @@ first_order_lag = MemoryFamily(
     sentence="{target} lags with a time constant of {tau}",
     targets=places.inputs,
     quantities=_lag,
-    lookalikes=("delay", "rate_limit", "parameter"),
+    lookalikes=("delay", "rate_limit", "slew_limit", "parameter"),
     advance=_advance_lag,
 )
 
@@ -117,7 +118,7 @@ rate_limit = MemoryFamily(
     sentence="{target} can't move faster than {r}",
     targets=places.inputs,
     quantities=_rate,
-    lookalikes=("first_order_lag", "delay", "saturation"),
+    lookalikes=("slew_limit", "first_order_lag", "delay", "saturation"),
     advance=_advance_rate,
 )
 

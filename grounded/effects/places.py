@@ -10,6 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from grounded.model import Model
 
 POSITIONS = (("x", "y"), ("north", "east"), ("px", "py"), ("pos_x", "pos_y"))
@@ -82,3 +84,21 @@ def pairs(model: Model) -> list[str]:
     names = dynamic(model)
     targets = [n for n in model.state_names if n not in position(model)]
     return [f"{t}<-{s}" for t in targets for s in names if s != t]
+
+
+def following(model: Model) -> list[str]:
+    """States that follow an input by themselves: a steering angle, a motor's speed, a servo.
+
+    Their rate depends on an input, on no state but themselves, and somewhere falls with them.
+    """
+    rng, dt = np.random.default_rng(0), 1e-2
+    x, u = rng.uniform(0.2, 1.0, (8, model.n)), rng.uniform(0.2, 1.0, (8, model.m))
+    f_x, f_u = model.system.linearise(x, u, model.values, dt)
+    found = []
+    for i, name in enumerate(model.state_names):
+        driven = np.abs(f_u[:, i]).max() > 1e-6
+        alone = np.abs(np.delete(f_x[:, i], i, axis=1)).max(initial=0.0) < 1e-6
+        own = f_x[:, i, i]
+        if driven and alone and own.min() < 1 - 1e-6 and np.abs(own).max() > 1e-9:
+            found.append(name)
+    return [name for name in found if name not in position(model)]

@@ -11,7 +11,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from grounded.effects import friction, geometry, input, memory, parameter, places, rate, sensor
+from grounded.effects import (
+    friction,
+    geometry,
+    input,
+    memory,
+    parameter,
+    places,
+    rate,
+    sensor,
+    slew,
+)
 from grounded.effects.family import Effect, Family, RateFamily, Scales, Site
 from grounded.errors import GroundedError, nearest
 from grounded.model import Model
@@ -20,6 +30,7 @@ BUILT_IN: tuple[Family, ...] = (
     *input.FAMILIES,
     *memory.FAMILIES,
     *rate.FAMILIES,
+    *slew.FAMILIES,
     *friction.FAMILIES,
     *geometry.FAMILIES,
     *sensor.FAMILIES,

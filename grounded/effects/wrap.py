@@ -6,11 +6,12 @@ One control step of the wrapped model, for commands held over the step:
     own    = (f(s, u_eff) - s) / dt               the model's own rate, its mean over the step
     s1     = f(s + dt/2 rate(s), u_eff)           half of an added rate before the step ...
     s+     = s1 + dt/2 rate(s1)                   ... and half after it (Strang): second order in dt
+    s+     = s + h (own + rate(s))                families that limit a rate, h = dt / parts
     y+     = measure(s+),  s = recover(y)         sensor families
 
 It is a `step` model in plain NumPy, so that it is traced and compiled where the original was.
 Memory (a lag's output, a queue, a clock) becomes further states, all of them functions of the
-commands and the measured states: `memory_of` recovers them along a recorded trial.
+commands and the measured states: `memory_of` (recall.py) recovers them along a recorded trial.
 """
 
 from __future__ import annotations
@@ -33,9 +34,7 @@ from grounded.effects.family import (
 )
 from grounded.effects.registry import partner
 from grounded.errors import GroundedError
-from grounded.frozen import Array
 from grounded.model import Model, Param
-from grounded.trial import Trial
 
 Step = Callable[[Any, Any, Any, Any], dict[str, Any]]
 
@@ -89,6 +88,7 @@ def wrap(effect: Effect, values: Mapping[str, float], dt: float) -> Model:
     }
     for kind, build in make.items():
         if isinstance(family, kind):
+            build = _limit_step if isinstance(family, RateFamily) and family.parts else build
             step, memory = build(effect, whole, dt)
             break
     else:
@@ -205,6 +205,36 @@ def _rate_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str
     return step, {clock: "s"} if timed else {}
 
 
+def _limit_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str, str]]:
+    """A rate that acts on the mean rate of parts of the step."""
+    model, family = effect.site.model, effect.family
+    assert isinstance(family, RateFamily)
+    base, clock, timed = plain_step(model), _clock(effect), family.timed
+    tied = {n: k for n in model.state_names if (k := partner(model, n))}
+
+    def step(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
+        start, t = _own_state(model, s), s[clock] if timed else 0.0
+        final, h, touched = start, dt / family.parts, 0.0
+        for part in range(family.parts):
+            ahead = base(final, a, p, h)
+            own = {n: (ahead[n] - final[n]) / h for n in start}
+            added = family.rate(final, a, own, t + part * h, _quantities(effect, p), effect.site)
+            values = [ahead[n] + h * added[n] if n in added else ahead[n] for n in start]
+            final = Named("state", model.state_names, values)
+            touched = touched + sum(np.abs(rate) for rate in added.values())
+        ahead = base(start, a, p, dt)
+        values = [np.where(touched > 0, final[n], ahead[n]) for n in start]
+        final = Named("state", model.state_names, values)
+        result = dict(final)
+        for n, k in tied.items():
+            if model.derivative is not None:
+                first, last = model.derivative(start, a, p), model.derivative(final, a, p)
+                result[k] = s[k] + last[n] - first[n]
+        return {**result, clock: t + dt} if timed else result
+
+    return step, {clock: "s"} if timed else {}
+
+
 def _in_order(model: Model, values: Mapping[str, Any]) -> list[Any]:
     return [values[n] for n in model.state_names]
 
@@ -251,36 +281,3 @@ def _sensor_delay_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, 
         return {**after, target: logged, **dict(zip(memory, line, strict=False))}
 
     return step, dict.fromkeys(memory, model.states[target])
-
-
-def memory_of(wrapped: Model, base: Model, trial: Trial) -> Array:
-    """The memory states along a recorded trial, (T + 1, wrapped.n - base.n).
-
-    They start at what held before t = 0 (the held input, the first logged value, a clock at zero)
-    and follow the commands and the logged states.
-    """
-    extra = wrapped.state_names[base.n :]
-    now = memory_start(wrapped, base, trial)
-    found = [now]
-    for t in range(trial.steps):
-        x = np.concatenate([trial.states[t], now])[None]
-        after = wrapped.system.step(x, trial.inputs[t][None], wrapped.values, trial.dt)
-        now = after[0, base.n :]
-        found.append(now)
-    return np.array(found).reshape(trial.steps + 1, len(extra))
-
-
-def memory_start(wrapped: Model, base: Model, trial: Trial) -> Array:
-    """The memory states at t = 0, (wrapped.n - base.n,)."""
-    held = np.zeros(base.m) if trial.start_inputs is None else trial.start_inputs
-    start = []
-    for name in wrapped.state_names[base.n :]:
-        inputs = [i for i, n in enumerate(base.input_names) if name.startswith(f"{n}_")]
-        states = [i for i, n in enumerate(base.state_names) if name.startswith(f"{n}_true")]
-        if name.endswith("_clock"):
-            start.append(0.0)
-        elif states:
-            start.append(float(trial.states[0, states[-1]]))
-        else:
-            start.append(float(held[inputs[-1]]) if inputs else 0.0)
-    return np.array(start)

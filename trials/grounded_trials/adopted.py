@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from grounded.effects.order import wrapping_order
 from grounded.effects.registry import Library
 from grounded.effects.wrap import wrap
 from grounded.errors import GroundedError
@@ -24,7 +25,7 @@ from grounded.task import Task
 def planner_with(
     task: Task, effects: Sequence[Mapping[str, Any]], library: Library | None = None
 ) -> Planner:
-    """The planner of a task whose model got these effects, in their order.
+    """The planner of a task whose model got these effects, in the order in which they act.
 
     Raises:
         GroundedError: for an unknown effect, or a quantity that is missing or unknown.
@@ -32,7 +33,9 @@ def planner_with(
     library = library or Library()
     assert task.latency is not None
     model, latency = task.model, np.array(task.latency)
-    for entry in effects:
+    families = [library.family(str(entry["name"]).partition(":")[0]) for entry in effects]
+    for i in wrapping_order(families):
+        entry = effects[i]
         name = str(entry["name"])
         values = {key: value for key, value in entry.items() if key != "name"}
         for key, value in values.items():
@@ -41,9 +44,8 @@ def planner_with(
                     f"grounded.toml: [model] effects: {name}: {key} must be a number, "
                     f"found {value!r}"
                 )
-        family, _, target = name.partition(":")
-        if family == "delay":
-            for one in target.split("+"):
+        if families[i].name == "delay":
+            for one in name.partition(":")[2].split("+"):
                 latency[_input(task, name, one)] += float(values.get("d", 0.0))
             continue
         effect = library.effect(name, model)
