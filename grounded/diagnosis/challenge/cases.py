@@ -235,7 +235,7 @@ def _truth(
     while len(effects) < (2 if kind == "double" else 1):
         effect = draw(model, scales, rng)
         if effect.name not in [e.name for e, _ in effects]:
-            effects.append((effect, values_of(effect, scales, rng)))
+            effects.append((effect, values_of(effect, scales, rng, states)))
     true_model = model
     for effect, values in effects:
         if isinstance(effect.family, ParamFamily):

@@ -7,7 +7,10 @@ from typing import Any
 import numpy as np
 
 from grounded.effects import Effect, Library, Scales
+from grounded.frozen import Array
 from grounded.model import Model
+
+SMALLEST, LARGEST = 0.04, 0.35  # of the signals an effect acts on
 
 
 def draw(model: Model, scales: Any, rng: np.random.Generator) -> Effect:
@@ -20,9 +23,20 @@ def draw(model: Model, scales: Any, rng: np.random.Generator) -> Effect:
     return options[int(rng.integers(0, len(options)))]
 
 
-def values_of(effect: Effect, scales: Any, rng: np.random.Generator) -> dict[str, float]:
-    """A size from barely visible to large, as a part of the signals it acts on."""
-    size = float(np.exp(rng.uniform(np.log(0.02), np.log(0.35))))
+def values_of(
+    effect: Effect, scales: Any, rng: np.random.Generator, visited: Array
+) -> dict[str, float]:
+    """A size from barely visible to large, as a part of the signals it acts on.
+
+    Of sizes from 2 to 4 % four in ten stayed below 3 nats, of larger ones one in seven.
+
+    Args:
+        effect: which.
+        scales: sizes of the signals.
+        rng: draws.
+        visited: (N, n) states of the manoeuvres: a place that differs is one that is visited.
+    """
+    size = float(np.exp(rng.uniform(np.log(SMALLEST), np.log(LARGEST))))
     sign = float(rng.choice([-1, 1]))
     target, values = effect.site.target, dict(effect.fixed)
     model = effect.site.model
@@ -36,6 +50,10 @@ def values_of(effect: Effect, scales: Any, rng: np.random.Generator) -> dict[str
         angle = rng.uniform(0, 2 * np.pi)
         top = _rate_scale(scales, target) * size
         values |= {"a": top * np.cos(angle), "b": top * np.sin(angle)}
+    if effect.family.name == "patch":
+        where = visited[int(rng.integers(0, len(visited)))]
+        names = model.state_names
+        values |= {q: where[names.index(q[:-1])] for q in values if q[:-1] in names}
     return {name: float(v) for name, v in values.items()}
 
 
@@ -62,7 +80,7 @@ def _value(
         return (1 - size) * scales.peak(target)
     if family == "backlash":
         return size * scales.spread(target)
-    if family == "rate_limit":
+    if family in ("rate_limit", "slew_limit"):
         return float(float(scales.spread(target)) * np.exp(rng.uniform(np.log(0.3), np.log(3.0))))
     if family in ("delay", "sensor_delay"):
         return 0.6 * size
@@ -93,9 +111,8 @@ def _value(
         return sign * size * _rate_scale(scales, target) / duration
     if family == "periodic" and quantity == "omega":
         return 2 * np.pi * float(np.exp(rng.uniform(np.log(0.3), np.log(2.0))))
-    if family == "patch" and quantity != "c":
-        if quantity == "radius":
-            return 0.12 * max(effect.free[-1].grid) / 0.16
-        name = quantity[:-1]
-        return float(rng.uniform(scales.low[name], scales.high[name]))
+    if family == "patch" and quantity == "c":
+        return 4 * sign * size * _rate_scale(scales, target)  # it acts for a moment only
+    if family == "patch":
+        return 0.12 * max(effect.free[-1].grid) / 0.16  # of the radius; the place is drawn apart
     return sign * size * _rate_scale(scales, target)

@@ -85,7 +85,8 @@ class _Run:
         self.memory: dict[str, Any] = {}
         self.own_state: dict[str, Any] = {"rng": rng}
         latency = truth.latency or (0.0,) * model.m
-        self.queues = [[held[j]] * round(latency[j] / self.fine) for j in range(model.m)]
+        self.late = [divmod(seconds / self.fine, 1.0) for seconds in latency]
+        self.queues = [[held[j]] * (int(whole) + 1) for j, (whole, _) in enumerate(self.late)]
         self.gust = np.zeros(model.n)
         self.past: list[Array] = []
         self.last, self.tied = self.held, list[tuple[int, int]]()
@@ -136,9 +137,11 @@ class _Run:
                     out[j], self.memory[key] = family.advance(out[j], z, values, self.fine)
         for actuator in self.truth.actuators:
             out = actuator(out, self.own_state, t, self.fine)
-        for j, queue in enumerate(self.queues):
+        for j, queue in enumerate(self.queues):  # the mean of what arrives within a fine step
+            part = self.late[j][1]
             queue.append(out[j])
-            out[j] = queue.pop(0)
+            out[j] = (1 - part) * queue[1] + part * queue[0]
+            queue.pop(0)
         return out
 
     def rates(self, x: Array, u: Array, t: float) -> Array:
