@@ -179,7 +179,7 @@ def test_a_parameter_that_is_off_is_blamed_as_a_parameter():
 
 def test_parameters_that_are_off_are_named_most_important_first():
     model, trials = cart(trials=6)
-    found = diagnose(model.with_values({"k": 1.7, "tau": 1.25}), trials)
+    found = diagnose(model.with_values({"k": 1.9, "tau": 0.88}), trials)
     named = {f"parameter:{name}" for name in ("k", "tau")}
     assert set(found.effects) & named, found.sentence
     assert set(found.effects) <= named

@@ -6,7 +6,7 @@ import pytest
 from grounded.diagnosis import filter as kalman
 from grounded.diagnosis import kernels
 from grounded.diagnosis.filter import innovations, smoother, transition
-from grounded.diagnosis.information import information
+from grounded.diagnosis.information import average, working
 from grounded.diagnosis.noise import Noise, Structure, climbed, slopes
 
 L, B = 150, 2
@@ -93,17 +93,73 @@ def test_a_covariance_that_is_not_finite_is_an_error():
         problem.passes(problem.q, problem.v)
 
 
+def noise_of(problem, phi, dt=0.05):
+    tau = None if phi is None else -dt / np.log(phi)
+    n, q = problem.n, np.log(problem.q)
+    log_c = q[n:] - np.log(1 - phi**2) if phi else np.zeros(n)
+    return Noise(Structure(tau), q[:n], np.log(problem.v), log_c, np.full(n, -30.0))
+
+
+def information(problem, noise, dt=0.05):
+    g, _, _, back = problem.passes(noise.process(dt), np.exp(noise.log_r))
+    columns = working(noise, back, problem.G, dt)
+    return average(innovations(g, *columns)[0]), back
+
+
+def dense(problem):
+    """By run: covariance of all that was measured, its part from each noise, the residual."""
+    n, N, A = problem.n, problem.N, problem.A
+    for b in range(B):
+        rows, there = np.zeros((L, n, N)), problem.seen[1:, b].reshape(-1) > 0
+        z, drift = np.eye(N), np.zeros((L, n))
+        e = np.concatenate([problem.r[0, b, :, 0] * problem.seen[0, b], np.zeros(N - n)])
+        for t in range(L):
+            z, e = A[t, b] @ z, A[t, b] @ e
+            e[:n] += problem.d[t, b, :, 0]
+            rows[t], drift[t] = z[:n], e[:n]
+        first = np.concatenate([problem.v, np.ones(N - n)])
+        start = rows.reshape(-1, N) * np.sqrt(first)
+        whole, parts = start @ start.T, []
+        for i in range(N):
+            answers = np.zeros((L, L, n))
+            for t in range(L):
+                unit = np.zeros(N)
+                unit[i] = 1.0
+                if problem.G is not None and i < n:
+                    unit[:n] = problem.G[t, b][:, i]
+                for later in range(t, L):
+                    answers[t, later] = unit[:n]
+                    if later + 1 < L:
+                        unit = A[later + 1, b] @ unit
+            D = answers.reshape(L, -1).T
+            parts.append(problem.q[i] * D @ D.T)
+        for i in range(n):
+            parts.insert(n + i, np.diag(np.tile(np.eye(n)[i] * problem.v[i], L)))
+        whole = whole + sum(parts)
+        residual = (problem.r[1:, b, :, 0] - drift).reshape(-1)
+        keep = np.ix_(there, there)
+        yield whole[keep], [part[keep] for part in parts], residual[there]
+
+
+@pytest.mark.parametrize("case", CASES[:3])
+def test_average_information_is_that_of_the_dense_covariance(case):
+    problem = Problem(*case)
+    found, _ = information(problem, noise_of(problem, case[2]))
+    expected = 0.0
+    for whole, parts, y in dense(problem):
+        weighed = np.linalg.solve(whole, y)
+        answers = np.stack([part @ weighed for part in parts])
+        expected = expected + 0.5 * answers @ np.linalg.solve(whole, answers.T)
+    assert np.allclose(found, expected, rtol=1e-6, atol=1e-6 * np.abs(expected).max())
+
+
 def test_noise_climbs_to_the_top_though_channels_share_it():
-    problem, zeros = Problem(3, True, None, False), np.zeros(3)
-    noise = Noise(Structure(), np.log(problem.q), np.log(problem.v), zeros, zeros - 30)
-
-    def adjoints(noises):
-        return [problem.passes(np.exp(w.log_q), np.exp(w.log_r))[3] for w in noises]
-
+    problem = Problem(3, True, None, False)
+    noise = noise_of(problem, None)
     for _ in range(12):
-        info = information(noise, adjoints, 0.05)
-        noise = climbed(noise, slopes(noise, adjoints([noise])[0], 0.05), info, L * B)
-    rest = slopes(noise, adjoints([noise])[0], 0.05)
-    assert np.abs(rest).max() < 1.0
+        info, back = information(problem, noise)
+        noise = climbed(noise, slopes(noise, back, 0.05), info, L * B)
+    rest = slopes(noise, information(problem, noise)[1], 0.05)
+    assert np.abs(rest).max() < 0.01
     before = problem.loglik(problem.q, problem.v)
     assert problem.loglik(np.exp(noise.log_q), np.exp(noise.log_r)) > before

@@ -9,18 +9,17 @@ and drop what another explains better.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from grounded.diagnosis.data import Data
 from grounded.diagnosis.fitted import Fit
-from grounded.diagnosis.hypothesis import Hypothesis
 from grounded.diagnosis.noise import Structure
 from grounded.diagnosis.refine import clean
 from grounded.diagnosis.search import CLAIM, LARGE, SHORTLIST, Search, parametric
 from grounded.effects import Effect
 
+HOPEFUL = 4  # larger sets that are fitted to the end
 RESTARTED = 3  # large effects that are also fitted from a start of their own
 
 
@@ -77,9 +76,10 @@ def _explore(search: Search) -> Fit:
         # a large effect has a long way from its first look
         search.refined([f for f in singles[:SHORTLIST] if f.noise.structure == kind], 8)
     search.again(search.of_size(1)[: RESTARTED if search.data.model.n <= LARGE else 2])
+    search.beside_parameters()
     best = search.of_size(1)[0]
     for _ in range(3):  # with the noise that the best one leaves, others may look better
-        search.extended(_without_last(best))
+        search.extended(search.without(best, best.hypothesis.names[-1]))
         search.structures(best)
         search.calibrated(best)
         again = search.of_size(1)[0]
@@ -102,22 +102,6 @@ def outliers(fit: Fit) -> bool:
     count = float((np.abs(fit.white) > 4.0).sum())
     expected = 6.3e-5 * fit.white.size
     return count > 4 + 3 * expected
-
-
-def _without_last(fit: Fit) -> Fit:
-    """The fit's noise and track with its last effect taken out of the hypothesis."""
-    h = fit.hypothesis.minus(fit.hypothesis.names[-1])
-    return _bare(fit, h)
-
-
-def _bare(fit: Fit, h: Hypothesis) -> Fit:
-    """A fit that pretends another hypothesis at the same noise and track (to scan from)."""
-    k = len(h.theta)
-    rest = fit.gram.shape[-1] - len(fit.hypothesis.theta)
-    B = len(fit.rss)
-    return replace(
-        fit, hypothesis=h, gram=np.zeros((B, k + rest, k + rest)), score=np.zeros((B, k + rest))
-    )
 
 
 def _starts(search: Search, size: int, best: Fit) -> list[Fit]:
@@ -144,12 +128,14 @@ def _grow(search: Search, best: Fit, most: int) -> None:
     while 1 <= size < most:
         for start in _starts(search, size, best):
             search.extended(start, 8)
+        for fit in search.of_size(size + 1)[:HOPEFUL]:
+            search.refined([fit], 10)
         search.again(search.of_size(size + 1)[:2])
         larger = search.of_size(size + 1)
         if not larger or search.score(larger[0]) < search.score(best) + CLAIM:
             return
         best = larger[0]
         for name in best.hypothesis.names:  # what goes better with the others?
-            search.extended(_bare(best, best.hypothesis.minus(name)), 6)
+            search.extended(search.without(best, name), 6)
         best = search.of_size(size + 1)[0]
         size += 1

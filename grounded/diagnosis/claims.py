@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from grounded.diagnosis.calibration import blamed
@@ -79,15 +80,18 @@ class Claims:
         return rows
 
     def parts(self) -> dict[str, float]:
-        """What the evidence loses without each claimed effect."""
+        """What the evidence loses without each claimed effect.
+
+        An effect of the others that vanished (a delay too short to be one) is left out with it.
+        """
         search, found = self.search, {}
         whole = search.score(self.best)
         for name in self.names:
-            rest = tuple(sorted(n for n in self.names if n != name))
-            fits = [
-                f for f in search.of_size(len(rest)) if tuple(sorted(f.hypothesis.names)) == rest
-            ]
-            scores = [search.score(f) for f in fits] if rest else []
+            rest = {n for n in self.names if n != name}
+            scores: list[float] = []
+            for size in range(len(rest), 0, -1):
+                fits = [f for f in search.of_size(size) if set(f.hypothesis.names) <= rest]
+                scores = scores or [s for f in fits if math.isfinite(s := search.score(f))]
             found[name] = whole - max(scores or [self.base])
         return found
 

@@ -11,14 +11,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from grounded.diagnosis import filter as kalman
-from grounded.diagnosis.columns import linearised, step_sizes, system_of
+from grounded.diagnosis.columns import step_sizes
 from grounded.diagnosis.data import Data
-from grounded.diagnosis.delays import delays_of
 from grounded.diagnosis.fitted import Fit, calibrated
-from grounded.diagnosis.hypothesis import Hypothesis, Predictor, param_scale
-from grounded.diagnosis.information import information
-from grounded.diagnosis.noise import Noise, channel_information, climbed, slopes
+from grounded.diagnosis.hypothesis import Hypothesis, param_scale
+from grounded.diagnosis.noise import Noise
 from grounded.frozen import Array
 
 MOST_NUMBERS = 2e6  # of one (L, B, N, N) array: what fits in the cache goes fastest
@@ -82,9 +79,7 @@ class Work:
         self.track = best.track + step.track if self.moving else best.track
 
 
-def proposed(
-    data: Data, fit: Fit, filtered: Array, adjoint: kalman.Adjoint, memory: Array | None
-) -> Step:
+def proposed(data: Data, fit: Fit, filtered: Array, noise: Noise) -> Step:
     """Gauss-Newton in values and shifts, scoring in the noise, the filtered track as the track."""
     h = fit.hypothesis
     G = fit.gram.sum(axis=0) + np.diag(fit.prior)
@@ -98,7 +93,6 @@ def proposed(
         theta, shift = delta[:k], delta[k:]
         moved = delta != 0
         track = track + filtered[..., 1:][..., moved] @ delta[moved]
-    noise = fit.noise if memory is None else _climbed(data, fit.noise, adjoint, memory)
     return Step(theta, shift, track, noise)
 
 
@@ -135,49 +129,6 @@ def _room(data: Data, h: Hypothesis, k: int, size: int) -> tuple[Array, Array]:
         low[k:] = np.minimum((lowest - at) / unit, 0.0)[which]
         high[k:] = np.maximum((highest - at) / unit, 0.0)[which]
     return low, high
-
-
-def _climbed(data: Data, noise: Noise, adjoint: kalman.Adjoint, memory: Array) -> Noise:
-    count = int(data.valid.sum())
-    info = noise.info
-    if info is None:
-        info = channel_information(noise, memory, data.dt, count)
-    return climbed(noise, slopes(noise, adjoint, data.dt), info, count)
-
-
-def measured(predictor: Predictor, fit: Fit) -> Noise:
-    """A fit's noise with the information of its variances measured."""
-    data, h = predictor.data, fit.hypothesis
-    F, d, r = linearised(predictor, h, fit.track)
-    (L, B), delays = data.time.shape, delays_of(h, data)
-    (A, _, _, seen, _, G), late = system_of(predictor, h, fit.noise, fit.track, F)
-    each = max(1, int(MOST_NUMBERS / A.size))  # noises at once: what fits in the cache goes fastest
-
-    def some(noises: list[Noise]) -> list[kalman.Adjoint]:
-        H = len(noises)
-        by_state = noises if delays is None else [delays.noise(w) for w in noises]
-        g = kalman.gains(
-            np.tile(A, (1, H, 1, 1)),
-            np.concatenate([spread_over(w.process(data.dt), (L, B)) for w in noises], axis=1),
-            np.concatenate([spread_over(w.measurement(L), (L + 1, B)) for w in by_state], axis=1),
-            np.tile(seen, (1, H, 1)),
-            np.concatenate([w.start(B) for w in noises]),
-            None if G is None else np.tile(G, (1, H, 1, 1)),
-            None if late is None else late.tiled(H),
-        )
-        column, of_log = np.tile(d[..., :1], (1, H, 1, 1)), np.tile(r[..., :1], (1, H, 1, 1))
-        white, _ = kalman.innovations(g, column, of_log)
-        found = kalman.smoother(g, white[..., 0]).parts(B)
-        return found if delays is None else [delays.restored(adjoint) for adjoint in found]
-
-    def adjoints(noises: list[Noise]) -> list[kalman.Adjoint]:
-        return [one for i in range(0, len(noises), each) for one in some(noises[i : i + each])]
-
-    try:
-        info = information(fit.noise, adjoints, data.dt)
-    except np.linalg.LinAlgError:
-        return fit.noise
-    return replace(fit.noise, info=info) if np.isfinite(info).all() else fit.noise
 
 
 def _limited(h: Hypothesis, delta: Array) -> Array:

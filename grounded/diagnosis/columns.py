@@ -14,8 +14,11 @@ from grounded.diagnosis import filter as kalman
 from grounded.diagnosis.delays import delays_of
 from grounded.diagnosis.fitted import Fit, calibrated
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor, param_scale
+from grounded.diagnosis.jacobian import heading_slope, passed, slopes, with_effects
 from grounded.diagnosis.late import Late, System
 from grounded.diagnosis.noise import Noise
+from grounded.diagnosis.secant import PART, sensitivities
+from grounded.effects import ParamFamily
 from grounded.frozen import Array
 
 
@@ -35,19 +38,21 @@ def linearised(predictor: Predictor, h: Hypothesis, track: Array) -> tuple[Array
     columns_d = [model.difference(after, track[1:])]
     columns_r = [model.difference(y - here, np.asarray(offset))]
     theta = h.theta
-    for j, size in enumerate(step_sizes(h)):
-        other, moved = _nudged(h, theta, j, size)
-        if moved == 0:
-            columns_d.append(np.zeros_like(after))
-            columns_r.append(np.zeros_like(track))
-            continue
-        columns_d.append(
-            model.difference(predictor.advance(other, x, predictor.inputs(other), data.time), after)
-            / moved
-        )
-        other_shown = shown if delays is None else delays.moved(other).shown(ahead, track)
-        shifted = predictor.standing(other, other_shown)
-        columns_r.append((shown - other_shown + offset - shifted) / moved)
+    for j, sizes in enumerate(_tried(h)):
+        by_d, by_r = np.zeros_like(after), np.zeros_like(track)
+        for size in sizes:
+            other, moved = _nudged(h, theta, j, size)
+            if moved == 0:
+                continue
+            ahead_too = predictor.advance(other, x, predictor.inputs(other), data.time)
+            by_d = model.difference(ahead_too, after) / moved
+            other_shown = shown if delays is None else delays.moved(other).shown(ahead, track)
+            shifted = predictor.standing(other, other_shown)
+            by_r = (shown - other_shown + offset - shifted) / moved
+            if by_d.any() or by_r.any():
+                break
+        columns_d.append(by_d)
+        columns_r.append(by_r)
     F, of_shifts = _sensitivities(predictor, h, x, u)
     more = np.zeros((*track.shape, of_shifts.shape[-1]))
     d = np.concatenate([np.stack(columns_d, axis=-1), of_shifts], axis=-1)
@@ -63,32 +68,42 @@ def _sensitivities(predictor: Predictor, h: Hypothesis, x: Array, u: Array) -> t
         np.ascontiguousarray(u.reshape(-1, model.m)),
     )
     if h.spread == 0:
-        f_x, _ = model.system.linearise(*flat, p, data.dt)
-        return f_x.reshape(L, B, model.n, model.n), np.zeros((L, B, model.n, 0))
+        return jacobian(predictor, h, x), np.zeros((L, B, model.n, 0))
     which = calibrated(data)
-    f_x, _, f_p = model.system.sensitivities(*flat, p, data.dt)
+    f_x, f_p = sensitivities(model, *flat, p, data.dt)
     scaled = f_p[:, :, which] * param_scale(model)[which]
-    return f_x.reshape(L, B, model.n, model.n), scaled.reshape(L, B, model.n, -1)
+    F = with_effects(predictor, h, x, u, f_x.reshape(L, B, model.n, model.n))
+    return F, passed(predictor, h, x, u, scaled.reshape(L, B, model.n, -1))
 
 
-def noise_entry(predictor: Predictor, h: Hypothesis, track: Array) -> Array | None:
-    """G of the filter (L, B, n, n): a carried heading rate moves with what it is a function of."""
+def jacobian(predictor: Predictor, h: Hypothesis, track: Array) -> Array:
+    """F of every step along a track (L or more, B, n), (L, B, n, n)."""
+    data, u = predictor.data, predictor.inputs(h)
+    model, (L, B) = data.model, data.time.shape
+    flat_x = np.ascontiguousarray(track[:L].reshape(-1, model.n))
+    flat_u = np.ascontiguousarray(u.reshape(-1, model.m))
+    f_x, _ = model.system.linearise(flat_x, flat_u, predictor.params(h), data.dt)
+    return with_effects(predictor, h, track[:L], u, f_x.reshape(L, B, model.n, model.n))
+
+
+def noise_entry(predictor: Predictor, h: Hypothesis, track: Array, F: Array) -> Array | None:
+    """G of the filter (L, B, n, n): a carried heading rate moves with what it is a function of.
+
+    F (L, B, n, n) is the Jacobian along the track.
+    """
     tied = predictor.tied()
     if not tied:
         return None
     data = predictor.data
-    model, (L, B) = data.model, data.time.shape
-    x = np.ascontiguousarray(track[1:].reshape(-1, model.n))
-    u = np.ascontiguousarray(predictor.inputs(h).reshape(-1, model.m))
-    short = 1e-3 * data.dt
-    f_x, _ = model.system.linearise(x, u, predictor.params(h), short)
-    G = np.zeros((L * B, model.n, model.n))
-    G[:, np.arange(model.n), np.arange(model.n)] = 1.0
+    x, u, n = track[1:], predictor.inputs(h), data.model.n
+    G = np.zeros((*x.shape, n))
+    G[..., np.arange(n), np.arange(n)] = 1.0
+    added = slopes(predictor, h, x, u, data.time + data.dt, F)
     for heading, rate in tied:
-        slope = f_x[:, heading, :] / short
-        slope[:, [heading, rate]] = 0.0
-        G[:, rate, :] += slope
-    return G.reshape(L, B, model.n, model.n)
+        slope = heading_slope(predictor, h, x, u, heading, rate) + added[..., heading, :]
+        slope[..., [heading, rate]] = 0.0
+        G[..., rate, :] += slope
+    return G
 
 
 def system_of(
@@ -100,7 +115,7 @@ def system_of(
     seen, late = data.seen, None
     if delays is not None:
         noise, seen, late = delays.noise(noise), delays.samples()[1], delays.late()
-    G = noise_entry(predictor, h, track)
+    G = noise_entry(predictor, h, track, F)
     A = kalman.transition(F, noise.structure.phi(data.dt), G)
     Q = np.broadcast_to(noise.process(data.dt), (L, B, A.shape[-1]))
     R = np.broadcast_to(noise.measurement(L), (L + 1, B, n))
@@ -134,6 +149,19 @@ def step_sizes(h: Hypothesis) -> list[float]:
             else:
                 sizes.append(1e-3 * max(abs(values[q.name]), 1e-2))
     return sizes
+
+
+def _tried(h: Hypothesis) -> list[tuple[float, ...]]:
+    """The step of each free value; for a parameter that may be a threshold a larger one beside."""
+    effects = [effect for effect in h.effects for _ in effect.free]
+    found: list[tuple[float, ...]] = []
+    for effect, size in zip(effects, step_sizes(h), strict=True):
+        if isinstance(effect.family, ParamFamily):
+            value = effect.site.model.params[effect.site.target].value
+            found.append((size, PART * abs(value)))
+        else:
+            found.append((size,))
+    return found
 
 
 def _nudged(h: Hypothesis, theta: Array, j: int, size: float) -> tuple[Hypothesis, float]:

@@ -3,7 +3,8 @@
     x_{t+1} = f_h(x_t, commands)        y_t = x_t + offset_h(x)
 
 Effects on inputs act on the command sequence of the whole trial; rates act by Strang splitting,
-half before and half after the model's step; sensor effects act on what is compared with the log.
+half before and half after the model's step, or, limits, on its mean rate; sensor effects act on
+what is compared with the log.
 The very equations that `grounded.effects.wrap` adopts, evaluated on arrays.
 """
 
@@ -25,6 +26,7 @@ from grounded.effects import (
     RateFamily,
     SensorDelayFamily,
     SensorFamily,
+    acting_order,
 )
 from grounded.effects.registry import partner
 from grounded.frozen import Array
@@ -118,12 +120,9 @@ class Predictor:
 
     @staticmethod
     def acting(h: Hypothesis) -> list[tuple[Effect, Mapping[str, float]]]:
-        """The effects on inputs with their values."""
-        return [
-            (e, v)
-            for e, v in zip(h.effects, h.values, strict=True)
-            if isinstance(e.family, InputFamily | MemoryFamily)
-        ]
+        """The effects on inputs with their values, in the order in which they act."""
+        order = acting_order([effect.family for effect in h.effects])
+        return [(h.effects[i], h.values[i]) for i in order]
 
     def params(self, h: Hypothesis) -> Array:
         """The model's parameters under a hypothesis (k,)."""
@@ -136,14 +135,14 @@ class Predictor:
                 p[names.index(effect.site.target)] += values["d"]
         return p
 
-    def step(self, x: Array, u: Array, p: Array) -> Array:
+    def step(self, x: Array, u: Array, p: Array, dt: float | None = None) -> Array:
         """The model's own step at any leading shape."""
         model = self.data.model
         flat = model.system.step(
             np.ascontiguousarray(x.reshape(-1, model.n)),
             np.ascontiguousarray(u.reshape(-1, model.m)),
             p,
-            self.data.dt,
+            dt or self.data.dt,
         )
         return flat.reshape(x.shape)
 
@@ -154,19 +153,15 @@ class Predictor:
     def advance(self, h: Hypothesis, x: Array, u: Array, t: Array) -> Array:
         """One step of a hypothesis from x (..., n) with received inputs u (..., m) at times t."""
         p, dt = self.params(h), self.data.dt
-        rates = [
-            (e, v)
-            for e, v in zip(h.effects, h.values, strict=True)
-            if isinstance(e.family, RateFamily)
-        ]
-        if not rates:
+        rates, limits = rates_of(h), limits_of(h)
+        if not rates and not limits:
             return self.step(x, u, p)
-        needs_own = any(e.family.needs_own for e in h.effects if isinstance(e.family, RateFamily))
+        needs_own = any(e.family.needs_own for e, _ in rates)
         own = self.named((self.step(x, u, p) - x) / dt) if needs_own else {}
         start = x + 0.5 * dt * self.added_rate(rates, x, u, t, own)
-        after = self.step(start, u, p)
+        after, mean = self.limited(limits, start, u, p, t)
         if needs_own:  # the mean over the very step: second order, steady where the model is stiff
-            own = self.named((after - start) / dt)
+            own = self.named(mean)
         result = after + 0.5 * dt * self.added_rate(rates, after, u, t + dt, own)
         for i, j in self.tied():  # a carried heading rate is the heading's rate, effects and all
             found = []
@@ -176,6 +171,22 @@ class Predictor:
                 found.append(rate[..., i] + self.added_rate(rates, s, u, when, own)[..., i])
             result[..., j] = x[..., j] + found[1] - found[0]
         return result
+
+    def limited(self, limits: Any, x: Array, u: Array, p: Array, t: Array) -> tuple[Array, Array]:
+        """The model's step through (effect, values) that limit its rates, and its mean rate."""
+        after = self.step(x, u, p)
+        free = (after - x) / self.data.dt
+        if not limits:
+            return after, free
+        parts = max(e.family.parts for e, _ in limits)
+        dt, mean = self.data.dt / parts, np.zeros_like(x)
+        touched = np.zeros((*x.shape[:-1], 1), bool)
+        for k in range(parts):
+            own = (self.step(x, u, p, dt) - x) / dt
+            added = self.added_rate(limits, x, u, t + k * dt, self.named(own))
+            x, mean = x + dt * (own + added), mean + own / parts
+            touched |= (added != 0).any(axis=-1, keepdims=True)
+        return np.where(touched, x, after), np.where(touched, mean, free)
 
     def named(self, rate: Array) -> Named:
         """Rates (..., n) by name."""
@@ -240,6 +251,18 @@ class Predictor:
             i = names.index(effect.site.target)
             total[..., i] += sensor_offset(effect, values, shown[..., i], self.data.dt)
         return total
+
+
+def rates_of(h: Hypothesis) -> list[tuple[Any, Mapping[str, float]]]:
+    """The rate effects of halves of a step, with their values."""
+    pairs = zip(h.effects, h.values, strict=True)
+    return [(e, v) for e, v in pairs if isinstance(e.family, RateFamily) and not e.family.parts]
+
+
+def limits_of(h: Hypothesis) -> list[tuple[Any, Mapping[str, float]]]:
+    """Those of parts of it: limits of rates."""
+    pairs = zip(h.effects, h.values, strict=True)
+    return [(e, v) for e, v in pairs if isinstance(e.family, RateFamily) and e.family.parts]
 
 
 def sensor_offset(effect: Effect, values: Mapping[str, float], track: Array, dt: float) -> Array:

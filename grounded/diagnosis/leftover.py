@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from grounded.diagnosis import filter as kalman
-from grounded.diagnosis.columns import gains_of
+from grounded.diagnosis.columns import gains_of, jacobian
 from grounded.diagnosis.fitted import Fit
 from grounded.diagnosis.hypothesis import Predictor
 from grounded.effects import places
@@ -153,13 +153,8 @@ def _channel(predictor: Predictor, fit: Fit, features: Array, i: int) -> tuple[f
 
 def filter_of(predictor: Predictor, fit: Fit) -> kalman.Gains:
     """The gains of a fit's filter."""
-    data = predictor.data
-    L, B = data.time.shape
-    n = data.model.n
-    flat_x = np.ascontiguousarray(fit.track[:-1].reshape(-1, n))
-    flat_u = np.ascontiguousarray(predictor.inputs(fit.hypothesis).reshape(-1, data.model.m))
-    F, _ = data.model.system.linearise(flat_x, flat_u, predictor.params(fit.hypothesis), data.dt)
-    return gains_of(predictor, fit.hypothesis, fit.noise, fit.track, F.reshape(L, B, n, n))
+    F = jacobian(predictor, fit.hypothesis, fit.track)
+    return gains_of(predictor, fit.hypothesis, fit.noise, fit.track, F)
 
 
 def whiteness(fit: Fit, seen: Array) -> dict[str, float]:

@@ -11,9 +11,9 @@ which real noise differs from the textbook's, allowed before an effect is claime
                the same ones, so that outliers count for little and favour nobody.
 
 Variances climb the likelihood by scoring: with the smoother's adjoint r and its covariance N,
-d loglik / d log q = q sum(r^2 - N) / 2. The information is first that of each channel by itself,
-then measured: the slope's own differences (`information.py`), since what is a disturbance of one
-channel can pass for measurement noise of another.
+d loglik / d log q = q sum(r^2 - N) / 2, all of them together by their average information
+(`information.py`), since what is a disturbance of one channel can pass for measurement noise of
+another.
 """
 
 from __future__ import annotations
@@ -60,7 +60,6 @@ class Noise:
     floor: Array  # (n,) log variance below which nothing is resolved
     weight_w: Array | float = 1.0
     weight_v: Array | float = 1.0
-    info: Array | None = None  # information of the log variances, (K, K), where it was measured
 
     def process(self, dt: float) -> Array:
         """Q for the filter: (L, B, N) or (N,)."""
@@ -87,11 +86,11 @@ class Noise:
     def allowing(self, structure: Structure, dt: float) -> Noise:
         """The same noise, free to be coloured (or not): where its fit starts."""
         if structure.tau is None:
-            return replace(self, structure=structure, info=None)
+            return replace(self, structure=structure)
         # a tenth of the low-frequency power: summed over time c has about 2 tau / dt times its own
         share = math.log(0.1 * dt / (2 * structure.tau))
         log_c = np.maximum(self.log_q + share, self.floor)
-        return replace(self, structure=structure, log_c=log_c, info=None)
+        return replace(self, structure=structure, log_c=log_c)
 
     def towards(self, other: Noise, part: float) -> Noise:
         """Part of the way to another noise of the same structure."""
@@ -141,36 +140,13 @@ def slopes(noise: Noise, adjoint: Adjoint, dt: float) -> Array:
     return np.stack([0.5 * (v * (s**2 - c)).sum(axis=(0, 1)) for v, s, c in parts])
 
 
-def channel_information(noise: Noise, memory: Array, dt: float, count: int) -> Array:
-    """Information of the log variances with each channel by itself, (K, K), K = 2 n or 3 n.
-
-    With x_{t+1} = m x_t + w a channel's measured differences have the spectrum
-    f = q + r |1 - m e^{i omega}|^2 + coloured part, and the information of log a and log b, two
-    parts of f, is T/2 mean_omega((a / f) (b / f)).
-    """
-    n, phi = len(noise.log_q), noise.structure.phi(dt)
-    omega = np.linspace(0.02, np.pi, 40)[:, None]
-    parts = [
-        np.broadcast_to(np.exp(noise.log_q), (40, n)),
-        np.exp(noise.log_r) * (1 - 2 * memory * np.cos(omega) + memory**2),
-    ]
-    if phi is not None:
-        eta = np.exp(noise.log_c) * (1 - phi**2)
-        parts.append(eta / (1 - 2 * phi * np.cos(omega) + phi**2))
-    whole = np.sum(parts, axis=0)
-    share = np.stack([part / whole for part in parts])  # (2 or 3, 40, n)
-    info = 0.5 * count * np.einsum("afn,bfn->abn", share, share) / len(omega)
-    found = np.zeros((len(parts), n, len(parts), n))
-    i = np.arange(n)
-    found[:, i, :, i] = np.moveaxis(info, -1, 0)
-    return found.reshape(len(parts) * n, -1)
-
-
 def climbed(noise: Noise, slope: Array, info: Array, count: int) -> Noise:
-    """One scoring step up the likelihood, all variances together.
+    """One step up the likelihood, all variances together.
 
     Along each principal direction of the information by itself, bounded there: so the step goes up
-    even where the information is poor.
+    even where the information is poor. For one variance v of N numbers whose mean square is s, the
+    slope N (s / v - 1) / 2 over the average information N s / (2 v) is a = 1 - v / s; the step
+    -log(1 - a) leads to v = s at once, from however far.
 
     Args:
         noise: as it is.
@@ -178,12 +154,13 @@ def climbed(noise: Noise, slope: Array, info: Array, count: int) -> Noise:
         info: (K, K) of all log variances.
         count: time steps in all.
     """
-    size, axes = np.linalg.eigh(0.5 * (info + info.T))
-    along = axes.T @ slope.reshape(-1)
-    along = np.clip(along / np.maximum(np.abs(size), 2e-5 * count), -2.5, 2.5)
-    step = (axes @ along).reshape(slope.shape)
-    logs = [noise.log_q, noise.log_r, noise.log_c][: len(slope)]
-    moved = np.maximum(np.stack(logs) + step, noise.floor)
+    logs = np.stack([noise.log_q, noise.log_r, noise.log_c][: len(slope)])
+    free = ((logs > noise.floor) | (slope > 0)).reshape(-1)
+    size, axes = np.linalg.eigh(info[np.ix_(free, free)])
+    along = axes.T @ slope.reshape(-1)[free] / np.maximum(size, 2e-5 * count)
+    step = np.zeros(free.shape)
+    step[free] = axes @ np.clip(-np.log1p(-np.minimum(along, 0.9)), -2.5, 2.5)
+    moved = np.maximum(logs + step.reshape(slope.shape), noise.floor)
     log_c = moved[2] if len(slope) > 2 else noise.log_c
     return replace(noise, log_q=moved[0], log_r=moved[1], log_c=log_c)
 
@@ -204,7 +181,6 @@ def cleaned(noise: Noise, adjoint: Adjoint) -> Noise:
         log_r=log_r,
         weight_w=(DOF + 1) / (DOF + w2 / np.exp(log_q)),
         weight_v=(DOF + 1) / (DOF + v2 / np.exp(log_r)),
-        info=None,
     )
 
 

@@ -15,22 +15,20 @@ All hypotheses of one noise structure step through time together, along the batc
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from grounded.diagnosis import filter as kalman
-from grounded.diagnosis.climb import MOST_NUMBERS, Work, measured, proposed, spread_over
+from grounded.diagnosis.climb import MOST_NUMBERS, Work, proposed, spread_over
 from grounded.diagnosis.columns import gains_of, linearised, noise_entry
 from grounded.diagnosis.data import Data
 from grounded.diagnosis.delays import Delays, delays_of, joined
 from grounded.diagnosis.fitted import Fit, calibrated, shift_precision
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor, param_scale
-from grounded.diagnosis.noise import Noise, cleaned
+from grounded.diagnosis.information import average, working
+from grounded.diagnosis.noise import Noise, cleaned, climbed, slopes
 from grounded.effects import SensorDelayFamily
 from grounded.frozen import Array
-
-MEASURED = (2, 7, 14)  # ages at which the noise's information is measured
 
 
 def refine(
@@ -79,13 +77,16 @@ def _of_one_shape(works: list[Work]) -> list[list[Work]]:
 
 def _iterate(predictor: Predictor, works: list[Work], fixed_noise: bool) -> None:
     data = predictor.data
-    L, B = data.time.shape
+    B = data.time.shape[1]
     late = [delays_of(work.h, data) for work in works]
     parts = [linearised(predictor, work.h, work.track) for work in works]
     width = kalman.whole(max(part[1].shape[-1] for part in parts), data.model.n)
     d = np.concatenate([_padded(part[1], width) for part in parts], axis=1)
     r = np.concatenate([_padded(part[2], width) for part in parts], axis=1)
-    carried = [noise_entry(predictor, work.h, work.track) for work in works]
+    carried = [
+        noise_entry(predictor, work.h, work.track, part[0])
+        for work, part in zip(works, parts, strict=True)
+    ]
     try:
         g = _gains(data, works, late, [part[0] for part in parts], carried)
     except np.linalg.LinAlgError:
@@ -98,23 +99,22 @@ def _iterate(predictor: Predictor, works: list[Work], fixed_noise: bool) -> None
         return
     white, filtered = kalman.innovations(g, d, r, track=True)
     assert filtered is not None
-    back = kalman.smoother(g, white[..., 0])
+    steps = [work.noise for work in works]
+    if not fixed_noise:
+        steps = _climbed(data, works, late, carried, g, white[..., 0])
     for i, work in enumerate(works):
         own = slice(i * B, (i + 1) * B)
-        adjoint, delays = back.parts(B)[i], late[i]
-        columns, before = parts[i][1].shape[-1], 0.0
+        columns, before, delays = parts[i][1].shape[-1], 0.0, late[i]
         if delays is not None:
             entry, residual = carried[i], white[:, own, :, 0]
             before = delays.before(work.noise, entry, work.track, residual, g.whiten[:, own])
-        memory = np.einsum("tbii->i", parts[i][0]) / (L * B)
         _update(
             predictor,
             work,
             white[:, own, :, :columns],
             g.logdet[:, own],
             filtered[:, own, :, :columns],
-            adjoint if delays is None else delays.restored(adjoint),
-            None if fixed_noise else memory,
+            steps[i],
             before,
         )
 
@@ -139,6 +139,34 @@ def _gains(
     seen = np.concatenate([data.seen if s is None else s.samples()[1] for s in late], axis=1)
     A = kalman.transition(np.concatenate(jacobians, axis=1), phi, G)
     return kalman.gains(A, Q, R, seen, start, G, joined(late))
+
+
+def _climbed(
+    data: Data,
+    works: list[Work],
+    late: list[Delays | None],
+    carried: list[Array | None],
+    g: kalman.Gains,
+    white: Array,
+) -> list[Noise]:
+    """Each work's noise after one step up the likelihood."""
+    B, width = data.time.shape[1], data.model.n
+    adjoints = kalman.smoother(g, white).parts(B)
+    each = []
+    for work, delays, entry, adjoint in zip(works, late, carried, adjoints, strict=True):
+        noise = work.noise if delays is None else delays.noise(work.noise)
+        each.append(working(noise, adjoint, entry, data.dt))
+    K = each[0][0].shape[-1]
+    wide = kalman.whole(K, width)
+    d, r = (np.concatenate([_padded(part[k], wide) for part in each], axis=1) for k in (0, 1))
+    columns = kalman.innovations(g, d, r)[0]
+    found = []
+    for i, (work, delays, adjoint) in enumerate(zip(works, late, adjoints, strict=True)):
+        info = average(columns[:, i * B : (i + 1) * B, :, :K])
+        in_log = adjoint if delays is None else delays.restored(adjoint)
+        slope = slopes(work.noise, in_log, data.dt)
+        found.append(climbed(work.noise, slope, info, int(data.valid.sum())))
+    return found
 
 
 def clean(predictor: Predictor, fit: Fit, rounds: int = 8) -> Fit:
@@ -174,8 +202,7 @@ def _update(
     white: Array,
     logdet: Array,
     filtered: Array,
-    adjoint: kalman.Adjoint,
-    memory: Array | None,
+    climbed: Noise,
     before: float,
 ) -> None:
     """Scores the point where the work stands, keeps it if it is the best, and moves on."""
@@ -187,13 +214,11 @@ def _update(
         work.shorten(data)
         return
     work.still = 0 if rise > 0.03 else 1
+    work.moving = work.moving or rise > 1.0
     work.part = min(1.0, 2 * work.part)
     work.age += 1
-    if memory is not None and work.age in MEASURED and (fit.noise.info is None or work.age > 4):
-        work.noise = measured(predictor, fit)
-        fit = replace(fit, noise=work.noise)
     work.best = fit
-    work.step = proposed(data, fit, filtered, adjoint, memory)
+    work.step = proposed(data, fit, filtered, climbed)
     work.go(data)
 
 

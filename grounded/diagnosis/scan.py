@@ -26,7 +26,9 @@ from grounded.diagnosis.columns import base_columns, system_of
 from grounded.diagnosis.delays import delays_of
 from grounded.diagnosis.fitted import Fit
 from grounded.diagnosis.grid import elsewhere, faint, grid_points
-from grounded.diagnosis.hypothesis import Predictor, sensor_offset, transformed
+from grounded.diagnosis.hypothesis import Predictor, sensor_offset
+from grounded.diagnosis.jacobian import passed, with_effects
+from grounded.diagnosis.secant import sensitivities
 from grounded.effects import (
     Effect,
     InputFamily,
@@ -96,9 +98,9 @@ class _Context:
             np.ascontiguousarray(self.x.reshape(-1, model.n)),
             np.ascontiguousarray(self.u.reshape(-1, model.m)),
         )
-        f_x, _, f_p = model.system.sensitivities(*flat, self.p, data.dt)
-        self.F = f_x.reshape(L, B, model.n, model.n)
-        self.f_p = f_p.reshape(L, B, model.n, -1)
+        f_x, f_p = sensitivities(model, *flat, self.p, data.dt)
+        self.F = with_effects(predictor, h, self.x, self.u, f_x.reshape(L, B, model.n, model.n))
+        self.f_p = passed(predictor, h, self.x, self.u, f_p.reshape(L, B, model.n, -1))
         system, late = system_of(predictor, h, fit.noise, fit.track, self.F)
         self.G, self.gains = system.G, kalman.gains(*system, late)
         self.delays = delays_of(h, data)
@@ -107,10 +109,10 @@ class _Context:
 
     def columns(self, i: int, point: int, effect: Effect, grid: dict[str, float]) -> list[_Column]:
         family = effect.family
-        if isinstance(family, RateFamily):
+        if isinstance(family, RateFamily) and not family.parts:
             return self._rate(i, point, effect, grid)
-        if isinstance(family, InputFamily | MemoryFamily):
-            return self._input(i, point, effect, grid)
+        if isinstance(family, InputFamily | MemoryFamily | RateFamily):
+            return self._step(i, point, effect, grid)
         if isinstance(family, SensorFamily | SensorDelayFamily):
             return self._sensor(i, point, effect, grid)
         if isinstance(family, ParamFamily):
@@ -173,20 +175,18 @@ class _Context:
         found: Named = cache[when]
         return found
 
-    def _input(self, i: int, point: int, effect: Effect, grid: dict[str, float]) -> list[_Column]:
+    def _step(self, i: int, point: int, effect: Effect, grid: dict[str, float]) -> list[_Column]:
+        """The whole step again, with the candidate in it."""
         data, predictor = self.predictor.data, self.predictor
-        acting = self.fit.hypothesis
         found = []
         for name, amount in self._linear(effect) or [("", 1.0)]:
             values = {**effect.fixed, **grid}
             if name:
                 values[name] = amount
-            u = transformed(effect, values, data.commands, data)
-            for other, v in zip(acting.effects, acting.values, strict=True):
-                if isinstance(other.family, InputFamily | MemoryFamily):
-                    u = transformed(other, v, u, data)
-            received = data.runs(data.delayed(u))
-            after = predictor.advance(acting, self.x, received, data.time)
+            h = self.fit.hypothesis.plus(effect, values)
+            acts = not isinstance(effect.family, RateFamily)
+            received = data.runs(predictor.received(h)) if acts else self.u
+            after = predictor.advance(h, self.x, received, data.time)
             d = data.model.difference(after, self.after) / amount
             found.append(_Column(i, point, name, d, _EMPTY))
         return found

@@ -11,15 +11,16 @@ pays by its prior (a fifth of its size) instead.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from grounded.diagnosis.data import Data
 from grounded.diagnosis.fitted import Fit
-from grounded.diagnosis.hypothesis import Hypothesis, Predictor
+from grounded.diagnosis.hypothesis import Hypothesis, Predictor, param_scale
 from grounded.diagnosis.noise import Noise, Structure, first_guess
+from grounded.diagnosis.price import price
 from grounded.diagnosis.refine import refine
 from grounded.diagnosis.scan import Look, scan
 from grounded.effects import Effect, ParamFamily
@@ -28,11 +29,10 @@ from grounded.frozen import Array
 CLAIM = 3.0  # nats from which an effect is claimed
 TIE = 3.0  # nats within which two explanations are not told apart
 SPREADS = (0.03, 0.1)  # prior relative errors of the model's parameters when they are calibrated
-PARAM_PRIOR = 0.2  # prior relative error of one parameter that is blamed
+CRUDE = 0.3  # the same of a model that is crude; tried without effects
 SHORTLIST = 14  # effects that are refined of a scan, and half as many parameters
 TAUS = (0.05, 0.1, 0.3)  # [s] of coloured noise
-BRIEF = 0.1  # of a control step: shorter delays and lags are a matter of time stamps
-TIMES = {"delay": "d", "sensor_delay": "d", "first_order_lag": "tau"}
+BESIDE = 4  # effects that are fitted with the parameters freed
 LARGE_GAIN = 50.0  # nats from which a hypothesis is also started by itself
 LARGE = 8  # states, above which one correlation time and half the shortlist have to do
 
@@ -50,28 +50,22 @@ class Search:
         self.candidates = tuple(candidates)
         self.tick = tick or (lambda what: None)
         self.N = max(data.steps, 2)
+        self._prices: dict[tuple[object, ...], float] = {}
         self.fits: dict[tuple[Structure, float, tuple[str, ...]], Fit] = {}
         families = [e.family.name for e in candidates]
         large = data.model.n > LARGE
         self.taus = [tau for tau in (TAUS[1:2] if large else TAUS) if tau > 0.7 * data.dt]
         self.most = SHORTLIST // 2 if large else SHORTLIST
+        self.beside = BESIDE // 2 if large else BESIDE
         self.crowd = {e.name: families.count(e.family.name) for e in candidates}
 
-    def price(self, effect: Effect, values: dict[str, float]) -> float:
+    def price(self, effect: Effect, values: Mapping[str, float]) -> float:
         """What an effect pays beside its likelihood, in nats."""
-        if isinstance(effect.family, ParamFamily):
-            return math.log(self.crowd.get(effect.name, 1)) + self._param_price(effect, values)
-        if values.get(TIMES.get(effect.family.name, ""), math.inf) < BRIEF * self.data.dt:
-            return math.inf
-        k = len(effect.free)
-        cost = 0.5 * k * math.log(self.N) + math.log(effect.places) + effect.family.vague
-        return cost + math.log(self.crowd.get(effect.name, 1))
-
-    def _param_price(self, effect: Effect, values: dict[str, float]) -> float:
-        """A normal prior of a fifth of the parameter's size, not a free parameter's cost."""
-        value = effect.site.model.params[effect.site.target].value
-        size = PARAM_PRIOR * (abs(value) or 1.0)
-        return 0.5 * (values.get("d", 0.0) / size) ** 2 + 0.25 * math.log(self.N) + 1.0
+        key = (effect.name, *sorted(values.items()))
+        if key not in self._prices:
+            targets = self.crowd.get(effect.name, 1)
+            self._prices[key] = price(self.predictor, effect, values, targets)
+        return self._prices[key]
 
     def score(self, fit: Fit) -> float:
         """Evidence of a fit in nats, up to a constant of the data."""
@@ -144,7 +138,8 @@ class Search:
                 for tau in self.taus
             ]
             self.refined(starts[1:], iterations=8)
-        self.refined(starts[:1], iterations=10)
+        (alone,) = self.refined(starts[:1], iterations=12)
+        self.calibrated(alone)
 
     def structures(self, fit: Fit) -> list[Fit]:
         """A hypothesis with coloured noise of several correlation times (if it had none)."""
@@ -157,17 +152,45 @@ class Search:
         return self.refined(starts, iterations=8)
 
     def calibrated(self, fit: Fit) -> list[Fit]:
-        """The same hypothesis with the model's parameters free to move a little, or more."""
+        """The same hypothesis with the model's parameters free to move a little, or more.
+
+        Without effects, where they already moved by more than that: much.
+        """
         shift = np.zeros(self.data.model.system.k)
         if fit.hypothesis.spread > 0 or not len(shift):
             return []
-        return self.refined(
-            [
-                (replace(fit.hypothesis, spread=spread, shift=shift), fit.noise, fit.track)
-                for spread in SPREADS
-            ],
-            iterations=9,
-        )
+        starts = [
+            (replace(fit.hypothesis, spread=w, shift=shift), fit.noise, fit.track) for w in SPREADS
+        ]
+        found = self.refined(starts, iterations=14)
+        far = found and not fit.hypothesis.effects and self._far(found[-1])
+        if far:
+            crude = replace(found[-1].hypothesis, spread=CRUDE)
+            found += self.refined([(crude, found[-1].noise, found[-1].track)], iterations=10)
+        return found
+
+    def _far(self, fit: Fit) -> bool:
+        """Whether a parameter has moved beyond its prior."""
+        h, unit = fit.hypothesis, param_scale(self.data.model)
+        assert h.shift is not None
+        return bool((np.abs(h.shift) > h.spread * unit).any())
+
+    def beside_parameters(self) -> None:
+        """Where the parameters are off: the likeliest effects with the parameters freed beside.
+
+        Started from exact parameters, where the effect has its size; started from parameters that
+        took its part, it would not grow.
+        """
+        if not self.calibrates():
+            return
+        exact = [
+            f
+            for (structure, spread, names), f in self.fits.items()
+            if len(names) == 1 and spread == 0 and structure.tau is None and not parametric(f)
+        ]
+        likely = sorted(exact, key=lambda f: -self.score(f))[: self.beside]
+        for fit in self.refined(likely, 12):
+            self.calibrated(fit)
 
     def best_null(self) -> Fit:
         """The likeliest fit without effects."""
@@ -194,14 +217,13 @@ class Search:
                 weights if fit.noise.structure == weights.structure else fit.noise,
                 weight_w=weights.weight_w,
                 weight_v=weights.weight_v,
-                info=None,
             )
             starts.append((fit.hypothesis, noise, fit.track))
         for structure in {s[1].structure for s in starts}:
             other.refined([s for s in starts if s[1].structure == structure], 8)
         plain = [f for f in other.fits.values() if not f.hypothesis.effects]
         if not any(f.noise.structure == Structure() and not f.hypothesis.spread for f in plain):
-            noise = replace(weights, structure=Structure(), info=None)
+            noise = replace(weights, structure=Structure())
             other.refined([(Hypothesis(), noise, clean_fit.track)], 12)
         return other
 
@@ -235,6 +257,12 @@ class Search:
                 for values in (look.values, *look.others)
             ]
         return self.refined(starts, iterations)[1:]
+
+    def without(self, fit: Fit, name: str) -> Fit:
+        """The fit with one effect taken out, its noise and track kept: where rivals are sought."""
+        start = (fit.hypothesis.minus(name), fit.noise, fit.track)
+        (alone,) = refine(self.predictor, [start], iterations=1, fixed_noise=True)
+        return alone
 
     def of_size(self, count: int) -> list[Fit]:
         """All fits with that many effects, best first, one a set of effects."""
