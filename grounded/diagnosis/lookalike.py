@@ -6,8 +6,9 @@ look-alikes of each claimed effect are measured by their shape. The effect's own
 
     s = whitened (f with the effect - f without it)
 
-after what the calibration and the other effects can take up is projected out; a candidate whose
-best values reproduce most of |s|^2 is named with that share, whatever the evidence says besides.
+after what the other effects can take up is projected out, the model's parameters as they were
+calibrated; a candidate whose best values reproduce most of |s|^2 is named with that share, whatever
+the evidence says besides.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from grounded.diagnosis.fitted import Fit
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor
 from grounded.diagnosis.leftover import filter_of
 from grounded.diagnosis.scan import scan
-from grounded.effects import Effect, ParamFamily, SensorDelayFamily
+from grounded.effects import Effect, ParamFamily
 
 NEARLY = 0.75  # share of an effect's signal from which a look-alike is named
 MOST = 3  # that are named for one effect
@@ -112,14 +113,14 @@ def _likely(
 def _shares(predictor: Predictor, fit: Fit, effect: Effect, own: Sequence[Effect]) -> list[float]:
     """Share of an effect's signal that the best values of each candidate reproduce."""
     h, data = fit.hypothesis, predictor.data
-    late = isinstance(effect.family, SensorDelayFamily)  # then its look-alikes see the log as it is
-    seen_by = replace(fit, hypothesis=h.minus(effect.name)) if late else fit
-    gains, delays = filter_of(predictor, seen_by), delays_of(seen_by.hypothesis, data)
-    if h.shift is not None:  # around the calibrated model, so that the prior doesn't pull
+    if h.shift is not None:
         moved = dict(zip(data.model.param_names, data.model.values + h.shift, strict=True))
         data = replace(data, model=data.model.with_values(moved))
-        h = replace(h, shift=np.zeros_like(h.shift))
+        h = replace(h, shift=None, spread=0.0)
     predictor, without = Predictor(data), h.minus(effect.name)
+    # all in the filter that knows nothing of the effect: its look-alikes are scanned there too
+    gains = filter_of(predictor, replace(fit, hypothesis=without))
+    delays = delays_of(without, data)
     x, model = fit.track[:-1], data.model
     bare, full = predictor.next(without, x), predictor.next(h, x)
     d = model.difference(bare, full)
