@@ -22,6 +22,7 @@ from grounded.effects import (
     sensor,
     slew,
 )
+from grounded.effects.aliases import aliases
 from grounded.effects.family import Effect, Family, RateFamily, Scales, Site
 from grounded.errors import GroundedError, nearest
 from grounded.model import Model
@@ -99,7 +100,7 @@ class Library:
         """Every effect that can apply to a model, in the library's order."""
         found = []
         idle, outright = derived_states(model), outright_states(model)
-        integrals = integrated_states(model)
+        integrals, same = integrated_states(model), aliases(model, idle | outright)
         for family in self.families:
             for target in family.targets(model):
                 driven = target.partition("<-")
@@ -109,8 +110,15 @@ class Library:
                     continue
                 if driven[2] and integrals.get(driven[0]) == driven[2]:
                     continue  # it would be rate_gain under another name
+                if _offered(self, same.get(f"{family.name}:{target}", "")):
+                    continue
                 found.append(_build(family, target, model, scales or Scales()))
         return tuple(found)
+
+
+def _offered(library: Library, name: str) -> bool:
+    """Whether the family of an effect is in the library."""
+    return name.partition(":")[0] in [family.name for family in library.families]
 
 
 def _build(family: Family, target: str, model: Model, scales: Scales) -> Effect:
