@@ -81,8 +81,7 @@ def _iterate(predictor: Predictor, works: list[Work], fixed_noise: bool) -> None
     late = [delays_of(work.h, data) for work in works]
     parts = [linearised(predictor, work.h, work.track) for work in works]
     width = kalman.whole(max(part[1].shape[-1] for part in parts), data.model.n)
-    d = np.concatenate([_padded(part[1], width) for part in parts], axis=1)
-    r = np.concatenate([_padded(part[2], width) for part in parts], axis=1)
+    d, r = (_side_by_side([part[k] for part in parts], width) for k in (1, 2))
     carried = [
         noise_entry(predictor, work.h, work.track, part[0])
         for work, part in zip(works, parts, strict=True)
@@ -158,7 +157,7 @@ def _climbed(
         each.append(working(noise, adjoint, entry, data.dt))
     K = each[0][0].shape[-1]
     wide = kalman.whole(K, width)
-    d, r = (np.concatenate([_padded(part[k], wide) for part in each], axis=1) for k in (0, 1))
+    d, r = (_side_by_side([part[k] for part in each], wide) for k in (0, 1))
     columns = kalman.innovations(g, d, r)[0]
     found = []
     for i, (work, delays, adjoint) in enumerate(zip(works, late, adjoints, strict=True)):
@@ -191,9 +190,13 @@ def clean(predictor: Predictor, fit: Fit, rounds: int = 8) -> Fit:
     return found[0] if found else fit
 
 
-def _padded(columns: Array, width: int) -> Array:
-    missing = width - columns.shape[-1]
-    return np.pad(columns, [(0, 0)] * (columns.ndim - 1) + [(0, missing)]) if missing else columns
+def _side_by_side(parts: Sequence[Array], width: int) -> Array:
+    """Columns (steps, B, n, any) of several works along the runs, zeros up to `width`."""
+    steps, B, n, _ = parts[0].shape
+    found = np.zeros((steps, B * len(parts), n, width))
+    for i, part in enumerate(parts):
+        found[:, i * B : (i + 1) * B, :, : part.shape[-1]] = part
+    return found
 
 
 def _update(
