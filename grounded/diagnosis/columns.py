@@ -14,7 +14,7 @@ from grounded.diagnosis import filter as kalman
 from grounded.diagnosis.delays import delays_of
 from grounded.diagnosis.fitted import Fit, calibrated
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor, param_scale
-from grounded.diagnosis.jacobian import heading_slope, passed, slopes, with_effects
+from grounded.diagnosis.jacobian import heading_slope, passed, with_effects
 from grounded.diagnosis.late import Late, System
 from grounded.diagnosis.noise import Noise
 from grounded.diagnosis.secant import PART, sensitivities
@@ -86,11 +86,8 @@ def jacobian(predictor: Predictor, h: Hypothesis, track: Array) -> Array:
     return with_effects(predictor, h, track[:L], u, f_x.reshape(L, B, model.n, model.n))
 
 
-def noise_entry(predictor: Predictor, h: Hypothesis, track: Array, F: Array) -> Array | None:
-    """G of the filter (L, B, n, n): a carried heading rate moves with what it is a function of.
-
-    F (L, B, n, n) is the Jacobian along the track.
-    """
+def noise_entry(predictor: Predictor, h: Hypothesis, track: Array) -> Array | None:
+    """G of the filter (L, B, n, n): a carried heading rate moves with what it is a function of."""
     tied = predictor.tied()
     if not tied:
         return None
@@ -98,11 +95,8 @@ def noise_entry(predictor: Predictor, h: Hypothesis, track: Array, F: Array) -> 
     x, u, n = track[1:], predictor.inputs(h), data.model.n
     G = np.zeros((*x.shape, n))
     G[..., np.arange(n), np.arange(n)] = 1.0
-    added = slopes(predictor, h, x, u, data.time + data.dt, F)
     for heading, rate in tied:
-        slope = heading_slope(predictor, h, x, u, heading, rate) + added[..., heading, :]
-        slope[..., [heading, rate]] = 0.0
-        G[..., rate, :] += slope
+        G[..., rate, :] += heading_slope(predictor, h, x, u, data.time + data.dt, heading, rate)
     return G
 
 
@@ -115,7 +109,7 @@ def system_of(
     seen, late = data.seen, None
     if delays is not None:
         noise, seen, late = delays.noise(noise), delays.samples()[1], delays.late()
-    G = noise_entry(predictor, h, track, F)
+    G = noise_entry(predictor, h, track)
     A = kalman.transition(F, noise.structure.phi(data.dt), G)
     Q = np.broadcast_to(noise.process(data.dt), (L, B, A.shape[-1]))
     R = np.broadcast_to(noise.measurement(L), (L + 1, B, n))

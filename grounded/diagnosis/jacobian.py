@@ -28,14 +28,16 @@ def with_effects(predictor: Predictor, h: Hypothesis, x: Array, u: Array, F: Arr
     F = passed(predictor, h, x, u, F, one)
     if not rates_of(h):
         return F
-    after, half = predictor.advance(h, x, u, data.time), 0.5 * data.dt
-    A0 = slopes(predictor, h, x, u, data.time, F)
-    A1 = slopes(predictor, h, after, u, data.time + data.dt, F)
-    found = (one + half * A1) @ F @ (one + half * A0)
+    after, half, mean = predictor.advance(h, x, u, data.time), 0.5 * data.dt, (F - one) / data.dt
+    first = slopes(predictor, h, x, u, data.time, mean)
+    direct = slopes(predictor, h, after, u, data.time + data.dt, None)
+    both = slopes(predictor, h, after, u, data.time + data.dt, mean)
+    # at the end the model's own rate is still the mean of the step: a function of its start
+    found = (F + half * (direct @ F + both - direct)) @ (one + half * first)
     for heading, rate in predictor.tied():
-        first = heading_slope(predictor, h, x, u, heading, rate) + A0[..., heading, :]
-        last = heading_slope(predictor, h, after, u, heading, rate) + A1[..., heading, :]
-        row = (last[..., None, :] @ found)[..., 0, :] - first
+        row = heading_slope(predictor, h, after, u, data.time + data.dt, heading, rate)
+        row = (row[..., None, :] @ found)[..., 0, :]
+        row -= heading_slope(predictor, h, x, u, data.time, heading, rate)
         row[..., rate] += 1.0
         found[..., rate, :] = row
     return np.asarray(found)
@@ -72,37 +74,43 @@ def passed(
     return np.asarray(slopes + held[..., None] * (slopes - still))
 
 
-def slopes(predictor: Predictor, h: Hypothesis, x: Array, u: Array, t: Array, F: Array) -> Array:
-    """Slope of the added rates (L, B, n, n) [1/s]; F gives that of the model's own rates."""
+def slopes(
+    predictor: Predictor, h: Hypothesis, x: Array, u: Array, t: Array, of_own: Array | None
+) -> Array:
+    """Slope of the added rates (L, B, n, n) [1/s] at x (L, B, n).
+
+    of_own: slope of the model's own rates, (L, B, n, n) or broadcastable; None: they stay.
+    """
     rates, data = rates_of(h), predictor.data
     n, half, names = x.shape[-1], 0.5 * data.dt, data.model.state_names
     if not rates:
         return np.zeros((*x.shape, n))
     needs = any(e.family.needs_own for e, _ in rates)
     own = (predictor.step(x, u, predictor.params(h)) - x) / data.dt if needs else x
-    moved_own = (F - np.eye(n)) / data.dt
     base = predictor.added_rate(rates, x, u, t, predictor.named(own))
     found = np.empty((*x.shape, n))
     for j, name in enumerate(names):
         size = SMALL * data.scales.spread(name)
         other = x.copy()
         other[..., j] += size
-        rate = predictor.named(own + size * moved_own[..., j] if needs else other)
-        found[..., j] = (predictor.added_rate(rates, other, u, t, rate) - base) / size
+        moved = own if of_own is None else own + size * of_own[..., j]
+        rate = predictor.added_rate(rates, other, u, t, predictor.named(moved))
+        found[..., j] = (rate - base) / size
     i = np.arange(n)
     found[..., i, i] = np.maximum(found[..., i, i], -STEEPEST / half)
     return found
 
 
 def heading_slope(
-    predictor: Predictor, h: Hypothesis, x: Array, u: Array, heading: int, rate: int
+    predictor: Predictor, h: Hypothesis, x: Array, u: Array, t: Array, heading: int, rate: int
 ) -> Array:
-    """Slope of the heading's own rate in the model, (L, B, n) [1/s]."""
+    """Slope of the heading's rate of this very moment, effects and all, (L, B, n) [1/s]."""
     data, n = predictor.data, x.shape[-1]
     short = 1e-3 * data.dt
     flat = np.ascontiguousarray(x.reshape(-1, n))
     inputs = np.ascontiguousarray(u.reshape(-1, u.shape[-1]))
     f_x, _ = data.model.system.linearise(flat, inputs, predictor.params(h), short)
-    slope = f_x[:, heading, :] / short
-    slope[:, [heading, rate]] = 0.0
-    return np.asarray(slope.reshape(x.shape))
+    own = ((f_x - np.eye(n)) / short).reshape(*x.shape, n)
+    slope = own[..., heading, :] + slopes(predictor, h, x, u, t, own)[..., heading, :]
+    slope[..., [heading, rate]] = 0.0
+    return np.asarray(slope)

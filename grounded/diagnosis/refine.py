@@ -82,10 +82,7 @@ def _iterate(predictor: Predictor, works: list[Work], fixed_noise: bool) -> None
     parts = [linearised(predictor, work.h, work.track) for work in works]
     width = kalman.whole(max(part[1].shape[-1] for part in parts), data.model.n)
     d, r = (_side_by_side([part[k] for part in parts], width) for k in (1, 2))
-    carried = [
-        noise_entry(predictor, work.h, work.track, part[0])
-        for work, part in zip(works, parts, strict=True)
-    ]
+    carried = [noise_entry(predictor, work.h, work.track) for work in works]
     try:
         g = _gains(data, works, late, [part[0] for part in parts], carried)
     except np.linalg.LinAlgError:
