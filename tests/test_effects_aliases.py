@@ -1,4 +1,4 @@
-"""One name for one effect: what an input's bias or a parameter does exactly is not offered twice."""
+"""One name for one effect: what a bias or a parameter does exactly is not offered twice."""
 
 import numpy as np
 import pytest

@@ -31,9 +31,11 @@ def with_effects(predictor: Predictor, h: Hypothesis, x: Array, u: Array, F: Arr
     after, half, mean = predictor.advance(h, x, u, data.time), 0.5 * data.dt, (F - one) / data.dt
     first = slopes(predictor, h, x, u, data.time, mean)
     direct = slopes(predictor, h, after, u, data.time + data.dt, None)
-    both = slopes(predictor, h, after, u, data.time + data.dt, mean)
-    # at the end the model's own rate is still the mean of the step: a function of its start
-    found = (F + half * (direct @ F + both - direct)) @ (one + half * first)
+    later = F + half * direct @ F
+    if any(e.family.needs_own for e, _ in rates_of(h)):
+        # at the end the model's own rate is still the mean of the step: a function of its start
+        later += half * (slopes(predictor, h, after, u, data.time + data.dt, mean) - direct)
+    found = later @ (one + half * first)
     for heading, rate in predictor.tied():
         row = heading_slope(predictor, h, after, u, data.time + data.dt, heading, rate)
         row = (row[..., None, :] @ found)[..., 0, :]
@@ -111,6 +113,8 @@ def heading_slope(
     inputs = np.ascontiguousarray(u.reshape(-1, u.shape[-1]))
     f_x, _ = data.model.system.linearise(flat, inputs, predictor.params(h), short)
     own = ((f_x - np.eye(n)) / short).reshape(*x.shape, n)
-    slope = own[..., heading, :] + slopes(predictor, h, x, u, t, own)[..., heading, :]
+    slope, name = own[..., heading, :].copy(), data.model.state_names[heading]
+    if any(name in e.site.targets or f"{name}<-" in e.name for e, _ in rates_of(h)):
+        slope += slopes(predictor, h, x, u, t, own)[..., heading, :]
     slope[..., [heading, rate]] = 0.0
     return np.asarray(slope)
