@@ -55,7 +55,8 @@ def test_a_parameter_at_its_bound_does_not_hold_up_the_others():
     assert "coulomb_friction:omega" in found.effects
     same = {"input_gain:torque", "parameter:m", "rate_gain:omega"}  # what a mass does to a torque
     assert set(found.effects) <= {"coulomb_friction:omega", *same}
-    assert found.gap["after"] < 1.5 < 10 < found.gap["before"]
+    assert found.gap["before"] > 50 * found.gap["after"]
+    assert found.gap["after"] < 5  # the friction's sign is smoothed over another width there
 
 
 def test_a_rate_that_is_another_state_has_one_name():
