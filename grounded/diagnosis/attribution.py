@@ -72,9 +72,7 @@ def _explore(search: Search) -> Fit:
     singles = search.of_size(1)
     if not singles:
         return null
-    for kind in {fit.noise.structure for fit in singles[:SHORTLIST]}:
-        # a large effect has a long way from its first look
-        search.refined([f for f in singles[:SHORTLIST] if f.noise.structure == kind], 8)
+    search.finished(singles[:SHORTLIST], 8)  # a large effect has a long way from its first look
     search.again(search.of_size(1)[: RESTARTED if search.data.model.n <= LARGE else 2])
     search.beside_parameters()
     best = search.of_size(1)[0]
@@ -128,8 +126,7 @@ def _grow(search: Search, best: Fit, most: int) -> None:
     while 1 <= size < most:
         for start in _starts(search, size, best):
             search.extended(start, 8)
-        for fit in search.of_size(size + 1)[:HOPEFUL]:
-            search.refined([fit], 10)
+        search.finished(search.of_size(size + 1)[:HOPEFUL], 10)
         search.again(search.of_size(size + 1)[:2])
         larger = search.of_size(size + 1)
         if not larger or search.score(larger[0]) < search.score(best) + CLAIM:

@@ -154,9 +154,3 @@ def _bounds(data: Data) -> tuple[Array, Array]:
     low = [max(b, 0.2 * v) if v > 0 else b for b, v in zip(low, values, strict=True)]
     high = [min(b, 0.2 * v) if v < 0 else b for b, v in zip(high, values, strict=True)]
     return np.array(low), np.array(high)
-
-
-def spread_over(values: Array | float, shape: tuple[int, int]) -> Array:
-    """Variances at every step of every run, (*shape, n)."""
-    array = np.asarray(values)
-    return np.broadcast_to(array, (*shape, array.shape[-1]))

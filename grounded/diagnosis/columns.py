@@ -61,19 +61,22 @@ def linearised(predictor: Predictor, h: Hypothesis, track: Array) -> tuple[Array
 
 def _sensitivities(predictor: Predictor, h: Hypothesis, x: Array, u: Array) -> tuple[Array, Array]:
     """F (L, B, n, n) and what each shift adds to a step, (L, B, n, k); k = 0 without shifts."""
-    data, p = predictor.data, predictor.params(h)
-    model, (L, B) = data.model, data.time.shape
-    flat = (
-        np.ascontiguousarray(x.reshape(-1, model.n)),
-        np.ascontiguousarray(u.reshape(-1, model.m)),
-    )
     if h.spread == 0:
-        return jacobian(predictor, h, x), np.zeros((L, B, model.n, 0))
-    which = calibrated(data)
-    f_x, f_p = sensitivities(model, *flat, p, data.dt)
-    scaled = f_p[:, :, which] * param_scale(model)[which]
-    F = with_effects(predictor, h, x, u, f_x.reshape(L, B, model.n, model.n))
-    return F, passed(predictor, h, x, u, scaled.reshape(L, B, model.n, -1))
+        return jacobian(predictor, h, x), np.zeros((*x.shape, 0))
+    which = calibrated(predictor.data)
+    F, f_p = sensitivities_of(predictor, h, x, u)
+    return F, f_p[..., which] * param_scale(predictor.data.model)[which]
+
+
+def sensitivities_of(
+    predictor: Predictor, h: Hypothesis, x: Array, u: Array
+) -> tuple[Array, Array]:
+    """Of a hypothesis' steps from x (L, B, n): F (L, B, n, n), slope in all parameters (..., k)."""
+    data, (L, B, n) = predictor.data, x.shape
+    flat = (np.ascontiguousarray(x.reshape(-1, n)), np.ascontiguousarray(u.reshape(L * B, -1)))
+    f_x, f_p = sensitivities(data.model, *flat, predictor.params(h), data.dt)
+    F = with_effects(predictor, h, x, u, f_x.reshape(L, B, n, n))
+    return F, passed(predictor, h, x, u, f_p.reshape(L, B, n, -1))
 
 
 def jacobian(predictor: Predictor, h: Hypothesis, track: Array) -> Array:

@@ -13,7 +13,6 @@ Noise (its weights) and adjoints belong to samples: outside the filter they stay
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -185,15 +184,6 @@ def delays_of(h: Hypothesis, data: Data) -> Delays | None:
     whole = np.floor(steps + 1e-9)
     part = np.maximum(steps - whole, 0.0)
     return Delays(data, tuple(i for i, _ in named), tuple(int(k) for k in whole), part)
-
-
-def joined(delays: Sequence[Delays | None]) -> Late | None:
-    """For a batch of hypotheses, each with as many late channels."""
-    each = [one.late() for one in delays if one is not None]
-    if not each:
-        return None
-    channel, part = [late.channel for late in each], [late.part for late in each]
-    return Late(np.concatenate(channel), np.concatenate(part))
 
 
 def _named(h: Hypothesis, data: Data) -> list[tuple[int, float]]:

@@ -15,6 +15,7 @@ Shapes: L steps, B runs, n channels, D late ones, n' = n + D, N' = n' or 2 n'.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -125,3 +126,17 @@ class Late:
         """Of values for each slot (L, B, N'), those of w and c, which have noise, (L, B, N)."""
         wide = n + self.count
         return np.concatenate([values[..., :n], values[..., wide : wide + n]], axis=-1)
+
+
+def joined(parts: Sequence[tuple[System, Late | None]]) -> tuple[System, Late | None]:
+    """Systems with as many late channels each as one, their runs one after the other."""
+    systems = [system for system, _ in parts]
+    A, Q, R, seen = (np.concatenate([one[k] for one in systems], axis=1) for k in range(4))
+    entries = [one.G for one in systems if one.G is not None]
+    G = np.concatenate(entries, axis=1) if entries else None
+    whole = System(A, Q, R, seen, np.concatenate([one.start for one in systems]), G)
+    each = [late for _, late in parts if late is not None]
+    if not each:
+        return whole, None
+    channel, part = [late.channel for late in each], [late.part for late in each]
+    return whole, Late(np.concatenate(channel), np.concatenate(part))

@@ -19,13 +19,14 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from grounded.diagnosis import filter as kalman
-from grounded.diagnosis.climb import MOST_NUMBERS, Work, proposed, spread_over
-from grounded.diagnosis.columns import gains_of, linearised, noise_entry
+from grounded.diagnosis.climb import MOST_NUMBERS, Work, proposed
+from grounded.diagnosis.columns import gains_of, linearised, system_of
 from grounded.diagnosis.data import Data
-from grounded.diagnosis.delays import Delays, delays_of, joined
+from grounded.diagnosis.delays import Delays, delays_of
 from grounded.diagnosis.fitted import Fit, calibrated, shift_precision
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor, param_scale
 from grounded.diagnosis.information import average, working
+from grounded.diagnosis.late import Late, System, joined
 from grounded.diagnosis.noise import Noise, cleaned, climbed, slopes
 from grounded.effects import SensorDelayFamily
 from grounded.frozen import Array
@@ -82,9 +83,13 @@ def _iterate(predictor: Predictor, works: list[Work], fixed_noise: bool) -> None
     parts = [linearised(predictor, work.h, work.track) for work in works]
     width = kalman.whole(max(part[1].shape[-1] for part in parts), data.model.n)
     d, r = (_side_by_side([part[k] for part in parts], width) for k in (1, 2))
-    carried = [noise_entry(predictor, work.h, work.track) for work in works]
+    systems = [
+        system_of(predictor, work.h, work.noise, work.track, part[0])
+        for work, part in zip(works, parts, strict=True)
+    ]
+    system, delayed = joined(systems)
     try:
-        g = _gains(data, works, late, [part[0] for part in parts], carried)
+        g = kalman.gains(*system, delayed)
     except np.linalg.LinAlgError:
         for work in works:
             work.still = 1
@@ -97,12 +102,12 @@ def _iterate(predictor: Predictor, works: list[Work], fixed_noise: bool) -> None
     assert filtered is not None
     steps = [work.noise for work in works]
     if not fixed_noise:
-        steps = _climbed(data, works, late, carried, g, white[..., 0])
+        steps = _climbed(data, works, late, systems, g, white[..., 0])
     for i, work in enumerate(works):
         own = slice(i * B, (i + 1) * B)
         columns, before, delays = parts[i][1].shape[-1], 0.0, late[i]
         if delays is not None:
-            entry, residual = carried[i], white[:, own, :, 0]
+            entry, residual = systems[i][0].G, white[:, own, :, 0]
             before = delays.before(work.noise, entry, work.track, residual, g.whiten[:, own])
         _update(
             predictor,
@@ -115,33 +120,11 @@ def _iterate(predictor: Predictor, works: list[Work], fixed_noise: bool) -> None
         )
 
 
-def _gains(
-    data: Data,
-    works: list[Work],
-    late: list[Delays | None],
-    jacobians: list[Array],
-    carried: list[Array | None],
-) -> kalman.Gains:
-    """The gains of all works' filters, one after the other along the runs."""
-    L, B = data.time.shape
-    entries = [entry for entry in carried if entry is not None]
-    G = np.concatenate(entries, axis=1) if entries else None
-    phi = works[0].noise.structure.phi(data.dt)
-    Q = np.concatenate([spread_over(w.noise.process(data.dt), (L, B)) for w in works], axis=1)
-    moved = zip(works, late, strict=True)
-    by_state = [work.noise if s is None else s.noise(work.noise) for work, s in moved]
-    R = np.concatenate([spread_over(w.measurement(L), (L + 1, B)) for w in by_state], axis=1)
-    start = np.concatenate([w.noise.start(B) for w in works])
-    seen = np.concatenate([data.seen if s is None else s.samples()[1] for s in late], axis=1)
-    A = kalman.transition(np.concatenate(jacobians, axis=1), phi, G)
-    return kalman.gains(A, Q, R, seen, start, G, joined(late))
-
-
 def _climbed(
     data: Data,
     works: list[Work],
     late: list[Delays | None],
-    carried: list[Array | None],
+    systems: list[tuple[System, Late | None]],
     g: kalman.Gains,
     white: Array,
 ) -> list[Noise]:
@@ -149,9 +132,9 @@ def _climbed(
     B, width = data.time.shape[1], data.model.n
     adjoints = kalman.smoother(g, white).parts(B)
     each = []
-    for work, delays, entry, adjoint in zip(works, late, carried, adjoints, strict=True):
+    for work, delays, (own, _), adjoint in zip(works, late, systems, adjoints, strict=True):
         noise = work.noise if delays is None else delays.noise(work.noise)
-        each.append(working(noise, adjoint, entry, data.dt))
+        each.append(working(noise, adjoint, own.G, data.dt))
     K = each[0][0].shape[-1]
     wide = kalman.whole(K, width)
     d, r = (_side_by_side([part[k] for part in each], wide) for k in (0, 1))

@@ -22,13 +22,11 @@ import numpy as np
 
 from grounded.compile import Named
 from grounded.diagnosis import filter as kalman
-from grounded.diagnosis.columns import base_columns, system_of
+from grounded.diagnosis.columns import base_columns, sensitivities_of, system_of
 from grounded.diagnosis.delays import delays_of
 from grounded.diagnosis.fitted import Fit
 from grounded.diagnosis.grid import elsewhere, faint, grid_points
 from grounded.diagnosis.hypothesis import Predictor, sensor_offset
-from grounded.diagnosis.jacobian import passed, with_effects
-from grounded.diagnosis.secant import sensitivities
 from grounded.effects import (
     Effect,
     InputFamily,
@@ -87,20 +85,12 @@ class _Context:
     def __init__(self, predictor: Predictor, fit: Fit) -> None:
         self.predictor, self.fit = predictor, fit
         data, h = predictor.data, fit.hypothesis
-        model = data.model
-        L, B = data.time.shape
         self.x = fit.track[:-1]
         self.u = predictor.inputs(h)
         self.p = predictor.params(h)
         self.after = predictor.advance(h, self.x, self.u, data.time)
         self.ahead = np.concatenate([fit.track[:1], self.after])
-        flat = (
-            np.ascontiguousarray(self.x.reshape(-1, model.n)),
-            np.ascontiguousarray(self.u.reshape(-1, model.m)),
-        )
-        f_x, f_p = sensitivities(model, *flat, self.p, data.dt)
-        self.F = with_effects(predictor, h, self.x, self.u, f_x.reshape(L, B, model.n, model.n))
-        self.f_p = passed(predictor, h, self.x, self.u, f_p.reshape(L, B, model.n, -1))
+        self.F, self.f_p = sensitivities_of(predictor, h, self.x, self.u)
         system, late = system_of(predictor, h, fit.noise, fit.track, self.F)
         self.G, self.gains = system.G, kalman.gains(*system, late)
         self.delays = delays_of(h, data)

@@ -1,11 +1,6 @@
 """The bookkeeping of one attribution: which hypotheses were fitted, their evidence, what to try.
 
-    evidence(h) = log p(y | h) - k/2 ln N - ln(places looked at) - ln(targets of the family)
-                  - what the noise structure costs
-
-N time steps, k free values. The price of looking pays for thresholds, frequencies and places that
-were scanned and for families that could have been blamed at many targets; a parameter of the model
-pays by its prior (a fifth of its size) instead.
+evidence(h) = log p(y | h) - what its effects cost (`price.py`) - what the noise structure costs
 """
 
 from __future__ import annotations
@@ -90,6 +85,11 @@ class Search:
         )
         self.keep(fits)
         return fits
+
+    def finished(self, fits: Sequence[Fit], iterations: int) -> None:
+        """Goes on with fits of any noise structure, those of one structure together."""
+        for structure in dict.fromkeys(fit.noise.structure for fit in fits):
+            self.refined([f for f in fits if f.noise.structure == structure], iterations)
 
     # -- without effects ------------------------------------------------------------------------
 
