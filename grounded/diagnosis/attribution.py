@@ -16,7 +16,7 @@ from grounded.diagnosis.data import Data
 from grounded.diagnosis.fitted import Fit
 from grounded.diagnosis.noise import Structure
 from grounded.diagnosis.refine import clean
-from grounded.diagnosis.search import CLAIM, LARGE, SHORTLIST, Search, parametric
+from grounded.diagnosis.search import CLAIM, LARGE, SHORTLIST, TO_THE_TOP, Search
 from grounded.effects import Effect
 
 HOPEFUL = 4  # larger sets that are fitted to the end
@@ -41,16 +41,7 @@ def attribute(
     with np.errstate(all="ignore"):  # a hypothesis that diverges scores minus infinity
         search, best = _searched(Search(data, candidates, tick))
         _grow(search, best, max_effects)
-    chosen = search.best_null()
-    for size in range(1, max_effects + 1):
-        for fit in search.of_size(size)[:1]:
-            if search.score(fit) > search.score(chosen) + CLAIM:
-                chosen = fit
-    if not chosen.hypothesis.effects and search.calibrates():
-        # one parameter is a calibration too: it need only be likelier than the shift of all
-        single = [f for f in search.of_size(1) if parametric(f)]
-        chosen = max([chosen, *single[:1]], key=search.score)
-    return search, chosen
+    return search, search.chosen(max_effects)
 
 
 def _searched(search: Search) -> tuple[Search, Fit]:
@@ -85,6 +76,8 @@ def _explore(search: Search) -> Fit:
         best = again
         if same:
             break
+    search.finished(search.of_size(1)[:HOPEFUL], TO_THE_TOP)
+    best = search.of_size(1)[0]
     search.fair(best)
     return max([best, search.best_null()], key=search.score)
 
@@ -128,6 +121,7 @@ def _grow(search: Search, best: Fit, most: int) -> None:
             search.extended(start, 8)
         search.finished(search.of_size(size + 1)[:HOPEFUL], 10)
         search.again(search.of_size(size + 1)[:2])
+        search.finished(search.of_size(size + 1)[:2], TO_THE_TOP)
         larger = search.of_size(size + 1)
         if not larger or search.score(larger[0]) < search.score(best) + CLAIM:
             return

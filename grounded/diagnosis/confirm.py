@@ -1,7 +1,10 @@
-"""No claim whose predictions of held-out trials run away: evidence alone does not see that.
+"""No claim that held-out trials contradict: evidence alone does not see that.
 
-Values that one trial alone determines (a wave, a saturation that one run reaches) can make the
-other trials' predictions useless. Such a hypothesis gives way to the next one that holds.
+Two ways in which the likeliest hypothesis can be wrong. Noise that is allowed to be coloured, or
+parameters that are allowed to move, explain a lasting effect away that predictions a second ahead
+still miss (a bias of a motor, a friction that is lower at first): then another noise is confirmed.
+And values that one trial alone determines (a wave, a saturation that one run reaches) can make the
+other trials' predictions useless: then a hypothesis gives way to the next one that holds.
 """
 
 from __future__ import annotations
@@ -9,10 +12,45 @@ from __future__ import annotations
 from grounded.diagnosis.fitted import Fit
 from grounded.diagnosis.gap import horizon
 from grounded.diagnosis.search import CLAIM, Search
-from grounded.diagnosis.shrinkage import shrinkage
+from grounded.diagnosis.shrinkage import gaps_of, shrinkage
 
+MISFIT = 1.3  # times what noise makes of predictions, from which the noise is doubted
+BETTER = 1.5  # times smaller is what another noise has to leave
 RUNAWAY = 3.0  # times the gap without the effects: beyond what sensors that differ may cost
 TRIES = 6  # hypotheses that are looked at
+
+
+def noise_confirmed(search: Search, best: Fit, most: int, seconds: float) -> tuple[Search, Fit]:
+    """The search and its best hypothesis, under the noise whose claims predict held-out trials.
+
+    Another structure of noise, or exact parameters, is preferred to the likeliest one only where
+    that one's claim leaves much more than noise and the other's leaves much less.
+
+    Args:
+        search: with all hypotheses that were fitted.
+        best: the likeliest one.
+        most: so many effects at most.
+        seconds: how far ahead trials are predicted [s].
+    """
+    if not best.hypothesis.effects or search.data.count < 2:
+        return search, best
+    where = horizon(search.predictor, best, seconds)
+    (gap,) = gaps_of(search.predictor, [best], where)
+    if not gap > MISFIT:
+        return search, best
+    found = []
+    for structure, spread in {(s, w) for s, w, _ in search.fits}:
+        if (structure, spread) == (best.noise.structure, best.hypothesis.spread):
+            continue
+        other = search.under(structure, spread)
+        if other is not None and (rival := other.chosen(most)).hypothesis.effects:
+            found.append((gaps_of(search.predictor, [rival], where)[0], other, rival))
+    found = [each for each in found if each[0] * BETTER < gap]
+    if not found:
+        return search, best
+    _, other, rival = min(found, key=lambda each: each[0])
+    other.finished(other.of_size(len(rival.hypothesis.effects))[:TRIES], 20)
+    return other, other.chosen(most)
 
 
 def confirmed(search: Search, best: Fit, seconds: float) -> Fit:

@@ -21,7 +21,7 @@ import numpy as np
 
 from grounded.diagnosis.attribution import attribute
 from grounded.diagnosis.claims import Claims
-from grounded.diagnosis.confirm import confirmed
+from grounded.diagnosis.confirm import confirmed, noise_confirmed
 from grounded.diagnosis.data import prepare, usable
 from grounded.diagnosis.delays import delays_of
 from grounded.diagnosis.fitted import Fit
@@ -85,6 +85,7 @@ def diagnose(
     search, best = attribute(data, candidates, max_effects=options.max_effects, tick=tick)
     tick("leftover")
     with np.errstate(all="ignore"):
+        search, best = noise_confirmed(search, best, options.max_effects, options.horizon)
         best = confirmed(search, best, options.horizon)
         left = leftovers(search.predictor, best)
         task = subject if isinstance(subject, Task) else None

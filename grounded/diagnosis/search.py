@@ -29,6 +29,7 @@ SHORTLIST = 14  # effects that are refined of a scan, and half as many parameter
 TAUS = (0.05, 0.1, 0.3)  # [s] of coloured noise
 BESIDE = 4  # effects that are fitted with the parameters freed
 LARGE_GAIN = 50.0  # nats from which a hypothesis is also started by itself
+TO_THE_TOP = 25  # iterations of fits that decide: most need fewer, and stop by themselves
 LARGE = 8  # states, above which one correlation time and half the shortlist have to do
 
 
@@ -149,7 +150,7 @@ class Search:
             (fit.hypothesis, fit.noise.allowing(Structure(tau), self.data.dt), fit.track)
             for tau in self.taus
         ]
-        return self.refined(starts, iterations=8)
+        return self.refined(starts, iterations=8 if fit.hypothesis.effects else TO_THE_TOP)
 
     def calibrated(self, fit: Fit) -> list[Fit]:
         """The same hypothesis with the model's parameters free to move a little, or more.
@@ -273,6 +274,27 @@ class Search:
             ):
                 best[names] = fit
         return sorted(best.values(), key=lambda f: -self.score(f))
+
+    def chosen(self, most: int) -> Fit:
+        """The hypothesis that would be claimed: every effect more has to pay for itself."""
+        chosen = self.best_null()
+        for size in range(1, most + 1):
+            for fit in self.of_size(size)[:1]:
+                if self.score(fit) > self.score(chosen) + CLAIM:
+                    chosen = fit
+        if not chosen.hypothesis.effects and self.calibrates():
+            # one parameter is a calibration too: it need only be likelier than the shift of all
+            single = [f for f in self.of_size(1) if parametric(f)]
+            chosen = max([chosen, *single[:1]], key=self.score)
+        return chosen
+
+    def under(self, structure: Structure, spread: float) -> Search | None:
+        """What was fitted under one noise and freedom of the parameters; None without a null."""
+        other = Search(self.data, self.candidates, self.tick)
+        exact = (structure, 0.0, ())
+        kept = {k: f for k, f in self.fits.items() if k[:2] == (structure, spread) or k == exact}
+        other.fits, other._prices = kept, self._prices
+        return other if exact in kept else None
 
 
 def parametric(fit: Fit) -> bool:

@@ -3,7 +3,7 @@
 A car is driven by the same commands in the model (grey) and in the model with one effect (orange);
 shown is the state that the effect changes most, in units of its own range: one that moves fast
 (speed, steering angle, heading rate) where it changes those, else a position. Strengths are chosen
-so that the change is seen: they double until a quarter of the range is reached.
+so that the change is seen: about a quarter of the range.
 """
 
 from __future__ import annotations
@@ -56,23 +56,31 @@ def run(model: Model, base: Model, inputs: Array) -> Array:
     return np.array(found)[:, : base.n]
 
 
+def settings(effect: Effect) -> list[dict[str, float]]:
+    """Values to try: strengths that double at the middle of the grid, or the grid itself."""
+    linear = [q for q in effect.free if not q.grid]
+    scanned = {q.name: np.sort(q.grid) for q in effect.free if q.grid}
+    if not linear:
+        most = max(map(len, scanned.values()))
+        return [{n: float(g[min(k, len(g) - 1)]) for n, g in scanned.items()} for k in range(most)]
+    middle = {name: float(grid[len(grid) // 2]) for name, grid in scanned.items()}
+    strengths = (0.01 * 2**k for k in range(12))
+    return [middle | {q.name: float(np.clip(s, q.low, q.high)) for q in linear} for s in strengths]
+
+
 def signature(effect: Effect, inputs: Array, plain: Array) -> tuple[str, Array, Array]:
     """The state that changes most: its name, without and with the effect (T + 1,)."""
     size = np.maximum(np.ptp(plain, axis=0), 1e-9)
-    values = {q.name: float(np.sort(q.grid)[len(q.grid) // 2]) for q in effect.free if q.grid}
-    linear, strength = [q for q in effect.free if not q.grid], 0.01
-    for _ in range(12):
-        values |= {q.name: float(np.clip(strength, q.low, q.high)) for q in linear}
+    fast = [car.state_names.index(name) for name in places.dynamic(car)]
+    found = []
+    for values in settings(effect):
         changed = run(wrap(effect, values, DT), car, inputs)
         change = np.abs(changed - plain).max(axis=0) / size
-        fast = [car.state_names.index(name) for name in places.dynamic(car)]
         if change[fast].max() > 0.02:
             change = np.where(np.isin(np.arange(car.n), fast), change, 0.0)
-        if not linear or change.max() > SEEN:
-            break
-        strength *= 2
-    i = int(np.argmax(change))
-    return car.state_names[i], plain[:, i], changed[:, i]
+        i = int(np.argmax(change))
+        found.append((abs(float(change[i]) - SEEN), car.state_names[i], plain[:, i], changed[:, i]))
+    return min(found, key=lambda each: each[0])[1:]
 
 
 def panel(title: str, state: str, plain: Array, changed: Array, x: float, y: float) -> str:
