@@ -18,6 +18,7 @@ from grounded.diagnosis.jacobian import heading_slope, passed, with_effects
 from grounded.diagnosis.late import Late, System
 from grounded.diagnosis.noise import Noise
 from grounded.diagnosis.secant import PART, sensitivities
+from grounded.diagnosis.starts import widened
 from grounded.effects import ParamFamily
 from grounded.frozen import Array
 
@@ -115,7 +116,7 @@ def system_of(
     G = noise_entry(predictor, h, track)
     A = kalman.transition(F, noise.structure.phi(data.dt), G)
     Q = np.broadcast_to(noise.process(data.dt), (L, B, A.shape[-1]))
-    R = np.broadcast_to(noise.measurement(L), (L + 1, B, n))
+    R = widened(data, np.broadcast_to(noise.measurement(L), (L + 1, B, n)), seen)
     return System(A, Q, R, seen, noise.start(B), G), late
 
 

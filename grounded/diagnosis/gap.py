@@ -22,6 +22,7 @@ from grounded.diagnosis.delays import delays_of
 from grounded.diagnosis.fitted import Fit
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor
 from grounded.diagnosis.leftover import filter_of
+from grounded.diagnosis.starts import widened
 from grounded.frozen import Array
 
 MOST_STARTS = 400
@@ -72,10 +73,11 @@ def _spread(predictor: Predictor, fit: Fit, at: Any, run: Any, steps: int) -> Ar
     Q, wide, N = Q if g.late is None else g.late.noises(Q, n), g.seen.shape[-1], g.A.shape[-1]
     Q = np.broadcast_to(Q, (L, B, N))
     P = np.zeros((len(at), N, N))
-    if delays is None:
+    if g.late is None and bool(data.seen.all()):
         P[:, :n, :n] = g.K[np.maximum(at - 1, 0), run][:, :n] * R[at, run][:, None, :]
     else:
-        P[:, :wide, :wide] = _covariances(g, Q, R)[np.maximum(at - 1, 0), run]
+        given = widened(data, R, g.seen[..., :n])
+        P[:, :wide, :wide] = _covariances(g, Q, given)[np.maximum(at - 1, 0), run]
     k = np.arange(wide, wide + n if wide < N else wide)
     P[:, k, k] = noise.start(1)[0] if wide < N else 0.0
     late = {} if delays is None else dict(zip(delays.channel, delays.whole, strict=True))
@@ -99,15 +101,19 @@ def _spread(predictor: Predictor, fit: Fit, at: Any, run: Any, steps: int) -> Ar
 
 
 def _covariances(g: kalman.Gains, Q: Array, R: Array) -> Array:
-    """Covariance of a widened state after each step, its noise's colour aside, (L, B, n', n')."""
-    assert g.late is not None and g.G is not None
+    """Covariance of a state after each step, its noise's colour aside, (L, B, n', n')."""
     (L, B, N, _), wide = g.A.shape, g.seen.shape[-1]
     found, P = np.empty((L, B, wide, wide)), np.zeros((B, N, N))
-    first = np.concatenate([R[0], np.take_along_axis(R[0], g.late.channel, axis=1)], axis=1)
+    first = R[0] * np.where(g.seen[0, :, : R.shape[-1]] > 0, 1.0, kalman.UNKNOWN)
+    if g.late is not None:
+        first = np.concatenate([first, np.take_along_axis(first, g.late.channel, axis=1)], axis=1)
     P[:, np.arange(wide), np.arange(wide)] = first
     for t in range(L):
         P = g.A[t] @ P @ g.A[t].swapaxes(1, 2)
-        P[:, :wide, :wide] += (g.G[t] * Q[t][:, None, :wide]) @ g.G[t].swapaxes(1, 2)
+        if g.G is None:
+            P[:, np.arange(wide), np.arange(wide)] += Q[t][:, :wide]
+        else:
+            P[:, :wide, :wide] += (g.G[t] * Q[t][:, None, :wide]) @ g.G[t].swapaxes(1, 2)
         P[:, np.arange(wide, N), np.arange(wide, N)] += Q[t][:, wide:]
         P = P - g.K[t] @ P[:, :wide]
         P = 0.5 * (P + P.swapaxes(1, 2))

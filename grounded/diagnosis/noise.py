@@ -27,6 +27,7 @@ from grounded.diagnosis.filter import Adjoint
 from grounded.frozen import Array
 
 DOF = 4.0
+UNSEEN = 1e-2  # of a state's scale: the disturbance of one that is never measured, at first
 NOTHING = 1e-4  # part of a channel's one-step variance below which a variance is nil
 
 
@@ -112,7 +113,9 @@ def first_guess(residual: Array, seen: Array, scale: Array) -> Noise:
     floor = 2 * np.log(1e-6 * scale + 1e-300)
     log_q, log_r = np.empty(n), np.empty(n)
     for i in range(n):
-        good = seen[1:, :, i] > 0
+        good = (seen[1:, :, i] > 0) & (seen[:-1, :, i] > 0)
+        steps = bool(good.any())  # else what is held from sample to sample is no step
+        good = good if steps else seen[1:, :, i] > 0
         e = residual[:, :, i]
         values = e[good]
         spread = 1.4826 * np.median(np.abs(values - np.median(values))) if values.size else 0.0
@@ -122,7 +125,10 @@ def first_guess(residual: Array, seen: Array, scale: Array) -> Noise:
         lagged = float(np.mean((clipped[1:] * clipped[:-1])[both])) if both.any() else 0.0
         r = min(max(-lagged, 0.02 * total), 0.45 * total)
         log_r[i], log_q[i] = math.log(r), math.log(max(total - 2 * r, 0.05 * total))
-        floor[i] = max(floor[i], math.log(NOTHING * total))
+        if not values.size:  # never measured: from where its disturbance can be seen, up or down
+            log_q[i] = floor[i] + 2 * math.log(UNSEEN / 1e-6)
+        if steps:
+            floor[i] = max(floor[i], math.log(NOTHING * total))
     return Noise(
         Structure(), np.maximum(log_q, floor), np.maximum(log_r, floor), log_q.copy(), floor
     )

@@ -28,6 +28,7 @@ from grounded.diagnosis.hypothesis import Hypothesis, Predictor, param_scale
 from grounded.diagnosis.information import average, working
 from grounded.diagnosis.late import Late, System, joined
 from grounded.diagnosis.noise import Noise, cleaned, climbed, slopes
+from grounded.diagnosis.starts import smoothed
 from grounded.effects import SensorDelayFamily
 from grounded.frozen import Array
 
@@ -100,6 +101,9 @@ def _iterate(predictor: Predictor, works: list[Work], fixed_noise: bool) -> None
         return
     white, filtered = kalman.innovations(g, d, r, track=True)
     assert filtered is not None
+    started = smoothed(data, g, np.concatenate([part[0] for part in parts], axis=1), white[..., 0])
+    if started is not None:
+        filtered[0, ..., 0] += started
     steps = [work.noise for work in works]
     if not fixed_noise:
         steps = _climbed(data, works, late, systems, g, white[..., 0])
@@ -161,6 +165,9 @@ def clean(predictor: Predictor, fit: Fit, rounds: int = 8) -> Fit:
             return fit
         white, filtered = kalman.innovations(g, d[..., :1], r[..., :1], track=True)
         assert filtered is not None
+        started = smoothed(predictor.data, g, F, white[..., 0])
+        if started is not None:
+            filtered[0, ..., 0] += started
         adjoint, delays = kalman.smoother(g, white[..., 0]), delays_of(work.h, predictor.data)
         work.noise = cleaned(work.noise, adjoint if delays is None else delays.restored(adjoint))
         work.track = work.track + filtered[..., 0]
