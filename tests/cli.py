@@ -6,6 +6,7 @@ import contextlib
 import io
 import json
 import os
+import re
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -62,3 +63,9 @@ def process(*args: object, cwd: Path | None = None, **env: str) -> Done:
         check=False,
     )
     return Done(done.returncode, done.stdout, done.stderr)
+
+
+def plain(text: str) -> str:
+    """A text without the -C DIR of the commands that it names, each in one piece."""
+    text = re.sub(r" \\\n +", " ", text)
+    return re.sub(r"grounded\s+-C\s+\S+\s+", "grounded ", text)

@@ -4,10 +4,13 @@ import json
 import shlex
 from pathlib import Path
 
+import click
 import pytest
 
-from cli import grounded
-from grounded_trials.next_step import folded
+from cli import grounded, plain, process
+from grounded_cli import address
+from grounded_cli.main import COMMANDS, cli
+from grounded_trials.words import folded
 from reported import DIAGNOSIS, cart, copied
 from workspaces import make
 
@@ -17,9 +20,9 @@ __all__ = ["cart"]
 def last(done):
     """The command of the `next:` line, a continued one in one piece."""
     assert done.code == 0, done.err
-    text = done.out.replace(" \\\n", " ").rstrip().splitlines()[-1]
+    text = plain(done.out).rstrip().splitlines()[-1]
     assert text.startswith("next: ")
-    return " ".join(text.removeprefix("next: ").split())
+    return text.removeprefix("next: ")
 
 
 def diagnosed(folder: Path, **changes):
@@ -98,3 +101,37 @@ def test_a_long_command_is_broken_where_a_shell_allows_it():
     assert max(map(len, text.splitlines())) <= 80
     assert shlex.split(text.removeprefix("next: ").replace("\\\n", " ")) == command.split()
     assert folded("grounded run") == "next: grounded run"
+    quoted = folded("grounded -C 'my own folder' " + command.removeprefix("grounded "))
+    assert shlex.split(quoted.replace("\\\n", " "))[3] == "my own folder"
+
+
+def test_printed_commands_work_from_where_the_user_is(tmp_path):
+    make(tmp_path / "my cart")
+    for at in (("-C", "my cart", "propose"), ("propose", "-C", "my cart")):
+        done = process(*at, cwd=tmp_path)
+        assert done.out.endswith("\nnext: grounded -C 'my cart' run\n"), done.out
+    for expected in ("ingest", "propose"):
+        words = shlex.split(done.out.rstrip().replace("\\\n", " ").splitlines()[-1])
+        done = process(*words[2:], cwd=tmp_path)
+        assert done.code == 0, done.err
+        assert f"next: grounded -C 'my cart' {expected}" in done.out
+    assert process("propose", cwd=tmp_path / "my cart").out.endswith("next: grounded run\n")
+
+
+def test_an_error_names_the_workspace_too_and_init_does_not(tmp_path):
+    make(tmp_path / "cart")
+    done = process("-C", "cart", "adopt", "delay:force", cwd=tmp_path)
+    assert "run `grounded -C cart diagnose` first" in done.err
+    done = process("-C", "cart", "init", "new", "--example", "pendulum", cwd=tmp_path)
+    assert "next: cd new && grounded propose" in done.out
+
+
+def test_the_commands_that_take_a_folder_are_those_that_are_printed_with_it():
+    found = []
+    with click.Context(cli) as ctx:
+        for name in COMMANDS:
+            command = cli.get_command(ctx, name)
+            if any("-C" in option.opts for option in command.params):
+                found.append(name)
+    assert tuple(found) == tuple(n for n in COMMANDS if n in address.COMMANDS)
+    assert set(found) == set(address.COMMANDS)

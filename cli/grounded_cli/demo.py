@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -74,7 +75,7 @@ def _tell(document: dict[str, Any]) -> None:
     show(field("gap", document["verdict"]["sentence"]))
     for kind, path in document["paths"].items():
         show(field(kind, path))
-    show(f"\nnext: grounded -C {document['workspace']} view")
+    show(f"\nnext: grounded -C {shlex.quote(document['workspace'])} view")
 
 
 def _optimum(workspace: Workspace) -> float | None:

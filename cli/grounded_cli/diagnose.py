@@ -10,7 +10,7 @@ import click
 from grounded_cli import completion as complete
 from grounded_cli.options import as_json, in_workspace, library_of, open_workspace
 from grounded_cli.terminal import field, names_in, number, show, show_json, stages, table
-from grounded_trials.words import with_unit
+from grounded_trials.words import folded, with_unit
 
 if TYPE_CHECKING:
     from grounded_trials.diagnosing import Diagnosed
@@ -61,7 +61,7 @@ def command(
 
 def _follow(workspace: Workspace, found: Diagnosed) -> str:
     """The command that follows: adopt what was claimed, or see the whole."""
-    from grounded_trials.next_step import after_diagnosis, folded
+    from grounded_trials.next_step import after_diagnosis
 
     verdict = found.document["verdict"]
     command = after_diagnosis(workspace, verdict["kind"], verdict["effects"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 import click
@@ -52,4 +53,4 @@ def command(folder: str | None, name: str | None, list_: bool, json_: bool) -> N
     ]
     show(f"{folder} is a workspace for {name}:")
     show("\n".join(f"  {a:14} {b}" for a, b in files))
-    show("\nnext: " + f"cd {folder} && " * (folder != ".") + "grounded propose")
+    show("\nnext: " + f"cd {shlex.quote(folder)} && " * (folder != ".") + "grounded propose")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -83,18 +84,19 @@ def _next(report: LogReport, log: str, mapped: bool) -> str:
     """What to do with the file."""
     from grounded_trials.own_files import CANDIDATE, TRIAL
 
+    quoted = shlex.quote(log)
     if report.damage:
-        return f"next: grounded recover {log if len(report.files) == 1 else 'FILE'}"
+        return f"next: grounded recover {quoted if len(report.files) == 1 else 'FILE'}"
     form = report.meta.get("format", "")
     if form == TRIAL and Path(log).resolve().parent.name == "trials":
         return "it is stored already, and needs no [log] table\nnext: grounded report"
     if form == TRIAL:
-        return f"it needs no [log] table\nnext: grounded ingest {log}"
+        return f"it needs no [log] table\nnext: grounded ingest {quoted}"
     if form == CANDIDATE:
         return f"next: grounded run {Path(log).stem}"
     if mapped:
-        return f"# next: put this table into grounded.toml, then: grounded ingest {log}"
-    return f"next: grounded -C WORKSPACE inspect {log}"
+        return f"# next: put this table into grounded.toml, then: grounded ingest {quoted}"
+    return f"next: grounded -C WORKSPACE inspect {quoted}"
 
 
 def _mapping(report: LogReport, folder: str | None) -> str:

@@ -13,7 +13,7 @@ import gc
 import importlib
 import os
 import sys
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small; threads only cost start-up
 
@@ -72,6 +72,19 @@ class LazyGroup(click.Group):
 
         ctx.fail(f"no command '{name}': {nearest(name, COMMANDS)}")
 
+    def invoke(self, ctx: click.Context) -> Any:
+        """Runs a command; the commands that its error advises name the workspace as -C did."""
+        try:
+            return super().invoke(ctx)
+        except Exception as error:
+            from grounded.errors import GroundedError
+
+            if not isinstance(error, GroundedError):
+                raise
+            from grounded_cli.address import addressed
+
+            raise GroundedError(addressed(str(error), fit=False)) from None
+
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
         """Names for the TAB key without importing any command."""
         from grounded_cli.completion import commands
@@ -86,16 +99,18 @@ class LazyGroup(click.Group):
 
 
 @click.command(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
-@click.option("-C", "folder", default=".", metavar="DIR", help="The workspace (default: here).")
+@click.option("-C", "folder", default=None, metavar="DIR", help="The workspace (default: here).")
 @click.version_option(package_name="grounded")
 @click.pass_context
-def cli(ctx: click.Context, folder: str) -> None:
+def cli(ctx: click.Context, folder: str | None) -> None:
     """Teach a real system a manoeuvre in a few trials, from a crude model.
 
     Start with `grounded demo car-figure8` in an empty folder, or make a workspace of your own with
     `grounded init DIR --example car-turn`.
     """
-    ctx.obj = folder
+    from grounded_cli.address import remember
+
+    remember(ctx, folder)
 
 
 def main() -> NoReturn:

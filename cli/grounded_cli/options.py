@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from grounded_cli.address import given, remember
+
 if TYPE_CHECKING:
     from grounded.effects import Library
     from grounded_trials.workspace import Workspace
@@ -17,8 +19,18 @@ F = TypeVar("F", bound=Callable[..., Any])
 def in_workspace(function: F) -> F:
     """Adds -C DIR; the folder is passed as `folder`, falling back on the group's."""
     return click.option(
-        "-C", "folder", default=None, metavar="DIR", help="The workspace (default: here)."
+        "-C",
+        "folder",
+        default=None,
+        metavar="DIR",
+        callback=_remembered,
+        help="The workspace (default: here).",
     )(function)
+
+
+def _remembered(ctx: click.Context, option: click.Parameter, folder: str | None) -> str | None:
+    remember(ctx, folder)
+    return folder
 
 
 def as_json(function: F) -> F:
@@ -34,9 +46,7 @@ def open_workspace(folder: str | None) -> Workspace:
     """
     from grounded_trials.workspace import Workspace
 
-    ctx = click.get_current_context()
-    chosen = folder if folder is not None else ctx.find_root().obj or "."
-    workspace = Workspace(chosen)
+    workspace = Workspace(folder or given() or ".")
     _ = workspace.config
     return workspace
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -93,20 +94,21 @@ def _next(found: Recovery) -> str:
     """What to do with the file."""
     from grounded_trials.own_files import CANDIDATE
 
+    target = shlex.quote(str(found.target))
     if found.format == CANDIDATE:
         return (
             f"a candidate is not for repair: remove {found.source}\n"
             "next: grounded propose   writes the one that is waiting again"
         )
     if not _is_trial(found):
-        return f"next: grounded inspect {found.target}"
+        return f"next: grounded inspect {target}"
     if found.hole:
         again = f"\nnext: grounded run {found.candidate}" * bool(found.candidate)
         return f"a trial with a hole can't be used: it has to be run again{again}"
     short = found.planned is None or found.steps < found.planned
     if found.complete or not (found.candidate and short):
-        return f"next: grounded ingest {found.target}"
+        return f"next: grounded ingest {target}"
     return (
-        f"next: grounded ingest --data {found.target}   for fit and diagnose only;\n"
+        f"next: grounded ingest --data {target}   for fit and diagnose only;\n"
         "without --data it counts as a run that failed, as one that ended early does"
     )

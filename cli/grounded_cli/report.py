@@ -6,8 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from grounded_cli.address import addressed
 from grounded_cli.options import as_json, in_workspace, open_workspace
 from grounded_cli.terminal import progress, remark, show, show_json, sparkline, table
+from grounded_trials.words import folded
 
 if TYPE_CHECKING:
     from grounded_trials.findings import Findings
@@ -27,7 +29,6 @@ def command(html: bool, png: bool, rrd: bool, folder: str | None, json_: bool) -
     """
     workspace = open_workspace(folder)
     from grounded_trials.gathering import gather
-    from grounded_trials.next_step import folded
     from grounded_trials.report_text import report_text
     from grounded_trials.reporting import save
 
@@ -71,7 +72,7 @@ def as_document(findings: Findings, paths: list[Any]) -> dict[str, Any]:
         "sentence": findings.standing.sentence,
         "optimum": findings.optimum,
         "lost": [vars(one) for one in findings.lost],
-        "next": findings.next_command,
+        "next": addressed(findings.next_command),
     }
     pictures = [str(path) for path in paths if path.suffix == ".png"]
     if pictures:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+
 import click
 
 from grounded_cli import completion as complete
@@ -39,4 +41,4 @@ def command(candidate: str | None, folder: str | None, json_: bool) -> None:
         show_json({"trial_file": str(path), "candidate": candidate})
     else:
         show(f"{candidate} was run: {path}")
-        show(f"\nnext: grounded ingest {path}")
+        show(f"\nnext: grounded ingest {shlex.quote(str(path))}")

@@ -9,7 +9,7 @@ import click
 
 from grounded_cli.options import as_json, in_workspace, open_workspace
 from grounded_cli.terminal import field, number, progress, show, show_json, sparkline, table
-from grounded_trials.words import verdict
+from grounded_trials.words import folded, verdict
 
 if TYPE_CHECKING:
     from grounded.search import Standing, Tried
@@ -127,7 +127,7 @@ def next_line(workspace: Workspace, standing: Standing) -> str:
     """The last line of an output: the command to type next."""
     from grounded.errors import GroundedError
     from grounded_trials.diagnosis_file import read_diagnosis
-    from grounded_trials.next_step import folded, next_command
+    from grounded_trials.next_step import next_command
 
     try:
         diagnosis = read_diagnosis(workspace.reports)

@@ -14,6 +14,7 @@ from typing import Any
 
 import click
 
+from grounded_cli.address import addressed
 from grounded_trials.words import WIDTH, wrapped
 from grounded_trials.words import figure as number
 
@@ -43,12 +44,12 @@ def style(text: str, **how: Any) -> str:
 
 def say(text: str) -> None:
     """Narration, on stderr."""
-    click.echo(harmless(text), err=True)
+    click.echo(harmless(addressed(text)), err=True)
 
 
 def show(text: str = "") -> None:
     """Data, on stdout."""
-    click.echo(harmless(text))
+    click.echo(harmless(addressed(text)))
 
 
 def harmless(text: str) -> str:
@@ -83,12 +84,12 @@ def _clean(value: Any) -> Any:
 def field(label: str, text: str, indent: str = "") -> str:
     """A label and its text, wrapped to 80 columns under itself; a number keeps its %."""
     head = f"{indent}{label:<10} "
-    return "\n".join(wrapped(text, head, " " * len(head)) or [head.rstrip()])
+    return "\n".join(wrapped(addressed(text), head, " " * len(head)) or [head.rstrip()])
 
 
 def remark(kind: str, text: str) -> None:
     """Narration with a word ahead, `note: ...`, wrapped to 80 columns."""
-    say("\n".join(wrapped(text, f"{kind}: ", "  ")))
+    say("\n".join(wrapped(addressed(text), f"{kind}: ", "  ")))
 
 
 def names_in(text: str | None) -> list[str]:

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 from grounded.search import Standing
 from grounded_trials.diagnosis_file import Diagnosis
-from grounded_trials.words import WIDTH
 from grounded_trials.workspace import Workspace
 
 EXPORT = "grounded export best --format npz"
@@ -35,17 +34,6 @@ def after_diagnosis(workspace: Workspace, kind: str, effects: Sequence[str]) -> 
     if all(name.startswith("parameter:") for name in new):
         return "grounded fit"  # the model's form is right: all of its numbers at once
     return " ".join(["grounded adopt", *new])
-
-
-def folded(command: str, lead: str = "next: ") -> str:
-    """A command after its lead, broken as a shell allows where it is wider than a terminal."""
-    lines = [lead]
-    for word in command.split(" "):
-        if len(lines[-1]) + len(word) + 3 > WIDTH and lines[-1].strip():
-            lines[-1] = lines[-1].rstrip() + " \\"
-            lines.append("    ")
-        lines[-1] += word + " "
-    return "\n".join(line.rstrip() for line in lines)
 
 
 def _outdated(workspace: Workspace, diagnosis: Diagnosis) -> bool:

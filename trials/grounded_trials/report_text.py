@@ -19,11 +19,11 @@ from grounded_trials.findings import (
     tracking_error,
 )
 from grounded_trials.forecast import SECONDS, forecast_error
-from grounded_trials.next_step import folded
 from grounded_trials.words import (
     WIDTH,
     count,
     figure,
+    folded,
     per_second,
     shown,
     verdict,

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from grounded.search import Tried
 
 WIDTH = 80  # columns of a terminal
+_WORD = re.compile(r"""(?:'[^']*'|"[^"]*"|\S)+""")  # of a command; what is quoted stays whole
 
 
 def figure(value: float | None, digits: int = 4) -> str:
@@ -69,6 +70,17 @@ def wrapped(text: str, first: str, rest: str) -> list[str]:
     wrapper = TextWrapper(WIDTH, initial_indent=first, subsequent_indent=rest)
     wrapper.break_on_hyphens = wrapper.break_long_words = False
     return [line.replace("\xa0", " ") for line in wrapper.wrap(whole)]
+
+
+def folded(command: str, lead: str = "next: ") -> str:
+    """A command after its lead, broken as a shell allows where it is wider than a terminal."""
+    lines = [lead]
+    for word in _WORD.findall(command):
+        if len(lines[-1]) + len(word) + 3 > WIDTH and lines[-1].strip():
+            lines[-1] = lines[-1].rstrip() + " \\"
+            lines.append("    ")
+        lines[-1] += word + " "
+    return "\n".join(line.rstrip() for line in lines)
 
 
 def verdict(tried: Tried, last: bool = True) -> str:
