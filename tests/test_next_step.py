@@ -135,3 +135,66 @@ def test_the_commands_that_take_a_folder_are_those_that_are_printed_with_it():
                 found.append(name)
     assert tuple(found) == tuple(n for n in COMMANDS if n in address.COMMANDS)
     assert set(found) == set(address.COMMANDS)
+
+
+# after a diagnosis
+
+
+def taken_in(folder, *numbers):
+    """Ids of the trials that a diagnosis is said to be made from."""
+    return {"trials": [f"t{k:04d}" for k in numbers], "adopted": [], "params": {}}
+
+
+def test_trials_that_came_after_a_diagnosis_make_it_old(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    count = len(list(folder.glob("trials/*.mcap")))
+    diagnosed(folder, diagnosed=taken_in(folder, *range(1, count + 1)))
+    assert last(grounded("-C", folder, "status")) == "grounded adopt viscous_friction:v"
+    assert "diagnosed with" not in grounded("-C", folder, "report").out
+    diagnosed(folder, diagnosed=taken_in(folder, 1, 2))
+    words = f"diagnosed with 2 of {count} trials; run `grounded diagnose` again"
+    for command in ("status", "report"):
+        done = grounded("-C", folder, command)
+        assert words in " ".join(plain(done.out).split())
+        assert last(done) == "grounded diagnose"
+    page = Path(grounded("-C", folder, "report", "--html", "--json").json["paths"]["html"])
+    assert f"Diagnosed with 2 of {count} trials" in page.read_text()
+
+
+def test_what_was_adopted_is_not_missing_any_more(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    names = ["viscous_friction:v", "delay:force"]
+    verdict = {"kind": "several", "effects": names, "sentence": "Friction; late."}
+    diagnosed(folder, verdict=verdict, diagnosed=taken_in(folder, 1, 2, 3, 4))
+    assert grounded("-C", folder, "adopt", "viscous_friction:v").code == 0
+    out = " ".join(plain(grounded("-C", folder, "report").out).split())
+    assert "adopted since: viscous_friction:v, but not delay:force; run `grounded dia" in out
+    assert "before that: Friction; late." in out
+    assert "crude model" not in out and "what the model without adopted effects lacks" in out
+    page = Path(grounded("-C", folder, "report", "--html", "--json").json["paths"]["html"])
+    text = page.read_text()
+    assert "Before that: Friction" in text and "viscous_friction:v (adopted since)" in text
+    assert "crude model" not in text
+    assert "adopted since" in " ".join(grounded("-C", folder, "status").out.split())
+
+
+def test_nothing_is_said_of_what_one_trial_can_not_know(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    why = "one trial alone confirms nothing; run a second one"
+    verdict = {"kind": "unknown", "effects": [], "sentence": f"No cause is named: {why}."}
+    diagnosed(folder, verdict=verdict, unknowable=[why])
+    done = grounded("-C", folder, "report")
+    assert why in done.out and last(done) == "grounded run best"
+    for words in ("after", "is explained", "delay:force"):
+        assert words not in done.out[done.out.index("gap to the model") :], words
+    page = Path(grounded("-C", folder, "report", "--html", "--json").json["paths"]["html"])
+    assert "of the squared error" not in page.read_text()
+    assert last(grounded("-C", folder, "status")) == "grounded run best"
+
+
+def test_diagnose_of_one_trial_asks_for_another(tmp_path):
+    folder = make(tmp_path / "w").folder
+    assert grounded("-C", folder, "learn", "--trials", 1).code == 0
+    done = grounded("-C", folder, "diagnose")
+    assert "No cause is named" in done.out and last(done) == "grounded propose"
+    assert "before, " not in done.out and "is explained" not in done.out

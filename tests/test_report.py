@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 from cli import grounded, plain
+from grounded_trials.diagnosis_file import diagnosis_of
+from grounded_trials.diagnosis_words import calibrated_sentence
 from grounded_trials.findings import prediction_error, rms, tracking_error
 from grounded_trials.gathering import gather
 from grounded_trials.reporting import save_optimum
@@ -41,7 +43,7 @@ def test_text_shows_the_diagnosis(cart):
     out = grounded("-C", cart, "report").out
     assert "explains 90 % of the gap" in out
     assert "k = 0.3 +- 0.01 1/s" in out
-    assert "4.10 before, 1.10 after, floor 1.00" in out
+    assert "4.10 before, 1.10 after, noise floor 1.00" in out
 
 
 def test_text_and_status_explain_their_columns(cart):
@@ -255,3 +257,26 @@ def test_a_candidate_that_was_not_run_yet_is_shown_as_predicted(tmp_path):
     assert done.code == 0, done.err
     assert "predicted for c0001" in Path(done.json["paths"]["html"]).read_text()
     assert plain(grounded("-C", tmp_path / "w", "report").out).endswith("next: grounded run\n")
+
+
+def test_text_says_what_was_calibrated_and_what_the_figures_are_measured_in(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    out = " ".join(grounded("-C", folder, "report").out.split())
+    assert "calibrated beside them: mass 1.00 -> 1.40 kg" in out
+    assert "figures of two diagnoses don't compare" in out
+    assert "from policy to policy the utilities themselves differ by 1.50" in out
+    assert "scatter" not in out and "crude model misses" not in out
+    one = DIAGNOSIS["utility_prediction"] | {"trials": 1, "spread": 0.0}
+    document = DIAGNOSIS | {"utility_prediction": one}
+    (folder / "reports" / "diagnosis.json").write_text(json.dumps(document))
+    assert "from policy to policy" not in " ".join(grounded("-C", folder, "report").out.split())
+
+
+def test_at_most_three_parameters_are_named_the_most_changed_first():
+    table = {f"p{k}": {"value": 1.0 + 0.1 * k, "std": 0.01, "unit": "m"} for k in range(6)}
+    found = diagnosis_of(DIAGNOSIS | {"parameters": table})
+    text = calibrated_sentence(found, dict.fromkeys(table, 1.0))
+    assert text == (
+        "calibrated beside them: p5 1.00 -> 1.50 m, p4 1.00 -> 1.40 m, p3 1.00 -> 1.30 m "
+        "(and 2 more)"
+    )

@@ -55,14 +55,19 @@ def command(
     if json_:
         show_json(found.document)
     else:
-        _tell(found.document)
+        params = workspace.base_model.params
+        _tell(found.document, {name: param.value for name, param in params.items()})
         show(f"\n{_follow(workspace, found)}")
 
 
 def _follow(workspace: Workspace, found: Diagnosed) -> str:
-    """The command that follows: adopt what was claimed, or see the whole."""
-    from grounded_trials.next_step import after_diagnosis
+    """The command that follows: adopt what was claimed, run another trial, or see the whole."""
+    from grounded_trials.diagnosis_file import diagnosis_of
+    from grounded_trials.next_step import after_diagnosis, another_trial
+    from grounded_trials.proposing import standing_in
 
+    if diagnosis_of(found.document).no_cause:
+        return folded(another_trial(workspace, standing_in(workspace, ahead=True)))
     verdict = found.document["verdict"]
     command = after_diagnosis(workspace, verdict["kind"], verdict["effects"])
     if not command and found.probe:
@@ -70,20 +75,20 @@ def _follow(workspace: Workspace, found: Diagnosed) -> str:
     return folded(command or "grounded report --html")
 
 
-def _tell(document: dict[str, Any]) -> None:
+def _tell(document: dict[str, Any], before: dict[str, float]) -> None:
     from grounded_trials.diagnosis_file import diagnosis_of
     from grounded_trials.diagnosis_words import error_lines
 
-    verdict = document["verdict"]
+    verdict, diagnosis = document["verdict"], diagnosis_of(document)
     show(_verdict(verdict["kind"], verdict["sentence"]))
     for text in document.get("unknowable", []):
         if text not in verdict["sentence"]:
             show(field("unknown", text))
-    show(field("gap", _gap(document["gap"])))
-    for title, text in error_lines(diagnosis_of(document)):
+    for title, text in error_lines(diagnosis, before):
         show(field(title, text))
     _places(document["where"])
-    _effects(document)
+    if not diagnosis.no_cause:
+        _effects(document)
     show("\n" + field("next trial", document["next_trial"]))
 
 
@@ -119,14 +124,6 @@ def _effects(document: dict[str, Any]) -> None:
             show(field(f"  {entry['effect']}:", _values(entry)))
     for group in document["indistinguishable"]:
         show(field("tied", f"the data can't tell apart: {', '.join(group)}"))
-
-
-def _gap(gap: dict[str, Any]) -> str:
-    held = "held out" if gap["held_out"] else "not held out, too few trials"
-    return (
-        f"{number(gap['before'], 3)} before, {number(gap['after'], 3)} after, noise floor "
-        f"{number(gap['floor'], 3)} ({gap['unit']}, {gap['horizon_s']:g} s ahead, {held})"
-    )
 
 
 def _ranked(entry: dict[str, Any]) -> tuple[str, str, str]:

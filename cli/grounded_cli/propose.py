@@ -86,7 +86,8 @@ def _tell(workspace: Workspace, proposed: Proposed) -> None:
     if standing.incumbent is not None:
         best = standing.incumbent
         show(field("so far", f"{number(best.utility)} by {best.candidate.id}", "  "))
-    show(field("trust", _trust(standing), "  "))
+    adopted = bool(workspace.config.model.effects)
+    show(field("trust", _trust(standing, adopted), "  "))
     for name, text in _extent(candidate, workspace.task):
         show(field(name, text, "  "))
     can_run = workspace.config.system.command or workspace.config.system.model
@@ -127,7 +128,7 @@ def _span(values: Any) -> str:
     return f"{round(low, digits) + 0.0:.{digits}f} to {round(high, digits) + 0.0:.{digits}f}"
 
 
-def _trust(standing: Standing) -> str:
+def _trust(standing: Standing, adopted: bool) -> str:
     """How the last prediction came true."""
     pairs = [
         (tried.candidate.predicted_utility, tried.utility)
@@ -135,6 +136,7 @@ def _trust(standing: Standing) -> str:
         if tried.utilities
     ]
     if not pairs:
-        return "unknown: the crude model was never compared with the real system"
+        model = "model with what was adopted" if adopted else "crude model"
+        return f"unknown: the {model} was never compared with the real system"
     predicted, real = pairs[-1]
     return f"the last prediction was {number(predicted)}, the real run gave {number(real)}"

@@ -94,4 +94,5 @@ def as_document(findings: Findings, paths: list[Any]) -> dict[str, Any]:
     if diagnosis is not None:
         verdict = {"kind": diagnosis.kind, "effects": diagnosis.effects}
         document["verdict"] = verdict | {"sentence": diagnosis.sentence}
+        document["outdated"] = findings.since.sentence or None
     return document

@@ -13,6 +13,7 @@ from grounded_trials.words import folded, verdict
 
 if TYPE_CHECKING:
     from grounded.search import Standing, Tried
+    from grounded_trials.diagnosis_file import Diagnosis
     from grounded_trials.workspace import Workspace
 
 LEGEND = "damp: penalty on leaving the last trial's inputs; +-: standard error"
@@ -32,6 +33,8 @@ def command(folder: str | None, json_: bool) -> None:
         show_json(as_document(standing))
         return
     show(summary(standing))
+    if text := _outdated(workspace):
+        show(field("diagnosis", text))
     show(f"\n{next_line(workspace, standing)}")
 
 
@@ -125,12 +128,26 @@ def certainty(standing: Standing) -> str:
 
 def next_line(workspace: Workspace, standing: Standing) -> str:
     """The last line of an output: the command to type next."""
+    from grounded_trials.next_step import next_command
+    from grounded_trials.since import usable_ids
+
+    usable = usable_ids(workspace)
+    return folded(next_command(workspace, standing, _diagnosis(workspace), usable))
+
+
+def _diagnosis(workspace: Workspace) -> Diagnosis | None:
     from grounded.errors import GroundedError
     from grounded_trials.diagnosis_file import read_diagnosis
-    from grounded_trials.next_step import next_command
 
     try:
-        diagnosis = read_diagnosis(workspace.reports)
+        return read_diagnosis(workspace.reports)
     except GroundedError:  # a damaged one is made again
-        diagnosis = None
-    return folded(next_command(workspace, standing, diagnosis))
+        return None
+
+
+def _outdated(workspace: Workspace) -> str:
+    """Why the last diagnosis is not the last word."""
+    from grounded_trials.since import since_diagnosis, usable_ids
+
+    found = _diagnosis(workspace)
+    return since_diagnosis(workspace, found, usable_ids(workspace)).sentence if found else ""

@@ -110,6 +110,12 @@ class Diagnosis:
     whiteness: tuple[tuple[str, float], ...] = ()  # p-value of what is left, by channel
     utility_prediction: UtilityPrediction | None = None
     lookalikes: tuple[Likeness, ...] = ()
+    unknowable: tuple[str, ...] = ()  # what the trials are too few or too quiet for
+
+    @property
+    def no_cause(self) -> bool:
+        """Whether too little is known to name any cause: its figures mean nothing then."""
+        return self.kind == "unknown" and any(text in self.sentence for text in self.unknowable)
 
 
 def read_diagnosis(folder: Path) -> Diagnosis | None:
@@ -159,6 +165,7 @@ def diagnosis_of(document: dict[str, Any]) -> Diagnosis:
         whiteness=white(where.get("whiteness")),
         utility_prediction=utility(document.get("utility_prediction")),
         lookalikes=likenesses(document.get("lookalikes")),
+        unknowable=tuple(map(str, document.get("unknowable") or ())),
     )
 
 

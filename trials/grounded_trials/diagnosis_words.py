@@ -9,15 +9,31 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 
 from grounded_trials.diagnosis_error import Split, coloured
-from grounded_trials.diagnosis_file import Diagnosis
-from grounded_trials.words import count, figure, percent
+from grounded_trials.diagnosis_file import Diagnosis, Gap
+from grounded_trials.words import count, figure, percent, with_unit
+
+MOST = 3  # parameters that are named
 
 
-def error_lines(diagnosis: Diagnosis) -> list[tuple[str, str]]:
-    """(title, text): what the error is made of, whether the rest is noise, the utility, doubles."""
+def error_lines(diagnosis: Diagnosis, before: Mapping[str, float]) -> list[tuple[str, str]]:
+    """(title, text): the gap, what the error is made of, whether the rest is noise, and so on.
+
+    Nothing where no cause could be named: with too little data, what was fitted is no finding.
+
+    Args:
+        diagnosis: what was found.
+        before: the values of the model's parameters before it.
+    """
+    if diagnosis.no_cause:
+        return []
     found = []
+    if diagnosis.gap is not None:
+        found.append(("gap", gap_sentence(diagnosis.gap)))
+    if text := calibrated_sentence(diagnosis, before):
+        found.append(("parameters", text))
     if diagnosis.split:
         found.append(("error", parts_sentence(diagnosis.split)))
     if diagnosis.whiteness:
@@ -31,6 +47,32 @@ def error_lines(diagnosis: Diagnosis) -> list[tuple[str, str]]:
         ]
         found.append(("alike", f"{', '.join(like)} of the signal of {effect}"))
     return found
+
+
+def gap_sentence(gap: Gap) -> str:
+    """The gap before and after, and what it is measured in."""
+    held = "held out" if gap.held_out else "not held out, too few trials"
+    return (
+        f"{figure(gap.before, 3)} before, {figure(gap.after, 3)} after, noise floor "
+        f"{figure(gap.floor, 3)} ({gap.horizon_s:g} s ahead, {held}; in units of the noise that "
+        "this diagnosis estimates: figures of two diagnoses don't compare)"
+    )
+
+
+def calibrated_sentence(diagnosis: Diagnosis, before: Mapping[str, float]) -> str:
+    """The model's own parameters that were fitted beside the effects, most changed first."""
+    if all(name.startswith("parameter:") for name in diagnosis.effects):
+        return ""
+    moved = []
+    for v in diagnosis.parameters:
+        old = before.get(v.name, math.nan)
+        if abs(v.value - old) > 1e-6 * max(abs(v.value), abs(old)):
+            change = abs(v.value - old) / abs(old) if old else math.inf
+            text = with_unit(f"{v.name} {figure(old, 3)} -> {figure(v.value, 3)}", v.unit)
+            moved.append((-change, text))
+    named = [text for _, text in sorted(moved)[:MOST]]
+    more = f" (and {len(moved) - MOST} more)" * (len(moved) > MOST)
+    return f"calibrated beside them: {', '.join(named)}{more}" if named else ""
 
 
 def main_horizon(splits: tuple[Split, ...]) -> Split:
@@ -65,14 +107,17 @@ def utility_sentence(diagnosis: Diagnosis) -> str:
     found = diagnosis.utility_prediction
     if found is None:
         return ""
-    crude, better = (
+    without, better = (
         f"by {figure(value, 3)}" if math.isfinite(value) else "beyond all measure"
         for value in (found.before, found.after)
     )
-    text = f"the crude model misses the utility of {count(found.trials, 'whole trial')} {crude}"
+    text = f"the model misses the utility of {count(found.trials, 'whole trial')} {without}"
     if diagnosis.effects:
         text += f", the diagnosed one {better}"
-    return f"{text} (rms; the trials themselves scatter by {figure(found.spread, 3)})"
+    if found.trials < 2:
+        return f"{text} (rms)"
+    spread = figure(found.spread, 3)
+    return f"{text} (rms; from policy to policy the utilities themselves differ by {spread})"
 
 
 def sentences(text: str) -> list[str]:

@@ -47,7 +47,7 @@ def _figure(findings: Findings, name: str, title: str, trial: Trial) -> Figure |
         t, values = crude.curve(i, trial.dt)
         curves = [
             Curve(times, trial.states[:, i], "real", "real"),
-            Curve(t + begin, values, "model", "crude model", 1.2),
+            Curve(t + begin, values, "model", findings.plain, 1.2),
         ]
         if better is not None and after is not None:
             t, values = after.curve(i, trial.dt)

@@ -58,7 +58,7 @@ def _shrinkage(diagnosis: Diagnosis) -> Bars:
     assert gap is not None
     title = f"Prediction error {gap.horizon_s:g} s ahead" if math.isfinite(gap.horizon_s) else "Gap"
     rows = (
-        ("crude model", gap.before, "model"),
+        ("model", gap.before, "model"),
         ("as diagnosed", gap.after, "best"),
         ("noise alone", gap.floor, "other"),
     )

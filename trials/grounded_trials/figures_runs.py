@@ -163,8 +163,9 @@ def bias_figure(findings: Findings) -> Figure | None:
             curves.append(_over_time(rest, task.dt, "predicted", words, 1.5))
         panels.append(_timed(labelled(name, per_second(unit)), per_second(unit), curves))
     caption = (
-        "What must be added to the crude model’s rate of change for it to replay the trial. A "
-        "curve that keeps its shape over the iterations is a property of the system, not of a run."
+        f"What must be added to the rate of change of the {findings.plain} for it to replay the "
+        "trial. A curve that keeps its shape over the iterations is a property of the system, not "
+        "of a run."
     )
     return Figure("bias", "Bias of the model", caption, tuple(panels), legend(panels))
 

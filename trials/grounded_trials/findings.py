@@ -6,7 +6,7 @@ Text, page, pictures and recording are four ways to show the same findings; none
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -18,6 +18,7 @@ from grounded.task import Task
 from grounded.trial import Trial, mean_trial
 from grounded_trials.better_model import Better
 from grounded_trials.diagnosis_file import Diagnosis
+from grounded_trials.since import Since
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,7 @@ class Findings:
     noise: float  # standard deviation of one trial's utility, NaN while unknown
     next_command: str
     better: Better | None = None  # the model as diagnosed, or with adopted effects
+    since: Since = field(default_factory=Since)  # the diagnosis
 
     @property
     def crude(self) -> Planner:
@@ -79,12 +81,14 @@ class Findings:
         return Planner(self.task, self.task)
 
     @property
-    def stale(self) -> int:
-        """Trials of this robot that came after the diagnosis."""
-        if self.diagnosis is None or not self.diagnosis.trials:
-            return 0
-        ids = {run.trial.id for run in self.runs} | {log.trial.id for log in self.logs}
-        return len(ids - set(self.diagnosis.trials))
+    def plain(self) -> str:
+        """What the model is called that judges: nothing that was adopted is in it."""
+        return "model without adopted effects" if self.effects else "crude model"
+
+    @property
+    def values(self) -> dict[str, float]:
+        """The model's parameters as they are now, by name."""
+        return {name: param.value for name, param in self.task.model.params.items()}
 
     @property
     def history(self) -> tuple[Tried, ...]:

@@ -28,6 +28,7 @@ from grounded_trials.diagnosis_file import Diagnosis, read_diagnosis
 from grounded_trials.findings import Findings, Log, Lost, Run
 from grounded_trials.mcap_log import read_trial
 from grounded_trials.next_step import next_command
+from grounded_trials.since import LEAST_STEPS, Since, since_diagnosis
 from grounded_trials.workspace import Workspace, candidate_of
 
 RUNAWAY = 1e15  # in any unit: the number of a run that diverged
@@ -47,6 +48,7 @@ def gather(workspace: Workspace) -> Findings:
     now = _settled(workspace, candidates, own, _standing(workspace, candidates, own))
     diagnosis = _diagnosis(workspace, lost)
     better = _better(workspace, diagnosis, lost)
+    usable = [t.id for t in trials if _fits(task, t) and t.finite_steps >= LEAST_STEPS]
     return Findings(
         name=workspace.folder.resolve().name,
         task=task,
@@ -61,8 +63,9 @@ def gather(workspace: Workspace) -> Findings:
         diagnosis=diagnosis,
         optimum=_optimum(workspace.reports),
         noise=utility_noise(now.history)[0],
-        next_command=next_command(workspace, now, diagnosis),
+        next_command=next_command(workspace, now, diagnosis, usable),
         better=better,
+        since=since_diagnosis(workspace, diagnosis, usable) if diagnosis else Since(),
     )
 
 

@@ -6,23 +6,49 @@ from collections.abc import Sequence
 
 from grounded.search import Standing
 from grounded_trials.diagnosis_file import Diagnosis
+from grounded_trials.since import since_diagnosis
 from grounded_trials.workspace import Workspace
 
 EXPORT = "grounded export best --format npz"
 
 
-def next_command(workspace: Workspace, now: Standing, diagnosis: Diagnosis | None) -> str:
-    """What a person does next, given where the search stands and what was diagnosed."""
+def next_command(
+    workspace: Workspace, now: Standing, diagnosis: Diagnosis | None, usable: Sequence[str]
+) -> str:
+    """What a person does next, given where the search stands and what was diagnosed.
+
+    Args:
+        workspace: whose model may have changed since the diagnosis.
+        now: where its search stands.
+        diagnosis: the last one.
+        usable: the trials that a diagnosis can use now, in order of arrival.
+    """
     if now.phase == "await-trial":
-        system = workspace.config.system
-        return "grounded run" if system.command or system.model else "grounded ingest TRIAL.mcap"
-    known = diagnosis is not None and not _outdated(workspace, diagnosis)
-    follow = ""
-    if known and diagnosis is not None:
-        follow = after_diagnosis(workspace, diagnosis.kind, diagnosis.effects)
+        return another_trial(workspace, now)
+    if diagnosis is None:
+        return "grounded propose" if now.phase == "propose" else "grounded diagnose"
+    since = since_diagnosis(workspace, diagnosis, usable)
+    follow = after_diagnosis(workspace, diagnosis.kind, diagnosis.effects)
     if now.phase == "propose":  # what logs have shown is adopted before the first candidate
-        return follow * (not now.history) or "grounded propose"
-    return follow or EXPORT if known else "grounded diagnose"
+        if now.history or since.changed or not follow:
+            return "grounded propose"
+        return "grounded diagnose" if since.newer else follow
+    if since.changed or since.newer:
+        return "grounded diagnose"
+    if diagnosis.no_cause:
+        return another_trial(workspace, now)
+    return follow or EXPORT
+
+
+def another_trial(workspace: Workspace, now: Standing) -> str:
+    """How to get one more trial: of what waits, of what comes next, or of the best again."""
+    system = workspace.config.system
+    here = bool(system.command or system.model)
+    if now.phase == "await-trial":
+        return "grounded run" if here else "grounded ingest TRIAL.mcap"
+    if now.phase == "propose" or now.incumbent is None:
+        return "grounded propose"
+    return "grounded run best" if here else "grounded ingest TRIAL.mcap"
 
 
 def after_diagnosis(workspace: Workspace, kind: str, effects: Sequence[str]) -> str:
@@ -34,11 +60,3 @@ def after_diagnosis(workspace: Workspace, kind: str, effects: Sequence[str]) -> 
     if all(name.startswith("parameter:") for name in new):
         return "grounded fit"  # the model's form is right: all of its numbers at once
     return " ".join(["grounded adopt", *new])
-
-
-def _outdated(workspace: Workspace, diagnosis: Diagnosis) -> bool:
-    """Whether it is about another model: effects or parameters were taken over since."""
-    model = workspace.config.model
-    adopted = tuple(str(effect["name"]) for effect in model.effects)
-    params = dict(diagnosis.model_params) if diagnosis.model_params is not None else None
-    return adopted != diagnosis.adopted or params not in (None, dict(model.params))

@@ -82,7 +82,7 @@ def _head(findings: Findings) -> str:
         f"{'closed loop' if task.feedback else 'open loop'}; {findings.method}"
     )
     diagnosis = findings.diagnosis
-    verdict = verdict_block(diagnosis, short=True) if diagnosis else ""
+    verdict = verdict_block(diagnosis, findings.since, short=True) if diagnosis else ""
     return (
         f'<h1>{escape(findings.name)}</h1><p class="soft">{escape(about)}</p>'
         f"{_lost(findings)}{_tiles(findings)}{verdict}"

@@ -7,6 +7,7 @@ from html import escape
 from grounded_trials.diagnosis_error import WHITE, Parts, Split
 from grounded_trials.diagnosis_file import Diagnosis
 from grounded_trials.diagnosis_words import (
+    gap_sentence,
     main_horizon,
     parts_sentence,
     sentences,
@@ -18,7 +19,8 @@ from grounded_trials.figures_gap import gap_figure
 from grounded_trials.findings import Findings
 from grounded_trials.page_parts import command, figure_block, table
 from grounded_trials.page_tables import effect_table, forecast_table, leftover_table
-from grounded_trials.words import count, percent
+from grounded_trials.since import Since
+from grounded_trials.words import percent
 
 
 def gap_section(findings: Findings) -> str:
@@ -29,9 +31,7 @@ def gap_section(findings: Findings) -> str:
             "<p>Not diagnosed yet. This says where the model is wrong, and which effect makes it "
             f"so: {command('grounded diagnose', 'c-diagnose')}</p>{_forecasts(findings)}"
         )
-    later = count(findings.stale, "trial")
-    stale = f"<p>{later} came after this diagnosis.</p>" if findings.stale else ""
-    return stale + _diagnosed(diagnosis) + _forecasts(findings)
+    return _diagnosed(diagnosis, findings.since) + _forecasts(findings)
 
 
 def _forecasts(findings: Findings) -> str:
@@ -42,26 +42,34 @@ def _forecasts(findings: Findings) -> str:
     return "".join([*parts, forecast_table(findings)])
 
 
-def _diagnosed(diagnosis: Diagnosis) -> str:
-    parts = [verdict_block(diagnosis)]
+def _diagnosed(diagnosis: Diagnosis, since: Since) -> str:
+    parts = [verdict_block(diagnosis, since)]
+    if diagnosis.no_cause:  # with too little data, what was fitted is no finding
+        return "".join(parts)
     parts.append(figure_block(gap_figure(diagnosis)))
     if diagnosis.ranking:
-        parts.append(f"<h3>Effects that were weighed</h3>{effect_table(diagnosis)}")
+        parts.append(f"<h3>Effects that were weighed</h3>{effect_table(diagnosis, since)}")
     parts.append(_alike(diagnosis))
     if diagnosis.leftover:
         parts.append(f"<h3>What no known effect explains</h3>{leftover_table(diagnosis)}")
     parts += [_made_of(diagnosis.split), _rest(diagnosis), _utility(diagnosis)]
     gap = diagnosis.gap
     if gap is not None:
-        held = "on trials that were held out" if gap.held_out else "on the trials that were fitted"
-        parts.append(f'<p class="soft">Gap: {escape(gap.unit)}, {held}.</p>')
+        parts.append(f'<p class="soft">Gap: {escape(gap_sentence(gap))}.</p>')
     return "".join(parts)
 
 
-def verdict_block(diagnosis: Diagnosis, *, short: bool = False) -> str:
-    """The verdict, a line for each of its sentences; the first two of them where `short`."""
+def verdict_block(diagnosis: Diagnosis, since: Since, *, short: bool = False) -> str:
+    """The verdict, a line for each of its sentences; the first two of them where `short`.
+
+    What happened since stands before it: it is no longer the last word then.
+    """
     texts = sentences(diagnosis.sentence or diagnosis.kind)
     texts = texts[:2] if short else texts
+    if since.adopted:
+        texts[0] = f"Before that: {texts[0]}"
+    if since.sentence:
+        texts.insert(0, f"{_begun(since.sentence)}.")
     lines = " ".join(f"<span>{escape(text)}</span>" for text in texts)
     return f'<p class="verdict">{lines}</p>'
 

@@ -18,6 +18,7 @@ from grounded_trials.findings import (
 )
 from grounded_trials.forecast import SECONDS, forecast_error
 from grounded_trials.page_parts import table
+from grounded_trials.since import Since
 from grounded_trials.words import figure, shown, verdict, with_unit
 
 INTERVAL = 1.96  # standard deviations of a 95 % interval
@@ -85,7 +86,7 @@ def forecast_table(findings: Findings) -> str:
     trials = ([best.trial] if best is not None else []) + [log.trial for log in findings.logs]
     if not trials:
         return ""
-    planners = [("crude", findings.crude)]
+    planners = [("without adopted effects" if findings.effects else "crude", findings.crude)]
     if findings.better is not None:
         planners.append((findings.better.name, findings.better.planner))
     columns = []
@@ -101,11 +102,11 @@ def forecast_table(findings: Findings) -> str:
     return title + table("forecasts", header, rows)
 
 
-def effect_table(diagnosis: Diagnosis) -> str:
+def effect_table(diagnosis: Diagnosis, since: Since) -> str:
     """The ranked effects with their parameters and 95 % intervals."""
     rows = [
         (
-            r.effect,
+            r.effect + " (adopted since)" * (r.effect in since.adopted),
             figure(r.evidence, 3),
             figure(r.gap_after, 3),
             f"{100 * r.shrinkage:.0f} %" if math.isfinite(r.shrinkage) else "-",
@@ -150,7 +151,7 @@ def leftover_table(diagnosis: Diagnosis) -> str:
 
 
 def parameter_table(findings: Findings) -> str:
-    """The crude model's parameters, and what the diagnosis would make of them."""
+    """The model's parameters, and what the diagnosis would make of them."""
     estimated = {v.name: v for v in findings.diagnosis.parameters} if findings.diagnosis else {}
     rows = []
     for name, param in findings.task.model.params.items():

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from grounded.search import Tried
-from grounded_trials.diagnosis_file import Diagnosis, Value
+from grounded_trials.diagnosis_file import Value
 from grounded_trials.diagnosis_words import error_lines, sentences
 from grounded_trials.findings import (
     Findings,
@@ -51,10 +51,7 @@ def report_text(findings: Findings, table: Table, bars: Callable[[Sequence[float
     parts = [_head(findings), _utilities(findings, table, bars)]
     if findings.best is not None:
         parts += [_trajectories(findings, table), _biases(findings, table)]
-    parts.append(_diagnosis(findings.diagnosis, table))
-    if findings.stale:
-        after = f"{count(findings.stale, 'trial')} came after this diagnosis: grounded diagnose"
-        parts[-1] += f"\n  {after}"
+    parts.append(_diagnosis(findings, table))
     if findings.logs:
         parts.append(_logs(findings, table))
     if findings.lost:
@@ -175,24 +172,23 @@ def _biases(findings: Findings, table: Table) -> str:
         for i, (name, unit) in enumerate(task.model.states.items())
     ]
     header = ("state", "unit", *(f"iter. {run.candidate.iteration}" for run in runs))
-    return "bias: what the crude model lacks, rms over the run\n" + table(rows, header)
+    return f"bias: what the {findings.plain} lacks, rms over the run\n" + table(rows, header)
 
 
-def _diagnosis(diagnosis: Diagnosis | None, table: Table) -> str:
+def _diagnosis(findings: Findings, table: Table) -> str:
+    diagnosis, since = findings.diagnosis, findings.since
     if diagnosis is None:
         return "gap to the model\n  not diagnosed yet: grounded diagnose"
     lines = ["gap to the model"]
-    for sentence in sentences(diagnosis.sentence or diagnosis.kind):
-        lines += _wrapped(sentence, "  ")
-    gap = diagnosis.gap
-    if gap is not None:
-        lines.append(
-            f"  {gap.horizon_s:g} s ahead: {figure(gap.before, 3)} before, {figure(gap.after, 3)} "
-            f"after, floor {figure(gap.floor, 3)} ({gap.unit})"
-        )
-    for title, text in error_lines(diagnosis):
+    if since.sentence:
+        lines += _wrapped(since.sentence, "  ")
+    then = "before that: " * bool(since.adopted)
+    for k, sentence in enumerate(sentences(diagnosis.sentence or diagnosis.kind)):
+        lines += _wrapped(then * (k == 0) + sentence, "  ")
+    before = {} if since.changed else findings.values
+    for title, text in error_lines(diagnosis, before):
         lines += _wrapped(f"{title}: {text}", "  ")
-    if diagnosis.ranking:
+    if diagnosis.ranking and not diagnosis.no_cause:
         rows = [
             (
                 r.effect[:30],
@@ -223,7 +219,7 @@ def _logs(findings: Findings, table: Table) -> str:
         (name, shown(unit), *(figure(float(c[i]), 3) for c in columns))
         for i, (name, unit) in enumerate(findings.task.model.states.items())
     ]
-    title = f"data: error of the crude model {SECONDS:g} s ahead, rms\n"
+    title = f"data: error of the {findings.plain} {SECONDS:g} s ahead, rms\n"
     return title + table(rows, ("state", "unit", *(log.trial.id for log in logs)))
 
 
