@@ -9,6 +9,9 @@ One control step of the wrapped model, for commands held over the step:
     s+     = s + h (own + rate(s))                families that limit a rate, h = dt / parts
     y+     = measure(s+),  s = recover(y)         sensor families
 
+Several rates are added up and all see the same `own`, whichever was wrapped first: `own` is never
+the rate of a model that has another of them in it. A limit acts inside the added halves.
+
 It is a `step` model in plain NumPy, so that it is traced and compiled where the original was.
 Memory (a lag's output, a queue, a clock) becomes further states, all of them functions of the
 commands and the measured states: `memory_of` (recall.py) recovers them along a recorded trial.
@@ -16,7 +19,7 @@ commands and the measured states: `memory_of` (recall.py) recovers them along a 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -41,9 +44,9 @@ Step = Callable[[Any, Any, Any, Any], dict[str, Any]]
 
 def plain_step(model: Model) -> Step:
     """The model's step(s, a, p, dt) in the user's own words, integrating a derivative."""
-    if model.step is not None:
-        return lambda s, a, p, dt: dict(model.step(s, a, p, dt))  # type: ignore[misc]
-    derivative, names = model.derivative, model.state_names
+    stepped, derivative, names = model.step, model.derivative, model.state_names
+    if stepped is not None:
+        return lambda s, a, p, dt: dict(stepped(s, a, p, dt))
     assert derivative is not None
 
     def moved(s: Any, rates: Mapping[str, Any], by: Any) -> Named:
@@ -88,7 +91,6 @@ def wrap(effect: Effect, values: Mapping[str, float], dt: float) -> Model:
     }
     for kind, build in make.items():
         if isinstance(family, kind):
-            build = _limit_step if isinstance(family, RateFamily) and family.parts else build
             step, memory = build(effect, whole, dt)
             break
     else:
@@ -168,75 +170,105 @@ def _memory_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[s
 
 
 def _rate_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str, str]]:
-    model, family = effect.site.model, effect.family
-    assert isinstance(family, RateFamily)
-    base, clock, timed = plain_step(model), _clock(effect), family.timed
+    """One more added or limited rate: it joins those that the model has already."""
+    model = effect.site.model
+    inner, others = getattr(model.step, "joined", (model, ()))
+    effects = (*others, effect)
+    step = _joint_step(inner, effects)
+    vars(step)["joined"] = (inner, effects)
+    return step, dict.fromkeys(_clocks([effect]), "s")
+
+
+def _joint_step(model: Model, effects: tuple[Effect, ...]) -> Step:
+    """A step with all rates at once, each of which sees the model's own, not the others'.
+
+    Nested, an effect would take another's rate for the model's and mean something else than the
+    diagnosis, `Predictor.advance`, of which these are the equations.
+    """
+    base, instant, clocks = plain_step(model), _instant(model), _clocks(effects)
+    limits = [e for e in effects if _family(e).parts]
+    rates = [e for e in effects if not _family(e).parts]
+    needs_own = any(_family(e).needs_own for e in rates)
     tied = {n: k for n in model.state_names if (k := partner(model, n))}
 
     def step(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
-        c = _quantities(effect, p)
-        t = s[clock] if timed else 0.0
-        start = _own_state(model, s)
-        own: Any = {}
-        if family.needs_own:
-            ahead = base(start, a, p, dt)
-            own = {n: (ahead[n] - start[n]) / dt for n in start}
-        added = family.rate(start, a, own, t, c, effect.site)
-        state = _kicked(start, added, dt)
-        after = Named("state", model.state_names, list(_in_order(model, base(state, a, p, dt))))
-        t = t + dt if timed else 0.0
-        if family.needs_own:  # the mean over the very step
-            own = {n: (after[n] - state[n]) / dt for n in start}
-        later = family.rate(after, a, own, t, c, effect.site)
-        final = _kicked(after, later, dt)
+        start, now = _own_state(model, s), {z: s[z] for z in clocks}
+        then = {z: s[z] + dt for z in clocks}
+        own = _mean_rate(start, base(start, a, p, dt), dt) if needs_own else {}
+        state = _kicked(start, _added(rates, start, a, own, now, p), dt)
+        after, own = _through(limits, base, state, a, p, dt, now)  # the mean over the very step
+        final = _kicked(after, _added(rates, after, a, own, then, p), dt)
         result = dict(final)
         for n, k in tied.items():  # a carried heading rate is the heading's rate, effects and all
-            if model.derivative is not None:
-                first, last = model.derivative(start, a, p), model.derivative(final, a, p)
-                if family.needs_own:
-                    added = family.rate(start, a, first, t - dt if timed else 0.0, c, effect.site)
-                    later = family.rate(final, a, last, t, c, effect.site)
-                rise = last[n] - first[n]
-                result[k] = s[k] + rise + later.get(n, 0.0) - added.get(n, 0.0)
-            elif n in added:
-                result[k] = result[k] + later[n] - added[n]
-        return {**result, clock: t} if timed else result
-
-    return step, {clock: "s"} if timed else {}
-
-
-def _limit_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str, str]]:
-    """A rate that acts on the mean rate of parts of the step."""
-    model, family = effect.site.model, effect.family
-    assert isinstance(family, RateFamily)
-    base, clock, timed = plain_step(model), _clock(effect), family.timed
-    tied = {n: k for n in model.state_names if (k := partner(model, n))}
-
-    def step(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
-        start, t = _own_state(model, s), s[clock] if timed else 0.0
-        final, h, touched = start, dt / family.parts, 0.0
-        for part in range(family.parts):
-            ahead = base(final, a, p, h)
-            own = {n: (ahead[n] - final[n]) / h for n in start}
-            added = family.rate(final, a, own, t + part * h, _quantities(effect, p), effect.site)
-            values = [ahead[n] + h * added[n] if n in added else ahead[n] for n in start]
-            final = Named("state", model.state_names, values)
-            touched = touched + sum(np.abs(rate) for rate in added.values())
-        ahead = base(start, a, p, dt)
-        values = [np.where(touched > 0, final[n], ahead[n]) for n in start]
-        final = Named("state", model.state_names, values)
-        result = dict(final)
-        for n, k in tied.items():
-            if model.derivative is not None:
-                first, last = model.derivative(start, a, p), model.derivative(final, a, p)
+            first, last = instant(start, a, p, dt), instant(final, a, p, dt)
+            if not rates:
                 result[k] = s[k] + last[n] - first[n]
-        return {**result, clock: t + dt} if timed else result
+                continue
+            before = _added(rates, start, a, first, now, p).get(n, 0.0)
+            later = _added(rates, final, a, last, then, p).get(n, 0.0)
+            result[k] = s[k] + (last[n] - first[n]) + later - before
+        return {**result, **then}
 
-    return step, {clock: "s"} if timed else {}
+    return step
 
 
-def _in_order(model: Model, values: Mapping[str, Any]) -> list[Any]:
-    return [values[n] for n in model.state_names]
+def _family(effect: Effect) -> RateFamily:
+    assert isinstance(effect.family, RateFamily)
+    return effect.family
+
+
+def _clocks(effects: Sequence[Effect]) -> list[str]:
+    return [_clock(e) for e in effects if _family(e).timed]
+
+
+def _instant(model: Model) -> Step:
+    """The model's own rates at a moment: its derivative, or the mean over a very short step."""
+    derivative, base = model.derivative, plain_step(model)
+
+    def rates(s: Any, a: Any, p: Any, dt: Any) -> Any:
+        h = 1e-3 * dt
+        return derivative(s, a, p) if derivative else _mean_rate(s, base(s, a, p, h), h)
+
+    return rates
+
+
+def _mean_rate(s: Named, ahead: Mapping[str, Any], dt: Any) -> dict[str, Any]:
+    return {n: (ahead[n] - s[n]) / dt for n in s}
+
+
+def _added(
+    effects: Sequence[Effect], s: Named, a: Any, own: Any, clock: Mapping[str, Any], p: Any
+) -> dict[str, Any]:
+    """Sum of the effects' rates at one moment, by state."""
+    total: dict[str, Any] = {}
+    for e in effects:
+        t = clock.get(_clock(e), 0.0)
+        for n, rate in _family(e).rate(s, a, own, t, _quantities(e, p), e.site).items():
+            total[n] = total[n] + rate if n in total else rate
+    return total
+
+
+def _through(
+    limits: Sequence[Effect], base: Step, s: Named, a: Any, p: Any, dt: Any, now: Mapping[str, Any]
+) -> tuple[Named, dict[str, Any]]:
+    """The model's step through limits, which act on its mean rate over parts of it; that rate."""
+    if not limits:
+        ahead = base(s, a, p, dt)
+        return Named("state", tuple(s), [ahead[n] for n in s]), _mean_rate(s, ahead, dt)
+    parts = max([_family(e).parts for e in limits])
+    final, h, touched, mean = s, dt / parts, 0.0, dict.fromkeys(s, 0.0)
+    for part in range(parts):
+        ahead = base(final, a, p, h)
+        own = _mean_rate(final, ahead, h)
+        added = _added(limits, final, a, own, {z: t + part * h for z, t in now.items()}, p)
+        values = [ahead[n] + h * added[n] if n in added else ahead[n] for n in s]
+        final = Named("state", tuple(s), values)
+        mean = {n: mean[n] + own[n] / parts for n in s}
+        touched = touched + sum(np.abs(rate) for rate in added.values())
+    ahead = base(s, a, p, dt)
+    free = _mean_rate(s, ahead, dt)
+    after = Named("state", tuple(s), [np.where(touched > 0, final[n], ahead[n]) for n in s])
+    return after, {n: np.where(touched > 0, mean[n], free[n]) for n in s}
 
 
 def _kicked(s: Named, rate: Values, dt: Any) -> Named:
