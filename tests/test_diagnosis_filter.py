@@ -1,5 +1,7 @@
 """The filter's likelihood has the slopes that the smoother says, compiled or not."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -163,3 +165,11 @@ def test_noise_climbs_to_the_top_though_channels_share_it():
     assert np.abs(rest).max() < 0.01
     before = problem.loglik(problem.q, problem.v)
     assert problem.loglik(np.exp(noise.log_q), np.exp(noise.log_r)) > before
+
+
+@pytest.mark.parametrize("name", ["kernels.py", "kernel_pen.py"])
+def test_kernels_that_another_version_of_us_wrote_are_not_used(monkeypatch, name):
+    read, version = Path.read_bytes, kernels._version.__wrapped__
+    before = version()
+    monkeypatch.setattr(Path, "read_bytes", lambda p: read(p) + b"#" * (p.name == name))
+    assert version() != before
