@@ -47,7 +47,7 @@ DIAGNOSIS: dict[str, Any] = {
     "ranking": [
         {
             "effect": "viscous_friction:v",
-            "params": {"k": {"value": 0.3, "std": 0.01, "unit": "1/s"}},
+            "params": {"k": {"value": 0.3, "std": 0.01, "interval": [0.29, 0.33], "unit": "1/s"}},
             "evidence": 40.0,
             "gap_after": 1.1,
             "shrinkage": 0.9,
@@ -69,7 +69,7 @@ DIAGNOSIS: dict[str, Any] = {
         {"effect": "viscous_friction:v", "like": "coulomb_friction:v", "share": 0.8},
     ],
     "next_trial": "a fast run and a slow one",
-    "parameters": {"mass": {"value": 1.4, "std": 0.02, "unit": "kg"}},
+    "parameters": {"mass": {"value": 1.4, "std": 0.02, "interval": [1.36, 1.44], "unit": "kg"}},
     "leftover": [
         {
             "channel": "v",

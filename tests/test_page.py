@@ -87,7 +87,7 @@ def test_page_shows_what_the_issue_lists(cart):
         "Share of the gap by time",
         "Share of the gap by region",
         "viscous_friction:v",
-        "0.280 to 0.320",  # the 95 % interval
+        "0.290 to 0.330",  # the 95 % interval, which is not symmetric
         "Prediction error 1 s ahead",
         "noise alone",
         "explains 90 %",
@@ -273,3 +273,13 @@ def test_page_of_many_trials_in_a_browser(tmp_path, window):
     window.open(path)
     assert window.errors() == []
     assert window.run("return document.documentElement.scrollWidth") <= 390
+
+
+@pytest.mark.parametrize("interval", [None, [None, None], [-3e9, 3e9], [0.4, 0.5]])
+def test_a_value_without_an_interval_is_said_to_be_undetermined(cart, interval):
+    value = {"value": 0.3, "std": 0.01, "unit": "1/s", "interval": interval}
+    entry = DIAGNOSIS["ranking"][0] | {"params": {"k": value}}
+    findings = gather(Workspace(cart))
+    text = page(replace(findings, diagnosis=diagnosis_of(DIAGNOSIS | {"ranking": [entry]})))
+    assert "k = –, not determined by these trials<" in text
+    assert "0.280 to 0.320" not in text

@@ -43,12 +43,13 @@ class Share:
 
 @dataclass(frozen=True)
 class Value:
-    """A parameter of an effect with its standard deviation."""
+    """A parameter of an effect with its standard deviation and 95 % interval."""
 
     name: str
     value: float
     std: float
     unit: str
+    interval: tuple[float, float] | None = None  # None in older files; NaN where there is none
 
 
 @dataclass(frozen=True)
@@ -203,9 +204,20 @@ def _ranked(row: dict[str, Any]) -> Ranked:
 
 def _values(table: dict[str, Any] | None) -> tuple[Value, ...]:
     return tuple(
-        Value(str(name), number(p["value"]), number(p.get("std")), str(p.get("unit") or ""))
+        Value(
+            str(name),
+            number(p["value"]),
+            number(p.get("std")),
+            str(p.get("unit") or ""),
+            _interval(p["interval"]) if "interval" in p else None,
+        )
         for name, p in (table or {}).items()
     )
+
+
+def _interval(ends: Any) -> tuple[float, float]:
+    low, high = ends or (None, None)
+    return number(low), number(high)
 
 
 def _left(one: dict[str, Any]) -> Left:

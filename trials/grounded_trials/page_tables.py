@@ -21,7 +21,8 @@ from grounded_trials.page_parts import table
 from grounded_trials.since import Since
 from grounded_trials.words import figure, shown, verdict, with_unit
 
-INTERVAL = 1.96  # standard deviations of a 95 % interval
+WIDEST = 1e6  # an interval so many times its value, or so wide, says nothing
+UNKNOWN = "–, not determined by these trials"
 
 
 def candidate_table(findings: Findings) -> str:
@@ -124,14 +125,17 @@ def _params(ranked: Ranked) -> str:
 
 
 def _value(v: Value) -> str:
-    return with_unit(f"{v.name} = {_interval(v)}", v.unit)
+    text = _interval(v)
+    return f"{v.name} = {text if text == UNKNOWN else with_unit(text, v.unit)}"
 
 
 def _interval(v: Value) -> str:
-    half = INTERVAL * v.std
-    if not 0 < half < math.inf:
+    """A value and its 95 % interval as the diagnosis has it; a dash where there is none."""
+    if v.interval is None:
         return figure(v.value)
-    return f"{figure(v.value)} ({figure(v.value - half, 3)} to {figure(v.value + half, 3)})"
+    low, high = v.interval
+    known = low <= v.value <= high and high - low < WIDEST * max(abs(v.value), 1.0)
+    return f"{figure(v.value)} ({figure(low, 3)} to {figure(high, 3)})" if known else UNKNOWN
 
 
 def leftover_table(diagnosis: Diagnosis) -> str:
