@@ -115,9 +115,7 @@ def scatter(
     lengths = data.valid.sum(axis=1).astype(int)
     total, count = np.zeros(data.model.n), np.zeros(data.model.n)
     for group in repeats:
-        by_trial = [np.flatnonzero(data.trial_of == trial) for trial in group]
-        for part in range(min((len(runs) for runs in by_trial), default=0)):
-            runs = np.array([own[part] for own in by_trial])
+        for runs in _side_by_side(data, group):
             moments = np.arange(1, int(lengths[runs].min()) - steps + 1)
             moments = moments[:: max(1, len(moments) // MOST_MOMENTS)]
             if len(runs) < 2 or not len(moments):
@@ -131,6 +129,13 @@ def scatter(
             total += (len(runs) - 1) * variance.sum(axis=0)
             count += (len(runs) - 1) * whole.sum(axis=0)
     return total / count if (count > 0).all() else None
+
+
+def _side_by_side(data: Data, group: Sequence[int]) -> list[Any]:
+    """The runs of a group's trials that begin at the same time, as indices."""
+    own = np.flatnonzero(np.isin(data.trial_of, group))
+    begins = data.time[0, own]
+    return [own[begins == begin] for begin in np.unique(begins)]
 
 
 def repeated(candidates: Sequence[str]) -> list[list[int]]:

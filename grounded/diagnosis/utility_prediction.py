@@ -72,8 +72,10 @@ def utility_prediction(
         real = task.utility(trial)
         if not np.isfinite(real) or i not in groups:
             continue
-        own = h if shifts is None else moved(predictor, h, shifts[groups.index(i)])
         first = int(np.flatnonzero(data.trial_of == i)[0])
+        if data.time[0, first] > 0:  # the run that it began with was left out
+            continue
+        own = h if shifts is None else moved(predictor, h, shifts[groups.index(i)])
         pairs = [(Hypothesis(), bare[0, first]), (own, fit.track[0, first])]
         parts = [task.utility(_again(predictor, g, trial, start, i)) for g, start in pairs]
         rows.append([real, *parts])
