@@ -354,3 +354,28 @@ def test_any_text_is_valid_or_one_sentence(tmp_path_factory, text):
     (folder / "grounded.toml").write_text(text, encoding="utf-8", errors="replace")
     with pytest.raises(GroundedError):
         read_config(folder)
+
+
+@pytest.mark.parametrize(
+    ("effect", "holds"),
+    [
+        ('name = "delay:force"', "needs a value for 'd'"),
+        ('name = "delay:force", d = 0.02, dd = 3.0', "has no quantity 'dd': did you mean 'd'"),
+        ('name = "delay:force", d = -0.02', "d = -0.02 can't be: expected at least 0"),
+        ('name = "delay:force", d = nan', "d must be a number"),
+        ('name = "dead_zone:force", c = -5.0', "c = -5 can't be: expected at least 0"),
+        ('name = "input_gain:force", g = 9.0', "expected at least -1.5 and at most 5"),
+        ('name = "viscous_friction:v"', "needs a value for 'k'"),
+    ],
+)
+def test_an_adopted_effect_is_whole_and_possible(tmp_path, effect, holds):
+    text = CONFIG.replace("[task]", f"effects = [{{ {effect} }}]\n[task]")
+    with pytest.raises(GroundedError, match=r"grounded.toml: \[model\] effects: ") as raised:
+        _ = make(tmp_path / "w", config=text).planner
+    assert holds in str(raised.value)
+
+
+def test_bounds_that_the_data_chose_are_none(tmp_path):
+    big = "[{ name = 'dead_zone:force', c = 3.0 }, { name = 'delay:force', d = 1.5 }]"
+    text = CONFIG.replace("[task]", f"effects = {big}\n[task]")
+    assert make(tmp_path / "w", config=text).planner.plan.latency[0] == 1.5

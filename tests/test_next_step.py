@@ -38,7 +38,9 @@ def test_every_command_says_the_same_once_the_search_has_ended(cart, command):
 def test_all_claimed_effects_are_adopted_at_once(cart, tmp_path):
     folder = copied(cart, tmp_path / "w")
     names = ["viscous_friction:v", "delay:force"]
-    diagnosed(folder, verdict={"kind": "several", "effects": names, "sentence": "Two."})
+    late = DIAGNOSIS["ranking"][1] | {"params": {"d": {"value": 0.02, "std": 0.01, "unit": "s"}}}
+    verdict = {"kind": "several", "effects": names, "sentence": "Two."}
+    diagnosed(folder, verdict=verdict, ranking=[DIAGNOSIS["ranking"][0], late])
     command = last(grounded("-C", folder, "status"))
     assert command == "grounded adopt viscous_friction:v delay:force"
     done = grounded("-C", folder, *shlex.split(command)[1:], "--json").json
@@ -198,3 +200,43 @@ def test_diagnose_of_one_trial_asks_for_another(tmp_path):
     done = grounded("-C", folder, "diagnose")
     assert "No cause is named" in done.out and last(done) == "grounded propose"
     assert "before, " not in done.out and "is explained" not in done.out
+
+
+# adopt
+
+
+def test_rivals_are_not_adopted_together(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    before = (folder / "grounded.toml").read_text()
+    done = grounded("-C", folder, "adopt", "viscous_friction:v", "delay:force")
+    assert done.code == 1 and "does not claim delay:force" in done.err
+    assert "one instead of another" in done.err
+    assert "`grounded adopt viscous_friction:v`" in plain(done.err)
+    assert (folder / "grounded.toml").read_text() == before
+
+
+def test_one_unclaimed_effect_comes_without_the_parameters_of_others(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    entry = DIAGNOSIS["ranking"][1] | {"params": {"d": {"value": 0.02, "std": 0.01, "unit": "s"}}}
+    diagnosed(folder, ranking=[DIAGNOSIS["ranking"][0], entry])
+    done = grounded("-C", folder, "adopt", "delay:force")
+    assert done.code == 0 and "was not claimed by the last diagnosis" in done.err
+    assert "mass" not in done.out and "params" not in (folder / "grounded.toml").read_text()
+
+
+def test_adopt_prints_every_parameter_that_it_writes(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    same = {"value": 0.2, "std": 0.02, "unit": "N s/m"}
+    diagnosed(folder, parameters=DIAGNOSIS["parameters"] | {"drag": same})
+    out = grounded("-C", folder, "adopt", "viscous_friction:v").out
+    assert "mass       1.000 -> 1.400 kg" in out and "drag       0.2000 -> 0.2000 N s/m" in out
+    assert "[model] params" in " ".join(grounded("adopt", "-h").out.split())
+
+
+def test_nothing_is_adopted_where_too_little_is_known(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    why = "one trial alone confirms nothing; run a second one"
+    verdict = {"kind": "unknown", "effects": [], "sentence": f"No cause is named: {why}."}
+    diagnosed(folder, verdict=verdict, unknowable=[why])
+    done = grounded("-C", folder, "adopt", "viscous_friction:v")
+    assert done.code == 1 and "too little is known" in done.err and "run another trial" in done.err

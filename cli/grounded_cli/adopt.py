@@ -6,8 +6,13 @@ import click
 
 from grounded_cli import completion as complete
 from grounded_cli.options import as_json, in_workspace, open_workspace
-from grounded_cli.terminal import field, number, show, show_json
+from grounded_cli.terminal import field, number, remark, show, show_json
 from grounded_trials.words import with_unit
+
+UNCLAIMED = (
+    "was not claimed by the last diagnosis: its values were fitted by themselves, in place of what "
+    "was claimed; the model's own parameters stay as they are"
+)
 
 
 @click.command("adopt")
@@ -21,25 +26,29 @@ def command(effects: tuple[str, ...], effect_only: bool, folder: str | None, jso
     """Add effects of the last diagnosis (`family:target`) to [model] in grounded.toml.
 
     Effects that were claimed together were estimated together: adopt them together. Parameters of
-    the model that were calibrated beside them come along.
+    the model that were calibrated beside them come along, in [model] params. An effect that was
+    not claimed can be adopted by itself: its values come without parameters.
 
     The search goes on from the best policy, planned with the better model. To undo it, take the
-    effects out of grounded.toml again.
+    effects out of [model] effects and the parameters that were printed out of [model] params in
+    grounded.toml, or give them their old values.
     """
     workspace = open_workspace(folder)
     from grounded_trials.adopting import adopt_effects
 
-    adopted, params = adopt_effects(workspace, effects, parameters=not effect_only)
+    done = adopt_effects(workspace, effects, parameters=not effect_only)
     if json_:
-        show_json({"effects": [dict(one) for one in adopted], "params": params})
+        found = [dict(one) for one in done.effects]
+        show_json({"effects": found, "params": dict(done.params), "claimed": done.claimed})
         return
     for name in dict.fromkeys(effects):
         show(f"{name} is part of the model now ({workspace.config.file})")
+    if not done.claimed:
+        remark("note", f"{effects[0]} {UNCLAIMED}")
+    if done.params:
+        show("written to [model] params, calibrated beside the effects:")
     before = workspace.base_model.params
-    changed = {n: v for n, v in params.items() if abs(v - before[n].value) > 1e-6 * abs(v)}
-    if changed:
-        show("the model's own parameters, calibrated beside the effects:")
-    for name, value in changed.items():
+    for name, value in done.params.items():
         text = with_unit(f"{number(before[name].value)} -> {number(value)}", before[name].unit)
         show(field(name, text, "  "))
     show("\nnext: grounded propose")

@@ -4,42 +4,47 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from grounded.errors import GroundedError, nearest
-from grounded_trials.diagnosis_file import FILE
+from grounded_trials.diagnosis_file import FILE, MALFORMED, diagnosis_of
 from grounded_trials.toml_edit import set_in_model
 from grounded_trials.workspace import Workspace
 
 Effect = dict[str, Any]  # {"name": "dead_zone:throttle", "c": 0.146}
 
 
+@dataclass(frozen=True)
+class Adopted:
+    """What the model has now."""
+
+    effects: tuple[Mapping[str, Any], ...]  # all that are adopted
+    params: Mapping[str, float]  # of the model, written with them
+    claimed: bool  # the diagnosis claims the new ones; else one was taken by itself
+
+
 def adopt_effects(
     workspace: Workspace, names: Sequence[str], *, parameters: bool = True
-) -> tuple[tuple[Mapping[str, Any], ...], dict[str, float]]:
-    """Adds diagnosed effects to [model] effects: all that are adopted now, and new parameters.
+) -> Adopted:
+    """Adds diagnosed effects to [model] effects, and the parameters that belong to them.
 
-    Where the diagnosis calibrated the model's own parameters beside the effects, they are adopted
-    too: the effects' values hold beside them.
+    Where the diagnosis calibrated the model's own parameters beside the effects that it claims,
+    they are adopted with those: the effects' values hold beside them. An effect that it does not
+    claim was fitted in place of those, without them.
 
     Raises:
-        GroundedError: if nothing was diagnosed, or an effect is not in its ranking; nothing is
-            written then.
+        GroundedError: if nothing was diagnosed, an effect is not in its ranking, or they were not
+            fitted together; nothing is written then.
     """
-    document = _document(workspace)
+    document, names = _document(workspace), list(dict.fromkeys(names))
     ranking = {str(entry["effect"]): entry for entry in document["ranking"]}
+    _check(names, list(ranking), workspace)
+    claimed = _claimed(document, names)
     adopted: list[Effect] = [dict(effect) for effect in workspace.config.model.effects]
-    found = document.get("parameters", {}) if parameters else {}
+    found = document.get("parameters", {}) if parameters and claimed else {}
     params = {key: _rounded(p["value"]) for key, p in found.items()}
-    for name in dict.fromkeys(names):
-        if name not in ranking:
-            raise GroundedError(
-                f"'{name}' is not among the effects of the last diagnosis: {nearest(name, ranking)}"
-            )
-        if any(effect["name"] == name for effect in adopted):
-            raise GroundedError(
-                f"'{name}' is adopted already; see [model] effects in grounded.toml"
-            )
+    for name in names:
         values = _values(ranking[name])
         family, _, target = name.partition(":")
         if family == "parameter":
@@ -49,7 +54,40 @@ def adopt_effects(
             adopted.append({"name": name, **values})
     whole = dict(workspace.config.model.params) | params
     set_in_model(workspace.config.file, params=whole if params else None, effects=adopted or None)
-    return tuple(adopted), params
+    return Adopted(tuple(adopted), params, claimed)
+
+
+def _check(names: Sequence[str], known: Sequence[str], workspace: Workspace) -> None:
+    """Each must have been weighed, and not be adopted."""
+    adopted = [effect["name"] for effect in workspace.config.model.effects]
+    for name in names:
+        if name not in known:
+            raise GroundedError(
+                f"'{name}' is not among the effects of the last diagnosis: {nearest(name, known)}"
+            )
+        if name in adopted:
+            raise GroundedError(
+                f"'{name}' is adopted already; see [model] effects in grounded.toml"
+            )
+
+
+def _claimed(document: Mapping[str, Any], names: Sequence[str]) -> bool:
+    """Whether the verdict claims them all; several that it doesn't were fitted as rivals."""
+    found = diagnosis_of(dict(document))
+    if found.no_cause:
+        raise GroundedError(
+            f"too little is known to adopt anything ({found.sentence}): run another trial, ingest "
+            "it, then `grounded diagnose`"
+        )
+    rivals = [name for name in names if name not in found.effects]
+    if rivals and len(names) > 1:
+        own = f"`grounded adopt {' '.join(found.effects)}`, " * bool(found.effects)
+        raise GroundedError(
+            f"the last diagnosis does not claim {', '.join(rivals)}: these effects were fitted one "
+            "instead of another, not together; expected effects that it claims together, or one "
+            f"alone: {own}or `grounded adopt {names[0]}`"
+        )
+    return not rivals
 
 
 def _values(entry: Mapping[str, Any]) -> dict[str, float]:
@@ -66,11 +104,12 @@ def _document(workspace: Workspace) -> dict[str, Any]:
     path = workspace.reports / FILE
     try:
         document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        _ = diagnosis_of(document)
         for entry in document["ranking"]:
             _ = str(entry["effect"]), entry["params"].items()
     except FileNotFoundError:
         raise GroundedError("nothing was diagnosed yet: run `grounded diagnose` first") from None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, *MALFORMED) as error:
         raise GroundedError(
             f"{path} can't be read ({error}): run `grounded diagnose` again"
         ) from None
