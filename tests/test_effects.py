@@ -13,6 +13,7 @@ from grounded.effects import (
     ParamFamily,
     Quantity,
     RateFamily,
+    Scales,
     memory_of,
     scales_of,
     wrap,
@@ -256,3 +257,29 @@ def test_the_docs_show_every_family():
         assert f">{family.name} (" in pictures
     for path in docs.glob("effects-*.svg"):
         assert f"({path.name})" in text
+
+
+def lag_of(dt, duration):
+    scales = Scales(dt=dt, duration=duration)
+    (tau,) = Library().effect("first_order_lag:steering", car, scales).quantities
+    return tau
+
+
+@pytest.mark.parametrize("dt", [0.002, 0.02, 0.05])
+def test_lags_of_usual_steps_end_at_two_seconds(dt):
+    tau = lag_of(dt, 10.0)
+    np.testing.assert_array_equal(tau.grid, np.geomspace(max(0.3 * dt, 0.005), 2.0, 10))
+    assert tau.high == 4.0
+
+
+def test_lags_of_long_steps_are_as_long_in_steps():
+    fast, slow = lag_of(0.05, 10.0), lag_of(2.0, 400.0)
+    np.testing.assert_allclose(slow.grid, 40 * np.array(fast.grid))
+    assert slow.high == 40 * fast.high
+
+
+@pytest.mark.parametrize("dt", [1e-4, 0.05, 0.5, 8.0])
+@pytest.mark.parametrize("steps", [2, 10, 1000])
+def test_lags_are_sought_within_their_bound(dt, steps):
+    tau = lag_of(dt, steps * dt)
+    assert 0 < tau.grid[0] < tau.grid[-1] <= tau.high

@@ -22,7 +22,8 @@ import numpy as np
 from grounded.effects import places
 from grounded.effects.family import MemoryFamily, Quantity, Site
 
-LONGEST_DELAY = 0.5  # [s] that a scan considers
+LONGEST_DELAY = 0.5  # [s] that a scan considers, where steps are not longer than usual
+LONGEST_LAG = 2.0  # [s] the same
 
 
 def _delay(site: Site) -> tuple[Quantity, ...]:
@@ -35,9 +36,11 @@ def _delay(site: Site) -> tuple[Quantity, ...]:
 
 def _lag(site: Site) -> tuple[Quantity, ...]:
     dt = site.scales.dt
-    top = min(2.0, site.scales.duration / 4)
-    grid = tuple(float(v) for v in np.geomspace(max(0.3 * dt, 0.005), max(top, dt), 10))
-    return (Quantity("tau", "s", grid, 0.0, 2 * top, places=6),)
+    top = min(max(LONGEST_LAG, 40 * dt), site.scales.duration / 4)
+    last = max(top, dt)
+    first = min(max(0.3 * dt, 0.005), 0.5 * last)
+    grid = tuple(float(v) for v in np.geomspace(first, last, 10))
+    return (Quantity("tau", "s", grid, 0.0, max(2 * top, last), places=6),)
 
 
 def _rate(site: Site) -> tuple[Quantity, ...]:
