@@ -89,3 +89,20 @@ def test_one_trial_alone_confirms_nothing():
     data = prepare(model, trials, np.zeros(1))
     search, best = attribute(data, Library().candidates(model, data.scales))
     assert confirm.noise_confirmed(search, best, 3, 1.0) == (search, best)
+
+
+def test_in_a_misfit_an_effect_that_predicts_no_better_is_dropped(wavy, monkeypatch):
+    search, best = wavy
+    names = set(best.hypothesis.names)
+    assert len(names) >= 2
+
+    def judged(worst, without):
+        monkeypatch.setattr(confirm, "gaps_of", lambda p, fits, w: [without for _ in fits])
+        gap = type("Gap", (), {"gap_before": 100.0, "gap_after": worst})
+        monkeypatch.setattr(confirm, "shrinkage", lambda *a: gap)
+        return confirm.confirmed(search, best, 1.0)
+
+    assert judged(1.2, 1.2) is best  # predicts down to the noise: the evidence decides
+    assert judged(5.0, 9.0) is best  # each of them is worth naming
+    fewer = judged(5.0, 5.0)
+    assert len(fewer.hypothesis.names) == 1 and set(fewer.hypothesis.names) < names

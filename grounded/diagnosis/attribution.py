@@ -17,9 +17,11 @@ from grounded.diagnosis.fitted import Fit
 from grounded.diagnosis.noise import Structure
 from grounded.diagnosis.refine import clean
 from grounded.diagnosis.search import CLAIM, LARGE, SHORTLIST, TO_THE_TOP, Search
+from grounded.diagnosis.tuning import tune
 from grounded.effects import Effect
 
 HOPEFUL = 4  # larger sets that are fitted to the end
+TUNED = 2  # sets whose constants are set by the data
 RESTARTED = 3  # large effects that are also fitted from a start of their own
 
 
@@ -77,6 +79,7 @@ def _explore(search: Search) -> Fit:
         if same:
             break
     search.finished(search.of_size(1)[:HOPEFUL], TO_THE_TOP)
+    tune(search, search.of_size(1)[:TUNED])
     best = search.of_size(1)[0]
     search.fair(best)
     return max([best, search.best_null()], key=search.score)
@@ -121,7 +124,8 @@ def _grow(search: Search, best: Fit, most: int) -> None:
             search.extended(start, 8)
         search.finished(search.of_size(size + 1)[:HOPEFUL], 10)
         search.again(search.of_size(size + 1)[:2])
-        search.finished(search.of_size(size + 1)[:2], TO_THE_TOP)
+        search.finished(search.of_size(size + 1)[:TUNED], TO_THE_TOP)
+        tune(search, search.of_size(size + 1)[:TUNED])
         larger = search.of_size(size + 1)
         if not larger or search.score(larger[0]) < search.score(best) + CLAIM:
             return

@@ -1,22 +1,27 @@
 """No claim that held-out trials contradict: evidence alone does not see that.
 
-Two ways in which the likeliest hypothesis can be wrong. Noise that is allowed to be coloured, or
-parameters that are allowed to move, explain a lasting effect away that predictions a second ahead
-still miss (a bias of a motor, a friction that is lower at first): then another noise is confirmed.
-And values that one trial alone determines (a wave, a saturation that one run reaches) can make the
-other trials' predictions useless: then a hypothesis gives way to the next one that holds.
+Three ways in which the likeliest hypothesis can be wrong, all of them where predictions miss by far
+more than noise makes: something is wrong then that is not in the library, and likelihoods are those
+of a wrong model.
+
+Noise that is allowed to be coloured, or parameters that are allowed to move, explain a lasting
+effect away that predictions a second ahead still miss (a bias of a motor, a friction that is lower
+at first): another noise is confirmed. A further effect takes up what is left somewhere and predicts
+hardly better: it is dropped. And values that one trial alone determines (a wave, a saturation that
+one run reaches) make predictions of the others worse: another hypothesis takes its place.
 """
 
 from __future__ import annotations
 
 from grounded.diagnosis.fitted import Fit
-from grounded.diagnosis.gap import horizon
+from grounded.diagnosis.gap import Horizon, horizon
 from grounded.diagnosis.search import CLAIM, Search
 from grounded.diagnosis.shrinkage import gaps_of, shrinkage
 
 MISFIT = 1.3  # times what noise makes of predictions, from which the noise is doubted
 BETTER = 1.5  # times smaller is what another noise has to leave
-RUNAWAY = 3.0  # times the gap without the effects: beyond what sensors that differ may cost
+WORTH = 1.3  # times larger is the gap without an effect that is worth naming in a misfit
+WORSE = 1.1  # times the gap without the effects
 TRIES = 6  # hypotheses that are looked at
 
 
@@ -71,6 +76,18 @@ def confirmed(search: Search, best: Fit, seconds: float) -> Fit:
     for fit in [best, *rivals[: TRIES - 1]]:
         where = horizon(search.predictor, fit, seconds)
         found = shrinkage(search.predictor, fit, null.track, where)
-        if not found.gap_after > RUNAWAY * found.gap_before:
-            return fit
+        if not found.gap_after > WORSE * found.gap_before:
+            return _pruned(search, fit, found.gap_after, where)
     return null
+
+
+def _pruned(search: Search, fit: Fit, gap: float, where: Horizon) -> Fit:
+    """Without the effects that predictions are hardly worse without, where they miss by much."""
+    while gap > MISFIT and len(fit.hypothesis.effects) > 1:
+        names = set(fit.hypothesis.names)
+        fewer = [f for f in search.of_size(len(names) - 1) if set(f.hypothesis.names) < names]
+        gaps = gaps_of(search.predictor, fewer, where)
+        if not gaps or not min(gaps) < WORTH * gap:
+            break
+        gap, fit = min(zip(gaps, fewer, strict=True), key=lambda each: each[0])
+    return fit

@@ -81,7 +81,7 @@ def diagnose(
     data = prepare(model, trials, latency, past)
     known = limits(data)
     tick("candidates")
-    candidates = knowable(data, options.library.candidates(model, data.scales), ())
+    candidates = knowable(data, options.library.candidates(model, data.scales))
     search, best = attribute(data, candidates, max_effects=options.max_effects, tick=tick)
     tick("leftover")
     with np.errstate(all="ignore"):

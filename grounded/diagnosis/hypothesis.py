@@ -73,6 +73,13 @@ class Hypothesis:
         whole = {**effect.fixed, **values}
         return replace(self, effects=(*self.effects, effect), values=(*self.values, whole))
 
+    def tuned(self, index: int, name: str, value: float) -> Hypothesis:
+        """One effect with another constant."""
+        effects, values = list(self.effects), list(self.values)
+        effects[index] = effects[index].tuned(name, value)
+        values[index] = {**values[index], name: value}
+        return replace(self, effects=tuple(effects), values=tuple(values))
+
     def minus(self, name: str) -> Hypothesis:
         """One effect less."""
         keep = [i for i, effect in enumerate(self.effects) if effect.name != name]

@@ -12,7 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from grounded.diagnosis.data import Data
-from grounded.effects import Effect, InputFamily, MemoryFamily, RateFamily, SensorFamily
+from grounded.effects import (
+    Effect,
+    InputFamily,
+    MemoryFamily,
+    RateFamily,
+    SensorDelayFamily,
+    SensorFamily,
+)
 
 FEW_STEPS = 30
 
@@ -42,11 +49,16 @@ def limits(data: Data) -> Limits:
         found.append(f"input {name} never changed, so nothing can be said of its actuator")
     if len(still) == data.model.m:
         no_cause = True
+    unmoved = still_states(data)
+    for name in unmoved:
+        found.append(f"state {name} never moved, so nothing can be said of what acts on it")
     if data.skipped:
         found.append(f"{data.skipped} stretches of the trials were left out, to bound memory")
     empty = [n for i, n in enumerate(data.model.state_names) if not data.seen[..., i].any()]
     for name in empty:
         found.append(f"state {name} was never measured")
+    if len(unmoved) + len(empty) == data.model.n:
+        no_cause = True
     return Limits(tuple(found), no_cause)
 
 
@@ -63,10 +75,19 @@ def constant_inputs(data: Data) -> list[str]:
     ]
 
 
-def knowable(data: Data, effects: Sequence[Effect], quiet: Sequence[str]) -> tuple[Effect, ...]:
+def still_states(data: Data) -> list[str]:
+    """States that had one value in every trial: to the last digit, so no sensor of them lives."""
+    found = []
+    for i, name in enumerate(data.model.state_names):
+        values = data.states[np.isfinite(data.states[:, i]), i]
+        if values.size and float(np.ptp(values)) <= 1e-9 * max(data.scales.peak(name), 1e-12):
+            found.append(name)
+    return found
+
+
+def knowable(data: Data, effects: Sequence[Effect]) -> tuple[Effect, ...]:
     """The effects that these data could show at all."""
-    still = set(constant_inputs(data))
-    dull = set(quiet)
+    still, unmoved = set(constant_inputs(data)), set(still_states(data))
     dead = {n for i, n in enumerate(data.model.state_names) if not data.seen[..., i].any()}
     kept = []
     for effect in effects:
@@ -74,11 +95,9 @@ def knowable(data: Data, effects: Sequence[Effect], quiet: Sequence[str]) -> tup
         family = effect.family
         if isinstance(family, InputFamily | MemoryFamily) and targets & still:
             continue
-        proportional = family.name not in ("offset", "trend", "periodic", "patch", "slope")
-        proportional = proportional and family.name not in ("drift_world", "drift_body")
-        if isinstance(family, RateFamily) and proportional and targets & dull:
+        if isinstance(family, RateFamily) and targets & unmoved:
             continue
-        if isinstance(family, SensorFamily) and targets & dead:
+        if isinstance(family, SensorFamily | SensorDelayFamily) and targets & (dead | unmoved):
             continue
         kept.append(effect)
     return tuple(kept)

@@ -39,7 +39,8 @@ def price(
         return math.log(targets) + _of_parameter(effect, values, data.steps)
     if values.get(TIMES.get(effect.family.name, ""), math.inf) < BRIEF * data.dt:
         return math.inf
-    cost = 0.5 * len(effect.free) * math.log(max(data.steps, 2)) + effect.family.vague
+    numbers = len(effect.free) + sum(q.tuned for q in effect.quantities)
+    cost = 0.5 * numbers * math.log(max(data.steps, 2)) + effect.family.vague
     if not _mere_offset(predictor, effect, values):
         cost += math.log(effect.places)
     return cost + math.log(targets)

@@ -18,7 +18,9 @@ from grounded.diagnosis.noise import Noise, Structure, first_guess
 from grounded.diagnosis.price import price
 from grounded.diagnosis.refine import refine
 from grounded.diagnosis.scan import Look, scan
+from grounded.diagnosis.undefined import undefined
 from grounded.effects import Effect, ParamFamily
+from grounded.errors import GroundedError
 from grounded.frozen import Array
 
 CLAIM = 3.0  # nats from which an effect is claimed
@@ -27,6 +29,7 @@ SPREADS = (0.03, 0.1)  # prior relative errors of the model's parameters when th
 CRUDE = 0.3  # the same of a model that is crude; tried without effects
 SHORTLIST = 14  # effects that are refined of a scan, and half as many parameters
 TAUS = (0.05, 0.1, 0.3)  # [s] of coloured noise
+SLOW = (1.0, 2.0, 6.0)  # the same in steps, where a step is longer than all of them
 BESIDE = 4  # effects that are fitted with the parameters freed
 LARGE_GAIN = 50.0  # nats from which a hypothesis is also started by itself
 TO_THE_TOP = 25  # iterations of fits that decide: most need fewer, and stop by themselves
@@ -50,7 +53,9 @@ class Search:
         self.fits: dict[tuple[Structure, float, tuple[str, ...]], Fit] = {}
         families = [e.family.name for e in candidates]
         large = data.model.n > LARGE
-        self.taus = [tau for tau in (TAUS[1:2] if large else TAUS) if tau > 0.7 * data.dt]
+        taus = TAUS[1:2] if large else TAUS
+        self.taus = [tau for tau in taus if tau > 0.7 * data.dt]
+        self.taus = self.taus or [k * data.dt for k in SLOW[: len(taus)]]
         self.most = SHORTLIST // 2 if large else SHORTLIST
         self.beside = BESIDE // 2 if large else BESIDE
         self.crowd = {e.name: families.count(e.family.name) for e in candidates}
@@ -96,7 +101,10 @@ class Search:
 
     def nulls(self) -> Fit:
         """The model alone under every noise structure, and with its parameters calibrated."""
-        (plain,) = self.refined([self.fresh(Hypothesis())], iterations=20)
+        found = self.refined([self.fresh(Hypothesis())], iterations=20)
+        if not found:
+            raise GroundedError(undefined(self.predictor))
+        (plain,) = found
         self.structures(plain)
         self.calibrated(plain)
         if self.best_null() is not plain:
@@ -262,8 +270,8 @@ class Search:
     def without(self, fit: Fit, name: str) -> Fit:
         """The fit with one effect taken out, its noise and track kept: where rivals are sought."""
         start = (fit.hypothesis.minus(name), fit.noise, fit.track)
-        (alone,) = refine(self.predictor, [start], iterations=1, fixed_noise=True)
-        return alone
+        alone = refine(self.predictor, [start], iterations=1, fixed_noise=True)
+        return alone[0] if alone else self.best_null()
 
     def of_size(self, count: int) -> list[Fit]:
         """All fits with that many effects, best first, one a set of effects."""

@@ -12,13 +12,14 @@ diagnosis, and listed in docs/effects.md.
 
 c are the effect's quantities by name. A quantity without a scan grid is absent at zero and the
 equation is (to first order) linear in it; one with a grid is scanned first, then refined. A fixed
-quantity is a constant that the data's scale chose (the width of a smoothed sign), never fitted.
+quantity is a constant that the data's scale chose (the width of a smoothed sign); where the effect
+is large, the data may set it themselves.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
 
@@ -43,6 +44,8 @@ class Quantity:
         fixed: a constant of the effect, not estimated; its value is `start`.
         start: value at which the effect is absent (or, fixed, the value itself).
         places: how many independent values the grid looks at, for the price of looking.
+        tunable: a constant that data may set (above zero) where they show the effect well.
+        tuned: it was.
     """
 
     name: str
@@ -53,6 +56,8 @@ class Quantity:
     fixed: bool = False
     start: float = 0.0
     places: float = 1.0
+    tunable: bool = False
+    tuned: bool = False
 
 
 @dataclass(frozen=True)
@@ -217,6 +222,13 @@ class Effect:
     def fixed(self) -> dict[str, float]:
         """The constants."""
         return {q.name: q.start for q in self.quantities if q.fixed}
+
+    def tuned(self, name: str, value: float) -> Effect:
+        """The same effect with another constant."""
+        found = [
+            replace(q, start=value, tuned=True) if q.name == name else q for q in self.quantities
+        ]
+        return replace(self, quantities=tuple(found))
 
     @property
     def places(self) -> float:

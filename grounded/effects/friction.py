@@ -3,7 +3,8 @@
     v' = model + rate(v)
 
 Viscous and quadratic drag act on any velocity. Coulomb friction's sign is smoothed over a small
-width w (a hundredth of the largest speed): with noise around zero a sharp sign would chatter.
+width w (a hundredth of the largest speed, or what data show): with noise around zero a sharp sign
+would chatter, and real friction needs some way to build up.
 Stiction holds what is slower than v_s: the model's own rate is cancelled up to c,
 
     v' = own - exp(-(v / v_s)^2) clip(own + 2 v, -c, c)               (the 2 is 2 per second)
@@ -31,7 +32,7 @@ def _coulomb(site: Site) -> tuple[Quantity, ...]:
     unit = site.unit(site.target)
     return (
         Quantity("c", per(unit)),
-        Quantity("width", unit, fixed=True, start=_width(site, 0.01)),
+        Quantity("width", unit, fixed=True, start=_width(site, 0.01), tunable=True),
     )
 
 
