@@ -5,9 +5,11 @@ import json
 import pytest
 from click.testing import CliRunner
 
+from cli import grounded
 from grounded.errors import GroundedError
 from grounded_cli.main import cli
 from grounded_trials.challenge_files import open_label, read_manifest, score_case
+from grounded_trials.store import Store
 from grounded_trials.workspace import Workspace
 
 
@@ -96,3 +98,98 @@ def test_labels_inside_the_cases_are_refused(tmp_path):
     result = CliRunner().invoke(cli, ["challenge", "make", str(tmp_path / "c"), *words])
     assert isinstance(result.exception, GroundedError)
     assert "must lie outside" in str(result.exception)
+
+
+def test_an_interrupted_challenge_goes_on_with_the_same_command(made, tmp_path, monkeypatch):
+    folder, labels, _ = made
+    add, calls = Store.add, []
+    last = len(Store(folder / "single-0000" / "trials").list()) + 2  # the second of the second case
+
+    def interrupted(store, *args):
+        calls.append(args)
+        if len(calls) == last:
+            raise KeyboardInterrupt
+        return add(store, *args)
+
+    words = ["challenge", "make", str(tmp_path / "c"), "--kind", "single", "--cases", "2", "--seed"]
+    with monkeypatch.context() as patch:
+        patch.setattr(Store, "add", interrupted)
+        assert CliRunner().invoke(cli, [*words, "3"]).exit_code != 0
+    assert Store(tmp_path / "c" / "single-0001" / "trials").list()
+    other = CliRunner().invoke(cli, [*words, "4"])
+    assert isinstance(other.exception, GroundedError)
+    assert "holds trials of another challenge" in str(other.exception)
+    again = CliRunner().invoke(cli, [*words, "3"])
+    assert again.exit_code == 0, again.output
+    for first, second in ((folder, tmp_path / "c"), (labels, tmp_path / "c-labels")):
+        assert files_of(second) == files_of(first)
+
+
+def files_of(folder):
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file() and not path.name.startswith(".")
+    }
+
+
+def said(*words, code=0):
+    done = grounded("challenge", *words)
+    assert done.code == code, done.err
+    return done
+
+
+def answered(folder):
+    """As if every case had been diagnosed."""
+    done = {"verdict": {"kind": "none", "effects": []}, "ranking": [], "indistinguishable": []}
+    done |= {"leftover": [], "gap": {"after": 1.0}}
+    for name in read_manifest(folder):
+        (folder / name / "reports").mkdir()
+        (folder / name / "reports" / "diagnosis.json").write_text(json.dumps(done))
+
+
+def test_the_next_command_says_where_the_labels_are_to_be_looked_for(tmp_path):
+    folder, labels = tmp_path / "cases", tmp_path / "sealed"
+    words = ["make", folder, "--kind", "none", "--cases", "1", "--seed", "5"]
+    assert said(*words, "--labels", labels).out.startswith("1 case in ")
+    answered(folder)
+    run = said("run", folder, "--without", "delay,offset", "--without", "stall").out
+    assert "nothing to do: every case is diagnosed already" in run
+    assert f"next: grounded challenge score {folder} --labels DIR\nDIR is the folder" in run
+    missing = said("score", folder, code=1).err
+    assert "are kept elsewhere" in missing and "--labels DIR" in missing
+    wrong = said("score", folder, "--labels", tmp_path / "nowhere", code=1).err
+    assert "there is no " in wrong and "look for none-0000.json" in wrong
+    wrong = said("score", folder, "--labels", tmp_path, code=1).err
+    assert "holds no none-0000.json" in wrong and "name --labels DIR" not in wrong
+    out = said("score", folder, "--labels", labels).out
+    assert max(map(len, out.splitlines())) <= 80
+    assert "\nnone\n  cases                1\n" in out
+
+
+def test_what_is_no_challenge_is_said_to_be_none(tmp_path):
+    for command in ("run", "score"):
+        message = said(command, tmp_path / "nothere", code=1).err
+        assert "there is no folder" in message and "Errno" not in message
+        labels = ["--labels", tmp_path] * (command == "score")
+        message = said(command, tmp_path, *labels, code=1).err
+        assert "it has no manifest.json" in message
+
+
+def test_an_impossible_error_of_parameters_is_refused(tmp_path):
+    words = ["make", tmp_path / "c", "--kind", "none", "--cases", "1", "--seed", "0"]
+    for error in ("-1", "0.6"):
+        assert "0.0<=x<=0.5" in said(*words, "--param-error", error, code=2).err
+
+
+def test_families_may_be_named_in_a_list_or_one_by_one(tmp_path, monkeypatch):
+    folder, seen = tmp_path / "cases", []
+    said("make", folder, "--kind", "none", "--cases", "1", "--seed", "5")
+    monkeypatch.setattr(
+        "grounded_trials.challenge_jobs.diagnose_cases",
+        lambda folder, *, without, **others: seen.append(without) or {"none-0000": 1.0},
+    )
+    out = said("run", folder, "--without", "delay,offset", "--without", "stall").out
+    assert seen == [["delay", "offset", "stall"]]
+    assert "1 case is diagnosed now; 1.0 s of CPU a case" in out
+    assert out.endswith(f"next: grounded challenge score {folder}\n")

@@ -21,7 +21,7 @@ from grounded.errors import GroundedError
 from grounded_trials.config import FILE
 from grounded_trials.examples import toml_of
 from grounded_trials.mcap_log import trial_bytes
-from grounded_trials.store import Store, write_atomically
+from grounded_trials.store import DIGITS, Store, write_atomically
 from grounded_trials.target_file import write_target
 from grounded_trials.workspace import Workspace
 
@@ -36,15 +36,23 @@ def write_cases(
 ) -> list[str]:
     """Writes the workspaces, then the labels, then the manifest; returns the cases' names.
 
+    The manifest comes last: a folder without one was interrupted, and the same cases go on in it.
+
     Raises:
-        GroundedError: if the folder holds a challenge already, or the labels would lie inside it.
+        GroundedError: if the folder holds a challenge already, or cases that are others, or the
+            labels would lie inside it.
     """
     if (folder / MANIFEST).exists():
         raise GroundedError(f"{folder} holds a challenge already: name another folder")
     if labels.resolve().is_relative_to(folder.resolve()):
         raise GroundedError(f"the labels ({labels}) must lie outside {folder}: they are sealed")
     for place in (folder, labels):
-        place.mkdir(parents=True, exist_ok=True)
+        try:
+            place.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise GroundedError(
+                f"{place} can't be made: {error.strerror}; name a folder that can"
+            ) from None
     entries: dict[str, Any] = {}
     for number, case in enumerate(cases, start=1):
         trials = _write_case(case, folder / case.name)
@@ -62,7 +70,16 @@ def _write_case(case: Case, folder: Path) -> list[str]:
     """A case as a workspace; the hashes of its trials."""
     from grounded.diagnosis.challenge import task_of
 
-    folder.mkdir(parents=True)
+    store = Store(folder / "trials")
+    files = [trial_bytes(trial, {"kind": "data"}) for trial in case.trials]
+    hashes = [hashlib.sha256(data).hexdigest() for data in files]
+    stored = [entry.digest for entry in store.list()]
+    if stored != [digest[:DIGITS] for digest in hashes[: len(stored)]]:
+        raise GroundedError(
+            f"{folder} holds trials of another challenge: make the same one again, or name another "
+            "folder"
+        )
+    folder.mkdir(parents=True, exist_ok=True)
     task, names = task_of(case), case.model.state_names
     columns = {name: case.target[:, i] for i, name in enumerate(names)}
     write_target(folder / "target.csv", case.dt, columns)
@@ -75,8 +92,7 @@ def _write_case(case: Case, folder: Path) -> list[str]:
     lines[at : at + 1] = [f'module = "grounded.models.{case.system}"', f"params = {{ {values} }}"]
     system = next(i for i, line in enumerate(lines) if line.startswith("[system]"))
     write_atomically(folder / FILE, ("\n".join(lines[:system]) + "\n").encode())
-    store = Store(folder / "trials")
-    return [store.add(trial_bytes(trial, {"kind": "data"})).sha256 for trial in case.trials]
+    return [store.add(data).sha256 for data in files]
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
@@ -85,13 +101,20 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     Raises:
         GroundedError: if there is none.
     """
+    path, advice = folder / MANIFEST, "name the folder that `grounded challenge make` wrote"
+    if not folder.is_dir():
+        raise GroundedError(f"there is no folder {folder}: {advice}")
     try:
-        document = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+        document = json.loads(path.read_text(encoding="utf-8"))
         return dict(document["cases"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except FileNotFoundError:
         raise GroundedError(
-            f"{folder} holds no challenge ({error}): make one with `grounded challenge make`"
+            f"{folder} holds no challenge, it has no {MANIFEST}: {advice}"
         ) from None
+    except OSError as error:
+        raise GroundedError(f"{path} can't be read: {error.strerror}; {advice}") from None
+    except (ValueError, KeyError, TypeError):
+        raise GroundedError(f"{path} is not the list of a challenge's cases: {advice}") from None
 
 
 def open_label(labels: Path, name: str, entry: dict[str, Any]) -> dict[str, Any]:
@@ -103,8 +126,16 @@ def open_label(labels: Path, name: str, entry: dict[str, Any]) -> dict[str, Any]
     path = labels / f"{name}.json"
     try:
         data = path.read_bytes()
+    except FileNotFoundError:
+        there = f"{labels} holds no {path.name}" if labels.is_dir() else f"there is no {labels}"
+        raise GroundedError(
+            f"{there}: expected the folder in which `grounded challenge make` put the label of "
+            f"every case; look for {path.name}"
+        ) from None
     except OSError as error:
-        raise GroundedError(f"{path} can't be read: {error.strerror}; name --labels DIR") from None
+        raise GroundedError(
+            f"{path} can't be read: {error.strerror}; make it readable, it is the case's label"
+        ) from None
     if hashlib.sha256(data).hexdigest() != entry["label_sha256"]:
         raise GroundedError(f"{path} is not the label that the manifest announced: it was changed")
     return dict(json.loads(data))
