@@ -265,6 +265,7 @@ def test_export_without_a_best_or_into_nowhere(w, tmp_path):
     step(w)
     nowhere = grounded("-C", w, "export", "c0001", "-o", tmp_path / "no" / "c.json")
     assert nowhere.code == 1 and "can't be written" in nowhere.err
+    assert "does not exist; make it, or name another place" in nowhere.err
     assert not list(tmp_path.glob("**/*.tmp"))
 
 

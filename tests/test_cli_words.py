@@ -130,7 +130,12 @@ def test_repeats_say_what_is_waited_for(tmp_path):
         (["adopt", "x:y"], "nothing was diagnosed yet"),
         (["diagnose", "--trials", "t9,"], "there is no trial to learn from"),
         (["diagnose", "--without", "delay,delai"], "did you mean 'delay'"),
+        (["diagnose", "--trials", ""], "--trials names no trial: expected some, like t0001"),
+        (["diagnose", "--trials", " , "], "leave it out to take all"),
         (["recover", "trials"], "is a folder"),
+        (["recover", "model.py"], "look for another copy of the recording"),
+        (["ingest", "nofile.mcap"], "name an MCAP file or a bag's folder"),
+        (["ingest", "no/nofile.mcap"], "nor does its folder no: name a log"),
         (["inspect", "nowhere.mcap"], "does not exist"),
     ],
 )

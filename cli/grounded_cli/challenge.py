@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Any
 
 import click
 
 from grounded_cli.options import as_json
-from grounded_cli.terminal import bar, number, show, show_json, table
+from grounded_cli.terminal import bar, names_in, number, show, show_json, table
+from grounded_trials.words import count
 
 
 @click.group("challenge")
@@ -47,7 +49,12 @@ def parallel(function: Any) -> Any:
 @click.option("--cases", type=click.IntRange(1), required=True, metavar="N", help="How many.")
 @click.option("--seed", type=click.IntRange(0), required=True, metavar="S", help="Of everything.")
 @click.option("--labels", metavar="DIR", help="Where the labels go (default: DIR-labels).")
-@click.option("--param-error", type=float, metavar="E", help="Error of the model's parameters.")
+@click.option(
+    "--param-error",
+    type=click.FloatRange(0.0, 0.5),
+    metavar="E",
+    help="Relative error of the model's parameters, 0 to 0.5.",
+)
 @as_json
 def make_cases(
     folder: str,
@@ -69,13 +76,14 @@ def make_cases(
     if json_:
         show_json({"workspace": folder, "labels": str(sealed), "cases": names})
         return
-    show(f"{len(names)} cases in {folder}, their labels in {sealed} (keep them away from it)")
-    show(f"\nnext: grounded challenge run {folder}")
+    made = count(len(names), "case")
+    show(f"{made} in {folder}, the labels in {sealed} (keep them away from it)")
+    show(f"\nnext: grounded challenge run {shlex.quote(folder)}")
 
 
 @command.command("run", short_help="Diagnose the cases that were not yet.")
 @click.argument("folder", metavar="DIR")
-@click.option("--without", multiple=True, metavar="FAMILY", help="Not to blame (repeatable).")
+@click.option("--without", multiple=True, metavar="F1,F2,...", help="Families not to blame.")
 @click.option("--again", is_flag=True, help="Those that were diagnosed before too.")
 @parallel
 @as_json
@@ -90,19 +98,25 @@ def run_cases(
 ) -> None:
     """Diagnose the cases of DIR that were not yet; a run that was cut off goes on."""
     from grounded.experiments.jobs import Engine
-    from grounded_trials.challenge_jobs import diagnose_cases
+    from grounded_trials.challenge_jobs import diagnose_cases, undiagnosed
 
     where = Engine(jobs=jobs, name=engine, address=address)
+    families = [name for text in without for name in names_in(text)]
+    waiting = undiagnosed(Path(folder), again=again)
     with bar("diagnoses") as progress:
         times = diagnose_cases(
-            Path(folder), without=without, again=again, engine=where, progress=progress
+            Path(folder), without=families, again=again, engine=where, progress=progress
         )
     if json_:
         show_json({"cases": list(times), "cpu_s": times})
         return
-    mean = sum(times.values()) / max(len(times), 1)
-    show(f"{len(times)} cases are diagnosed, {mean:.1f} s of CPU each")
-    show(f"\nnext: grounded challenge score {folder}")
+    if waiting:
+        mean = sum(times.values()) / max(len(times), 1)
+        are = "case is" if len(waiting) == 1 else "cases are"
+        show(f"{len(waiting)} {are} diagnosed now; {mean:.1f} s of CPU a case")
+    else:
+        show("nothing to do: every case is diagnosed already (--again does them once more)")
+    show(f"\nnext: {_score_command(folder)}")
 
 
 @command.command("score", short_help="Open the labels, mark the diagnoses.")
@@ -118,7 +132,7 @@ def score(
     from grounded.experiments.jobs import Engine
     from grounded_trials.challenge_jobs import score_cases
 
-    sealed = Path(labels or f"{folder}-labels")
+    sealed = _labels(folder, labels)
     where = Engine(jobs=jobs, name=engine, address=address)
     with bar("cases") as progress:
         marks = score_cases(Path(folder), sealed, engine=where, progress=progress)
@@ -129,17 +143,40 @@ def score(
     rows = [(m["case"], ", ".join(m["truth"]), m["verdict"], ", ".join(m["named"])) for m in marks]
     show(table(rows, ("case", "truth", "verdict", "named")))
     for kind, row in found.items():
-        show(f"\n{kind}: {_words(row)}")
+        show(f"\n{kind}")
+        for key, value in row.items():
+            show(f"  {key.replace('_', ' '):<20} {_words(value)}")
 
 
-def _words(row: dict[str, Any]) -> str:
-    parts = []
-    for key, value in row.items():
-        if isinstance(value, dict):
-            parts.append(f"{key} " + ", ".join(f"{k} {_figure(v)}" for k, v in value.items()))
-        else:
-            parts.append(f"{key.replace('_', ' ')} {_figure(value)}")
-    return "; ".join(parts)
+def _labels(folder: str, labels: str | None) -> Path:
+    """Where the labels are.
+
+    Raises:
+        GroundedError: if they were not named, and are not where they are by default.
+    """
+    from grounded.errors import GroundedError
+
+    usual = Path(f"{folder}-labels")
+    if labels is None and Path(folder).is_dir() and not usual.is_dir():
+        raise GroundedError(
+            f"{usual} does not exist: the labels of {folder} are kept elsewhere; name the folder "
+            "that `grounded challenge make` wrote them to with --labels DIR"
+        )
+    return Path(labels) if labels is not None else usual
+
+
+def _score_command(folder: str) -> str:
+    """How the cases are scored; it says what is to be filled in where the labels are elsewhere."""
+    command = f"grounded challenge score {shlex.quote(folder)}"
+    if Path(f"{folder}-labels").is_dir():
+        return command
+    return f"{command} --labels DIR\nDIR is the folder with the labels, where `make` wrote them"
+
+
+def _words(value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {_figure(one)}" for key, one in value.items())
+    return _figure(value)
 
 
 def _figure(value: Any) -> str:

@@ -44,9 +44,14 @@ def command(
     would tell them apart is written.
     """
     workspace = open_workspace(folder)
+    from grounded.errors import GroundedError
     from grounded_trials.diagnosing import diagnose_in
 
     chosen = names_in(trials)
+    if trials is not None and not chosen:
+        raise GroundedError(
+            "--trials names no trial: expected some, like t0001,t0002; leave it out to take all"
+        )
     library = library_of(tuple(name for text in without for name in names_in(text)))
     with stages() as tell:
         found = diagnose_in(

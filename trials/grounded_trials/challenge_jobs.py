@@ -47,9 +47,7 @@ def diagnose_cases(
     """
     from grounded.experiments.jobs import Job, run_jobs
 
-    names = list(read_manifest(folder))
-    if not again:
-        names = [name for name in names if not (folder / name / "reports" / FILE).is_file()]
+    names = undiagnosed(folder, again=again)
     jobs = [
         Job(
             diagnose_case,
@@ -62,6 +60,16 @@ def diagnose_cases(
     times |= {str(one["case"]): float(one["cpu_s"]) for one in found}
     write_atomically(folder / TIMES, json.dumps(times, indent=1, sort_keys=True).encode())
     return times
+
+
+def undiagnosed(folder: Path, *, again: bool = False) -> list[str]:
+    """The cases that were not diagnosed yet, or all of them.
+
+    Raises:
+        GroundedError: if the folder holds no challenge.
+    """
+    names = list(read_manifest(folder))
+    return [n for n in names if again or not (folder / n / "reports" / FILE).is_file()]
 
 
 def diagnose_case(folder: str, name: str, without: Sequence[str]) -> dict[str, Any]:

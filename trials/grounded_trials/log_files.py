@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import BinaryIO
 
-from grounded.errors import GroundedError
+from grounded.errors import GroundedError, nearest
 
 _LISTED = re.compile(r"^\s*-\s+(?:path:\s*)?[\"']?([^\"'\s#]+\.mcap)[\"']?\s*$", re.MULTILINE)
 _DIGITS = re.compile(r"(\d+)")
@@ -29,7 +29,7 @@ def log_files(paths: str | Path | Sequence[str | Path]) -> tuple[Path, ...]:
         files.extend(_bag(path) if path.is_dir() else [path])
     for path in files:
         if not path.exists():
-            raise GroundedError(f"{path} does not exist")
+            raise GroundedError(f"{path} does not exist{_nearby(path)}")
     if not files:
         raise GroundedError("no log was given")
     return tuple(files)
@@ -54,6 +54,16 @@ def _bag(folder: Path) -> list[Path]:
     if not inside:
         raise GroundedError(f"{folder} holds no *.mcap file{_advice(folder)}")
     return sorted(inside, key=lambda path: _natural(path.name))
+
+
+def _nearby(path: Path) -> str:
+    """What to do about a file that is not there."""
+    if not path.parent.is_dir():
+        return f", nor does its folder {path.parent}: name a log, seen from the folder you are in"
+    names = sorted(p.name for p in path.parent.glob("*.mcap"))
+    if names:
+        return f": {nearest(path.name, names[:5])}"
+    return ": name an MCAP file or a bag's folder, seen from the folder you are in"
 
 
 def _advice(folder: Path) -> str:
@@ -81,7 +91,7 @@ def open_log(path: Path) -> BinaryIO:
     try:
         return path.open("rb")
     except FileNotFoundError:
-        raise GroundedError(f"{path} does not exist") from None
+        raise GroundedError(f"{path} does not exist{_nearby(path)}") from None
     except IsADirectoryError:
         raise GroundedError(f"{path} is a folder: name a file in it") from None
     except OSError as error:

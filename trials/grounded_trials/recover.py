@@ -87,7 +87,10 @@ def recover_log(source: str | Path, target: str | Path) -> Recovery:
     if not copy.anything:
         target.unlink()
         why = salvage.losses[0] if salvage.losses else "it is a log without messages"
-        raise GroundedError(f"{source}: there is nothing to save: {why}")
+        raise GroundedError(
+            f"{source}: there is nothing to save: {why}; expected an MCAP log, whole or damaged: "
+            "look for another copy of the recording"
+        )
     losses = list(salvage.losses)
     if copy.homeless:
         these = count(copy.homeless, "message")

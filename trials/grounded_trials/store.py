@@ -218,6 +218,11 @@ def write_atomically(path: Path, data: bytes) -> None:
             sync_folder(path.parent)
         finally:
             _remove(temporary)
+    except FileNotFoundError:
+        raise GroundedError(
+            f"{path} can't be written: the folder {path.parent} does not exist; make it, or name "
+            "another place"
+        ) from None
     except OSError as error:
         raise GroundedError(f"{path} can't be written: {error.strerror}") from None
 
