@@ -1,6 +1,7 @@
 """The diagnosis: its filter against dense algebra, its verdicts on known answers."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,8 +15,10 @@ from grounded.diagnosis.challenge import judge, make, oracle, sealed, summary
 from grounded.diagnosis.data import prepare, shifted
 from grounded.diagnosis.diagnose import Options, diagnose
 from grounded.diagnosis.excitation import probe
+from grounded.diagnosis.gap import _stump
 from grounded.diagnosis.leftover import chi2_tail
-from grounded.diagnosis.report import Estimate
+from grounded.diagnosis.report import Estimate, Remainder
+from grounded.diagnosis.verdict import verdict
 from grounded.diagnosis.words import meaning, sentence
 from grounded.effects import Library
 from grounded.models.pendulum import model as pendulum
@@ -226,6 +229,10 @@ def test_sentences_are_english():
     assert said("offset:v", c=0.1) == "The speed v drifts by 0.1 m/s^2."
     assert said("offset:w", c=0.1) == "The state w drifts by 0.1 1/s."
     assert said("input_gain:throttle", g=-0.2) == "The throttle acts 20 % weaker than modelled."
+    assert said("input_fade:throttle", k=-0.05) == "The throttle gets 5 % stronger every second."
+    assert said("input_fade:throttle", k=0.05) == (
+        "The throttle gets 5 % weaker every second (a battery that sags)."
+    )
     assert said("parameter:k", d=0.1) == "The parameter k is off by 0.1 1/s."
     for effect in Library().candidates(model):
         known = {q.name: Estimate(0.1, 0, 0.1, 0.1, q.unit) for q in effect.quantities}
@@ -239,6 +246,27 @@ def test_what_no_effect_explains_is_left_over():
     assert found.leftover or found.gap["after"] < 1.3
     if found.leftover:
         assert found.leftover[0].channel == "v"
+
+
+def test_leftovers_that_are_not_named_are_counted():
+    claims = SimpleNamespace(known=SimpleNamespace(no_cause=False), blamed=(), names=())
+    off = tuple(Remainder(name, 0.1, "m/s", 9.0, None) for name in "abcd")
+    said = {k: verdict(claims, 2.0, 1.0, (), (), (), off[:k])[1] for k in (2, 3, 4)}
+    assert said[2].endswith("a is off by 0.1 m/s rms; b is off by 0.1 m/s rms.")
+    assert said[3].endswith("b is off by 0.1 m/s rms; and 1 more.")
+    assert said[4].endswith("b is off by 0.1 m/s rms; and 2 more.")
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0])
+def test_a_threshold_that_is_zero_but_for_rounding_reads_zero(scale):
+    sides = np.linspace(0.1, 1, 25)
+    y = scale * np.concatenate([-sides, np.full(50, 1.58e-7), sides])[:, None]
+    gain = (y < 0).astype(float)
+    row = _stump("y", y, gain, np.ones_like(y, bool), float(gain.sum()))
+    assert row["when"] == "y < 0" and row["share"] == 1
+    other = (y > 0.5 * scale).astype(float)
+    row = _stump("y", y, other, np.ones_like(y, bool), float(other.sum()))
+    assert float(row["when"].split()[-1]) > 1e-3 * scale  # others are told as they are
 
 
 def test_without_the_family_a_look_alike_is_marked_by_what_it_leaves():

@@ -187,7 +187,8 @@ def by_region(
     signals: list[tuple[str, Array]] = []
     u = data.runs(data.commands)
     signals += [(n, u[..., j]) for j, n in enumerate(model.input_names)]
-    signals += [(n, fit.track[:-1, :, i]) for i, n in enumerate(model.state_names)]
+    shown = [(i, n) for i, n in enumerate(model.state_names) if i not in data.hidden]
+    signals += [(n, fit.track[:-1, :, i]) for i, n in shown]
     signals.append(("t", data.time))
     whole = max(float(gain.sum()), 1e-12)
     valid = data.valid.T > 0
@@ -206,6 +207,7 @@ def _stump(
     """The best threshold of one signal, of its value or its size."""
     best: dict[str, float | str] | None = None
     margin = 0.1
+    nothing = 1e-3 * float(signal[valid].std())  # a level that is zero but for rounding
     forms: list[tuple[str, Callable[[Array], Array]]] = [(name, lambda v: v)]
     if float(signal.min()) < 0 < float(signal.max()):
         forms.append((f"|{name}|", np.abs))
@@ -219,8 +221,9 @@ def _stump(
                 if occupancy < 0.03 or share - occupancy <= margin:
                     continue
                 margin = share - occupancy
+                shown = 0.0 if abs(level) < nothing else level
                 best = {
-                    "when": f"{label} {sign} {level:.3g}",
+                    "when": f"{label} {sign} {shown:.3g}",
                     "share": min(share, 1.0),
                     "occupancy": occupancy,
                 }

@@ -17,6 +17,8 @@ from grounded.diagnosis.report import (
 )
 from grounded.diagnosis.words import distinguishing, improvement, meaning, nearly, sentence, tied
 
+NAMED = 2  # leftovers
+
 
 def verdict(
     claims: Claims,
@@ -38,7 +40,8 @@ def verdict(
         alike: what is nearly the same as a claimed effect.
         remainder: what no effect explains.
     """
-    left = "; ".join(r.sentence() for r in remainder[:2])
+    left = "; ".join(r.sentence() for r in remainder[:NAMED])
+    left += f"; and {len(remainder) - NAMED} more" if len(remainder) > NAMED else ""
     if claims.known.no_cause:
         return "unknown", f"No cause is named: {claims.known.sentences[0]}."
     if claims.blamed:

@@ -93,7 +93,7 @@ saturation = InputFamily(
 input_fade = InputFamily(
     name="input_fade",
     equation="u_eff = (1 - k t) u",
-    sentence="{target} fades by {k%} every second (a battery that sags)",
+    sentence="{target} gets {k%weaker every second (a battery that sags)|stronger every second}",
     targets=places.inputs,
     quantities=_fade,
     lookalikes=("input_gain", "trend", "input_bias"),
