@@ -68,7 +68,7 @@ def test_a_state_that_is_measured_now_and_then_leaves_its_noise_to_be_found(stat
 def test_a_friction_is_still_found_with_an_angle_at_every_tenth_step():
     trials = list(seen_every(swings(6, 200, 3, friction=0.03), 0, 10))
     found = diagnose(pendulum, trials)
-    assert "viscous_friction:omega" in {name for name in found.effects} | {
+    assert "viscous_friction:omega" in set(found.effects) | {
         other for group in found.indistinguishable for other in group
     }
 

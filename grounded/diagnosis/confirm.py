@@ -83,9 +83,10 @@ def confirmed(search: Search, best: Fit, seconds: float) -> Fit:
 
 def _pruned(search: Search, fit: Fit, gap: float, where: Horizon) -> Fit:
     """Without the effects that predictions are hardly worse without, where they miss by much."""
-    while gap > MISFIT and len(fit.hypothesis.effects) > 1:
+    while gap > MISFIT and fit.hypothesis.effects:
         names = set(fit.hypothesis.names)
         fewer = [f for f in search.of_size(len(names) - 1) if set(f.hypothesis.names) < names]
+        fewer = fewer if len(names) > 1 else [search.best_null()]
         gaps = gaps_of(search.predictor, fewer, where)
         if not gaps or not min(gaps) < WORTH * gap:
             break

@@ -46,6 +46,9 @@ class Data:
     scales: Scales
     skipped: int  # runs left out because there are too many
     ids: tuple[str, ...]
+    hidden: tuple[
+        int, ...
+    ] = ()  # states that no sensor has: their course is a guess, but the start
 
     @property
     def count(self) -> int:
@@ -71,6 +74,9 @@ class Data:
     def seen(self) -> Array:
         """1.0 where a state was measured and its step was run, (L + 1, B, n)."""
         there = np.isfinite(self.states[self.state_at])
+        begins = np.isin(self.state_at, np.cumsum([0, *(self.lengths + 1)]))
+        for i in self.hidden:
+            there[..., i] &= begins
         run = np.concatenate([np.ones((len(self.valid), 1)), self.valid], axis=1)
         return np.ascontiguousarray((there * run[:, :, None]).swapaxes(0, 1))
 
@@ -103,7 +109,11 @@ def shifted(signal: Array, held: Array, steps: float) -> Array:
 
 
 def prepare(
-    model: Model, trials: Sequence[Trial], latency: Array | None = None, past: Array | None = None
+    model: Model,
+    trials: Sequence[Trial],
+    latency: Array | None = None,
+    past: Array | None = None,
+    hidden: Sequence[str] = (),
 ) -> Data:
     """Trials of one time grid as one record.
 
@@ -113,6 +123,8 @@ def prepare(
             last finite state is left out, gaps in single states stay (as missing).
         latency: transport delay of the inputs [s] that is already modelled (m,).
         past: the input held before t = 0 where a trial does not say (m,).
+        hidden: states that no sensor has (the memory of adopted effects): known at the start, what
+            the trials say of them later is where their fit begins.
 
     Raises:
         GroundedError: for trials of other states or inputs, of different dt, or empty ones.
@@ -153,6 +165,7 @@ def prepare(
         scales=scales_of(model, states, steps, dt, float(lengths.max() * dt)),
         skipped=len(step_at) - len(keep),
         ids=tuple(trial.id for trial, _ in used),
+        hidden=tuple(model.state_names.index(name) for name in hidden),
     )
 
 

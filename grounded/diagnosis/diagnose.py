@@ -13,7 +13,7 @@ excitation   what to run next, where two explanations tie
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -49,11 +49,15 @@ class Options:
         library: the families that may be blamed.
         max_effects: at most so many at once.
         horizon: how far ahead predictions are judged [s].
+        hidden: states that no sensor has: the memory of effects that were adopted.
+        but: effects that are not blamed, by name: adopted ones, whose numbers are parameters now.
     """
 
     library: Library = field(default_factory=Library)
     max_effects: int = 3
     horizon: float = 1.0
+    hidden: tuple[str, ...] = ()
+    but: Collection[str] = ()
 
 
 def diagnose(
@@ -78,10 +82,11 @@ def diagnose(
     model = subject.model if isinstance(subject, Task) else subject
     latency = subject.latency if isinstance(subject, Task) else None
     past = subject.past if isinstance(subject, Task) else None
-    data = prepare(model, trials, latency, past)
+    data = prepare(model, trials, latency, past, options.hidden)
     known = limits(data)
     tick("candidates")
-    candidates = knowable(data, options.library.candidates(model, data.scales))
+    offered = options.library.candidates(model, data.scales)
+    candidates = knowable(data, [e for e in offered if e.name not in options.but])
     search, best = attribute(data, candidates, max_effects=options.max_effects, tick=tick)
     tick("leftover")
     with np.errstate(all="ignore"):
@@ -111,6 +116,8 @@ class _Writer:
         self.search, self.best, self.left, self.known = search, best, left, known
         self.options, self.tick = options, tick
         self.predictor, self.data = search.predictor, search.data
+        names = search.data.model.state_names
+        self.shown = [(i, n) for i, n in enumerate(names) if i not in search.data.hidden]
         self.claims = Claims(search, best, known, left=bool(left))
 
     def diagnosis(self) -> Diagnosis:
@@ -187,37 +194,40 @@ class _Writer:
                 "unit": data.model.states[name],
                 "noise": float(np.sqrt((spread[:, i] ** 2).mean())),
             }
-            for i, name in enumerate(data.model.state_names)
+            for i, name in self.shown
         ]
         return sorted(rows, key=lambda row: -float(row["share"]))
 
     def by_channel(self, before: Any, after: Any, spread: Any) -> dict[str, Any]:
         """The gap of each state, noise-normalised."""
         found = {}
-        for i, name in enumerate(self.data.model.state_names):
+        for i, name in self.shown:
             b, a = (float(_rms(e[:, i] / spread[:, i])) for e in (before, after))
             found[name] = {"before": b, "after": a}
         return found
 
     def noise(self) -> dict[str, Any]:
         """The noise as it was estimated."""
-        noise, names = self.best.noise, self.data.model.state_names
+        noise = self.best.noise
         q, r = np.exp(0.5 * noise.log_q), np.exp(0.5 * noise.log_r)
         return {
-            "process": {n: float(v) for n, v in zip(names, q, strict=True)},
-            "measurement": {n: float(v) for n, v in zip(names, r, strict=True)},
+            "process": {name: float(q[i]) for i, name in self.shown},
+            "measurement": {name: float(r[i]) for i, name in self.shown},
             "correlation_s": noise.structure.tau,
             "outliers": not isinstance(noise.weight_v, float),
         }
 
     def whole_run(self, bare: Any) -> dict[str, Any]:
         """Errors of predictions from the first state to the end of each run."""
-        names = self.data.model.state_names
         before = whole_runs(self.predictor, Hypothesis(), bare)
         after = whole_runs(self.predictor, self.best.hypothesis, self.best.track)
         return {
-            n: {"before": float(b), "after": float(a), "unit": self.data.model.states[n]}
-            for n, b, a in zip(names, before, after, strict=True)
+            name: {
+                "before": float(before[i]),
+                "after": float(after[i]),
+                "unit": self.data.model.states[name],
+            }
+            for i, name in self.shown
         }
 
     def split(self, bare: Any, where: Horizon) -> dict[str, Any]:
@@ -238,7 +248,7 @@ class _Writer:
         delays = delays_of(self.best.hypothesis, self.data)
         seen = self.data.seen if delays is None else delays.samples()[1]
         found = whiteness(self.best, seen)
-        return {name: found[str(i)] for i, name in enumerate(self.data.model.state_names)}
+        return {name: found[str(i)] for i, name in self.shown}
 
     def utility_prediction(self, bare: Any) -> dict[str, Any] | None:
         """Rms errors of predicted utilities, held out; None for a bare model."""

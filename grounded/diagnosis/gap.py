@@ -187,7 +187,8 @@ def by_region(
     signals: list[tuple[str, Array]] = []
     u = data.runs(data.commands)
     signals += [(n, u[..., j]) for j, n in enumerate(model.input_names)]
-    signals += [(n, fit.track[:-1, :, i]) for i, n in enumerate(model.state_names)]
+    shown = [(i, n) for i, n in enumerate(model.state_names) if i not in data.hidden]
+    signals += [(n, fit.track[:-1, :, i]) for i, n in shown]
     signals.append(("t", data.time))
     whole = max(float(gain.sum()), 1e-12)
     valid = data.valid.T > 0

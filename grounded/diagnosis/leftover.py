@@ -53,6 +53,8 @@ def leftovers(predictor: Predictor, fit: Fit) -> list[Leftover]:
     features = flexible(predictor, fit)
     found = []
     for i, name in enumerate(data.model.state_names):
+        if i in data.hidden:
+            continue
         gain, step_gain, weights = _channel(predictor, fit, features, i)
         if gain > CLAIM:
             correction = features @ weights

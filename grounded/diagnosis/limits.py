@@ -57,7 +57,7 @@ def limits(data: Data) -> Limits:
     empty = [n for i, n in enumerate(data.model.state_names) if not data.seen[..., i].any()]
     for name in empty:
         found.append(f"state {name} was never measured")
-    if len(unmoved) + len(empty) == data.model.n:
+    if len(unmoved) + len(empty) + len(data.hidden) == data.model.n:
         no_cause = True
     return Limits(tuple(found), no_cause)
 
@@ -79,6 +79,8 @@ def still_states(data: Data) -> list[str]:
     """States that had one value in every trial: to the last digit, so no sensor of them lives."""
     found = []
     for i, name in enumerate(data.model.state_names):
+        if i in data.hidden:
+            continue
         values = data.states[np.isfinite(data.states[:, i]), i]
         if values.size and float(np.ptp(values)) <= 1e-9 * max(data.scales.peak(name), 1e-12):
             found.append(name)
@@ -89,10 +91,13 @@ def knowable(data: Data, effects: Sequence[Effect]) -> tuple[Effect, ...]:
     """The effects that these data could show at all."""
     still, unmoved = set(constant_inputs(data)), set(still_states(data))
     dead = {n for i, n in enumerate(data.model.state_names) if not data.seen[..., i].any()}
+    memory = {data.model.state_names[i] for i in data.hidden}
     kept = []
     for effect in effects:
         targets = {part for t in effect.site.targets for part in t.split("<-")}
         family = effect.family
+        if targets & memory:
+            continue
         if isinstance(family, InputFamily | MemoryFamily) and targets & still:
             continue
         if isinstance(family, RateFamily) and targets & unmoved:

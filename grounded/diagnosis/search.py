@@ -117,6 +117,7 @@ class Search:
         predicted = self.predictor.next(h, track[:-1])
         residual = data.model.difference(predicted, track[1:])
         scale = np.array([data.scales.spread(n) for n in data.model.state_names])
+        scale[list(data.hidden)] = 0.0  # nothing disturbs a memory
         return h, first_guess(residual, data.seen, scale), track
 
     def again(self, fits: Sequence[Fit]) -> list[Fit]:

@@ -68,6 +68,7 @@ class Split:
                     **_named(each[:, i]),
                 }
                 for i, name in enumerate(model.state_names)
+                if i not in data.hidden
             ],
             "irreducible_from": "noise" if self.repeats is None else "repeats",
         }
@@ -128,7 +129,8 @@ def scatter(
             variance = np.where(whole, np.nan_to_num(error).var(axis=0, ddof=1), 0.0)
             total += (len(runs) - 1) * variance.sum(axis=0)
             count += (len(runs) - 1) * whole.sum(axis=0)
-    return total / count if (count > 0).all() else None
+    shown = np.delete(np.arange(data.model.n), list(data.hidden))
+    return total / np.maximum(count, 1) if (count[shown] > 0).all() else None
 
 
 def _side_by_side(data: Data, group: Sequence[int]) -> list[Any]:

@@ -39,7 +39,8 @@ def adopt_effects(
     """
     document, names = _document(workspace), list(dict.fromkeys(names))
     ranking = {str(entry["effect"]): entry for entry in document["ranking"]}
-    _check(names, list(ranking), workspace)
+    before = {str(e["name"]): e for e in document.get("diagnosed", {}).get("adopted", [])}
+    _check(names, list(ranking), workspace, before)
     claimed = _claimed(document, names)
     adopted: list[Effect] = [dict(effect) for effect in workspace.config.model.effects]
     found = document.get("parameters", {}) if parameters and claimed else {}
@@ -48,18 +49,49 @@ def adopt_effects(
         values = _values(ranking[name])
         family, _, target = name.partition(":")
         if family == "parameter":
-            nominal = workspace.base_model.params[target].value
-            params[target] = _rounded(nominal + values["d"])
+            params[target] = _rounded(_nominal(document, workspace, target) + values["d"])
+        elif name in before:  # a delay more
+            values["d"] = _rounded(float(before[name]["d"]) + values["d"])
+            adopted = [e | values if e["name"] == name else e for e in adopted]
         else:
             adopted.append({"name": name, **values})
-    whole = dict(workspace.config.model.params) | params
-    set_in_model(workspace.config.file, params=whole if params else None, effects=adopted or None)
-    return Adopted(tuple(adopted), params, claimed)
+    own, adopted = _settled(params, adopted)
+    whole = dict(workspace.config.model.params) | own
+    set_in_model(workspace.config.file, params=whole if own else None, effects=adopted or None)
+    return Adopted(tuple(adopted), own, claimed)
 
 
-def _check(names: Sequence[str], known: Sequence[str], workspace: Workspace) -> None:
-    """Each must have been weighed, and not be adopted."""
-    adopted = [effect["name"] for effect in workspace.config.model.effects]
+def _nominal(document: Mapping[str, Any], workspace: Workspace, name: str) -> float:
+    """A parameter's value when the diagnosis was made."""
+    values = document.get("diagnosed", {}).get("nominal", {})
+    if name in values:
+        return float(values[name])
+    if name not in workspace.base_model.params:
+        raise GroundedError(
+            f"the last diagnosis does not say from which value of '{name}' it counts: run "
+            "`grounded diagnose` again"
+        )
+    return float(workspace.base_model.params[name].value)
+
+
+def _settled(
+    params: Mapping[str, float], effects: Sequence[Effect]
+) -> tuple[dict[str, float], list[Effect]]:
+    """The model's own parameters, and the effects with the values of theirs."""
+    own, changed = dict(params), []
+    for effect in effects:
+        family, _, targets = str(effect["name"]).partition(":")
+        stem = f"{family}_{targets.replace('+', '_').replace('<-', '_from_')}"
+        new = {q: own.pop(f"{stem}_{q}") for q in effect if f"{stem}_{q}" in own}
+        changed.append(effect | new)
+    return own, changed
+
+
+def _check(
+    names: Sequence[str], known: Sequence[str], workspace: Workspace, before: Mapping[str, Any]
+) -> None:
+    """Each must have been weighed, and not be adopted since."""
+    adopted = [e["name"] for e in workspace.config.model.effects if e["name"] not in before]
     for name in names:
         if name not in known:
             raise GroundedError(

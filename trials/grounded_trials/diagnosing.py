@@ -17,7 +17,6 @@ from grounded_trials.workspace import Workspace
 if TYPE_CHECKING:
     from grounded.diagnosis.report import Diagnosis
     from grounded.effects import Library
-    from grounded.task import Task
     from grounded.trial import Trial
 
 
@@ -53,30 +52,34 @@ def diagnose_in(
     from grounded.diagnosis.diagnose import Options, diagnose
     from grounded.effects import Library
 
+    names = [str(effect["name"]) for effect in workspace.config.model.effects]
+    adopted = {name for name in names if not name.startswith("delay:")}  # whose d is no parameter
     library = library or Library()
-    subject, used = _subject(workspace), _chosen(workspace, trials)
-    options = Options(library=library, max_effects=max_effects)
-    found = diagnose(subject, used, options, progress=progress)
+    planner, used = workspace.planner, _chosen(workspace, trials)
+    memory = planner.plan.model.state_names[planner.task.model.n :]
+    options = Options(library=library, max_effects=max_effects, hidden=tuple(memory), but=adopted)
+    lifted = [planner.lift(trial) for trial in used]
+    found = diagnose(planner.plan, lifted, options, progress=progress)
     document = found.to_dict()
     document["diagnosed"] = {
         "trials": [trial.id for trial in used],
         "adopted": [dict(effect) for effect in workspace.config.model.effects],
         "params": dict(workspace.config.model.params),
+        "nominal": {name: p.value for name, p in planner.plan.model.params.items()},
     }
-    probe = _probe(workspace, subject, found, used, library)
+    _keep(workspace, document)
+    probe = _probe(workspace, found, lifted, library)
     if probe:
         document["next_trial"] = f"{probe[1]} ({probe[0]}: grounded run {probe[0]})"
         document["probe"] = probe[0]
-    workspace.reports.mkdir(exist_ok=True)
-    text = json.dumps(_finite(document), indent=1, ensure_ascii=False, allow_nan=False)
-    write_atomically(workspace.reports / FILE, (text + "\n").encode())
+        _keep(workspace, document)
     return Diagnosed(found, document, probe[0] if probe else "")
 
 
-def _subject(workspace: Workspace) -> Task:
-    """The task with adopted effects; without them where they gave the model memory states."""
-    plan = workspace.planner.plan
-    return plan if plan.model.n == workspace.task.model.n else workspace.task
+def _keep(workspace: Workspace, document: dict[str, Any]) -> None:
+    workspace.reports.mkdir(exist_ok=True)
+    text = json.dumps(_finite(document), indent=1, ensure_ascii=False, allow_nan=False)
+    write_atomically(workspace.reports / FILE, (text + "\n").encode())
 
 
 def _chosen(workspace: Workspace, names: Sequence[str]) -> list[Trial]:
@@ -97,9 +100,11 @@ def _measured(trial: Trial, guessed: Sequence[str]) -> Trial:
 
 
 def _probe(
-    workspace: Workspace, task: Task, found: Diagnosis, trials: Sequence[Trial], library: Library
+    workspace: Workspace, found: Diagnosis, trials: Sequence[Trial], library: Library
 ) -> tuple[str, str] | None:
     """Writes the candidate that would tell two tied effects apart: (id, sentence)."""
+    planner = workspace.planner
+    task = planner.plan
     if not found.indistinguishable:
         return None
     from grounded.diagnosis.excitation import probe
@@ -111,19 +116,20 @@ def _probe(
     best = standing_in(workspace).incumbent
     if best is None:
         return None
-    base = workspace.planner.widened(best.candidate.policy)
+    base = planner.widened(best.candidate.policy)
     made = probe(task, base, found, trials, library)
     if made is None:
         return None
-    predicted = simulate(task.problem(exact=True), made.policy)
+    policy = planner.narrowed(made.policy)
+    predicted = simulate(task.problem(exact=True), planner.widened(policy))
     candidate = Candidate(
         id=workspace.next_id(),
-        policy=made.policy,
+        policy=policy,
         iteration=0,
         alpha=1.0,
         base=best.candidate.id,
         model=model_fingerprint(task),
-        predicted_states=predicted.states,
+        predicted_states=predicted.states[:, : planner.task.model.n],
         predicted_inputs=predicted.inputs,
         predicted_utility=predicted.utility,
     )
