@@ -58,7 +58,7 @@ def standard_deviations(fit: Fit, trial_of: Array) -> tuple[Array, Array]:
     C = fit.gram.shape[-1]
     if C == 0:
         return np.zeros(0), np.zeros(0)
-    fisher = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))
+    fisher = _fisher(fit.gram.sum(axis=0) + np.diag(fit.prior))
     shifts, _ = leave_one_out(fit, trial_of)
     S = len(shifts)
     if S < 3:
@@ -67,3 +67,13 @@ def standard_deviations(fit: Fit, trial_of: Array) -> tuple[Array, Array]:
     jack = np.sqrt((S - 1) / S * (spread**2).sum(axis=0))
     t = T[min(S - 2, 29)]
     return np.maximum(fisher, jack), np.maximum(1.96 * fisher, t * jack)
+
+
+def _fisher(information: Array) -> Array:
+    """Standard deviations from an information matrix (C, C), each unknown in units of its own.
+
+    A direction in which nothing is known makes all that take part in it as good as unknown.
+    """
+    scale = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+    size, axes = np.linalg.eigh(information * np.outer(scale, scale))
+    return np.asarray(scale * np.sqrt((axes**2 / np.maximum(size, 1e-12)).sum(axis=1)))
