@@ -7,6 +7,7 @@ from typing import Any
 
 from grounded.diagnosis.calibration import blamed
 from grounded.diagnosis.fitted import Fit, calibrated
+from grounded.diagnosis.found import TIE, parametric
 from grounded.diagnosis.gap import normalised
 from grounded.diagnosis.hypothesis import param_scale
 from grounded.diagnosis.intervals import standard_deviations
@@ -16,7 +17,7 @@ from grounded.diagnosis.report import (
     Estimate,
     Ranked,
 )
-from grounded.diagnosis.search import TIE, Search, parametric
+from grounded.diagnosis.search import Search
 from grounded.diagnosis.shrinkage import gaps_of, held_out
 
 RANKED = 12  # explanations that are listed

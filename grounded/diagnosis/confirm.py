@@ -14,8 +14,9 @@ one run reaches) make predictions of the others worse: another hypothesis takes 
 from __future__ import annotations
 
 from grounded.diagnosis.fitted import Fit
+from grounded.diagnosis.found import CLAIM
 from grounded.diagnosis.gap import Horizon, horizon
-from grounded.diagnosis.search import CLAIM, Search
+from grounded.diagnosis.search import Search
 from grounded.diagnosis.shrinkage import gaps_of, shrinkage
 
 MISFIT = 1.3  # times what noise makes of predictions, from which the noise is doubted

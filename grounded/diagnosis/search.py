@@ -1,21 +1,17 @@
-"""The bookkeeping of one attribution: which hypotheses were fitted, their evidence, what to try.
-
-evidence(h) = log p(y | h) - what its effects cost (`price.py`) - what the noise structure costs
-"""
+"""What one attribution tries: fits from where, under which noise, with what beside."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from grounded.diagnosis.data import Data
 from grounded.diagnosis.fitted import Fit
-from grounded.diagnosis.hypothesis import Hypothesis, Predictor, param_scale
+from grounded.diagnosis.found import Found, parametric
+from grounded.diagnosis.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.noise import Noise, Structure, first_guess
-from grounded.diagnosis.price import price
 from grounded.diagnosis.refine import refine
 from grounded.diagnosis.scan import Look, scan
 from grounded.diagnosis.undefined import undefined
@@ -23,8 +19,6 @@ from grounded.effects import Effect, ParamFamily
 from grounded.errors import GroundedError
 from grounded.frozen import Array
 
-CLAIM = 3.0  # nats from which an effect is claimed
-TIE = 3.0  # nats within which two explanations are not told apart
 SPREADS = (0.03, 0.1)  # prior relative errors of the model's parameters when they are calibrated
 CRUDE = 0.3  # the same of a model that is crude; tried without effects
 SHORTLIST = 14  # effects that are refined of a scan, and half as many parameters
@@ -36,8 +30,8 @@ TO_THE_TOP = 25  # iterations of fits that decide: most need fewer, and stop by 
 LARGE = 8  # states, above which one correlation time and half the shortlist have to do
 
 
-class Search:
-    """The bookkeeping of one attribution."""
+class Search(Found):
+    """The fits of one attribution (`Found`), and the ways to more of them."""
 
     def __init__(
         self,
@@ -45,44 +39,14 @@ class Search:
         candidates: Sequence[Effect],
         tick: Callable[[str], None] | None = None,
     ) -> None:
-        self.data, self.predictor = data, Predictor(data)
-        self.candidates = tuple(candidates)
+        super().__init__(data, candidates)
         self.tick = tick or (lambda what: None)
-        self.N = max(data.steps, 2)
-        self._prices: dict[tuple[object, ...], float] = {}
-        self.fits: dict[tuple[Structure, float, tuple[str, ...]], Fit] = {}
-        families = [e.family.name for e in candidates]
         large = data.model.n > LARGE
         taus = TAUS[1:2] if large else TAUS
         self.taus = [tau for tau in taus if tau > 0.7 * data.dt]
         self.taus = self.taus or [k * data.dt for k in SLOW[: len(taus)]]
         self.most = SHORTLIST // 2 if large else SHORTLIST
         self.beside = BESIDE // 2 if large else BESIDE
-        self.crowd = {e.name: families.count(e.family.name) for e in candidates}
-
-    def price(self, effect: Effect, values: Mapping[str, float]) -> float:
-        """What an effect pays beside its likelihood, in nats."""
-        key = (effect.name, *sorted(values.items()))
-        if key not in self._prices:
-            targets = self.crowd.get(effect.name, 1)
-            self._prices[key] = price(self.predictor, effect, values, targets)
-        return self._prices[key]
-
-    def score(self, fit: Fit) -> float:
-        """Evidence of a fit in nats, up to a constant of the data."""
-        h = fit.hypothesis
-        paid = sum(self.price(e, dict(v)) for e, v in zip(h.effects, h.values, strict=True))
-        extra = fit.noise.structure.numbers(self.data.model.n)
-        calibration = 1.0 if h.spread > 0 else 0.0
-        return fit.evidence - paid - 0.5 * extra * math.log(self.N) - calibration
-
-    def keep(self, fits: Sequence[Fit]) -> None:
-        """Remembers the best fit of every hypothesis under every structure."""
-        for fit in fits:
-            h = fit.hypothesis
-            key = (fit.noise.structure, h.spread, tuple(sorted(h.names)))
-            if key not in self.fits or self.score(fit) > self.score(self.fits[key]):
-                self.fits[key] = fit
 
     def refined(self, starts: Sequence[Fit | tuple], iterations: int = 6) -> list[Fit]:  # type: ignore[type-arg]
         """Refines, remembers, returns."""
@@ -202,21 +166,6 @@ class Search:
         for fit in self.refined(likely, 12):
             self.calibrated(fit)
 
-    def best_null(self) -> Fit:
-        """The likeliest fit without effects."""
-        return max((f for f in self.fits.values() if not f.hypothesis.effects), key=self.score)
-
-    def exact_null(self) -> Fit:
-        """The likeliest fit without effects and with the parameters as they are."""
-        bare = (f for (_, spread, names), f in self.fits.items() if not names and spread == 0)
-        return max(bare, key=self.score)
-
-    def calibrates(self) -> bool:
-        """Whether calibrating the model's parameters explains more than noise does."""
-        best = self.best_null()
-        spread = best.hypothesis.spread
-        return spread > 0 and self.score(best) > self.score(self.exact_null()) + CLAIM
-
     def with_weights(self, clean_fit: Fit) -> Search:
         """A new search on the same data with a clean fit's outlier weights in all noise."""
         other = Search(self.data, self.candidates, self.tick)
@@ -274,29 +223,6 @@ class Search:
         alone = refine(self.predictor, [start], iterations=1, fixed_noise=True)
         return alone[0] if alone else self.best_null()
 
-    def of_size(self, count: int) -> list[Fit]:
-        """All fits with that many effects, best first, one a set of effects."""
-        best: dict[tuple[str, ...], Fit] = {}
-        for (_, _, names), fit in self.fits.items():
-            if len(names) == count and (
-                names not in best or self.score(fit) > self.score(best[names])
-            ):
-                best[names] = fit
-        return sorted(best.values(), key=lambda f: -self.score(f))
-
-    def chosen(self, most: int) -> Fit:
-        """The hypothesis that would be claimed: every effect more has to pay for itself."""
-        chosen = self.best_null()
-        for size in range(1, most + 1):
-            for fit in self.of_size(size)[:1]:
-                if self.score(fit) > self.score(chosen) + CLAIM:
-                    chosen = fit
-        if not chosen.hypothesis.effects and self.calibrates():
-            # one parameter is a calibration too: it need only be likelier than the shift of all
-            single = [f for f in self.of_size(1) if parametric(f)]
-            chosen = max([chosen, *single[:1]], key=self.score)
-        return chosen
-
     def under(self, structure: Structure, spread: float) -> Search | None:
         """What was fitted under one noise and freedom of the parameters; None without a null."""
         other = Search(self.data, self.candidates, self.tick)
@@ -304,9 +230,3 @@ class Search:
         kept = {k: f for k, f in self.fits.items() if k[:2] == (structure, spread) or k == exact}
         other.fits, other._prices = kept, self._prices
         return other if exact in kept else None
-
-
-def parametric(fit: Fit) -> bool:
-    """Whether all that a fit blames is the model's own parameters."""
-    effects = fit.hypothesis.effects
-    return bool(effects) and all(isinstance(e.family, ParamFamily) for e in effects)
