@@ -10,7 +10,11 @@ import pytest
 from cli import grounded, plain, process
 from grounded_cli import address
 from grounded_cli.main import COMMANDS, cli
+from grounded_trials.diagnosis_file import diagnosis_of
+from grounded_trials.since import since_diagnosis
+from grounded_trials.toml_edit import set_in_model
 from grounded_trials.words import folded
+from grounded_trials.workspace import Workspace
 from reported import DIAGNOSIS, cart, copied
 from workspaces import make
 
@@ -240,3 +244,32 @@ def test_nothing_is_adopted_where_too_little_is_known(cart, tmp_path):
     diagnosed(folder, verdict=verdict, unknowable=[why])
     done = grounded("-C", folder, "adopt", "viscous_friction:v")
     assert done.code == 1 and "too little is known" in done.err and "run another trial" in done.err
+
+
+def test_a_candidate_that_another_replaces_is_said_to_be_void(tmp_path):
+    folder = make(tmp_path / "w").folder
+    assert grounded("-C", folder, "learn", "--trials", 1).code == 0
+    assert "void" not in grounded("-C", folder, "propose").err
+    (folder / "reports").mkdir(exist_ok=True)
+    diagnosed(folder)
+    assert grounded("-C", folder, "adopt", "viscous_friction:v").code == 0
+    done = grounded("-C", folder, "propose")
+    assert "c0002 was not run and is void" in done.err and "Run c0003" in done.out
+    assert "void" not in grounded("-C", folder, "propose").err  # it is said once
+
+
+def test_a_delay_more_than_the_adopted_one_is_open_until_it_is_adopted(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    then = {"name": "delay:force", "d": 0.01}
+    made = {"trials": [], "adopted": [then], "params": {}}
+    verdict = {"kind": "effect", "effects": ["delay:force"], "sentence": "Later still."}
+    found = diagnosis_of(DIAGNOSIS | {"verdict": verdict, "diagnosed": made})
+    assert found.open([then]) == ("delay:force",)
+    assert found.open([then | {"d": 0.03}]) == ()
+    workspace = Workspace(folder)
+    assert since_diagnosis(workspace, found, []).changed  # the cart has no effect at all
+    set_in_model(workspace.config.file, effects=[then | {"d": 0.03}])
+    since = since_diagnosis(Workspace(folder), found, [])
+    assert since.changed and since.adopted == ("delay:force",)
+    set_in_model(workspace.config.file, effects=[then])
+    assert since_diagnosis(Workspace(folder), found, []).sentence == ""

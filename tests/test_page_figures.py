@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from grounded_trials.figures_all import all_figures
 from grounded_trials.figures_axis import Axis, fitted, round_up, without_astray
 from grounded_trials.figures_draw import Stroke, draw
 from grounded_trials.figures_png import dashed, plain, png
+from grounded_trials.figures_runs import error_figure
 from grounded_trials.figures_svg import svg
 from grounded_trials.figures_thin import thinned
 from grounded_trials.forecast import forecast, forecast_error
@@ -222,3 +224,20 @@ def test_a_forecast_of_a_trial_without_steps_is_none():
     trial = Trial(np.full((3, 2), np.nan), np.zeros((2, 1)), task.dt, *names)
     assert forecast(Planner(task, task), trial) is None
     assert np.isnan(forecast_error(Planner(task, task), trial)).all()
+
+
+def test_what_is_cut_off_is_marked(cart):
+    findings = gather(Workspace(cart))
+    first = findings.first
+    assert first is not None
+    whole = error_figure(findings)
+    assert whole is not None and not any("cut off" in panel.note for panel in whole.panels)
+    states = first.trial.states.copy()
+    states[20, 0] = findings.task.target[20, 0] - 490.0
+    wild = replace(first, trial=replace(first.trial, states=states))
+    runs = tuple(wild if run is first else run for run in findings.runs)
+    cut = error_figure(replace(findings, runs=runs))
+    assert cut is not None
+    panel = cut.panels[0]
+    assert panel.note == "model’s policy is cut off: it reaches −490"
+    assert panel.y_range[0] > -490 and panel.note in svg(draw(panel), "p")

@@ -71,10 +71,10 @@ def _follow(workspace: Workspace, found: Diagnosed) -> str:
     from grounded_trials.next_step import after_diagnosis, another_trial
     from grounded_trials.proposing import standing_in
 
-    if diagnosis_of(found.document).no_cause:
+    diagnosis = diagnosis_of(found.document)
+    if diagnosis.no_cause:
         return folded(another_trial(workspace, standing_in(workspace, ahead=True)))
-    verdict = found.document["verdict"]
-    command = after_diagnosis(workspace, verdict["kind"], verdict["effects"])
+    command = after_diagnosis(workspace, diagnosis)
     if not command and found.probe:
         command = f"grounded run {found.probe}"
     return folded(command or "grounded report --html")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -105,13 +106,20 @@ class Diagnosis:
     parameters: tuple[Value, ...] = ()  # of the model, estimated beside the effects
     leftover: tuple[Left, ...] = ()
     trials: tuple[str, ...] = ()  # that it was made from
-    adopted: tuple[str, ...] = ()  # effects that were in the model then
+    adopted: tuple[Mapping[str, Any], ...] = ()  # effects that were in the model then
+    nominal: tuple[tuple[str, float], ...] = ()  # the values of its parameters then
     model_params: tuple[tuple[str, float], ...] | None = None  # and its [model] params
     split: tuple[Split, ...] = ()  # what the error is made of, by horizon
     whiteness: tuple[tuple[str, float], ...] = ()  # p-value of what is left, by channel
     utility_prediction: UtilityPrediction | None = None
     lookalikes: tuple[Likeness, ...] = ()
     unknowable: tuple[str, ...] = ()  # what the trials are too few or too quiet for
+
+    def open(self, adopted: Iterable[Mapping[str, Any]]) -> tuple[str, ...]:
+        """The claimed effects that the model with these adopted ones lacks as it did then."""
+        now = {str(e["name"]): dict(e) for e in adopted}
+        then = {str(e["name"]): dict(e) for e in self.adopted}
+        return tuple(name for name in self.effects if now.get(name) == then.get(name))
 
     @property
     def no_cause(self) -> bool:
@@ -160,7 +168,8 @@ def diagnosis_of(document: dict[str, Any]) -> Diagnosis:
         parameters=_values(document.get("parameters")),
         leftover=tuple(_left(one) for one in document.get("leftover") or ()),
         trials=tuple(map(str, made.get("trials") or ())),
-        adopted=tuple(str(effect["name"]) for effect in made.get("adopted") or ()),
+        adopted=tuple({"name": str(e["name"])} | e for e in made.get("adopted") or ()),
+        nominal=_params(made.get("nominal")) or (),
         model_params=_params(made.get("params")),
         split=splits(where.get("split")),
         whiteness=white(where.get("whiteness")),

@@ -63,9 +63,9 @@ def calibrated_sentence(diagnosis: Diagnosis, before: Mapping[str, float]) -> st
     """The model's own parameters that were fitted beside the effects, most changed first."""
     if all(name.startswith("parameter:") for name in diagnosis.effects):
         return ""
-    moved = []
+    moved, then = [], {**before, **dict(diagnosis.nominal)}
     for v in diagnosis.parameters:
-        old = before.get(v.name, math.nan)
+        old = then.get(v.name, math.nan)
         if abs(v.value - old) > 1e-6 * max(abs(v.value), abs(old)):
             change = abs(v.value - old) / abs(old) if old else math.inf
             text = with_unit(f"{v.name} {figure(old, 3)} -> {figure(v.value, 3)}", v.unit)

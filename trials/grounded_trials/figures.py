@@ -89,6 +89,7 @@ class Panel:
     loss: bool = False
     whole: bool = False  # x counts
     y_range: tuple[float, float] | None = None
+    note: str = ""  # inside, top right
 
 
 @dataclass(frozen=True)

@@ -109,6 +109,8 @@ class _Plot:
             shapes += self._curve(curve)
         for dot in panel.dots:
             shapes += self._dot(dot)
+        if panel.note:
+            shapes.append(Words(WIDTH - RIGHT - 4, TOP + 12, panel.note, "end", "faint"))
         names = (panel.x_name, panel.y_name)
         tops = tuple(shapes)
         return Drawing(

@@ -16,7 +16,7 @@ from grounded_trials.findings import (
     tracking_error,
 )
 from grounded_trials.scene import scene_of
-from grounded_trials.words import labelled, per_second, shown
+from grounded_trials.words import figure, labelled, per_second, shown
 
 TIME = "time [s]"
 ITERATIONS = 5
@@ -182,11 +182,25 @@ def _timed(
     rules: list[Rule] | None = None,
     spare: float = 3.0,
 ) -> Panel:
-    """A panel over time; a first run that went astray is cut off rather than flatten the others."""
+    """A panel over time; a first run that went astray is cut off rather than flatten the others.
+
+    A note says so then, and how far the run went.
+    """
     rules = rules or []
     calm = [c.y for c in curves if c.role != "model"] + [np.array([r.y for r in rules])]
     wild = [c.y for c in curves if c.role == "model"]
     values = without_astray(calm, wild, spare) if any(len(v) for v in calm) else wild
-    return Panel(
-        title, TIME, shown(unit), tuple(curves), rules=tuple(rules), y_range=fitted(values)
-    )
+    bounds = fitted(values)
+    note, lines = _cut_off(wild, bounds), tuple(rules)
+    return Panel(title, TIME, shown(unit), tuple(curves), rules=lines, y_range=bounds, note=note)
+
+
+def _cut_off(values: list[Array], bounds: tuple[float, float]) -> str:
+    """How far values go that lie outside the picture, "" where all are inside."""
+    finite = [v[np.isfinite(v)] for v in values]
+    ends = [float(e) for v in finite if len(v) for e in (v.min(), v.max())]
+    out = sorted({e for e in ends if not bounds[0] <= e <= bounds[1]})
+    if not out:
+        return ""
+    reached = " and ".join(figure(e, 2) for e in out).replace("-", "−")
+    return f"model’s policy is cut off: it reaches {reached}"

@@ -28,7 +28,7 @@ def next_command(
     if diagnosis is None:
         return "grounded propose" if now.phase == "propose" else "grounded diagnose"
     since = since_diagnosis(workspace, diagnosis, usable)
-    follow = after_diagnosis(workspace, diagnosis.kind, diagnosis.effects)
+    follow = after_diagnosis(workspace, diagnosis)
     if now.phase == "propose":  # what logs have shown is adopted before the first candidate
         if now.history or since.changed or not follow:
             return "grounded propose"
@@ -51,11 +51,10 @@ def another_trial(workspace: Workspace, now: Standing) -> str:
     return "grounded run best" if here else "grounded ingest TRIAL.mcap"
 
 
-def after_diagnosis(workspace: Workspace, kind: str, effects: Sequence[str]) -> str:
+def after_diagnosis(workspace: Workspace, diagnosis: Diagnosis) -> str:
     """What to do about the effects that a diagnosis claims, "" where there is nothing to do."""
-    adopted = {str(effect["name"]) for effect in workspace.config.model.effects}
-    new = [name for name in effects if name not in adopted]
-    if kind not in ("effect", "several") or not new:
+    new = diagnosis.open(workspace.config.model.effects)
+    if diagnosis.kind not in ("effect", "several") or not new:
         return ""
     if all(name.startswith("parameter:") for name in new):
         return "grounded fit"  # the model's form is right: all of its numbers at once

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -40,12 +40,27 @@ def propose_in(workspace: Workspace) -> Proposed:
         planner=workspace.planner,
         refit=refitted,
     )
-    if proposal.candidate is None:
+    candidate = proposal.candidate
+    if candidate is None:
         return Proposed(proposal, None)
-    path = workspace.candidate_path(proposal.candidate.id)
+    path = workspace.candidate_path(candidate.id)
     if proposal.is_new or not path.is_file():
-        workspace.save_candidate(proposal.candidate, workspace.task)
+        workspace.save_candidate(candidate, workspace.task)
+    if void := _void(proposal):
+        proposal = replace(proposal, notes=(*proposal.notes, void))
     return Proposed(proposal, path)
+
+
+def _void(proposal: Proposal) -> str:
+    """That a candidate which was never run is replaced, "" where none is."""
+    history, made = proposal.standing.history, proposal.candidate
+    last = history[-1] if history else None
+    if made is None or not proposal.is_new or last is None or last.trials:
+        return ""
+    return (
+        f"{last.candidate.id} was not run and is void: the model was changed since it was made; "
+        f"run {made.id} in its place"
+    )
 
 
 def standing_in(workspace: Workspace, *, ahead: bool = False) -> Standing:

@@ -57,16 +57,16 @@ def since_diagnosis(workspace: Workspace, diagnosis: Diagnosis, usable: Sequence
         usable: the trials that can be used now, in order of arrival.
     """
     model, seen = workspace.config.model, set(diagnosis.trials)
-    names = tuple(str(effect["name"]) for effect in model.effects)
     params = None if diagnosis.model_params is None else dict(diagnosis.model_params)
     last = max((k for k, name in enumerate(usable) if name in seen), default=-1)
-    claimed = [name for name in diagnosis.effects if name not in diagnosis.adopted]
-    adopted = tuple(name for name in claimed if name in names)
+    missing = diagnosis.open(model.effects)
+    adopted = tuple(name for name in diagnosis.effects if name not in missing)
+    same = [dict(e) for e in model.effects] == [dict(e) for e in diagnosis.adopted]
     return Since(
         used=sum(name in seen for name in usable),
         usable=len(usable),
         newer=len(usable) - 1 - last if seen else 0,
         adopted=adopted,
-        missing=tuple(name for name in claimed if name not in names) if adopted else (),
-        changed=names != diagnosis.adopted or params not in (None, dict(model.params)),
+        missing=missing if adopted else (),
+        changed=not same or params not in (None, dict(model.params)),
     )
