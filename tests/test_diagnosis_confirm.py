@@ -96,9 +96,12 @@ def test_in_a_misfit_an_effect_that_predicts_no_better_is_dropped(wavy, monkeypa
     names = set(best.hypothesis.names)
     assert len(names) >= 2
 
-    def judged(worst, without):
-        monkeypatch.setattr(confirm, "gaps_of", lambda p, fits, w: [without for _ in fits])
-        gap = type("Gap", (), {"gap_before": 100.0, "gap_after": worst})
+    def judged(worst, without, bare=100.0):
+        def gaps(predictor, fits, where):
+            return [without if f.hypothesis.names else bare for f in fits]
+
+        monkeypatch.setattr(confirm, "gaps_of", gaps)
+        gap = type("Gap", (), {"gap_before": bare, "gap_after": worst})
         monkeypatch.setattr(confirm, "shrinkage", lambda *a: gap)
         return confirm.confirmed(search, best, 1.0)
 
@@ -106,3 +109,4 @@ def test_in_a_misfit_an_effect_that_predicts_no_better_is_dropped(wavy, monkeypa
     assert judged(5.0, 9.0) is best  # each of them is worth naming
     fewer = judged(5.0, 5.0)
     assert len(fewer.hypothesis.names) == 1 and set(fewer.hypothesis.names) < names
+    assert not judged(5.0, 5.0, bare=6.0).hypothesis.names  # nor is one that changes little
