@@ -124,6 +124,14 @@ def test_printed_commands_work_from_where_the_user_is(tmp_path):
     assert process("propose", cwd=tmp_path / "my cart").out.endswith("next: grounded run\n")
 
 
+def test_a_command_that_is_broken_over_two_lines_is_completed_too():
+    context = click.Context(cli)
+    with context:
+        address.remember(context, "w")
+        text = "one\n  run `grounded\n  diagnose` again"
+        assert address.addressed(text) == "one\n  run `grounded -C w\n  diagnose` again"
+
+
 def test_an_error_names_the_workspace_too_and_init_does_not(tmp_path):
     make(tmp_path / "cart")
     done = process("-C", "cart", "adopt", "delay:force", cwd=tmp_path)
@@ -215,7 +223,7 @@ def test_rivals_are_not_adopted_together(cart, tmp_path):
     done = grounded("-C", folder, "adopt", "viscous_friction:v", "delay:force")
     assert done.code == 1 and "does not claim delay:force" in done.err
     assert "one instead of another" in done.err
-    assert "`grounded adopt viscous_friction:v`" in plain(done.err)
+    assert "`grounded adopt viscous_friction:v`, or `grounded adopt delay:force`" in plain(done.err)
     assert (folder / "grounded.toml").read_text() == before
 
 

@@ -58,9 +58,9 @@ def addressed(text: str, *, fit: bool = True) -> str:
     if folder is None or "grounded" not in text:
         return text
     call = f"grounded -C {shlex.quote(folder)}"
-    lines = []
-    for line in text.replace(_BROKEN, " ").split("\n"):
-        found = _CALL.sub(lambda _: call, line)
+    whole, lines = text.replace(_BROKEN, " "), []
+    after = _CALL.sub(lambda _: call, whole).split("\n")
+    for line, found in zip(whole.split("\n"), after, strict=True):
         wide = fit and found != line and len(found) > WIDTH and not found.startswith("#")
         lines += _fitted(found) if wide else [found]
     return "\n".join(lines)

@@ -117,7 +117,7 @@ def _claimed(document: Mapping[str, Any], names: Sequence[str]) -> bool:
         raise GroundedError(
             f"the last diagnosis does not claim {', '.join(rivals)}: these effects were fitted one "
             "instead of another, not together; expected effects that it claims together, or one "
-            f"alone: {own}or `grounded adopt {names[0]}`"
+            f"alone: {own}or `grounded adopt {rivals[0]}`"
         )
     return not rivals
 
