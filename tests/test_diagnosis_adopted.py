@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from cli import grounded
+from grounded import Trial
 from grounded.diagnosis.data import prepare
 from grounded.diagnosis.diagnose import Options, diagnose
 from grounded.diagnosis.limits import limits
@@ -160,3 +161,44 @@ def test_a_delay_more_adds_to_the_delay(tmp_path):
         assert done.code == 0, done.err
         (effect,) = effects_of(config)["effects"]
         assert effect["d"] == pytest.approx(0.033)
+
+
+def test_gaps_in_a_state_and_guesses_cost_their_samples_only(tmp_path):
+    """What a smoother made of a state in one log says nothing of the others' measurements."""
+    from grounded_trials.diagnosable import diagnosable
+    from grounded_trials.diagnosing import _chosen
+    from grounded_trials.mcap_log import write_trial
+    from grounded_trials.workspace import Workspace
+
+    assert grounded("init", tmp_path / "ws", "--example", "pendulum").code == 0
+    rng = np.random.default_rng(0)
+    for k in range(3):
+        states = rng.standard_normal((41, 2))
+        if k == 1:
+            states[10:20, 1] = np.nan
+        run = Trial(states, rng.standard_normal((40, 1)), 0.02, ("theta", "omega"), ("torque",))
+        meta = {"kind": "data"} | ({"estimated": "omega"} if k == 2 else {})
+        path = tmp_path / f"log{k}.mcap"
+        write_trial(path, run, meta)
+        done = grounded("-C", tmp_path / "ws", "ingest", "--data", path)
+        assert done.code == 0, done.err
+    workspace = Workspace(tmp_path / "ws")
+    assert [trial.steps for trial in diagnosable(workspace)] == [40, 40, 40]
+    known = [np.isfinite(trial.states).sum(axis=0).tolist() for trial in _chosen(workspace, ())]
+    assert known == [[41, 41], [41, 31], [41, 0]]
+
+
+def test_a_trial_that_diverged_counts_up_to_there():
+    from grounded_trials.diagnosable import known_steps
+
+    states = np.zeros((11, 2))
+    run = Trial(states, np.zeros((10, 1)), 0.1, ("a", "b"), ("u",))
+    assert known_steps(run) == 10
+    states = states.copy()
+    states[7:, 1] = 1e200
+    assert known_steps(replace(run, states=states)) == 6
+    states[4:] = np.nan
+    assert known_steps(replace(run, states=states)) == 3
+    inputs = run.inputs.copy()
+    inputs[2] = np.nan
+    assert known_steps(replace(run, inputs=inputs)) == 2

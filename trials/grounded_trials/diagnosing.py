@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from grounded.errors import GroundedError, nearest
+from grounded_trials.diagnosable import diagnosable
 from grounded_trials.diagnosis_file import FILE
-from grounded_trials.fitting import usable_trials
 from grounded_trials.store import write_atomically
 from grounded_trials.workspace import Workspace
 
@@ -83,17 +83,26 @@ def _keep(workspace: Workspace, document: dict[str, Any]) -> None:
 
 
 def _chosen(workspace: Workspace, names: Sequence[str]) -> list[Trial]:
-    used, guessed = usable_trials(workspace), workspace.estimated_states()
+    """The trials to diagnose: gaps in a state stay, what a smoother made of them is no evidence."""
+    used = diagnosable(workspace)
+    if not used:
+        raise GroundedError(
+            "there is no trial to learn from: ingest some, runs of candidates or logs with --data"
+        )
     known = [trial.id for trial in used]
     for name in names:
         if name not in known:
             raise GroundedError(f"there is no usable trial '{name}': {nearest(name, known)}")
-    used = [trial for trial in used if not names or trial.id in names]
-    return [_measured(trial, guessed) for trial in used] if guessed else used
+    guessed = {t.stored.id: t.meta.get("estimated", "") for t in workspace.trials()}
+    return [
+        _measured(trial, [name for name in guessed[trial.id].split(",") if name])
+        for trial in used
+        if not names or trial.id in names
+    ]
 
 
 def _measured(trial: Trial, guessed: Sequence[str]) -> Trial:
-    """A trial without the states that were not measured: a smoother's are no evidence."""
+    """A trial without the states that it did not measure."""
     states = trial.states.copy()
     states[:, [trial.state_names.index(name) for name in guessed]] = math.nan
     return replace(trial, states=states)

@@ -8,10 +8,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from grounded_trials.diagnosable import diagnosable
 from grounded_trials.diagnosis_file import Diagnosis
 from grounded_trials.workspace import Workspace
-
-LEAST_STEPS = 3  # of a trial that can be used
 
 
 @dataclass(frozen=True)
@@ -45,7 +44,7 @@ def usable_ids(workspace: Workspace) -> list[str]:
     Raises:
         GroundedError: if a stored file is damaged.
     """
-    return [t.id for t in workspace.task_trials() if t.finite_steps >= LEAST_STEPS]
+    return [trial.id for trial in diagnosable(workspace)]
 
 
 def since_diagnosis(workspace: Workspace, diagnosis: Diagnosis, usable: Sequence[str]) -> Since:

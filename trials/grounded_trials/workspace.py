@@ -40,8 +40,9 @@ class StoredTrial:
     """A trial of the store with what its file says of it."""
 
     stored: Stored
-    trial: Trial  # .id is its short name (t0007)
+    trial: Trial  # .id is its short name (t0007); short gaps are bridged
     meta: dict[str, str]
+    measured: Trial  # as it was logged, gaps and all
 
     @property
     def is_data(self) -> bool:
@@ -189,19 +190,24 @@ class Workspace:
     def _read_trials(self) -> Iterator[StoredTrial]:
         for stored in self.store.list():
             trial, meta, _ = read_trial(self.store.read(stored), stored.path.name)
-            yield StoredTrial(stored, bridge(replace(trial, id=stored.id)).trial, meta)
+            logged = replace(trial, id=stored.id)
+            yield StoredTrial(stored, bridge(logged).trial, meta, logged)
 
     def estimated_states(self) -> tuple[str, ...]:
         """States that some stored trial did not measure: the smoother's, no evidence."""
         found = {n for t in self.trials() for n in t.meta.get("estimated", "").split(",") if n}
         return tuple(name for name in self.base_model.state_names if name in found)
 
-    def task_trials(self) -> list[Trial]:
-        """The trials whose states and inputs are this model's and whose dt is this task's."""
+    def task_trials(self, *, measured: bool = False) -> list[Trial]:
+        """The trials whose states and inputs are this model's and whose dt is this task's.
+
+        Args:
+            measured: as they were logged; else short gaps are bridged.
+        """
         names = (self.base_model.state_names, self.base_model.input_names)
         dt = self.config.task.dt
         return [
-            t.trial
+            t.measured if measured else t.trial
             for t in self.trials()
             if (t.trial.state_names, t.trial.input_names) == names and abs(t.trial.dt - dt) < 1e-9
         ]
