@@ -1,6 +1,7 @@
 """After an effect was adopted: what is left is diagnosed, not the same effect again."""
 
 import json
+import tomllib
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,14 @@ from grounded import Trial
 from grounded.diagnosis.data import prepare
 from grounded.diagnosis.diagnose import Options, diagnose
 from grounded.diagnosis.limits import limits
+from grounded.diagnosis.search import Search
 from grounded.effects import Library, memory_of, wrap
+from grounded_trials.diagnosable import diagnosable, known_steps
+from grounded_trials.diagnosing import _chosen
+from grounded_trials.diagnosis_file import diagnosis_of
+from grounded_trials.mcap_log import write_trial
+from grounded_trials.next_step import after_diagnosis
+from grounded_trials.workspace import Workspace
 from test_diagnosis import DT, cart
 
 LAG = 0.12
@@ -80,8 +88,6 @@ def test_a_memory_is_known_at_the_start_and_disturbed_by_nothing():
     assert data.seen.shape[1] == 4  # two runs of each trial
     assert data.seen[0, :, i].sum() == 2 and data.seen[1:, :, i].sum() == 0
     assert not [s for s in limits(data).sentences if memory[0] in s]
-    from grounded.diagnosis.search import Search
-
     noise = Search(data, ()).nulls().noise
     assert np.exp(noise.log_q[i]) < 1e-20
 
@@ -125,8 +131,6 @@ def row(effect, **values):
 
 
 def effects_of(config):
-    import tomllib
-
     return tomllib.loads(config.read_text())["model"]
 
 
@@ -140,6 +144,9 @@ def test_more_of_an_adopted_effect_changes_its_numbers(tmp_path):
         [row("parameter:viscous_friction_omega_k", d=0.05), row("parameter:l", d=0.01)],
     )
     names = ["parameter:viscous_friction_omega_k", "parameter:l"]
+    read = diagnosis_of(json.loads((tmp_path / "ws" / "reports" / "diagnosis.json").read_text()))
+    advice = after_diagnosis(Workspace(tmp_path / "ws"), read)
+    assert advice == f"grounded adopt {' '.join(names)}"  # fit knows the model's own numbers only
     for _ in range(2):  # twice is once
         done = grounded("-C", tmp_path / "ws", "adopt", *names)
         assert done.code == 0, done.err
@@ -165,11 +172,6 @@ def test_a_delay_more_adds_to_the_delay(tmp_path):
 
 def test_gaps_in_a_state_and_guesses_cost_their_samples_only(tmp_path):
     """What a smoother made of a state in one log says nothing of the others' measurements."""
-    from grounded_trials.diagnosable import diagnosable
-    from grounded_trials.diagnosing import _chosen
-    from grounded_trials.mcap_log import write_trial
-    from grounded_trials.workspace import Workspace
-
     assert grounded("init", tmp_path / "ws", "--example", "pendulum").code == 0
     rng = np.random.default_rng(0)
     for k in range(3):
@@ -189,8 +191,6 @@ def test_gaps_in_a_state_and_guesses_cost_their_samples_only(tmp_path):
 
 
 def test_a_trial_that_diverged_counts_up_to_there():
-    from grounded_trials.diagnosable import known_steps
-
     states = np.zeros((11, 2))
     run = Trial(states, np.zeros((10, 1)), 0.1, ("a", "b"), ("u",))
     assert known_steps(run) == 10

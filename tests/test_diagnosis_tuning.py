@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 
-from grounded import Model, Param, Trial
+from grounded import Trial
 from grounded.diagnosis.attribution import attribute
 from grounded.diagnosis.data import prepare
 from grounded.diagnosis.diagnose import diagnose
 from grounded.diagnosis.price import price
 from grounded.effects import Library
+from test_diagnosis import cart
 
 DT, FRICTION, WIDTH = 0.05, 0.4, 0.15
 
@@ -19,14 +20,7 @@ def rate_of(x, u, friction):
 
 def pushed(friction, trials=4, steps=120, seed=0):
     """A cart whose friction builds up over WIDTH, and its crude model."""
-    model = Model(
-        states={"x": "m", "v": "m/s"},
-        inputs={"u": "1"},
-        params={"k": Param(2.0, "m/s^2", 0.1, 10.0), "tau": Param(1.0, "s", 0.1, 10.0)},
-        roles={"position": ("x",), "speed": "v"},
-        derivative=lambda s, a, p: {"x": s.v, "v": p.k * a.u - s.v / p.tau},
-        name="cart",
-    )
+    model, _ = cart(trials=1, steps=2)
     rng, found = np.random.default_rng(seed), []
     for _ in range(trials):
         t, x, states = np.arange(steps) * DT, np.zeros(2), [np.zeros(2)]

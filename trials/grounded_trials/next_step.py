@@ -56,6 +56,7 @@ def after_diagnosis(workspace: Workspace, diagnosis: Diagnosis) -> str:
     new = diagnosis.open(workspace.config.model.effects)
     if diagnosis.kind not in ("effect", "several") or not new:
         return ""
-    if all(name.startswith("parameter:") for name in new):
+    own = {f"parameter:{name}" for name in workspace.base_model.params}
+    if own.issuperset(new):
         return "grounded fit"  # the model's form is right: all of its numbers at once
     return " ".join(["grounded adopt", *new])
