@@ -124,6 +124,8 @@ def _effects(document: dict[str, Any]) -> None:
     if ranking:
         rows = [_ranked(entry) for entry in ranking]
         show("\n" + table(rows, ("effect (*: claimed)", "evidence [nats]", "gap after")))
+        show("  evidence of a claimed effect: what is lost without it; of others: what each")
+        show("  gains by itself; +-: standard deviation")
     for entry in ranking:
         if entry.get("claimed"):
             show(field(f"  {entry['effect']}:", _values(entry)))
