@@ -7,6 +7,7 @@ from grounded.diagnosis.climb import _bounded
 from grounded.diagnosis.diagnose import diagnose
 from grounded.effects import Library
 from grounded.experiments.pendulum_task import pendulum_task
+from grounded.experiments.real_pendulum import FRICTION, HEAVIER
 from grounded.experiments.real_pendulum import model as real_pendulum
 from grounded.improve import learn
 from grounded.models.car import model as car
@@ -52,11 +53,28 @@ def test_a_parameter_at_its_bound_does_not_hold_up_the_others():
 
     _, _, trials = learn(task, run, Options(max_trials=4))
     found = diagnose(task, trials)
-    assert "coulomb_friction:omega" in found.effects
+    row = found.ranking[0]
+    assert row.effect == "coulomb_friction:omega" and row.claimed
+    assert row.params["c"].value == pytest.approx(FRICTION / (HEAVIER * 0.25), rel=0.1)
+    assert row.fixed["width"] == pytest.approx(0.05, rel=0.2)  # it builds up over 0.05 rad/s
     same = {"input_gain:torque", "parameter:m", "rate_gain:omega"}  # what a mass does to a torque
     assert set(found.effects) <= {"coulomb_friction:omega", *same}
-    assert found.gap["before"] > 50 * found.gap["after"]
-    assert found.gap["after"] < 5  # the friction's sign is smoothed over another width there
+    assert found.gap["before"] > 50 * found.gap["after"] and found.gap["after"] < 3
+
+
+def test_without_noise_the_demo_names_the_friction_alone():
+    """The last digits of a step are no claim."""
+    task = pendulum_task(pendulum)
+    plant, rng = Plant(real_pendulum), np.random.default_rng(0)
+    _, _, trials = learn(
+        task, lambda candidate: plant.run(candidate.policy, {}, rng), Options(max_trials=3)
+    )
+    found = diagnose(task, trials)
+    assert found.effects == ("coulomb_friction:omega",)
+    assert found.ranking[0].params["c"].value == pytest.approx(
+        FRICTION / (HEAVIER * 0.25), rel=0.01
+    )
+    assert found.parameters["m"].value == pytest.approx(HEAVIER, rel=0.03)
 
 
 def test_a_rate_that_is_another_state_has_one_name():

@@ -110,3 +110,6 @@ def test_in_a_misfit_an_effect_that_predicts_no_better_is_dropped(wavy, monkeypa
     fewer = judged(5.0, 5.0)
     assert len(fewer.hypothesis.names) == 1 and set(fewer.hypothesis.names) < names
     assert not judged(5.0, 5.0, bare=6.0).hypothesis.names  # nor is one that changes little
+    assert judged(1.0, 3.0) is best
+    assert len(judged(1.0, 3.0, bare=1000.0).hypothesis.names) == 1  # 0.3 % of the gap
+    assert judged(1.0, 6.0, bare=1000.0) is best

@@ -1,14 +1,16 @@
 """No claim that held-out trials contradict: evidence alone does not see that.
 
-Three ways in which the likeliest hypothesis can be wrong, all of them where predictions miss by far
+Four ways in which the likeliest hypothesis can be wrong, most of them where predictions miss by far
 more than noise makes: something is wrong then that is not in the library, and likelihoods are those
 of a wrong model.
 
 Noise that is allowed to be coloured, or parameters that are allowed to move, explain a lasting
 effect away that predictions a second ahead still miss (a bias of a motor, a friction that is lower
 at first): another noise is confirmed. A further effect takes up what is left somewhere and predicts
-hardly better: it is dropped. And values that one trial alone determines (a wave, a saturation that
-one run reaches) make predictions of the others worse: another hypothesis takes its place.
+hardly better: it is dropped. So is what makes less than a two-hundredth of the gap: where there is
+next to no noise, the last digits of a step can be a claim. And values that one trial alone
+determines (a wave, a saturation that one run reaches) make predictions of the others worse: another
+hypothesis takes its place.
 """
 
 from __future__ import annotations
@@ -17,11 +19,12 @@ from grounded.diagnosis.fitted import Fit
 from grounded.diagnosis.found import CLAIM
 from grounded.diagnosis.gap import Horizon, horizon
 from grounded.diagnosis.search import Search
-from grounded.diagnosis.shrinkage import gaps_of, shrinkage
+from grounded.diagnosis.shrinkage import Shrinkage, gaps_of, shrinkage
 
 MISFIT = 1.3  # times what noise makes of predictions, from which the noise is doubted
 BETTER = 1.5  # times smaller is what another noise has to leave
 WORTH = 1.3  # times larger is the gap without an effect that is worth naming in a misfit
+SLIGHT = 0.005  # of the bare model's gap: what is not worth a name
 WORSE = 1.1  # times the gap without the effects
 TRIES = 6  # hypotheses that are looked at
 
@@ -78,18 +81,19 @@ def confirmed(search: Search, best: Fit, seconds: float) -> Fit:
         where = horizon(search.predictor, fit, seconds)
         found = shrinkage(search.predictor, fit, null.track, where)
         if not found.gap_after > WORSE * found.gap_before:
-            return _pruned(search, fit, found.gap_after, where)
+            return _pruned(search, fit, found, where)
     return null
 
 
-def _pruned(search: Search, fit: Fit, gap: float, where: Horizon) -> Fit:
-    """Without the effects that predictions are hardly worse without, where they miss by much."""
-    while gap > MISFIT and fit.hypothesis.effects:
+def _pruned(search: Search, fit: Fit, held: Shrinkage, where: Horizon) -> Fit:
+    """Without the effects that hardly matter: in a misfit, or beside one that makes all the gap."""
+    gap, slight = held.gap_after, SLIGHT * held.gap_before
+    while fit.hypothesis.effects and (gap > MISFIT or slight > max(gap, 1.0)):
         names = set(fit.hypothesis.names)
         fewer = [f for f in search.of_size(len(names) - 1) if set(f.hypothesis.names) < names]
         fewer = fewer if len(names) > 1 else [search.best_null()]
         gaps = gaps_of(search.predictor, fewer, where)
-        if not gaps or not min(gaps) < WORTH * gap:
+        if not gaps or not min(gaps) < max(WORTH * gap if gap > MISFIT else 0.0, slight):
             break
         gap, fit = min(zip(gaps, fewer, strict=True), key=lambda each: each[0])
     return fit
