@@ -29,9 +29,14 @@ def command(
     Prediction errors are measured on a quarter of the time that the fit has not seen.
     """
     workspace = open_workspace(folder)
+    from grounded.errors import GroundedError
     from grounded_trials.fitting import apply_fit, fit_trials
 
     names = names_in(params) or None
+    if params is not None and names is None:
+        raise GroundedError(
+            "--params names no parameter: expected some, like a1,L; leave it out to fit all"
+        )
     with progress("fitting"):
         found = fit_trials(workspace, names, latency=latency)
     if apply_:
