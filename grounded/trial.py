@@ -63,6 +63,19 @@ class Trial:
         known = int(np.argmax(states)) - 1 if states.any() else self.steps
         return min(known, int(np.argmax(inputs))) if inputs.any() else known
 
+    @property
+    def known_steps(self) -> int:
+        """Steps whose inputs are known, up to the last state of which anything is; none diverged.
+
+        What needs no whole states (a diagnosis) loses the samples of a gap, not what follows it.
+        """
+        known = np.flatnonzero(np.isfinite(self.states).any(axis=1))
+        wild = (np.abs(self.states) >= HUGE).any(axis=1)
+        bad = ~(np.abs(self.inputs) < HUGE).all(axis=1)
+        last = int(known[-1]) if len(known) else 0
+        last = min(last, int(np.argmax(wild)) - 1) if wild.any() else last
+        return max(0, min(last, int(np.argmax(bad))) if bad.any() else last)
+
     def until(self, steps: int) -> Trial:
         """The trial up to so many steps; a log may go on after the horizon."""
         if steps >= self.steps:

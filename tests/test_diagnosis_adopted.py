@@ -14,7 +14,7 @@ from grounded.diagnosis.diagnose import Options, diagnose
 from grounded.diagnosis.limits import limits
 from grounded.diagnosis.search import Search
 from grounded.effects import Library, memory_of, wrap
-from grounded_trials.diagnosable import diagnosable, known_steps
+from grounded_trials.diagnosable import diagnosable
 from grounded_trials.diagnosing import _chosen
 from grounded_trials.diagnosis_file import diagnosis_of
 from grounded_trials.mcap_log import write_trial
@@ -193,12 +193,12 @@ def test_gaps_in_a_state_and_guesses_cost_their_samples_only(tmp_path):
 def test_a_trial_that_diverged_counts_up_to_there():
     states = np.zeros((11, 2))
     run = Trial(states, np.zeros((10, 1)), 0.1, ("a", "b"), ("u",))
-    assert known_steps(run) == 10
+    assert run.known_steps == 10
     states = states.copy()
     states[7:, 1] = 1e200
-    assert known_steps(replace(run, states=states)) == 6
+    assert replace(run, states=states).known_steps == 6
     states[4:] = np.nan
-    assert known_steps(replace(run, states=states)) == 3
+    assert replace(run, states=states).known_steps == 3
     inputs = run.inputs.copy()
     inputs[2] = np.nan
-    assert known_steps(replace(run, inputs=inputs)) == 2
+    assert replace(run, inputs=inputs).known_steps == 2

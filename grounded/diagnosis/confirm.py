@@ -48,7 +48,7 @@ def noise_confirmed(search: Search, best: Fit, most: int, seconds: float) -> tup
     if not gap > MISFIT:
         return search, best
     found = []
-    for structure, spread in {(s, w) for s, w, _ in search.fits}:
+    for structure, spread in dict.fromkeys((s, w) for s, w, _ in search.fits):
         if (structure, spread) == (best.noise.structure, best.hypothesis.spread):
             continue
         other = search.under(structure, spread)

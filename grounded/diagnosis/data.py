@@ -46,9 +46,7 @@ class Data:
     scales: Scales
     skipped: int  # runs left out because there are too many
     ids: tuple[str, ...]
-    hidden: tuple[
-        int, ...
-    ] = ()  # states that no sensor has: their course is a guess, but the start
+    hidden: tuple[int, ...] = ()  # states that no sensor has: only their start is known
 
     @property
     def count(self) -> int:
@@ -74,9 +72,9 @@ class Data:
     def seen(self) -> Array:
         """1.0 where a state was measured and its step was run, (L + 1, B, n)."""
         there = np.isfinite(self.states[self.state_at])
-        begins = np.isin(self.state_at, np.cumsum([0, *(self.lengths + 1)]))
-        for i in self.hidden:
-            there[..., i] &= begins
+        if self.hidden:
+            begins = np.isin(self.state_at, np.cumsum([0, *(self.lengths + 1)]))
+            there[..., list(self.hidden)] &= begins[..., None]
         run = np.concatenate([np.ones((len(self.valid), 1)), self.valid], axis=1)
         return np.ascontiguousarray((there * run[:, :, None]).swapaxes(0, 1))
 
@@ -130,7 +128,7 @@ def prepare(
         GroundedError: for trials of other states or inputs, of different dt, or empty ones.
     """
     _check(model, trials)
-    used = [(trial, usable(trial)) for trial in trials]
+    used = [(trial, trial.known_steps) for trial in trials]
     used = [(trial, T) for trial, T in used if T >= 2]
     if not used:
         raise GroundedError(
@@ -187,14 +185,6 @@ def _check(model: Model, trials: Sequence[Trial]) -> None:
                 f"trials have different time steps ({trials[0].dt:g} s and {trial.dt:g} s): "
                 "diagnose them apart"
             )
-
-
-def usable(trial: Trial) -> int:
-    """Steps up to the first missing input or the last state of which anything is known."""
-    bad = ~np.isfinite(trial.inputs).all(axis=1)
-    last = int(np.argmax(bad)) if bad.any() else trial.steps
-    known = np.flatnonzero(np.isfinite(trial.states).any(axis=1))
-    return min(last, int(known[-1]) if len(known) else 0)
 
 
 def _cut(lengths: Any) -> tuple[Any, Any, Array, Any]:

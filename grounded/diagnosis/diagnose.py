@@ -22,7 +22,7 @@ import numpy as np
 from grounded.diagnosis.attribution import attribute
 from grounded.diagnosis.claims import Claims
 from grounded.diagnosis.confirm import confirmed, noise_confirmed
-from grounded.diagnosis.data import prepare, usable
+from grounded.diagnosis.data import prepare
 from grounded.diagnosis.delays import delays_of
 from grounded.diagnosis.fitted import Fit
 from grounded.diagnosis.gap import Horizon, by_region, by_time, explained, horizon
@@ -94,7 +94,7 @@ def diagnose(
         best = confirmed(search, best, options.horizon)
         left = leftovers(search.predictor, best)
         task = subject if isinstance(subject, Task) else None
-        used = [trial for trial in trials if usable(trial) >= 2]
+        used = [trial for trial in trials if trial.known_steps >= 2]
         return _Writer(search, best, left, known, options, tick, task, used).diagnosis()
 
 

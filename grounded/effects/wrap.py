@@ -81,7 +81,7 @@ def wrap(effect: Effect, values: Mapping[str, float], dt: float) -> Model:
     if isinstance(family, ParamFamily):
         name = effect.site.target
         return model.with_values({name: model.params[name].value + whole["d"]})
-    added = {param_name(effect, q.name): _param(q, whole[q.name]) for q in effect.quantities}
+    added = {param_name(effect.name, q.name): _param(q, whole[q.name]) for q in effect.quantities}
     make = {
         InputFamily: _input_step,
         MemoryFamily: _memory_step,
@@ -106,10 +106,10 @@ def wrap(effect: Effect, values: Mapping[str, float], dt: float) -> Model:
     )
 
 
-def param_name(effect: Effect, quantity: str) -> str:
-    """`dead_zone_throttle_c`: the wrapped model's name of an effect's quantity."""
-    target = "_".join(effect.site.targets).replace("<-", "_from_")
-    return f"{effect.family.name}_{target}_{quantity}"
+def param_name(effect: str, quantity: str) -> str:
+    """`dead_zone_throttle_c`: the wrapped model's name of a quantity of `dead_zone:throttle`."""
+    family, _, targets = effect.partition(":")
+    return f"{family}_{targets.replace('+', '_').replace('<-', '_from_')}_{quantity}"
 
 
 def _param(quantity: Any, value: float) -> Param:
@@ -121,7 +121,7 @@ def _param(quantity: Any, value: float) -> Param:
 
 
 def _quantities(effect: Effect, p: Any) -> dict[str, Any]:
-    return {q.name: p[param_name(effect, q.name)] for q in effect.quantities}
+    return {q.name: p[param_name(effect.name, q.name)] for q in effect.quantities}
 
 
 def _own_state(model: Model, s: Any) -> Named:

@@ -78,12 +78,12 @@ def _settled(
     params: Mapping[str, float], effects: Sequence[Effect]
 ) -> tuple[dict[str, float], list[Effect]]:
     """The model's own parameters, and the effects with the values of theirs."""
+    from grounded.effects.wrap import param_name
+
     own, changed = dict(params), []
     for effect in effects:
-        family, _, targets = str(effect["name"]).partition(":")
-        stem = f"{family}_{targets.replace('+', '_').replace('<-', '_from_')}"
-        new = {q: own.pop(f"{stem}_{q}") for q in effect if f"{stem}_{q}" in own}
-        changed.append(effect | new)
+        names = {q: param_name(str(effect["name"]), q) for q in effect}
+        changed.append(effect | {q: own.pop(name) for q, name in names.items() if name in own})
     return own, changed
 
 

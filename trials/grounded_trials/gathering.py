@@ -24,7 +24,7 @@ from grounded.search import Candidate, Standing, standing
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.better_model import Better, better_model
-from grounded_trials.diagnosable import LEAST_STEPS, known_steps
+from grounded_trials.diagnosable import LEAST_STEPS
 from grounded_trials.diagnosis_file import Diagnosis, read_diagnosis
 from grounded_trials.findings import Findings, Log, Lost, Run
 from grounded_trials.mcap_log import read_trial
@@ -49,7 +49,7 @@ def gather(workspace: Workspace) -> Findings:
     now = _settled(workspace, candidates, own, _standing(workspace, candidates, own))
     diagnosis = _diagnosis(workspace, lost)
     better = _better(workspace, diagnosis, lost)
-    usable = [t.id for t in trials if _fits(task, t) and known_steps(t) >= LEAST_STEPS]
+    usable = [t.id for t in trials if _fits(task, t) and t.known_steps >= LEAST_STEPS]
     return Findings(
         name=workspace.folder.resolve().name,
         task=task,
