@@ -19,8 +19,8 @@ from grounded import Model, Param
 from grounded.compile import Problem
 from grounded.experiments.car_tasks import car_task
 from grounded.experiments.figure8 import flight_task
-from grounded.first_guess import first_guess
 from grounded.models.aircraft import model as aircraft_model
+from grounded.search.first_policy import first_guess
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from pathlib import Path
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from grounded_trials.signals import SignalSpec, read_signals
+from grounded_trials.logs.signals import SignalSpec, read_signals
 
 PARTS = {
     "": "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/PoseWithCovariance pose\n"

@@ -41,7 +41,7 @@ def cpu(function, repeats=20):
 
 
 def our_solve(case, iterations, tolerance=0.0):
-    from grounded.ddp import Options, solve
+    from grounded.solve.ddp import Options, solve
 
     options = Options(max_iterations=iterations, tolerance=tolerance)
     return solve(case.problem, case.u, options=options)
@@ -54,7 +54,7 @@ def our_row(case):
     """
     from peer_data import CLOSE
 
-    from grounded.ddp import Options, solve
+    from grounded.solve.ddp import Options, solve
 
     best = our_solve(case, 50, 1e-10).cost
     iterations = next(i for i in range(1, 50) if our_solve(case, i).cost <= best * (1 + CLOSE))
@@ -144,7 +144,7 @@ def stretched(problem, H):
 def horizon_part(options):
     from cases import cases
 
-    from grounded.ddp import Options, solve
+    from grounded.solve.ddp import Options, solve
 
     case, settings = cases(["aircraft"])[0], Options(max_iterations=3, tolerance=0.0)
     print("\nCPU of 3 iterations against the horizon (aircraft, straight flight)")
@@ -181,7 +181,7 @@ def network(n, m=4, H=300):
 
 
 def size_part(options):
-    from grounded.ddp import solve
+    from grounded.solve.ddp import solve
 
     print("\nCPU of a whole solve against the state (a chain, m = 4, H = 300)")
     for n in (4, 8, 12, 16, 24, 32, 40):
@@ -199,7 +199,7 @@ def size_part(options):
 def swarm_part(options):
     from cases import cases
 
-    from grounded.ddp import Options, solve
+    from grounded.solve.ddp import Options, solve
 
     case, rng = cases(["car"])[0], np.random.default_rng(0)
     p = case.problem.p
@@ -217,7 +217,7 @@ def memory_part(options):
     code = (
         "import resource, sys; sys.path[:0] = sys.argv[1:]\n"
         "import numpy as np\nfrom cases import cases\nfrom run import stretched\n"
-        "from grounded.ddp import Options, solve\n"
+        "from grounded.solve.ddp import Options, solve\n"
         "case = cases(['aircraft'])[0]\n"
         "solve(*stretched(case.problem, 20_000), options=Options(max_iterations=10))\n"
         "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)"

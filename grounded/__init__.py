@@ -1,7 +1,7 @@
 """grounded: learn a manoeuvre on a real system from a crude model and a handful of trials.
 
 Abbeel, Quigley & Ng, "Using Inaccurate Models in Reinforcement Learning", ICML 2006.
-Start reading in `grounded.improve`.
+Start reading in `grounded.search.improve`.
 """
 
 from __future__ import annotations

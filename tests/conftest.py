@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from grounded_trials.workspace import Workspace
+from grounded_trials.workspace.folder import Workspace
 from shared_data import DATA
 
 

@@ -10,7 +10,7 @@ import shlex
 
 import click
 
-from grounded_trials.words import WIDTH, folded, wrapped
+from grounded_trials.wording import WIDTH, folded, wrapped
 
 # the commands that take -C
 COMMANDS = (

@@ -7,7 +7,7 @@ import click
 from grounded_cli import completion as complete
 from grounded_cli.options import as_json, in_workspace, open_workspace
 from grounded_cli.terminal import field, number, remark, show, show_json
-from grounded_trials.words import with_unit
+from grounded_trials.wording import with_unit
 
 UNCLAIMED = (
     "was not claimed by the last diagnosis: its values were fitted by themselves, in place of what "
@@ -34,7 +34,7 @@ def command(effects: tuple[str, ...], effect_only: bool, folder: str | None, jso
     grounded.toml, or give them their old values.
     """
     workspace = open_workspace(folder)
-    from grounded_trials.adopting import adopt_effects
+    from grounded_trials.workspace.adopting import adopt_effects
 
     done = adopt_effects(workspace, effects, parameters=not effect_only)
     if json_:

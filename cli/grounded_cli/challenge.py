@@ -10,7 +10,7 @@ import click
 
 from grounded_cli.options import as_json
 from grounded_cli.terminal import bar, names_in, number, show, show_json, table
-from grounded_trials.words import count
+from grounded_trials.wording import count
 
 
 @click.group("challenge")
@@ -66,8 +66,8 @@ def make_cases(
     json_: bool,
 ) -> None:
     """Write N workspaces of trials into DIR, and their labels, sealed by hash, elsewhere."""
-    from grounded.diagnosis.challenge import make
-    from grounded_trials.challenge_files import write_cases
+    from grounded.challenge import make
+    from grounded_trials.workspace.challenge import write_cases
 
     sealed = Path(labels or f"{folder}-labels")
     drawn = make(kind, cases, seed, param_error=param_error)  # type: ignore[arg-type]
@@ -98,7 +98,7 @@ def run_cases(
 ) -> None:
     """Diagnose the cases of DIR that were not yet; a run that was cut off goes on."""
     from grounded.experiments.jobs import Engine
-    from grounded_trials.challenge_jobs import diagnose_cases, undiagnosed
+    from grounded_trials.workspace.challenge import diagnose_cases, undiagnosed
 
     where = Engine(jobs=jobs, name=engine, address=address)
     families = [name for text in without for name in names_in(text)]
@@ -128,9 +128,9 @@ def score(
     folder: str, labels: str | None, jobs: int, engine: str, address: str | None, json_: bool
 ) -> None:
     """Open the labels and mark the diagnoses of DIR, beside an oracle that knows the effects."""
-    from grounded.diagnosis.challenge import summary
+    from grounded.challenge import summary
     from grounded.experiments.jobs import Engine
-    from grounded_trials.challenge_jobs import score_cases
+    from grounded_trials.workspace.challenge import score_cases
 
     sealed = _labels(folder, labels)
     where = Engine(jobs=jobs, name=engine, address=address)

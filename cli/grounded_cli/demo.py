@@ -12,10 +12,10 @@ from grounded_cli.learn import learn_in
 from grounded_cli.options import as_json
 from grounded_cli.status import summary
 from grounded_cli.terminal import field, number, progress, say, show, show_json
-from grounded_trials.words import count
+from grounded_trials.wording import count
 
 if TYPE_CHECKING:
-    from grounded_trials.workspace import Workspace
+    from grounded_trials.workspace.folder import Workspace
 
 
 @click.command("demo")
@@ -29,9 +29,9 @@ def command(name: str, folder: str | None, json_: bool) -> None:
     which the search never sees.
     """
     from grounded.errors import GroundedError
-    from grounded_trials.examples import example, write_example
-    from grounded_trials.reporting import save_optimum
-    from grounded_trials.workspace import Workspace
+    from grounded_trials.report.reporting import save_optimum
+    from grounded_trials.workspace.examples import example, write_example
+    from grounded_trials.workspace.folder import Workspace
 
     example(name)
     target = Path(folder or f"demo-{name}")
@@ -79,14 +79,14 @@ def _tell(document: dict[str, Any]) -> None:
 
 
 def _optimum(workspace: Workspace) -> float | None:
-    from grounded_trials.optimum import optimum
+    from grounded_trials.workspace.running import optimum
 
     with progress("finding the optimum with the true model"):
         return optimum(workspace)
 
 
 def _diagnosis(workspace: Workspace) -> dict[str, Any] | None:
-    from grounded_trials.diagnosing import diagnose_in
+    from grounded_trials.workspace.diagnosing import diagnose_in
 
     with progress("diagnosing the gap"):
         return dict(diagnose_in(workspace).document["verdict"])

@@ -10,11 +10,11 @@ import click
 from grounded_cli import completion as complete
 from grounded_cli.options import as_json, in_workspace, library_of, open_workspace
 from grounded_cli.terminal import field, names_in, number, show, show_json, stages, table
-from grounded_trials.words import folded, with_unit
+from grounded_trials.wording import folded, with_unit
 
 if TYPE_CHECKING:
-    from grounded_trials.diagnosing import Diagnosed
-    from grounded_trials.workspace import Workspace
+    from grounded_trials.workspace.diagnosing import Diagnosed
+    from grounded_trials.workspace.folder import Workspace
 
 
 @click.command("diagnose")
@@ -45,7 +45,7 @@ def command(
     """
     workspace = open_workspace(folder)
     from grounded.errors import GroundedError
-    from grounded_trials.diagnosing import diagnose_in
+    from grounded_trials.workspace.diagnosing import diagnose_in
 
     chosen = names_in(trials)
     if trials is not None and not chosen:
@@ -67,9 +67,9 @@ def command(
 
 def _follow(workspace: Workspace, found: Diagnosed) -> str:
     """The command that follows: adopt what was claimed, run another trial, or see the whole."""
-    from grounded_trials.diagnosis_file import diagnosis_of
-    from grounded_trials.next_step import after_diagnosis, another_trial
-    from grounded_trials.proposing import standing_in
+    from grounded_trials.workspace.diagnosis_file import diagnosis_of
+    from grounded_trials.workspace.next_step import after_diagnosis, another_trial
+    from grounded_trials.workspace.proposing import standing_in
 
     diagnosis = diagnosis_of(found.document)
     if diagnosis.no_cause:
@@ -81,8 +81,8 @@ def _follow(workspace: Workspace, found: Diagnosed) -> str:
 
 
 def _tell(document: dict[str, Any], before: dict[str, float]) -> None:
-    from grounded_trials.diagnosis_file import diagnosis_of
-    from grounded_trials.diagnosis_words import error_lines
+    from grounded_trials.report.diagnosis_words import error_lines
+    from grounded_trials.workspace.diagnosis_file import diagnosis_of
 
     verdict, diagnosis = document["verdict"], diagnosis_of(document)
     show(_verdict(verdict["kind"], verdict["sentence"]))
@@ -99,7 +99,7 @@ def _tell(document: dict[str, Any], before: dict[str, float]) -> None:
 
 def _verdict(kind: str, text: str) -> str:
     """The kind, then a sentence a line: they say different things."""
-    from grounded_trials.diagnosis_words import sentences
+    from grounded_trials.report.diagnosis_words import sentences
 
     first, *others = sentences(text)
     lines = [field("verdict", f"{kind}: {first}")]

@@ -21,7 +21,7 @@ STUDIES = {
     "footnote9": ("footnote9", "run", "", "a model that is wrong by a constant"),
     "theorem1": ("theorem1", "run", "seeds", "gradient error and where the search ends"),
     "baselines": ("baselines", "run", "seeds", "trials to close the gap, seven methods"),
-    "noise": ("noise", "run", "seeds", "the line search under noise, six rules"),
+    "noise": ("repeats", "run", "seeds", "the line search under noise, six rules"),
 }
 
 
@@ -59,7 +59,7 @@ def command(
         show("\n".join(f"{key:15} {text}" for key, (_, _, _, text) in STUDIES.items()))
         return
     from grounded.experiments.jobs import Engine
-    from grounded_trials.study_store import StudyStore
+    from grounded_trials.store.study_store import StudyStore
 
     where = Engine(jobs=jobs, name=engine, address=address)
     module, function, kind, _ = STUDIES[name]
@@ -75,7 +75,7 @@ def command(
             given["progress"] = progress
         result = study(**given)
     if png:
-        from grounded_trials.study_pictures import draw_study
+        from grounded_trials.report.studies.trends import draw_study
 
         draw_study(name, result, Path(png))
     if json_:

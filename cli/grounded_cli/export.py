@@ -39,7 +39,7 @@ def command(
     """
     form = _format(form, output)
     workspace = open_workspace(folder)
-    from grounded_trials.exporting import export_candidate
+    from grounded_trials.workspace.exporting import export_candidate
 
     path = Path(output or f"{candidate}.{form}")
     chosen = export_candidate(workspace, candidate, form, path)

@@ -8,7 +8,7 @@ import click
 
 from grounded_cli.options import as_json, in_workspace, open_workspace
 from grounded_cli.terminal import names_in, number, progress, remark, show, show_json, table
-from grounded_trials.words import count, shown
+from grounded_trials.wording import count, shown
 
 if TYPE_CHECKING:
     from grounded.fit import Fit
@@ -30,7 +30,7 @@ def command(
     """
     workspace = open_workspace(folder)
     from grounded.errors import GroundedError
-    from grounded_trials.fitting import apply_fit, fit_trials
+    from grounded_trials.workspace.fitting import apply_fit, fit_trials
 
     names = names_in(params) or None
     if params is not None and names is None:

@@ -12,7 +12,7 @@ from grounded_cli.options import as_json, in_workspace, open_workspace
 from grounded_cli.terminal import field, number, progress, remark, show, show_json, table
 
 if TYPE_CHECKING:
-    from grounded_trials.ingest import Ingested
+    from grounded_trials.workspace.ingest import Ingested
 
 # what a verdict means for the search
 VERDICTS = {
@@ -44,8 +44,8 @@ def command(
     prints one).
     """
     workspace = open_workspace(folder)
-    from grounded_trials.ingest import ingest_log
-    from grounded_trials.proposing import candidate_named
+    from grounded_trials.workspace.ingest import ingest_log
+    from grounded_trials.workspace.proposing import candidate_named
 
     done: list[Ingested] = []
     for name in files:

@@ -28,7 +28,7 @@ def command(folder: str | None, name: str | None, list_: bool, json_: bool) -> N
 
     real.py stands in for your robot; replace [system] in grounded.toml when you have one.
     """
-    from grounded_trials.examples import EXAMPLES, write_example
+    from grounded_trials.workspace.examples import EXAMPLES, write_example
 
     if list_:
         if json_:

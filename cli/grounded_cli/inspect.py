@@ -10,10 +10,10 @@ import click
 
 from grounded_cli.options import as_json, in_workspace, open_workspace
 from grounded_cli.terminal import number, progress, remark, show, show_json, table
-from grounded_trials.words import count
+from grounded_trials.wording import count
 
 if TYPE_CHECKING:
-    from grounded_trials.inspect_report import LogReport, TopicReport
+    from grounded_trials.logs.inspect_report import LogReport, TopicReport
 
 
 @click.command("inspect")
@@ -26,7 +26,7 @@ def command(log: str, folder: str | None, json_: bool) -> None:
     The table is guessed for the states and inputs of the workspace; `unsure` marks what to look at.
     It is left out for files of grounded's own, for damaged ones, and outside a workspace.
     """
-    from grounded_trials.inspect_log import inspect_log
+    from grounded_trials.logs.inspect_log import inspect_log
 
     with progress(f"reading {log}"):
         report = inspect_log(log)
@@ -68,7 +68,7 @@ def _tell(topic: TopicReport) -> None:
 
 def _what(report: LogReport) -> str:
     """What a file is, where it says so itself."""
-    from grounded_trials.own_files import CANDIDATE, TRIAL
+    from grounded_trials.store.own_files import CANDIDATE, TRIAL
 
     damaged = "DAMAGED" * bool(report.damage)
     comma = ", " * bool(damaged)
@@ -82,7 +82,7 @@ def _what(report: LogReport) -> str:
 
 def _next(report: LogReport, log: str, mapped: bool) -> str:
     """What to do with the file."""
-    from grounded_trials.own_files import CANDIDATE, TRIAL
+    from grounded_trials.store.own_files import CANDIDATE, TRIAL
 
     quoted = shlex.quote(log)
     if report.damage:
@@ -101,7 +101,7 @@ def _next(report: LogReport, log: str, mapped: bool) -> str:
 
 def _mapping(report: LogReport, folder: str | None) -> str:
     from grounded.errors import GroundedError
-    from grounded_trials.inspect_guess import guess_mapping, is_simulated, mapping_toml
+    from grounded_trials.logs.inspect_guess import guess_mapping, is_simulated, mapping_toml
 
     try:
         model = open_workspace(folder).base_model

@@ -12,8 +12,8 @@ from grounded_cli.status import as_document, next_line, summary
 from grounded_cli.terminal import number, progress, remark, say, show, show_json
 
 if TYPE_CHECKING:
-    from grounded.search import Standing
-    from grounded_trials.workspace import Workspace
+    from grounded.search.standing import Standing
+    from grounded_trials.workspace.folder import Workspace
 
 
 @click.command("learn")
@@ -34,9 +34,9 @@ def command(trials: int | None, folder: str | None, json_: bool) -> None:
 
 def learn_in(workspace: Workspace, trials: int | None = None) -> Standing:
     """The loop over the commands' own functions; narrates each trial."""
-    from grounded_trials.ingest import ingest_log
-    from grounded_trials.proposing import propose_in, standing_in
-    from grounded_trials.running import run_candidate
+    from grounded_trials.workspace.ingest import ingest_log
+    from grounded_trials.workspace.proposing import propose_in, standing_in
+    from grounded_trials.workspace.running import run_candidate
 
     done = 0
     while trials is None or done < trials:

@@ -11,7 +11,7 @@ from grounded_cli.address import given, remember
 
 if TYPE_CHECKING:
     from grounded.effects import Library
-    from grounded_trials.workspace import Workspace
+    from grounded_trials.workspace.folder import Workspace
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -44,7 +44,7 @@ def open_workspace(folder: str | None) -> Workspace:
     Raises:
         GroundedError: if its grounded.toml is missing or wrong.
     """
-    from grounded_trials.workspace import Workspace
+    from grounded_trials.workspace.folder import Workspace
 
     workspace = Workspace(folder or given() or ".")
     _ = workspace.config

@@ -10,13 +10,13 @@ import click
 from grounded_cli.options import as_json, in_workspace, open_workspace
 from grounded_cli.status import next_line
 from grounded_cli.terminal import field, number, progress, remark, show, show_json
-from grounded_trials.words import count, with_unit
+from grounded_trials.wording import count, with_unit
 
 if TYPE_CHECKING:
-    from grounded.search import Candidate, Standing
+    from grounded.search.standing import Candidate, Standing
     from grounded.task import Task
-    from grounded_trials.proposing import Proposed
-    from grounded_trials.workspace import Workspace
+    from grounded_trials.workspace.folder import Workspace
+    from grounded_trials.workspace.proposing import Proposed
 
 
 @click.command("propose")
@@ -29,7 +29,7 @@ def command(folder: str | None, json_: bool) -> None:
     the search has ended.
     """
     workspace = open_workspace(folder)
-    from grounded_trials.proposing import propose_in
+    from grounded_trials.workspace.proposing import propose_in
 
     with progress("planning"):
         proposed = propose_in(workspace)

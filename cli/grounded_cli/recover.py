@@ -10,10 +10,10 @@ import click
 
 from grounded_cli.options import as_json
 from grounded_cli.terminal import field, progress, say, show, show_json
-from grounded_trials.words import count
+from grounded_trials.wording import count
 
 if TYPE_CHECKING:
-    from grounded_trials.recover import Recovery
+    from grounded_trials.logs.recover import Recovery
 
 
 @click.command("recover")
@@ -25,7 +25,7 @@ def command(log: str, output: str | None, json_: bool) -> None:
 
     The damaged file is not changed.
     """
-    from grounded_trials.recover import recover_log
+    from grounded_trials.logs.recover import recover_log
 
     source = Path(log)
     target = Path(output) if output else source.with_name(f"{source.stem}-recovered.mcap")
@@ -78,7 +78,7 @@ def _tell(found: Recovery) -> None:
 
 
 def _is_trial(found: Recovery) -> bool:
-    from grounded_trials.own_files import TRIAL
+    from grounded_trials.store.own_files import TRIAL
 
     return found.format == TRIAL
 
@@ -92,7 +92,7 @@ def _steps(found: Recovery) -> str:
 
 def _next(found: Recovery) -> str:
     """What to do with the file."""
-    from grounded_trials.own_files import CANDIDATE
+    from grounded_trials.store.own_files import CANDIDATE
 
     target = shlex.quote(str(found.target))
     if found.format == CANDIDATE:

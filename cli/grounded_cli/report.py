@@ -9,11 +9,11 @@ import click
 from grounded_cli.address import addressed
 from grounded_cli.options import as_json, in_workspace, open_workspace
 from grounded_cli.terminal import progress, remark, show, show_json, sparkline, table
-from grounded_trials.words import folded
+from grounded_trials.wording import folded
 
 if TYPE_CHECKING:
-    from grounded_trials.findings import Findings
-    from grounded_trials.workspace import Workspace
+    from grounded_trials.report.findings import Findings
+    from grounded_trials.workspace.folder import Workspace
 
 
 @click.command("report")
@@ -28,9 +28,9 @@ def command(html: bool, png: bool, rrd: bool, folder: str | None, json_: bool) -
     A damaged or missing trial is left out and named (exit code 3).
     """
     workspace = open_workspace(folder)
-    from grounded_trials.gathering import gather
-    from grounded_trials.report_text import report_text
-    from grounded_trials.reporting import save
+    from grounded_trials.report.gathering import gather
+    from grounded_trials.report.report_text import report_text
+    from grounded_trials.report.reporting import save
 
     with progress("reading trials"):
         findings = gather(workspace)
@@ -52,8 +52,8 @@ def command(html: bool, png: bool, rrd: bool, folder: str | None, json_: bool) -
 
 def write_all(workspace: Workspace) -> dict[str, str]:
     """The page and the recording; their files by kind."""
-    from grounded_trials.gathering import gather
-    from grounded_trials.reporting import save
+    from grounded_trials.report.gathering import gather
+    from grounded_trials.report.reporting import save
 
     paths = save(workspace, gather(workspace), html=True, png=False, rrd=True)
     return {path.suffix[1:]: str(path) for path in paths}
@@ -61,7 +61,7 @@ def write_all(workspace: Workspace) -> dict[str, str]:
 
 def as_document(findings: Findings, paths: list[Any]) -> dict[str, Any]:
     """The fields of CONTRACT.md, and the figures of the text by state and input."""
-    from grounded_trials.findings import prediction_error, rms, tracking_error
+    from grounded_trials.report.findings import prediction_error, rms, tracking_error
 
     task, names = findings.task, findings.task.model.state_names
     runs = {"model_policy": findings.first, "best": findings.best}

@@ -23,8 +23,8 @@ def command(candidate: str | None, folder: str | None, json_: bool) -> None:
     """
     workspace = open_workspace(folder)
     from grounded.errors import GroundedError
-    from grounded_trials.proposing import candidate_named, standing_in
-    from grounded_trials.running import run_candidate
+    from grounded_trials.workspace.proposing import candidate_named, standing_in
+    from grounded_trials.workspace.running import run_candidate
 
     if candidate is None:
         standing = standing_in(workspace)

@@ -9,12 +9,12 @@ import click
 
 from grounded_cli.options import as_json, in_workspace, open_workspace
 from grounded_cli.terminal import field, number, progress, show, show_json, sparkline, table
-from grounded_trials.words import folded, verdict
+from grounded_trials.wording import folded, verdict
 
 if TYPE_CHECKING:
-    from grounded.search import Standing, Tried
-    from grounded_trials.diagnosis_file import Diagnosis
-    from grounded_trials.workspace import Workspace
+    from grounded.search.standing import Standing, Tried
+    from grounded_trials.workspace.diagnosis_file import Diagnosis
+    from grounded_trials.workspace.folder import Workspace
 
 LEGEND = "damp: penalty on leaving the last trial's inputs; +-: standard error"
 
@@ -25,7 +25,7 @@ LEGEND = "damp: penalty on leaving the last trial's inputs; +-: standard error"
 def command(folder: str | None, json_: bool) -> None:
     """Show where the search stands: derived from the stored trials, nothing is written."""
     workspace = open_workspace(folder)
-    from grounded_trials.proposing import standing_in
+    from grounded_trials.workspace.proposing import standing_in
 
     with progress("reading trials"):
         standing = standing_in(workspace, ahead=True)
@@ -71,7 +71,7 @@ def as_document(standing: Standing) -> dict[str, Any]:
 
 def summary(standing: Standing) -> str:
     """The history as a table, with a line of bars and how sure the last improvement is."""
-    from grounded_trials.report_text import spaced
+    from grounded_trials.report.report_text import spaced
 
     lines = []
     if standing.history:
@@ -121,15 +121,14 @@ def _row(tried: Tried, last: bool) -> tuple[str, ...]:
 
 def certainty(standing: Standing) -> str:
     """Whether the last improvement exceeds the noise of the utility, as a sentence."""
-    from grounded.certainty import last_improvement
+    from grounded.search.certainty import last_improvement
 
     return last_improvement(standing.history)
 
 
 def next_line(workspace: Workspace, standing: Standing) -> str:
     """The last line of an output: the command to type next."""
-    from grounded_trials.next_step import next_command
-    from grounded_trials.since import usable_ids
+    from grounded_trials.workspace.next_step import next_command, usable_ids
 
     usable = usable_ids(workspace)
     return folded(next_command(workspace, standing, _diagnosis(workspace), usable))
@@ -137,7 +136,7 @@ def next_line(workspace: Workspace, standing: Standing) -> str:
 
 def _diagnosis(workspace: Workspace) -> Diagnosis | None:
     from grounded.errors import GroundedError
-    from grounded_trials.diagnosis_file import read_diagnosis
+    from grounded_trials.workspace.diagnosis_file import read_diagnosis
 
     try:
         return read_diagnosis(workspace.reports)
@@ -147,7 +146,7 @@ def _diagnosis(workspace: Workspace) -> Diagnosis | None:
 
 def _outdated(workspace: Workspace) -> str:
     """Why the last diagnosis is not the last word."""
-    from grounded_trials.since import since_diagnosis, usable_ids
+    from grounded_trials.workspace.next_step import since_diagnosis, usable_ids
 
     found = _diagnosis(workspace)
     return since_diagnosis(workspace, found, usable_ids(workspace)).sentence if found else ""

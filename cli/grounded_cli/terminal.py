@@ -15,8 +15,8 @@ from typing import Any
 import click
 
 from grounded_cli.address import addressed
-from grounded_trials.words import WIDTH, wrapped
-from grounded_trials.words import figure as number
+from grounded_trials.wording import WIDTH, wrapped
+from grounded_trials.wording import figure as number
 
 __all__ = [
     "bar",

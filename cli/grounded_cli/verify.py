@@ -14,7 +14,7 @@ from grounded_cli.terminal import progress, remark, show, show_json
 def command(folder: str | None, json_: bool) -> None:
     """Check every stored trial against the hash in its name, and every candidate's checksum."""
     workspace = open_workspace(folder)
-    from grounded_trials.verifying import damaged_files
+    from grounded_trials.workspace.exporting import damaged_files
 
     with progress("checking"):
         checked, damaged = damaged_files(workspace)

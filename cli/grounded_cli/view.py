@@ -23,7 +23,7 @@ def command(folder: str | None) -> None:
     has one (`pip install rerun-sdk`) and open it there: rerun recording.rrd
     """
     workspace = open_workspace(folder)
-    from grounded_trials.reporting import save_recording
+    from grounded_trials.report.reporting import save_recording
 
     with progress("writing the recording"):
         path = save_recording(workspace)

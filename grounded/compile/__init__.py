@@ -9,16 +9,24 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from grounded.compile.descent import Descent, Options, Status
-from grounded.compile.graph import TooLong
-from grounded.compile.interpreted import Integrator, Kind
 from grounded.compile.names import Named, where
-from grounded.compile.problem import Problem, history_depths
-from grounded.compile.python import DifferencedSystem
-from grounded.compile.system import Backward, Swarm, System
-from grounded.compile.threads import parallel
-from grounded.compile.traced import TracedSystem
-from grounded.compile.tracing import Signature, trace
+from grounded.compile.problem import (
+    Backward,
+    Descent,
+    Integrator,
+    Kind,
+    Options,
+    Problem,
+    Status,
+    Swarm,
+    System,
+    history_depths,
+)
+from grounded.compile.run.differenced import DifferencedSystem
+from grounded.compile.run.threads import parallel
+from grounded.compile.run.traced import TracedSystem
+from grounded.compile.trace.graph import TooLong
+from grounded.compile.trace.tracing import Signature, trace
 
 __all__ = [
     "Backward",
@@ -60,8 +68,8 @@ def system_of(
     Raises:
         GroundedError: if the function can't be a model of these names, naming its file and line.
     """
-    from grounded.compile import jit
-    from grounded.compile.compiled import MAX_PLACES, CompiledSystem
+    from grounded.compile.run import jit
+    from grounded.compile.run.compiled import MAX_PLACES, CompiledSystem
 
     def differenced(why: str) -> System:
         return DifferencedSystem(

@@ -91,3 +91,47 @@ def raised_at(error: BaseException, function: Any) -> str:
             found = f"{file}:{trace.tb_lineno}"
         trace = trace.tb_next
     return found
+
+
+def check_names(values: Any, states: Sequence[str], function: Any) -> None:
+    """Whether a function returned a dict of exactly the states.
+
+    Raises:
+        GroundedError: naming the function's file and line, what is missing and what is too much.
+    """
+    if not isinstance(values, Mapping):
+        raise GroundedError(
+            f"{where(function)}: the model must return a dict of state names, "
+            f"got {type(values).__name__}; return {{{', '.join(f'{s!r}: ...' for s in states)}}}"
+        )
+    extra = [name for name in values if name not in states]
+    if extra:
+        raise GroundedError(
+            f"{where(function)}: the model returned '{extra[0]}', which is not a state: "
+            + nearest(str(extra[0]), states)
+        )
+    missing = [name for name in states if name not in values]
+    if missing:
+        raise GroundedError(
+            f"{where(function)}: the model returned {len(values)} of {len(states)} states; "
+            f"missing: {', '.join(missing)}"
+        )
+
+
+def wrong_value(name: str, value: Any, function: Any) -> GroundedError:
+    """The error for a returned state that is not one real number."""
+    try:
+        array = np.asarray(value)
+    except ValueError:
+        array = np.asarray(None)
+    if array.dtype.kind == "c":
+        found = f"a complex number ({value})"
+    elif array.size != 1:
+        found = f"an array of shape {array.shape}"
+    elif array.dtype.kind == "O":
+        found = f"{type(value).__name__} ({value!r})"
+    else:
+        found = f"{value!r}"
+    return GroundedError(
+        f"{where(function)}: the model must return one real number for state '{name}', got {found}"
+    )

@@ -13,19 +13,46 @@ receives, under a zero-order hold, the mean over the step (1 - phi) u_j[t-d] + p
         + W_H |x_H - target_H|^2,                         low <= u_t <= high
 
 J is a COST: minus the paper's utility. Errors of states marked as angles wrap to [-pi, pi].
+
+The inputs already sent: where they sit in z, and what of them reaches the actuator.
+
+z_t = [x_t, q_t] with q_t the past inputs, newest first, input by input. A delay of d + phi steps
+(0 <= phi < 1) under a zero-order hold means
+
+    u_eff_t = now * u_t + past q_t          (weights 1 - phi and phi on two neighbours)
+    q_{t+1} = [u_t, q_t without the oldest]  for each input.
+
+What the loop of `ddp.solve` and its compiled twin (`llvm_descent.py`) have in common.
+
+What every path from a user's function to numbers offers: compiled, traced, or differenced.
+
+`ddp`, `fit`, `estimate` and the diagnosis talk to this interface alone, so that a black-box
+simulator and a model compiled to machine code are the same thing to them. All arrays are float64
+and C-contiguous; a state that leaves the finite numbers is returned as it is (NaN, inf), never
+raised: the caller turns it into a status.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from grounded.compile.system import System
+MAX_ITERATIONS = 50
+STOP = 1e-11  # on the free gradient, relative to |g|
+ARMIJO = 0.1
+ROUNDING = 1e-13  # of the value: a smaller rise is none
+
+STAGES: dict[str, tuple[tuple[float, float], ...]] = {  # (c, b): where and with what weight
+    "rk4": ((0.0, 1 / 6), (0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6)),
+    "euler": ((0.0, 1.0),),
+}
+
+Kind = Literal["derivative", "step"]
+Integrator = Literal["rk4", "euler"]
 
 Array = NDArray[np.float64]
 
@@ -86,3 +113,197 @@ class Problem:
         """z_0: the start state and the input held before it, (nz,)."""
         held = [np.full(d, self.past[j]) for j, d in enumerate(self.depths)]
         return np.concatenate([self.start, *held])
+
+
+@dataclass(frozen=True, eq=False)
+class Queue:
+    """Sizes: n states, m inputs, D past inputs in all."""
+
+    n: int
+    depths: tuple[int, ...]  # (m,)
+    first: tuple[int, ...]  # (m,) index in z of each input's newest past value
+    now: Array  # (m,) weight of u_t itself
+    past: Array  # (m, D) weights of q_t
+
+    @property
+    def nz(self) -> int:
+        """Size of z."""
+        return self.n + sum(self.depths)
+
+    def effective(self, z: Array, u: Array) -> Array:
+        """What the actuator receives: z (..., nz), u (..., m) -> (..., m)."""
+        return self.now * u + z[..., self.n :] @ self.past.T
+
+    def after(self, q: Array, u: Array) -> Array:
+        """The past inputs one step later: q (..., D), u (..., m) -> (..., D)."""
+        later = np.empty_like(q)
+        for j, (at, depth) in enumerate(zip(self.first, self.depths, strict=True)):
+            at -= self.n
+            later[..., at] = u[..., j]
+            later[..., at + 1 : at + depth] = q[..., at : at + depth - 1]
+        return later
+
+    def shift(self) -> tuple[Array, Array]:
+        """q_{t+1} = S q_t + E u_t: S (D, D), E (D, m)."""
+        D, m = self.nz - self.n, len(self.depths)
+        return self.after(np.eye(D), np.zeros((D, m))).T, self.after(np.zeros((m, D)), np.eye(m)).T
+
+
+def queue_of(problem: Problem) -> Queue:
+    """The queue of a problem: depths and weights from its delays."""
+    n, depths = problem.system.n, problem.depths
+    starts = np.concatenate([[0], np.cumsum(depths)]).astype(int)
+    now, past = np.zeros(len(depths)), np.zeros((len(depths), int(starts[-1])))
+    for j, delay in enumerate(problem.delay):
+        whole = int(np.floor(delay + 1e-9))
+        part = max(0.0, float(delay) - whole)
+        part = 0.0 if part < 1e-9 else part
+        for steps, weight in ((whole, 1.0 - part), (whole + 1, part)):
+            if weight == 0.0:
+                continue
+            if steps == 0:
+                now[j] = weight
+            else:
+                past[j, starts[j] + steps - 1] = weight
+    return Queue(n, depths, tuple(int(n + s) for s in starts[:-1]), now, past)
+
+
+Status = Literal["converged", "no improvement", "max iterations", "not finite"]
+STATUSES: tuple[Status, ...] = ("converged", "no improvement", "max iterations", "not finite")
+
+FLOOR = 1e-6  # first regularisation after a failed factorisation
+SEARCH_FLOOR = 1e-3  # regularisation after a failed search
+GROWTH = 10.0
+CEILING = 1e10
+LARGE_MU = 1.0
+LEAST = 1e-14  # a predicted change that is none
+
+
+@dataclass(frozen=True)
+class Options:
+    """Settings of `ddp.solve`."""
+
+    max_iterations: int = 100
+    tolerance: float = 1e-8  # stop when the predicted change is below this times the cost
+    halvings: int = 11  # alpha = 1 ... 1/2^11
+    accept: float = 0.1  # least part of the predicted change
+
+
+@dataclass(frozen=True, eq=False)
+class Descent:
+    """Where the loop ended: the last trajectory, the gains of the last sweep, a line a search."""
+
+    status: Status
+    z: Array  # (H+1, nz)
+    u: Array  # (H, m)
+    k: Array  # (H, m)
+    K: Array  # (H, m, nz)
+    cost: float
+    failed_at: int  # "not finite": the step at which the last sweep failed, -1 before the first
+    lines: Array  # (i, 4): cost, predicted change, alpha (0: none was accepted), mu
+
+
+@dataclass(frozen=True, eq=False)
+class Swarm:
+    """The runs of one rollout call, one for each alpha: z (A, H+1, nz), u (A, H, m), cost (A,)."""
+
+    z: Array
+    u: Array
+    cost: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Backward:
+    """One Riccati sweep: u_t = ubar_t + alpha k_t + K_t (z_t - zbar_t).
+
+    The cost is expected to change by alpha d1 + alpha^2 d2 (d1 <= 0 <= d2). `failed_at` is the
+    step whose Q_uu was not positive definite or not finite, -1 when the sweep went through.
+    """
+
+    k: Array  # (H, m)
+    K: Array  # (H, m, nz)
+    d1: float
+    d2: float
+    failed_at: int
+
+
+class System(Protocol):
+    """Discrete dynamics x_{t+1} = f(x_t, u_t; p) over a step dt, and the kernels built on them."""
+
+    n: int
+    m: int
+    k: int  # number of parameters
+    how: str  # "compiled", "traced" or "differenced"
+    note: str  # why it is not compiled, naming the line; empty when it is
+    source: str  # file:line of the user's function
+    states: tuple[str, ...]  # names, for messages
+
+    def step(self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0) -> Array:
+        """From x (N, n), u (N, m) to the next x (N, n)."""
+        ...
+
+    def check(self, x: Array, u: Array, p: Array, dt: float) -> None:
+        """Compares a trace with the user's own function at points x (N, n), u (N, m).
+
+        Raises:
+            GroundedError: where they differ, with both values.
+        """
+        ...
+
+    def linearise(
+        self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
+    ) -> tuple[Array, Array]:
+        """f_x (N, n, n) and f_u (N, n, m)."""
+        ...
+
+    def sensitivities(
+        self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
+    ) -> tuple[Array, Array, Array]:
+        """f_x (N, n, n), f_u (N, n, m) and f_p (N, n, k)."""
+        ...
+
+    def rollout(
+        self,
+        problem: Problem,
+        ubar: Array,
+        K: Array | None = None,
+        zbar: Array | None = None,
+        k: Array | None = None,
+        alphas: Array | None = None,
+    ) -> Swarm:
+        """u_t = clip(ubar_t + alpha k_t + K_t (z_t - zbar_t)), from the problem's start.
+
+        ubar (H, m), K (H, m, nz), zbar (H, nz) or (H+1, nz), k (H, m), alphas (A,) or one of 1.
+        Differences of angles wrap.
+        """
+        ...
+
+    def backward(
+        self,
+        problem: Problem,
+        z: Array,
+        u: Array,
+        damping: Array,
+        into: Backward | None = None,
+    ) -> Backward:
+        """Linearise along z (H+1, nz), u (H, m) and sweep back, Q_uu + diag(damping), damping (m,).
+
+        Input limits are part of each step's quadratic programme (box-DDP, Tassa et al. 2014): the
+        rows of K of a clamped input are zero. `into` is an earlier result that nobody needs any
+        more: its arrays may be used again.
+        """
+        ...
+
+    def descend(
+        self,
+        problem: Problem,
+        ubar: Array,
+        K: Array | None,
+        zbar: Array | None,
+        options: Options,
+    ) -> Descent | None:
+        """The loop of `ddp.solve` in one piece; None where it is left to `ddp`.
+
+        From the rollout of ubar (H, m) or of ubar + K (z - zbar).
+        """
+        ...

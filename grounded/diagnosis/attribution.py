@@ -14,11 +14,10 @@ import numpy as np
 
 from grounded.diagnosis.data import Data
 from grounded.diagnosis.fitted import Fit
-from grounded.diagnosis.found import CLAIM
+from grounded.diagnosis.hypotheses import CLAIM
 from grounded.diagnosis.noise import Structure
 from grounded.diagnosis.refine import clean
-from grounded.diagnosis.search import LARGE, SHORTLIST, TO_THE_TOP, Search
-from grounded.diagnosis.tuning import tune
+from grounded.diagnosis.search import LARGE, SHORTLIST, TO_THE_TOP, Search, tune
 from grounded.effects import Effect
 
 HOPEFUL = 4  # larger sets that are fitted to the end

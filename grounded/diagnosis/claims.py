@@ -7,12 +7,12 @@ from typing import Any
 
 from grounded.diagnosis.calibration import blamed
 from grounded.diagnosis.fitted import Fit, calibrated
-from grounded.diagnosis.found import TIE, parametric
-from grounded.diagnosis.gap import normalised
+from grounded.diagnosis.hypotheses import TIE, parametric
 from grounded.diagnosis.hypothesis import param_scale
 from grounded.diagnosis.intervals import standard_deviations
 from grounded.diagnosis.limits import Limits
 from grounded.diagnosis.lookalike import Likeness, lookalikes, of_parameters
+from grounded.diagnosis.prediction_error import normalised
 from grounded.diagnosis.report import (
     Estimate,
     Ranked,

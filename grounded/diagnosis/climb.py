@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from grounded.diagnosis.columns import step_sizes
 from grounded.diagnosis.data import Data
 from grounded.diagnosis.fitted import Fit, calibrated
 from grounded.diagnosis.hypothesis import Hypothesis, param_scale
+from grounded.diagnosis.linearise import step_sizes
 from grounded.diagnosis.noise import Noise
 from grounded.frozen import Array
 

@@ -16,8 +16,8 @@ hypothesis takes its place.
 from __future__ import annotations
 
 from grounded.diagnosis.fitted import Fit
-from grounded.diagnosis.found import CLAIM
-from grounded.diagnosis.gap import Horizon, horizon
+from grounded.diagnosis.hypotheses import CLAIM
+from grounded.diagnosis.prediction_error import Horizon, horizon
 from grounded.diagnosis.search import Search
 from grounded.diagnosis.shrinkage import Shrinkage, gaps_of, shrinkage
 

@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis.data import Data
+from grounded.diagnosis.delayed_measurement import Late
 from grounded.diagnosis.filter import UNKNOWN, Adjoint
 from grounded.diagnosis.hypothesis import Hypothesis
-from grounded.diagnosis.late import Late
 from grounded.diagnosis.noise import Noise
 from grounded.effects import SensorDelayFamily
 from grounded.frozen import Array

@@ -25,10 +25,10 @@ from grounded.diagnosis.confirm import confirmed, noise_confirmed
 from grounded.diagnosis.data import prepare
 from grounded.diagnosis.delays import delays_of
 from grounded.diagnosis.fitted import Fit
-from grounded.diagnosis.gap import Horizon, by_region, by_time, explained, horizon
 from grounded.diagnosis.hypothesis import Hypothesis
 from grounded.diagnosis.leftover import Leftover, leftovers, whiteness
 from grounded.diagnosis.limits import Limits, knowable, limits
+from grounded.diagnosis.prediction_error import Horizon, by_region, by_time, explained, horizon
 from grounded.diagnosis.report import Diagnosis, Remainder
 from grounded.diagnosis.search import Search
 from grounded.diagnosis.shrinkage import shrinkage, whole_runs

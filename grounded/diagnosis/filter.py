@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis import kernels
-from grounded.diagnosis.late import Late, System
+from grounded.diagnosis.delayed_measurement import Late, System
 from grounded.frozen import Array
 
 UNKNOWN = 1e6  # standard deviations: how little is known of a state that was not measured at t = 0

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from grounded.compile.llvm_batch import Words
-from grounded.compile.llvm_text import Writer, splat
+from grounded.compile.emit.llvm_batch import Words
+from grounded.compile.emit.llvm_text import Writer, splat
 
 GAINS = ("A", "Q", "R", "seen", "start", "G", "L", "B", "K", "W", "state")
 INNOVATIONS = ("A", "K", "W", "d", "r", "seen", "L", "B", "blocks", "C", "out", "track", "state")

@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from grounded.compile import jit
-from grounded.compile.compiled import call
-from grounded.compile.llvm_text import declarations, number, splat
+from grounded.compile.emit.llvm_text import declarations, number, splat
+from grounded.compile.run import jit
+from grounded.compile.run.compiled import call
 from grounded.diagnosis.kernel_pen import NAMES, Pen
 
 LARGEST = 16  # states whose factorisation is written out

@@ -20,9 +20,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from grounded.diagnosis import filter as kalman
-from grounded.diagnosis.columns import gains_of, jacobian
 from grounded.diagnosis.fitted import Fit
 from grounded.diagnosis.hypothesis import Predictor
+from grounded.diagnosis.linearise import gains_of, jacobian
 from grounded.effects import places
 from grounded.effects.family import per
 from grounded.frozen import Array

@@ -20,11 +20,11 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis import filter as kalman
-from grounded.diagnosis.columns import base_columns
 from grounded.diagnosis.delays import delays_of
 from grounded.diagnosis.fitted import Fit
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor
 from grounded.diagnosis.leftover import filter_of
+from grounded.diagnosis.linearise import base_columns
 from grounded.diagnosis.scan import scan
 from grounded.effects import Effect, ParamFamily
 

@@ -20,15 +20,14 @@ import numpy as np
 
 from grounded.diagnosis import filter as kalman
 from grounded.diagnosis.climb import MOST_NUMBERS, Work, proposed
-from grounded.diagnosis.columns import gains_of, linearised, system_of
 from grounded.diagnosis.data import Data
+from grounded.diagnosis.delayed_measurement import Late, System, joined
 from grounded.diagnosis.delays import Delays, delays_of
 from grounded.diagnosis.fitted import Fit, calibrated, shift_precision
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor, param_scale
-from grounded.diagnosis.information import average, working
-from grounded.diagnosis.late import Late, System, joined
-from grounded.diagnosis.noise import Noise, cleaned, climbed, slopes
-from grounded.diagnosis.starts import smoothed
+from grounded.diagnosis.initial_state import smoothed
+from grounded.diagnosis.linearise import gains_of, linearised, system_of
+from grounded.diagnosis.noise import Noise, average, cleaned, climbed, slopes, working
 from grounded.effects import SensorDelayFamily
 from grounded.frozen import Array
 

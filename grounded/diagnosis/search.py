@@ -9,12 +9,11 @@ import numpy as np
 
 from grounded.diagnosis.data import Data
 from grounded.diagnosis.fitted import Fit
-from grounded.diagnosis.found import Found, parametric
-from grounded.diagnosis.hypothesis import Hypothesis, param_scale
+from grounded.diagnosis.hypotheses import Found, parametric
+from grounded.diagnosis.hypothesis import Hypothesis, Predictor, param_scale
 from grounded.diagnosis.noise import Noise, Structure, first_guess
 from grounded.diagnosis.refine import refine
 from grounded.diagnosis.scan import Look, scan
-from grounded.diagnosis.undefined import undefined
 from grounded.effects import Effect, ParamFamily
 from grounded.errors import GroundedError
 from grounded.frozen import Array
@@ -25,6 +24,8 @@ SHORTLIST = 14  # effects that are refined of a scan, and half as many parameter
 TAUS = (0.05, 0.1, 0.3)  # [s] of coloured noise
 SLOW = (1.0, 2.0, 6.0)  # the same in steps, where a step is longer than all of them
 BESIDE = 4  # effects that are fitted with the parameters freed
+FIRST, COARSE, LAST = 3.0, 1.4, 1.05  # factors by which a constant is moved
+ROUNDS = 12
 LARGE_GAIN = 50.0  # nats from which a hypothesis is also started by itself
 TO_THE_TOP = 25  # iterations of fits that decide: most need fewer, and stop by themselves
 LARGE = 8  # states, above which one correlation time and half the shortlist have to do
@@ -230,3 +231,69 @@ class Search(Found):
         kept = {k: f for k, f in self.fits.items() if k[:2] == (structure, spread) or k == exact}
         other.fits, other._prices = kept, self._prices
         return other if exact in kept else None
+
+
+def undefined(predictor: Predictor) -> str:
+    """Where a model is no number along the log, in words."""
+    data, h = predictor.data, Hypothesis()
+    with np.errstate(all="ignore"):
+        after = predictor.next(h, data.y[:-1])
+    bad = np.argwhere(~np.isfinite(after).all(axis=-1) & (data.valid.T > 0))
+    if not len(bad):
+        return (
+            "the model's own predictions of these trials diverge: try it with `grounded fit`, or "
+            "check the units of its parameters"
+        )
+    t, b = bad[0]
+    trial = data.ids[data.trial_of[b]] or f"number {data.trial_of[b] + 1}"
+    values = ", ".join(
+        f"{name} = {value:.4g}"
+        for name, value in zip(data.model.state_names, data.y[t, b], strict=True)
+    )
+    return (
+        f"the model '{data.model.name}' is no number at a state that was measured: trial {trial}, "
+        f"t = {data.time[t, b]:.3g} s, {values}; noise can carry a log beyond where a square root "
+        "or a logarithm holds: bound its argument in the model (np.maximum(x, 0))"
+    )
+
+
+def tune(search: Search, fits: list[Fit]) -> None:
+    """Tries other constants of large effects (over which speed a dry friction builds up).
+
+    A constant is no parameter: for a small effect any sensible one will do. Where an effect is
+    worth many nats, a wrong one leaves so much that further effects are blamed for it. So it is
+    walked up and down by shrinking factors, the rest fitted anew at each, and pays as one more
+    number.
+    """
+    floor = search.score(search.best_null()) + LARGE_GAIN
+    for fit in fits:
+        if search.score(fit) < floor:
+            continue
+        for index, effect in enumerate(fit.hypothesis.effects):
+            for q in effect.quantities:
+                if q.tunable:
+                    fit = _walked(search, fit, index, q.name)
+
+
+def _walked(search: Search, fit: Fit, index: int, name: str) -> Fit:
+    """The likeliest fit along one constant: uphill by factors, then to the top of a parabola."""
+    factor = FIRST
+    for _ in range(ROUNDS):
+        at = fit.hypothesis.values[index][name]
+        tried = _tried(search, fit, index, name, (at / factor, at * factor))
+        best = max([fit, *tried], key=search.score)
+        if best is fit and factor < COARSE and len(tried) == 2:
+            down, up = (search.score(f) - search.score(fit) for f in tried)
+            part = 0.5 * (down - up) / min(down + up, -1e-9)
+            tried = _tried(search, fit, index, name, (at * factor ** float(part),))
+            best = max([fit, *tried], key=search.score)
+        factor = factor**0.5 if best is fit or factor < COARSE else factor
+        fit = best
+        if factor < LAST:
+            break
+    return fit
+
+
+def _tried(search: Search, fit: Fit, index: int, name: str, values: tuple[float, ...]) -> list[Fit]:
+    starts = [(fit.hypothesis.tuned(index, name, v), fit.noise, fit.track) for v in values]
+    return search.refined(starts, TO_THE_TOP)

@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from grounded.diagnosis.fitted import Fit, calibrated
-from grounded.diagnosis.gap import Horizon, errors, normalised
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor, param_scale
 from grounded.diagnosis.intervals import leave_one_out
+from grounded.diagnosis.prediction_error import Horizon, errors, normalised
 from grounded.frozen import Array
 
 

@@ -21,8 +21,8 @@ import numpy as np
 
 from grounded.diagnosis.data import Data
 from grounded.diagnosis.fitted import Fit
-from grounded.diagnosis.gap import Horizon, errors
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor
+from grounded.diagnosis.prediction_error import Horizon, errors
 from grounded.diagnosis.shrinkage import held_out
 from grounded.frozen import Array
 

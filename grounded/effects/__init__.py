@@ -16,10 +16,9 @@ from grounded.effects.family import (
     Site,
     scales_of,
 )
-from grounded.effects.order import acting_order, wrapping_order
-from grounded.effects.recall import memory_of, memory_start
+from grounded.effects.memory import memory_of, memory_start
 from grounded.effects.registry import Library
-from grounded.effects.wrap import param_name, wrap
+from grounded.effects.wrap import acting_order, param_name, wrap, wrapping_order
 
 __all__ = [
     "Effect",

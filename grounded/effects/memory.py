@@ -10,6 +10,8 @@ actuator delivers over the step, and fractions of a step matter:
                                       u_eff = u + (z - u) (1 - e) tau / dt
     rate limit |z'| <= r:             z+ = z + clip(u - z, -r dt, r dt), ramp then hold
     backlash   width b:               z+ = clip(z, u - b/2, u + b/2)
+
+The memory states of a wrapped model along a recorded trial, where no sensor measured them.
 """
 
 from __future__ import annotations
@@ -21,6 +23,9 @@ import numpy as np
 
 from grounded.effects import places
 from grounded.effects.family import MemoryFamily, Quantity, Site
+from grounded.frozen import Array
+from grounded.model import Model
+from grounded.trial import Trial
 
 LONGEST_DELAY = 0.5  # [s] that a scan considers, where steps are not longer than usual
 LONGEST_LAG = 2.0  # [s] the same
@@ -142,3 +147,36 @@ def _together(names: tuple[str, ...]) -> list[str]:
 
 
 FAMILIES = (delay, first_order_lag, rate_limit, backlash)
+
+
+def memory_of(wrapped: Model, base: Model, trial: Trial) -> Array:
+    """The memory states along a recorded trial, (T + 1, wrapped.n - base.n).
+
+    They start at what held before t = 0 (the held input, the first logged value, a clock at zero)
+    and follow the commands and the logged states.
+    """
+    extra = wrapped.state_names[base.n :]
+    now = memory_start(wrapped, base, trial)
+    found = [now]
+    for t in range(trial.steps):
+        x = np.concatenate([trial.states[t], now])[None]
+        after = wrapped.system.step(x, trial.inputs[t][None], wrapped.values, trial.dt)
+        now = after[0, base.n :]
+        found.append(now)
+    return np.array(found).reshape(trial.steps + 1, len(extra))
+
+
+def memory_start(wrapped: Model, base: Model, trial: Trial) -> Array:
+    """The memory states at t = 0, (wrapped.n - base.n,)."""
+    held = np.zeros(base.m) if trial.start_inputs is None else trial.start_inputs
+    start = []
+    for name in wrapped.state_names[base.n :]:
+        inputs = [i for i, n in enumerate(base.input_names) if name.startswith(f"{n}_")]
+        states = [i for i, n in enumerate(base.state_names) if name.startswith(f"{n}_true")]
+        if name.endswith("_clock"):
+            start.append(0.0)
+        elif states:
+            start.append(float(trial.states[0, states[-1]]))
+        else:
+            start.append(float(held[inputs[-1]]) if inputs else 0.0)
+    return np.array(start)

@@ -2,6 +2,10 @@
 
 Third parties add families by the entry point group `grounded.effects` (read once, by the command
 line's options.py); here a library is a plain value.
+
+The model is right in form: one of its own parameters differs from its nominal value.
+
+p = nominal + d
 """
 
 from __future__ import annotations
@@ -16,26 +20,40 @@ from grounded.effects import (
     geometry,
     input,
     memory,
-    parameter,
     places,
     rate,
     sensor,
-    slew,
 )
 from grounded.effects.aliases import aliases
-from grounded.effects.family import Effect, Family, RateFamily, Scales, Site
+from grounded.effects.family import Effect, Family, ParamFamily, Quantity, RateFamily, Scales, Site
 from grounded.errors import GroundedError, nearest
 from grounded.model import Model
+
+
+def _shift(site: Site) -> tuple[Quantity, ...]:
+    param = site.model.params[site.target]
+    low = -np.inf if param.low is None else param.low - param.value
+    high = np.inf if param.high is None else param.high - param.value
+    return (Quantity("d", param.unit, low=low, high=high),)
+
+
+parameter = ParamFamily(
+    name="parameter",
+    equation="p = nominal + d",
+    sentence="the parameter {target} is off by {d}",
+    targets=lambda model: model.param_names,
+    quantities=_shift,
+    lookalikes=("input_gain", "rate_gain", "viscous_friction", "first_order_lag"),
+)
 
 BUILT_IN: tuple[Family, ...] = (
     *input.FAMILIES,
     *memory.FAMILIES,
     *rate.FAMILIES,
-    *slew.FAMILIES,
     *friction.FAMILIES,
     *geometry.FAMILIES,
     *sensor.FAMILIES,
-    *parameter.FAMILIES,
+    parameter,
 )
 
 

@@ -15,6 +15,15 @@ the rate of a model that has another of them in it. A limit acts inside the adde
 It is a `step` model in plain NumPy, so that it is traced and compiled where the original was.
 Memory (a lag's output, a queue, a clock) becomes further states, all of them functions of the
 commands and the measured states: `memory_of` (recall.py) recovers them along a recorded trial.
+
+In which order several effects act: one rule for prediction, for probes, for adopted models.
+
+    command -> input effects as they were claimed -> transport delays -> model -> sensor effects
+
+A transport delay commutes with all that does not depend on time, so it may as well act last; there
+a fraction of a step blends two samples of what is delivered, not two commands that a nonlinear
+effect has yet to see. Of two effects the one that is wrapped LAST acts FIRST on a command, so
+wrapping goes from the model outwards: parameters, limits of rates, rates, sensors, inputs.
 """
 
 from __future__ import annotations
@@ -27,6 +36,7 @@ import numpy as np
 from grounded.compile.names import Named
 from grounded.effects.family import (
     Effect,
+    Family,
     InputFamily,
     MemoryFamily,
     ParamFamily,
@@ -313,3 +323,28 @@ def _sensor_delay_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, 
         return {**after, target: logged, **dict(zip(memory, line, strict=False))}
 
     return step, dict.fromkeys(memory, model.states[target])
+
+
+def acting_order(families: Sequence[Family]) -> list[int]:
+    """Indices of the effects on inputs, the one that acts first on a command first."""
+    own = [i for i, f in enumerate(families) if isinstance(f, InputFamily | MemoryFamily)]
+    return sorted(own, key=lambda i: _transports(families[i]))
+
+
+def wrapping_order(families: Sequence[Family]) -> list[int]:
+    """Indices of all effects, the one that is wrapped first (the innermost) first."""
+    inputs = acting_order(families)
+    rest = [i for i in range(len(families)) if i not in inputs]
+    return [*sorted(rest, key=lambda i: _depth(families[i])), *reversed(inputs)]
+
+
+def _transports(family: Family) -> bool:
+    return isinstance(family, MemoryFamily) and family.transport
+
+
+def _depth(family: Family) -> int:
+    if isinstance(family, ParamFamily):
+        return 0
+    if isinstance(family, RateFamily):
+        return 1 if family.parts else 2
+    return 3

@@ -14,8 +14,7 @@ from __future__ import annotations
 
 from grounded.estimate.consistency import Consistency, consistency
 from grounded.estimate.likelihood import NoiseEstimate
-from grounded.estimate.measurement import Measurement, of_function, of_states
-from grounded.estimate.noise import Noise
+from grounded.estimate.measurement import Measurement, Noise, of_function, of_states
 from grounded.estimate.record import Record, cut, merged, record_of
 from grounded.estimate.tracker import Tracker
 from grounded.estimate.trials import (

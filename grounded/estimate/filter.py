@@ -34,8 +34,7 @@ import numpy as np
 from grounded.estimate import lanes
 from grounded.estimate.batch import Batch
 from grounded.estimate.filtered import Filtered
-from grounded.estimate.measurement import Measurement
-from grounded.estimate.noise import Noise
+from grounded.estimate.measurement import Measurement, Noise
 from grounded.estimate.recursion import recursion
 from grounded.estimate.steps import ModelSteps
 from grounded.frozen import Array

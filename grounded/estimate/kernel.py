@@ -22,9 +22,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from grounded.compile import jit
-from grounded.compile.llvm_batch import Words
-from grounded.compile.llvm_text import Writer, declarations, splat
+from grounded.compile.emit.llvm_batch import Words
+from grounded.compile.emit.llvm_text import Writer, declarations, splat
+from grounded.compile.run import jit
 
 LARGEST = 16  # states or channels; beyond, NumPy
 SIZES = ("G", "T")

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 from grounded.estimate import kernel
 from grounded.estimate.batch import Batch
-from grounded.estimate.noise import Noise
+from grounded.estimate.measurement import Noise
 from grounded.frozen import Array
 
 
 def usable(T: int, n: int, ny: int) -> bool:
     """Whether the compiled recursions can run here, for these sizes."""
-    from grounded.compile import jit
+    from grounded.compile.run import jit
 
     return T > 0 and 0 < n <= kernel.LARGEST and 0 < ny <= kernel.LARGEST and not jit.trouble()
 
@@ -86,7 +86,7 @@ def linearised(
         e0: y - h(xbar), (T + 1, B, ny), zero where not seen.
         xbar: predicted states about which H holds, (T + 1, B, n).
     """
-    from grounded.compile import jit
+    from grounded.compile.run import jit
 
     width, B = jit.lanes(), len(batch.lengths)
     given = {"A": A, "f": f, "more": more, "track": track, "H": H, "e0": e0, "xbar": xbar}
@@ -107,7 +107,7 @@ def linearised(
 
 def forward(lin: Linearised, noise: Noise) -> Pass:
     """The filter along a linearisation."""
-    from grounded.compile.compiled import call
+    from grounded.compile.run.compiled import call
 
     G, T, n, ny, width = lin.sizes
     R = noise.measurement**2
@@ -137,7 +137,7 @@ def posterior_std(done: Pass) -> Array:
 
 def backward(done: Pass) -> dict[str, Array]:
     """The smoother: `ry` (G, T+1, n, W), `Ny` (G, T+1, n n, W), `r_slope` (G, T+1, ny, W)."""
-    from grounded.compile.compiled import call
+    from grounded.compile.run.compiled import call
 
     lin = done.linearised
     G, T, n, ny, width = lin.sizes

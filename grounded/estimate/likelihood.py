@@ -21,8 +21,7 @@ from grounded.estimate import lanes
 from grounded.estimate.batch import Batch, batch_of
 from grounded.estimate.filter import run
 from grounded.estimate.filtered import Filtered
-from grounded.estimate.measurement import Measurement
-from grounded.estimate.noise import Noise
+from grounded.estimate.measurement import Measurement, Noise
 from grounded.estimate.record import Record
 from grounded.estimate.recursion import recursion
 from grounded.estimate.smoother import smooth

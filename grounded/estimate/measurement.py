@@ -2,6 +2,12 @@
 
 The default measures states as they are. A camera that sees two markers, a gyroscope, an encoder
 are a function h of states (N, n) -> (N, ny), with its Jacobian or without (then it is differenced).
+
+Noise: how far a state strays in a step, and how far a measurement strays from the state.
+
+    x_{t+1} = f(x_t, u_t) + w_t,  w ~ N(0, diag(process^2)),     y = h(x) + v,  v ~ N(0, diag(r^2))
+
+Both are the data's to say: see `grounded.estimate.likelihood`.
 """
 
 from __future__ import annotations
@@ -12,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from grounded.errors import GroundedError, nearest
-from grounded.frozen import Array
+from grounded.frozen import Array, readonly
 from grounded.model import Model
 
 DIFFERENCE = 1e-6  # step of the central difference, relative to max(1, |x|)
@@ -111,3 +117,32 @@ def _differenced(function: Callable[[Array], Array]) -> Callable[[Array], Array]
         return np.asarray(slopes.transpose(0, 2, 1))
 
     return jacobian
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Standard deviations, in the units of the states and of the channels.
+
+    Args:
+        process: of w over `dt`, (n,); over another step h it is process * sqrt(h / dt).
+        measurement: of v, (ny,).
+        dt: [s].
+
+    Raises:
+        GroundedError: for a value that is negative or not finite, or a measurement without noise.
+    """
+
+    process: Array
+    measurement: Array
+    dt: float
+
+    def __post_init__(self) -> None:
+        for name in ("process", "measurement"):
+            value = readonly(getattr(self, name))
+            if value.ndim != 1 or not np.isfinite(value).all() or (value < 0).any():
+                raise GroundedError(f"{name} noise must be finite standard deviations, got {value}")
+            object.__setattr__(self, name, value)
+        if (self.measurement == 0).any():
+            raise GroundedError(
+                "a measurement without noise can't be filtered: give it a small std"
+            )

@@ -6,8 +6,7 @@ import numpy as np
 
 from grounded.estimate.batch import Batch
 from grounded.estimate.filtered import Filtered
-from grounded.estimate.measurement import Measurement
-from grounded.estimate.noise import Noise
+from grounded.estimate.measurement import Measurement, Noise
 from grounded.estimate.steps import Advance
 from grounded.frozen import Array
 

@@ -15,8 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from grounded.errors import GroundedError
-from grounded.estimate.measurement import Measurement, of_states
-from grounded.estimate.noise import Noise
+from grounded.estimate.measurement import Measurement, Noise, of_states
 from grounded.estimate.record import Record
 from grounded.frozen import Array
 from grounded.model import Model

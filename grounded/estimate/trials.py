@@ -12,8 +12,7 @@ from grounded.estimate.batch import Batch, batch_of
 from grounded.estimate.filter import run
 from grounded.estimate.filtered import Filtered
 from grounded.estimate.likelihood import NoiseEstimate, noise_of_records
-from grounded.estimate.measurement import Measurement, of_states
-from grounded.estimate.noise import Noise
+from grounded.estimate.measurement import Measurement, Noise, of_states
 from grounded.estimate.record import Record, records_of
 from grounded.estimate.smoother import smooth
 from grounded.estimate.steps import ModelSteps

@@ -14,14 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from grounded.experiments.bench import KINDS, bench, optimum
+from grounded.experiments.bench import KINDS, bench, optimum, standing_still, true_utility
 from grounded.experiments.car_tasks import NAMES
-from grounded.experiments.jobs import Engine, Job, Progress, run_jobs
+from grounded.experiments.jobs import Engine, Job, Progress, Table, run_jobs
 from grounded.experiments.methods import METHODS, run_method
-from grounded.experiments.scatter import standing_still, true_utility
-from grounded.experiments.summary import Table
-from grounded.improve import first_policy
-from grounded.search import Options
+from grounded.search.improve import first_policy
+from grounded.search.standing import Options
 
 SHARES = (0.5, 0.9, 0.97, 0.99)
 BUDGET = 40  # trials of every method but finite differences

@@ -7,10 +7,13 @@
 
 The optimum is what the search reaches when it plans with the TRUE model and latency: no method sees
 it. It is a local optimum, like the paper's; `share` of the gap may therefore exceed one.
+
+A plant with more or less of its own noise, and a policy's TRUE utility under it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,13 +22,12 @@ from grounded.experiments.car_tasks import LATENCY as MODELLED
 from grounded.experiments.car_tasks import car_task
 from grounded.experiments.real_car import CALIBRATION, SCATTER, real_car
 from grounded.experiments.real_car import LATENCY as TRUE
-from grounded.experiments.scatter import start_of
 from grounded.frozen import Array
-from grounded.improve import learn
 from grounded.models.car import model as car
 from grounded.plant import Noise, Plant
-from grounded.policy import Policy
-from grounded.search import Candidate, Options
+from grounded.policy import Policy, z_difference
+from grounded.search.improve import learn
+from grounded.search.standing import Candidate, Options
 from grounded.task import Task
 from grounded.trial import Trial
 
@@ -84,3 +86,96 @@ def optimum(case: Bench) -> tuple[Policy, float]:
     standing, _, _ = learn(case.truth, run, options)
     assert standing.incumbent is not None
     return standing.incumbent.candidate.policy, standing.incumbent.utility
+
+
+def scaled(plant: Plant, level: float) -> Plant:
+    """The plant with all standard deviations times `level`."""
+    noise = Noise(
+        **{
+            kind: {name: level * std for name, std in getattr(plant.noise, kind).items()}
+            for kind in ("start", "process", "measurement")
+        }
+    )
+    return replace(plant, noise=noise)
+
+
+def start_of(task: Task) -> dict[str, float]:
+    """The start state by name."""
+    return dict(zip(task.model.state_names, map(float, task.start), strict=True))
+
+
+def true_utility(task: Task, plant: Plant, policy: Policy, runs: int, seed: int = 1) -> float:
+    """Mean utility of fresh runs of a policy: what a winner's own trials flatter.
+
+    A run that crashes counts with the utility of a car that stayed at the start.
+    """
+    streams = [np.random.default_rng([seed, 7, i]) for i in range(runs)]
+    utilities = [task.utility(trial) for trial in many_runs(task, plant, policy, streams)]
+    return float(np.mean(np.maximum(utilities, standing_still(task))))
+
+
+def many_runs(
+    task: Task, plant: Plant, policy: Policy, streams: Sequence[np.random.Generator]
+) -> list[Trial]:
+    """`plant.run` of one policy for many streams side by side, one run a stream.
+
+    The plant's states and inputs must be the policy's, in the same order.
+    """
+    model, H, N = plant.model, policy.horizon, len(streams)
+    assert model.state_names == policy.state_names and model.input_names == policy.input_names
+    draws = np.stack([rng.standard_normal((2 + 2 * H, model.n)) for rng in streams])
+    start, process, error = (
+        np.array([getattr(plant.noise, kind).get(name, 0.0) for name in model.state_names])
+        for kind in ("start", "process", "measurement")
+    )
+    x = task.start + start * draws[:, 0]
+    measured = np.full((N, H + 1, model.n), np.nan)
+    measured[:, 0] = x + error * draws[:, 1]
+    sent = np.tile(policy.past, (N, H, 1))
+    for t in range(H):
+        sent[:, t] = _actions(policy, measured[:, t], sent, t)
+        x = _advanced(plant, policy, x, sent, t) + process * draws[:, 2 + 2 * t]
+        x = np.where(np.abs(x).max(axis=1, keepdims=True) <= 1e9, x, np.nan)
+        measured[:, t + 1] = x + error * draws[:, 3 + 2 * t]
+    names = (policy.state_names, policy.input_names)
+    trials = [
+        Trial(m, u, policy.dt, *names, start_inputs=policy.past)
+        for m, u in zip(measured, sent, strict=True)
+    ]
+    return [trial.until(trial.finite_steps) for trial in trials]
+
+
+def _actions(policy: Policy, x: Array, sent: Array, t: int) -> Array:
+    """The inputs of step t (N, m) for measured states x (N, n) and the inputs sent before."""
+    u: Array = np.tile(policy.feedforward[t], (len(x), 1))
+    if policy.gain is not None and policy.reference is not None:
+        past = [
+            sent[:, t - 1 - i, j] if t - 1 - i >= 0 else np.full(len(x), policy.past[j])
+            for j, depth in enumerate(policy.depths)
+            for i in range(depth)
+        ]
+        dz = z_difference(np.column_stack([x, *past]), policy.reference[t], policy.angles)
+        correction = dz @ policy.gain[t].T
+        u += np.where(np.isfinite(correction).all(axis=1, keepdims=True), correction, 0.0)
+    clipped: Array = np.clip(u, policy.low, policy.high)
+    return clipped
+
+
+def _advanced(plant: Plant, policy: Policy, x: Array, sent: Array, t: int) -> Array:
+    """One control step of N cars in substeps, each with the commands that have arrived."""
+    h = policy.dt / plant.substeps
+    for i in range(plant.substeps):
+        u = np.empty((len(x), len(policy.input_names)))
+        for j, name in enumerate(policy.input_names):
+            age = plant.latency.get(name, 0.0) - (i + 0.5) * h
+            row = t - int(np.ceil(age / policy.dt - 1e-9)) if age > 0 else t
+            u[:, j] = sent[:, row, j] if row >= 0 else policy.past[j]
+        with np.errstate(all="ignore"):
+            x = plant.model.system.step(x, u, plant.model.values, h)
+    return x
+
+
+def standing_still(task: Task) -> float:
+    """Utility of never moving: a floor for runs that ended early."""
+    error = task.model.difference(np.tile(task.start, (task.horizon + 1, 1)), task.target)
+    return -float((np.nan_to_num(error) ** 2 @ task.reward.state).sum())

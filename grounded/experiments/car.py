@@ -18,15 +18,13 @@ from typing import Any
 
 import numpy as np
 
-from grounded.experiments.bench import Bench, optimum
+from grounded.experiments.bench import Bench, optimum, true_utility
 from grounded.experiments.car_tasks import NAMES, car_task
-from grounded.experiments.jobs import Engine, Job, Progress, run_jobs
+from grounded.experiments.jobs import Engine, Job, Progress, Table, improvement, mean_se, run_jobs
 from grounded.experiments.real_car import LATENCY, real_car, real_plant
-from grounded.experiments.scatter import true_utility
-from grounded.experiments.summary import Table, improvement, mean_se
-from grounded.improve import learn
 from grounded.models.car import model as car
-from grounded.search import Candidate, Options
+from grounded.search.improve import learn
+from grounded.search.standing import Candidate, Options
 from grounded.trial import Trial
 
 PAPER = {"turn": 0.97, "circle": 0.88, "figure8": 0.63}

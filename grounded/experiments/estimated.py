@@ -22,17 +22,15 @@ from typing import Any
 import numpy as np
 
 from grounded.estimate import Measurement, Noise, noise_of
-from grounded.experiments.bench import Bench, optimum
+from grounded.experiments.bench import Bench, optimum, standing_still
 from grounded.experiments.car import BUDGET, ITERATIONS, PAPER, real_case
 from grounded.experiments.driving import RATE, film, hands, markers
 from grounded.experiments.filmed import Filmed, Flown
-from grounded.experiments.jobs import Engine, Job, Progress, run_jobs
-from grounded.experiments.scatter import standing_still
-from grounded.experiments.summary import Table, improvement, mean_se
+from grounded.experiments.jobs import Engine, Job, Progress, Table, improvement, mean_se, run_jobs
 from grounded.frozen import Array
-from grounded.improve import learn
 from grounded.policy import Policy
-from grounded.search import Candidate, Options
+from grounded.search.improve import learn
+from grounded.search.standing import Candidate, Options
 from grounded.trial import Trial
 
 CAMERA = 0.003  # [m] noise of a marker's position

@@ -20,8 +20,7 @@ import numpy as np
 
 from grounded.experiments.driving import drive, markers
 from grounded.experiments.first_values import first_values
-from grounded.experiments.jobs import Engine, Job, Progress, run_jobs
-from grounded.experiments.summary import Table
+from grounded.experiments.jobs import Engine, Job, Progress, Table, run_jobs
 from grounded.fit import fit
 from grounded.frozen import Array
 from grounded.model import Model

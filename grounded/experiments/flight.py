@@ -21,13 +21,21 @@ import numpy as np
 
 from grounded.errors import GroundedError
 from grounded.experiments.figure8 import RADIUS, figure8_target, flight_task, perturbed
-from grounded.experiments.jobs import Engine, Job, Progress, run_jobs
-from grounded.experiments.summary import Table, improvement, jsonable, mean_se
+from grounded.experiments.jobs import (
+    Engine,
+    Job,
+    Progress,
+    Table,
+    improvement,
+    jsonable,
+    mean_se,
+    run_jobs,
+)
 from grounded.frozen import Array
-from grounded.improve import first_policy, learn, propose
 from grounded.models.aircraft import model as aircraft
 from grounded.rollout import simulate
-from grounded.search import Candidate, Options
+from grounded.search.improve import first_policy, learn, propose
+from grounded.search.standing import Candidate, Options
 from grounded.task import Task
 from grounded.trial import Trial
 

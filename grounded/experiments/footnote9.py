@@ -22,10 +22,10 @@ from typing import Any
 
 import numpy as np
 
-from grounded.experiments.summary import Table
-from grounded.improve import learn
+from grounded.experiments.jobs import Table
 from grounded.model import Model, Param
-from grounded.search import Candidate, Options
+from grounded.search.improve import learn
+from grounded.search.standing import Candidate, Options
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded.utility import Reward

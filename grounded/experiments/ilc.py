@@ -24,10 +24,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from grounded.bias import effective_inputs
 from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.rollout import augmented, simulate
+from grounded.solve.bias import effective_inputs
 from grounded.task import Task
 from grounded.trial import Trial
 

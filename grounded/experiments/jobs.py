@@ -9,18 +9,27 @@ through Dask's own joblib backend (extra `grounded[cluster]`); there is no sched
                 caller may keep it on disk: a study that was cut off goes on where it was. The key
                 holds a hash of our sources, so that results of two versions are never mixed.
     lost worker its job is run again (by Dask itself, or here after a process died), not the study.
+
+Numbers that studies report: means with standard errors, improvements, slopes, tables.
+
+Improvement of a utility (never positive) from U_0 to U: (U - U_0) / |U_0|, so 0.76 means that 76 %
+of the cost is gone. The paper does not say whether its 76 % is a mean of ratios or a ratio of
+means; both are given.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, MutableMapping, Sequence
+import math
+from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from grounded.errors import GroundedError
 
@@ -216,3 +225,44 @@ def _import(name: str, remedy: str) -> Any:
         return importlib.import_module(name)
     except ImportError as error:
         raise GroundedError(f"this needs the package '{name}': {remedy}") from error
+
+
+@dataclass(frozen=True)
+class Table:
+    """A title, column heads and rows of text, for the terminal and for docs/experiments.md."""
+
+    title: str
+    head: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
+def improvement(before: float, after: float) -> float:
+    """Share of the cost that is gone."""
+    return (after - before) / abs(before)
+
+
+def mean_se(values: Sequence[float]) -> tuple[float, float]:
+    """Mean and one standard error of it (nan for fewer than two values)."""
+    data = np.asarray(values, dtype=float)
+    if len(data) < 2:
+        return (float(data.mean()) if len(data) else math.nan), math.nan
+    return float(data.mean()), float(data.std(ddof=1) / math.sqrt(len(data)))
+
+
+def jsonable(value: Any) -> Any:
+    """The same with null for numbers that JSON does not have (nan, infinities)."""
+    if isinstance(value, Mapping):
+        return {key: jsonable(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [jsonable(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def slope(x: Sequence[float], y: Sequence[float]) -> tuple[float, float]:
+    """Least-squares slope of log y over log x, and its standard error."""
+    u, v = np.log(np.asarray(x, dtype=float)), np.log(np.asarray(y, dtype=float))
+    centred = u - u.mean()
+    value = float(centred @ v / (centred @ centred))
+    left = v - v.mean() - value * centred
+    spread = math.sqrt(float(left @ left) / max(len(u) - 2, 1) / float(centred @ centred))
+    return value, spread

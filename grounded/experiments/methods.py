@@ -22,10 +22,10 @@ import numpy as np
 from grounded.experiments.bench import Bench
 from grounded.experiments.ilc import gradient_of, lifted, update
 from grounded.frozen import Array
-from grounded.improve import first_policy, propose
 from grounded.model import Model
 from grounded.policy import Policy
-from grounded.search import Candidate, Options
+from grounded.search.improve import first_policy, propose
+from grounded.search.standing import Candidate, Options
 from grounded.task import Task
 from grounded.trial import Trial, mean_trial
 

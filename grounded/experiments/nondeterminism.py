@@ -14,11 +14,10 @@ from typing import Any
 
 import numpy as np
 
+from grounded.experiments.bench import scaled
 from grounded.experiments.car_tasks import DT, car_task
-from grounded.experiments.jobs import Engine, Job, Progress, run_jobs
+from grounded.experiments.jobs import Engine, Job, Progress, Table, run_jobs
 from grounded.experiments.real_car import real_plant
-from grounded.experiments.scatter import scaled
-from grounded.experiments.summary import Table
 from grounded.frozen import Array
 from grounded.models.car import model as car
 

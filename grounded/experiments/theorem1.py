@@ -26,13 +26,21 @@ from typing import Any
 
 import numpy as np
 
-from grounded.bias import ground
 from grounded.compile import Problem
-from grounded.experiments.jobs import Engine, Job, Progress, run_jobs
-from grounded.experiments.summary import Table, jsonable, mean_se, slope
+from grounded.experiments.jobs import (
+    Engine,
+    Job,
+    Progress,
+    Table,
+    jsonable,
+    mean_se,
+    run_jobs,
+    slope,
+)
 from grounded.frozen import Array
 from grounded.model import Model, Param
-from grounded.policy_gradient import gradient
+from grounded.solve.bias import ground
+from grounded.solve.policy_gradient import gradient
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded.utility import Reward

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from grounded.estimate import Noise
-from grounded.fit.gauss_newton import direction
-from grounded.fit.innovations import Data, Linear, Point, linear, point
+from grounded.fit.gauss_newton import Data, Linear, Point, direction, linear, point
 from grounded.frozen import Array
 
 COARSE, FINE, ROUNDS = 21, 5, 4

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from grounded.estimate import Measurement, Noise, Record, cut
 from grounded.estimate.batch import batch_of
 from grounded.estimate.likelihood import enough, first_noise, maximum_likelihood
-from grounded.fit.gauss_newton import Climb, climb
-from grounded.fit.innovations import Data, Linear, Point, linear, point
+from grounded.fit.gauss_newton import Climb, Data, Linear, Point, climb, linear, point
 from grounded.fit.scan import coarse_to_fine, quiet, scan
 from grounded.fit.unknowns import Unknowns
 from grounded.frozen import Array

@@ -1,6 +1,8 @@
-"""The disk: MCAP logs, mapping, resampling, the store, the workspace, recordings.
+"""The disk: logs, the store, the workspace, reports. A file is data, never code.
 
-Own files are written by `mcap_log` and kept by `store`; foreign logs come in through `signals`
-(which values, from which messages) and `resample` (onto the control grid). A file is data, never
-code: nothing read here is executed.
+formats/    bytes of log files as arrays
+logs/       foreign logs: which signal is which state, samples on the control grid
+store/      our own files, content-addressed
+workspace/  START HERE: a folder with a task, and what each command does in it
+report/     text, page, pictures, recording
 """

@@ -1,0 +1,246 @@
+"""Blind cases: a crude model, real trials, and a label that is sealed apart.
+
+A case is data; the command line writes it as a workspace of MCAP trials. Everything about it
+follows from one seed: the system, the task, rates, noise, number of trials, the effect and its size
+from barely visible to large.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from grounded.challenge import systems, withheld
+from grounded.challenge.draws import draw, values_of
+from grounded.challenge.truth import Disturbance, Truth
+from grounded.effects import Effect, ParamFamily, scales_of
+from grounded.errors import GroundedError
+from grounded.frozen import Array
+from grounded.model import Model
+from grounded.trial import Trial
+
+Kind = Literal["single", "double", "none", "withheld"]
+KINDS: tuple[Kind, ...] = ("single", "double", "none", "withheld")
+NOISE_KINDS = ("white", "coloured", "heavy")
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """One case. `model` is what the user has; `label` is what is sealed."""
+
+    name: str
+    system: str
+    model: Model
+    trials: tuple[Trial, ...]
+    fresh: tuple[Trial, ...]  # further trials of the same truth, for judging predictions
+    dt: float
+    target: Array  # (T + 1, n)
+    start: Array
+    low: Array
+    high: Array
+    latency: Array  # (m,) [s]
+    label: Mapping[str, Any] = field(default_factory=dict)
+
+
+def make(
+    kind: Kind,
+    count: int,
+    seed: int,
+    *,
+    only: str | None = None,
+    param_error: float | None = None,
+    noise: str | None = None,
+) -> Iterator[Case]:
+    """Cases of a kind, one by one.
+
+    Args:
+        kind: single, double, none or withheld.
+        count: how many.
+        seed: everything follows from it.
+        only: one system instead of all three.
+        param_error: relative errors of the model's parameters (uniform), instead of a random third
+            of the cases with 5 %.
+        noise: "white", "coloured" or "heavy", instead of mostly white (of all three for "none").
+
+    Raises:
+        GroundedError: for an unknown kind or system.
+    """
+    if kind not in KINDS:
+        raise GroundedError(f"a challenge is one of {', '.join(KINDS)}; got '{kind}'")
+    if only is not None and only not in systems.SYSTEMS:
+        raise GroundedError(f"systems of the challenge: {', '.join(systems.SYSTEMS)}; got '{only}'")
+    for i in range(count):
+        rng = np.random.default_rng([seed, KINDS.index(kind), i])
+        name = only or rng.choice(list(systems.SYSTEMS), p=[0.6, 0.2, 0.2])
+        yield _case(f"{kind}-{i:04d}", kind, i, systems.SYSTEMS[name](), rng, param_error, noise)
+
+
+def sealed(label: Mapping[str, Any]) -> str:
+    """The hash under which a label is announced before it is opened."""
+    return hashlib.sha256(json.dumps(label, sort_keys=True).encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class _Setting:
+    """What is drawn for a case beside its effect."""
+
+    dt: float
+    steps: int
+    trials: int
+    level: float
+    roughness: float
+    same_task: bool
+    kind: str
+
+
+def _case(
+    name: str,
+    kind: Kind,
+    index: int,
+    system: systems.SystemUnderTest,
+    rng: np.random.Generator,
+    param_error: float | None,
+    noise: str | None,
+) -> Case:
+    dt = 1.0 / float(rng.choice(system.rates))
+    duration = float(rng.uniform(5, 10)) if system.name != "aircraft" else float(rng.uniform(5, 7))
+    drawn = NOISE_KINDS[index % 3] if kind == "none" else rng.choice(NOISE_KINDS, p=[0.8, 0.1, 0.1])
+    setting = _Setting(
+        dt=dt,
+        steps=round(duration / dt),
+        trials=int(rng.integers(3, 9)),
+        level=float(rng.choice([0.5, 1.0, 2.0])),
+        roughness=float(rng.choice([0.5, 1.0, 3.0])),
+        same_task=bool(rng.random() < 0.3),
+        kind=noise or str(drawn),
+    )
+    error = param_error
+    if error is None:
+        error = 0.05 if kind == "single" and rng.random() < 0.33 else 0.0
+    crude = _with_errors(system.model, error, rng)
+    plans = _plans(system, crude, setting, rng)
+    disturbance = Disturbance(
+        {k: v * setting.roughness for k, v in system.process.items()},
+        {k: v * setting.level for k, v in system.measurement.items()},
+        setting.kind,
+    )
+    truth, label = _truth(kind, system, plans, setting, disturbance, rng)
+    runs = [_run(system, truth, plan, setting, rng) for plan in plans]
+    label |= {
+        "noise": setting.kind,
+        "level": setting.level,
+        "roughness": setting.roughness,
+        "param_error": error,
+    }
+    label |= {"system": system.name, "kind": kind, "case": name}
+    return Case(
+        name=name,
+        system=system.name,
+        model=crude,
+        trials=tuple(runs[: setting.trials]),
+        fresh=tuple(runs[setting.trials :]),
+        dt=dt,
+        target=plans[0][2],
+        start=plans[0][1],
+        low=system.low,
+        high=system.high,
+        latency=np.array(system.latency or (0.0,) * system.model.m),
+        label=label,
+    )
+
+
+def _with_errors(model: Model, error: float, rng: np.random.Generator) -> Model:
+    if error == 0:
+        return model
+    factors = 1 + error * rng.uniform(-1, 1, len(model.params))
+    names = zip(model.params.items(), factors, strict=True)
+    return model.with_values({n: p.value * float(f) for (n, p), f in names})
+
+
+Plan = tuple[Array, Array, Array, Array]  # inputs (T, m), start (n,), target (T + 1, n), gains
+
+
+def _plans(
+    system: systems.SystemUnderTest, crude: Model, setting: _Setting, rng: np.random.Generator
+) -> list[Plan]:
+    """A manoeuvre for each trial (or one for all, inputs varied a little), and two fresh ones."""
+    t = np.arange(setting.steps) * setting.dt
+    found: list[Plan] = []
+    for i in range(setting.trials + 2):
+        if i == 0 or not setting.same_task:
+            u, start = system.manoeuvre(rng, t, crude)
+        else:
+            spread = 0.05 * (system.high - system.low)
+            bend = np.column_stack([systems.wave(rng, t, 2, 0.1, 0.5) for _ in range(crude.m)])
+            u, start = np.clip(found[0][0] + spread * bend, system.low, system.high), found[0][1]
+        target, gains = systems.regulator(system, crude, u, start, setting.dt)
+        found.append((u, start, target, gains))
+    return found
+
+
+def _run(
+    system: systems.SystemUnderTest,
+    truth: Truth,
+    plan: Plan,
+    setting: _Setting,
+    rng: np.random.Generator,
+) -> Trial:
+    u, start, target, gains = plan
+    model = truth.model
+
+    def control(t: int, y: Array) -> Array:
+        error = np.clip(model.difference(y, target[t]), -2.0, 2.0)
+        return np.asarray(np.clip(u[t] + gains[t] @ error, system.low, system.high))
+
+    held = u[0] if system.name == "aircraft" else system.held
+    wobble = np.array([truth.disturbance.measurement.get(n, 0.0) for n in model.state_names])
+    first = start + wobble * rng.standard_normal(model.n)
+    return truth.run(rng, control, first, held, setting.steps, setting.dt)
+
+
+def _truth(
+    kind: Kind,
+    system: systems.SystemUnderTest,
+    plans: list[Plan],
+    setting: _Setting,
+    disturbance: Disturbance,
+    rng: np.random.Generator,
+) -> tuple[Truth, dict[str, Any]]:
+    model, latency = system.model, system.latency
+    states = np.concatenate([plan[2] for plan in plans])
+    inputs = np.concatenate([plan[0] for plan in plans])
+    scales = scales_of(model, states, inputs, setting.dt, setting.steps * setting.dt)
+    if kind == "none":
+        return Truth(model, disturbance=disturbance, latency=latency), {"effects": []}
+    if kind == "withheld":
+        driven = "v" if system.name == "car" else ("omega" if system.name == "pendulum" else "q")
+        rate = float(np.quantile(np.abs(np.diff(states[:, model.state_names.index(driven)])), 0.9))
+        hidden = withheld.draw(
+            rng,
+            model,
+            np.abs(inputs - inputs.mean(axis=0)).max(axis=0) + 0.5 * np.abs(inputs).max(axis=0),
+            driven,
+            max(rate / setting.dt, 0.3),
+            setting.steps * setting.dt,
+        )
+        truth = Truth(model, (), disturbance, hidden.actuators, hidden.rates, latency)
+        label = {"name": hidden.name, "target": hidden.target, "params": hidden.params}
+        return truth, {"effects": [], "withheld": label}
+    effects: list[tuple[Effect, dict[str, float]]] = []
+    while len(effects) < (2 if kind == "double" else 1):
+        effect = draw(model, scales, rng)
+        if effect.name not in [e.name for e, _ in effects]:
+            effects.append((effect, values_of(effect, scales, rng, states)))
+    true_model = model
+    for effect, values in effects:
+        if isinstance(effect.family, ParamFamily):
+            name = effect.site.target
+            true_model = true_model.with_values({name: true_model.params[name].value + values["d"]})
+    acting = tuple((e, v) for e, v in effects if not isinstance(e.family, ParamFamily))
+    named = [{"effect": e.name, "params": dict(v)} for e, v in effects]
+    return Truth(true_model, acting, disturbance, latency=latency), {"effects": named}

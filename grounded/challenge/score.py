@@ -1,0 +1,192 @@
+"""Judging diagnoses against opened labels, and against an oracle that knows the effect.
+
+The oracle fits the true effects (values free, noise and parameters as in a diagnosis) and nothing
+else: a case counts as detectable where its evidence exceeds 3 nats, and its held-out gap is what a
+diagnosis is compared with.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from grounded.diagnosis.data import prepare
+from grounded.diagnosis.hypothesis import Hypothesis
+from grounded.diagnosis.prediction_error import horizon, normalised
+from grounded.diagnosis.search import Search
+from grounded.diagnosis.shrinkage import held_out
+from grounded.effects import Library
+from grounded.frozen import Array
+from grounded.model import Model
+from grounded.trial import Trial
+
+DETECTABLE = 3.0  # nats
+
+
+@dataclass(frozen=True)
+class Oracle:
+    """Evidence of the true effects over the best hypothesis without [nats]; their held-out gap."""
+
+    evidence: float
+    gap_after: float
+    each: Mapping[str, float]  # what the evidence loses without each true effect
+
+
+def oracle(
+    model: Model, trials: Sequence[Trial], latency: Array, label: Mapping[str, Any]
+) -> Oracle | None:
+    """What knowing the label would give; None where the library has no such effect."""
+    if not label["effects"]:
+        return None
+    data = prepare(model, trials, latency)
+    effects = [Library().effect(e["effect"], model, data.scales) for e in label["effects"]]
+    values = [
+        {q.name: float(e["params"][q.name]) for q in effect.free}
+        for e, effect in zip(label["effects"], effects, strict=True)
+    ]
+    search = Search(data, Library().candidates(model, data.scales))
+    search.nulls()
+
+    def fitted(which: Sequence[int]) -> float:
+        """The best score of a set of the true effects."""
+        h = Hypothesis()
+        for i in which:
+            h = h.plus(effects[i], values[i])
+        starts = [(h, f.noise, f.track) for f in (*search.of_size(0), *_plain(search))]
+        for start in [*starts, search.fresh(h)]:
+            fits = search.refined([start], 12)
+            for fit in fits:
+                search.calibrated(fit)
+        names = tuple(sorted(h.names))
+        found = [
+            f for f in search.of_size(len(which)) if tuple(sorted(f.hypothesis.names)) == names
+        ]
+        search.fair(found[0])
+        return search.score(found[0])
+
+    everything = list(range(len(effects)))
+    whole = fitted(everything)
+    each = {}
+    for i, effect in enumerate(effects):
+        rest = [j for j in everything if j != i]
+        below = fitted(rest) if rest else search.score(search.best_null())
+        each[effect.name] = whole - below
+    best = search.of_size(len(effects))[0]
+    where = horizon(search.predictor, best, 1.0)
+    gap = normalised(held_out(search.predictor, best, best.track, where), where)
+    return Oracle(whole - search.score(search.best_null()), gap, each)
+
+
+def _plain(search: Search) -> list[Any]:
+    """Fits without effects under white noise with exact parameters."""
+    return [
+        f
+        for (structure, spread, names), f in search.fits.items()
+        if not names and spread == 0 and structure.tau is None
+    ]
+
+
+def judge(
+    label: Mapping[str, Any], diagnosis: Mapping[str, Any], known: Oracle | None
+) -> dict[str, Any]:
+    """One case's marks."""
+    truth = [e["effect"] for e in label["effects"]]
+    named = list(diagnosis["verdict"]["effects"])
+    order = [r["effect"] for r in diagnosis["ranking"]]
+    group = set(order[:1])
+    for g in diagnosis["indistinguishable"]:
+        if order and order[0] in g:
+            group |= set(g[:3])
+    marks: dict[str, Any] = {
+        "case": label["case"],
+        "kind": label["kind"],
+        "noise": label["noise"],
+        "verdict": diagnosis["verdict"]["kind"],
+        "truth": truth or [label.get("withheld", {}).get("name", "none")],
+        "named": named,
+        "first": bool(truth) and order[:1] == truth[:1],
+        "in_group": bool(truth) and truth[0] in group,
+        "top3": bool(truth) and truth[0] in order[:3],
+        "both": set(truth) <= set(named),
+        "leftover": bool(diagnosis["leftover"]),
+        "gap_after": diagnosis["gap"]["after"],
+        "false_effect": not truth and any(not n.startswith("parameter:") for n in named),
+    }
+    if known is not None:
+        marks["evidence"] = known.evidence
+        marks["detectable"] = known.evidence > DETECTABLE
+        marks["each_detectable"] = all(v > DETECTABLE for v in known.each.values())
+        marks["gap_ratio"] = diagnosis["gap"]["after"] / max(known.gap_after, 1e-9)
+    marks |= _values(label, diagnosis)
+    return marks
+
+
+def _values(label: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> dict[str, Any]:
+    """Errors and interval coverage of the true effects' values, where they were claimed."""
+    covered, errors = [], []
+    rows = {r["effect"]: r for r in diagnosis["ranking"] if r["claimed"]}
+    for entry in label["effects"]:
+        row = rows.get(entry["effect"])
+        if row is None:
+            continue
+        for name, estimate in row["params"].items():
+            true = float(entry["params"][name])
+            low, high = estimate["interval"]
+            covered.append(bool(low <= true <= high))
+            if abs(true) > 1e-12:
+                errors.append(abs(estimate["value"] - true) / abs(true))
+    return {"covered": covered, "errors": errors}
+
+
+def summary(marks: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Figures of a set of judged cases, by kind."""
+    found: dict[str, Any] = {}
+    for kind in sorted({m["kind"] for m in marks}):
+        some = [m for m in marks if m["kind"] == kind]
+        row: dict[str, Any] = {"cases": len(some)}
+        row["verdicts"] = {
+            v: sum(m["verdict"] == v for m in some)
+            for v in ("effect", "several", "none", "unknown")
+        }
+        if kind == "single":
+            seen = [m for m in some if m.get("detectable")]
+            row |= {
+                "detectable": len(seen),
+                "first": _part(seen, "first"),
+                "in_group": _part(seen, "in_group"),
+                "top3": _part(seen, "top3"),
+                "first_of_all": _part(some, "first"),
+                "leftover": _part(seen, "leftover"),
+            }
+        if kind == "double":
+            seen = [m for m in some if m.get("each_detectable")]
+            row |= {"both_detectable": len(seen), "both": _part(seen, "both")}
+        if kind in ("single", "double"):
+            covered = [c for m in some for c in m["covered"]]
+            ratios = [m["gap_ratio"] for m in some if m.get("detectable")]
+            row["coverage"] = float(np.mean(covered)) if covered else None
+            row["gap_ratio_median"] = float(np.median(ratios)) if ratios else None
+            row["gap_within_1.15"] = float(np.mean(np.array(ratios) < 1.15)) if ratios else None
+            errors = [e for m in some for e in m["errors"]]
+            row["param_error_median"] = float(np.median(errors)) if errors else None
+        if kind == "none":
+            row["false"] = {
+                noise: _part([m for m in some if m["noise"] == noise], "false_effect")
+                for noise in sorted({m["noise"] for m in some})
+            }
+        if kind == "withheld":
+            bad = [m["false_effect"] and m["gap_after"] > 1.3 and not m["leftover"] for m in some]
+            row["misleading"] = float(np.mean(bad))
+            row["claimed"] = _part(some, "false_effect")
+            row["leftover"] = _part(some, "leftover")
+        times = [m["cpu_s"] for m in some if "cpu_s" in m]
+        row["cpu_s_mean"] = float(np.mean(times)) if times else None
+        found[kind] = row
+    return found
+
+
+def _part(marks: Sequence[Mapping[str, Any]], key: str) -> float | None:
+    return float(np.mean([bool(m[key]) for m in marks])) if marks else None

@@ -1,0 +1,131 @@
+"""Kernels over N independent samples, W lanes at a time: the step, and its Jacobian.
+
+A kernel takes one pointer, to a table of 64-bit words: addresses, integers, doubles. The Jacobian
+is computed as the values of its places and scattered into matrices that are zero elsewhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from grounded.compile.emit.llvm_step import Dynamics, StepWriter
+from grounded.compile.emit.llvm_text import Writer
+
+BATCH = ("x", "u", "p", "dt", "eps", "N", "out", "f_x", "f_u", "f_p")  # a kernel's words
+
+
+class Words:
+    """The table of words that a kernel is called with."""
+
+    def __init__(self, f: Writer, names: Sequence[str]) -> None:
+        self.f, self.names = f, tuple(names)
+
+    def _address(self, name: str) -> str:
+        return self.f.at("%words", self.names.index(name), "i64")
+
+    def pointer(self, name: str) -> str:
+        """An array."""
+        return self.f.emit(f"load ptr, ptr {self._address(name)}, align 8")
+
+    def integer(self, name: str) -> str:
+        """An i64."""
+        return self.f.emit(f"load i64, ptr {self._address(name)}, align 8")
+
+    def double(self, name: str) -> str:
+        """A double."""
+        return self.f.emit(f"load double, ptr {self._address(name)}, align 8")
+
+
+def start_table(f: Writer, words: Words, d: Dynamics) -> str:
+    """Room for the uniform values, filled."""
+    table = f.room(d.uniforms.size)
+    p, dt, eps = words.pointer("p"), words.double("dt"), words.double("eps")
+    f.do(f"call void @uniforms(ptr {p}, double {dt}, double {eps}, ptr {table})")
+    return table
+
+
+def gather_rows(
+    f: Writer, arrays: Sequence[tuple[str, int, str]], first: str, count: str, width: int
+) -> None:
+    """Rows first .. first + W - 1 of (count, size) arrays to [size][W], the last row repeated.
+
+    Args:
+        f: where to write.
+        arrays: (address, size, destination) of each.
+        first: number of the first row.
+        count: number of rows.
+        width: W.
+    """
+    last = f.integer("sub", count, 1)
+    with f.loop(width) as lane:
+        i = f.integer("add", first, lane)
+        beyond = f.emit(f"icmp sgt i64 {i}, {last}")
+        row = f.emit(f"select i1 {beyond}, i64 {last}, i64 {i}")
+        for base, size, out in arrays:
+            source, to = f.at(base, f.integer("mul", row, size)), f.at(out, lane)
+            for j in range(size):
+                f.store(f.load(source, j), to, j * width)
+
+
+def step_kernel(d: Dynamics, width: int) -> str:
+    """`void @step(words)`: out (N, n)."""
+    f = Writer("void @step(ptr %words)")
+    words = Words(f, BATCH)
+    x, u, out, count = (
+        words.pointer("x"),
+        words.pointer("u"),
+        words.pointer("out"),
+        words.integer("N"),
+    )
+    table = start_table(f, words, d)
+    writer = StepWriter(f, d, width, table)
+    blocks = f.integer("sdiv", f.integer("add", count, width - 1), width)
+    with f.loop(blocks) as block:
+        first = f.integer("mul", block, width)
+        gather_rows(f, [(x, d.n, writer.x), (u, d.m, writer.u)], first, count, width)
+        writer.step()
+        left = f.integer("sub", count, first)
+        full = f.emit(f"icmp sgt i64 {left}, {width}")
+        with f.loop(f.emit(f"select i1 {full}, i64 {width}, i64 {left}")) as lane:
+            to = f.at(out, f.integer("mul", f.integer("add", first, lane), d.n))
+            source = f.at(writer.next, lane)
+            for i in range(d.n):
+                f.store(f.load(source, i * width), to, i)
+    f.do("ret void")
+    return f.text()
+
+
+def linearise_kernel(d: Dynamics, width: int, k: int) -> str:
+    """`void @linearise(words)`: f_x (N, n, n), f_u (N, n, m) and, for k > 0, f_p (N, n, k)."""
+    f = Writer("void @linearise(ptr %words)")
+    words = Words(f, BATCH)
+    x, u, count = words.pointer("x"), words.pointer("u"), words.integer("N")
+    table = start_table(f, words, d)
+    xu, following = f.room((d.n + d.m) * width), f.room(d.n * width)
+    values = f.room(len(d.places) * width)
+    blocks = f.integer("sdiv", f.integer("add", count, width - 1), width)
+    with f.loop(blocks) as block:
+        first, inputs = f.integer("mul", block, width), f.at(xu, d.n * width)
+        gather_rows(f, [(x, d.n, xu), (u, d.m, inputs)], first, count, width)
+        f.do(f"call i64 @jacobian(ptr {xu}, ptr {table}, ptr {following}, ptr {values})")
+        left = f.integer("sub", count, first)
+        full = f.emit(f"icmp sgt i64 {left}, {width}")
+        with f.loop(f.emit(f"select i1 {full}, i64 {width}, i64 {left}")) as lane:
+            _scatter(f, words, d, k, f.integer("add", first, lane), f.at(values, lane), width)
+    f.do("ret void")
+    return f.text()
+
+
+def _scatter(
+    f: Writer, words: Words, d: Dynamics, k: int, row: str, values: str, width: int
+) -> None:
+    """One sample's values into its matrices."""
+    starts, matrices = [0, d.n, d.n + d.m], [("f_x", d.n), ("f_u", d.m), ("f_p", k)]
+    to = [
+        f.at(words.pointer(name), f.integer("mul", row, d.n * size)) if size else ""
+        for name, size in matrices
+    ]
+    for e, (r, c) in enumerate(d.places):
+        which = sum(c >= start for start in starts) - 1
+        index = r * matrices[which][1] + c - starts[which]
+        f.store(f.load(values, e * width), to[which], index)

@@ -1,0 +1,160 @@
+"""Tables of 64-bit words, a kernel's only argument: addresses, integers, doubles.
+
+What a problem gives every kernel is packed once and kept beside the problem; a call adds its own.
+
+Memory for results, used again: the first touch of a page costs as much as ten control steps.
+
+A solve of thousands of steps fills a megabyte. Taken from the system and given back each time, its
+pages would be mapped and zeroed each time, which takes longer than the computation. So a block goes
+to a shelf when the last array made of it is gone, and the next result of that size takes it down.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from grounded.compile.emit.llvm_rollout import Layout
+from grounded.compile.problem import Array, Problem, queue_of
+
+Table = ctypes.Array[ctypes.c_int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Packed:
+    """A problem as words, its arrays kept alive beside them."""
+
+    words: dict[str, int]
+    kept: tuple[Array, ...]
+    layout: Layout
+    kernels: dict[Any, Any] = field(default_factory=dict)  # by system, see `CompiledSystem`
+
+
+def packed(problem: Problem) -> Packed:
+    """The words of a problem, made when they are first asked for."""
+    known: Packed | None = problem.__dict__.get("_packed")
+    if known is None:
+        known = problem.__dict__["_packed"] = _pack(problem)
+    return known
+
+
+def _pack(problem: Problem) -> Packed:
+    queue, shift = queue_of(problem), problem.input_shift
+    m = len(problem.depths)
+    arrays = {
+        "start": problem.z_start(),
+        "p": problem.p,
+        "bias": problem.bias,
+        "shift": np.zeros((problem.horizon, m)) if shift is None else shift,
+        "target": problem.target,
+        "weight": problem.state_weight,
+        "input_target": problem.input_target,
+        "R": problem.input_weight,
+        "S": problem.change_weight,
+        "low": problem.low,
+        "high": problem.high,
+        "now": queue.now,
+        "past": queue.past,
+    }
+    kept = {name: plain(array) for name, array in arrays.items()}
+    words = {name: word(array) for name, array in kept.items()}
+    words |= {"dt": word(float(problem.dt)), "eps": word(float(problem.smoothing))}
+    words["H"] = problem.horizon
+    layout = Layout(problem.system.n, problem.depths, tuple(bool(a) for a in problem.angles))
+    return Packed(words, tuple(kept.values()), layout)
+
+
+def table(names: Sequence[str], known: Mapping[str, int], values: Mapping[str, Any]) -> Table:
+    """Words in the order of `names`: of `values`, else `known`, else 0 (a null pointer)."""
+    return (ctypes.c_int64 * len(names))(
+        *[word(values[name]) if name in values else known.get(name, 0) for name in names]
+    )
+
+
+def call(function: Any, names: Sequence[str], values: Mapping[str, Any]) -> int:
+    """Calls a kernel with these words; arrays must be contiguous float64."""
+    return run(function, table(names, {}, values))
+
+
+def run(function: Any, words: Table) -> int:
+    """Calls a kernel with its table, which outlives the call."""
+    return int(function(ctypes.addressof(words)))
+
+
+def word(value: Any) -> int:
+    """An integer as it is, an array's address, a double's bits."""
+    if type(value) is int:
+        return value
+    if isinstance(value, np.ndarray):
+        return address(value) if value.size else int(value.ctypes.data)
+    return int(struct.unpack("<q", struct.pack("<d", value))[0])
+
+
+def address(array: Array) -> int:
+    """Where an array's first element is."""
+    return int(array.__array_interface__["data"][0])
+
+
+def plain(array: Any) -> Array:
+    """The array as a kernel reads it."""
+    return np.ascontiguousarray(array, dtype=np.float64)
+
+
+SMALL = 2**13  # doubles; below, the C library keeps its pages
+MOST = 2**23  # doubles on the shelf
+
+_shelf: dict[int, list[Array]] = {}  # free blocks by size
+
+
+def empty(shape: tuple[int, ...]) -> Array:
+    """An array whose values are not set, float64 and C-contiguous."""
+    size = math.prod(shape)
+    if size < SMALL:
+        return np.empty(shape)
+    return np.asarray(_Block(1 << (size - 1).bit_length(), shape), np.float64)
+
+
+def zeros(shape: tuple[int, ...]) -> Array:
+    """An array of zeros, float64 and C-contiguous."""
+    array = empty(shape)
+    array.fill(0.0)
+    return array
+
+
+def side_by_side(shapes: Mapping[str, tuple[int, ...]]) -> tuple[dict[str, Array], dict[str, int]]:
+    """Arrays of these shapes in one block, each on a cache line of its own, and their addresses."""
+    places, size = dict[str, tuple[int, int]](), 0
+    for name, shape in shapes.items():
+        end = size + math.prod(shape)
+        places[name] = (size, end)
+        size = (end + 7) & -8
+    block = empty((size,))
+    start = int(block.__array_interface__["data"][0])
+    arrays = {name: block[a:b].reshape(shapes[name]) for name, (a, b) in places.items()}
+    return arrays, {name: start + 8 * first for name, (first, _) in places.items()}
+
+
+class _Block:
+    """Owns memory that an array and its views look at; NumPy keeps it alive as their base."""
+
+    def __init__(self, size: int, shape: tuple[int, ...]) -> None:
+        try:
+            self._memory = _shelf[size].pop()
+        except (KeyError, IndexError):
+            self._memory = np.empty(size)  # a page that is never touched takes no room
+        self.__array_interface__: dict[str, Any] = dict(self._memory.__array_interface__)
+        self.__array_interface__["shape"] = shape
+
+    def __del__(self, shelf: dict[int, list[Array]] = _shelf, most: int = MOST) -> None:
+        memory = getattr(self, "_memory", None)
+        if memory is None:
+            return
+        blocks = shelf.setdefault(memory.size, [])
+        if sum(size * len(kept) for size, kept in tuple(shelf.items())) + memory.size <= most:
+            blocks.append(memory)

@@ -1,0 +1,297 @@
+"""The fast path: the user's function as machine code.
+
+Three modules, each made when it is first asked for: steps and Jacobians of many samples; rollouts
+and sweeps about one layout of z (its delays); the sensitivities that a fit needs. Parameters, bias,
+targets and weights are arguments: one compile serves every trial, every perturbed model, every fit.
+What can't be compiled, or would take too long to, is left to the interpreted twin (`traced.py`).
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import threading
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from grounded.compile.emit.llvm_batch import BATCH, linearise_kernel, step_kernel
+from grounded.compile.emit.llvm_box import MAX_INPUTS, box_functions
+from grounded.compile.emit.llvm_descent import (
+    COST,
+    COUNT,
+    DESCENT,
+    FAILED_AT,
+    TURN,
+    descent_kernel,
+)
+from grounded.compile.emit.llvm_product import sweep_tables
+from grounded.compile.emit.llvm_riccati import SWEEP, sweep_kernel
+from grounded.compile.emit.llvm_rollout import LANES, ROLLOUT, Layout, rollout_kernel
+from grounded.compile.emit.llvm_step import Dynamics, dynamics_of, jacobian_function, stage_tables
+from grounded.compile.emit.llvm_text import declarations
+from grounded.compile.problem import (
+    STATUSES,
+    Array,
+    Backward,
+    Descent,
+    Integrator,
+    Options,
+    Problem,
+    Swarm,
+)
+from grounded.compile.run import jit
+from grounded.compile.run.arguments import (
+    call,
+    empty,
+    packed,
+    plain,
+    run,
+    side_by_side,
+    table,
+    zeros,
+)
+from grounded.compile.run.traced import TracedSystem
+from grounded.compile.trace.tracing import Signature, Trace, Variant
+
+__all__ = ["BATCH", "CompiledSystem", "Kernels", "call"]
+
+SMALL = 600  # operations of a model that need not be counted with their derivatives
+MAX_PLACES = 8_000  # of a Jacobian that a kernel keeps on its stack, 4 MB of it
+FORMAT = 1  # raise when kernels change their words or their meaning
+
+
+class Kernels:
+    """The compiled modules of one trace, each made (or loaded) when it is first called."""
+
+    def __init__(self, variant: Variant, system: CompiledSystem) -> None:
+        n, m, k = self.sizes = (system.n, system.m, system.k)
+        self._variant, self._kind, self._integrator = variant, system.kind, system.integrator
+        graph = variant.trace.graph.digest(variant.trace.outputs)  # its derivatives follow from it
+        self._key = (
+            f"{FORMAT} {jit.writers()} {graph} {n} {m} {k} {system.kind} {system.integrator}"
+        )
+        self._libraries: dict[Any, jit.Library] = {}
+        self._lock = threading.RLock()
+
+    @cached_property
+    def dynamics(self) -> Dynamics:
+        """Values and derivatives by state and input."""
+        return self._dynamics(self.sizes[0] + self.sizes[1])
+
+    def _dynamics(self, width: int) -> Dynamics:
+        n, m, _ = self.sizes
+        return dynamics_of(self._variant, n, m, width, self._kind, self._integrator)
+
+    def batch(self) -> jit.Library:
+        """Step and linearise, of many samples."""
+        return self._library("batch", ("step", "linearise", "jacobian"), self._batch_text)
+
+    def search(self, layout: Layout) -> jit.Library:
+        """Rollout and, for few enough inputs, sweep and descent; about a layout of z."""
+        small = layout.m <= MAX_INPUTS
+        names = ("rollout", "sweep", "descent") if small else ("rollout",)
+        return self._library(layout, names, lambda: self._search_text(layout))
+
+    def full(self) -> jit.Library:
+        """Linearise with respect to the parameters as well."""
+        return self._library("full", ("linearise",), self._full_text)
+
+    def _library(self, key: Any, names: Sequence[str], write: Callable[[], str]) -> jit.Library:
+        known = self._libraries.get(key)
+        if known is not None:
+            return known
+        with self._lock:
+            if key not in self._libraries:
+                digest = hashlib.sha256(f"{self._key} {key}".encode()).hexdigest()
+                self._libraries[key] = jit.library(digest, write, names)
+            return self._libraries[key]
+
+    def _batch_text(self) -> str:
+        d, width = self.dynamics, jit.lanes()
+        kernels = (
+            jacobian_function(d, width) + linearise_kernel(d, width, 0) + step_kernel(d, width)
+        )
+        return _start_of_module(d, width) + kernels
+
+    def _full_text(self) -> str:
+        d, width = self._dynamics(sum(self.sizes)), jit.lanes()
+        kernels = jacobian_function(d, width) + linearise_kernel(d, width, self.sizes[2])
+        return _start_of_module(d, width) + kernels
+
+    def _search_text(self, layout: Layout) -> str:
+        d, width = self.dynamics, jit.lanes()
+        text = _start_of_module(d, width) + rollout_kernel(d, layout)
+        if layout.m > MAX_INPUTS:
+            return text
+        text += sweep_tables(d, width) + box_functions(layout.m) + sweep_kernel(d, layout, width)
+        return text + descent_kernel(layout.m, layout.nz)
+
+
+def _start_of_module(d: Dynamics, width: int) -> str:
+    return declarations({width, LANES}) + stage_tables(d) + d.uniforms.function()
+
+
+class CompiledSystem(TracedSystem):
+    """A traced function, compiled."""
+
+    how = "compiled"
+
+    def __init__(self, signature: Signature, first: Trace, integrator: Integrator) -> None:
+        super().__init__(signature, first, integrator, "")
+        self._kernels: dict[int, Kernels] = {}
+
+    @property
+    def operations(self) -> int:
+        """Operations of the model and its derivatives where it is large; 0 says it is small."""
+        large = [v for v in self._variants if len(v.trace.graph.nodes) > SMALL]
+        return max((variant.operations() for variant in large), default=0)
+
+    def _compiled(self, p: Array, dt: float) -> Kernels:
+        variant = self.variant(p, dt)
+        kernels = self._kernels.get(id(variant))
+        if kernels is None:
+            kernels = self._kernels.setdefault(id(variant), Kernels(variant, self))
+        return kernels
+
+    def step(self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0) -> Array:
+        """See `System.step`."""
+        out = empty((len(x), self.n))
+        library = self._compiled(p, dt).batch()
+        self._batch(library["step"], (x, u, p, dt, smoothing), {"out": out})
+        return out
+
+    def linearise(
+        self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
+    ) -> tuple[Array, Array]:
+        """See `System.linearise`."""
+        N, n = len(x), self.n
+        f_x, f_u = zeros((N, n, n)), zeros((N, n, self.m))
+        library = self._compiled(p, dt).batch()
+        self._batch(library["linearise"], (x, u, p, dt, smoothing), {"f_x": f_x, "f_u": f_u})
+        return f_x, f_u
+
+    def sensitivities(
+        self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
+    ) -> tuple[Array, Array, Array]:
+        """See `System.sensitivities`."""
+        if self.n * (self.n + self.m + self.k) > MAX_PLACES:
+            return super().sensitivities(x, u, p, dt, smoothing)
+        N, n = len(x), self.n
+        f_x, f_u, f_p = zeros((N, n, n)), zeros((N, n, self.m)), zeros((N, n, self.k))
+        out = {"f_x": f_x, "f_u": f_u, "f_p": f_p}
+        self._batch(self._compiled(p, dt).full()["linearise"], (x, u, p, dt, smoothing), out)
+        return f_x, f_u, f_p
+
+    def _batch(
+        self, kernel: Any, point: tuple[Array, Array, Array, float, float], out: dict[str, Array]
+    ) -> None:
+        x, u, p, dt, eps = point
+        if len(x) == 0:
+            return
+        words = dict.fromkeys(BATCH, 0) | {"x": plain(x), "u": plain(u), "p": plain(p)}
+        call(kernel, BATCH, words | {"dt": float(dt), "eps": float(eps), "N": len(x)} | out)
+
+    def rollout(
+        self,
+        problem: Problem,
+        ubar: Array,
+        K: Array | None = None,
+        zbar: Array | None = None,
+        k: Array | None = None,
+        alphas: Array | None = None,
+    ) -> Swarm:
+        """See `System.rollout`."""
+        steps = np.ones(1) if alphas is None else np.asarray(alphas, float)
+        runs, H, nz = len(steps), problem.horizon, problem.nz
+        z, u, cost = empty((runs, H + 1, nz)), empty((runs, H, self.m)), np.empty(runs)
+        known, lanes = packed(problem), np.empty(LANES)
+        values = _policy(ubar, K, zbar, k) | {"alphas": lanes}
+        kernel = self._search(problem)[0]["rollout"]
+        for at in range(0, runs, LANES):
+            some = min(LANES, runs - at)
+            lanes[:some], lanes[some:] = steps[at : at + some], steps[at]
+            values |= {"runs": some, "z": z[at:], "u": u[at:], "cost": cost[at:]}
+            run(kernel, table(ROLLOUT, known.words, values))
+        return Swarm(z, u, cost)
+
+    def backward(
+        self,
+        problem: Problem,
+        z: Array,
+        u: Array,
+        damping: Array,
+        into: Backward | None = None,
+    ) -> Backward:
+        """See `System.backward`."""
+        if self.m > MAX_INPUTS:
+            return super().backward(problem, z, u, damping)
+        H, nz = problem.horizon, problem.nz
+        expected = np.zeros(2)
+        if into is not None and into.K.shape == (H, self.m, nz):
+            k, K = into.k, into.K
+        else:
+            k, K = empty((H, self.m)), empty((H, self.m, nz))
+        values = {"z_run": plain(z), "u_run": plain(u), "damping": plain(damping)}
+        values |= {"k": k, "K": K, "expected": expected}
+        library, jacobian = self._search(problem)
+        words = table(SWEEP, packed(problem).words | {"jacobian": jacobian}, values)
+        failed = run(library["sweep"], words)
+        if failed >= 0:
+            k[: failed + 1], K[: failed + 1] = 0.0, 0.0
+        elif not np.isfinite(K[0]).all():
+            failed = 0
+        return Backward(k, K, float(expected[0]), float(expected[1]), failed)
+
+    def descend(
+        self,
+        problem: Problem,
+        ubar: Array,
+        K: Array | None,
+        zbar: Array | None,
+        options: Options,
+    ) -> Descent | None:
+        """See `System.descend`."""
+        if self.m > MAX_INPUTS:
+            return None
+        H, nz, m, known = problem.horizon, problem.nz, self.m, packed(problem).words
+        most = max(int(options.max_iterations), 0)
+        library, jacobian = self._search(problem)
+        results, at = side_by_side(
+            {"z0": (H + 1, nz), "z1": (H + 1, nz), "u0": (H, m), "u1": (H, m), "k": (H, m)}
+            | {"K": (H, m, nz), "damping": (m,), "alphas": (LANES,), "costs": (LANES,)}
+            | {"expected": (2,), "result": (4,), "lines": (most + 1, 4)}
+        )
+        results["alphas"][:] = 1.0
+        policy = _policy(ubar, K, zbar, None)
+        first = {"cost": at["costs"], "runs": 1, "z": at["z0"], "u": at["u0"]}
+        rollout = table(ROLLOUT, known, at | first | policy)
+        sweep = table(SWEEP, known | {"jacobian": jacobian}, at)
+        values = at | {"rollout": ctypes.addressof(rollout), "sweep": ctypes.addressof(sweep)}
+        values |= {"halvings": int(options.halvings), "max_iterations": most}
+        settings = {"accept": float(options.accept), "tolerance": float(options.tolerance)}
+        words = table(DESCENT, {}, values | settings | {"scale": plain(problem.input_scale)})
+        status = STATUSES[run(library["descent"], words)]
+        found = results["result"]
+        z, u = ("z1", "u1") if found[TURN] else ("z0", "u0")
+        lines = results["lines"][: int(found[COUNT])].copy()
+        gains, cost = (results["k"], results["K"]), float(found[COST])
+        return Descent(status, results[z], results[u], *gains, cost, int(found[FAILED_AT]), lines)
+
+    def _search(self, problem: Problem) -> tuple[jit.Library, int]:
+        """The kernels about a problem's layout, and the address of the Jacobian they call."""
+        known = packed(problem)
+        if self not in known.kernels:
+            kernels = self._compiled(problem.p, problem.dt)
+            search = kernels.search(known.layout)
+            known.kernels[self] = search, kernels.batch().addresses["jacobian"]
+        found: tuple[jit.Library, int] = known.kernels[self]
+        return found
+
+
+def _policy(ubar: Array, K: Array | None, zbar: Array | None, k: Array | None) -> dict[str, Any]:
+    """Words of a policy: those that are not given are null."""
+    given = {"ubar": ubar, "K": None if zbar is None else K, "zbar": zbar, "k": k}
+    return {name: 0 if array is None else plain(array) for name, array in given.items()}

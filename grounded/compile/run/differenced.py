@@ -1,0 +1,166 @@
+"""The path that always works: the user's function, called; its derivatives, differenced.
+
+The function is first given arrays of N samples a name. One that can't take them (an `if` on a
+state, `math.sin`, a simulator) is called sample by sample; a function that takes them but mixes
+the samples up is found out by comparing a few samples with single calls.
+
+Central differences with a step h = 6e-6 max(1, |x|) (the cube root of the machine's precision)
+are good to about 1e-10 of the function's scale; all 2 (n + m) shifted points go in one call.
+`smoothing` is ignored here: what can't be traced can't be smoothed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from grounded.compile.names import Named, check_names, raised_at, where, wrong_value
+from grounded.compile.problem import Array, Integrator, Kind
+from grounded.compile.run.interpreted import Interpreted
+from grounded.errors import GroundedError
+
+RELATIVE_STEP = float(np.cbrt(np.finfo(float).eps))
+CHUNK = 4096  # samples in one call, so that long horizons don't fill the memory
+
+
+class DifferencedSystem(Interpreted):
+    """Any Python callable as a System."""
+
+    how = "differenced"
+
+    def __init__(
+        self,
+        function: Callable[..., Mapping[str, Any]],
+        *,
+        kind: Kind,
+        states: Sequence[str],
+        inputs: Sequence[str],
+        params: Sequence[str],
+        integrator: Integrator = "rk4",
+        note: str = "",
+        returns: Sequence[str] = (),
+    ) -> None:
+        super().__init__(kind, integrator, (len(states), len(inputs), len(params)), note)
+        self.function, self.source = function, where(function)
+        self.states, self.inputs, self.params = tuple(states), tuple(inputs), tuple(params)
+        self.outputs = tuple(returns) or self.states  # names of what the function returns
+        self._batches = True  # until the function fails on arrays
+        self._calls = 0
+
+    def evaluate(self, x: Array, u: Array, p: Array, dt: float, smoothing: float) -> Array:
+        """The function at N samples."""
+        x, u = np.asarray(x, float), np.asarray(u, float)
+        if len(x) > 1 and self._batches:
+            result = self._batch(x, u, p, dt)
+            if result is not None:
+                return result
+            self._batches = False
+        return np.array([self._single(a, b, p, dt) for a, b in zip(x, u, strict=True)]).reshape(
+            len(x), len(self.outputs)
+        )
+
+    def check(self, x: Array, u: Array, p: Array, dt: float) -> None:
+        """Nothing to compare: this is the user's own function."""
+
+    def linearise(
+        self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
+    ) -> tuple[Array, Array]:
+        """f_x and f_u by central differences of `step`."""
+        shifted = self.n + self.m
+        both = np.concatenate([x, u], axis=1)
+        J = np.empty((len(x), self.n, shifted))
+        size = max(1, CHUNK // (2 * shifted))
+        for at in range(0, len(x), size):
+            J[at : at + size] = self._jacobian(both[at : at + size], p, dt)
+        return np.ascontiguousarray(J[:, :, : self.n]), np.ascontiguousarray(J[:, :, self.n :])
+
+    def sensitivities(
+        self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
+    ) -> tuple[Array, Array, Array]:
+        """As `linearise`, and f_p."""
+        f_x, f_u = self.linearise(x, u, p, dt)
+        f_p = np.empty((len(x), self.n, self.k))
+        for i, value in enumerate(p):
+            up, down = np.array(p, float), np.array(p, float)
+            up[i] += RELATIVE_STEP * max(1.0, abs(value))
+            down[i] -= RELATIVE_STEP * max(1.0, abs(value))
+            f_p[:, :, i] = (self.step(x, u, up, dt) - self.step(x, u, down, dt)) / (up[i] - down[i])
+        return f_x, f_u, f_p
+
+    def _jacobian(self, both: Array, p: Array, dt: float) -> Array:
+        """(N, n + m) points -> (N, n, n + m), in one call of the step."""
+        N, d = both.shape
+        h = RELATIVE_STEP * np.maximum(1.0, np.abs(both))
+        points = np.broadcast_to(both, (2, d, N, d)).copy()
+        i = np.arange(d)
+        points[0, i, :, i] += h.T
+        points[1, i, :, i] -= h.T
+        width = (points[0, i, :, i] - points[1, i, :, i]).T  # what was really stepped (N, d)
+        flat = points.reshape(-1, d)
+        y = self.step(flat[:, : self.n], flat[:, self.n :], p, dt).reshape(2, d, N, self.n)
+        with np.errstate(all="ignore"):
+            return np.asarray((y[0] - y[1]).transpose(1, 2, 0) / width[:, None, :])
+
+    def _batch(self, x: Array, u: Array, p: Array, dt: float) -> Array | None:
+        """The function on arrays of samples; None when it can't take them."""
+        self._calls += 1
+        try:
+            values = self._call([*x.T], [*u.T], p, dt)
+            result = np.empty((len(x), len(self.outputs)))
+            for i, name in enumerate(self.outputs):
+                result[:, i] = np.broadcast_to(np.asarray(values[name], float), len(x))
+        except Exception:  # whatever it is, the call on one sample tells the user
+            return None
+        if self._calls & (self._calls - 1):
+            return result
+        for i in (0, len(x) - 1):  # calls 1, 2, 4, 8 ... : do samples stay apart?
+            alone = self._single(x[i], u[i], p, dt)
+            if not np.allclose(alone, result[i], rtol=1e-9, atol=1e-9, equal_nan=True):
+                return None
+        return result
+
+    def _single(self, x: Array, u: Array, p: Array, dt: float) -> Array:
+        """The function on one sample; NaN where it leaves the finite numbers."""
+        if not (np.isfinite(x).all() and np.isfinite(u).all()):
+            return np.full(len(self.outputs), np.nan)
+        try:
+            values = self._call(x.tolist(), u.tolist(), p, dt)
+        except ArithmeticError:
+            return np.full(len(self.outputs), np.nan)
+        except ValueError as error:
+            if "math domain error" in str(error) or "nonnegative input" in str(error):
+                return np.full(len(self.outputs), np.nan)
+            raise self._failure(error) from error
+        except GroundedError:
+            raise
+        except Exception as error:
+            raise self._failure(error) from error
+        return np.array([self._number(name, values[name]) for name in self.outputs])
+
+    def _call(self, x: Sequence[Any], u: Sequence[Any], p: Array, dt: float) -> Mapping[str, Any]:
+        s = Named("state", self.states, x)
+        a = Named("input", self.inputs, u)
+        parameters = Named("parameter", self.params, np.asarray(p, float).tolist())
+        with np.errstate(all="ignore"):
+            if self.kind == "step":
+                values = self.function(s, a, parameters, dt)
+            else:
+                values = self.function(s, a, parameters)
+        check_names(values, self.outputs, self.function)
+        return values
+
+    def _number(self, name: str, value: Any) -> float:
+        try:
+            array = np.asarray(value)
+            if array.size == 1 and array.dtype.kind in "fiub":
+                return float(array.reshape(()))
+        except Exception:  # ragged lists and stranger things are described below
+            array = np.asarray(None)
+        raise wrong_value(name, value, self.function)
+
+    def _failure(self, error: Exception) -> GroundedError:
+        return GroundedError(
+            f"{raised_at(error, self.function)}: the model raised {type(error).__name__}: {error}"
+        )

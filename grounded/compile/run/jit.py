@@ -1,0 +1,113 @@
+"""LLVM IR text to functions, by llvmlite, through the disk cache.
+
+Loading a cached object takes about a millisecond; compiling takes a tenth of a second. Kernels are
+called through ctypes, which releases the GIL while they run.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import threading
+from collections.abc import Callable, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from grounded.compile.run import cache as disk
+
+OLDEST = (0, 45)  # of llvmlite: pointers without a type
+OPTIMISATION = 1  # of LLVM's code generator; the text is optimised as it is written
+_LOCK = threading.Lock()
+
+
+@cache
+def _host() -> tuple[str, str, str]:
+    """CPU name, its features, and everything that makes compiled code fit here and now."""
+    import llvmlite
+    import llvmlite.binding as llvm
+
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    name, features = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
+    version = ".".join(str(v) for v in llvm.llvm_version_info)
+    triple = llvm.get_process_triple()
+    return name, features, f"{llvmlite.__version__} {version} {triple} {name} {features}"
+
+
+def _machine() -> Any:
+    """The host as a target machine; an engine takes it over, so each gets its own.
+
+    Code and constants are mapped apart, now and then by more than the 2 GB that the small code
+    model reaches: then LLVM aborts, or worse. The large one addresses anything.
+    """
+    import llvmlite.binding as llvm
+
+    name, features, _ = _host()
+    return llvm.Target.from_default_triple().create_target_machine(
+        cpu=name, features=features, opt=OPTIMISATION, reloc="static", codemodel="large", jit=True
+    )
+
+
+def trouble() -> str:
+    """Why nothing can be compiled here, or nothing: llvmlite is missing or too old."""
+    try:
+        import llvmlite.binding
+    except (ImportError, OSError) as error:
+        return f"llvmlite can't be imported ({error})"
+    found = tuple(int(part) for part in llvmlite.__version__.split(".")[:2] if part.isdigit())
+    return "" if found >= OLDEST else f"llvmlite {llvmlite.__version__} is older than 0.45"
+
+
+@cache
+def lanes() -> int:
+    """Doubles in the widest vector of this machine, 4 or 8."""
+    return 8 if "+avx512f" in _host()[1].split(",") else 4
+
+
+@cache
+def writers() -> str:
+    """A hash of the files that write kernels: another version of us writes another text."""
+    text = hashlib.sha256()
+    for path in sorted(Path(__file__).parents[1].rglob("*.py")):
+        text.update(path.read_bytes())
+    return text.hexdigest()[:16]
+
+
+class Library:
+    """Compiled functions of one module; keeps the code alive."""
+
+    def __init__(self, engine: Any, names: Sequence[str]) -> None:
+        self._engine = engine
+        prototype = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_void_p)
+        self.addresses = {name: int(engine.get_function_address(name)) for name in names}
+        self.functions: dict[str, Callable[[int], int]] = {
+            name: prototype(address) for name, address in self.addresses.items()
+        }
+
+    def __getitem__(self, name: str) -> Callable[[int], int]:
+        return self.functions[name]
+
+
+def library(key: str, write: Callable[[], str], names: Sequence[str]) -> Library:
+    """The functions of a module, loaded from the cache or compiled now.
+
+    Args:
+        key: identifies the text; the machine and llvmlite's version are added here.
+        write: returns the IR text, called only when it has to be compiled.
+        names: functions wanted, each `(words: ptr) -> i64 or void`.
+    """
+    import llvmlite.binding as llvm
+
+    with _LOCK:  # LLVM's global context is not thread safe
+        digest = hashlib.sha256(f"{key} {_host()[2]}".encode()).hexdigest()
+        machine, code = _machine(), disk.read(digest)
+        if code is None:
+            module = llvm.parse_assembly(write())
+            module.triple = llvm.get_process_triple()
+            code = machine.emit_object(module)
+            disk.write(digest, code)
+        engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
+        engine.add_object_file(llvm.ObjectFileRef.from_data(code))
+        engine.finalize_object()
+        return Library(engine, names)

@@ -1,0 +1,145 @@
+"""The path between: the user's function as a graph, run by NumPy, with exact derivatives.
+
+It needs no compiler, vectorises over samples even where the function itself can't, and is the
+twin against which the compiled kernels are tested. The derivative of an integration step follows
+the stages of Runge-Kutta: with k_i = f(x_i), x_i = x + c_i dt k_{i-1}, T_i = d x_i / d (x, u, p),
+
+    K_i = f_x(x_i) T_i + [0 f_u f_p],    T_{i+1} = [I 0 0] + c_{i+1} dt K_i,
+    d x' / d (x, u, p) = [I 0 0] + dt sum_i b_i K_i.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from grounded.compile.names import where
+from grounded.compile.problem import STAGES, Array, Integrator
+from grounded.compile.run.differenced import DifferencedSystem
+from grounded.compile.run.interpreted import Interpreted
+from grounded.compile.trace.graph import Program
+from grounded.compile.trace.tracing import (
+    Signature,
+    Trace,
+    Variant,
+    leaves_of,
+    trace,
+    values_and_jacobian,
+)
+from grounded.errors import GroundedError
+
+CHUNK = 1024  # samples at once
+AGREE = 1e-9  # a trace and its original, relative to the size of the state's values
+
+
+class TracedSystem(Interpreted):
+    """A traced function, interpreted."""
+
+    how = "traced"
+
+    def __init__(
+        self, signature: Signature, first: Trace, integrator: Integrator, note: str
+    ) -> None:
+        sizes = (len(signature.states), len(signature.inputs), len(signature.params))
+        super().__init__(signature.kind, integrator, sizes, note)
+        self.signature, self.source = signature, where(signature.function)
+        self.states = signature.states
+        self.original = DifferencedSystem(
+            signature.function,
+            kind=signature.kind,
+            states=signature.states,
+            inputs=signature.inputs,
+            params=signature.params,
+            integrator=integrator,
+        )
+        self._variants = [Variant(first, sizes)] if not first.guards else []
+
+    def variant(self, p: Array, dt: float) -> Variant:
+        """The trace that holds for these parameters.
+
+        Raises:
+            GroundedError: when the branch they take can't be traced.
+        """
+        for known in self._variants:
+            if known.trace.holds(p, dt):
+                return known
+        found = trace(self.signature, np.asarray(p, float), dt)
+        if isinstance(found, str):
+            raise GroundedError(f"{found}; with these parameters only; use np.where")
+        self._variants.append(Variant(found, (self.n, self.m, self.k)))
+        return self._variants[-1]
+
+    def evaluate(self, x: Array, u: Array, p: Array, dt: float, smoothing: float) -> Array:
+        """The graph at N samples."""
+        values = self.variant(p, dt).values(leaves_of(x, u, p, dt), smoothing)
+        return np.stack([np.broadcast_to(v, len(x)) for v in values], axis=1)
+
+    def linearise(
+        self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
+    ) -> tuple[Array, Array]:
+        """f_x and f_u, exact."""
+        J = self._derivatives(x, u, p, dt, smoothing, False)
+        return np.ascontiguousarray(J[:, :, : self.n]), np.ascontiguousarray(J[:, :, self.n :])
+
+    def sensitivities(
+        self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
+    ) -> tuple[Array, Array, Array]:
+        """f_x, f_u and f_p, exact."""
+        J = self._derivatives(x, u, p, dt, smoothing, True)
+        ends = (self.n, self.n + self.m)
+        f_x, f_u, f_p = np.split(J, ends, axis=2)
+        return np.ascontiguousarray(f_x), np.ascontiguousarray(f_u), np.ascontiguousarray(f_p)
+
+    def check(self, x: Array, u: Array, p: Array, dt: float) -> None:
+        """See `System.check`."""
+        x, u = np.asarray(x, float), np.asarray(u, float)
+        with np.errstate(all="ignore"):
+            mine = self.evaluate(x, u, p, dt, 0.0)
+            theirs = self.original.evaluate(x, u, p, dt, 0.0)
+        scale = 1.0 + np.max(np.abs(theirs), axis=0, initial=0.0, where=np.isfinite(theirs))
+        differ = ~np.isclose(mine, theirs, rtol=AGREE, atol=0.0, equal_nan=True)
+        differ &= ~(np.abs(mine - theirs) <= AGREE * scale)
+        if differ.any():
+            t, i = np.argwhere(differ)[0]
+            raise GroundedError(
+                f"{where(self.signature.function)}: the traced model differs from the function: "
+                f"at sample {t}, state '{self.signature.states[i]}', the trace gives "
+                f"{mine[t, i]!r} and the function {theirs[t, i]!r}. Does it use random numbers, "
+                "keep a memory, or look at the type of its arguments?"
+            )
+
+    def _derivatives(
+        self, x: Array, u: Array, p: Array, dt: float, smoothing: float, full: bool
+    ) -> Array:
+        width = self.n + self.m + (self.k if full else 0)
+        J = np.empty((len(x), self.n, width))
+        variant = self.variant(p, dt)
+        program = variant.full if full else variant.small
+        for at in range(0, len(x), CHUNK):
+            some = slice(at, at + CHUNK)
+            with np.errstate(all="ignore"):
+                J[some] = self._chain(program, x[some], u[some], p, dt, smoothing, width)
+        return J
+
+    def _chain(
+        self,
+        program: tuple[Program, list[tuple[int, int]]],
+        x: Array,
+        u: Array,
+        p: Array,
+        dt: float,
+        smoothing: float,
+        width: int,
+    ) -> Array:
+        if self.kind == "step":
+            return values_and_jacobian(program, leaves_of(x, u, p, dt), smoothing, len(x), width)[1]
+        identity = np.eye(self.n, width)
+        k, K = np.zeros_like(x), np.zeros((len(x), self.n, width))
+        total = np.zeros_like(K)
+        for c, b in STAGES[self.integrator]:
+            leaves = leaves_of(x + c * dt * k, u, p, dt)
+            k, K_own = values_and_jacobian(program, leaves, smoothing, len(x), width)
+            T = identity + c * dt * K
+            K = K_own[:, :, : self.n] @ T
+            K[:, :, self.n :] += K_own[:, :, self.n :]
+            total = total + b * K
+        return np.asarray(identity + dt * total)

@@ -1,0 +1,193 @@
+"""Runs the user's function once on expressions and keeps the graph of what it computed.
+
+An `if` on a parameter is decided by the parameter's value while tracing, and remembered: such a
+trace holds only where the same decisions come out (`guards`), and another one is made where they
+don't. An `if` on a state or an input can't be decided; the reason and its line become the note of
+the slower path that is taken instead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from grounded.compile.names import Named, check_names, raised_at, wrong_value
+from grounded.compile.problem import Array, Kind
+from grounded.compile.trace.derivative import jacobian
+from grounded.compile.trace.expression import Expression, NotTraceable, node_of
+from grounded.compile.trace.graph import MAX_NODES, Graph, Program, TooLong
+from grounded.compile.trace.rebinding import rebound
+from grounded.errors import GroundedError
+
+
+@dataclass(frozen=True)
+class Signature:
+    """What a user's function is called with."""
+
+    function: Callable[..., Mapping[str, Any]]
+    kind: Kind
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    params: tuple[str, ...]
+    returns: tuple[str, ...] = ()  # names of what it returns; empty: the states
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the returned values, in array order."""
+        return self.returns or self.states
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """The graph of a function: a node for each state, and the decisions it rests on."""
+
+    graph: Graph
+    outputs: tuple[int, ...]  # (n,)
+    guards: tuple[tuple[int, bool], ...]
+
+    def holds(self, p: Array, dt: float) -> bool:
+        """Whether the function would take the same branches with these parameters."""
+        if not self.guards:
+            return True
+        found = Program(self.graph, [i for i, _ in self.guards])(_uniform(p, dt), 0.0)
+        return all(bool(v) == outcome for v, (_, outcome) in zip(found, self.guards, strict=True))
+
+
+def trace(signature: Signature, p: Array | None, dt: float, limit: int = MAX_NODES) -> Trace | str:
+    """The trace, or why there is none, naming file and line.
+
+    Args:
+        signature: the function and its names.
+        p: parameter values (k,) that decide an `if` on parameters; None: every `if` is taken.
+        dt: control step [s], which may be part of such a decision.
+        limit: most operations.
+
+    Raises:
+        GroundedError: for what is wrong with the function on any path: names, a complex result.
+    """
+    graph, guards = Graph(limit), []
+
+    def oracle(i: int) -> bool:
+        if any(graph.nodes[j].leaf and graph.nodes[j].leaf[0] in "xu" for j in graph.live([i])):  # type: ignore[index]
+            raise NotTraceable("an `if` (or and, or, while) on a state or an input; use np.where")
+        outcome = True if p is None else bool(Program(graph, [i])(_uniform(p, dt), 0.0)[0])
+        guards.append((i, outcome))
+        return outcome
+
+    graph.oracle = oracle
+    try:
+        values = _call(signature, graph)
+    except GroundedError:
+        raise
+    except TooLong as error:
+        found = f"{raised_at(error, signature.function)}: it unrolls to {error} (a long loop?)"
+        if signature.kind == "step":  # a simulator of one's own runs as it is
+            return found
+        raise GroundedError(
+            f"{found}; write it with fewer steps, or give the model as step=, which is run as it "
+            "is, on finite differences"
+        ) from None
+    except NotTraceable as error:
+        return f"{raised_at(error, signature.function)}: {error}"
+    except Exception as error:  # the plain call will tell whether this is the user's mistake
+        return f"{raised_at(error, signature.function)}: {type(error).__name__}: {error}"
+    check_names(values, signature.outputs, signature.function)
+    outputs = tuple(_output(graph, name, values[name], signature) for name in signature.outputs)
+    return Trace(graph, outputs, tuple(guards))
+
+
+def _call(signature: Signature, graph: Graph) -> Mapping[str, Any]:
+    def leaves(letter: str, count: int) -> list[Expression]:
+        return [Expression(graph, graph.leaf(letter, i)) for i in range(count)]
+
+    s = Named("state", signature.states, leaves("x", len(signature.states)))
+    a = Named("input", signature.inputs, leaves("u", len(signature.inputs)))
+    p = Named("parameter", signature.params, leaves("p", len(signature.params)))
+    function = rebound(signature.function)
+    if signature.kind == "step":
+        values = function(s, a, p, Expression(graph, graph.leaf("d")))
+    else:
+        values = function(s, a, p)
+    return values  # type: ignore[no-any-return]
+
+
+def _output(graph: Graph, name: str, value: Any, signature: Signature) -> int:
+    if getattr(value, "size", 1) == 1 and hasattr(value, "reshape"):
+        value = value.reshape(-1)[0]
+    try:
+        return node_of(graph, value)
+    except NotTraceable:
+        raise wrong_value(name, value, signature.function) from None
+
+
+def _uniform(p: Array, dt: float) -> dict[tuple[str, int], Any]:
+    return {("d", 0): dt} | {("p", i): value for i, value in enumerate(p)}
+
+
+def leaves_of(
+    x: Array, u: Array, p: Sequence[float] | Array, dt: float
+) -> dict[tuple[str, int], Any]:
+    """Leaf values of N samples: x (N, n), u (N, m), p (k,)."""
+    values: dict[tuple[str, int], Any] = _uniform(p, dt)  # type: ignore[arg-type]
+    values |= {("x", i): x[:, i] for i in range(x.shape[1])}
+    return values | {("u", j): u[:, j] for j in range(u.shape[1])}
+
+
+class Variant:
+    """One trace; its derivatives and the programs made of them, when they are asked for."""
+
+    def __init__(self, found: Trace, sizes: tuple[int, int, int]) -> None:
+        self.trace, self.sizes = found, sizes
+        self.values = Program(found.graph, found.outputs)
+
+    def entries(self, width: int) -> list[tuple[int, int, int]]:
+        """(row, column, node) of the non-zero derivatives by the first `width` of x, u, p."""
+        graph = self.trace.graph
+        letters = [
+            (letter, i) for letter, size in zip("xup", self.sizes, strict=True) for i in range(size)
+        ]
+        variables = [graph.leaf(*letter) for letter in letters[:width]]
+        column = {v: c for c, v in enumerate(variables)}
+        rows = jacobian(graph, self.trace.outputs, variables)
+        return sorted((r, column[v], i) for r, row in enumerate(rows) for v, i in row.items())
+
+    @cached_property
+    def small(self) -> tuple[Program, list[tuple[int, int]]]:
+        """Values and derivatives by state and input."""
+        return self._program(self.sizes[0] + self.sizes[1])
+
+    @cached_property
+    def full(self) -> tuple[Program, list[tuple[int, int]]]:
+        """Values and derivatives by state, input and parameter."""
+        return self._program(sum(self.sizes))
+
+    def operations(self) -> int:
+        """Nodes of the values and of their derivatives by state and input."""
+        entries = self.entries(self.sizes[0] + self.sizes[1])
+        return len(self.trace.graph.live([*self.trace.outputs, *(i for _, _, i in entries)]))
+
+    def _program(self, width: int) -> tuple[Program, list[tuple[int, int]]]:
+        entries = self.entries(width)
+        outputs = [*self.trace.outputs, *(i for _, _, i in entries)]
+        return Program(self.trace.graph, outputs), [(r, c) for r, c, _ in entries]
+
+
+def values_and_jacobian(
+    program: tuple[Program, list[tuple[int, int]]],
+    leaves: Mapping[tuple[str, int], Any],
+    smoothing: float,
+    N: int,
+    width: int,
+) -> tuple[Array, Array]:
+    """The r outputs (N, r) and their Jacobian (N, r, width) at N samples."""
+    run, places = program
+    found = run(leaves, smoothing)
+    values = found[: len(found) - len(places)]
+    J = np.zeros((N, len(values), width))
+    for (r, c), value in zip(places, found[len(values) :], strict=True):
+        J[:, r, c] = value
+    return np.stack([np.broadcast_to(v, N) for v in values], axis=1), J

@@ -1,0 +1,168 @@
+"""What an attribution has found so far: which hypotheses were fitted, their evidence, the best.
+
+evidence(h) = log p(y | h) - what its effects cost (`price.py`) - what the noise structure costs
+
+What naming an effect costs: the price of its numbers, of looking for it, of where it might be.
+
+    price = k/2 ln N + ln(places looked at) + ln(targets of the family)
+
+k free values, N time steps. Thresholds, frequencies and places that were scanned pay for the
+looking, and families that could have been blamed at many targets for the choice. A parameter of the
+model pays by its prior (a fifth of its size) instead.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from grounded.diagnosis.data import Data
+from grounded.diagnosis.fitted import Fit
+from grounded.diagnosis.hypothesis import Hypothesis, Predictor
+from grounded.diagnosis.noise import Structure
+from grounded.effects import Effect, ParamFamily
+
+CLAIM = 3.0  # nats from which an effect is claimed
+TIE = 3.0  # nats within which two explanations are not told apart
+
+
+class Found:
+    """Fits by noise structure, freedom of the parameters, and effects: the best of each."""
+
+    def __init__(self, data: Data, candidates: Sequence[Effect]) -> None:
+        self.data, self.predictor = data, Predictor(data)
+        self.candidates = tuple(candidates)
+        self.N = max(data.steps, 2)
+        self._prices: dict[tuple[object, ...], float] = {}
+        self.fits: dict[tuple[Structure, float, tuple[str, ...]], Fit] = {}
+        families = [e.family.name for e in candidates]
+        self.crowd = {e.name: families.count(e.family.name) for e in candidates}
+
+    def price(self, effect: Effect, values: Mapping[str, float]) -> float:
+        """What an effect pays beside its likelihood, in nats."""
+        key = (effect.name, *sorted(values.items()))
+        if key not in self._prices:
+            targets = self.crowd.get(effect.name, 1)
+            self._prices[key] = price(self.predictor, effect, values, targets)
+        return self._prices[key]
+
+    def score(self, fit: Fit) -> float:
+        """Evidence of a fit in nats, up to a constant of the data."""
+        h = fit.hypothesis
+        paid = sum(self.price(e, dict(v)) for e, v in zip(h.effects, h.values, strict=True))
+        extra = fit.noise.structure.numbers(self.data.model.n)
+        calibration = 1.0 if h.spread > 0 else 0.0
+        return fit.evidence - paid - 0.5 * extra * math.log(self.N) - calibration
+
+    def keep(self, fits: Sequence[Fit]) -> None:
+        """Remembers the best fit of every hypothesis under every structure."""
+        for fit in fits:
+            h = fit.hypothesis
+            key = (fit.noise.structure, h.spread, tuple(sorted(h.names)))
+            if key not in self.fits or self.score(fit) > self.score(self.fits[key]):
+                self.fits[key] = fit
+
+    def best_null(self) -> Fit:
+        """The likeliest fit without effects."""
+        return max((f for f in self.fits.values() if not f.hypothesis.effects), key=self.score)
+
+    def exact_null(self) -> Fit:
+        """The likeliest fit without effects and with the parameters as they are."""
+        bare = (f for (_, spread, names), f in self.fits.items() if not names and spread == 0)
+        return max(bare, key=self.score)
+
+    def calibrates(self) -> bool:
+        """Whether calibrating the model's parameters explains more than noise does."""
+        best = self.best_null()
+        spread = best.hypothesis.spread
+        return spread > 0 and self.score(best) > self.score(self.exact_null()) + CLAIM
+
+    def of_size(self, count: int) -> list[Fit]:
+        """All fits with that many effects, best first, one a set of effects."""
+        best: dict[tuple[str, ...], Fit] = {}
+        for (_, _, names), fit in self.fits.items():
+            if len(names) == count and (
+                names not in best or self.score(fit) > self.score(best[names])
+            ):
+                best[names] = fit
+        return sorted(best.values(), key=lambda f: -self.score(f))
+
+    def chosen(self, most: int) -> Fit:
+        """The hypothesis that would be claimed: every effect more has to pay for itself."""
+        chosen = self.best_null()
+        for size in range(1, most + 1):
+            for fit in self.of_size(size)[:1]:
+                if self.score(fit) > self.score(chosen) + CLAIM:
+                    chosen = fit
+        if not chosen.hypothesis.effects and self.calibrates():
+            # one parameter is a calibration too: it need only be likelier than the shift of all
+            single = [f for f in self.of_size(1) if parametric(f)]
+            chosen = max([chosen, *single[:1]], key=self.score)
+        return chosen
+
+
+def parametric(fit: Fit) -> bool:
+    """Whether all that a fit blames is the model's own parameters."""
+    effects = fit.hypothesis.effects
+    return bool(effects) and all(isinstance(e.family, ParamFamily) for e in effects)
+
+
+PARAM_PRIOR = 0.2  # prior relative error of one parameter that is blamed
+BRIEF = 0.1  # of a control step: shorter delays and lags are a matter of time stamps
+TIMES = {"delay": "d", "sensor_delay": "d", "first_order_lag": "tau"}
+SAME = 0.05  # part of a dead zone's power that a mere offset may lack and still be the same
+
+
+def price(
+    predictor: Predictor, effect: Effect, values: Mapping[str, float], targets: int = 1
+) -> float:
+    """What an effect pays beside its likelihood [nats].
+
+    Args:
+        predictor: the data.
+        effect: which.
+        values: its values, for those whose price depends on them.
+        targets: at how many targets its family could have been blamed.
+    """
+    data = predictor.data
+    if isinstance(effect.family, ParamFamily):
+        return math.log(targets) + _of_parameter(effect, values, data.steps)
+    if values.get(TIMES.get(effect.family.name, ""), math.inf) < BRIEF * data.dt:
+        return math.inf
+    numbers = len(effect.free) + sum(q.tuned for q in effect.quantities)
+    cost = 0.5 * numbers * math.log(max(data.steps, 2)) + effect.family.vague
+    if not _mere_offset(predictor, effect, values):
+        cost += math.log(effect.places)
+    return cost + math.log(targets)
+
+
+def _of_parameter(effect: Effect, values: Mapping[str, float], steps: int) -> float:
+    """A normal prior of a fifth of the parameter's size, not a free parameter's cost."""
+    value = effect.site.model.params[effect.site.target].value
+    size = PARAM_PRIOR * (abs(value) or 1.0)
+    return 0.5 * (values.get("d", 0.0) / size) ** 2 + 0.25 * math.log(max(steps, 2)) + 1.0
+
+
+def _mere_offset(predictor: Predictor, effect: Effect, values: Mapping[str, float]) -> bool:
+    """Whether a dead zone acts as one offset all the time, because nothing ever rests in it.
+
+    Then its threshold was not searched for among many: any would have been the same effect.
+    """
+    if effect.family.name != "dead_zone" or "c" not in values:
+        return False
+    data, x = predictor.data, predictor.data.y[:-1]
+    model, j = data.model, data.model.input_names.index(effect.site.target)
+    zone = predictor.inputs(Hypothesis().plus(effect, values))
+    plain = predictor.inputs(Hypothesis())
+    offset = plain.copy()
+    offset[..., j] -= values["c"] * np.sign(plain[..., j].mean())
+    p = predictor.params(Hypothesis())
+    acts, missed = 0.0, 0.0
+    after = predictor.step(x, zone, p)
+    for other in (plain, offset):
+        moved = model.difference(predictor.step(x, other, p), after)
+        size = float((moved**2 * data.valid.T[..., None]).sum())
+        acts, missed = (size, missed) if other is plain else (acts, size)
+    return missed <= SAME * acts

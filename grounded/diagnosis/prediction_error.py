@@ -1,0 +1,230 @@
+"""Where the gap lies: how wrong the model's predictions are, by channel, time and region.
+
+Predictions start at the filtered state and run on with the recorded commands; their errors after a
+second are compared with what noise alone would make of them (the filter's own covariance, carried
+on): 1.0 is the floor, what is above it can be explained. What the best hypothesis, or a flexible
+one, explains of the innovations is laid out by channel, by time and by the half-space of a state or
+an input that holds most of it in the least time.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from grounded.diagnosis import filter as kalman
+from grounded.diagnosis.data import Data
+from grounded.diagnosis.delays import delays_of
+from grounded.diagnosis.fitted import Fit
+from grounded.diagnosis.hypothesis import Hypothesis, Predictor
+from grounded.diagnosis.initial_state import widened
+from grounded.diagnosis.leftover import filter_of
+from grounded.frozen import Array
+
+MOST_STARTS = 400
+
+
+@dataclass(frozen=True, eq=False)
+class Horizon:
+    """Predictions over one horizon: where they start, what noise alone makes of their errors.
+
+    at: (M,) step of the run; run: (M,); spread: (M, n) standard deviation from noise alone.
+    """
+
+    steps: int
+    at: Any
+    run: Any
+    spread: Array
+
+
+def horizon(predictor: Predictor, fit: Fit, seconds: float) -> Horizon:
+    """Starting points spread over all runs, and the floor under their errors.
+
+    Args:
+        predictor: the data.
+        fit: the best hypothesis: its noise is the floor.
+        seconds: how far; shorter where runs are.
+    """
+    data = predictor.data
+    B = len(data.valid)
+    lengths = data.valid.sum(axis=1).astype(int)
+    longest = max(int(np.median(lengths)) - 2, 1)
+    steps = max(1, round(min(seconds / data.dt, longest)))
+    pairs = [(t, b) for b in range(B) for t in range(1, lengths[b] - steps + 1)]
+    if not pairs:
+        steps = max(1, int(lengths.max()) - 2)
+        pairs = [(t, b) for b in range(B) for t in range(1, lengths[b] - steps + 1)] or [(0, 0)]
+    stride = max(1, len(pairs) // MOST_STARTS)
+    at, run = np.array(pairs[::stride]).T
+    return Horizon(steps, at, run, _spread(predictor, fit, at, run, steps))
+
+
+def _spread(predictor: Predictor, fit: Fit, at: Any, run: Any, steps: int) -> Array:
+    """Standard deviation that noise alone gives the log `steps` after the moments (M,), (M, n)."""
+    data, noise = predictor.data, fit.noise
+    (L, B), n = data.time.shape, data.model.n
+    g, delays = filter_of(predictor, fit), delays_of(fit.hypothesis, data)
+    R = np.broadcast_to(noise.measurement(L), (L + 1, B, n))
+    Q = noise.process(data.dt)
+    Q, wide, N = Q if g.late is None else g.late.noises(Q, n), g.seen.shape[-1], g.A.shape[-1]
+    Q = np.broadcast_to(Q, (L, B, N))
+    P = np.zeros((len(at), N, N))
+    if g.late is None and bool(data.seen.all()):
+        P[:, :n, :n] = g.K[np.maximum(at - 1, 0), run][:, :n] * R[at, run][:, None, :]
+    else:
+        given = widened(data, R, g.seen[..., :n])
+        P[:, :wide, :wide] = _covariances(g, Q, given)[np.maximum(at - 1, 0), run]
+    k = np.arange(wide, wide + n if wide < N else wide)
+    P[:, k, k] = noise.start(1)[0] if wide < N else 0.0
+    late = {} if delays is None else dict(zip(delays.channel, delays.whole, strict=True))
+    # what a late channel shows at the horizon is that much nearer; what lies before the moment has
+    # been filtered already, and this is more than its error
+    found = {i: P[:, i, i] for i, whole in late.items() if whole >= steps}
+    for j in range(steps):
+        A, q = g.A[at + j, run], Q[at + j, run]
+        P = A @ P @ A.swapaxes(1, 2)
+        entry = np.zeros((len(at), N, N))
+        entry[:, np.arange(N), np.arange(N)] = q
+        if g.G is not None:
+            Gt = g.G[at + j, run]
+            entry[:, :wide, :wide] = (Gt * q[:, None, :wide]) @ Gt.swapaxes(1, 2)
+        P = P + entry
+        found |= {i: P[:, i, i] for i, whole in late.items() if whole == steps - 1 - j}
+    variance = np.einsum("bii->bi", P[:, :n, :n]).copy()
+    for i, of_late in found.items():
+        variance[:, i] = of_late
+    return np.asarray(np.sqrt(variance + R[at + steps, run]))
+
+
+def _covariances(g: kalman.Gains, Q: Array, R: Array) -> Array:
+    """Covariance of a state after each step, its noise's colour aside, (L, B, n', n')."""
+    (L, B, N, _), wide = g.A.shape, g.seen.shape[-1]
+    found, P = np.empty((L, B, wide, wide)), np.zeros((B, N, N))
+    first = R[0] * np.where(g.seen[0, :, : R.shape[-1]] > 0, 1.0, kalman.UNKNOWN)
+    if g.late is not None:
+        first = np.concatenate([first, np.take_along_axis(first, g.late.channel, axis=1)], axis=1)
+    P[:, np.arange(wide), np.arange(wide)] = first
+    for t in range(L):
+        P = g.A[t] @ P @ g.A[t].swapaxes(1, 2)
+        if g.G is None:
+            P[:, np.arange(wide), np.arange(wide)] += Q[t][:, :wide]
+        else:
+            P[:, :wide, :wide] += (g.G[t] * Q[t][:, None, :wide]) @ g.G[t].swapaxes(1, 2)
+        P[:, np.arange(wide, N), np.arange(wide, N)] += Q[t][:, wide:]
+        P = P - g.K[t] @ P[:, :wide]
+        P = 0.5 * (P + P.swapaxes(1, 2))
+        found[t] = P[:, :wide, :wide]
+    return found
+
+
+def errors(predictor: Predictor, h: Hypothesis, track: Array, where: Horizon) -> Array:
+    """Y - prediction at the horizon, (M, n); NaN where nothing was measured."""
+    data = predictor.data
+    x = track[where.at, where.run]
+    u, t = predictor.inputs(h), data.time
+    delays = delays_of(h, data)
+    oldest = 0 if delays is None else max(delays.whole) + 1  # what late sensors may still show
+    path = [track[np.maximum(where.at - j, 0), where.run] for j in range(oldest, -1, -1)]
+    for j in range(where.steps):
+        index = (where.at + j, where.run)
+        x = predictor.advance(h, x, u[index], t[index])
+        x = np.clip(x, -1e6, 1e6)
+        path.append(x)
+    offset = predictor.offset(h, np.stack(path))
+    last = x if isinstance(offset, float) else x + offset[-1]
+    index = (where.at + where.steps, where.run)
+    error = data.model.difference(data.y[index], last)
+    return np.where(data.seen[index] > 0, error, np.nan)
+
+
+def normalised(error: Array, where: Horizon) -> float:
+    """Root mean square of errors in units of what noise alone makes."""
+    return float(np.sqrt(np.nanmean((error / where.spread) ** 2)))
+
+
+def explained(predictor: Predictor, null: Hypothesis, best: Fit) -> Array:
+    """What `best` gains over the bare model at every step and channel, (L, B, n) [nats].
+
+    Both are filtered with the noise of `best`: the bare model's innovations would hide the gap in a
+    larger noise.
+    """
+    data = predictor.data
+    g = filter_of(predictor, best)
+    track = best.track
+    x = track[:-1]
+    after = predictor.advance(null, x, predictor.inputs(null), data.time)
+    d = data.model.difference(after, track[1:])
+    r = data.model.difference(data.y - track, np.zeros_like(track))
+    delays = delays_of(best.hypothesis, data)
+    r = r if delays is None else delays.aligned(r)
+    white, _ = kalman.innovations(g, d[..., None], r[..., None])
+    return np.asarray(0.5 * (white[..., 0] ** 2 - best.white**2))
+
+
+def by_time(gain: Array, data: Data, parts: int = 8) -> list[dict[str, float]]:
+    """Shares of the gap over equal parts of the trial's duration."""
+    whole = max(float(np.maximum(gain.sum(), 1e-12)), 1e-12)
+    end = float(data.time.max()) + data.dt
+    edges = np.linspace(0, end, parts + 1)
+    found = []
+    for a, b in itertools.pairwise(edges):
+        inside = (data.time >= a) & (data.time < b)
+        share = float(gain[inside].sum()) / whole
+        found.append({"from": float(a), "to": float(b), "share": max(share, 0.0)})
+    return found
+
+
+def by_region(
+    gain: Array, predictor: Predictor, fit: Fit, most: int = 3
+) -> list[dict[str, float | str]]:
+    """Half-spaces of a state or an input that hold most of the gap in little of the time."""
+    data = predictor.data
+    model = data.model
+    signals: list[tuple[str, Array]] = []
+    u = data.runs(data.commands)
+    signals += [(n, u[..., j]) for j, n in enumerate(model.input_names)]
+    shown = [(i, n) for i, n in enumerate(model.state_names) if i not in data.hidden]
+    signals += [(n, fit.track[:-1, :, i]) for i, n in shown]
+    signals.append(("t", data.time))
+    whole = max(float(gain.sum()), 1e-12)
+    valid = data.valid.T > 0
+    found = []
+    for name, signal in signals:
+        best = _stump(name, signal, gain, valid, whole)
+        if best is not None:
+            found.append(best)
+    found.sort(key=lambda r: -(float(r["share"]) - float(r["occupancy"])))
+    return found[:most]
+
+
+def _stump(
+    name: str, signal: Array, gain: Array, valid: Any, whole: float
+) -> dict[str, float | str] | None:
+    """The best threshold of one signal, of its value or its size."""
+    best: dict[str, float | str] | None = None
+    margin = 0.1
+    nothing = 1e-3 * float(signal[valid].std())  # a level that is zero but for rounding
+    forms: list[tuple[str, Callable[[Array], Array]]] = [(name, lambda v: v)]
+    if float(signal.min()) < 0 < float(signal.max()):
+        forms.append((f"|{name}|", np.abs))
+    for label, form in forms:
+        values = form(signal)
+        for level in np.quantile(values[valid], np.linspace(0.1, 0.9, 9)):
+            for sign, inside in (("<", values < level), (">", values > level)):
+                inside = inside & valid
+                occupancy = float(inside.sum()) / float(valid.sum())
+                share = float(gain[inside].sum()) / whole
+                if occupancy < 0.03 or share - occupancy <= margin:
+                    continue
+                margin = share - occupancy
+                shown = 0.0 if abs(level) < nothing else level
+                best = {
+                    "when": f"{label} {sign} {shown:.3g}",
+                    "share": min(share, 1.0),
+                    "occupancy": occupancy,
+                }
+    return best

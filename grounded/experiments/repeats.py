@@ -1,0 +1,249 @@
+"""The line search when trials scatter: what a comparison of single trials costs, and what helps.
+
+Rules at four levels of scatter, as multiples of the simulated car's own (`real_car.SCATTER`).
+Judged is the TRUE utility, the mean of fresh runs, of each policy that a rule accepts:
+
+    false      accepted steps that made the policy truly worse
+    closed     share of the gap between the model's policy and the optimum that the final one closes
+    early      the same after EARLY trials: who has fewer batteries than BUDGET
+    flattered  utility that the winner's own trials claim, minus its true utility, by the gap
+
+A rule runs a candidate `repeats` times and averages states, inputs and utilities; the bias is that
+of the mean. "incumbent again" runs the best policy once more beside every candidate, so that a
+lucky winner loses its luck; "losses checked" does so only after a loss that may be luck
+([search] rerun_incumbent).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, MutableMapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from grounded.experiments.bench import bench, optimum, scaled, true_utility
+from grounded.experiments.jobs import Engine, Job, Progress, Table, mean_se, run_jobs
+from grounded.frozen import Array
+from grounded.policy import Policy
+from grounded.search.improve import propose
+from grounded.search.standing import Candidate, Options
+from grounded.task import Task
+from grounded.trial import Trial
+
+LEVELS = (0.5, 1.0, 2.0, 3.0)
+MANOEUVRES = ("turn", "figure8")
+BUDGET = 40  # trials
+EARLY = 10  # trials
+FRESH = 30  # runs that judge a policy
+
+
+@dataclass(frozen=True)
+class Rule:
+    """How trials decide."""
+
+    name: str
+    repeats: int
+    max_halvings: int
+    again: bool = False  # the incumbent is run again beside every candidate
+    checked: bool = False  # ... only after a loss that may be luck
+
+
+RULES = (
+    Rule("single trials, alpha to 1/64", 1, 6),
+    Rule("single trials, alpha to 1/8", 1, 3),
+    Rule("single trials, incumbent again", 1, 3, again=True),
+    Rule("losses checked, alpha to 1/64", 1, 6, checked=True),
+    Rule("losses checked, alpha to 1/8", 1, 3, checked=True),
+    Rule("2 trials, alpha to 1/8", 2, 3),
+    Rule("3 trials, alpha to 1/8", 3, 3),
+)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One rule on one case."""
+
+    rule: str
+    manoeuvre: str
+    level: float
+    seed: int
+    accepted: int  # steps
+    false: int
+    closed: float
+    early: float
+    flattered: float
+    trials: int
+
+
+@dataclass(frozen=True)
+class NoiseResult:
+    """All outcomes, in the order of manoeuvre, level, rule, seed."""
+
+    outcomes: tuple[Outcome, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """Outcomes by name, and the rule that follows from them."""
+        return {"outcomes": [vars(o) for o in self.outcomes], "recommended": self.recommended}
+
+    @property
+    def recommended(self) -> str:
+        """The cheapest rule that closes as much as the best one, within a standard error.
+
+        Shares are compared case by case and seed by seed; cheap is the mean number of trials.
+        """
+        closed = {rule: self._over_cases(rule, "closed") for rule in self._rules}
+        best = closed[max(closed, key=lambda rule: float(closed[rule].mean()))]
+
+        def as_good(rule: str) -> bool:
+            short, error = mean_se((best - closed[rule]).tolist())
+            return short <= (error if np.isfinite(error) else 0.0)
+
+        good = [rule for rule in self._rules if as_good(rule)]
+        return min(good, key=lambda rule: float(self._over_cases(rule, "trials").mean()))
+
+    @property
+    def _rules(self) -> list[str]:
+        return list(dict.fromkeys(o.rule for o in self.outcomes))
+
+    def _over_cases(self, rule: str, what: str) -> Array:
+        """One figure a case and seed, in the same order for every rule."""
+        own = sorted(
+            (o.manoeuvre, o.level, o.seed, getattr(o, what))
+            for o in self.outcomes
+            if o.rule == rule
+        )
+        return np.array([values[-1] for values in own])
+
+    def _summary(self) -> Table:
+        rows, recommended = [], self.recommended
+        for rule in self._rules:
+            closed, early, trials = (
+                self._over_cases(rule, k) for k in ("closed", "early", "trials")
+            )
+            mean, error = mean_se(closed.tolist())
+            mark = "* " if rule == recommended else "  "
+            rows.append(
+                (
+                    mark + rule,
+                    f"{mean:.1%} (±{error:.1%})",
+                    f"{closed.min():.1%}",
+                    f"{early.mean():.1%}",
+                    f"{trials.mean():.1f}",
+                )
+            )
+        head = ("rule (*: recommended)", "gap closed", "worst", f"after {EARLY}", "trials")
+        return Table("all cases: means", head, tuple(rows))
+
+    def _of(self, rule: str, manoeuvre: str, level: float) -> list[Outcome]:
+        wanted = (rule, manoeuvre, level)
+        return [o for o in self.outcomes if (o.rule, o.manoeuvre, o.level) == wanted]
+
+    def tables(self) -> list[Table]:
+        """By manoeuvre and level: false acceptances, share closed, flattery; then all cases."""
+        cases = dict.fromkeys((o.manoeuvre, o.level) for o in self.outcomes)
+        each = [self._table(manoeuvre, level) for manoeuvre, level in cases]
+        return [*each, self._summary()]
+
+    def _table(self, manoeuvre: str, level: float) -> Table:
+        rows = []
+        for rule in self._rules:
+            own = self._of(rule, manoeuvre, level)
+            if not own:
+                continue
+            steps, false = sum(o.accepted for o in own), sum(o.false for o in own)
+            closed = [o.closed for o in own]
+            rows.append(
+                (
+                    rule,
+                    f"{false} of {steps}",
+                    f"{np.median(closed):.1%}",
+                    f"{min(closed):.1%}",
+                    f"{np.median([o.early for o in own]):.1%}",
+                    f"{np.median([o.flattered for o in own]):.1%}",
+                    f"{np.median([o.trials for o in own]):g}",
+                )
+            )
+        after = f"after {EARLY}"
+        head = ("rule", "false acceptances", "gap closed", "worst", after, "flattered by", "trials")
+        return Table(f"{manoeuvre}, scatter x{level:g}", head, tuple(rows))
+
+
+def run(
+    seeds: Sequence[int] = range(8),
+    *,
+    manoeuvres: Sequence[str] = MANOEUVRES,
+    levels: Sequence[float] = LEVELS,
+    rules: Sequence[Rule] = RULES,
+    engine: Engine | None = None,
+    finished: MutableMapping[str, dict[str, Any]] | None = None,
+    progress: Progress | None = None,
+) -> NoiseResult:
+    """Every rule on every case; a job is one of them."""
+    jobs = [
+        Job(one, {"rule": vars(rule), "manoeuvre": manoeuvre, "level": level, "seed": seed})
+        for manoeuvre in manoeuvres
+        for level in levels
+        for rule in rules
+        for seed in seeds
+    ]
+    found = run_jobs(jobs, engine, finished=finished, progress=progress)
+    return NoiseResult(tuple(Outcome(**result) for result in found))
+
+
+def one(rule: dict[str, Any], manoeuvre: str, level: float, seed: int) -> dict[str, Any]:
+    """A job: one rule, one case."""
+    how = Rule(**rule)
+    case = bench(manoeuvre, "noise", seed)
+    best, _ = optimum(case)
+    case = replace(case, plant=scaled(case.plant, level))
+
+    def truly(policy: Policy) -> float:
+        return true_utility(case.task, case.plant, policy, FRESH, seed)
+
+    accepted, claimed, trials = _search(how, case.real, case.task)
+    utilities = [truly(policy) for _, policy in accepted]
+    early = [u for (ran, _), u in zip(accepted, utilities, strict=True) if ran <= EARLY][-1]
+    gap = truly(best) - utilities[0]
+    return {
+        "rule": how.name,
+        "manoeuvre": manoeuvre,
+        "level": level,
+        "seed": seed,
+        "accepted": len(accepted) - 1,
+        "false": int((np.diff(utilities) < 0).sum()),
+        "closed": (utilities[-1] - utilities[0]) / gap,
+        "early": (early - utilities[0]) / gap,
+        "flattered": (claimed - utilities[-1]) / gap,
+        "trials": trials,
+    }
+
+
+def _search(
+    rule: Rule, real: Callable[[Policy, int], Trial], task: Task
+) -> tuple[list[tuple[int, Policy]], float, int]:
+    """The policies kept in turn and after how many trials, what the last one claims, trials run."""
+    options = Options(
+        max_trials=BUDGET,
+        repeats=rule.repeats,
+        max_halvings=rule.max_halvings,
+        rerun_incumbent=rule.checked,
+    )
+    candidates: list[Candidate] = []
+    trials: list[Trial] = []
+    accepted: list[tuple[int, Policy]] = []
+    while True:
+        proposal = propose(task, candidates, trials, options)
+        best = proposal.standing.incumbent
+        if best is not None and (not accepted or accepted[-1][1] is not best.candidate.policy):
+            accepted.append((len(trials), best.candidate.policy))
+        if proposal.candidate is None or len(trials) >= BUDGET:
+            assert best is not None
+            return accepted, best.utility, len(trials)
+        if proposal.is_new:
+            candidates.append(proposal.candidate)
+            if rule.again and best is not None:
+                again = real(best.candidate.policy, len(trials))
+                trials.append(replace(again, candidate=best.candidate.id))
+        trial = real(proposal.candidate.policy, len(trials))
+        trials.append(replace(trial, candidate=proposal.candidate.id))

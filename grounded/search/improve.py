@@ -1,0 +1,288 @@
+"""START HERE: the paper's algorithm as a function of stored trials.
+
+Abbeel, Quigley & Ng, "Using Inaccurate Models in Reinforcement Learning", ICML 2006, section 3.
+The idea: let the REAL system evaluate the policy, and ask the crude model only which way to change
+it. The model is made to replay the last trial exactly, so that its derivatives are taken along the
+true states.
+
+    f_t^(i+1)(s, a) = f_t(s, a) + s_{t+1}^(i) - f_t(s_t^(i), a_t^(i))
+
+| step | paper                                          | here                                    |
+|------|------------------------------------------------|-----------------------------------------|
+| 1, 2 | optimal policy of the crude model              | `first_policy` (`first_guess`, `ddp`)   |
+| 3    | run it, record the trial                       | people, robots: `grounded run`, `ingest`|
+| 4    | add a bias to the ORIGINAL model               | `bias.ground`                           |
+| 5    | direction d from algorithm A in that model     | `direction` (`ddp`, `policy_gradient`)  |
+| 6    | theta + alpha d, line search on the real system| `Policy.toward`, `line_search`          |
+| 7    | none improves: return the current policy       | `search.standing`                       |
+
+`propose` is a pure function: the same candidates and trials give the same next candidate, bit for
+bit. `learn` is the loop for a real system that is a function call.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from grounded.compile import Problem
+from grounded.frozen import Array
+from grounded.model import Model
+from grounded.policy import Policy
+from grounded.rollout import simulate
+from grounded.search.first_policy import first_guess
+from grounded.search.planner import Planner
+from grounded.search.safety import objections, spread
+from grounded.search.standing import Candidate, Options, Standing, Tried, standing
+from grounded.search.step_size import Step
+from grounded.solve import ddp
+from grounded.solve.bias import Grounding, ground
+from grounded.task import Task
+from grounded.trial import Trial, mean_trial
+
+PLANNING = ddp.Options(max_iterations=30, tolerance=1e-6)  # a direction needs no more digits
+CAUTION = 100.0  # factor on the input penalties each time the first policy crashed (FACTS.md 2)
+
+
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """What to run next, or why nothing is: `candidate` is None when the search has ended."""
+
+    standing: Standing
+    candidate: Candidate | None
+    is_new: bool
+    notes: tuple[str, ...] = ()
+
+
+def model_fingerprint(task: Task) -> str:
+    """16 hex digits over the model that plans: its values, latency, smoothing and predictions.
+
+    Predictions at fixed points stand for the code of the dynamics, which has no other identity.
+    """
+    model, problem = task.model, task.problem(exact=True)
+    digest = hashlib.sha256()
+    digest.update(repr((model.state_names, model.input_names, model.param_names)).encode())
+    rng = np.random.default_rng(0)
+    x = task.start + rng.uniform(-0.5, 0.5, (8, model.n))
+    u = np.clip(task.past + rng.uniform(-0.5, 0.5, (8, model.m)), task.low, task.high)
+    with np.errstate(all="ignore"):
+        moved = problem.system.step(x, u, problem.p, problem.dt)
+    for array in (model.values, problem.delay, np.array([task.smoothing]), np.round(moved, 9)):
+        digest.update(np.ascontiguousarray(array + 0.0).tobytes())
+    return digest.hexdigest()[:16]
+
+
+def first_policy(task: Task, caution: int = 0) -> tuple[Policy, ddp.Result]:
+    """Steps 1 and 2: the (locally) optimal policy of the crude model.
+
+    Args:
+        task: the manoeuvre and the crude model.
+        caution: how often a first policy has crashed; each time penalises inputs CAUTION x more.
+    """
+    if caution:
+        reward = replace(
+            task.reward,
+            input=task.reward.input * CAUTION**caution,
+            input_change=np.maximum(task.reward.input_change, 1e-3) * CAUTION**caution,
+        )
+        task = replace(task, reward=reward)
+    guess = first_guess(task)
+    result = ddp.solve(task.problem(), guess.inputs, guess.gain, guess.z[:-1])
+    return task.policy(result.u, result.K, result.z[:-1]), result
+
+
+def direction(
+    task: Task, policy: Policy, grounding: Grounding, options: Options, damping: float = 1.0
+) -> Policy:
+    """Step 5: theta' such that d = theta' - theta improves the policy in the biased model.
+
+    Args:
+        task: the manoeuvre, with the ORIGINAL model.
+        policy: theta, the policy that ran the trial.
+        grounding: the trial as the biased model replays it (step 4).
+        options: which algorithm A.
+        damping: lambda of `trust`, the share of mu that leaving the trial's inputs costs.
+    """
+    if options.method == "policy-gradient":
+        return _gradient_direction(task, policy, grounding)
+    problem = grounding.on(task.problem())
+    if options.step == "damped":
+        problem = damped(problem, grounding.inputs, damping)
+    gains = ddp.damped_step(problem, grounding.z, grounding.inputs, np.zeros(task.model.m)).gains
+    result = ddp.solve(problem, grounding.inputs, gains.K, grounding.z[:-1], PLANNING)
+    return task.policy(result.u, result.K, result.z[:-1])
+
+
+def damped(problem: Problem, inputs: Array, factor: float = 1.0) -> Problem:
+    """The problem with a price mu |u_t - inputs_t|^2 on leaving the trial's inputs (H, m).
+
+    The fully converged step goes to the optimum of the biased MODEL, and that need not be uphill in
+    the real system (FACTS.md 2); with mu it turns towards the gradient, which is uphill while the
+    model's derivatives are within 90 degrees (section 3). mu = R + S, the problem's own weights on
+    inputs: the same idea as norm-optimal iterative learning control. Both quadratic penalties on
+    u_t are one: weight R + mu about (R u_target + mu inputs) / (R + mu).
+    """
+    mu = factor * (problem.input_weight + problem.change_weight)
+    weight = problem.input_weight + mu
+    mixed = problem.input_weight * problem.input_target + mu * inputs
+    safe = np.where(weight > 0, weight, 1.0)
+    return replace(problem, input_weight=weight, input_target=mixed / safe)
+
+
+def _gradient_direction(task: Task, policy: Policy, grounding: Grounding) -> Policy:
+    from grounded.solve.policy_gradient import ascent
+
+    return ascent(task, policy, grounding)
+
+
+def propose(
+    task: Task,
+    candidates: Sequence[Candidate],
+    trials: Sequence[Trial],
+    options: Options,
+    *,
+    identity: str = "",
+    planner: Planner | None = None,
+    refit: Callable[[Task, Sequence[Trial]], Model] | None = None,
+) -> Proposal:
+    """What to run next: the outstanding candidate, a new one, or nothing.
+
+    Args:
+        task: the manoeuvre; it judges the trials.
+        candidates: those proposed so far, in order.
+        trials: stored trials, in order.
+        options: the [search] table.
+        identity: the name of a new candidate; by default the next after those of this task.
+        planner: plans with adopted effects; None: with the task's own model.
+        refit: with options.refit, gives the model with parameters fitted to all trials.
+    """
+    planner = planner or Planner(task, task)
+    fingerprint = model_fingerprint(planner.plan)
+    now = standing(task, candidates, trials, options, fingerprint)
+    if now.phase == "await-trial":
+        return Proposal(now, now.outstanding, is_new=False)
+    if now.phase != "propose":
+        return Proposal(now, None, is_new=False)
+    if options.refit and refit is not None and now.incumbent is not None:
+        planner = planner.with_model(refit(planner.plan, trials))
+    make = _Maker(planner, now, identity or f"c{len(candidates) + 1:04d}", fingerprint)
+    if now.incumbent is None:
+        policy, _ = first_policy(planner.plan, now.caution)
+        return make.checked(make.candidate(policy, planner.plan.problem(exact=True), Step()))
+    return _improvement(make, now.incumbent, options)
+
+
+def _improvement(make: _Maker, incumbent: Tried, options: Options) -> Proposal:
+    """Steps 4 to 6: the first step, from the one that is due on, that the model believes in.
+
+    A step whose predicted run loses is passed over in the model, at no trial's cost: d must satisfy
+    U^(theta + alpha d) >= U^(theta) for some alpha (step 5).
+    """
+    planner, plan = make.planner, make.planner.plan
+    own = planner.lift(mean_trial(incumbent.trials, planner.task.model.angle_mask))
+    plan.model.system.check(own.states[:-1], own.inputs, plan.model.values, plan.dt)
+    matched = options.match_inputs
+    grounding = ground(plan, own, match_inputs=matched)
+    exact = ground(plan, own, exact=True, shift=grounding.shift)
+    real = exact.on(plan.problem(exact=True))
+    theta = planner.widened(incumbent.candidate.policy)
+    # Where a trial started off s_0, its utility is no measure for runs that start there: theta's
+    # own run in the grounded model is. It replays the trial when the start was s_0.
+    already = simulate(real, theta).utility
+    already = already if np.isfinite(already) else incumbent.utility
+    least = options.tolerance * abs(already)
+    unsafe: Proposal | None = None
+    directions: dict[float, Policy] = {}
+    step = make.now.step
+    while step is not None:
+        if step.damping not in directions:
+            directions[step.damping] = direction(plan, theta, grounding, options, step.damping)
+        policy = theta.toward(directions[step.damping], step.alpha)
+        made = make.candidate(policy, real, step, already)
+        if made.predicted_gain > least:
+            proposal = make.checked(made)
+            if proposal.candidate is not None:
+                return proposal
+            unsafe = proposal
+        elif abs(made.predicted_gain) <= least:
+            break
+        step = options.next_step(step)
+    if unsafe is not None:
+        return unsafe
+    sentence = (
+        f"the model promises less than {100 * options.tolerance:g} % more from any step ([search] "
+        f"tolerance): {incumbent.candidate.id} is the result"
+    )
+    ended = dataclasses.replace(make.now, phase="converged", step=None, sentence=sentence)
+    return Proposal(ended, None, is_new=False)
+
+
+@dataclass(frozen=True, eq=False)
+class _Maker:
+    """Makes candidates of a policy: what a robot can run of it, and its predicted run."""
+
+    planner: Planner
+    now: Standing
+    identity: str
+    fingerprint: str
+
+    def candidate(
+        self, policy: Policy, problem: Problem, step: Step, already: float = float("nan")
+    ) -> Candidate:
+        base, policy = self.now.incumbent, self.planner.narrowed(policy)
+        predicted = simulate(problem, self.planner.widened(policy))
+        return Candidate(
+            id=self.identity,
+            policy=policy,
+            iteration=0 if base is None else self.now.iteration + 1,
+            alpha=step.alpha,
+            damping=step.damping,
+            predicted_gain=predicted.utility - already,
+            base="" if base is None else base.candidate.id,
+            model=self.fingerprint,
+            predicted_states=predicted.states[:, : self.planner.task.model.n],
+            predicted_inputs=predicted.inputs,
+            predicted_utility=predicted.utility,
+            caution=self.now.caution,
+        )
+
+    def checked(self, made: Candidate) -> Proposal:
+        """A candidate that is finite, inside the limits and predicted to stay safe; or none."""
+        task = self.planner.task
+        found = objections(task, made, spread(task, self.now.history))
+        if not found:
+            return Proposal(self.now, made, is_new=True)
+        stopped = dataclasses.replace(self.now, phase="stopped", sentence=found[0])
+        return Proposal(stopped, None, is_new=False, notes=tuple(found))
+
+
+def learn(
+    task: Task,
+    run: Callable[[Candidate], Trial],
+    options: Options,
+    *,
+    max_iterations: int | None = None,
+) -> tuple[Standing, list[Candidate], list[Trial]]:
+    """Steps 1 to 7 for a real system that is a function call: `run` executes a candidate once.
+
+    Args:
+        task: the manoeuvre.
+        run: executes a candidate and returns its trial; its `candidate` field is set here.
+        options: the [search] table.
+        max_iterations: ends after so many accepted improvements.
+    """
+    candidates: list[Candidate] = []
+    trials: list[Trial] = []
+    while True:
+        proposal = propose(task, candidates, trials, options)
+        done = max_iterations is not None and proposal.standing.iteration >= max_iterations
+        if proposal.candidate is None or (done and proposal.is_new):
+            return proposal.standing, candidates, trials
+        if proposal.is_new:
+            candidates.append(proposal.candidate)
+        trial = run(proposal.candidate)
+        trials.append(replace(trial, candidate=proposal.candidate.id))

@@ -1,0 +1,92 @@
+"""Planner: the task as the search plans it, beside the task as the robot's trials judge it.
+
+They differ once effects are adopted: a lag, a backlash or a rate limit gives the model memory
+states that no sensor of the robot knows. Trials are LIFTED to the planning model (the memory
+follows from the commands), policies are NARROWED to what the robot measures (gains on memory are
+dropped; their part of the feed-forward stays), and the predicted run is the narrowed policy's.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+
+from grounded.model import Model
+from grounded.policy import Policy
+from grounded.task import Task
+from grounded.trial import Trial
+from grounded.utility import Reward
+
+
+@dataclass(frozen=True, eq=False)
+class Planner:
+    """`task` judges; `plan` has the planning model, whose first states are the task's."""
+
+    task: Task
+    plan: Task
+
+    def lift(self, trial: Trial) -> Trial:
+        """A trial with the planning model's memory states beside its own."""
+        plan, base = self.plan.model, self.task.model
+        if plan.n == base.n:
+            return trial
+        from grounded.effects.memory import memory_of
+
+        if trial.start_inputs is None:
+            trial = dataclasses.replace(trial, start_inputs=self.task.past)
+        states = np.hstack([trial.states, memory_of(plan, base, trial)])
+        return dataclasses.replace(trial, states=states, state_names=plan.state_names)
+
+    def widened(self, policy: Policy) -> Policy:
+        """A robot's policy over the planning model's z."""
+        model = self.plan.model
+        angles = tuple(bool(a) for a in model.angle_mask)
+        return policy.laid_out(model.state_names, angles, self.plan.problem().depths)
+
+    def narrowed(self, policy: Policy) -> Policy:
+        """A planned policy over what the robot measures and sent."""
+        model = self.task.model
+        angles = tuple(bool(a) for a in model.angle_mask)
+        return policy.laid_out(model.state_names, angles, policy.depths)
+
+    def with_model(self, model: Model) -> Planner:
+        """The same with other parameter values of the planning model."""
+        return dataclasses.replace(self, plan=self.plan.with_model(model))
+
+
+def planner_for(task: Task, model: Model, latency: np.ndarray) -> Planner:
+    """A planner with another model, whose first states are the task's, and another latency (m,)."""
+    extra = model.n - task.model.n
+    held = Trial(
+        states=task.start[None],
+        inputs=np.zeros((0, task.model.m)),
+        dt=task.dt,
+        state_names=task.model.state_names,
+        input_names=task.model.input_names,
+        start_inputs=task.past,
+    )
+    memory = np.zeros(0)
+    if extra:  # effects take a while to import, and most models have none
+        from grounded.effects.memory import memory_start
+
+        memory = memory_start(model, task.model, held)
+    nothing, reward = np.zeros(extra), task.reward
+    assert task.safety_low is not None and task.safety_high is not None
+    plan = dataclasses.replace(
+        task,
+        model=model,
+        latency=latency,
+        target=np.hstack([task.target, np.full((task.horizon + 1, extra), np.nan)]),
+        reward=Reward(
+            np.append(reward.state, nothing),
+            np.append(reward.terminal, nothing),
+            reward.input,
+            reward.input_change,
+        ),
+        start=np.append(task.start, memory),
+        safety_low=np.append(task.safety_low, np.full(extra, -np.inf)),
+        safety_high=np.append(task.safety_high, np.full(extra, np.inf)),
+    )
+    return Planner(task, plan)

@@ -1,0 +1,92 @@
+"""What must hold before a candidate is handed to a robot.
+
+Finite numbers, inputs inside the hard limits, gains within reason, and a PREDICTED run that stays
+inside [safety], widened by the spread that real runs have shown so far. Each objection is a
+sentence that says which limit, where and when.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from grounded.frozen import Array
+from grounded.search.standing import Candidate, Tried
+from grounded.task import Task
+
+MAX_GAIN = 1e6  # input units per state unit: beyond it a gain is a numerical accident
+
+
+def spread(task: Task, history: Sequence[Tried]) -> Array:
+    """How far real runs strayed from what was expected of them, (H + 1, n); zero before the first.
+
+    Two standard deviations between repeated runs of one candidate, or the error of the latest
+    prediction that was grounded on a trial, whichever is larger. The first candidate's error says
+    what the crude model lacks, not what the next run will do, and doesn't count.
+    """
+    found = np.zeros((task.horizon + 1, task.model.n))
+    for tried in history:
+        whole = [t.states for t in tried.trials if t.finite_steps == task.horizon]
+        if len(whole) > 1:
+            off = task.model.difference(np.array(whole), np.mean(whole, axis=0))
+            scatter = np.sqrt((off**2).sum(axis=0) / (len(whole) - 1))
+            found = np.maximum(found, 2 * scatter)
+    grounded = [
+        (tried.candidate.predicted_states, trial.states)
+        for tried in history
+        for trial in tried.trials
+        if tried.candidate.base and trial.finite_steps == task.horizon
+    ]
+    if grounded:
+        predicted, real = grounded[-1]
+        found = np.maximum(found, np.abs(task.model.difference(real, predicted)))
+    return found
+
+
+def objections(task: Task, candidate: Candidate, strays: Array | None = None) -> list[str]:
+    """Why a candidate must not be run; empty when nothing speaks against it.
+
+    Args:
+        task: gives [safety].
+        candidate: with its predicted run.
+        strays: how far real runs strayed so far, (H + 1, n), see `spread`; None: not at all.
+    """
+    policy = candidate.policy
+    parts = {"feed-forward": policy.feedforward, "predicted state": candidate.predicted_states}
+    if policy.gain is not None and policy.reference is not None:
+        parts |= {"gain": policy.gain, "reference": policy.reference}
+    for name, values in parts.items():
+        bad = ~np.isfinite(values.reshape(len(values), -1)).all(axis=1)
+        if bad.any():
+            t = int(np.argmax(bad))
+            return [
+                f"the {name} of {candidate.id} is not a finite number at t = {t * task.dt:g} s "
+                f"(step {t}): the model diverges there; check it with a shorter horizon"
+            ]
+    around = np.zeros_like(candidate.predicted_states) if strays is None else strays
+    found = [_outside(task, candidate, around[:, i], i) for i in range(task.model.n)]
+    if policy.gain is not None and np.abs(policy.gain).max() > MAX_GAIN:
+        t = int(np.argmax(np.abs(policy.gain).max(axis=(1, 2))))
+        found.append(
+            f"a gain of {candidate.id} reaches {np.abs(policy.gain).max():.3g} at t = "
+            f"{t * task.dt:g} s, more than {MAX_GAIN:g}: raise the input weights"
+        )
+    return [sentence for sentence in found if sentence]
+
+
+def _outside(task: Task, candidate: Candidate, stray: Array, i: int) -> str:
+    """The sentence for state i leaving [safety] in the predicted run, or ""."""
+    assert task.safety_low is not None and task.safety_high is not None
+    value = candidate.predicted_states[:, i]
+    excess = np.maximum(task.safety_low[i] - value, value - task.safety_high[i]) + stray
+    t = int(np.argmax(excess))
+    if excess[t] <= 0:
+        return ""
+    name = task.model.state_names[i]
+    around = f" +- {stray[t]:.3f}" * bool(stray[t])
+    return (
+        f"{candidate.id} (alpha = {candidate.alpha:g}) is predicted to take {name} to "
+        f"{value[t]:.3f}{around} {task.model.states[name]} at t = {t * task.dt:.2f} s, outside "
+        f"[safety] {name} = [{task.safety_low[i]:g}, {task.safety_high[i]:g}]"
+    )

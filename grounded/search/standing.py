@@ -1,0 +1,292 @@
+"""Where the search stands: DERIVED from candidates and stored trials, never kept beside them.
+
+The real system is run by people, so the paper's loop can't be a while loop. Candidates in the order
+in which they were proposed, and the trials that came back, say all there is to know:
+
+    the incumbent    the best candidate so far, pi_theta^(i); its trials measure the next bias
+    outstanding      the candidate that was proposed and has not been run often enough
+    tried            the alphas along the present direction that did not improve (step 6)
+    in doubt         a loss that may be luck: the incumbent is run once more before it is believed
+
+Same candidates and trials, same state: nothing depends on the clock or on the process that asks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from grounded.errors import GroundedError
+from grounded.frozen import Array
+from grounded.policy import Policy
+from grounded.search.step_size import Step, after_failure, after_success, next_alpha
+from grounded.task import Task
+from grounded.trial import Trial
+
+Phase = Literal["propose", "await-trial", "converged", "stopped"]
+MAX_CAUTION = 3  # times the first policy is designed again, ever more gently, after a crash
+
+
+@dataclass(frozen=True)
+class Options:
+    """The [search] table: see CONTRACT.md. `tolerance` ends a search that has nothing to gain."""
+
+    method: Literal["ddp", "policy-gradient"] = "ddp"
+    step: Literal["damped", "full"] = "damped"
+    refit: bool = False
+    match_inputs: bool = True  # False: the paper's bias alone, see `matching`
+    max_halvings: int = 6
+    repeats: int = 1
+    rerun_incumbent: bool = True  # see `_in_doubt`
+    max_trials: int = 40
+    tolerance: float = 1e-3  # stop when the model predicts less relative gain than this
+
+    def __post_init__(self) -> None:
+        bounds = {"max_halvings": (0, 30), "repeats": (1, 100), "max_trials": (1, 100_000)}
+        for name, (low, high) in bounds.items():
+            if not low <= getattr(self, name) <= high:
+                raise GroundedError(
+                    f"[search] {name} must be {low} to {high}, got {getattr(self, name)}"
+                )
+        if self.repeats > self.max_trials:
+            raise GroundedError(
+                f"[search] repeats = {self.repeats} is more than max_trials = {self.max_trials}"
+            )
+        if not 0 <= self.tolerance < 1:
+            raise GroundedError(f"[search] tolerance must be in [0, 1), got {self.tolerance}")
+
+    @property
+    def damps(self) -> bool:
+        """Whether steps are damped by `trust`, or only halved as in the paper."""
+        return self.method == "ddp" and self.step == "damped"
+
+    def first_step(self) -> Step:
+        """The first step along a new direction when nothing is known of the model's promises."""
+        return Step(damping=1.0 if self.damps else 0.0)
+
+    def next_step(self, step: Step) -> Step | None:
+        """The step after one that did not improve; None when the search has failed (step 7)."""
+        if self.damps:
+            return after_failure(step, self.max_halvings)
+        alpha = next_alpha([step.alpha], self.max_halvings)
+        return None if alpha is None else Step(step.damping, alpha)
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A policy to run, and how it came about."""
+
+    id: str  # c0001, c0002 ...: the order of proposal
+    policy: Policy
+    iteration: int  # i of theta^(i) that it tries to be; 0 is the model's own policy
+    alpha: float
+    base: str  # the candidate whose trials it was derived from, "" for the model's own
+    model: str  # fingerprint of the model it was planned in
+    predicted_states: Array  # (H + 1, n) in the (biased) model
+    predicted_inputs: Array  # (H, m)
+    predicted_utility: float
+    damping: float = 1.0  # lambda of `trust`
+    predicted_gain: float = float("nan")  # over the mean trial of its base
+    caution: int = 0  # how often the first policy was redesigned after a crash
+
+
+@dataclass(frozen=True, eq=False)
+class Tried:
+    """A candidate with its trials: mean utility and, for two trials or more, its standard error."""
+
+    candidate: Candidate
+    trials: tuple[Trial, ...]
+    utilities: tuple[float, ...]
+    accepted: bool | None  # None: not decided, trials are missing
+    in_doubt: bool = False  # its own trials are there: the incumbent's are missing
+
+    @property
+    def utility(self) -> float:
+        """Mean utility of the trials; nan without a trial, -inf when one of them failed."""
+        return float(np.mean(self.utilities)) if self.utilities else float("nan")
+
+    @property
+    def standard_error(self) -> float:
+        """Of the mean; nan for fewer than two trials, or where one of them failed."""
+        if len(self.utilities) < 2 or not np.isfinite(self.utilities).all():
+            return float("nan")
+        return float(np.std(self.utilities, ddof=1) / np.sqrt(len(self.utilities)))
+
+
+@dataclass(frozen=True, eq=False)
+class Standing:
+    """Where the search stands, with the sentence that says it."""
+
+    phase: Phase
+    iteration: int  # accepted improvements so far
+    incumbent: Tried | None
+    outstanding: Candidate | None
+    missing: int  # trials that the outstanding candidate still needs
+    step: Step | None  # what to try next when a candidate is to be made
+    caution: int
+    history: tuple[Tried, ...]
+    trials: int
+    sentence: str
+
+    @property
+    def utilities(self) -> list[float]:
+        """Utility of the model's policy, then after each accepted improvement."""
+        return [t.utility for t in self.history if t.accepted]
+
+
+def standing(
+    task: Task,
+    candidates: Sequence[Candidate],
+    trials: Sequence[Trial],
+    options: Options,
+    model: str,
+) -> Standing:
+    """Steps 6 and 7 over stored trials.
+
+    Args:
+        task: judges the trials.
+        candidates: in order of proposal.
+        trials: in order of storage; those of no known candidate are ignored here.
+        options: the [search] table.
+        model: fingerprint of the task's model now; a direction belongs to one model.
+    """
+    history, incumbent, iteration = _judge(task, candidates, trials, options, model)
+    total = sum(len(t.trials) for t in history)
+    last = history[-1] if history else None
+    doubt = next((t for t in history if t.in_doubt), None)
+
+    def state(phase: Phase, sentence: str, **more: object) -> Standing:
+        fields = {"outstanding": None, "missing": 0, "step": None, "caution": 0} | more
+        return Standing(
+            phase,
+            iteration,
+            incumbent,
+            history=history,
+            trials=total,
+            sentence=sentence,
+            **fields,  # type: ignore[arg-type]
+        )
+
+    if doubt is not None and incumbent is not None:
+        own = incumbent.candidate.id
+        return state(
+            "await-trial",
+            f"{doubt.candidate.id} lost to {own} by less than luck may do: {own} is waiting for "
+            "another trial",
+            outstanding=incumbent.candidate,
+            missing=1,
+        )
+    if last is not None and last.accepted is None and last.candidate.model == model:
+        missing = options.repeats - len(last.trials)
+        return state(
+            "await-trial",
+            f"{last.candidate.id} is waiting for {missing} trial{'s' * (missing > 1)}",
+            outstanding=last.candidate,
+            missing=missing,
+        )
+    if total + options.repeats > options.max_trials:
+        used = "all" if total >= options.max_trials else f"{total} of"
+        needs = f"; a candidate needs {options.repeats}" * (total < options.max_trials)
+        return state(
+            "stopped",
+            f"{used} {options.max_trials} trials are used up{needs} ([search] max_trials)",
+        )
+    if incumbent is None:
+        failed = sum(t.accepted is False for t in history)
+        if failed > MAX_CAUTION:
+            return state(
+                "stopped",
+                f"the first policy crashed {failed} times, designed more gently each time: the "
+                "model is too far off to start from; mend it (fit, diagnose) and propose again",
+            )
+        return state(
+            "propose",
+            "the model's own policy comes first",
+            step=options.first_step(),
+            caution=failed,
+        )
+    own = incumbent.candidate.id
+    step = _next_step(history, incumbent, options, model)
+    if step is None:
+        return state(
+            "converged",
+            f"no step improved on {own} down to alpha = {2.0**-options.max_halvings:g}: "
+            f"{own} is the result (step 7)",
+        )
+    return state("propose", f"improve on {own} with alpha = {step.alpha:g}", step=step)
+
+
+def _next_step(
+    history: tuple[Tried, ...], incumbent: Tried, options: Options, model: str
+) -> Step | None:
+    """Damping and alpha after what the trials have shown; a direction belongs to one model."""
+    made = incumbent.candidate
+    step = options.first_step()
+    base = next((t for t in history if t.candidate.id == made.base), None)
+    if base is not None and made.model == model and options.damps:
+        real = incumbent.utility - base.utility
+        step = after_success(Step(made.damping, made.alpha), made.predicted_gain, real)
+    losers = [
+        t.candidate
+        for t in history
+        if t.accepted is False and t.candidate.base == made.id and t.candidate.model == model
+    ]
+    return options.next_step(Step(losers[-1].damping, losers[-1].alpha)) if losers else step
+
+
+def _judge(
+    task: Task,
+    candidates: Sequence[Candidate],
+    trials: Sequence[Trial],
+    options: Options,
+    model: str,
+) -> tuple[tuple[Tried, ...], Tried | None, int]:
+    """Every candidate with its trials, accepted or not; the incumbent; iterations done."""
+    history: list[Tried] = []
+    incumbent: Tried | None = None
+    iteration = losses = 0  # accepted improvements; steps from the incumbent that did not improve
+    ids = {c.id for c in candidates}
+    spent = sum(t.candidate in ids for t in trials) >= options.max_trials
+    for candidate in candidates:
+        own = tuple(t.until(task.horizon) for t in trials if t.candidate == candidate.id)
+        utilities = tuple(task.utility(t) for t in own)
+        failed = any(u == -np.inf for u in utilities)
+        if len(own) < options.repeats and not failed:
+            history.append(Tried(candidate, own, utilities, None))
+            continue
+        better = incumbent is None or float(np.mean(utilities)) > incumbent.utility
+        accepted = better and not failed
+        tried = Tried(candidate, own, utilities, accepted)
+        if accepted:
+            iteration += incumbent is not None
+            incumbent, losses = tried, 0
+        elif incumbent is not None and (candidate.base, candidate.model) == (
+            incumbent.candidate.id,
+            model,
+        ):
+            losses += 1
+            if (
+                options.rerun_incumbent
+                and not spent
+                and _in_doubt(incumbent, tried, losses + options.repeats)
+            ):
+                tried = replace(tried, accepted=None, in_doubt=True)
+        history.append(tried)
+    return tuple(history), incumbent, iteration
+
+
+def _in_doubt(incumbent: Tried, loser: Tried, most: int) -> bool:
+    """Whether a loss may be luck: the incumbent's, whose trials were the best of several.
+
+    A lucky winner blocks every step from there on. So a loss within two standard errors of the
+    incumbent's own scatter (unknown after one trial) sends it out once more, until it has `most`
+    trials: one for each loss. Where trials repeat themselves exactly, it costs one trial a winner.
+    """
+    if not np.isfinite(loser.utility) or len(incumbent.trials) >= most:
+        return False
+    scatter = incumbent.standard_error * np.sqrt(len(incumbent.trials))
+    error = scatter * np.sqrt(1 / len(incumbent.trials) + 1 / len(loser.trials))
+    return not incumbent.utility - loser.utility > 2 * error

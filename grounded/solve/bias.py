@@ -1,0 +1,190 @@
+"""Step 4: the ORIGINAL model plus a time-dependent bias, so that it replays a trial exactly.
+
+    f_t^(i+1)(s, a) = f_t(s, a) + s_{t+1}^(i) - f_t(s_t^(i), a_t^(i))
+
+The bias is measured on one trial (or on the mean of repeated ones) and added to the model that was
+never changed by an earlier trial: errors do not pile up. With an input shift rho (`matching.py`)
+the model is asked about s, a - rho_t and still replays the trial; rho = 0 is the paper's. In the
+biased model the trial's own policy gives the trial's own states, so derivatives are taken along the
+true states (section 4.1).
+
+Matched inputs: what the MODEL would have needed to move as the real system did.
+
+A crude model has regimes: a motor drives or brakes, a wheel grips, a stick is in its dead zone.
+Along a real trial (s_t, a_t) a miscalibrated model is easily in another regime than the robot was:
+the car held its speed, the model at the same throttle brakes. Its derivatives are then those of the
+wrong branch, and DDP is told that the throttle does nothing. So the part of the disagreement that
+inputs can explain is booked on the inputs, and only the rest is added as a bias:
+
+    f_t^(i+1)(s, a) = f_t(s, a - rho_t) + bias_t,       rho_t = a_t - w_t,
+    w_t = argmin_w  |(f_t(s_t, w) - s_{t+1}) / (dt scale)|^2 + (PULL (w - a_t) / span)^2
+
+The model still replays the trial exactly, and its derivatives are still taken along the trial's own
+STATES (section 4.1 of the paper); rho = 0 is the paper's step 4. scale is the spread of each
+state's rate along the trial, span that of each input. rho is smoothed over WINDOW steps, since
+noise in the states would shake it. Measured on the car (docs/experiments.md): one trial does what
+took five.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from grounded.compile import Problem
+from grounded.errors import GroundedError
+from grounded.frozen import Array
+from grounded.rollout import augmented
+from grounded.solve.levenberg_marquardt import Batch, Rows, solve
+from grounded.task import Task
+from grounded.trial import Trial
+
+
+@dataclass(frozen=True, eq=False)
+class Grounding:
+    """A trial as the biased model sees it: bias (H, n), z (H + 1, nz), inputs and shift (H, m)."""
+
+    bias: Array
+    z: Array
+    inputs: Array
+    shift: Array | None = None  # rho of `matching`, None for none
+
+    def on(self, problem: Problem) -> Problem:
+        """The problem with a model that replays the trial."""
+        return replace(problem, bias=self.bias, input_shift=self.shift)
+
+
+def effective_inputs(
+    z: Array, inputs: Array, delay: Array, depths: tuple[int, ...], n: int
+) -> Array:
+    """What the actuators receive, (T, m): commands after their transport delay (in steps)."""
+    received = np.empty_like(inputs)
+    first = n
+    for j, depth in enumerate(depths):
+        queue = np.column_stack([inputs[:, j], z[: len(inputs), first : first + depth]])
+        whole = int(np.floor(delay[j] + 1e-9))
+        part = delay[j] - whole
+        received[:, j] = queue[:, whole]
+        if part > 1e-9:
+            received[:, j] = (1 - part) * queue[:, whole] + part * queue[:, whole + 1]
+        first += depth
+    return received
+
+
+def ground(
+    task: Task,
+    trial: Trial,
+    *,
+    exact: bool = False,
+    match_inputs: bool = False,
+    shift: Array | None = None,
+) -> Grounding:
+    """The bias that makes the task's model replay a trial (step 4).
+
+    Args:
+        task: gives the original model, with its latency.
+        trial: a whole trial, finite for H steps; what follows is not used.
+        exact: measure the bias of the exact model, not of the smoothed planning model.
+        match_inputs: book on the inputs what inputs can explain (`matching.py`).
+        shift: rho (H, m), where it is known already.
+
+    Raises:
+        GroundedError: if the trial is short or not finite: its bias is not known to the end.
+    """
+    trial = trial.until(task.horizon)
+    if trial.steps < task.horizon or trial.finite_steps < trial.steps:
+        raise GroundedError(
+            f"a bias needs a whole trial of {task.horizon} steps; this one is finite for "
+            f"{trial.finite_steps}"
+        )
+    problem = task.problem(exact=exact)
+    z, received = _along(problem, trial)
+    if match_inputs and shift is None:
+        shift = input_shift(task.problem(), trial.states, received)
+    asked = received if shift is None else received - shift
+    predicted = problem.system.step(
+        trial.states[:-1], asked, problem.p, problem.dt, problem.smoothing
+    )
+    # s_{t+1} - f(s_t, a_t); NOT wrapped: replay must land on the recorded number itself.
+    return Grounding(trial.states[1:] - predicted, z, trial.inputs, shift)
+
+
+def _along(problem: Problem, trial: Trial) -> tuple[Array, Array]:
+    """A trial's z (T + 1, nz), and what the actuators received (T, m)."""
+    past = problem.past if trial.start_inputs is None else trial.start_inputs
+    z = augmented(problem, trial.states, trial.inputs, past)
+    n = trial.states.shape[1]
+    return z, effective_inputs(z, trial.inputs, problem.delay, problem.depths, n)
+
+
+def residuals(task: Task, trial: Trial) -> Array:
+    """One-step residuals of the exact model on a trial, (T, n), angles wrapped."""
+    problem = task.problem(exact=True)
+    _, received = _along(problem, trial)
+    predicted = problem.system.step(trial.states[:-1], received, problem.p, problem.dt)
+    return task.model.difference(trial.states[1:], predicted)
+
+
+PULL = 0.2  # price of leaving the recorded input: a whole span costs as much as 0.2 spreads of rate
+WINDOW = 5  # steps of the Hann window
+ITERATIONS = 15
+ELSEWHERE = (-0.15, 0.15)  # further starts, in spans, where a stalled motor has no slope
+DEAD = 0.1  # of an input's usual effect
+
+
+def input_shift(problem: Problem, x: Array, received: Array) -> Array:
+    """Rho (T, m) along a trial.
+
+    Args:
+        problem: the original model, exact or smoothed.
+        x: states s_0 .. s_T, (T + 1, n).
+        received: what the actuators received, (T, m).
+    """
+    T, batch = len(received), _moves(problem, x, received)
+    rows = np.arange(T)
+    best = solve(batch, received, rows, ITERATIONS)
+    lost = np.flatnonzero(_without_slope(batch.jacobian(best.w, rows)[:, : x.shape[1]]))
+    for part in ELSEWHERE if len(lost) else ():
+        start = received[lost] + part * _span(problem, received)
+        best = best.better_of(solve(batch, start, lost, ITERATIONS), lost)
+    rho = received - best.w
+    if not np.isfinite(rho).all():
+        return np.zeros_like(received)
+    window = np.hanning(WINDOW + 2)[1:-1]
+    padded = np.pad(rho, ((WINDOW // 2, WINDOW // 2), (0, 0)), mode="edge")
+    smooth = [np.convolve(column, window / window.sum(), mode="valid") for column in padded.T]
+    return np.column_stack(smooth)
+
+
+def _without_slope(J: Array) -> NDArray[np.bool_]:
+    """Steps at which some input does next to nothing, (T,), for J (T, n, m)."""
+    effect = np.linalg.norm(J, axis=1)
+    return np.asarray((effect < DEAD * np.median(effect, axis=0)).any(axis=1))
+
+
+def _span(problem: Problem, received: Array) -> Array:
+    limits = problem.high - problem.low
+    used = np.ptp(received, axis=0) + 1e-9
+    return np.where(np.isfinite(limits), limits, used)
+
+
+def _moves(problem: Problem, x: Array, received: Array) -> Batch:
+    """The equations of every step in w, the input that the model is given."""
+    settings = (problem.p, problem.dt, problem.smoothing)
+    rate = np.diff(x, axis=0) / problem.dt
+    scale = np.std(rate, axis=0) + 1e-3 * float(np.abs(rate).max()) + 1e-9
+    pull = PULL / _span(problem, received)
+
+    def residual(w: Array, rows: Rows) -> Array:
+        with np.errstate(all="ignore"):
+            moved = problem.system.step(x[rows], np.ascontiguousarray(w), *settings)
+        return np.hstack([(moved - x[rows + 1]) / problem.dt / scale, (w - received[rows]) * pull])
+
+    def jacobian(w: Array, rows: Rows) -> Array:
+        _, f_u = problem.system.linearise(x[rows], np.ascontiguousarray(w), *settings)
+        pulls = np.tile(np.diag(pull), (len(rows), 1, 1))
+        return np.concatenate([f_u / problem.dt / scale[:, None], pulls], axis=1)
+
+    return Batch(residual, jacobian, problem.low, problem.high, solved=0.0)

@@ -1,0 +1,348 @@
+"""The commands: exit codes, JSON documents, data on stdout and narration on stderr."""
+
+import csv
+import importlib.util
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cli import COMMAND, grounded, process
+from grounded.policy import load
+from grounded_cli.main import COMMANDS
+from grounded_trials.workspace.examples import EXAMPLES
+from workspaces import CONFIG, REAL, make
+
+HERE = [n for n, (m, _) in COMMANDS.items() if importlib.util.find_spec(f"grounded_cli.{m}")]
+
+
+@pytest.fixture
+def w(tmp_path):
+    return make(tmp_path / "w").folder
+
+
+def step(w):
+    """One propose, run and ingest; the documents of the three."""
+    proposed = grounded("-C", w, "propose", "--json").json
+    run = grounded("-C", w, "run", "--json").json
+    return proposed, run, grounded("-C", w, "ingest", run["trial_file"], "--json").json
+
+
+# the frame
+
+
+@pytest.mark.parametrize("name", HERE)
+def test_every_command_explains_itself(name):
+    done = grounded(name, "--help")
+    assert done.code == 0 and not done.err
+    assert done.out.startswith(f"Usage: grounded {name}")
+    text = done.out.split("Options:")[0]
+    assert len(text.split("\n\n", 1)[1].strip()) > 20, "a sentence that says what it does"
+    options = re.findall(r"^  (-[^ ,]*,? ?--[\w-]+|--[\w-]+).*", done.out, re.M)
+    for line in re.findall(r"^  --[\w-]+(?: [A-Z\[][^ ]*)?$", done.out, re.M):
+        raise AssertionError(f"'{line}' has no help")
+    assert options
+
+
+def test_the_list_of_commands_is_in_the_order_of_use():
+    done = grounded("--help")
+    listed = re.findall(r"^  (\w+)  ", done.out.split("Commands:")[1], re.M)
+    assert listed == list(COMMANDS) and done.code == 0
+    assert grounded("-h").out == done.out
+    assert "grounded demo car-figure8" in done.out
+
+
+def test_help_needs_no_numpy():
+    """`grounded --help` is quick: it imports no command and no array library."""
+    code = (
+        "import sys, atexit\nsys.argv = ['grounded', '--help']\n"
+        "from grounded_cli.main import main\n"
+        "atexit.register(lambda: print([m for m in ('numpy', 'scipy', 'llvmlite', 'mcap') "
+        "if m in sys.modules], file=sys.stderr))\nmain()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stderr.strip() == "[]"
+
+
+def test_version():
+    done = grounded("--version")
+    assert done.code == 0 and re.search(r"\d+\.\d+\.\d+", done.out)
+
+
+@pytest.mark.parametrize(
+    ("args", "match"),
+    [
+        (["propse"], "no command 'propse': did you mean 'propose'"),
+        (["propose", "--jsn"], "--json"),
+        (["init"], "give a folder and an example"),
+        (["init", "x"], "give a folder and an example"),
+        (["ingest"], "Missing argument"),
+        (["learn", "--trials", "0"], "0 is not in the range"),
+        (["learn", "--trials", "many"], "not a valid integer"),
+        (["export", "c0001", "--format", "xml"], "'xml' is not one of"),
+        (["-C"], "requires an argument"),
+    ],
+    ids=lambda v: " ".join(v) if isinstance(v, list) else "",
+)
+def test_wrong_usage_is_exit_2(args, match):
+    done = grounded(*args)
+    assert done.code == 2 and match in done.err and not done.out
+    assert "Traceback" not in done.err
+
+
+@pytest.mark.parametrize(
+    "name", [n for n in HERE if n in ("propose", "run", "learn", "status", "fit", "verify")]
+)
+def test_a_folder_that_is_no_workspace_is_exit_1(name, tmp_path):
+    done = grounded("-C", tmp_path, name)
+    assert done.code == 1 and not done.out
+    assert done.err.startswith("error: ") and "this is not a workspace" in done.err
+    assert "grounded init DIR --example car-turn" in done.err and done.err.count("\n") == 1
+
+
+def test_dash_c_works_before_and_after_the_command(w):
+    assert grounded("-C", w, "status").out == grounded("status", "-C", w).out
+
+
+def test_colour_only_on_a_terminal(w):
+    for env in ({"NO_COLOR": "1"}, {}):
+        done = process("-C", w, "propse" if not env else "run", **env)
+        assert "\x1b" not in done.err + done.out
+
+
+# the loop
+
+
+def test_init_lists_and_makes_workspaces(tmp_path):
+    listed = grounded("init", "--list", "--json").json["examples"]
+    assert list(listed) == list(EXAMPLES)
+    assert {"car-turn", "car-circle", "car-figure8", "flight-figure8", "pendulum"} <= set(listed)
+    for name in EXAMPLES:
+        done = grounded("init", tmp_path / name, "--example", name, "--json")
+        assert done.json["workspace"] == str(tmp_path / name)
+        here = {p.name for p in (tmp_path / name).iterdir()}
+        assert {"grounded.toml", "model.py", "target.csv", "trials", "candidates"} <= here
+    again = grounded("init", tmp_path / "pendulum", "--example", "pendulum")
+    assert again.code == 1 and "exists already" in again.err
+    wrong = grounded("init", tmp_path / "x", "--example", "car-trun")
+    assert wrong.code == 1 and "did you mean 'car-turn'" in wrong.err
+    assert not (tmp_path / "x").exists()
+
+
+def test_the_loop_by_hand(w):
+    status = grounded("-C", w, "status", "--json").json
+    assert (status["phase"], status["trials"], status["best"]) == ("propose", 0, None)
+    proposed, run, ingested = step(w)
+    assert {"candidate", "file", "iteration", "alpha", "predicted_utility", "phase"} <= set(
+        proposed
+    )
+    assert (proposed["candidate"], proposed["iteration"], proposed["alpha"]) == ("c0001", 0, 1.0)
+    assert proposed["phase"] == "await-trial" and Path(proposed["file"]).is_file()
+    assert Path(run["trial_file"]).name == "c0001-1.mcap"
+    (trial,) = ingested["trials"]
+    fields = {"trial", "sha256", "known", "candidate", "utility", "accepted", "warnings"}
+    assert fields <= set(trial)
+    assert (trial["trial"], trial["candidate"], trial["known"]) == ("t0001", "c0001", False)
+    assert trial["accepted"] is True and trial["warnings"] == [] and trial["utility"] < 0
+    assert len(trial["sha256"]) == 64
+    second, _, _ = step(w)
+    assert (second["candidate"], second["iteration"]) == ("c0002", 1)
+    status = grounded("-C", w, "status", "--json").json
+    assert {"phase", "iteration", "best", "utilities", "trials"} <= set(status)
+    assert status["trials"] == 2 and status["iteration"] == 1 and len(status["utilities"]) == 2
+    assert status["best"] == {"candidate": "c0002", "utility": status["utilities"][-1]}
+    assert second["best_utility"] == status["utilities"][0]
+
+
+def test_propose_names_the_outstanding_candidate_again(w):
+    first = grounded("-C", w, "propose", "--json")
+    content = Path(first.json["file"]).read_bytes()
+    again = grounded("-C", w, "propose", "--json")
+    assert again.json["candidate"] == "c0001" and again.json["new"] is False
+    assert Path(again.json["file"]).read_bytes() == content
+    assert "c0001" in grounded("-C", w, "propose").out
+    Path(first.json["file"]).unlink()
+    grounded("-C", w, "propose")
+    assert Path(first.json["file"]).read_bytes() == content
+
+
+def test_ingest_of_the_same_file_twice_is_a_success_that_names_the_trial(w):
+    _, run, first = step(w)
+    before = sorted(p.name for p in (w / "trials").iterdir())
+    again = grounded("-C", w, "ingest", run["trial_file"], "--json")
+    assert again.code == 0 and again.json["trials"][0]["known"] is True
+    assert again.json["trials"][0]["trial"] == first["trials"][0]["trial"] == "t0001"
+    assert sorted(p.name for p in (w / "trials").iterdir()) == before
+    said = grounded("-C", w, "ingest", run["trial_file"])
+    assert said.code == 0 and "stored before as t0001" in said.out
+
+
+def test_learn_runs_to_the_end_and_says_what_is_next(w):
+    part = grounded("-C", w, "learn", "--trials", "2", "--json")
+    assert part.json["trials"] == 2 and part.code == 0
+    assert part.err.count("c000") == 2  # narration, a line a trial
+    done = grounded("-C", w, "learn", "--json").json
+    assert {"utilities", "trials", "phase"} <= set(done)
+    assert done["phase"] in ("converged", "stopped") and done["trials"] <= 12
+    status = grounded("-C", w, "status", "--json").json
+    assert status["phase"] == done["phase"] and status["utilities"] == done["utilities"]
+    ended = grounded("-C", w, "propose", "--json")
+    assert ended.code == 0 and ended.json["candidate"] is None
+    assert ended.json["phase"] == done["phase"] and ended.json["sentence"]
+    again = grounded("-C", w, "learn", "--json")
+    assert again.json["trials"] == done["trials"] and again.code == 0
+    text = grounded("-C", w, "status")
+    assert "better than the model's own policy" in text.out and "next:" in text.out
+    assert not text.err
+
+
+def test_run_may_name_any_candidate_and_needs_one(w):
+    none = grounded("-C", w, "run")
+    assert none.code == 1 and "no candidate is waiting" in none.err
+    step(w)
+    again = grounded("-C", w, "run", "c0001", "--json").json
+    assert Path(again["trial_file"]).name == "c0001-2.mcap"
+    wrong = grounded("-C", w, "run", "c0009")
+    assert wrong.code == 1 and "no candidate 'c0009': did you mean 'c0001'" in wrong.err
+
+
+@pytest.mark.parametrize("form", ["json", "npz", "csv"])
+def test_export_holds_the_policy_with_units_and_time_base(w, tmp_path, form):
+    step(w)
+    path = tmp_path / f"best.{form}"
+    done = grounded("-C", w, "export", "best", "--format", form, "-o", path, "--json")
+    assert done.json["file"] == str(path) and done.json["candidate"] == "c0001"
+    content = path.read_bytes()
+    assert b"kg" not in content  # units of states and inputs, not of parameters
+    if form == "npz":
+        run = load(path, states=("x", "v"), inputs=("force",))
+        assert run.policy.dt == 0.05 and run.policy.horizon == 40
+        with np.load(path) as data:
+            assert json.loads(str(data["units"])) == {"x": "m", "v": "m/s", "force": "N"}
+            assert str(data["time_unit"]) == "s"
+    elif form == "json":
+        data = json.loads(content)
+        assert (data["dt"], data["time_unit"], data["units"]["v"]) == (0.05, "s", "m/s")
+        assert np.shape(data["gain"]) == (40, 1, 3)
+    else:
+        head = [line for line in content.decode().splitlines() if line.startswith("#")]
+        assert any('"v": "m/s"' in line for line in head) and "# dt [s]: 0.05" in head
+        rows = list(
+            csv.DictReader(line for line in content.decode().splitlines() if line[0] != "#")
+        )
+        assert len(rows) == 40 and rows[1]["t"] == "0.05" and "gain.force.force[t-1]" in rows[0]
+
+
+def test_the_three_exports_say_the_same(w, tmp_path):
+    step(w)
+    for form in ("json", "npz", "csv"):
+        grounded("-C", w, "export", "c0001", "--format", form, "-o", tmp_path / f"c.{form}")
+    a = load(tmp_path / "c.npz").policy
+    b = json.loads((tmp_path / "c.json").read_text())
+    rows = list(
+        csv.DictReader(
+            line for line in (tmp_path / "c.csv").read_text().splitlines() if line[0] != "#"
+        )
+    )
+    np.testing.assert_array_equal(a.feedforward, b["feedforward"])
+    np.testing.assert_array_equal(a.gain, b["gain"])
+    np.testing.assert_array_equal(
+        a.feedforward[:, 0], [float(r["feedforward.force"]) for r in rows]
+    )
+    np.testing.assert_array_equal(
+        a.reference[:, 2], [float(r["reference.force[t-1]"]) for r in rows]
+    )
+
+
+def test_export_without_a_best_or_into_nowhere(w, tmp_path):
+    none = grounded("-C", w, "export", "best")
+    assert none.code == 1 and "no best candidate yet" in none.err
+    step(w)
+    nowhere = grounded("-C", w, "export", "c0001", "-o", tmp_path / "no" / "c.json")
+    assert nowhere.code == 1 and "can't be written" in nowhere.err
+    assert "does not exist; make it, or name another place" in nowhere.err
+    assert not list(tmp_path.glob("**/*.tmp"))
+
+
+def test_verify_names_what_is_damaged_and_fails(w):
+    step(w)
+    step(w)
+    good = grounded("-C", w, "verify", "--json")
+    assert (good.code, good.json["damaged"], good.json["checked"]) == (0, [], 4)
+    path = sorted((w / "trials").glob("t0002*"))[0]
+    path.chmod(0o644)
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(bytes(data))
+    bad = grounded("-C", w, "verify", "--json")
+    assert bad.code == 1 and [d["file"] for d in bad.json["damaged"]] == [str(path)]
+    said = grounded("-C", w, "verify")
+    assert "t0002" in said.err and "damaged" in said.out
+    stopped = grounded("-C", w, "propose")
+    assert stopped.code == 1 and "t0002" in stopped.err and "damaged" in stopped.err
+    candidate = w / "candidates" / "c0001.mcap"
+    candidate.write_bytes(candidate.read_bytes()[:-100])
+    worse = grounded("-C", w, "verify", "--json").json["damaged"]
+    assert len(worse) == 2 and worse[1]["file"] == str(candidate)
+
+
+def test_fit_shows_values_with_intervals_and_applies_them(w):
+    grounded("-C", w, "learn", "--trials", "3")
+    found = grounded("-C", w, "fit", "--json").json
+    assert {"value", "std", "unit"} <= set(found["params"]["mass"])
+    assert found["params"]["mass"]["value"] == pytest.approx(1.4, rel=0.1)
+    assert found["params"]["mass"]["unit"] == "kg" and not found["applied"]
+    text = (w / "grounded.toml").read_text()
+    applied = grounded("-C", w, "fit", "--apply")
+    assert applied.code == 0 and "mass" in applied.out and "95 % interval" in applied.out
+    changed = (w / "grounded.toml").read_text()
+    assert changed != text and "params = " in changed
+    assert changed.split("[task]")[1] == text.split("[task]")[1]  # the rest is left alone
+    made = grounded("-C", w, "propose", "--json").json
+    assert made["candidate"] and made["alpha"] == 1.0
+    only = grounded("-C", w, "fit", "--params", "drag", "--json").json
+    assert set(only["params"]) == {"drag"}
+    wrong = grounded("-C", w, "fit", "--params", "drg")
+    assert wrong.code == 1 and "did you mean 'drag'" in wrong.err
+
+
+def test_fit_without_trials_says_so(w):
+    done = grounded("-C", w, "fit")
+    assert done.code == 1 and "no trial to learn from" in done.err
+
+
+def test_narration_is_not_data(w):
+    """stdout of every --json command is one document and nothing else."""
+    for args in (["propose"], ["run"], ["status"], ["verify"], ["learn", "--trials", "1"]):
+        done = process("-C", w, *args, "--json")
+        assert done.code == 0 and isinstance(done.json, dict), done.err
+        assert "\r" not in done.out + done.err  # no progress bar in a pipe
+
+
+def test_a_closed_pipe_is_no_traceback(w):
+    command = " ".join(f"'{c}'" for c in COMMAND)
+    done = subprocess.run(
+        ["bash", "-c", f"{command} -C '{w}' status --json | true"],
+        capture_output=True,
+        text=True,
+        env=os.environ,
+        check=False,
+    )
+    assert "Traceback" not in done.stderr and "BrokenPipe" not in done.stderr
+
+
+def test_repeats_and_a_failed_run_in_words(tmp_path):
+    noisy = (
+        CONFIG.replace("[search]", "[search]\nrepeats = 3") + "noise = { process = { v = 0.02 } }\n"
+    )
+    folder = make(tmp_path / "w", config=noisy, real=REAL).folder
+    done = grounded("-C", folder, "learn", "--trials", "9", "--json").json
+    assert done["trials"] == 9 and len(done["history"][0]["trials"]) == 3
+    assert done["history"][0]["standard_error"] > 0
+    text = grounded("-C", folder, "status").out
+    assert "probability" in text and "certainty" in text

@@ -1,0 +1,169 @@
+"""A whole session as a person reads it: 80 columns, one trial and two trials, the same words."""
+
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+
+from cli import grounded, process
+from reported import cart, copied
+from workspaces import CONFIG, MODEL, make
+
+__all__ = ["cart"]
+
+
+def said(done, code=0):
+    """All that a command printed, checked as every output is."""
+    assert done.code == code, done.err
+    text = done.out + done.err
+    long = [line for line in text.splitlines() if len(line) > 80]
+    assert not long, long
+    assert not re.search(r"(?<![\d.,])1 (trial|log|step|message|sample|file|improvement)s\b", text)
+    for word in ("not accepted", "no improvement", "[1]", "of ours"):
+        assert word not in text
+    return text
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """A new workspace, which is the current folder."""
+    make(tmp_path / "w")
+    monkeypatch.chdir(tmp_path / "w")
+    return tmp_path / "w"
+
+
+def test_a_session_from_the_first_trial_to_the_export(here):
+    assert "N, limits -5 to 5" in said(grounded("propose"))
+    said(grounded("run"))
+    text = said(grounded("ingest", "runs/c0001-1.mcap"))
+    assert re.search(r"c0001 +utility .*, first: what the search improves on", text)
+    assert "best       c0001" in said(grounded("status"))
+    said(grounded("learn", "--trials", 1))
+    text = said(grounded("learn"))
+    assert re.search(r"c0001 .* first$", text, re.M)
+    assert said(grounded("status")).rstrip().endswith("next: grounded diagnose")
+    text = said(grounded("diagnose"))
+    assert "of the squared error is explained" in text and "next: grounded " in text
+    assert "whole trials" in text
+    for command in ("report", "fit", "verify", "propose"):
+        said(grounded(command))
+    assert "grounded.policy.load" in said(grounded("export", "best", "-o", "p.npz"))
+    assert Path("p.npz").read_bytes()[:2] == b"PK"
+
+
+def test_the_first_trial_is_called_first(tmp_path):
+    folder = make(tmp_path / "w").folder
+    lines = grounded("-C", folder, "learn", "--trials", 2).err.splitlines()
+    assert lines[0].endswith("  first") and lines[1].endswith("better")
+
+
+def test_a_trial_that_was_no_better_is_called_so_everywhere(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    (worse,) = folder.glob("trials/t0001-*")
+    shutil.copy(worse, tmp_path / "again.mcap")
+    said_so = [grounded("-C", folder, command) for command in ("status", "report")]
+    page = grounded("-C", folder, "report", "--html").out.splitlines()[0]
+    if any("no better" in done.out for done in said_so):
+        assert all("no better" in done.out for done in said_so)
+        assert "no better" in Path(page).read_text()
+    again = grounded("-C", folder, "ingest", tmp_path / "again.mcap")
+    assert "was stored before as t0001" in again.out and ", first:" in again.out
+
+
+def test_a_failed_first_policy_is_no_measure_of_the_gain(tmp_path):
+    """Once c0001 has a failed trial, the best can't be so many per cent better than it."""
+    folder = make(tmp_path / "w").folder
+    assert grounded("-C", folder, "learn", "--trials", 2).code == 0
+    from grounded_trials.store.trial_file import read_trial, trial_bytes
+    from grounded_trials.workspace.folder import Workspace
+
+    w = Workspace(folder)
+    stored = w.store.list()[0]
+    trial, meta, policy = read_trial(w.store.read(stored))
+    about = {key: meta[key] for key in ("kind", "iteration", "alpha", "task")}
+    short = trial.until(5)
+    (tmp_path / "short.mcap").write_bytes(trial_bytes(short, about, policy))
+    done = grounded("-C", folder, "ingest", tmp_path / "short.mcap")
+    assert done.code == 0, done.err
+    assert "utility failed, no better: it did not run to the end" in " ".join(done.out.split())
+    out = said(grounded("-C", folder, "status"))
+    assert "the model's own policy failed" in " ".join(out.split())
+    assert "better than the model's own policy" not in " ".join(out.split())
+
+
+def test_a_unit_of_one_is_not_printed(tmp_path):
+    model = MODEL.replace('"force": "N"', '"force": "1"').replace('1.0, "kg"', '1.0, "1"')
+    folder = make(tmp_path / "w", model=model).folder
+    assert re.search(r"force +-?[\d.]+ to [\d.]+, limits", grounded("-C", folder, "propose").out)
+    grounded("-C", folder, "learn")
+    fitted = grounded("-C", folder, "fit").out
+    assert re.search(r"^mass .*\d\.\d+$", fitted, re.M), fitted
+    page = Path(grounded("-C", folder, "report", "--html").out.splitlines()[0]).read_text()
+    assert "force [1]" not in page and "<td>1</td><td>0.01, change" not in page
+    exported = grounded("-C", folder, "export", "best", "--json").json["file"]
+    assert '"force": "1"' in Path(exported).read_text().replace("'", '"')
+    Path(exported).unlink()
+
+
+def test_repeats_say_what_is_waited_for(tmp_path):
+    folder = make(tmp_path / "w", config=CONFIG.replace("[search]", "[search]\nrepeats = 2")).folder
+    grounded("-C", folder, "propose")
+    path = grounded("-C", folder, "run", "--json").json["trial_file"]
+    out = grounded("-C", folder, "ingest", path).out
+    assert "waiting: more trials of it are needed" in " ".join(out.split())
+    text = " ".join(grounded("-C", folder, "propose").out.split())
+    assert "Run c0001 once more" in text and "is waiting for 1 trial" in text
+    path = grounded("-C", folder, "run", "--json").json["trial_file"]
+    assert grounded("-C", folder, "ingest", path, "--json").json["trials"][0]["verdict"] == "first"
+
+
+# mistakes
+
+
+@pytest.mark.parametrize(
+    ("words", "holds"),
+    [
+        (["status", "-C", "grounded.toml"], "is a file: -C takes the folder"),
+        (["ingest", "."], "is a workspace: name the log"),
+        (["ingest", "model.py"], "this is not an MCAP file"),
+        (["adopt", "x:y"], "nothing was diagnosed yet"),
+        (["diagnose", "--trials", "t9,"], "there is no trial to learn from"),
+        (["diagnose", "--without", "delay,delai"], "did you mean 'delay'"),
+        (["diagnose", "--trials", ""], "--trials names no trial: expected some, like t0001"),
+        (["fit", "--params", ","], "--params names no parameter: expected some, like a1,L"),
+        (["diagnose", "--trials", " , "], "leave it out to take all"),
+        (["recover", "trials"], "is a folder"),
+        (["recover", "model.py"], "look for another copy of the recording"),
+        (["ingest", "nofile.mcap"], "name an MCAP file or a bag's folder"),
+        (["ingest", "no/nofile.mcap"], "nor does its folder no: name a log"),
+        (["inspect", "nowhere.mcap"], "does not exist"),
+    ],
+)
+def test_a_mistake_is_named(here, words, holds):
+    done = grounded(*words)
+    assert done.code == 1 and holds in done.err and "Errno" not in done.err, done.err
+
+
+def test_a_file_says_its_format_and_must_not_contradict(here):
+    done = process("export", "best", "--format", "csv", "-o", "x.npz", cwd=here)
+    assert done.code == 2 and "is named as npz, --format says csv" in done.err
+
+
+def test_a_document_says_the_same_words(cart):
+    history = grounded("-C", cart, "status", "--json").json["history"]
+    shown = grounded("-C", cart, "status").out.splitlines()[1 : len(history) + 1]
+    for entry, line in zip(history, shown, strict=True):
+        assert line.startswith(entry["candidate"]) and line.endswith(entry["verdict"])
+
+
+def test_the_best_one_is_run_again_by_that_name(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    best = grounded("-C", folder, "status", "--json").json["best"]["candidate"]
+    done = grounded("-C", folder, "run", "best", "--json").json
+    assert done["candidate"] == best
+    out = grounded("-C", folder, "ingest", done["trial_file"]).out
+    assert "run again: its utility is the mean of its trials" in " ".join(out.split())
+    empty = make(tmp_path / "empty").folder
+    refused = grounded("-C", empty, "run", "best")
+    assert refused.code == 1 and "there is no best candidate yet" in refused.err

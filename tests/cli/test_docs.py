@@ -1,0 +1,309 @@
+"""Every command and code block of README.md and docs/*.md runs.
+
+    ```console    lines that start with `$ ` are run in bash; the lines that follow are the output,
+                  compared loosely: numbers may differ, `...` stands for anything
+    ```python     run in the same folder as the console blocks of the page, in one namespace a page
+    ```toml       parsed; a block named by `<!-- file: NAME -->` is written to the workspace
+    ```text, ```  not run: pictures, equations, output
+
+An HTML comment just above a block says what is special about it:
+
+    <!-- not run: WHY -->         it is not; WHY must be a reason
+    <!-- file: NAME -->           it is written to NAME in the page's folder
+    <!-- workspace: EXAMPLE -->   from here on the page works in a fresh workspace of an example
+    <!-- trial: NAME -->          a trial with states x, y, psi is written to NAME before
+    <!-- needs: shared -->        skipped where ../shared (or an importable module) is missing
+    <!-- exit: 1 -->              the last command must end with this code
+    <!-- slow -->                 only with GROUNDED_DOCS=all (above ten seconds)
+    <!-- demo-command -->         the README's set-up commands: checked, and run by .ci/run
+    <!-- test-command -->
+
+Every block starts in the page's folder; a `cd` holds to the end of its block.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import json
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from grounded.trial import Trial
+from grounded_trials.store.trial_file import write_trial
+from shared_data import DATA
+from workspaces import make
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = [p for p in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))) if p.is_file()]
+FENCE = re.compile(r"^( *)```+ *(\S*).*?\n(.*?)^\1```+ *$", re.M | re.S)
+MARK = re.compile(
+    r"<!--\s*(not run|file|trial|workspace|needs|exit|slow|demo-command|test-command)"
+    r"\s*:?\s*(.*?)\s*-->",
+    re.S,
+)
+RUN = ("console", "python", "bash", "sh", "shell", "toml", "json")
+SHOWN = ("", "text", "mermaid", "cpp", "c++", "c", "cmake", "csv", "diff", "yaml", "xml", "html")
+ALL = os.environ.get("GROUNDED_DOCS") == "all"
+
+
+@dataclass(frozen=True)
+class Block:
+    language: str
+    text: str
+    line: int
+    marks: dict[str, str] = field(default_factory=dict)
+
+
+def blocks_of(text: str) -> list[Block]:
+    """The fenced blocks of a page with the comments that stand directly above each."""
+    found, end = [], 0
+    for match in FENCE.finditer(text):
+        above = re.split(r"\n\s*\n(?!\s*<!--)", text[end : match.start()].rstrip("\n"))[-1]
+        comments = re.search(r"(?:<!--(?:(?!-->).)*-->\s*)+$", above, re.S)
+        marks = dict(MARK.findall(comments.group(0))) if comments else {}
+        indent = len(match[1])
+        body = "".join(line[indent:] for line in match[3].splitlines(keepends=True))
+        found.append(Block(match[2].lower(), body, text[: match.start()].count("\n") + 1, marks))
+        end = match.end()
+    return found
+
+
+def sessions(text: str) -> list[tuple[str, list[str]]]:
+    """Commands of a console block, each with the output lines shown below it."""
+    found: list[tuple[str, list[str]]] = []
+    lines = iter(text.splitlines())
+    for line in lines:
+        if line.startswith("$ "):
+            command = line[2:]
+            while command.endswith("\\"):
+                command = command[:-1] + next(lines).removeprefix("> ")
+            found.append((command, []))
+        elif found:
+            found[-1][1].append(line)
+    return found
+
+
+def loosely(line: str) -> str:
+    """A line with what may differ from run to run left out: numbers, blanks, bars, paths."""
+    line = re.sub(r"\x1b\[[0-9;]*m", "", line)
+    line = re.sub(r"[▁▂▃▄▅▆▇█x]{2,}", "BAR", line)
+    line = re.sub(r"[0-9a-f]{12,}", "HASH", line)
+    line = re.sub(r"[-+]?\d[\d,]*(\.\d+)?(e[-+]?\d+)?", "N", line)
+    return re.sub(r"\s+", " ", line).strip()
+
+
+def missing_lines(shown: list[str], out: str) -> list[str]:
+    """Shown lines that the output does not hold, in order; `...` skips any number."""
+    real = [loosely(line) for line in out.splitlines()]
+    at, missing = 0, []
+    for line in shown:
+        wanted = loosely(line)
+        if not wanted or wanted in ("...", "…"):
+            continue
+        pattern = re.compile(re.escape(wanted).replace(r"\.\.\.", ".*"))
+        hit = next((i for i in range(at, len(real)) if pattern.fullmatch(real[i])), None)
+        if hit is None:
+            missing.append(line)
+        else:
+            at = hit + 1
+    return missing
+
+
+class Page:
+    """Runs the blocks of one page, one after another, in one folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.names, self.count = folder, {"__name__": "__main__"}, 0
+        binary = Path(sys.executable).parent
+        self.env = os.environ | {
+            "PATH": f"{binary}{os.pathsep}{os.environ['PATH']}",
+            "NO_COLOR": "1",
+            "COLUMNS": "80",
+        }
+        if DATA is not None:
+            self.env["GROUNDED_SHARED"] = str(DATA.parent)
+
+    def take(self, block: Block) -> None:
+        if "workspace" in block.marks:
+            self.count += 1
+            folder = self.folder / f"w{self.count}"
+            self.folder = make(folder, block.marks["workspace"]).folder
+        if "trial" in block.marks:
+            _write_trial(self.folder / block.marks["trial"])
+        if "file" in block.marks:
+            path = self.folder / block.marks["file"]
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(block.text)
+        if block.language == "toml":
+            tomllib.loads(block.text)
+        elif block.language == "json":
+            json.loads(block.text)
+        elif block.language == "python":
+            self.python(block)
+        elif block.language in ("console", "bash", "sh", "shell"):
+            self.console(block)
+
+    def python(self, block: Block) -> None:
+        if "file" in block.marks:
+            ast.parse(block.text)
+            return
+        script = self.folder / f".block_{block.line}.py"
+        before = Path.cwd()
+        try:
+            os.chdir(self.folder)
+            exec(compile("\n" * block.line + block.text, str(script), "exec"), self.names)
+        finally:
+            os.chdir(before)
+
+    def console(self, block: Block) -> None:
+        steps = sessions(block.text)
+        if block.language != "console" and not steps:
+            steps = [(line, []) for line in block.text.splitlines() if line.strip()]
+        assert steps, f"line {block.line}: a console block needs lines that start with '$ '"
+        folder = self.folder
+        for k, (command, shown) in enumerate(steps):
+            if command.startswith("cd "):
+                folder = (folder / command[3:].split("&&")[0].strip()).resolve()
+                if "&&" not in command:
+                    continue
+                command = command.split("&&", 1)[1].strip()
+            done = subprocess.run(
+                ["bash", "-c", command],
+                cwd=folder,
+                env=self.env,
+                capture_output=True,
+                text=True,
+                timeout=600,
+                check=False,
+            )
+            last = k == len(steps) - 1
+            wanted = int(block.marks.get("exit", "0")) if last else 0
+            said = f"line {block.line}: $ {command}\n{done.stdout}{done.stderr}"
+            assert done.returncode == wanted, said
+            lost = missing_lines(shown, done.stdout + done.stderr)
+            lost = missing_lines(shown, done.stderr + done.stdout) if lost else lost
+            assert not lost, f"{said}\nshown in the page, not in the output: {lost}"
+
+
+def _there(name: str) -> bool:
+    if name == "shared":
+        return DATA is not None
+    return not name or importlib.util.find_spec(name) is not None
+
+
+def _write_trial(path: Path) -> None:
+    states, inputs = np.zeros((21, 3)), np.zeros((20, 2))
+    trial = Trial(states, inputs, 0.05, ("x", "y", "psi"), ("speed", "turn"))
+    write_trial(path, trial, {"kind": "trial"})
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_every_block_of_the_page_runs(page, tmp_path):
+    runner, skipped = Page(tmp_path), []
+    for block in blocks_of(page.read_text()):
+        where = f"{page.name} line {block.line}"
+        assert block.language in RUN + SHOWN, f"{where}: unknown language '{block.language}'"
+        if "not run" in block.marks:
+            assert len(block.marks["not run"]) >= 5, f"{where}: say why it is not run"
+            continue
+        if block.language in SHOWN:
+            if "file" in block.marks:
+                (runner.folder / block.marks["file"]).write_text(block.text)
+            continue
+        if not _there(block.marks.get("needs", "")):
+            skipped.append(f"{where}: {block.marks['needs']} is missing")
+            continue
+        if {"demo-command", "test-command"} & set(block.marks):
+            continue
+        if "slow" in block.marks and not ALL:
+            skipped.append(f"{where}: slow (GROUNDED_DOCS=all)")
+            continue
+        runner.take(block)
+    if skipped:
+        print("\n".join(skipped))
+
+
+def test_the_two_set_up_commands_are_complete():
+    """One line each, from nothing but Python: a venv, an install that exists, what is promised."""
+    marked = {}
+    for block in blocks_of((ROOT / "README.md").read_text()):
+        for name in {"demo-command", "test-command"} & set(block.marks):
+            marked[name] = block.text.strip()
+    if not marked:
+        pytest.skip("README.md marks no set-up commands yet")
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    for text in marked.values():
+        assert "\n" not in text and text.startswith(
+            "python3 -m venv .venv && .venv/bin/pip install"
+        )
+        for extra in re.findall(r"\[(\w+)\]", text):
+            assert extra in project["optional-dependencies"]
+    assert marked["demo-command"].endswith(".venv/bin/grounded demo car-figure8")
+    assert "pytest" in marked["test-command"] and len(marked) == 2
+
+
+def test_links_between_pages_lead_somewhere():
+    for page in PAGES:
+        text = FENCE.sub("", page.read_text())
+        for target in re.findall(r"\]\(([^)#:\s]+)(?:#[^)]*)?\)", text):
+            assert (page.parent / target).exists(), f"{page.name}: {target} is not there"
+
+
+def test_every_command_is_documented():
+    from grounded_cli.main import COMMANDS
+
+    text = "\n".join(page.read_text() for page in PAGES)
+    missing = [name for name in COMMANDS if f"grounded {name}" not in text]
+    if not (ROOT / "README.md").read_text().count("```") > 4:
+        pytest.skip("README.md is not written yet")
+    assert not missing, f"no page shows {missing}"
+
+
+# the harness itself
+
+
+def test_the_harness_finds_blocks_and_their_marks():
+    text = (
+        "# a\n\n<!-- not run: needs a robot at hand -->\n```console\n$ ros2 run x\n```\n\n"
+        "words\n\n<!-- file: a.py -->\n<!-- slow -->\n\n```python\nx = 1\n```\n"
+        "- item\n\n  ```console\n  $ ls \\\n  > -l\n  total 3\n  ```\n```\nfree\n```\n"
+    )
+    found = blocks_of(text)
+    assert [b.language for b in found] == ["console", "python", "console", ""]
+    assert found[0].marks == {"not run": "needs a robot at hand"}
+    assert found[1].marks == {"file": "a.py", "slow": ""}
+    assert found[2].marks == {} and sessions(found[2].text) == [("ls -l", ["total 3"])]
+    assert found[0].line == 4
+
+
+def test_the_harness_compares_loosely_but_does_compare():
+    out = "best  c0004, utility -0.7259, 22.0 % better\nutility ▁▇██\nphase: converged\n"
+    assert not missing_lines(["best c0003, utility -1.5, 3 % better", "...", "phase: ..."], out)
+    assert missing_lines(["phase: stopped"], out) == ["phase: stopped"]
+    assert missing_lines(["phase: converged", "best c0001, utility 1, 2 % better"], out)
+
+
+def test_the_harness_runs_and_fails(tmp_path):
+    page = Page(tmp_path)
+    page.take(Block("python", "x = 3\n", 1))
+    page.take(Block("python", "assert x == 3\n", 2))
+    page.take(Block("console", "$ echo hello 7\nhello 8\n", 3))
+    page.take(Block("console", "$ false\n", 4, {"exit": "1"}))
+    page.take(Block("console", "$ mkdir a && cd a\n$ cd a\n$ pwd\n.../a\n", 5))
+    for bad in (
+        Block("console", "$ false\n", 6),
+        Block("console", "$ echo a\nb\n", 7),
+        Block("toml", "[a\n", 8),
+        Block("python", "assert x == 4\n", 9),
+    ):
+        with pytest.raises((AssertionError, ValueError)):
+            page.take(bad)

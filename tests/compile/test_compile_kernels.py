@@ -1,0 +1,215 @@
+"""Compiled kernels against their interpreted twins: rollouts, sweeps, whole solves."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from grounded.compile import Problem, parallel, system_of
+from grounded.compile.emit.llvm_box import MAX_INPUTS
+from grounded.compile.run import jit
+from grounded.compile.run.traced import TracedSystem
+from grounded.compile.trace.graph import TooLong
+from grounded.compile.trace.tracing import Signature, trace
+from grounded.solve.ddp import solve
+from problems import SPECS, problem
+
+TIGHT = {"rtol": 1e-10, "atol": 1e-10}
+
+
+def traced(function, *, kind, states, inputs, params, integrator="rk4", angles=()):
+    signature = Signature(function, kind, tuple(states), tuple(inputs), tuple(params))
+    return TracedSystem(signature, trace(signature, None, 1.0), integrator, "")
+
+
+def pair(name, horizon=37, **changes):
+    """The same problem for the compiled and for the interpreted system."""
+    return problem(name, horizon, **changes), problem(name, horizon, make=traced, **changes)
+
+
+def cases():
+    for name in sorted(SPECS):
+        for delay in (0.0, 0.4, 1.0, 2.7):
+            for limit in (np.inf, 0.2):
+                yield name, delay, limit
+
+
+@pytest.mark.parametrize(("name", "delay", "limit"), list(cases()))
+def test_rollout_sweep_and_solve_agree(name, delay, limit):
+    m = len(SPECS[name]["inputs"])
+    changes = {
+        "delay": np.full(m, delay),
+        "low": np.full(m, -limit),
+        "high": np.full(m, limit),
+        "smoothing": 0.05,
+        "input_shift": 0.02 * np.random.default_rng(3).normal(size=(37, m)) if delay else None,
+    }
+    fast, slow = pair(name, **changes)
+    assert (fast.system.how, slow.system.how) == ("compiled", "traced")
+    u = np.full((37, m), 0.15)
+    a, b = fast.system.rollout(fast, u), slow.system.rollout(slow, u)
+    assert np.allclose(a.z, b.z, **TIGHT) and np.allclose(a.cost, b.cost, **TIGHT)
+    damping = np.full(m, 0.3)
+    mine = fast.system.backward(fast, b.z[0], b.u[0], damping)
+    theirs = slow.system.backward(slow, b.z[0], b.u[0], damping)
+    assert np.allclose(mine.k, theirs.k, **TIGHT) and np.allclose(mine.K, theirs.K, **TIGHT)
+    assert np.allclose((mine.d1, mine.d2), (theirs.d1, theirs.d2), **TIGHT)
+    alphas = np.array([1.0, 0.5, 0.25, 0.1, 0.01])  # more than the lanes of one call
+    a = fast.system.rollout(fast, u, theirs.K, b.z[0], theirs.k, alphas)
+    b = slow.system.rollout(slow, u, theirs.K, b.z[0], theirs.k, alphas)
+    assert np.allclose(a.z, b.z, **TIGHT) and np.allclose(a.u, b.u, **TIGHT)
+    assert np.allclose(a.cost, b.cost, **TIGHT)
+    x, y = solve(fast, u), solve(slow, u)
+    assert (x.status, len(x.trace)) == (y.status, len(y.trace))
+    assert np.allclose(x.u, y.u, **TIGHT) and np.allclose(x.K, y.K, **TIGHT)
+
+
+def test_angles_wrap_in_cost_and_feedback():
+    fast, slow = pair("pendulum")
+    u = np.full((37, 1), 0.2)
+    gains = slow.system.backward(slow, slow.system.rollout(slow, u).z[0], u, np.zeros(1))
+    zbar = slow.system.rollout(slow, u).z[0]
+    zbar[:, 0] += 4 * np.pi
+    a = fast.system.rollout(fast, u, gains.K, zbar)
+    b = slow.system.rollout(slow, u, gains.K, zbar)
+    assert np.allclose(a.u, b.u, **TIGHT) and np.allclose(a.u[0], u, atol=1e-9)
+    far = replace(fast, target=fast.target + np.array([2 * np.pi, 0.0]))
+    cost = fast.system.rollout(fast, u).cost
+    assert np.allclose(far.system.rollout(far, u).cost, cost, **TIGHT)
+
+
+def test_step_kind_and_many_sizes():
+    def step(s, a, p, dt):
+        return {"x": s.x + dt * s.v, "v": s.v + dt * (a.f - p.c * s.v * abs(s.v)), "w": a.g * dt}
+
+    names = {"states": ("x", "v", "w"), "inputs": ("f", "g", "h"), "params": ("c",)}
+    fast = system_of(step, kind="step", **names)
+    slow = traced(step, kind="step", **names)
+    rng = np.random.default_rng(0)
+    for N in (0, 1, 2, 7, 8, 9, 33):
+        x, u, p = rng.normal(size=(N, 3)), rng.normal(size=(N, 3)), np.array([0.4])
+        assert fast.step(x, u, p, 0.1).shape == (N, 3)
+        if N:
+            assert np.allclose(fast.step(x, u, p, 0.1), slow.step(x, u, p, 0.1), **TIGHT)
+        for mine, theirs in zip(
+            fast.sensitivities(x, u, p, 0.1), slow.sensitivities(x, u, p, 0.1), strict=True
+        ):
+            assert mine.shape == theirs.shape and np.allclose(mine, theirs, **TIGHT)
+
+
+def wide(n, m, dense, make=system_of, limits=0.3):
+    """A random stable network of n states and m inputs as a problem of 12 steps."""
+    rng = np.random.default_rng(n)
+    A = rng.normal(size=(n, n)) / n
+    if not dense:
+        A *= np.abs(np.subtract.outer(np.arange(n), np.arange(n))) <= 1
+    B = rng.normal(size=(n, m))
+    states, inputs = [f"x{i}" for i in range(n)], [f"u{j}" for j in range(m)]
+
+    def network(s, a, p):
+        x, u = np.array([s[k] for k in states]), np.array([a[k] for k in inputs])
+        return dict(zip(states, A @ np.sin(x) - p.c * x + B @ u, strict=True))
+
+    H, system = (
+        12,
+        make(
+            network,
+            kind="derivative",
+            states=states,
+            inputs=inputs,
+            params=("c",),
+            integrator="rk4",
+        ),
+    )
+    return Problem(
+        system,
+        p=np.array([0.5]),
+        dt=0.1,
+        start=rng.normal(size=n),
+        past=np.zeros(m),
+        delay=rng.uniform(0, 1.5, m),
+        bias=np.zeros((H, n)),
+        target=np.zeros((H + 1, n)),
+        state_weight=np.ones((H + 1, n)),
+        input_target=np.zeros((H, m)),
+        input_weight=np.ones(m),
+        change_weight=np.ones(m),
+        low=np.full(m, -limits),
+        high=np.full(m, limits),
+        angles=np.zeros(n, bool),
+    )
+
+
+@pytest.mark.parametrize(
+    ("n", "m", "dense"),
+    [(1, 1, True), (3, 5, True), (7, 8, False), (16, 4, True), (26, 3, False), (6, 9, True)],
+)
+def test_sizes_written_out_and_looped(n, m, dense):
+    fast, slow = wide(n, m, dense), wide(n, m, dense, traced)
+    assert fast.system.how == "compiled"
+    u = np.zeros((12, m))
+    run = slow.system.rollout(slow, u)
+    mine = fast.system.backward(fast, run.z[0], u, np.zeros(m))
+    theirs = slow.system.backward(slow, run.z[0], u, np.zeros(m))
+    assert np.allclose(mine.k, theirs.k, **TIGHT) and np.allclose(mine.K, theirs.K, **TIGHT)
+    assert (m > MAX_INPUTS) == (m == 9)  # beyond, the sweep is NumPy's
+    if n > 1:
+        assert np.any(np.isin(u + theirs.k, (-0.3, 0.3)))  # limits were met
+    assert np.allclose(solve(fast, u).u, solve(slow, u).u, **TIGHT)
+
+
+def test_many_models_in_threads():
+    task, rng = problem("car", 50), np.random.default_rng(0)
+    values = [task.p * rng.uniform(0.9, 1.1, len(task.p)) for _ in range(24)]
+
+    def cost(p):
+        return solve(replace(task, p=p), np.full((50, 2), 0.3)).cost
+
+    assert parallel(cost, values, workers=4) == [cost(p) for p in values]
+    assert parallel(cost, []) == []
+    with pytest.raises(ZeroDivisionError):
+        parallel(lambda i: 1 / i, [1, 0, 2], workers=2)
+
+
+def test_too_many_operations_are_not_compiled(monkeypatch):
+    import grounded.compile as package
+
+    monkeypatch.setattr(package, "MAX_COMPILED", 20)
+    monkeypatch.setattr("grounded.compile.run.compiled.SMALL", 0)
+    task = problem("car")
+    assert task.system.how == "traced" and "operations" in task.system.note
+    with pytest.raises(TooLong):
+        from grounded.compile.trace.graph import Graph
+
+        graph = Graph(limit=3)
+        for i in range(5):
+            graph.const(float(i))
+
+
+def test_a_failed_sweep_names_the_same_step():
+    zero = np.zeros(1)
+    fast, slow = pair("double_integrator", 9, input_weight=zero, change_weight=zero)
+    weight = np.zeros((10, 2))
+    weight[6:] = 1.0  # nothing to be minimised before step 5 but the future
+    z, u = np.zeros((10, 3)), np.zeros((9, 1))
+    for task in (fast, slow):
+        task = replace(task, state_weight=np.zeros((10, 2)))
+        assert task.system.backward(task, z, u, zero).failed_at == 8
+        bad = z.copy()
+        bad[4] = np.nan
+        found = task.system.backward(replace(task, state_weight=weight), bad, u, np.ones(1))
+        assert found.failed_at >= 0
+
+
+def test_lanes_fit_the_machine():
+    assert jit.lanes() in (4, 8)
+
+
+def test_a_hundred_states_are_interpreted_and_forty_run_in_a_thread():
+    big = wide(100, 2, True)
+    assert big.system.how == "traced" and "100 states" in big.system.note
+    forty = wide(40, 4, True)
+    assert forty.system.how == "compiled"
+    u = np.zeros((12, 4))
+    costs = parallel(lambda p: solve(replace(forty, p=p), u).cost, [forty.p] * 2, workers=2)
+    assert costs[0] == costs[1] == solve(forty, u).cost

@@ -1,0 +1,128 @@
+"""The path that always works: any callable, differenced; and its errors."""
+
+import math
+from functools import partial
+
+import numpy as np
+import pytest
+
+from grounded.compile import Named
+from grounded.compile.run.differenced import DifferencedSystem
+from grounded.errors import GroundedError
+from problems import SPECS, system
+
+
+def make(function, states=("x", "v"), inputs=("f",), params=("m",), kind="derivative", **more):
+    return DifferencedSystem(
+        function, kind=kind, states=states, inputs=inputs, params=params, **more
+    )
+
+
+X, U, P = np.array([[1.0, 2.0], [-1.0, 0.5]]), np.array([[0.3], [0.1]]), np.array([2.0])
+
+
+def test_names():
+    s = Named("state", ("x", "v"), (1.0, 2.0))
+    assert (s.x, s["v"], len(s), list(s), dict(s)) == (
+        1.0,
+        2.0,
+        2,
+        ["x", "v"],
+        {"x": 1.0, "v": 2.0},
+    )
+    for ask in (lambda: s.velocity, lambda: s["velocity"], lambda: s[3]):
+        with pytest.raises(GroundedError, match=r"test_compile_python\.py:\d+: there is no state"):
+            ask()
+    with pytest.raises(GroundedError, match="can't be assigned"):
+        s.x = 3.0
+    assert not hasattr(s, "__array__")
+
+
+def test_unknown_name_says_which_line_and_what_was_meant():
+    def dynamics(s, a, p):
+        return {"x": s.velo, "v": a.f}
+
+    with pytest.raises(
+        GroundedError, match=r"test_compile_python.py:\d+.*'velo'.*valid names: x, v"
+    ):
+        make(dynamics).step(X, U, P, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [
+        (lambda s, a, p: {"x": s.v}, "missing: v"),
+        (lambda s, a, p: {"x": s.v, "v": a.f, "vv": 0.0}, "'vv', which is not a state.*'v'"),
+        (lambda s, a, p: [s.v, a.f], "must return a dict.*got list"),
+        (lambda s, a, p: {"x": s.v + 1j, "v": a.f}, "one real number for state 'x'.*complex"),
+        (lambda s, a, p: {"x": s.v, "v": np.zeros(3)}, r"array of shape \(3,\)"),
+        (lambda s, a, p: {"x": s.v, "v": None}, "NoneType"),
+        (lambda s, a, p: {"x": s.v, "v": a.f + "1"}, "raised"),
+    ],
+)
+def test_bad_models_name_their_file_and_line(function, message):
+    for rows in (1, 2):
+        with pytest.raises(GroundedError, match=message) as caught:
+            make(function).step(X[:rows], U[:rows], P, 0.1)
+        assert "test_compile_python.py:" in str(caught.value)
+
+
+def test_function_that_does_not_broadcast_runs_sample_by_sample():
+    def scalar(s, a, p):
+        force = a.f if s.x > 0 else -math.sin(a.f)
+        return {"x": s.v, "v": force / p.m}
+
+    def vector(s, a, p):
+        return {"x": s.v, "v": np.where(s.x > 0, a.f, -np.sin(a.f)) / p.m}
+
+    assert np.allclose(make(scalar).step(X, U, P, 0.1), make(vector).step(X, U, P, 0.1), atol=1e-15)
+
+
+def test_function_that_mixes_samples_up_is_found_out():
+    def mixing(s, a, p):
+        return {"x": s.v, "v": -np.linalg.norm([s.x, s.v]) * s.v + 0 * a.f}
+
+    one = [make(mixing).step(X[i : i + 1], U[i : i + 1], P, 0.1)[0] for i in range(2)]
+    assert np.array_equal(make(mixing).step(X, U, P, 0.1), one)
+
+
+def test_black_box_step_with_any_callable():
+    class Simulator:
+        def __call__(self, s, a, p, dt):
+            return {"x": s.x + dt * s.v, "v": s.v + dt * a.f / p.m}
+
+    expected = X + 0.1 * np.column_stack([X[:, 1], U[:, 0] / 2.0])
+    for function in (Simulator(), partial(Simulator().__call__)):
+        assert np.allclose(make(function, kind="step").step(X, U, P, 0.1), expected)
+
+
+def test_what_leaves_the_finite_numbers_is_nan_not_raised():
+    def overflow(s, a, p):
+        return {"x": math.exp(1000 * s.x), "v": math.sqrt(a.f - 10.0)}
+
+    assert np.isnan(make(overflow).step(X[:1], U[:1], P, 0.1)).all()
+    assert np.isnan(make(overflow).step(np.full((1, 2), np.nan), U[:1], P, 0.1)).all()
+
+
+def test_rk4_is_fourth_order_and_euler_first():
+    def rate(s, a, p):
+        return {"x": s.v, "v": -s.x}
+
+    exact = np.array([math.cos(0.1), -math.sin(0.1)])
+    x, u = np.array([[1.0, 0.0]]), np.zeros((1, 1))
+    assert np.abs(make(rate).step(x, u, P, 0.1) - exact).max() < 1e-7
+    assert np.allclose(make(rate, integrator="euler").step(x, u, P, 0.1), [[1.0, -0.1]])
+
+
+def test_derivatives_of_a_linear_model_are_exact():
+    f, p = system("double_integrator", DifferencedSystem)
+    x, u = np.random.default_rng(0).normal(size=(5, 2)), np.zeros((5, 1))
+    f_x, f_u, f_p = f.sensitivities(x, u, p, 0.05)
+    mass, drag = SPECS["double_integrator"]["params"].values()
+    h = 0.05
+    decay = sum((-drag * h) ** i / math.factorial(i) for i in range(5))
+    assert np.allclose(f_x[:, 1, 1], decay, atol=1e-9)
+    assert np.allclose(f_x[:, :, 0], [1.0, 0.0], atol=1e-9)
+    assert np.allclose(f_u[:, 1, 0], (1 - decay) / drag / mass, atol=1e-9)
+    assert np.allclose(f_p[:, 1, 0], 0.0, atol=1e-9)
+    assert not np.allclose(f_p[:, 1, 1], 0.0, atol=1e-3)

@@ -1,0 +1,412 @@
+"""The diagnosis: its filter against dense algebra, its verdicts on known answers."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from grounded import GroundedError, Model, Param, Trial
+from grounded.challenge import judge, make, oracle, sealed, summary
+from grounded.diagnosis import confirm
+from grounded.diagnosis import filter as kalman
+from grounded.diagnosis.attribution import attribute
+from grounded.diagnosis.calibration import loss
+from grounded.diagnosis.data import prepare, shifted
+from grounded.diagnosis.diagnose import Options, diagnose
+from grounded.diagnosis.excitation import probe
+from grounded.diagnosis.leftover import chi2_tail
+from grounded.diagnosis.prediction_error import _stump
+from grounded.diagnosis.report import Estimate, Remainder
+from grounded.diagnosis.verdict import meaning, sentence, verdict
+from grounded.effects import Library
+from grounded.models.pendulum import model as pendulum
+from grounded.policy import Policy
+from grounded.task import Task
+from grounded.utility import Reward
+
+DT = 0.05
+
+
+def cart(friction=0.0, dead=0.0, asymmetric=0.0, trials=4, steps=120, noise=1.0, seed=0):
+    """A cart that is pushed: v' = k u - v / tau, with noise; and its crude model."""
+    model = Model(
+        states={"x": "m", "v": "m/s"},
+        inputs={"u": "1"},
+        params={"k": Param(2.0, "m/s^2", 0.1, 10.0), "tau": Param(1.0, "s", 0.1, 10.0)},
+        roles={"position": ("x",), "speed": "v"},
+        derivative=lambda s, a, p: {"x": s.v, "v": p.k * a.u - s.v / p.tau},
+        name="cart",
+    )
+    rng, found = np.random.default_rng(seed), []
+    for _ in range(trials):
+        t = np.arange(steps) * DT
+        u = 0.6 * np.sin(rng.uniform(1, 3) * t + rng.uniform(0, 6)) + 0.4 * np.sin(
+            rng.uniform(3, 6) * t
+        )
+        x, states = np.zeros(2), [np.zeros(2)]
+        for value in u:
+            force = np.sign(value) * max(abs(value) - dead, 0)
+            force *= 1 + (asymmetric if force > 0 else 0)
+            for _ in range(10):
+                v = x[1]
+                rate = 2.0 * force - v - friction * np.tanh(v / 0.01)
+                x = x + DT / 10 * np.array([v, rate])
+            x = x + noise * np.array([0.0003, 0.003]) * rng.standard_normal(2)
+            states.append(x)
+        y = np.array(states) + noise * np.array([0.002, 0.01]) * rng.standard_normal((steps + 1, 2))
+        found.append(Trial(y, u[:, None], DT, ("x", "v"), ("u",), start_inputs=np.zeros(1)))
+    return model, found
+
+
+def random_filter(rng, L=4, B=2, n=2):
+    A = 0.5 * rng.standard_normal((L, B, n, n)) + np.eye(n)
+    Q, R = rng.uniform(0.5, 2, (L, B, n)), rng.uniform(0.5, 2, (L + 1, B, n))
+    d, r = rng.standard_normal((L, B, n, 1)), rng.standard_normal((L + 1, B, n, 1))
+    return A, Q, R, d, r
+
+
+def dense_loglik(A, Q, R, d, r, b):
+    """log p(r_1 .. r_L | r_0) by the joint covariance of everything, one run."""
+    L, n = len(A), A.shape[-1]
+    blocks = L * n
+    mean, cov = np.zeros(blocks), np.zeros((blocks, blocks))
+    m, maps = r[0, b, :, 0], [np.eye(n)]
+    P = [np.diag(R[0, b])]
+    for t in range(L):
+        m = A[t, b] @ m + d[t, b, :, 0]
+        P.append(A[t, b] @ P[-1] @ A[t, b].T + np.diag(Q[t, b]))
+        mean[t * n : t * n + n] = m
+        maps.append(A[t, b])
+    for i in range(1, L + 1):
+        C = P[i]
+        for j in range(i, L + 1):
+            if j > i:
+                C = C @ A[j - 1, b].T
+            cov[(i - 1) * n : i * n, (j - 1) * n : j * n] = C
+            cov[(j - 1) * n : j * n, (i - 1) * n : i * n] = C.T
+        cov[(i - 1) * n : i * n, (i - 1) * n : i * n] += np.diag(R[i, b])
+    e = r[1:, b, :, 0].reshape(-1) - mean
+    return -0.5 * (e @ np.linalg.solve(cov, e) + np.linalg.slogdet(cov)[1])
+
+
+def filter_loglik(A, Q, R, d, r):
+    L, B, n, _ = A.shape
+    g = kalman.gains(A, Q, R, np.ones((L + 1, B, n)), np.zeros((B, 0)))
+    white, _ = kalman.innovations(g, d, r)
+    return -0.5 * ((white**2).sum() + g.logdet.sum()), g, white
+
+
+def test_the_filter_is_the_joint_normal_law():
+    A, Q, R, d, r = random_filter(np.random.default_rng(0))
+    whole = sum(dense_loglik(A, Q, R, d, r, b) for b in range(2))
+    assert filter_loglik(A, Q, R, d, r)[0] == pytest.approx(whole, rel=1e-9)
+
+
+def test_the_smoother_is_the_gradient_of_the_likelihood():
+    A, Q, R, d, r = random_filter(np.random.default_rng(1))
+    _, g, white = filter_loglik(A, Q, R, d, r)
+    back = kalman.smoother(g, white[..., 0])
+    h = 1e-5
+    for t, b, i in ((0, 0, 0), (2, 1, 1), (3, 0, 1)):
+        for which, score in (
+            (Q, 0.5 * (back.r**2 - back.N)[t, b, i]),
+            (R[1:], 0.5 * (back.u**2 - back.D)[t, b, i]),
+        ):
+            which[t, b, i] += h
+            up = filter_loglik(A, Q, R, d, r)[0]
+            which[t, b, i] -= 2 * h
+            down = filter_loglik(A, Q, R, d, r)[0]
+            which[t, b, i] += h
+            assert score == pytest.approx((up - down) / (2 * h), rel=1e-5, abs=1e-7)
+
+
+def test_a_missing_measurement_says_nothing():
+    A, Q, R, d, r = random_filter(np.random.default_rng(2))
+    L, B, n, _ = A.shape
+    seen = np.ones((L + 1, B, n))
+    seen[2, 0, 1] = 0
+    ends = []
+    for value in (0.0, 100.0):
+        r[2, 0, 1] = value
+        g = kalman.gains(A, Q, R, seen, np.zeros((B, 0)))
+        white, _ = kalman.innovations(g, d, r)
+        ends.append((white**2).sum() + g.logdet.sum())
+    assert ends[0] == pytest.approx(ends[1])
+
+
+def test_a_delay_of_any_fraction():
+    u = np.arange(1.0, 6.0)[None]
+    np.testing.assert_allclose(shifted(u, np.zeros(1), 1.0)[0], [0, 1, 2, 3, 4])
+    np.testing.assert_allclose(shifted(u, np.zeros(1), 1.25)[0], [0, 0.75, 1.75, 2.75, 3.75])
+
+
+def test_chi_square_tail():
+    assert chi2_tail(18.31, 10) == pytest.approx(0.05, abs=0.002)
+
+
+@pytest.mark.parametrize(
+    ("truth", "name", "quantity", "value"),
+    [
+        ({"friction": 0.4}, "coulomb_friction:v", "c", 0.4),
+        ({"dead": 0.15}, "dead_zone:u", "c", 0.15),
+    ],
+)
+def test_one_effect_is_named_with_its_size(truth, name, quantity, value):
+    model, trials = cart(**truth)
+    found = diagnose(model, trials)
+    assert found.ranking[0].effect == name
+    assert found.kind == "effect", found.sentence
+    estimate = found.ranking[0].params[quantity]
+    assert estimate.value == pytest.approx(value, rel=0.1)
+    assert found.gap["after"] < 1.25 < found.gap["before"]
+    assert found.channels[0]["name"] == "v"
+
+
+def test_no_effect_is_claimed_where_there_is_none():
+    for seed in range(3):
+        model, trials = cart(seed=seed)
+        found = diagnose(model, trials)
+        assert found.kind == "none", found.sentence
+        assert found.effects == ()
+        assert found.gap["before"] == pytest.approx(1.0, abs=0.25)
+
+
+def test_a_parameter_that_is_off_is_blamed_as_a_parameter():
+    model, trials = cart()
+    found = diagnose(model.with_values({"tau": 1.2}), trials)
+    assert "parameter:tau" in [r.effect for r in found.ranking[:3]]
+    assert found.gap["after"] < 1.2
+
+
+def test_parameters_that_are_off_are_named_most_important_first():
+    model, trials = cart(trials=6)
+    found = diagnose(model.with_values({"k": 1.9, "tau": 0.88}), trials)
+    named = {f"parameter:{name}" for name in ("k", "tau")}
+    assert set(found.effects) & named, found.sentence
+    assert set(found.effects) <= named
+    assert found.kind == ("effect" if len(found.effects) == 1 else "several")
+    claimed = [row for row in found.ranking if row.claimed]
+    assert tuple(row.effect for row in claimed) == found.effects
+    assert [row.effect for row in found.ranking[: len(claimed)]] == list(found.effects)
+    evidences = [row.evidence for row in claimed]
+    assert evidences == sorted(evidences, reverse=True)
+    for row in claimed:
+        assert f"{row.effect.partition(':')[2]} " in found.sentence
+    # a gain of the input and the parameter behind it are one thing, and that is said
+    same = {group[0]: group[1:] for group in found.indistinguishable}
+    assert "input_gain:u" in same.get("parameter:k", ()), found.sentence
+    assert "viscous_friction:v" in same.get("parameter:tau", ()), found.sentence
+
+
+def test_of_two_parameters_that_are_one_only_one_is_blamed():
+    H = np.array([[100.0, 99.0], [99.0, 100.0]])
+    b = np.array([0.5, 0.5])
+    assert loss(H, b, [0, 1]) == 0
+    assert loss(H, b, [0]) < 1 < 40 < loss(H, b, [])
+
+
+def test_sentences_are_english():
+    model = Model(
+        states={"x": "m", "v": "m/s", "w": "1"},
+        inputs={"steering": "1", "throttle": "1", "u": "N"},
+        params={"k": Param(1.0, "1/s")},
+        roles={"position": ("x",), "speed": "v"},
+        derivative=lambda s, a, p: {"x": s.v, "v": a.throttle + a.u, "w": p.k * a.steering},
+    )
+
+    def said(name, **values):
+        effect = Library().effect(name, model)
+        units = {q.name: q.unit for q in effect.quantities}
+        known = {n: Estimate(v, 0.0, v, v, units[n]) for n, v in values.items()}
+        return sentence([meaning(effect, known)])
+
+    assert said("delay:steering+throttle+u", d=0.04) == (
+        "The steering and the throttle and the input u arrive 0.04 s later than modelled."
+    )
+    assert said("delay:u", d=0.04) == "The input u arrives 0.04 s later than modelled."
+    assert said("offset:v", c=0.1) == "The speed v drifts by 0.1 m/s^2."
+    assert said("offset:w", c=0.1) == "The state w drifts by 0.1 1/s."
+    assert said("input_gain:throttle", g=-0.2) == "The throttle acts 20 % weaker than modelled."
+    assert said("input_fade:throttle", k=-0.05) == "The throttle gets 5 % stronger every second."
+    assert said("input_fade:throttle", k=0.05) == (
+        "The throttle gets 5 % weaker every second (a battery that sags)."
+    )
+    assert said("parameter:k", d=0.1) == "The parameter k is off by 0.1 1/s."
+    for effect in Library().candidates(model):
+        known = {q.name: Estimate(0.1, 0, 0.1, 0.1, q.unit) for q in effect.quantities}
+        text = meaning(effect, known)
+        assert "{" not in text and ":" not in text, text
+
+
+def test_what_no_effect_explains_is_left_over():
+    model, trials = cart(asymmetric=0.6, trials=6)
+    found = diagnose(model, trials)
+    assert found.leftover or found.gap["after"] < 1.3
+    if found.leftover:
+        assert found.leftover[0].channel == "v"
+
+
+def test_leftovers_that_are_not_named_are_counted():
+    claims = SimpleNamespace(known=SimpleNamespace(no_cause=False), blamed=(), names=())
+    off = tuple(Remainder(name, 0.1, "m/s", 9.0, None) for name in "abcd")
+    said = {k: verdict(claims, 2.0, 1.0, (), (), (), off[:k])[1] for k in (2, 3, 4)}
+    assert said[2].endswith("a is off by 0.1 m/s rms; b is off by 0.1 m/s rms.")
+    assert said[3].endswith("b is off by 0.1 m/s rms; and 1 more.")
+    assert said[4].endswith("b is off by 0.1 m/s rms; and 2 more.")
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0])
+def test_a_threshold_that_is_zero_but_for_rounding_reads_zero(scale):
+    sides = np.linspace(0.1, 1, 25)
+    y = scale * np.concatenate([-sides, np.full(50, 1.58e-7), sides])[:, None]
+    gain = (y < 0).astype(float)
+    row = _stump("y", y, gain, np.ones_like(y, bool), float(gain.sum()))
+    assert row["when"] == "y < 0" and row["share"] == 1
+    other = (y > 0.5 * scale).astype(float)
+    row = _stump("y", y, other, np.ones_like(y, bool), float(other.sum()))
+    assert float(row["when"].split()[-1]) > 1e-3 * scale  # others are told as they are
+
+
+def test_without_the_family_a_look_alike_is_marked_by_what_it_leaves():
+    model, trials = cart(dead=0.25, trials=6)
+    library = Library().without(["dead_zone", "stall", "backlash", "stiction", "coulomb_friction"])
+    found = diagnose(model, trials, Options(library=library))
+    assert found.kind == "unknown" or found.leftover or found.gap["after"] < 1.3
+
+
+def test_one_trial_names_no_cause():
+    model, trials = cart(friction=0.5, trials=1)
+    found = diagnose(model, trials)
+    assert found.kind == "unknown"
+    assert found.effects == ()
+    assert "one trial" in found.sentence
+
+
+def test_a_constant_input_is_not_blamed():
+    model, trials = cart(friction=0.5)
+    flat = [
+        Trial(t.states, np.full_like(t.inputs, 0.3), t.dt, t.state_names, t.input_names)
+        for t in trials
+    ]
+    found = diagnose(model, flat)
+    assert found.kind == "unknown"
+    assert any("never changed" in s for s in found.unknowable)
+    assert not any(r.effect.endswith(":u") for r in found.ranking)
+
+
+def test_no_trials_and_foreign_trials_are_refused():
+    model, trials = cart()
+    with pytest.raises(GroundedError, match="no trials"):
+        diagnose(model, [])
+    with pytest.raises(GroundedError, match="states"):
+        diagnose(pendulum, trials)
+
+
+def test_gaps_in_the_log_are_bridged_by_the_filter():
+    model, trials = cart(friction=0.4)
+    holed = []
+    for t in trials:
+        states = t.states.copy()
+        states[30:40] = np.nan
+        states[60:63, 1] = np.nan
+        holed.append(Trial(states, t.inputs, t.dt, t.state_names, t.input_names))
+    assert prepare(model, holed).steps == prepare(model, trials).steps
+    found = diagnose(model, holed)
+    assert found.ranking[0].effect == "coulomb_friction:v"
+
+
+def test_the_document_is_plain_json():
+    model, trials = cart(friction=0.4, trials=2, steps=80)
+    document = diagnose(model, trials).to_dict()
+    again = json.loads(json.dumps(document, allow_nan=False))
+    for key in ("verdict", "where", "ranking", "indistinguishable", "gap", "next_trial"):
+        assert key in again
+    assert set(again["gap"]) >= {"horizon_s", "unit", "before", "after", "floor", "held_out"}
+    assert {"effect", "params", "evidence", "gap_after", "shrinkage"} <= set(again["ranking"][0])
+    assert {"value", "std", "unit"} <= set(next(iter(again["ranking"][0]["params"].values())))
+
+
+def test_a_probe_tells_two_explanations_apart():
+    model, trials = cart(dead=0.1, steps=60, trials=3)
+    H = 100
+    task = Task(
+        model=model,
+        dt=DT,
+        target=np.zeros((H + 1, 2)),
+        reward=Reward(np.ones(2), np.zeros(2), np.zeros(1), np.zeros(1)),
+        start=np.zeros(2),
+        past=np.zeros(1),
+        low=np.array([-1.0]),
+        high=np.array([1.0]),
+    )
+    found = diagnose(task, trials)
+    tied = type(found)(
+        **{
+            **found.__dict__,
+            "effects": ("dead_zone:u",),
+            "indistinguishable": (("dead_zone:u", found.ranking[1].effect),),
+        }
+    )
+    base = Policy(
+        feedforward=0.3 * np.ones((H, 1)),
+        low=task.low,
+        high=task.high,
+        dt=DT,
+        state_names=model.state_names,
+        input_names=model.input_names,
+        depths=(1,),
+        angles=(False, False),
+        past=np.zeros(1),
+    )
+    best = probe(task, base, tied, trials)
+    assert best is not None
+    assert best.expected > 3
+    assert (best.policy.feedforward >= -1).all()
+    assert (best.policy.feedforward <= 1).all()
+    assert probe(task, base, found, trials) is None or found.indistinguishable
+
+
+def test_blind_cases_follow_from_their_seed_and_are_judged():
+    (case,) = make("single", 1, 4, only="pendulum")
+    (again,) = make("single", 1, 4, only="pendulum")
+    assert sealed(case.label) == sealed(again.label)
+    np.testing.assert_array_equal(case.trials[0].states, again.trials[0].states)
+    known = oracle(case.model, case.trials, case.latency, case.label)
+    marks = judge(case.label, diagnose(case.model, case.trials).to_dict(), known)
+    row = summary([marks])["single"]
+    assert row["cases"] == 1
+    with pytest.raises(GroundedError, match="single, double"):
+        next(make("triple", 1, 0))
+
+
+def test_the_diagnosis_does_not_reach_the_simulated_truth():
+    import subprocess
+    import sys
+
+    code = (
+        "import sys, grounded.diagnosis.diagnose, grounded.diagnosis.excitation;"
+        "bad = [m for m in sys.modules if m.startswith(('grounded.models', 'grounded.plant',"
+        " 'grounded.experiments', 'grounded.challenge'))]; assert not bad, bad"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_a_hypothesis_whose_held_out_predictions_run_away_gives_way(monkeypatch):
+    model, trials = cart(friction=0.4)
+    data = prepare(model, trials, np.zeros(1))
+    search, best = attribute(data, Library().candidates(model, data.scales))
+    assert best.hypothesis.effects and confirm.confirmed(search, best, 1.0) is best
+
+    class Gap:
+        gap_before = 2.0
+
+        def __init__(self, after):
+            self.gap_after = after
+
+    monkeypatch.setattr(confirm, "shrinkage", lambda *a: Gap(1e6))
+    assert not confirm.confirmed(search, best, 1.0).hypothesis.effects
+    monkeypatch.setattr(confirm, "shrinkage", lambda p, f, t, w: Gap(1e6 if f is best else 1.0))
+    other = confirm.confirmed(search, best, 1.0)
+    assert other is not best and other.hypothesis.effects
+    assert search.score(other) > search.score(search.best_null())

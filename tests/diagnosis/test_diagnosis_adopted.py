@@ -1,0 +1,203 @@
+"""After an effect was adopted: what is left is diagnosed, not the same effect again."""
+
+import json
+import tomllib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_diagnosis import DT, cart
+
+from cli import grounded
+from grounded import Trial
+from grounded.diagnosis.data import prepare
+from grounded.diagnosis.diagnose import Options, diagnose
+from grounded.diagnosis.limits import limits
+from grounded.diagnosis.search import Search
+from grounded.effects import Library, memory_of, wrap
+from grounded_trials.store.trial_file import write_trial
+from grounded_trials.workspace.diagnosing import _chosen, diagnosable
+from grounded_trials.workspace.diagnosis_file import diagnosis_of
+from grounded_trials.workspace.folder import Workspace
+from grounded_trials.workspace.next_step import after_diagnosis
+
+LAG = 0.12
+
+
+def lagging(friction, trials=4):
+    """Trials of a cart whose push lags and that has dry friction; its crude model."""
+    model, found = cart(trials=1, steps=2)
+    true = wrap(Library().effect("first_order_lag:u", model), {"tau": LAG}, DT)
+    effect = Library().effect("coulomb_friction:v", true)
+    true = wrap(effect, {"c": friction, "width": 0.01}, DT)
+    rng, runs = np.random.default_rng(1), []
+    for _ in range(trials):
+        t = np.arange(240) * DT
+        u = 0.6 * np.sin(rng.uniform(1, 3) * t) + 0.4 * np.sign(np.sin(rng.uniform(2, 4) * t))
+        x, states = np.zeros(true.n), [np.zeros(true.n)]
+        for value in u:
+            x = true.system.step(x[None], np.array([[value]]), true.values, DT)[0]
+            x[:2] += np.array([0.0003, 0.003]) * rng.standard_normal(2)
+            states.append(x)
+        y = np.array(states)[:, :2]
+        y = y + np.array([0.002, 0.01]) * rng.standard_normal(y.shape)
+        runs.append(replace(found[0], states=y, inputs=u[:, None]))
+    return model, runs
+
+
+def adopted(model, runs):
+    """The model with the lag, trials with its memory beside, the memory's name."""
+    better = wrap(Library().effect("first_order_lag:u", model), {"tau": LAG}, DT)
+    lifted = [
+        replace(
+            run,
+            states=np.hstack([run.states, memory_of(better, model, run)]),
+            state_names=better.state_names,
+        )
+        for run in runs
+    ]
+    return better, lifted, better.state_names[model.n :]
+
+
+def test_what_is_left_beside_an_adopted_lag_is_named():
+    model, runs = lagging(0.4)
+    better, lifted, memory = adopted(model, runs)
+    assert len(memory) == 1
+    options = Options(hidden=memory, but={"first_order_lag:u"})
+    found = diagnose(better, lifted, options)
+    assert found.effects == ("coulomb_friction:v",)
+    assert found.ranking[0].params["c"].value == pytest.approx(0.4, rel=0.05)
+    assert 0.8 < found.gap["after"] < 1.2
+    text = json.dumps(found.to_dict())
+    assert memory[0] not in text.replace("first_order_lag_u_tau", "")
+
+
+def test_nothing_is_left_beside_what_is_all():
+    model, runs = lagging(0.0)
+    better, lifted, memory = adopted(model, runs)
+    found = diagnose(better, lifted, Options(hidden=memory, but={"first_order_lag:u"}))
+    assert found.kind == "none" and not found.leftover and found.gap["after"] < 1.2
+
+
+def test_a_memory_is_known_at_the_start_and_disturbed_by_nothing():
+    model, runs = lagging(0.4, trials=2)
+    better, lifted, memory = adopted(model, runs)
+    data = prepare(better, lifted, hidden=memory)
+    (i,) = data.hidden
+    assert data.seen.shape[1] == 4  # two runs of each trial
+    assert data.seen[0, :, i].sum() == 2 and data.seen[1:, :, i].sum() == 0
+    assert not [s for s in limits(data).sentences if memory[0] in s]
+    noise = Search(data, ()).nulls().noise
+    assert np.exp(noise.log_q[i]) < 1e-20
+
+
+def workspace(folder, effects, diagnosed, ranking):
+    """A pendulum's workspace with adopted effects and a diagnosis that claims `ranking`."""
+    made = grounded("init", folder, "--example", "pendulum")
+    assert made.code == 0, made.err
+    config = folder / "grounded.toml"
+    rows = "\n".join(f"    {row}," for row in effects)
+    text = config.read_text().replace("[model]\n", f"[model]\neffects = [\n{rows}\n]\n", 1)
+    config.write_text(text)
+    names = [row["effect"] for row in ranking]
+    document = {
+        "verdict": {"kind": "effect", "effects": names, "sentence": "It is so."},
+        "ranking": ranking,
+        "diagnosed": diagnosed,
+        "where": {"channels": [], "times": [], "regions": []},
+        "gap": {"before": 2.0, "after": 1.0, "floor": 1.0, "horizon_s": 1.0, "held_out": True},
+        "indistinguishable": [],
+        "next_trial": "",
+        "parameters": {},
+    }
+    (folder / "reports").mkdir(exist_ok=True)
+    (folder / "reports" / "diagnosis.json").write_text(json.dumps(document))
+    return config
+
+
+def row(effect, **values):
+    params = {
+        k: {"value": v, "std": 0.0, "unit": "1", "interval": [v, v]} for k, v in values.items()
+    }
+    return {
+        "effect": effect,
+        "params": params,
+        "fixed": {},
+        "evidence": 9.0,
+        "gap_after": 1.0,
+        "claimed": True,
+    }
+
+
+def effects_of(config):
+    return tomllib.loads(config.read_text())["model"]
+
+
+def test_more_of_an_adopted_effect_changes_its_numbers(tmp_path):
+    friction = '{name = "viscous_friction:omega", k = 0.3}'
+    known = {"viscous_friction_omega_k": 0.3, "l": 0.5}
+    config = workspace(
+        tmp_path / "ws",
+        [friction],
+        {"trials": [], "adopted": [{"name": "viscous_friction:omega", "k": 0.3}], "nominal": known},
+        [row("parameter:viscous_friction_omega_k", d=0.05), row("parameter:l", d=0.01)],
+    )
+    names = ["parameter:viscous_friction_omega_k", "parameter:l"]
+    read = diagnosis_of(json.loads((tmp_path / "ws" / "reports" / "diagnosis.json").read_text()))
+    advice = after_diagnosis(Workspace(tmp_path / "ws"), read)
+    assert advice == f"grounded adopt {' '.join(names)}"  # fit knows the model's own numbers only
+    for _ in range(2):  # twice is once
+        done = grounded("-C", tmp_path / "ws", "adopt", *names)
+        assert done.code == 0, done.err
+        model = effects_of(config)
+        assert model["effects"] == [{"name": "viscous_friction:omega", "k": 0.35}]
+        assert model["params"]["l"] == pytest.approx(0.51)
+    assert grounded("-C", tmp_path / "ws", "status").code == 0
+
+
+def test_a_delay_more_adds_to_the_delay(tmp_path):
+    config = workspace(
+        tmp_path / "ws",
+        ['{name = "delay:torque", d = 0.02}'],
+        {"trials": [], "adopted": [{"name": "delay:torque", "d": 0.02}], "nominal": {}},
+        [row("delay:torque", d=0.013)],
+    )
+    for _ in range(2):
+        done = grounded("-C", tmp_path / "ws", "adopt", "delay:torque")
+        assert done.code == 0, done.err
+        (effect,) = effects_of(config)["effects"]
+        assert effect["d"] == pytest.approx(0.033)
+
+
+def test_gaps_in_a_state_and_guesses_cost_their_samples_only(tmp_path):
+    """What a smoother made of a state in one log says nothing of the others' measurements."""
+    assert grounded("init", tmp_path / "ws", "--example", "pendulum").code == 0
+    rng = np.random.default_rng(0)
+    for k in range(3):
+        states = rng.standard_normal((41, 2))
+        if k == 1:
+            states[10:20, 1] = np.nan
+        run = Trial(states, rng.standard_normal((40, 1)), 0.02, ("theta", "omega"), ("torque",))
+        meta = {"kind": "data"} | ({"estimated": "omega"} if k == 2 else {})
+        path = tmp_path / f"log{k}.mcap"
+        write_trial(path, run, meta)
+        done = grounded("-C", tmp_path / "ws", "ingest", "--data", path)
+        assert done.code == 0, done.err
+    workspace = Workspace(tmp_path / "ws")
+    assert [trial.steps for trial in diagnosable(workspace)] == [40, 40, 40]
+    known = [np.isfinite(trial.states).sum(axis=0).tolist() for trial in _chosen(workspace, ())]
+    assert known == [[41, 41], [41, 31], [41, 0]]
+
+
+def test_a_trial_that_diverged_counts_up_to_there():
+    states = np.zeros((11, 2))
+    run = Trial(states, np.zeros((10, 1)), 0.1, ("a", "b"), ("u",))
+    assert run.known_steps == 10
+    states = states.copy()
+    states[7:, 1] = 1e200
+    assert replace(run, states=states).known_steps == 6
+    states[4:] = np.nan
+    assert replace(run, states=states).known_steps == 3
+    inputs = run.inputs.copy()
+    inputs[2] = np.nan
+    assert replace(run, inputs=inputs).known_steps == 2

@@ -1,0 +1,82 @@
+"""The climb of one hypothesis: steps inside bounds, and what hangs on them."""
+
+import numpy as np
+import pytest
+
+from grounded.diagnosis.climb import _bounded
+from grounded.diagnosis.diagnose import diagnose
+from grounded.effects import Library
+from grounded.experiments.pendulum import FRICTION, HEAVIER, pendulum_task
+from grounded.experiments.pendulum import model as real_pendulum
+from grounded.models.car import model as car
+from grounded.models.pendulum import model as pendulum
+from grounded.plant import Noise, Plant
+from grounded.search.improve import learn
+from grounded.search.standing import Options
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_bounded_step_is_the_best_one_inside(seed):
+    """With the unknowns that stopped held where they are, nothing else wants to move."""
+    rng = np.random.default_rng(seed)
+    A = rng.standard_normal((12, 4))
+    G, slope = A.T @ A, 3 * rng.standard_normal(4)
+    low, high = -rng.uniform(0, 0.2, 4), rng.uniform(0, 0.2, 4)
+    low[3], high[3] = -np.inf, np.inf
+    step = _bounded(G, slope, low, high)
+    assert (step >= low).all() and (step <= high).all()
+    inside = (step > low) & (step < high)
+    assert np.abs((G @ step + slope)[inside]).max(initial=0.0) < 1e-9
+    np.testing.assert_allclose(
+        _bounded(G, slope, low - np.inf, high + np.inf), -np.linalg.solve(G, slope)
+    )
+
+
+def test_an_unknown_whose_slope_is_no_number_stays_where_it_is():
+    G = np.diag([2.0, np.nan, 1.0])
+    G[1, 0] = G[0, 1] = np.nan
+    wide = np.full(3, np.inf)
+    step = _bounded(G, np.array([2.0, np.nan, 3.0]), -wide, wide)
+    np.testing.assert_allclose(step, [-1.0, 0.0, -3.0])
+    assert not _bounded(np.full((2, 2), np.nan), np.full(2, np.nan), -wide[:2], wide[:2]).any()
+
+
+def test_a_parameter_at_its_bound_does_not_hold_up_the_others():
+    """A pendulum 30 % too heavy with dry friction; its g may move by 1 % only."""
+    task = pendulum_task(pendulum)
+    noise = Noise(process={"omega": 0.01}, measurement={"theta": 0.002, "omega": 0.01})
+    plant, rng = Plant(real_pendulum, noise=noise), np.random.default_rng(0)
+
+    def run(candidate):
+        return plant.run(candidate.policy, {}, rng)
+
+    _, _, trials = learn(task, run, Options(max_trials=4))
+    found = diagnose(task, trials)
+    row = found.ranking[0]
+    assert row.effect == "coulomb_friction:omega" and row.claimed
+    assert row.params["c"].value == pytest.approx(FRICTION / (HEAVIER * 0.25), rel=0.1)
+    assert row.fixed["width"] == pytest.approx(0.05, rel=0.2)  # it builds up over 0.05 rad/s
+    same = {"input_gain:torque", "parameter:m", "rate_gain:omega"}  # what a mass does to a torque
+    assert set(found.effects) <= {"coulomb_friction:omega", *same}
+    assert found.gap["before"] > 50 * found.gap["after"] and found.gap["after"] < 3
+
+
+def test_without_noise_the_demo_names_the_friction_alone():
+    """The last digits of a step are no claim."""
+    task = pendulum_task(pendulum)
+    plant, rng = Plant(real_pendulum), np.random.default_rng(0)
+    _, _, trials = learn(
+        task, lambda candidate: plant.run(candidate.policy, {}, rng), Options(max_trials=3)
+    )
+    found = diagnose(task, trials)
+    assert found.effects == ("coulomb_friction:omega",)
+    assert found.ranking[0].params["c"].value == pytest.approx(
+        FRICTION / (HEAVIER * 0.25), rel=0.01
+    )
+    assert found.parameters["m"].value == pytest.approx(HEAVIER, rel=0.03)
+
+
+def test_a_rate_that_is_another_state_has_one_name():
+    offered = {effect.name for effect in Library().candidates(pendulum)}
+    assert "rate_gain:theta" in offered and "coupling:theta<-omega" not in offered
+    assert any(effect.name.startswith("coupling:") for effect in Library().candidates(car))

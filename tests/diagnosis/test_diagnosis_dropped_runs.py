@@ -1,0 +1,63 @@
+"""Runs that are left out for memory: a trial is told from its start, repeats at the same time."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from test_diagnosis import DT, cart
+from test_diagnosis_split import task_of
+
+from grounded import Trial
+from grounded.diagnosis import data as diagnosis_data
+from grounded.diagnosis.data import prepare
+from grounded.diagnosis.hypothesis import Hypothesis, Predictor
+from grounded.diagnosis.split import scatter
+from grounded.diagnosis.utility_prediction import utility_prediction
+
+STEPS = 450  # three runs of 150 steps
+
+
+@pytest.fixture
+def known(monkeypatch):
+    """A predictor of four trials without noise, of 12 runs 0 1 3 5 7 9 11 are kept; its fit."""
+    model, _ = cart(trials=1)
+    found = []
+    for k in range(4):
+        u = np.sin((1 + 0.2 * (k % 2)) * np.arange(STEPS) * DT)[:, None]  # 0 and 2, 1 and 3 repeat
+        x = [np.zeros(2)]
+        for a in u:
+            x.append(model.system.step(x[-1][None], a[None], model.values, DT)[0])
+        names = (model.state_names, model.input_names)
+        found.append(Trial(np.array(x), u, DT, *names, start_inputs=np.zeros(1)))
+    monkeypatch.setattr(diagnosis_data, "MOST_NUMBERS", 7.5 * 150 * model.n**2 * 4)
+    predictor = Predictor(prepare(model, found))
+    assert predictor.data.trial_of.tolist() == [0, 0, 1, 1, 2, 3, 3]
+    return predictor, SimpleNamespace(hypothesis=Hypothesis(), track=predictor.data.y), found
+
+
+def test_a_utility_is_predicted_from_the_trials_own_start(known):
+    predictor, fit, trials = known
+    task = task_of(predictor.data.model, STEPS)
+    found = utility_prediction(predictor, fit, fit.track, task, trials)
+    assert len(found.real) == 3  # of trial 2 the beginning was left out
+    np.testing.assert_allclose(found.before, found.real, rtol=1e-9)
+    np.testing.assert_allclose(found.after, found.real, rtol=1e-9)
+
+
+def test_repeats_are_compared_at_the_same_time(known):
+    predictor, fit, _ = known
+    fit.hypothesis = Hypothesis(shift=np.array([0.5, 0.0]))  # wrong alike in repeats
+    found = scatter(predictor, fit, 20, [[0, 2], [1, 3]])
+    np.testing.assert_allclose(found, 0.0, atol=1e-20)
+    only = scatter(predictor, fit, 20, [[1, 2]])  # nothing that begins together
+    assert only is None
+
+
+def test_repeats_of_different_length_are_compared_where_they_begin_together(known, monkeypatch):
+    predictor, fit, trials = known
+    monkeypatch.setattr(diagnosis_data, "MOST_NUMBERS", 6e6)
+    short = replace(trials[2], states=trials[2].states[:351], inputs=trials[2].inputs[:350])
+    some = Predictor(prepare(predictor.data.model, [trials[0], short]))
+    fit = SimpleNamespace(hypothesis=Hypothesis(shift=np.array([0.5, 0.0])), track=some.data.y)
+    np.testing.assert_allclose(scatter(some, fit, 20, [[0, 1]]), 0.0, atol=1e-20)

@@ -1,0 +1,174 @@
+"""The filter's likelihood has the slopes that the smoother says, compiled or not."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from grounded.diagnosis import filter as kalman
+from grounded.diagnosis import kernels
+from grounded.diagnosis.filter import innovations, smoother, transition
+from grounded.diagnosis.noise import Noise, Structure, average, climbed, slopes, working
+
+L, B = 150, 2
+CASES = [
+    (2, False, None, False),
+    (3, True, None, False),
+    (3, True, 0.8, True),
+    (6, False, 0.9, True),
+]
+
+
+class Problem:
+    """A random linear system with noise that may enter through G, be coloured, be missed."""
+
+    def __init__(self, n, through, phi, missing):
+        rng = np.random.default_rng(n)
+        self.n, F = n, 0.95 * np.eye(n) + 0.05 * rng.standard_normal((L, B, n, n))
+        self.G = None
+        if through:
+            self.G = np.tile(np.eye(n), (L, B, 1, 1))
+            self.G[:, :, n - 1, : n - 1] = 3 * rng.standard_normal((L, B, n - 1))
+        self.A = transition(F, phi, self.G)
+        self.N = self.A.shape[-1]
+        self.seen = np.ones((L + 1, B, n))
+        if missing:
+            self.seen[1:] = rng.random((L, B, n)) > 0.2
+            self.seen[-10:, 1] = 0.0
+        self.d = 0.1 * rng.standard_normal((L, B, n, 3))
+        self.r = rng.standard_normal((L + 1, B, n, 3))
+        self.q = 0.1 * np.exp(rng.standard_normal(self.N))
+        self.v = 0.1 * np.exp(rng.standard_normal(n))
+
+    def passes(self, q, v):
+        R = np.tile(v, (L + 1, 1, 1))
+        R[0] = self.v  # the start is given
+        start = np.ones((B, self.N - self.n))
+        g = kalman.gains(self.A, q, R, self.seen, start, self.G)
+        white, track = innovations(g, self.d, self.r, track=True)
+        return g, white, track, smoother(g, white[..., 0])
+
+    def loglik(self, q, v):
+        g, white, *_ = self.passes(q, v)
+        return -0.5 * float((white[..., 0] ** 2).sum() + g.logdet.sum())
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_smoother_gives_the_slope_of_the_likelihood_after_many_steps(case, monkeypatch):
+    problem = Problem(*case)
+    for compiled in (True, False):
+        if not compiled:
+            monkeypatch.setattr(kernels, "available", lambda n: False)
+        back = problem.passes(problem.q, problem.v)[3]
+        of_q = 0.5 * (problem.q * (back.r**2 - back.N)).sum(axis=(0, 1))
+        of_v = 0.5 * (problem.v * (back.u**2 - back.D)).sum(axis=(0, 1))
+        for at, slope in enumerate([*of_q, *of_v]):
+            found = []
+            for sign in (-1, 1):
+                logs = np.zeros(problem.N + problem.n)
+                logs[at] = 1e-4 * sign
+                q, v = problem.q * np.exp(logs[: problem.N]), problem.v * np.exp(logs[problem.N :])
+                found.append(problem.loglik(q, v))
+            assert slope == pytest.approx((found[1] - found[0]) / 2e-4, rel=1e-3, abs=0.01)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_kernels_and_numpy_agree(case, monkeypatch):
+    problem = Problem(*case)
+    fast = problem.passes(problem.q, problem.v)
+    monkeypatch.setattr(kernels, "available", lambda n: False)
+    slow = problem.passes(problem.q, problem.v)
+    for name in ("K", "whiten", "logdet"):
+        assert np.allclose(getattr(fast[0], name), getattr(slow[0], name), rtol=1e-9, atol=1e-11)
+    for one, other in zip(fast[1:3], slow[1:3], strict=True):
+        assert np.allclose(one, other, rtol=1e-9, atol=1e-9)
+    for name in ("u", "D", "r", "N"):
+        one, other = getattr(fast[3], name), getattr(slow[3], name)
+        assert np.allclose(one, other, rtol=1e-8, atol=1e-8 * np.abs(other).max())
+
+
+def test_a_covariance_that_is_not_finite_is_an_error():
+    problem = Problem(2, False, None, False)
+    problem.A[3] = np.nan
+    with pytest.raises(np.linalg.LinAlgError):
+        problem.passes(problem.q, problem.v)
+
+
+def noise_of(problem, phi, dt=0.05):
+    tau = None if phi is None else -dt / np.log(phi)
+    n, q = problem.n, np.log(problem.q)
+    log_c = q[n:] - np.log(1 - phi**2) if phi else np.zeros(n)
+    return Noise(Structure(tau), q[:n], np.log(problem.v), log_c, np.full(n, -30.0))
+
+
+def information(problem, noise, dt=0.05):
+    g, _, _, back = problem.passes(noise.process(dt), np.exp(noise.log_r))
+    columns = working(noise, back, problem.G, dt)
+    return average(innovations(g, *columns)[0]), back
+
+
+def dense(problem):
+    """By run: covariance of all that was measured, its part from each noise, the residual."""
+    n, N, A = problem.n, problem.N, problem.A
+    for b in range(B):
+        rows, there = np.zeros((L, n, N)), problem.seen[1:, b].reshape(-1) > 0
+        z, drift = np.eye(N), np.zeros((L, n))
+        e = np.concatenate([problem.r[0, b, :, 0] * problem.seen[0, b], np.zeros(N - n)])
+        for t in range(L):
+            z, e = A[t, b] @ z, A[t, b] @ e
+            e[:n] += problem.d[t, b, :, 0]
+            rows[t], drift[t] = z[:n], e[:n]
+        first = np.concatenate([problem.v, np.ones(N - n)])
+        start = rows.reshape(-1, N) * np.sqrt(first)
+        whole, parts = start @ start.T, []
+        for i in range(N):
+            answers = np.zeros((L, L, n))
+            for t in range(L):
+                unit = np.zeros(N)
+                unit[i] = 1.0
+                if problem.G is not None and i < n:
+                    unit[:n] = problem.G[t, b][:, i]
+                for later in range(t, L):
+                    answers[t, later] = unit[:n]
+                    if later + 1 < L:
+                        unit = A[later + 1, b] @ unit
+            D = answers.reshape(L, -1).T
+            parts.append(problem.q[i] * D @ D.T)
+        for i in range(n):
+            parts.insert(n + i, np.diag(np.tile(np.eye(n)[i] * problem.v[i], L)))
+        whole = whole + sum(parts)
+        residual = (problem.r[1:, b, :, 0] - drift).reshape(-1)
+        keep = np.ix_(there, there)
+        yield whole[keep], [part[keep] for part in parts], residual[there]
+
+
+@pytest.mark.parametrize("case", CASES[:3])
+def test_average_information_is_that_of_the_dense_covariance(case):
+    problem = Problem(*case)
+    found, _ = information(problem, noise_of(problem, case[2]))
+    expected = 0.0
+    for whole, parts, y in dense(problem):
+        weighed = np.linalg.solve(whole, y)
+        answers = np.stack([part @ weighed for part in parts])
+        expected = expected + 0.5 * answers @ np.linalg.solve(whole, answers.T)
+    assert np.allclose(found, expected, rtol=1e-6, atol=1e-6 * np.abs(expected).max())
+
+
+def test_noise_climbs_to_the_top_though_channels_share_it():
+    problem = Problem(3, True, None, False)
+    noise = noise_of(problem, None)
+    for _ in range(12):
+        info, back = information(problem, noise)
+        noise = climbed(noise, slopes(noise, back, 0.05), info, L * B)
+    rest = slopes(noise, information(problem, noise)[1], 0.05)
+    assert np.abs(rest).max() < 0.01
+    before = problem.loglik(problem.q, problem.v)
+    assert problem.loglik(np.exp(noise.log_q), np.exp(noise.log_r)) > before
+
+
+@pytest.mark.parametrize("name", ["kernels.py", "kernel_pen.py"])
+def test_kernels_that_another_version_of_us_wrote_are_not_used(monkeypatch, name):
+    read, version = Path.read_bytes, kernels._version.__wrapped__
+    before = version()
+    monkeypatch.setattr(Path, "read_bytes", lambda p: read(p) + b"#" * (p.name == name))
+    assert version() != before

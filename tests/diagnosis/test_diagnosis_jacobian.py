@@ -1,0 +1,104 @@
+"""The filter's Jacobian is that of the whole hypothesis; thresholds have a slope; a mere offset."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from grounded.challenge.cases import make
+from grounded.diagnosis.data import prepare
+from grounded.diagnosis.hypotheses import price
+from grounded.diagnosis.hypothesis import Hypothesis, Predictor
+from grounded.diagnosis.jacobian import sensitivities
+from grounded.diagnosis.linearise import jacobian
+from grounded.diagnosis.search import Search
+from grounded.effects import Library
+
+
+@pytest.fixture(scope="module")
+def cars():
+    case = next(iter(make("none", 1, 17, only="car")))
+    return case, prepare(case.model, case.trials, case.latency)
+
+
+def effect(data, name):
+    return Library().effect(name, data.model, data.scales)
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("coupling:psi<-v", {"k": 0.36}),
+        ("viscous_friction:v", {"k": 0.8}),
+        ("quadratic_drag:v", {"k": 0.5}),
+        ("understeer:psi", {"k": 0.2}),
+        ("rate_gain:v", {"g": 0.3}),
+        ("slope:v", {"a": 0.2, "b": -0.3}),
+        ("slew_limit:delta", {"r": 0.5}),
+    ],
+)
+def test_the_jacobian_is_that_of_the_hypothesis(cars, name, values):
+    _, data = cars
+    predictor, h = Predictor(data), Hypothesis().plus(effect(data, name), values)
+    track = data.y.copy()
+    track[..., data.model.state_names.index("v")] += 0.5  # away from the kink at rest
+    F = jacobian(predictor, h, track)
+    x, u, size = track[:-1], predictor.inputs(h), 1e-6
+    for j in range(data.model.n):
+        ends = []
+        for sign in (-1, 1):
+            moved = x.copy()
+            moved[..., j] += sign * size
+            ends.append(predictor.advance(h, moved, u, data.time))
+        slope = (ends[1] - ends[0]) / (2 * size)
+        error = np.abs(F[..., j] - slope)
+        # kinks (braking, a limit that is just reached) lie on few of the steps
+        assert np.quantile(error.max(axis=-1), 0.9) < 0.02 * max(1.0, np.abs(slope).max())
+
+
+def test_without_the_effects_slope_it_would_be_another(cars):
+    _, data = cars
+    predictor = Predictor(data)
+    h = Hypothesis().plus(effect(data, "coupling:psi<-v"), {"k": 0.36})
+    names = data.model.state_names
+    with_it, alone = (jacobian(predictor, one, data.y) for one in (h, Hypothesis()))
+    change = (with_it - alone)[..., names.index("psi"), names.index("v")]
+    assert change.max() == pytest.approx(0.36 * data.dt, rel=0.01)
+    assert change.min() > 0.7 * 0.36 * data.dt  # less where v itself decays within a step
+
+
+def test_a_threshold_of_the_model_has_a_slope(cars):
+    case, data = cars
+    model = case.model
+    x = np.tile([0.0, 0.1, 0.0, 0.0, 0.0, 0.0], (9, 1))
+    u = np.column_stack([np.zeros(9), np.linspace(0.16, 0.2, 9)])  # around the stall
+    _, f_p = sensitivities(model, x, u, model.values, data.dt)
+    exact = model.system.sensitivities(x, u, model.values, data.dt)[2]
+    stall = model.param_names.index("stall")
+    assert not exact[..., stall].any()
+    assert f_p[:, model.state_names.index("v"), stall].min() < 0
+    others = [i for i in range(len(model.param_names)) if i != stall and exact[..., i].any()]
+    np.testing.assert_array_equal(f_p[..., others], exact[..., others])
+
+
+def test_a_stall_that_is_off_is_calibrated_not_blamed_on_another_effect():
+    case = next(iter(make("none", 1, 20, only="car", noise="white")))  # its throttle passes there
+    crude = case.model.with_values({"stall": 1.15 * case.model.params["stall"].value})
+    data = prepare(crude, case.trials, case.latency)
+    search = Search(data, Library().candidates(crude, data.scales))
+    with np.errstate(all="ignore"):
+        search.nulls()
+    fit = search.best_null()
+    assert fit.hypothesis.spread > 0
+    found = fit.hypothesis.shift[crude.param_names.index("stall")] / crude.params["stall"].value
+    assert found == pytest.approx(1 / 1.15 - 1, abs=0.04)
+
+
+def test_a_dead_zone_in_which_nothing_rests_was_not_searched_for(cars):
+    _, data = cars
+    predictor, zone = Predictor(data), effect(data, "dead_zone:steering")
+    wide = price(predictor, zone, {"c": 0.3})
+    steady = np.full_like(data.commands, 0.6)
+    steady[..., 0] += 0.2 * data.commands[..., 0]
+    driven = Predictor(replace(data, commands=steady))
+    assert price(driven, zone, {"c": 0.1}) == pytest.approx(wide - np.log(zone.places))

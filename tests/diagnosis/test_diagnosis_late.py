@@ -1,0 +1,236 @@
+"""A late measurement: the filter's likelihood is the exact one, the log comes back as it was."""
+
+import numpy as np
+import pytest
+
+from grounded.diagnosis import kernels
+from grounded.diagnosis.data import prepare
+from grounded.diagnosis.delayed_measurement import Late
+from grounded.diagnosis.delays import delays_of
+from grounded.diagnosis.filter import UNKNOWN, Adjoint, gains, innovations, smoother, transition
+from grounded.diagnosis.hypothesis import Hypothesis
+from grounded.diagnosis.noise import Noise, Structure
+from grounded.diagnosis.prediction_error import horizon, normalised
+from grounded.diagnosis.search import Search
+from grounded.diagnosis.shrinkage import held_out
+from grounded.effects import Library
+from grounded.models.pendulum import model as pendulum
+from grounded.trial import Trial
+
+L, B, n = 12, 2, 3
+# late channels of each run, p of each, colour, noise through G, missing samples
+CASES = [
+    ([[1], [1]], [[0.0], [0.0]], None, False, False),
+    ([[1], [1]], [[0.4], [0.4]], None, True, False),
+    ([[0], [2]], [[0.4], [0.9]], 0.8, False, True),
+    ([[0, 2], [0, 1]], [[0.0, 0.7], [0.4, 0.4]], 0.9, True, True),
+    ([[2, 1], [2, 1]], [[0.5, 0.2], [0.1, 0.3]], None, True, True),
+]
+
+
+class Problem:
+    """A random linear system whose measurements of some channels are late by part of a step."""
+
+    def __init__(self, channel, part, phi, through, missing, steps=L):
+        rng = np.random.default_rng(n)
+        self.L, self.phi, self.late = steps, phi, Late(np.array(channel), np.array(part))
+        self.F = 0.9 * np.eye(n) + 0.1 * rng.standard_normal((steps, B, n, n))
+        self.G = None
+        if through:
+            self.G = np.tile(np.eye(n), (steps, B, 1, 1))
+            self.G[:, :, n - 1, : n - 1] = rng.standard_normal((steps, B, n - 1))
+        self.A = transition(self.F, phi, self.G)
+        self.N = self.A.shape[-1]
+        self.seen = np.ones((steps + 1, B, n))
+        if missing:
+            self.seen[1:] = rng.random((steps, B, n)) > 0.3
+            self.seen[-3:, 1] = 0.0
+        self.d = 0.3 * rng.standard_normal((steps, B, n, 2))
+        self.r = rng.standard_normal((steps + 1, B, n, 2))
+        self.q, self.v = np.exp(rng.standard_normal(self.N)), np.exp(rng.standard_normal(n))
+        self.start = np.full((B, self.N - n), 0.7)
+
+    def passes(self, q, v):
+        g = gains(self.A, q, v, self.seen, self.start, self.G, self.late)
+        white, track = innovations(g, self.d, self.r, track=True)
+        return g, white, track, smoother(g, white[..., 0])
+
+    def dense(self, b):
+        """Log density of what run b measures from step 1, all of it one normal vector."""
+        G = np.tile(np.eye(n), (self.L, 1, 1)) if self.G is None else self.G[:, b]
+        power = self.q[:n] + (self.start[b] if n < self.N else 0.0)
+        first = self.v * np.where(self.seen[0, b] > 0, 1.0, UNKNOWN)
+        late = dict(zip(self.late.channel[b], self.late.part[b], strict=True))
+        for i, p in late.items():
+            first[i] += p**2 * float(G[0][i] ** 2 @ power)
+        variances = [*first, *self.start[b], *np.tile(self.q, self.L)]
+        sources = len(variances)
+        e = np.zeros((n, sources))
+        e[:, :n] = np.eye(n)
+        c = np.zeros((n, sources))
+        if n < self.N:
+            c[:, n : 2 * n] = np.eye(n)
+        mean, at = self.r[0, b, :, 0] * self.seen[0, b], self.N
+        rows, missed, noise = [], [], []
+        for t in range(self.L):
+            before, mean_before = e, mean
+            w = np.zeros((n, sources))
+            w[:, at : at + n] = np.eye(n)
+            e = self.F[t, b] @ e + G[t] @ (c + w)
+            mean = self.F[t, b] @ mean + self.d[t, b, :, 0]
+            if n < self.N:
+                c = self.phi * c
+                c[:, at + n : at + 2 * n] += np.eye(n)
+            at += self.N
+            for i in range(n):
+                if self.seen[t + 1, b, i]:
+                    p = late.get(i, 0.0)
+                    rows.append((1 - p) * e[i] + p * before[i])
+                    missed.append(self.r[t + 1, b, i, 0] - (1 - p) * mean[i] - p * mean_before[i])
+                    noise.append(self.v[i])
+        H, nu = np.array(rows), np.array(missed)
+        S = (H * np.array(variances)) @ H.T + np.diag(noise)
+        return -0.5 * float(nu @ np.linalg.solve(S, nu) + np.linalg.slogdet(S)[1])
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("case", CASES)
+def test_the_likelihood_is_that_of_all_measurements_together(case, compiled, monkeypatch):
+    problem = Problem(*case)
+    if not compiled:
+        monkeypatch.setattr(kernels, "available", lambda n: False)
+    g, white, track, _ = problem.passes(problem.q, problem.v)
+    found = -0.5 * ((white[..., 0] ** 2).sum(axis=(0, 2)) + g.logdet.sum(axis=0))
+    assert found == pytest.approx([problem.dense(b) for b in range(B)], rel=1e-9)
+    assert white.shape == problem.d.shape and track.shape == problem.r.shape
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_kernels_and_numpy_agree(case, monkeypatch):
+    problem = Problem(*case)
+    fast = problem.passes(problem.q, problem.v)
+    monkeypatch.setattr(kernels, "available", lambda n: False)
+    slow = problem.passes(problem.q, problem.v)
+    for one, other in zip(fast[1:3], slow[1:3], strict=True):
+        assert np.allclose(one, other, rtol=1e-8, atol=1e-8)
+    for name in ("u", "D", "r", "N"):
+        one, other = getattr(fast[3], name), getattr(slow[3], name)
+        assert np.allclose(one, other, rtol=1e-8, atol=1e-8 * np.abs(other).max())
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_smoother_gives_the_slope_of_the_likelihood(case):
+    problem = Problem(*case, steps=40)
+    back = problem.passes(problem.q, problem.v)[3]
+    of_q = 0.5 * (problem.q * (back.r**2 - back.N))[1:].sum(axis=(0, 1))
+    of_v = 0.5 * (problem.v * (back.u**2 - back.D)).sum(axis=(0, 1))
+
+    def loglik(logs):
+        Q = np.broadcast_to(problem.q, (problem.L, B, problem.N)).copy()
+        Q[1:] *= np.exp(logs[: problem.N])  # the first step's is part of the start
+        R = np.tile(problem.v, (problem.L + 1, B, 1))
+        R[1:] *= np.exp(logs[problem.N :])
+        g = gains(problem.A, Q, R, problem.seen, problem.start, problem.G, problem.late)
+        white, _ = innovations(g, problem.d, problem.r)
+        return -0.5 * float((white[..., 0] ** 2).sum() + g.logdet.sum())
+
+    for at, slope in enumerate([*of_q, *of_v]):
+        step = np.zeros(problem.N + n)
+        step[at] = 1e-4
+        assert slope == pytest.approx((loglik(step) - loglik(-step)) / 2e-4, rel=1e-4, abs=1e-3)
+
+
+def _trials(lengths, dt=0.02):
+    rng = np.random.default_rng(1)
+    found = []
+    for T in lengths:
+        states = np.cumsum(rng.standard_normal((T + 1, 2)), axis=0)
+        states[7, 1] = np.nan
+        names = pendulum.state_names, pendulum.input_names
+        found.append(Trial(states, rng.standard_normal((T, 1)), dt, *names))
+    return found
+
+
+@pytest.mark.parametrize("whole", [0, 2, 5])
+def test_a_moved_log_crosses_the_runs_of_a_trial_but_not_its_end(whole):
+    data = prepare(pendulum, _trials([450, 230]))  # several runs a trial, of unequal length
+    effect = Library().effect("sensor_delay:omega", pendulum, data.scales)
+    h = Hypothesis().plus(effect, {"d": (whole + 0.25) * data.dt})
+    delays = delays_of(h, data)
+    assert delays.whole == (whole,) and delays.part == pytest.approx([0.25])
+    y, seen = delays.samples()
+    ends = np.cumsum(data.lengths + 1) - 1
+    valid = np.concatenate([np.ones_like(data.valid[:, :1]), data.valid], axis=1)
+    for b in range(len(data.valid)):
+        for s in range(y.shape[0]):
+            source = data.state_at[b, s] + whole
+            there = valid[b, s] and source <= ends[data.trial_of[b]]
+            there = there and np.isfinite(data.states[source, 1])
+            assert seen[s, b, 1] == there
+            if there:
+                assert y[s, b, 1] == data.states[source, 1]
+    assert (y[..., 0] == data.y[..., 0]).all() and (seen[..., 0] == data.seen[..., 0]).all()
+    # values of samples go with them, and come back
+    assert (delays.aligned(data.y)[..., 1] == y[..., 1])[seen[..., 1] > 0].all()
+    weight = np.random.default_rng(0).uniform(0.5, 2.0, data.seen[1:].shape)
+    log = np.zeros(2)
+    moved = delays.noise(Noise(Structure(), log, log, log, log, weight, weight)).weight_v
+    back = delays.restored(Adjoint(moved, moved, moved, moved))
+    same = back.u[..., 1] == weight[..., 1]
+    lost = data.seen[1:, :, 1].sum() - seen[1:, :, 1].sum()
+    assert lost == whole * data.count
+    assert (~same)[data.valid.T > 0].sum() == whole * data.count
+    assert (back.u[..., 0] == weight[..., 0]).all()
+
+
+@pytest.mark.parametrize("whole", [0, 2, 5])
+def test_samples_of_what_was_before_a_trial_count_like_those_of_a_state_that_drifts(whole):
+    data = prepare(pendulum, _trials([250, 120]))
+    effect = Library().effect("sensor_delay:omega", pendulum, data.scales)
+    delays = delays_of(Hypothesis().plus(effect, {"d": (whole + 0.25) * data.dt}), data)
+    log, L, B = np.log([0.5, 1.0]), len(data.time), len(data.valid)
+    noise = Noise(Structure(), log, log - 1, log, log)
+    white, whiten = np.zeros((L, B, 2)), np.tile(1e-9 * np.eye(2), (L, B, 1, 1))
+    still = np.zeros((L + 1, B, 2))
+    found = delays.before(noise, None, still, white, whiten)
+    t, exact = np.arange(whole + 1), 0.0
+    S = np.minimum(t[1:, None], t[1:]) * 1.0 + np.exp(-1) * (np.eye(whole) + 1)
+    for run in delays.first:
+        missed = (data.y[1 : whole + 1] - data.y[0])[:, run, 1]
+        exact -= 0.5 * (missed @ np.linalg.solve(S, missed) + np.linalg.slogdet(S)[1])
+    assert list(delays.first) == [0, 2] and found == pytest.approx(exact)
+    certain = np.tile(np.eye(2), (L, B, 1, 1))  # samples that are far more likely than these
+    assert delays.before(noise, None, still, white, certain) == pytest.approx(
+        max(exact, -1.0 * whole * 2)
+    )
+
+
+def test_a_delay_is_found_where_the_state_is_disturbed_and_predictions_reach_the_noise():
+    rng, dt, late = np.random.default_rng(3), 0.02, 2.4
+    trials = []
+    for _ in range(4):
+        T = 260
+        u = 1.5 * np.sin(np.arange(T) * dt * rng.uniform(2, 6) + rng.uniform(0, 6))[:, None]
+        x = [np.array([0.5, 0.0])]
+        for t in range(T):
+            after = pendulum.system.step(x[-1][None], u[t][None], pendulum.values, dt)[0]
+            x.append(after + [0.0, 0.03] * rng.standard_normal(2))
+        log, at = np.array(x), np.maximum(np.arange(T + 1) - late, 0.0)
+        log[:, 1] = np.interp(at, np.arange(T + 1), log[:, 1])
+        log += [0.002, 0.01] * rng.standard_normal(log.shape)
+        trials.append(Trial(log, u, dt, pendulum.state_names, pendulum.input_names))
+    data = prepare(pendulum, trials)
+    search, found = Search(data, ()), {}
+    (null,) = search.refined([search.fresh(Hypothesis())], 20)
+    for name, values in (("sensor_delay", {"d": 0.03}), ("viscous_friction", {"k": 0.1})):
+        effect = Library().effect(f"{name}:omega", pendulum, data.scales)
+        h = null.hypothesis.plus(effect, values)
+        (found[name],) = search.refined([(h, null.noise, null.track)], 25)
+    fit = found["sensor_delay"]
+    assert fit.hypothesis.values[0]["d"] == pytest.approx(late * dt, abs=0.05 * dt)
+    assert fit.loglik > max(null.loglik, found["viscous_friction"].loglik) + 300
+    assert np.exp(0.5 * fit.noise.log_q[1]) == pytest.approx(0.03, rel=0.1)
+    where = horizon(search.predictor, fit, 0.5)
+    error = held_out(search.predictor, fit, fit.track, where)
+    of_late = float(np.sqrt((error[:, 1] ** 2 / where.spread[:, 1] ** 2).mean()))
+    assert 0.85 < of_late < 1.15 and 0.85 < normalised(error, where) < 1.15

@@ -1,0 +1,64 @@
+"""What the data cannot tell: said, and no cause made of it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_diagnosis_unmeasured import swings
+
+from grounded import GroundedError, Model, Param, Trial
+from grounded.diagnosis.data import prepare
+from grounded.diagnosis.diagnose import diagnose
+from grounded.diagnosis.limits import knowable, still_states
+from grounded.diagnosis.search import Search
+from grounded.effects import Library
+from grounded.models.pendulum import model as pendulum
+
+
+def stuck(trials, *states):
+    """The same with sensors that show one value."""
+    for trial in trials:
+        y = trial.states.copy()
+        y[:, list(states)] = 0.25
+        yield replace(trial, states=y)
+
+
+def test_states_that_never_moved_give_no_cause():
+    found = diagnose(pendulum, list(stuck(swings(), 0, 1)))
+    assert found.kind == "unknown" and not found.effects
+    assert [s for s in found.unknowable if "never moved" in s] == [
+        f"state {name} never moved, so nothing can be said of what acts on it"
+        for name in ("theta", "omega")
+    ]
+
+
+def test_what_acts_on_a_state_that_never_moved_is_not_offered():
+    data = prepare(pendulum, list(stuck(swings(), 1)))
+    assert still_states(data) == ["omega"]
+    offered = {e.name for e in knowable(data, Library().candidates(pendulum, data.scales))}
+    assert "offset:theta" in offered and "sensor_scale:theta" in offered
+    assert not {"viscous_friction:omega", "sensor_delay:omega", "sensor_bias:omega"} & offered
+
+
+def test_a_model_that_is_no_number_at_a_measured_state_says_where():
+    tank = Model(
+        states={"h": "m"},
+        inputs={"u": "1"},
+        params={"k": Param(0.2, "m/s"), "c": Param(0.3, "1")},
+        derivative=lambda s, a, p: {"h": p.k * a.u - p.c * np.sqrt(s.h)},
+        name="tank",
+    )
+    h = np.abs(np.sin(0.1 * np.arange(60)))[:, None]
+    h[17] = -0.004
+    trials = [Trial(h, np.ones((59, 1)), 0.1, ("h",), ("u",), id=f"t000{k}") for k in (1, 2)]
+    with pytest.raises(GroundedError, match=r"trial t0001, t = 1\.7 s, h = -0\.004") as raised:
+        diagnose(tank, trials)
+    assert "np.maximum" in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("dt", "expected"), [(0.02, [0.05, 0.1, 0.3]), (0.1, [0.1, 0.3]), (2.0, [2.0, 4.0, 12.0])]
+)
+def test_coloured_noise_is_offered_however_slow_the_system_is(dt, expected):
+    trials = [replace(trial, dt=dt) for trial in swings(2, 40)]
+    assert Search(prepare(pendulum, trials), ()).taus == pytest.approx(expected)

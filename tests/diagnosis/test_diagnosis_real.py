@@ -1,0 +1,128 @@
+"""Real systems whose authors published what the model lacks (../shared/data, each SOURCE.md).
+
+Their logs become MCAP trials, which are ingested and diagnosed by the commands that a user types.
+"""
+
+import numpy as np
+import pytest
+
+from cli import grounded
+from grounded_trials.store.trial_file import write_trial
+from real_systems import DART_STEERING, DART_THROTTLE, EMPS, SERVO
+from shared_data import needs_data
+
+CONFIG = """[model]
+file = "model.py"
+
+[task]
+dt = {dt}
+horizon = 10
+target = "target.csv"
+
+[reward]
+state = {{ {state} = 1.0 }}
+"""
+
+
+def diagnosed(system, folder):
+    """Trials as MCAP files, ingested and diagnosed; the document."""
+    trials = system.read()
+    first = trials[0]
+    name = first.state_names[0]
+    folder.mkdir()
+    (folder / "model.py").write_text(system.text)
+    (folder / "grounded.toml").write_text(CONFIG.format(dt=first.dt, state=name))
+    rows = "\n".join(f"{k * first.dt:.6f},0" for k in range(11))
+    (folder / "target.csv").write_text(f"t,{name}\n{rows}\n")
+    paths = []
+    for k, trial in enumerate(trials):
+        paths.append(str(folder / f"log{k:02d}.mcap"))
+        write_trial(folder / f"log{k:02d}.mcap", trial, {"kind": "data"})
+    stored = grounded("-C", folder, "ingest", "--data", *paths, "--json")
+    assert stored.code == 0 and len(stored.json["trials"]) == len(trials), stored.err
+    found = grounded("-C", folder, "diagnose", "--json")
+    assert found.code == 0, found.err
+    return found.json
+
+
+def values(document, effect):
+    row = next(r for r in document["ranking"] if r["effect"] == effect)
+    return {name: estimate["value"] for name, estimate in row["params"].items()}
+
+
+@needs_data
+def test_emps_has_dry_and_viscous_friction_of_the_published_size(tmp_path):
+    found = diagnosed(EMPS, tmp_path / "emps")
+    assert {"coulomb_friction:v", "viscous_friction:v"} <= set(found["verdict"]["effects"])
+    dry, viscous = values(found, "coulomb_friction:v"), values(found, "viscous_friction:v")
+    assert dry["c"] == pytest.approx(20.394 / 95.109, rel=0.05)
+    assert viscous["k"] == pytest.approx(203.5 / 95.109, rel=0.05)
+    assert found["gap"]["held_out"] and found["gap"]["before"] > 20 * found["gap"]["after"]
+
+
+@needs_data
+def test_the_servo_has_a_speed_limit_and_a_delay(tmp_path):
+    """Published: 40 ms, 1.56/s. The filter's r is lower: the servo also needs time to speed up."""
+    found = diagnosed(SERVO, tmp_path / "servo")
+    assert {"slew_limit:position", "delay:command"} <= set(found["verdict"]["effects"])
+    assert 1.0 < values(found, "slew_limit:position")["r"] < 1.7
+    assert 0.035 < values(found, "delay:command")["d"] < 0.05
+
+
+@needs_data
+def test_the_dart_steers_late(tmp_path):
+    found = diagnosed(DART_STEERING, tmp_path / "dart")
+    named = found["verdict"]["effects"]
+    late = [e for e in named if e in ("first_order_lag:steering", "delay:steering")]
+    assert len(late) == 1  # beside a response that saturates
+    assert 0.05 < next(iter(values(found, late[0]).values())) < 0.18
+
+
+@needs_data
+def test_the_dart_throttle_has_a_dead_zone(tmp_path):
+    found = diagnosed(DART_THROTTLE, tmp_path / "dart")
+    assert found["ranking"][0]["effect"] == "dead_zone:throttle"
+    assert 0.15 < values(found, "dead_zone:throttle")["c"] < 0.22
+    alike = {
+        one["like"]: one["share"]
+        for one in found["lookalikes"]
+        if one["effect"] == "dead_zone:throttle"
+    }
+    assert 0.75 < alike["coulomb_friction:v"] < 1
+    assert "dead_zone:throttle is nearly inseparable from" in found["verdict"]["sentence"]
+
+
+def lagged(tau, way):
+    """Rms error of w = K v s on the DART's rows, its steering s lagged by a plain filter."""
+    dt, xs, ws = 0.1, [], []
+    a = np.exp(-dt / tau)
+    for trial in DART_STEERING.read():
+        s, y = trial.inputs[:, 0], trial.inputs[0, 0]
+        seen = np.empty(len(s))
+        for k, command in enumerate(s):
+            later = a * y + (1 - a) * command
+            mean = command + (y - command) * (1 - a) * tau / dt
+            seen[k], y = (later if way == "end" else mean), later
+        xs.append(trial.inputs[:, 1] * seen)
+        ws.append(trial.states[1:, 0])
+    x, w = np.concatenate(xs), np.concatenate(ws)
+    return float(np.sqrt(np.mean((w - x * (x @ w) / (x @ x)) ** 2)))
+
+
+@needs_data
+def test_the_published_lag_is_a_matter_of_convention():
+    """0.13 s where the filter's value at the end of a step counts, 0.085 s where its mean does."""
+    taus = np.linspace(0.04, 0.25, 106)
+    best = {way: taus[np.argmin([lagged(t, way) for t in taus])] for way in ("end", "mean")}
+    assert best["end"] == pytest.approx(0.129, abs=0.005)
+    assert best["mean"] == pytest.approx(0.085, abs=0.005)
+
+
+@needs_data
+def test_the_servo_rests_for_one_row_after_a_step():
+    """So its delay is between 20 and 40 ms, whatever the model."""
+    moved = []
+    for trial in SERVO.read()[1:11]:  # the steps
+        moved.append(np.abs(trial.states[:4, 0] - trial.states[0, 0]) * 2048)  # counts
+    rows = np.array(moved)
+    assert rows[:, 1].max() < 2 < 4 < rows[:, 2].min()

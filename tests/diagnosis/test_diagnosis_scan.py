@@ -1,0 +1,55 @@
+"""What the scan hands on: faint values, other places; what is too brief to be claimed."""
+
+import math
+
+import numpy as np
+import pytest
+
+from grounded import Model, Param
+from grounded.diagnosis.data import prepare
+from grounded.diagnosis.scan import elsewhere, faint
+from grounded.diagnosis.search import Search
+from grounded.effects import Library
+from grounded.models.car import model as car
+from grounded.models.pendulum import model as pendulum
+from grounded.trial import Trial
+
+
+def test_below_the_smallest_grid_value_an_effect_is_linear():
+    effect = Library().effect("sensor_delay:v", car)
+    (d,) = (q for q in effect.free)
+    first, second = sorted(d.grid)[:2]
+    assert faint(effect, {"d": first}, -30.0, 100.0) == pytest.approx(0.3)
+    assert faint(effect, {"d": first}, -300.0, 100.0) == 1.0
+    assert faint(effect, {"d": second}, -30.0, 100.0) == 1.0
+    limit = Library().effect("saturation:throttle", car)  # absent at infinity, not at zero
+    assert faint(limit, {"c": min(limit.free[0].grid)}, -30.0, 100.0) == 1.0
+
+
+def test_other_places_are_kept_where_they_are_no_neighbours():
+    effect = Library().effect("delay:throttle", car)
+    grid = sorted(effect.free[0].grid)
+    looks = [(100.0, {"d": grid[3]}), (99.0, {"d": grid[4]}), (80.0, {"d": grid[7]})]
+    assert elsewhere(effect, [*looks, (10.0, {"d": grid[0]})]) == ({"d": grid[7]},)
+
+
+def test_a_delay_of_a_hundredth_of_a_step_is_a_matter_of_time_stamps():
+    t = np.arange(60) * 0.05
+    trial = Trial(np.zeros((61, 2)), np.sin(t)[:, None], 0.05, ("theta", "omega"), ("torque",))
+    data = prepare(pendulum, [trial, trial])
+    search = Search(data, Library().candidates(pendulum, data.scales))
+    effect = Library().effect("delay:torque", pendulum, data.scales)
+    assert search.price(effect, {"d": 0.0005}) == math.inf
+    assert search.price(effect, {"d": 0.02}) < 20
+
+
+def test_a_state_that_is_set_outright_has_no_rate_to_be_scaled():
+    model = Model(
+        states={"w": "rad/s"},
+        inputs={"steering": "1"},
+        params={"k": Param(1.0, "rad/s")},
+        step=lambda s, a, p, dt: {"w": p.k * a.steering + 0 * s.w},
+    )
+    names = [effect.name for effect in Library().candidates(model)]
+    assert "rate_gain:w" not in names and "offset:w" in names
+    assert "rate_gain:omega" in [effect.name for effect in Library().candidates(pendulum)]

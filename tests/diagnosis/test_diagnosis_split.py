@@ -1,0 +1,98 @@
+"""What the error is made of, and how well utilities are predicted."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_diagnosis import DT, cart
+
+from grounded.diagnosis.diagnose import Options, diagnose
+from grounded.diagnosis.split import Split, repeated
+from grounded.effects import Library
+from grounded.task import Task
+from grounded.utility import Reward
+
+HORIZONS = ("one_step", "horizon", "whole_run")
+
+
+def task_of(model, steps=120):
+    return Task(
+        model=model,
+        dt=DT,
+        target=np.zeros((steps + 1, 2)),
+        reward=Reward(np.ones(2), np.zeros(2), np.zeros(1), np.zeros(1)),
+        start=np.zeros(2),
+        past=np.zeros(1),
+        low=np.array([-1.0]),
+        high=np.array([1.0]),
+    )
+
+
+def parts(row):
+    return [row[key] for key in ("explained", "unexplained", "irreducible")]
+
+
+def test_an_effect_that_is_found_explains_the_error():
+    model, trials = cart(friction=0.4)
+    document = diagnose(task_of(model), trials).to_dict()
+    split = document["where"]["split"]
+    assert tuple(split) == HORIZONS
+    for row in split.values():
+        for one in (row["all"], *row["channels"]):
+            assert sum(parts(one)) == pytest.approx(1)
+            assert min(parts(one)) >= 0
+    assert split["horizon"]["all"]["explained"] > 0.98
+    assert split["one_step"]["channels"][0]["irreducible"] > 0.8  # of x: one step is mostly noise
+    assert split["whole_run"]["horizon_s"] > 5
+    assert min(document["where"]["whiteness"].values()) > 0.01
+    utility = document["utility_prediction"]
+    assert utility["trials"] == 4
+    assert utility["after"] < 0.1 * utility["before"]
+
+
+def test_without_an_effect_the_error_is_noise():
+    model, trials = cart()
+    found = diagnose(model, trials)
+    row = found.split["horizon"]
+    assert row["all"]["explained"] == 0
+    assert row["all"]["irreducible"] > 0.85
+    assert row["irreducible_from"] == "noise"
+    assert found.utility_prediction is None
+
+
+def test_what_no_effect_explains_stays_unexplained_and_is_not_white():
+    model, trials = cart(asymmetric=0.8, trials=6)
+    poor = Options(library=Library((Library().family("trend"),)))  # nothing that could explain it
+    found = diagnose(task_of(model), trials, poor)
+    assert found.leftover and found.whiteness["v"] < 0.01
+    assert found.split["horizon"]["channels"][1]["explained"] < 1
+
+
+def test_repeats_of_a_candidate_tell_the_noise():
+    model, trials = cart(trials=1)
+    noise, same = np.random.default_rng(3), []
+    for _ in range(4):  # the same commands again, other noise
+        x, states = np.zeros(2), [np.zeros(2)]
+        for value in trials[0].inputs[:, 0]:
+            for _ in range(10):
+                x = x + DT / 10 * np.array([x[1], 2.0 * value - x[1]])
+            x = x + np.array([0.0003, 0.003]) * noise.standard_normal(2)
+            states.append(x)
+        y = np.array(states) + np.array([0.002, 0.01]) * noise.standard_normal((121, 2))
+        same.append(replace(trials[0], states=y, candidate="c0001"))
+    row = diagnose(model, same).split["horizon"]
+    assert row["irreducible_from"] == "repeats"
+    assert row["all"]["irreducible"] > 0.7
+
+
+def test_groups_of_repeats():
+    assert repeated(["a", "", "b", "a", "", "c"]) == [[0, 3]]
+
+
+def test_shares_are_of_what_there_was():
+    before, after, noise = np.array([4.0, 1.0]), np.array([1.0, 2.0]), np.array([0.5, 0.4])
+    found = Split(1.0, before, after, noise, None).shares()
+    np.testing.assert_allclose(found[:, 0], [0.75, 0.125, 0.125])
+    np.testing.assert_allclose(found[:, 1], [0.0, 0.6, 0.4])
+    by_trials = Split(1.0, before, after, noise, np.array([1.0, 0.4])).shares()
+    np.testing.assert_allclose(by_trials[:, 0], [0.75, 0.0, 0.25])

@@ -1,0 +1,285 @@
+"""Every effect: adopted and diagnosed one equation, it compiles, it is absent at its start."""
+
+import numpy as np
+import pytest
+
+from grounded import GroundedError, Model, Param, Trial
+from grounded.diagnosis.data import prepare
+from grounded.diagnosis.hypothesis import Hypothesis, Predictor
+from grounded.effects import (
+    InputFamily,
+    Library,
+    MemoryFamily,
+    ParamFamily,
+    Quantity,
+    RateFamily,
+    Scales,
+    memory_of,
+    scales_of,
+    wrap,
+)
+from grounded.models.aircraft import model as aircraft
+from grounded.models.car import model as car
+from grounded.models.pendulum import model as pendulum
+
+DT = 0.05
+
+
+def drive(model=car, seed=0, steps=60):
+    """A run of the model itself under lively inputs."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(steps) * DT
+    u = np.stack([0.5 * np.sin(2 * t + 1), 0.45 + 0.3 * np.sin(1.3 * t)], axis=1)
+    u = u[:, : model.m] + 0.05 * rng.standard_normal((steps, model.m))
+    x = [np.full(model.n, 0.1)]
+    for row in u:
+        x.append(model.system.step(x[-1][None], row[None], model.values, DT)[0])
+    held = np.zeros(model.m)
+    return Trial(np.array(x), u, DT, model.state_names, model.input_names, start_inputs=held)
+
+
+def sizes(trial, model=car):
+    return scales_of(model, trial.states, trial.inputs, DT, trial.steps * DT)
+
+
+def typical(effect):
+    """A middling value of every quantity."""
+    values = {}
+    for q in effect.free:
+        if q.grid:
+            values[q.name] = float(np.sort(q.grid)[len(q.grid) // 2])
+        else:
+            values[q.name] = 0.02
+    return values
+
+
+TRIAL = drive()
+EFFECTS = Library().candidates(car, sizes(TRIAL))
+ONE_EACH = list({e.family.name: e for e in reversed(EFFECTS)}.values())
+
+
+@pytest.mark.parametrize("effect", ONE_EACH, ids=lambda e: e.name)
+def test_an_adopted_effect_is_the_one_that_was_diagnosed(effect):
+    values = typical(effect)
+    wrapped = wrap(effect, values, DT)
+    memory = memory_of(wrapped, car, TRIAL)
+    z = np.hstack([TRIAL.states, memory])
+    adopted = wrapped.system.step(z[:-1], TRIAL.inputs, wrapped.values, DT)[:, : car.n]
+
+    predictor = Predictor(prepare(car, [TRIAL]))
+    h = Hypothesis().plus(effect, values)
+    x = TRIAL.states[:-1]
+    if effect.family.name in ("sensor_bias", "sensor_scale"):
+        i = car.state_names.index(effect.site.target)
+        x = x.copy()
+        x[:, i] = effect.family.recover(x[:, i], values)
+    if effect.family.name == "sensor_delay":
+        return  # the adopted one keeps a hidden true value; see test_sensor_delay
+    ahead = predictor.next(h, x[:, None, :])[:, 0]
+    ahead = (
+        ahead + np.asarray(predictor.offset(h, ahead[:, None, :]))[..., 0, :]
+        if (effect.family.name.startswith("sensor"))
+        else ahead
+    )
+    carried = car.state_names.index(
+        "psi_rate"
+    )  # the heading's rate, by a short step in one of them
+    np.testing.assert_allclose(adopted[:, carried], ahead[:, carried], atol=1e-3)
+    np.testing.assert_allclose(
+        np.delete(adopted, carried, 1), np.delete(ahead, carried, 1), atol=2e-6
+    )
+
+
+@pytest.mark.parametrize("effect", ONE_EACH, ids=lambda e: e.name)
+def test_an_adopted_effect_compiles_and_its_derivatives_are_right(effect):
+    wrapped = wrap(effect, typical(effect), DT)
+    assert wrapped.system.how == "compiled", wrapped.system.note
+    rng = np.random.default_rng(1)
+    x = rng.uniform(0.2, 0.9, (4, wrapped.n))
+    u = rng.uniform(0.3, 0.8, (4, wrapped.m))
+    f_x, f_u = wrapped.system.linearise(x, u, wrapped.values, DT)
+    h = 1e-6
+    for j in range(wrapped.n):
+        nudge = np.zeros(wrapped.n)
+        nudge[j] = h
+        ends = [wrapped.system.step(x + s * nudge, u, wrapped.values, DT) for s in (1, -1)]
+        np.testing.assert_allclose(
+            f_x[:, :, j], (ends[0] - ends[1]) / (2 * h), atol=2e-4, rtol=1e-4
+        )
+    assert np.isfinite(f_u).all()
+
+
+@pytest.mark.parametrize("effect", EFFECTS, ids=lambda e: e.name)
+def test_an_effect_is_absent_at_its_start(effect):
+    if not isinstance(effect.family, RateFamily | InputFamily | ParamFamily | MemoryFamily):
+        return
+    if any(q.grid for q in effect.free) and not isinstance(effect.family, MemoryFamily):
+        values = {q.name: (q.start if q.start else 1e-12) for q in effect.free}
+        if effect.family.name in ("patch", "periodic"):
+            values = {**typical(effect), **dict.fromkeys(("c", "A", "B"), 0.0)}
+            values = {q.name: values[q.name] for q in effect.free}
+    else:
+        values = {q.name: q.start or 1e-9 for q in effect.free}
+    if effect.family.name == "rate_limit":
+        values = {"r": 1e8}  # the first command is a jump from what was held before
+    predictor = Predictor(prepare(car, [TRIAL]))
+    x = TRIAL.states[:-1][:, None, :]
+    with_it = predictor.next(Hypothesis().plus(effect, values), x)
+    without = predictor.next(Hypothesis(), x)
+    carried = car.state_names.index("psi_rate")
+    np.testing.assert_allclose(with_it[..., carried], without[..., carried], atol=1e-3)
+    np.testing.assert_allclose(
+        np.delete(with_it, carried, -1), np.delete(without, carried, -1), atol=1e-5
+    )
+
+
+def test_the_contract_names_every_family():
+    named = (
+        "input_bias input_gain delay first_order_lag dead_zone stall saturation rate_limit "
+        "backlash input_fade offset rate_gain viscous_friction coulomb_friction quadratic_drag "
+        "stiction slew_limit "
+        "coupling periodic patch drift_world drift_body side_slip understeer slope trend "
+        "odometry_scale sensor_bias sensor_scale sensor_delay parameter"
+    )
+    assert set(named.split()) <= {family.name for family in Library().families}
+
+
+def test_names_of_effects_find_their_way_back():
+    for effect in EFFECTS:
+        again = Library().effect(effect.name, car, sizes(TRIAL))
+        assert again.name == effect.name
+        assert [q.name for q in again.quantities] == [q.name for q in effect.quantities]
+
+
+def test_an_unknown_effect_names_the_nearest():
+    with pytest.raises(GroundedError, match="dead_zone"):
+        Library().effect("deadzone:throttle", car)
+    with pytest.raises(GroundedError, match="throttle"):
+        Library().effect("dead_zone:throtle", car)
+
+
+def test_a_library_without_a_family_does_not_offer_it():
+    less = Library().without(["dead_zone"])
+    assert all(e.family.name != "dead_zone" for e in less.candidates(car))
+    with pytest.raises(GroundedError, match="no effect family 'dead_zone'"):
+        less.family("dead_zone")
+
+
+def test_a_third_party_family_is_one_value():
+    drag = RateFamily(
+        name="cubic_drag",
+        equation="v' = model - k v^3",
+        sentence="{target} has a cubic drag of {k}",
+        targets=lambda model: [n for n, u in model.states.items() if u == "m/s"],
+        quantities=lambda site: (Quantity("k", "s/m^2"),),
+        rate=lambda s, a, own, t, c, site: {site.target: -c["k"] * s[site.target] ** 3},
+    )
+    library = Library().with_families([drag])
+    effect = library.effect("cubic_drag:v", car, sizes(TRIAL))
+    assert wrap(effect, {"k": 0.1}, DT).system.how == "compiled"
+    with pytest.raises(GroundedError, match="two effect families"):
+        library.with_families([drag])
+
+
+@pytest.mark.parametrize("model", [aircraft, pendulum], ids=lambda m: m.name)
+def test_other_models_get_their_own_candidates(model):
+    names = [e.name for e in Library().candidates(model)]
+    assert len(names) == len(set(names))
+    assert any(name.startswith("viscous_friction:") for name in names)
+    if model is pendulum:
+        assert not any(name.startswith(("drift_", "side_slip", "slope")) for name in names)
+
+
+def test_a_black_box_model_takes_effects_too():
+    def step(s, a, p, dt):
+        if s["v"] > 1e9:  # a Python `if` on a state: can't be traced
+            return {"v": 0.0}
+        return {"v": s["v"] + dt * (a["u"] - p["k"] * s["v"])}
+
+    box = Model(
+        states={"v": "m/s"}, inputs={"u": "m/s^2"}, params={"k": Param(0.5, "1/s")}, step=step
+    )
+    effect = Library().effect("coulomb_friction:v", box)
+    wrapped = wrap(effect, {"c": 0.2}, DT)
+    after = wrapped.system.step(np.array([[1.0]]), np.array([[0.0]]), wrapped.values, DT)
+    assert after[0, 0] == pytest.approx(1.0 - DT * 0.7, abs=2e-3)
+
+
+def test_several_effects_wrap_one_another():
+    model = car
+    for name, values in (
+        ("viscous_friction:v", {"k": 0.1}),
+        ("dead_zone:throttle", {"c": 0.05}),
+        ("first_order_lag:steering", {"tau": 0.1}),
+        ("delay:throttle", {"d": 0.07}),
+    ):
+        model = wrap(Library().effect(name, model, sizes(TRIAL)), values, DT)
+    assert model.system.how == "compiled"
+    assert model.n == car.n + 1 + 3
+    assert memory_of(model, car, TRIAL).shape == (TRIAL.steps + 1, 4)
+
+
+def test_sensor_delay():
+    """A logged heading that is 0.1 s old is the true heading two steps ago."""
+    effect = Library().effect("sensor_delay:psi", car, sizes(TRIAL))
+    wrapped = wrap(effect, {"d": 2 * DT}, DT)
+    memory = memory_of(wrapped, car, TRIAL)
+    z = np.concatenate([TRIAL.states[20], memory[20]])
+    after = wrapped.system.step(z[None], TRIAL.inputs[20][None], wrapped.values, DT)[0]
+    names = wrapped.state_names
+    # d = 2 steps: the log of step 21 is the truth of step 19, which step 20 calls "one ago"
+    assert after[names.index("psi")] == pytest.approx(z[names.index("psi_true_1")], abs=1e-12)
+
+
+def test_missing_and_unknown_quantities_are_named():
+    effect = Library().effect("dead_zone:throttle", car)
+    with pytest.raises(GroundedError, match="no quantity 'width'"):
+        wrap(effect, {"width": 0.1}, DT)
+    with pytest.raises(GroundedError, match="needs a value for 'c'"):
+        wrap(effect, {}, DT)
+
+
+def test_the_docs_have_a_row_for_every_family():
+    from pathlib import Path
+
+    text = (Path(__file__).parents[2] / "docs" / "effects.md").read_text(encoding="utf-8")
+    for family in Library().families:
+        assert f"| `{family.name}` |" in text
+
+
+def test_the_docs_show_every_family():
+    from pathlib import Path
+
+    docs = Path(__file__).parents[2] / "docs"
+    pictures = "".join(path.read_text(encoding="utf-8") for path in docs.glob("effects-*.svg"))
+    text = (docs / "effects.md").read_text(encoding="utf-8")
+    for family in Library().families:
+        assert f">{family.name} (" in pictures
+    for path in docs.glob("effects-*.svg"):
+        assert f"({path.name})" in text
+
+
+def lag_of(dt, duration):
+    scales = Scales(dt=dt, duration=duration)
+    (tau,) = Library().effect("first_order_lag:steering", car, scales).quantities
+    return tau
+
+
+@pytest.mark.parametrize("dt", [0.002, 0.02, 0.05])
+def test_lags_of_usual_steps_end_at_two_seconds(dt):
+    tau = lag_of(dt, 10.0)
+    np.testing.assert_array_equal(tau.grid, np.geomspace(max(0.3 * dt, 0.005), 2.0, 10))
+    assert tau.high == 4.0
+
+
+def test_lags_of_long_steps_are_as_long_in_steps():
+    fast, slow = lag_of(0.05, 10.0), lag_of(2.0, 400.0)
+    np.testing.assert_allclose(slow.grid, 40 * np.array(fast.grid))
+    assert slow.high == 40 * fast.high
+
+
+@pytest.mark.parametrize("dt", [1e-4, 0.05, 0.5, 8.0])
+@pytest.mark.parametrize("steps", [2, 10, 1000])
+def test_lags_are_sought_within_their_bound(dt, steps):
+    tau = lag_of(dt, steps * dt)
+    assert 0 < tau.grid[0] < tau.grid[-1] <= tau.high

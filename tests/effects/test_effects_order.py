@@ -1,0 +1,121 @@
+"""Several effects together: diagnosis, probe and adopted model agree which of them acts first."""
+
+import numpy as np
+import pytest
+
+from grounded import Trial
+from grounded.diagnosis.data import prepare, shifted
+from grounded.diagnosis.excitation import _run
+from grounded.diagnosis.hypothesis import Hypothesis, Predictor
+from grounded.effects import Library, acting_order, memory_start, scales_of, wrapping_order
+from grounded.models.car import model as car
+from grounded.task import Task
+from grounded.utility import Reward
+from grounded_trials.workspace.adopted import planner_with
+
+DT, STEPS = 0.05, 60
+LIMIT = ("rate_limit:steering", {"r": 2.0})
+DELAY = ("delay:steering", {"d": 2 * DT})
+LAG = ("first_order_lag:steering", {"tau": 0.1})
+ZONE = ("dead_zone:steering", {"c": 0.1})
+PULL = ("offset:delta", {"c": 0.1})
+HELD = np.array([0.0, 0.3])  # a dead zone leaves it as it is
+
+
+def commands():
+    """Jumps and waves, (STEPS, 2)."""
+    t = np.arange(STEPS) * DT
+    return np.stack([0.7 * np.sign(np.sin(4 * t)) * np.cos(t), 0.5 + 0.2 * np.sin(3 * t)], axis=1)
+
+
+def task():
+    return Task(
+        model=car,
+        dt=DT,
+        target=np.zeros((STEPS + 1, car.n)),
+        reward=Reward(np.ones(car.n), np.ones(car.n), np.ones(2), np.ones(2)),
+        start=np.full(car.n, 0.1),
+        past=HELD,
+        low=np.array([-1.0, -1.0]),
+        high=np.array([1.0, 1.0]),
+    )
+
+
+def hypothesis(parts):
+    start = np.full((2, car.n), 0.1)
+    scales = scales_of(car, start, commands(), DT, STEPS * DT)
+    h = Hypothesis()
+    for name, values in parts:
+        h = h.plus(Library().effect(name, car, scales), values)
+    return h
+
+
+def predicted(parts):
+    """The diagnosis' own prediction from the start, (STEPS + 1, n)."""
+    names = (car.state_names, car.input_names)
+    empty = np.full((STEPS + 1, car.n), 0.1)
+    predictor = Predictor(prepare(car, [Trial(empty, commands(), DT, *names, start_inputs=HELD)]))
+    h = hypothesis(parts)
+    received = predictor.received(h)[0]
+    x = [np.full(car.n, 0.1)]
+    for t in range(STEPS):
+        x.append(predictor.advance(h, x[-1], received[t], np.array(t * DT)))
+    return np.array(x)
+
+
+def probed(parts):
+    """What a probe simulates."""
+    one = task()
+    return _run(one, hypothesis(parts), one.policy(commands(), None, None)).states
+
+
+def adopted(parts):
+    """What the adopted model plans with: a delay is latency, the rest is in the model."""
+    plan = planner_with(task(), [{"name": name, **values} for name, values in parts]).plan
+    still = Trial(
+        np.full((2, car.n), 0.1),
+        commands()[:1],
+        DT,
+        car.state_names,
+        car.input_names,
+        start_inputs=HELD,
+    )
+    z = [np.hstack([np.full(car.n, 0.1), memory_start(plan.model, car, still)])]
+    received = [
+        shifted(commands()[None, :, j], HELD[j : j + 1], plan.latency[j] / DT)[0] for j in range(2)
+    ]
+    for u in np.stack(received, axis=1):
+        z.append(plan.model.system.step(z[-1][None], u[None], plan.model.values, DT)[0])
+    return np.array(z)[:, : car.n]
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        (LIMIT, DELAY),
+        (DELAY, LIMIT),
+        (LAG, LIMIT),
+        (LIMIT, LAG),
+        (DELAY, ZONE, LAG),
+    ],
+    ids=lambda parts: " ".join(name.partition(":")[0] for name, _ in parts),
+)
+def test_one_order_everywhere(parts):
+    want = predicted(parts)
+    np.testing.assert_allclose(probed(parts), want, atol=1e-9)
+    np.testing.assert_allclose(adopted(parts), want, atol=1e-9)
+
+
+def test_effects_on_inputs_do_not_commute():
+    one, other = predicted((LAG, LIMIT)), predicted((LIMIT, LAG))
+    assert np.abs(one - other).max() > 1e-3
+
+
+def test_a_delay_acts_last_whenever_it_was_claimed():
+    np.testing.assert_array_equal(predicted((LIMIT, DELAY)), predicted((DELAY, LIMIT)))
+
+
+def test_what_is_wrapped_last_acts_first():
+    families = [Library().family(name.partition(":")[0]) for name, _ in (DELAY, LAG, PULL, ZONE)]
+    assert acting_order(families) == [1, 3, 0]
+    assert wrapping_order(families) == [2, 0, 3, 1]

@@ -1,0 +1,342 @@
+"""The filter against a dense Gaussian, the slopes against differences, claims against truth."""
+
+import numpy as np
+import pytest
+
+from grounded.errors import GroundedError
+from grounded.estimate import (
+    Noise,
+    Tracker,
+    consistency,
+    cut,
+    filter_trials,
+    merged,
+    noise_of,
+    of_function,
+    of_states,
+    record_of,
+    smooth_trials,
+)
+from grounded.estimate.batch import batch_of
+from grounded.estimate.filter import run, sensitivity
+from grounded.estimate.likelihood import _slope
+from grounded.estimate.recursion import recursion
+from grounded.estimate.smoother import smooth
+from grounded.estimate.steps import ModelSteps, fixed_steps
+from grounded.estimate.tracker import nearest_step
+from grounded.model import Model, Param
+from grounded.models.car import model as car
+from grounded.solve.bias import effective_inputs
+from grounded.trial import Trial
+
+DT = 0.05
+
+
+def _spring(s, a, p):
+    return {"x": s.v, "v": a.force - p.k * s.x - p.d * s.v}
+
+
+SPRING = Model(
+    name="spring",
+    states={"x": "m", "v": "m/s"},
+    inputs={"force": "N"},
+    params={"k": Param(4.0, "1/s^2", 0.1, 20.0), "d": Param(0.5, "1/s", 0.0, 5.0)},
+    derivative=_spring,
+)
+SPRING_NOISE = Noise(np.array([0.002, 0.02]), np.array([0.01, 0.05]), DT)
+
+
+def simulated(model, rng, noise, *, B=4, T=100, latency=0.0, low=-1.0, high=1.0):
+    """B noisy open-loop runs with random steps of input: true states and trials."""
+    system, p, dt = model.system, model.values, noise.dt
+    u = np.repeat(rng.uniform(low, high, (T // 10 + 1, B, model.m)), 10, axis=0)[:T]
+    x = np.zeros((T + 1, B, model.n))
+    delay = round(latency / dt)
+    for t in range(T):
+        received = u[t - delay] if t >= delay else np.zeros((B, model.m))
+        w = noise.process * rng.standard_normal((B, model.n))
+        x[t + 1] = system.step(x[t], received, p, dt) + w
+    y = x + noise.measurement * rng.standard_normal(x.shape)
+    names = (model.state_names, model.input_names)
+    return [x[:, b] for b in range(B)], [Trial(y[:, b], u[:, b], dt, *names) for b in range(B)]
+
+
+def batched(model, trials, latency=None):
+    measurement = of_states(model)
+    delay = np.zeros(model.m) if latency is None else latency
+    return batch_of([record_of(model, t) for t in trials], measurement, model.n, delay), measurement
+
+
+def dense(model, trial, noise):
+    """Mean and covariance of all states given the start sample, and of all later samples."""
+    system, p, n, T = model.system, model.values, model.n, trial.steps
+    Q, R = np.diag(noise.process**2), np.diag(noise.measurement**2)
+    A = system.linearise(trial.states[:1], trial.inputs[:1], p, DT)[0][0]
+    mean, cov = [trial.states[0]], np.zeros(((T + 1) * n, (T + 1) * n))
+    cov[:n, :n] = R
+    for t in range(T):
+        mean.append(system.step(mean[t][None], trial.inputs[t : t + 1], p, DT)[0])
+        here, there = slice(t * n, (t + 1) * n), slice((t + 1) * n, (t + 2) * n)
+        cov[there] = A @ cov[here]
+        cov[:, there] = cov[there].T
+        cov[there, there] = A @ cov[here, here] @ A.T + Q
+    return np.concatenate(mean), cov
+
+
+def test_a_linear_model_is_filtered_and_smoothed_exactly():
+    _, trials = simulated(SPRING, np.random.default_rng(0), SPRING_NOISE, B=1, T=30)
+    trial, n = trials[0], 2
+    mean, cov = dense(SPRING, trial, SPRING_NOISE)
+    H = np.eye(len(mean))[n:]
+    S = H @ cov @ H.T + np.kron(np.eye(30), np.diag(SPRING_NOISE.measurement**2))
+    e = trial.states[1:].ravel() - H @ mean
+    loglik = -0.5 * (e @ np.linalg.solve(S, e) + np.linalg.slogdet(2 * np.pi * S)[1])
+    gain = cov @ H.T @ np.linalg.inv(S)
+    after, spread = mean + gain @ e, cov - gain @ H @ cov
+
+    smoothed = smooth_trials(SPRING, trials, SPRING_NOISE)[0]
+    assert smoothed.loglik == pytest.approx(loglik, abs=1e-6)
+    assert np.allclose(smoothed.states.ravel(), after, atol=1e-9)
+    assert np.allclose(smoothed.std.ravel() ** 2, np.diag(spread), rtol=1e-5, atol=1e-12)
+    filtered = filter_trials(SPRING, trials, SPRING_NOISE)[0]
+    assert filtered.loglik == pytest.approx(loglik, abs=1e-6)
+    assert np.allclose(filtered.states[-1], smoothed.states[-1])
+
+
+def test_sensitivities_of_the_innovations_match_differences():
+    _, trials = simulated(car, np.random.default_rng(1), CAR_NOISE, B=2, T=40)
+    batch, measurement = batched(car, trials)
+    base = run(batch, measurement, CAR_NOISE, ModelSteps(car.system, car.values, batch))
+    F = np.stack(
+        [car.system.sensitivities(base.x[t], batch.u[t], car.values, DT)[2] for t in range(40)]
+    )
+    W = sensitivity(base, F)
+    for name in ("a2", "tau_delta", "L"):
+        i = car.param_names.index(name)
+        h = 1e-5
+        moved = np.zeros_like(W[..., 0])
+        for sign in (1, -1):
+            x, shift = base.x_prior[0].copy(), np.zeros_like(base.e)
+            p = car.values.copy()
+            p[i] += sign * h
+            for t in range(41):  # the same gains, another model
+                e = measurement.innovation(batch.y[t], x)
+                e = np.where(batch.seen[t], e, 0.0)
+                shift[t] = (base.C[t] @ e[..., None])[..., 0]
+                x = x + (base.K[t] @ e[..., None])[..., 0]
+                x = car.system.step(x, batch.u[t], p, DT) if t < 40 else x
+            moved += sign * shift / (2 * h)
+        assert np.allclose(W[..., i], moved, atol=2e-3 * np.abs(moved).max())
+
+
+CAR_NOISE = Noise(
+    np.array([0.003, 0.01, 0.001, 0.001, 0.002, 0.02]),
+    np.array([0.01, 0.03, 0.003, 0.003, 0.01, 0.05]),
+    DT,
+)
+
+
+def test_slopes_by_the_variances_match_differences():
+    _, trials = simulated(SPRING, np.random.default_rng(2), SPRING_NOISE, B=3, T=25)
+    short = Trial(
+        trials[2].states[:11], trials[2].inputs[:10], DT, SPRING.state_names, SPRING.input_names
+    )
+    lost = trials[1].states.copy()
+    lost[5:8, 0], lost[3] = np.nan, np.nan
+    gappy = Trial(lost, trials[1].inputs, DT, SPRING.state_names, SPRING.input_names)
+    batch, measurement = batched(SPRING, [trials[0], gappy, short])
+    base = run(batch, measurement, SPRING_NOISE, ModelSteps(SPRING.system, SPRING.values, batch))
+
+    def at(theta):
+        std = np.exp(theta / 2)
+        noise = Noise(std[:2], std[2:], DT)
+        return noise, recursion(batch, measurement, noise, fixed_steps(base))
+
+    theta = 2 * np.log(np.concatenate([SPRING_NOISE.process, SPRING_NOISE.measurement]))
+    noise, here = at(theta)
+    slope = _slope(here, batch, noise)
+    for i in range(4):
+        step = 1e-4 * np.eye(4)[i]
+        assert slope[i] == pytest.approx(
+            (at(theta + step)[1].loglik - at(theta - step)[1].loglik) / 2e-4, rel=1e-5
+        )
+
+
+@pytest.mark.parametrize("width", [1, 3, 9])
+def test_the_compiled_pass_is_the_recursion(width):
+    rng = np.random.default_rng(20)
+    _, trials = simulated(car, rng, CAR_NOISE, B=width, T=60, latency=0.1)
+    lost = trials[0].states.copy()
+    lost[20:25, 2:], lost[30, :2] = np.nan, np.nan
+    names = (car.state_names, car.input_names)
+    trials[0] = Trial(lost, trials[0].inputs, DT, *names)
+    trials[-1] = Trial(trials[-1].states[:41], trials[-1].inputs[:40], DT, *names)
+    batch, measurement = batched(car, trials, np.array([0.1, 0.07]))
+    steps = ModelSteps(car.system, car.values, batch)
+    plain = recursion(batch, measurement, CAR_NOISE, steps.at)
+    near = Noise(1.2 * CAR_NOISE.process, 0.9 * CAR_NOISE.measurement, DT)
+    fast = run(batch, measurement, CAR_NOISE, steps, recursion(batch, measurement, near, steps.at))
+    assert fast.done is not None
+    assert fast.loglik == pytest.approx(plain.loglik, abs=1e-3)
+    for name in ("x", "x_prior", "P_prior", "e", "A", "f", "P", "K", "C", "eps"):
+        a, b = getattr(fast, name), getattr(plain, name)
+        assert np.allclose(a, b, atol=1e-3 * np.abs(b).max()), name
+    one, two = smooth(fast, batch), smooth(plain, batch)
+    for name in ("x", "P", "process_slope", "measurement_slope", "start_slope"):
+        a, b = getattr(one, name), getattr(two, name)
+        assert np.allclose(a, b, atol=2e-3 * np.abs(b).max()), name
+    assert np.allclose(
+        _slope(fast, batch, CAR_NOISE), _slope(plain, batch, CAR_NOISE), rtol=1e-2, atol=0.1
+    )
+
+
+def test_padding_and_lost_samples_change_nothing_of_the_others():
+    _, trials = simulated(SPRING, np.random.default_rng(3), SPRING_NOISE, B=2, T=40)
+    short = Trial(
+        trials[1].states[:21], trials[1].inputs[:20], DT, SPRING.state_names, SPRING.input_names
+    )
+    together = filter_trials(SPRING, [trials[0], short], SPRING_NOISE)
+    for one, trial in zip(together, [trials[0], short], strict=True):
+        alone = filter_trials(SPRING, [trial], SPRING_NOISE)[0]
+        assert one.loglik == pytest.approx(alone.loglik)
+        assert np.allclose(one.states, alone.states)
+        assert np.allclose(one.covariance, alone.covariance)
+
+
+def test_the_noise_is_recovered_and_the_filter_is_consistent():
+    rng = np.random.default_rng(4)
+    truth, trials = simulated(car, rng, CAR_NOISE, B=8, T=150, latency=0.1, low=0.2, high=0.9)
+    latency = np.array([0.1, 0.1])
+    found = noise_of(car, trials, latency=latency)
+    assert found.status == "converged"
+    assert np.allclose(np.log(found.noise.process / CAR_NOISE.process), 0, atol=0.35)
+    assert np.allclose(np.log(found.noise.measurement / CAR_NOISE.measurement), 0, atol=0.15)
+    filtered = filter_trials(car, trials, found.noise, latency=latency)
+    verdict = consistency(filtered, truth)
+    assert 0.93 < verdict.nis < 1.07
+    assert abs(verdict.lag_one) < 0.05
+    assert 0.85 < verdict.nees < 1.15
+    smoothed = smooth_trials(car, trials, found.noise, latency=latency)
+    raw, after = (
+        np.sqrt(np.mean([(a - b) ** 2 for a, b in zip(states, truth, strict=True)], axis=(0, 1)))
+        for states in ([t.states for t in trials], [s.states for s in smoothed])
+    )
+    assert (after < 0.6 * raw).all()
+
+
+def test_a_filter_with_the_wrong_noise_is_called_inconsistent():
+    truth, trials = simulated(SPRING, np.random.default_rng(12), SPRING_NOISE)
+    wrong = Noise(SPRING_NOISE.process / 3, SPRING_NOISE.measurement, DT)
+    assert not consistency(filter_trials(SPRING, trials, wrong), truth).consistent
+    assert consistency(filter_trials(SPRING, trials, SPRING_NOISE), truth).consistent
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.4, 1.0, 2.0, 2.3])
+def test_received_inputs_are_the_delay_queue_of_the_kernels(delay):
+    rng = np.random.default_rng(6)
+    u, past = rng.standard_normal((20, 1)), np.array([0.3])
+    trial = Trial(np.zeros((21, 2)), u, DT, SPRING.state_names, SPRING.input_names, "", "", past)
+    depth = max(1, int(np.ceil(delay)))
+    sent = np.concatenate([np.full(depth, past[0]), u[:, 0]])
+    queue = np.stack([sent[depth - 1 - i : depth - 1 - i + 20] for i in range(depth)], axis=1)
+    expected = effective_inputs(queue, u, np.array([delay]), (depth,), 0)
+    record = record_of(SPRING, trial)
+    assert np.allclose(record.received(np.array([delay * DT]))[0], expected)
+    h = 1e-5
+    up, down = (record.received(np.array([delay * DT + s]))[0] for s in (h, -h))
+    assert np.allclose(record.received(np.array([delay * DT]))[1], (up - down) / (2 * h))
+
+
+def test_camera_at_30_hz_and_control_at_20_hz_from_two_markers():
+    rng = np.random.default_rng(7)
+    L, sigma = 0.15, 0.003
+    steps = 600  # of 1/60 s
+    noise = Noise(np.array([1e-3, 5e-3, 2e-4, 2e-4, 5e-4, 1e-3]), np.full(4, sigma), 1 / 60)
+
+    def markers(x):
+        front = x[:, 2:4] + L * np.stack([np.cos(x[:, 4]), np.sin(x[:, 4])], axis=1)
+        return np.hstack([front, x[:, 2:4]])
+
+    camera = of_function(("front_x", "front_y", "rear_x", "rear_y"), markers)
+    command_times = np.arange(0, steps / 60, 0.05)
+    commands = np.stack([np.sin(command_times), 0.5 + 0.2 * np.sin(0.7 * command_times)], axis=1)
+    latency = np.array([0.1, 0.1])
+    x = np.zeros((steps + 1, 6))
+    for t in range(steps):
+        held = int(np.floor((t / 60 - 0.1) / 0.05 + 1e-9))
+        u = commands[held] if held >= 0 else np.zeros(2)
+        x[t + 1] = car.system.step(x[t][None], u[None], car.values, 1 / 60)[0]
+        x[t + 1] += noise.process * rng.standard_normal(6)
+    times = np.arange(0, steps + 1, 2) / 60
+    y = markers(x[::2]) + sigma * rng.standard_normal((len(times), 4))
+
+    record = merged(times, y, command_times, commands)
+    stored = filter_trials(car, [record], noise, latency=latency, measurement=camera)[0]
+    tracker = Tracker(
+        car, noise, np.zeros(6), np.ones(6), measurement=camera, latency=latency, time=0.0
+    )
+    live, nis, sent = [], [], 0
+    for t, seen in zip(times, y, strict=True):
+        while sent < len(command_times) and command_times[sent] <= t + 1e-9:
+            tracker.predict(command_times[sent])
+            tracker.sent(command_times[sent], commands[sent])
+            sent += 1
+        nis.append(tracker.update(t, seen))
+        live.append(tracker.state)
+    rows = np.isfinite(stored.innovations[:, 0])
+    assert np.allclose(np.array(live), stored.states[rows], atol=1e-4)
+    error = (np.array(live) - x[::2])[60:]
+    assert np.sqrt(np.mean(error[:, 1] ** 2)) < 0.05  # speed, which no marker shows
+    assert np.sqrt(np.mean(error[:, 2] ** 2)) < sigma
+    assert 0.85 < np.mean(nis[1:]) < 1.15
+    assert np.isnan(tracker.update(1.0, y[0]))  # older than the estimate: not used
+
+
+def test_controllers_are_those_of_the_nearest_step():
+    assert [nearest_step(t, 0.05, 200) for t in (0.0, 0.024, 0.026, 3.0, 99.0)] == [
+        0,
+        0,
+        1,
+        60,
+        199,
+    ]
+
+
+def test_angles_wrap_in_innovations():
+    _, trials = simulated(car, np.random.default_rng(8), CAR_NOISE, B=1, T=100, low=0.5, high=1.0)
+    wrapped = trials[0].states.copy()
+    assert np.abs(wrapped[:, 4]).max() > 4
+    wrapped[:, 4] = (wrapped[:, 4] + np.pi) % (2 * np.pi) - np.pi
+    again = Trial(wrapped, trials[0].inputs, DT, car.state_names, car.input_names)
+    a, b = (filter_trials(car, [t], CAR_NOISE)[0].loglik for t in (trials[0], again))
+    assert a == pytest.approx(b)
+
+
+def test_a_model_that_runs_away_is_a_status():
+    explosive = SPRING.with_values({"k": -1e300})
+    _, trials = simulated(SPRING, np.random.default_rng(9), SPRING_NOISE, B=1)
+    found = filter_trials(explosive, trials, SPRING_NOISE)[0]
+    assert found.loglik == -np.inf
+    assert "finite" in found.status
+
+
+def test_pieces_of_a_record_keep_their_latency_and_cover_it():
+    _, trials = simulated(SPRING, np.random.default_rng(10), SPRING_NOISE, B=1, T=100)
+    whole = record_of(SPRING, trials[0])
+    pieces = cut(whole, 1.0)
+    assert len(pieces) == 5
+    latency = np.array([0.12])
+    joined = np.vstack([piece.received(latency)[0] for piece in pieces])
+    assert np.allclose(joined, whole.received(latency)[0])
+
+
+def test_misuse_says_what_to_do():
+    _, trials = simulated(SPRING, np.random.default_rng(11), SPRING_NOISE, B=1)
+    with pytest.raises(GroundedError, match="2 states and 2 channels"):
+        filter_trials(SPRING, trials, Noise(np.ones(3), np.ones(2), DT))
+    with pytest.raises(GroundedError, match="ingest at least one"):
+        filter_trials(SPRING, [], SPRING_NOISE)
+    with pytest.raises(GroundedError, match="no input 'steering'"):
+        filter_trials(car, trials, CAR_NOISE)
+    with pytest.raises(GroundedError, match="finite standard"):
+        Noise(np.array([np.nan]), np.ones(1), DT)

@@ -1,0 +1,153 @@
+"""Studies as jobs: any number of workers, kept results, lost workers, a Dask cluster."""
+
+import os
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+import experiment_jobs
+from grounded.errors import GroundedError
+from grounded.experiments.jobs import Engine, Job, run_jobs
+from shared_data import SUPPORT
+
+joblib = pytest.importorskip("joblib", reason="joblib is not installed")
+
+
+def draws(count, sleep=0.0):
+    return [Job(experiment_jobs.draw, {"seed": seed, "sleep": sleep}) for seed in range(count)]
+
+
+def test_any_number_of_workers_gives_the_same_bits():
+    alone = run_jobs(draws(6))
+    assert run_jobs(draws(6), Engine(jobs=2)) == alone
+    assert [result["seed"] for result in alone] == list(range(6))
+
+
+def test_finished_jobs_are_kept_and_not_run_again():
+    kept = {}
+    first = run_jobs(draws(3), finished=kept)
+    assert len(kept) == 3
+    kept[draws(1)[0].key] = {"seed": 0, "value": "kept"}
+    seen = []
+    again = run_jobs(
+        draws(5), finished=kept, progress=lambda done, total: seen.append((done, total))
+    )
+    assert again[0] == {"seed": 0, "value": "kept"}
+    assert again[1:3] == first[1:]
+    assert seen == [(3, 5), (4, 5), (5, 5)]
+
+
+def test_results_of_other_code_are_not_reused(monkeypatch):
+    kept = {}
+    run_jobs(draws(1), finished=kept)
+    monkeypatch.setattr("grounded.experiments.jobs.code", lambda: "another")
+    run_jobs(draws(1), finished=kept)
+    assert len(kept) == 2
+
+
+def test_a_worker_with_another_version_is_refused(monkeypatch):
+    monkeypatch.setattr("grounded.experiments.jobs.code", lambda: "another")
+    with pytest.raises(GroundedError, match="another version of grounded"):
+        run_jobs(draws(2), Engine(jobs=2))
+
+
+def test_the_same_job_twice_is_run_once():
+    seen = []
+    found = run_jobs(draws(1) * 3, progress=lambda done, total: seen.append(done))
+    assert len(found) == 3 and seen == [0, 1]
+
+
+def test_a_lost_worker_costs_its_job_only(tmp_path):
+    marker = str(tmp_path / "died")
+    jobs = [Job(experiment_jobs.dies_once, {"seed": s, "marker": marker}) for s in range(6)]
+    assert run_jobs(jobs, Engine(jobs=2)) == [{"seed": s} for s in range(6)]
+    assert Path(marker).exists()
+
+
+def test_workers_that_keep_dying_end_the_study_with_what_is_done():
+    kept = {}
+    jobs = [*draws(2), Job(experiment_jobs.dies_always, {"seed": 9})]
+    with pytest.raises(GroundedError, match="lost their worker"):
+        run_jobs(jobs, Engine(jobs=2), finished=kept)
+    assert set(kept) <= {job.key for job in jobs[:2]}
+
+
+def test_a_mistake_in_a_job_is_not_taken_for_a_lost_worker():
+    for engine in (None, Engine(jobs=2)):
+        with pytest.raises(ValueError, match="a mistake"):
+            run_jobs([Job(experiment_jobs.fails, {"seed": 0})] * 2, engine)
+
+
+def test_engines_that_make_no_sense_are_refused():
+    for wrong in ({"jobs": 0}, {"name": "slurm"}, {"name": "dask"}, {"address": "tcp://x:1"}):
+        with pytest.raises(GroundedError):
+            Engine(**wrong)
+
+
+@pytest.fixture
+def cluster(tmp_path):
+    """A scheduler and two worker processes of their own: (address, workers)."""
+    pytest.importorskip(
+        "distributed", reason='dask is not installed: pip install "grounded[cluster]"'
+    )
+    path = [str(SUPPORT), os.environ.get("PYTHONPATH", "")]
+    env = os.environ | {"PYTHONPATH": os.pathsep.join(path), "OPENBLAS_NUM_THREADS": "1"}
+
+    def start(module, *arguments):
+        command = [sys.executable, "-m", f"distributed.cli.{module}", *arguments]
+        log = (tmp_path / f"{module}{len(started)}.log").open("w")
+        started.append(subprocess.Popen(command, cwd=tmp_path, env=env, stdout=log, stderr=log))
+
+    started = []
+    try:
+        start("dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard")
+        log = tmp_path / "dask_scheduler0.log"
+        address = _wait_for(lambda: _address(log.read_text()))
+        for _ in range(2):
+            start("dask_worker", address, "--nthreads", "1", "--no-nanny", "--no-dashboard")
+        yield address, started[1:]
+    finally:
+        for process in reversed(started):
+            process.terminate()
+            process.wait(20)
+
+
+def _wait_for(condition, seconds=60):
+    until = time.monotonic() + seconds
+    while time.monotonic() < until:
+        if found := condition():
+            return found
+        time.sleep(0.1)
+    raise TimeoutError
+
+
+def _address(text):
+    found = re.search(r"Scheduler at:\s*(tcp://[\d.:]+)", text)
+    return found.group(1) if found else None
+
+
+@pytest.mark.filterwarnings("ignore")  # of Dask and tornado, about themselves
+def test_a_cluster_that_loses_a_worker_half_way_gives_the_same_bits(cluster):
+    address, workers = cluster
+    jobs = draws(12, sleep=0.3)
+
+    def kill_one_half_way(done, total):
+        if done == 5:
+            workers[0].kill()
+
+    engine = Engine(name="dask", address=address)
+    found = run_jobs(jobs, engine, progress=kill_one_half_way)
+    assert workers[0].wait(20) != 0
+    assert found == run_jobs(jobs)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_no_cluster_is_said_so(monkeypatch):
+    pytest.importorskip("distributed", reason="dask is not installed")
+    monkeypatch.setattr("grounded.experiments.jobs.CONNECT_S", 1.0)
+    with pytest.raises(GroundedError, match="no Dask scheduler answers"):
+        run_jobs(draws(1), Engine(name="dask", address="tcp://127.0.0.1:9"))

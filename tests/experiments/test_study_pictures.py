@@ -1,0 +1,136 @@
+"""Pictures of the studies, from results made by hand: a file each that shows what it must."""
+
+import io
+
+import numpy as np
+import pytest
+
+from grounded.errors import GroundedError
+from grounded.experiments.baselines import BaselinesResult, Line
+from grounded.experiments.car import CarResult, CarRun
+from grounded.experiments.estimated import EstimatedResult, EstimatedRun
+from grounded.experiments.fit_car import FitCarResult
+from grounded.experiments.flight import FlightResult, FlightRun
+from grounded.experiments.footnote9 import Footnote9Result, Footnote9Row
+from grounded.experiments.nondeterminism import NondeterminismResult, Spread
+from grounded.experiments.repeats import NoiseResult, Outcome
+from grounded.experiments.theorem1 import Theorem1Result, Theorem1Row
+from grounded_cli.experiment import STUDIES
+from grounded_trials.report.figures.draw import Box, Spot, Stroke, draw
+from grounded_trials.report.figures.figure import Bars
+from grounded_trials.report.studies.trends import PICTURES, draw_study
+
+ANGLE = np.linspace(0, 2 * np.pi, 61)
+LOOP = np.column_stack([40 * np.sin(ANGLE), 40 * np.cos(ANGLE), 0 * ANGLE])
+
+
+def flown(seed, off):
+    paths = {"model": (LOOP + off).tolist(), "learned": LOOP.tolist()}
+    return FlightRun(seed, False, (-9e3, -2e3, -1900.0), 3, (1.0, 1.0, 1.0), paths)
+
+
+def driven(name, noisy, iterations):
+    paths = {"target": LOOP[:, :2].tolist()}
+    for i in range(iterations + 1):
+        paths[f"iteration {i}"] = (LOOP[:, :2] * (1 + 0.1 / (1 + i))).tolist()
+    return CarRun(name, 0, noisy, (-9.0, -1.0), (-9.0, -1.0), -0.9, 4, (1.0,), paths)
+
+
+def filmed(name, way):
+    errors = (0.003, 0.05, 0.1) if way == "camera" else None
+    return EstimatedRun(name, 0, way, (-9.0, -1.0), (-9.0, -1.0, -0.9), 4, 1.0, errors, errors)
+
+
+def fitted():
+    value = {"true": 1.0, "first": 1.1, "value": 1.01, "std": 0.01, "low": 0.99, "high": 1.03}
+    return {"params": {"a1": value | {"unit": "rad", "inside": True}}}
+
+
+def results():
+    cars = [driven("turn", True, 5), driven("circle", False, 2), driven("figure8", True, 0)]
+    lines = [
+        Line("grounded", "turn", "noise", 0, (2, 2, 3, 4), 0.99, 4),
+        Line("refit", "turn", "noise", 0, (2, 3, None, None), 0.9, 4),
+        Line("differences", "turn", "noise", 0, (125, 300, 600, 850), 0.99, 850),
+    ]
+    outcomes = [
+        Outcome(rule, "turn", level, 0, 3, 1, 0.9 - 0.1 * level, 0.8, 0.1, 9)
+        for rule in ("single", "three")
+        for level in (1.0, 2.0)
+    ]
+    theorem = [
+        Theorem1Row(e, s, e * (1 + s), (e * (1 + s)) ** 2, 2.0, 9)
+        for e in (0.01, 0.1)
+        for s in (0, 1)
+    ]
+    spreads = tuple(Spread("circle", level, 0.1 * level, 0.2 * level) for level in (0.0, 1.0, 3.0))
+    ways = [filmed("circle", way) for way in ("camera", "true")]
+    return {
+        "flight": FlightResult((flown(0, 1.0), flown(1, 2.0)), -1826.0, LOOP.tolist()),
+        "car": CarResult(tuple(cars)),
+        "fit-car": FitCarResult((fitted(), fitted()), 30.0),
+        "estimated": EstimatedResult(tuple(ways)),
+        "nondeterminism": NondeterminismResult(spreads, 5),
+        "footnote9": Footnote9Result((Footnote9Row(5.0, 1e-11, 1.0, 2, 1e-11, 21),)),
+        "theorem1": Theorem1Result(tuple(theorem)),
+        "baselines": BaselinesResult(tuple(lines)),
+        "noise": NoiseResult(tuple(outcomes)),
+    }
+
+
+def test_every_study_has_its_picture():
+    assert set(PICTURES) == set(STUDIES) == set(results())
+
+
+@pytest.mark.parametrize("name", list(STUDIES))
+def test_the_picture_holds_its_figure(name, tmp_path):
+    from PIL import Image
+
+    path = tmp_path / "made" / f"{name}.png"
+    draw_study(name, results()[name], path)
+    with Image.open(io.BytesIO(path.read_bytes())) as image:
+        assert image.format == "PNG" and image.width >= 900
+        levels = np.asarray(image.convert("L"))
+    assert 0.005 < np.mean(levels < 250) < 0.5
+    for panel in PICTURES[name](results()[name]).panels:
+        kinds = [
+            type(shape) for shape in draw(panel).shapes if getattr(shape, "role", "") != "grid"
+        ]
+        if isinstance(panel, Bars):
+            assert kinds.count(Box) == len(panel.bars) > 0
+        else:
+            assert kinds.count(Stroke) >= len(panel.curves) > 0
+            assert kinds.count(Spot) == len(panel.dots)
+
+
+def test_flight_enlarges_what_is_too_small_to_see():
+    figure = PICTURES["flight"](results()["flight"])
+    whole, large, *_ = figure.panels
+    model, learned, desired = large.curves
+    assert "5 times" in large.title  # 2 m beside a loop of 80 m
+    assert np.allclose(model.x - desired.x, 5 * (whole.curves[0].x - whole.curves[2].x))
+    assert np.allclose(learned.x, desired.x)
+
+
+def test_the_turn_shows_its_iterations_and_the_circle_its_ends():
+    turn, circle, figure8, _ = PICTURES["car"](results()["car"]).panels
+    roles = [curve.role for curve in turn.curves]
+    assert roles == ["model", "step1", "step2", "step3", "other", "best", "desired"]
+    assert [curve.role for curve in circle.curves] == ["model", "best", "desired"]
+    assert [curve.role for curve in figure8.curves] == ["model", "desired"]  # nothing learned
+
+
+def test_methods_that_need_too_many_trials_are_cut_and_say_so():
+    (panel,) = PICTURES["baselines"](results()["baselines"]).panels
+    grounded, refit, differences = panel.bars
+    assert (grounded.value, grounded.text, grounded.role) == (3, "3", "best")
+    assert refit.text == "never: ends at 90.0%" and refit.role == "model"
+    assert differences.value == 40 and differences.text == "600"
+
+
+def test_a_study_without_a_picture_and_a_place_without_room_are_told(tmp_path):
+    with pytest.raises(GroundedError, match="no picture of 'taxi'"):
+        draw_study("taxi", None, tmp_path / "a.png")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(GroundedError, match="can't be made"):
+        draw_study("car", results()["car"], tmp_path / "file" / "a.png")

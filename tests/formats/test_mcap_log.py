@@ -1,0 +1,299 @@
+"""Trials and candidates as files: they come back to the last bit, or not at all."""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+
+from grounded.errors import GroundedError
+from grounded.policy import Policy
+from grounded.trial import Trial
+from grounded_trials.formats.mcap_writer import file_descriptor_set
+from grounded_trials.store.candidate_file import candidate_bytes, read_candidate, write_candidate
+from grounded_trials.store.trial_file import TrialWriter, read_trial, trial_bytes, write_trial
+
+
+def a_trial(steps: int = 40, seed: int = 0) -> Trial:
+    rng = np.random.default_rng(seed)
+    return Trial(
+        states=rng.normal(size=(steps + 1, 3)),
+        inputs=rng.normal(size=(steps, 2)),
+        dt=0.05,
+        state_names=("v", "x", "psi"),
+        input_names=("steering", "throttle"),
+        candidate="c0003",
+        start_inputs=np.array([0.1, -0.0]),
+    )
+
+
+def a_policy(H: int = 20, feedback: bool = True) -> Policy:
+    rng = np.random.default_rng(1)
+    return Policy(
+        feedforward=rng.normal(size=(H, 2)),
+        low=np.array([-1.0, -np.inf]),
+        high=np.array([0.1, np.inf]),
+        dt=1 / 30,
+        state_names=("v", "x", "psi"),
+        input_names=("steering", "throttle"),
+        depths=(2, 1),
+        angles=(False, False, True),
+        past=np.array([0.0, 1 / 3]),
+        gain=rng.normal(size=(H, 2, 6)) if feedback else None,
+        reference=rng.normal(size=(H, 6)) if feedback else None,
+    )
+
+
+def test_a_trial_comes_back_exactly() -> None:
+    trial = a_trial()
+    odd = trial.states.copy()
+    odd[3] = [np.nan, np.inf, -0.0]
+    odd[4] = [5e-324, 1.7e308, 0.1 + 0.2]
+    trial = replace(trial, states=odd)
+    meta = {"iteration": "3", "alpha": repr(0.1), "note": 'a "quoted" ü\nline'}
+    source = trial_bytes(trial, meta, b"policy", state_units={"v": "m/s"})
+    back, found, policy = read_trial(source)
+    assert back.states.tobytes() == trial.states.tobytes()
+    assert back.inputs.tobytes() == trial.inputs.tobytes()
+    assert back.start_inputs is not None and trial.start_inputs is not None
+    assert back.start_inputs.tobytes() == trial.start_inputs.tobytes()
+    assert (back.dt, back.state_names, back.input_names) == (0.05, *names(trial))
+    assert back.candidate == "c0003" and len(back.id) == 64
+    assert {k: found[k] for k in meta} == meta and policy == b"policy"
+    assert json.loads(found["states"]) == {"v": "m/s", "x": "1", "psi": "1"}
+
+
+def names(trial: Trial) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    return trial.state_names, trial.input_names
+
+
+def test_equal_trials_are_equal_files() -> None:
+    assert trial_bytes(a_trial(), {"a": "b"}, b"p") == trial_bytes(a_trial(), {"a": "b"}, b"p")
+    assert trial_bytes(a_trial(), {}) != trial_bytes(a_trial(seed=1), {})
+
+
+@pytest.mark.parametrize("feedback", [True, False])
+def test_a_candidate_comes_back_exactly(feedback: bool, tmp_path: Path) -> None:
+    policy, rng = a_policy(feedback=feedback), np.random.default_rng(2)
+    x, u = rng.normal(size=(21, 3)), rng.normal(size=(20, 2))
+    path = tmp_path / "c0001.mcap"
+    write_candidate(path, policy, x, u, {"alpha": "0.5"})
+    assert path.read_bytes() == candidate_bytes(policy, x, u, {"alpha": "0.5"})
+    back, px, pu, meta = read_candidate(path)
+    for part in ("feedforward", "low", "high", "past", "gain", "reference"):
+        mine, theirs = getattr(policy, part), getattr(back, part)
+        assert (mine is None and theirs is None) or mine.tobytes() == theirs.tobytes()
+    for part in ("dt", "state_names", "input_names", "depths", "angles"):
+        assert getattr(policy, part) == getattr(back, part)
+    assert np.array_equal(px, x) and np.array_equal(pu, u) and meta["alpha"] == "0.5"
+
+
+def test_other_tools_read_named_fields() -> None:
+    trial = a_trial()
+    reader = make_reader(
+        io.BytesIO(trial_bytes(trial, {})), decoder_factories=[DecoderFactory()], validate_crcs=True
+    )
+    seen = [m.decoded_message for m in reader.iter_decoded_messages(topics=["/state"])]
+    assert [s.x for s in seen] == trial.states[:, 1].tolist()
+    candidate = candidate_bytes(a_policy(), np.zeros((21, 3)), np.zeros((20, 2)), {})
+    reader = make_reader(io.BytesIO(candidate), decoder_factories=[DecoderFactory()])
+    seen = [m.decoded_message for m in reader.iter_decoded_messages(topics=["/policy"])]
+    gain = a_policy().gain
+    assert gain is not None and list(seen[5].gain) == gain[5].ravel().tolist()
+    summary = reader.get_summary()
+    assert summary is not None and summary.statistics is not None
+    assert (summary.statistics.metadata_count, summary.statistics.attachment_count) == (1, 1)
+
+
+@pytest.mark.parametrize("repeated", [False, True])
+def test_a_schema_is_what_the_protobuf_package_writes(repeated: bool) -> None:
+    from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Field
+    from google.protobuf.descriptor_pb2 import FileDescriptorSet
+
+    names = [f"größe_{i}" * (1 + i % 40) for i in range(300)]
+    files = FileDescriptorSet()
+    file = files.file.add(name="grounded/State.proto", package="grounded", syntax="proto3")
+    message = file.message_type.add(name="State")
+    label = Field.LABEL_REPEATED if repeated else Field.LABEL_OPTIONAL
+    for number, name in enumerate(names, start=1):
+        message.field.add(name=name, number=number, label=label, type=Field.TYPE_DOUBLE)
+    mine = file_descriptor_set("State", names, repeated=repeated)
+    assert mine == files.SerializeToString(deterministic=True)
+
+
+def test_a_live_trial_that_is_cut_off_keeps_all_but_its_last_second(tmp_path: Path) -> None:
+    path = tmp_path / "live.mcap"
+    writer = TrialWriter(path, 0.02, {"x": "m"}, {"u": "1"}, {})
+    for k in range(250):
+        writer.append(k * 0.02, np.array([k]), np.array([-k]))
+    on_disk = path.stat().st_size  # without close: the battery is gone
+    assert on_disk > 0.75 * 250 * 2 * 40
+    with pytest.raises(GroundedError, match="grounded recover"):
+        read_trial(path)
+    writer.close()
+    writer.close()
+    trial, _, _ = read_trial(path)
+    assert trial.steps == 249  # the last input led to no state
+
+
+def test_a_live_trial_with_jitter_is_on_the_grid_and_one_with_a_gap_is_not() -> None:
+    rng = np.random.default_rng(3)
+    for gap, fine in ((0, True), (1, False)):
+        stream = io.BytesIO()
+        with TrialWriter(stream, 0.02, {"x": "m"}, {"u": "1"}, {}, start_ns=10**18) as writer:
+            for k in range(50):
+                late = gap * 0.02 * (k > 20) + rng.uniform(-0.004, 0.004)
+                writer.append(k * 0.02 + late, np.array([k]), np.array([0.0]) if k < 49 else None)
+        if fine:
+            assert read_trial(stream.getvalue())[0].steps == 49
+        else:
+            with pytest.raises(GroundedError, match=r"sample 2[01] is stamped"):
+                read_trial(stream.getvalue())
+
+
+def test_a_live_trial_on_a_full_disk_says_so() -> None:
+    class Full(io.BytesIO):
+        def write(self, data: object) -> int:
+            if self.tell() > 3000:
+                raise OSError(28, "No space left on device")
+            return super().write(data)  # type: ignore[arg-type]
+
+    writer = TrialWriter(Full(), 0.1, {"x": "m"}, {"u": "1"}, {})
+    with pytest.raises(GroundedError, match="No space left on device"):
+        for k in range(1000):
+            writer.append(k * 0.1, np.zeros(1), np.zeros(1))
+    with pytest.raises(GroundedError, match="expected 1 numbers"):
+        writer.append(0.0, np.zeros(2), None)
+
+
+def test_a_writer_never_overwrites(tmp_path: Path) -> None:
+    path = tmp_path / "trial.mcap"
+    path.write_bytes(b"precious")
+    with pytest.raises(GroundedError, match="exists already"):
+        TrialWriter(path, 0.1, {"x": "m"}, {"u": "1"}, {})
+    assert path.read_bytes() == b"precious"
+
+
+def test_refusals() -> None:
+    with pytest.raises(GroundedError, match="'dt' is written by grounded itself"):
+        trial_bytes(a_trial(), {"dt": "1"})
+    policy, x, u = a_policy(), np.zeros((21, 3)), np.zeros((20, 2))
+    gain = np.array(policy.gain)
+    gain[7, 0, 0] = np.nan
+    with pytest.raises(GroundedError, match="gain is not a finite number at step 7"):
+        candidate_bytes(replace(policy, gain=gain), x, u, {})
+    with pytest.raises(GroundedError, match="expected an array of shape"):
+        candidate_bytes(policy, x[1:], u, {})
+    with pytest.raises(GroundedError, match="not a 'grounded trial 1' file"):
+        read_trial(candidate_bytes(policy, x, u, {}))
+    with pytest.raises(GroundedError, match="not a 'grounded candidate 1' file"):
+        read_candidate(trial_bytes(a_trial(), {}))
+    with pytest.raises(GroundedError, match="does not exist"):
+        read_trial("/nowhere/t.mcap")
+    with pytest.raises(GroundedError, match="can't be written"):
+        write_trial("/nowhere/t.mcap", a_trial(), {})
+
+
+def test_reading_needs_no_mcap_and_no_protobuf() -> None:
+    import subprocess
+    import sys
+
+    code = (
+        "import sys; from grounded_trials.store.trial_file import read_trial; "
+        "read_trial(sys.stdin.buffer.read()); "
+        "bad = [m for m in sys.modules if m.split('.')[0] in ('mcap', 'google', 'zstandard')]; "
+        "sys.exit(bool(bad) and str(bad))"
+    )
+    source = trial_bytes(a_trial(), {})
+    subprocess.run([sys.executable, "-c", code], input=source, check=True)
+
+
+def with_metadata(source: bytes, key: str, value: str | None) -> bytes:
+    """The same file, sound in itself, with one entry changed: a stranger's, or a mistake."""
+    from grounded_trials.formats.mcap_records import (
+        Attachment,
+        Channel,
+        Header,
+        Messages,
+        Metadata,
+        Schema,
+    )
+    from grounded_trials.formats.mcap_walk import read_records
+    from grounded_trials.formats.mcap_writer import CopyWriter
+
+    stream = io.BytesIO()
+    copy = CopyWriter(stream, Header("", "grounded"), compressed=False)
+    schemas: dict[int, Schema] = {}
+    numbers: dict[int, int] = {}
+    for r in read_records(io.BytesIO(source), "file"):
+        if isinstance(r, Metadata):
+            table = {k: v for k, v in r.data.items() if k != key}
+            copy.metadata(Metadata(r.name, table if value is None else {**table, key: value}))
+        elif isinstance(r, Attachment):
+            copy.attachment(r)
+        elif isinstance(r, Schema):
+            schemas[r.id] = r
+        elif isinstance(r, Channel):
+            numbers[r.id] = copy.channel(r, schemas[r.schema_id])
+        elif isinstance(r, Messages):
+            for identity in np.unique(r.channels).tolist():
+                copy.messages(r.take(r.channels == identity), numbers[identity])
+    copy.finish()
+    return stream.getvalue()
+
+
+NASTY = ["", "x", "-1", "0", "1e999", "nan", "inf", "null", "[]", "{}", "[[[1]]]", "[1e999, 2]"]
+NASTY += ['{"a": 1}', "[" * 10_000, '["a", "b"]', "[NaN, NaN]", "9" * 30, "\u0663", "-0.0", "0.05"]
+NASTY += ['{"v": "m/s", "x": "m", "psi": 3}', '{"depths": [1e300, -1], "low": 3}']
+
+
+@pytest.mark.parametrize("value", [None, *NASTY])
+def test_a_strangers_metadata_is_read_or_refused_with_a_message(value: str | None) -> None:
+    trial = trial_bytes(a_trial(4), {})
+    candidate = candidate_bytes(a_policy(), np.zeros((21, 3)), np.zeros((20, 2)), {})
+    for key in ("dt", "states", "inputs", "candidate", "start_inputs", "start_ns"):
+        try:
+            found, _, _ = read_trial(with_metadata(trial, key, value))
+        except GroundedError as error:
+            assert len(str(error)) < 500
+        else:
+            assert found.steps == 4 and found.dt > 0
+    table = json.loads(read_candidate(candidate)[3]["policy"])
+    for key in ("dt", "states", "inputs", "steps", "policy", *table):
+        changed = value
+        if key in table:
+            try:
+                inner = {**table, key: json.loads(value or "null")}
+            except (ValueError, RecursionError):
+                continue
+            key, changed = "policy", json.dumps(inner)
+        try:
+            policy, _, _, _ = read_candidate(with_metadata(candidate, key, changed))
+        except GroundedError as error:
+            assert len(str(error)) < 500
+        else:
+            assert policy.horizon == 20 and np.isfinite(policy.feedforward).all()
+
+
+def test_a_file_without_its_checksum_is_refused() -> None:
+    from mcap.writer import Writer
+
+    stream = io.BytesIO()
+    writer = Writer(stream)
+    writer.start()
+    writer.add_metadata("grounded", {"format": "grounded trial 1"})
+    writer.finish()
+    with pytest.raises(GroundedError, match="checksum is missing"):
+        read_trial(stream.getvalue())
+
+
+def test_a_candidate_that_lost_its_end_is_refused() -> None:
+    candidate = candidate_bytes(a_policy(), np.zeros((21, 3)), np.zeros((20, 2)), {})
+    with pytest.raises(GroundedError, match="a policy of 21 steps needs 21 messages"):
+        read_candidate(with_metadata(candidate, "steps", "21"))

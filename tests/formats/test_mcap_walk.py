@@ -1,0 +1,226 @@
+"""The walk over MCAP's records, against the format's own conformance files and other writers."""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+import tarfile
+import zlib
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.stream_reader import StreamReader
+from mcap.writer import CompressionType, Writer
+
+from grounded.errors import GroundedError
+from grounded_trials.formats.mcap_records import (
+    Attachment,
+    BadChunk,
+    Channel,
+    End,
+    Header,
+    Messages,
+    Metadata,
+    Schema,
+    decompress,
+)
+from grounded_trials.formats.mcap_walk import MAGIC, DamagedFile, read_records
+from shared_data import data, files, needs_data
+
+
+def plain(source: bytes) -> list[Any]:
+    """What the walk finds, in the words of the conformance suite's expected records."""
+    found: list[Any] = []
+    for r in read_records(io.BytesIO(source), "file"):
+        if isinstance(r, Header):
+            found.append(("Header", r.library, r.profile))
+        elif isinstance(r, Schema):
+            found.append(("Schema", r.id, r.name, r.encoding, r.data))
+        elif isinstance(r, Channel):
+            found.append(("Channel", r.id, r.topic, r.encoding, r.schema_id, r.metadata))
+        elif isinstance(r, Attachment):
+            found.append(("Attachment", r.name, r.media_type, r.data, r.log_time, r.create_time))
+        elif isinstance(r, Metadata):
+            found.append(("Metadata", r.name, r.data))
+        elif isinstance(r, Messages):
+            for i in range(len(r)):
+                body = r.buffer[r.starts[i] : r.ends[i]]
+                times = (int(r.log_times[i]), int(r.publish_times[i]))
+                found.append(("Message", int(r.channels[i]), int(r.sequences[i]), *times, body))
+    return found
+
+
+def expected(records: list[dict[str, Any]]) -> list[Any]:
+    """The expected records of a conformance file, without indexes and summary."""
+    found: list[Any] = []
+    for record in records:
+        f = dict(record["fields"])
+        octets = bytes(int(b) for b in f.get("data", [])) if record["type"] != "Chunk" else b""
+        kind = record["type"]
+        if kind == "DataEnd":
+            break
+        if kind == "Header":
+            found.append((kind, f["library"], f["profile"]))
+        elif kind == "Schema":
+            found.append((kind, int(f["id"]), f["name"], f["encoding"], octets))
+        elif kind == "Channel":
+            head = (kind, int(f["id"]), f["topic"], f["message_encoding"])
+            found.append((*head, int(f["schema_id"]), f["metadata"]))
+        elif kind == "Attachment":
+            times = (int(f["log_time"]), int(f["create_time"]))
+            found.append((kind, f["name"], f["media_type"], octets, *times))
+        elif kind == "Metadata":
+            found.append((kind, f["name"], f["metadata"]))
+        elif kind == "Message":
+            times = (int(f["log_time"]), int(f["publish_time"]))
+            found.append((kind, int(f["channel_id"]), int(f["sequence"]), *times, octets))
+    return found
+
+
+@needs_data
+def test_all_conformance_files_are_read_as_expected() -> None:
+    wanted = {}
+    with tarfile.open(data("mcap_conformance", "expected_records_json.tar.gz")) as archive:
+        for member in archive.getmembers():
+            stream = archive.extractfile(member)
+            if stream is not None and member.name.endswith(".json"):
+                wanted[member.name.split("/")[-1][:-5]] = json.load(stream)["records"]
+    paths = files("mcap_conformance/*/*.mcap")
+    assert len(paths) == len(wanted) == 416
+    for path in paths:
+        assert plain(path.read_bytes()) == expected(wanted[path.stem]), path.name
+
+
+@needs_data
+def test_agrees_with_the_mcap_package_on_every_undamaged_file() -> None:
+    paths = files("*/*.mcap") + files("mcap_format_fixtures/*/*.mcap")
+    paths = [p for p in paths if "derived_corrupt" not in str(p)]
+    assert len(paths) > 25
+    for path in paths:
+        mine = [r for r in plain(path.read_bytes()) if r[0] == "Message"]
+        theirs = []
+        for r in StreamReader(io.BytesIO(path.read_bytes())).records:
+            if type(r).__name__ == "Message":
+                times = (r.log_time, r.publish_time)
+                theirs.append(("Message", r.channel_id, r.sequence, *times, r.data))
+        assert mine == theirs, path.name
+
+
+@needs_data
+@pytest.mark.parametrize(
+    ("name", "what"),
+    [
+        ("zero_bytes.mcap", "empty"),
+        ("magic_only.mcap", "end is missing"),
+        ("cf_thrust_step1_cut_midchunk.mcap", "ends inside a record of type 6"),
+        ("dart_fast_truncated60pct.mcap", "ends inside"),
+        ("dart_fast_no_footer.mcap", "ends inside|end is missing"),
+        ("dart_fast_bitrot_chunk3.mcap", "chunk is damaged: its checksum"),
+    ],
+)
+def test_damaged_files_are_refused(name: str, what: str) -> None:
+    path = data("mcap_format_fixtures", "derived_corrupt", name)
+    with pytest.raises(DamagedFile, match=what) as caught:
+        plain(path.read_bytes())
+    assert caught.value.offset <= path.stat().st_size
+
+
+def written(**options: Any) -> bytes:
+    stream = io.BytesIO()
+    writer = Writer(stream, **options)
+    writer.start()
+    schema = writer.register_schema("a", "jsonschema", b"{}")
+    channel = writer.register_channel("/a", "json", schema)
+    for i in range(100):
+        writer.add_message(channel, i, b'{"x": %d}' % i, i)
+    writer.finish()
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize("chunked", [True, False])
+@pytest.mark.parametrize("compression", list(CompressionType))
+@pytest.mark.parametrize("crcs", [True, False])
+def test_every_way_to_write(chunked: bool, compression: CompressionType, crcs: bool) -> None:
+    source = written(
+        use_chunking=chunked,
+        compression=compression,
+        enable_crcs=crcs,
+        enable_data_crcs=crcs,
+        chunk_size=200,
+    )
+    messages = [r for r in plain(source) if r[0] == "Message"]
+    assert [m[3] for m in messages] == list(range(100))
+    *_, end = read_records(io.BytesIO(source), "file")
+    assert isinstance(end, End) and end.data_crc is crcs
+
+
+def record(opcode: int, content: bytes, length: int | None = None) -> bytes:
+    return struct.pack("<BQ", opcode, len(content) if length is None else length) + content
+
+
+def text(value: str) -> bytes:
+    return struct.pack("<I", len(value)) + value.encode()
+
+
+def chunk(content: bytes, compression: str, data: bytes, size: int | None = None) -> bytes:
+    size = len(content) if size is None else size
+    head = struct.pack("<QQQI", 0, 0, size, zlib.crc32(content)) + text(compression)
+    return record(6, head + struct.pack("<Q", len(data)) + data)
+
+
+def test_a_record_that_claims_too_much_takes_no_memory() -> None:
+    header = record(1, text("") + text(""))
+    for hostile in (
+        record(9, b"x", length=2**62),
+        record(3, b"x", length=2**33),
+        chunk(b"", "zstd", b"x" * 100, size=2**40),
+        chunk(b"", "lz4", b"x" * 100, size=2**40),
+    ):
+        with pytest.raises(DamagedFile, match=r"limit|damaged"):
+            plain(MAGIC + header + hostile)
+
+
+def test_bombs_end_at_their_stated_size() -> None:
+    import lz4.frame
+    import zstandard
+
+    bomb = bytes(50 * 2**20)
+    for name, packed in (("zstd", zstandard.compress(bomb)), ("lz4", lz4.frame.compress(bomb))):
+        with pytest.raises(BadChunk, match="holds 101 bytes, not the 100"):
+            decompress(name, packed, 100, 2**20)
+        assert decompress(name, packed, len(bomb), 2**30) == bomb
+    with pytest.raises(BadChunk, match="not one of"):
+        decompress("brotli", b"", 0, 10)
+
+
+def test_a_message_shorter_than_its_header() -> None:
+    header = record(1, text("") + text(""))
+    with pytest.raises(DamagedFile, match="a message claims 3 bytes"):
+        plain(MAGIC + header + record(5, b"abc"))
+    inner = record(5, b"abc")
+    with pytest.raises(DamagedFile, match="a message claims 3 bytes"):
+        plain(MAGIC + header + chunk(inner, "", inner))
+
+
+def test_what_is_no_mcap_file_says_so() -> None:
+    for source in (b"\x89PNG\r\n\x1a\n" + bytes(100), b"#ROSBAG V2.0\n" + bytes(100)):
+        with pytest.raises(GroundedError, match="not an MCAP file"):
+            plain(source)
+    with pytest.raises(GroundedError, match="first 8 bytes"):
+        plain(MAGIC[:5])
+    with pytest.raises(GroundedError, match="3 bytes follow after the end"):
+        plain(written() + b"abc")
+
+
+def test_a_damaged_chunk_can_be_stepped_over() -> None:
+    source = bytearray(written(chunk_size=200, compression=CompressionType.NONE))
+    at = source.index(b'{"x": 50}')
+    source[at] ^= 1
+    lost: list[DamagedFile] = []
+    walk = read_records(io.BytesIO(bytes(source)), "file", on_damage=lost.append)
+    kept = [r for r in walk if isinstance(r, Messages)]
+    times = np.concatenate([m.log_times for m in kept])
+    assert len(lost) == 1 and "checksum" in lost[0].found
+    assert 50 not in times and len(times) > 90

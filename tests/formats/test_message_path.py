@@ -1,0 +1,142 @@
+"""Message paths: what is one, what is not, and that no text brings down the parser."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from grounded.errors import GroundedError
+from grounded_trials.formats.message_path import (
+    BINARY,
+    UNARY,
+    Field,
+    Filter,
+    Function,
+    MessagePath,
+    Slice,
+    parse_path,
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "topic", "steps", "functions"),
+    [
+        ("/a.b", "/a", [Field("b")], []),
+        ("/a/b_1", "/a/b_1", [], []),
+        ("topic1.x", "topic1", [Field("x")], []),
+        ('"/odd topic.name".x', "/odd topic.name", [Field("x")], []),
+        ("'/a'.\"b c\"", "/a", [Field("b c")], []),
+        ("/a.b[2].c", "/a", [Field("b"), Slice(2, 2), Field("c")], []),
+        ("/a.b[-1]", "/a", [Field("b"), Slice(-1, -1)], []),
+        ("/a.b[1:3]", "/a", [Field("b"), Slice(1, 3)], []),
+        ("/a.b[:]", "/a", [Field("b"), Slice(0, -1)], []),
+        ("/a.b[:-2]", "/a", [Field("b"), Slice(0, -2)], []),
+        ("/a.b[-2:]", "/a", [Field("b"), Slice(-2, -1)], []),
+        ('/a{n=="b"}.x', "/a", [Filter(("n",), "==", "b"), Field("x")], []),
+        ("/a{n.m >= -1.5e3}.x", "/a", [Filter(("n", "m"), ">=", -1500.0), Field("x")], []),
+        ("/a{n==true}.x", "/a", [Filter(("n",), "==", 1.0), Field("x")], []),
+        ("/a{n<1&&m!=2}", "/a", [Filter(("n",), "<", 1.0), Filter(("m",), "!=", 2.0)], []),
+        ("/a{n<1}{m!=2}", "/a", [Filter(("n",), "<", 1.0), Filter(("m",), "!=", 2.0)], []),
+        ("/a.q.@rpy.yaw", "/a", [Field("q")], [Function("yaw")]),
+        ("/a.q.@rpy.yaw.@rad2deg", "/a", [Field("q")], [Function("yaw"), Function("rad2deg")]),
+        ("/a.x.@mul(-2).@add(.5)", "/a", [Field("x")], [Function("mul", -2), Function("add", 0.5)]),
+        ("/a.v.@norm", "/a", [Field("v")], [Function("norm")]),
+    ],
+)
+def test_paths(text: str, topic: str, steps: list[object], functions: list[object]) -> None:
+    assert parse_path(text) == MessagePath(text, topic, tuple(steps), tuple(functions))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("", "is empty"),
+        ("/a.", "its end: expected a field's name"),
+        ("/a..b", "character 4: expected a field's name"),
+        ("/a[", "expected ':' or '\\]'"),
+        ("/a[]", "expected an index"),
+        ("/a[1", "expected ':' or '\\]'"),
+        ("/a[1:2", "expected '\\]'"),
+        ("/a[$i]", "variables"),
+        ("/a[99999999999]", "expected"),
+        ("/a{}", "expected a field's name"),
+        ("/a{x=1}", "expected one of =="),
+        ("/a{x=='}", "does not end"),
+        ('/a{x<"b"}', "only be compared with == and !="),
+        ("/a{x==1", "expected '}'"),
+        ("/a.@yaw", "no function '@yaw'"),
+        ("/a.@rpy", "say which"),
+        ("/a.@rpy.jaw", "did you mean 'yaw'"),
+        ("/a.@norn", "did you mean 'norm'"),
+        ("/a.x.@derivative", "differences amplify noise"),
+        ("/a.x.@delta", "differences amplify noise"),
+        ("/a.x.@mul", "needs a number"),
+        ("/a.x.@mul(a)", "expected a number"),
+        ("/a.x.@div(0)", "division by 0"),
+        ("/a.x.@mul(1e999)", "finite"),
+        ("/a.x.@abs.y", "functions come last"),
+        ("/a b", "expected '.field'"),
+        (".x", "expected a topic"),
+        ("/" + "a" * 2000, "more than 1000 characters"),
+    ],
+)
+def test_no_paths(text: str, says: str) -> None:
+    with pytest.raises(GroundedError, match=says):
+        parse_path(text)
+
+
+PIECES = ["/a", ".", ".x", "[", "]", ":", "1", "-", "{", "}", "==", "<", '"', "'", "&&", "@", ".@"]
+PIECES += ["rpy", ".yaw", "(", ")", "$", "1e9", "true", " ", "é", "\0", "norm", "mul"]
+
+
+@given(st.lists(st.sampled_from(PIECES), max_size=12).map("".join) | st.text(max_size=40))
+def test_any_text_parses_or_says_why(text: str) -> None:
+    try:
+        path = parse_path(text)
+    except GroundedError as error:
+        assert str(error)
+    else:
+        assert path.topic and path.text == text
+
+
+NAMES = st.from_regex(r"[a-z_][a-z0-9_]{0,8}", fullmatch=True)
+INDEX = st.integers(-99, 99)
+VALUES = st.integers(-99, 99).map(float) | st.text("abc xyz", min_size=1, max_size=5)
+STEPS = st.one_of(
+    st.builds(Field, NAMES),
+    st.builds(Slice, INDEX, INDEX),
+    st.builds(
+        lambda n, v, o: Filter(tuple(n), o if isinstance(v, float) else "==", v),
+        st.lists(NAMES, min_size=1, max_size=3),
+        VALUES,
+        st.sampled_from(["==", "!=", "<", "<=", ">", ">="]),
+    ),
+)
+FUNCTIONS = st.one_of(
+    st.sampled_from(["norm", *UNARY]).map(Function),
+    st.builds(Function, st.sampled_from(BINARY), st.integers(1, 9).map(float)),
+)
+
+
+def spell(path: MessagePath) -> str:
+    text = path.topic
+    for step in path.steps:
+        if isinstance(step, Field):
+            text += f".{step.name}"
+        elif isinstance(step, Slice):
+            text += f"[{step.start}]" if step.is_index else f"[{step.start}:{step.stop}]"
+        else:
+            value = f'"{step.value}"' if isinstance(step.value, str) else f"{step.value:g}"
+            text += f"{{{'.'.join(step.path)} {step.operator} {value}}}"
+    for function in path.functions:
+        text += f".@{function.name}"
+        text += f"({function.argument:g})" if function.name in BINARY else ""
+    return text
+
+
+@given(NAMES, st.lists(STEPS, max_size=6), st.lists(FUNCTIONS, max_size=3))
+def test_what_is_spelled_is_parsed(name: str, steps: list[object], functions: list[object]) -> None:
+    path = MessagePath("", f"/{name}", tuple(steps), tuple(functions))  # type: ignore[arg-type]
+    found = parse_path(spell(path))
+    assert (found.topic, found.steps, found.functions) == (path.topic, path.steps, path.functions)

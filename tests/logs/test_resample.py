@@ -1,0 +1,201 @@
+"""Samples onto the grid: against signals whose true values are known, and defects of real logs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from grounded.errors import GroundedError
+from grounded_trials.logs.resample import END, START, Crossing, Span, to_grid
+from grounded_trials.logs.signals import Series, SignalSpec
+
+EPOCH = 1_700_000_000_000_000_000
+
+
+def series(
+    t: np.ndarray, y: np.ndarray, spec: SignalSpec | None = None, log_delay: float = 0.0
+) -> Series:
+    stamps = EPOCH + np.round(np.asarray(t) * 1e9).astype(np.int64)
+    return Series(
+        spec=spec or SignalSpec("/a.b"),
+        t=stamps,
+        values=np.asarray(y, float),
+        log_times=stamps + round(log_delay * 1e9),
+        messages=len(stamps),
+        type="a/B",
+        stamped=True,
+    )
+
+
+def command(t0: float = 0.0, t1: float = 2.0, dt: float = 0.05) -> Series:
+    t = np.arange(t0, t1, dt)
+    return series(t, np.arange(len(t)), SignalSpec("/u.data", "log"))
+
+
+def pose(f: Callable[[np.ndarray], np.ndarray], rate: float = 97.0, **spec: object) -> Series:
+    t = np.arange(-0.5, 3.0, 1 / rate)
+    return series(t, f(t), SignalSpec("/x.data", **spec))  # type: ignore[arg-type]
+
+
+def grid(x: Series, u: Series | None = None, **options: object):  # type: ignore[no-untyped-def]
+    return to_grid({"x": x, "u": u or command()}, 0.05, ["x"], ["u"], **options)  # type: ignore[arg-type]
+
+
+def test_a_moving_state_is_interpolated_and_commands_keep_their_step() -> None:
+    found = grid(pose(np.sin))
+    t = 0.05 * np.arange(len(found.states))
+    np.testing.assert_allclose(found.states[:, 0], np.sin(t), atol=2e-5)
+    assert found.inputs[:, 0].tolist() == list(range(40))
+    assert found.start_ns == EPOCH and found.start_inputs is None and found.warnings == ()
+
+
+def test_late_and_early_commands_are_not_moved_to_another_step() -> None:
+    rng = np.random.default_rng(0)
+    t = np.arange(40) * 0.05 + rng.uniform(0, 0.02, 40)
+    t[0] = 0.0
+    found = grid(pose(np.sin), series(t, np.arange(40), SignalSpec("/u", "log")))
+    assert found.inputs[:40, 0].tolist() == list(range(40))
+
+
+def test_a_delay_is_taken_back() -> None:
+    speed = 1.0  # [m/s]: 7 ms are 7 mm
+    stamps_late = pose(lambda t: speed * (t - 0.007))
+    assert np.abs(grid(stamps_late).states[:, 0] - 0.05 * np.arange(41)).max() > 0.0069
+    mended = pose(lambda t: speed * (t - 0.007), delay_s=0.007)
+    np.testing.assert_allclose(grid(mended).states[:, 0], 0.05 * np.arange(41), atol=1e-9)
+
+
+def test_scale_offset_and_unwrapping() -> None:
+    def wrapped_degrees(t: np.ndarray) -> np.ndarray:
+        return np.rad2deg((2 * t + np.pi) % (2 * np.pi) - np.pi)
+
+    scaled = pose(wrapped_degrees, scale=np.pi / 180, offset=1.0, unwrap=True)
+    found = grid(scaled).states[:, 0]
+    np.testing.assert_allclose(found - found[0], 0.1 * np.arange(41), atol=1e-9)
+    assert abs(found[0] - 1.0) < 1e-9
+    as_angle = grid(replace(scaled, spec=replace(scaled.spec, unwrap=False)), angles=["x"])
+    np.testing.assert_array_equal(as_angle.states[:, 0], found)
+
+
+def test_a_gap_is_refused_where_it_is_and_bridged_where_allowed() -> None:
+    x = pose(np.sin)
+    keep = (x.t < EPOCH + 1.0e9) | (x.t > EPOCH + 1.9e9)
+    gap = replace(x, t=x.t[keep], values=x.values[keep], log_times=x.log_times[keep])
+    with pytest.raises(GroundedError, match=r"gap of 0.9\d\d s from 0.99\d s to 1.9\d\d s") as e:
+        grid(gap)
+    assert "'x' (/x.data)" in str(e.value)
+    found = grid(replace(gap, spec=replace(gap.spec, max_age_s=1.0)))
+    (report, _) = found.reports
+    assert report.bridged == 19 and 0.9 < report.largest_gap_s < 0.93
+    assert 0.98 < report.largest_gap_at_s < 1.0 and "19 values bridged" in found.warnings[0]
+    assert grid(gap, span=Span(end=1.4)).states.shape == (19, 1)  # before the gap all is well
+
+
+def test_held_inputs_grow_old() -> None:
+    u = series(np.array([0.0, 0.1, 1.0]), np.arange(3), SignalSpec("/u", "log"))
+    assert grid(pose(np.sin), u).inputs.shape[0] > 50  # a command is in force until the next
+    strict = replace(u, spec=replace(u.spec, max_age_s=0.5))
+    with pytest.raises(GroundedError, match=r"gap of 0.5\d* s from 0.100 s"):
+        grid(pose(np.sin), strict)
+
+
+def test_one_shot_topics() -> None:
+    u = series(np.array([0.0]), np.array([0.3]), SignalSpec("/u", "log"))
+    found = grid(pose(np.sin), u)
+    assert (found.inputs == 0.3).all() and "held from a single sample" in found.warnings[0]
+    with pytest.raises(GroundedError, match="one sample can't be interpolated"):
+        grid(series(np.array([0.0]), np.array([1.0])))
+
+
+def test_values_that_are_no_numbers() -> None:
+    x = pose(np.sin)
+    values = x.values.copy()
+    values[::7] = np.nan
+    values[3] = np.inf
+    found = grid(replace(x, values=values))
+    t = 0.05 * np.arange(len(found.states))
+    np.testing.assert_allclose(found.states[:, 0], np.sin(t), atol=2e-4)
+    assert found.reports[0].not_finite == np.sum(~np.isfinite(values))
+    with pytest.raises(GroundedError, match="none of its 340 values is a finite number"):
+        grid(replace(x, values=np.full(len(values), np.nan)))
+
+
+def test_repeated_and_shuffled_stamps() -> None:
+    x = pose(np.sin)
+    order = np.arange(len(x.t))
+    order[10:20] = order[10:20][::-1]
+    order = np.insert(order, 50, [49, 49])
+    messy = replace(x, t=x.t[order], values=x.values[order], log_times=x.log_times[order])
+    found = grid(messy)
+    np.testing.assert_array_equal(found.states, grid(x).states)
+    report = found.reports[0]
+    assert (report.repeated, report.out_of_order) == (2, 9)
+    assert any("9 stamps out of order, 2 repeated" in w for w in found.warnings)
+
+
+def test_clocks_that_jump_or_differ_are_refused() -> None:
+    x = pose(np.sin)
+    reset = x.t.copy()
+    reset[200:] -= 5_000_000_000
+    with pytest.raises(GroundedError, match="header clock jumps back by"):
+        grid(replace(x, t=reset, log_times=reset))
+    simulated = replace(x, t=x.t - EPOCH + 929 * 10**9)
+    with pytest.raises(GroundedError, match="on clocks that differ by"):
+        grid(simulated)
+    zero = replace(x, t=np.zeros_like(x.t))
+    with pytest.raises(GroundedError, match=r"on clocks that differ|stamps are 0"):
+        grid(zero)
+    some = x.t.copy()
+    some[:3] = 0
+    assert grid(replace(x, t=some)).reports[0].unstamped == 3
+
+
+def test_a_skew_that_matters_is_said() -> None:
+    x = pose(np.sin)
+    skewed = replace(x, log_times=x.log_times + 300_000_000)
+    found = grid(skewed)
+    assert found.reports[0].skew_s == pytest.approx(-0.3)
+    assert any("clocks that differ by 0.300 s" in w for w in found.warnings)
+
+
+def test_the_span() -> None:
+    x, u = pose(np.sin), command()
+    assert grid(x, u, span=Span(start=1.0)).start_ns == EPOCH + 500_000_000  # 1 s after x began
+    assert grid(x, u, span=Span(EPOCH * 1e-9 + 0.25)).start_inputs.tolist() == [4]
+    assert grid(x, u, steps=10).states.shape == (11, 1)
+    armed = series(np.array([-0.4, 0.7, 1.0, 1.2]), np.array([0, 1, 1, 0]))
+    span = Span(Crossing("/armed", above=0), Crossing("/armed", below=0.5))
+    found = to_grid({"x": x, "u": u, START: armed, END: armed}, 0.05, ["x"], ["u"], span)
+    assert found.start_ns == EPOCH + 700_000_000 and len(found.inputs) == 10
+    assert found.start_inputs is not None and found.start_inputs.tolist() == [13]
+    never = Span(Crossing("/armed", above=2))
+    with pytest.raises(
+        GroundedError, match="is never above 2 in this log; its values go from 0 to"
+    ):
+        to_grid({"x": x, "u": u, START: armed}, 0.05, ["x"], ["u"], never)
+    with pytest.raises(GroundedError, match="0 steps"):
+        grid(x, u, span=Span(1.0, 0.5))
+    late = grid(pose(np.sin), command(-1.0))
+    assert late.late_s == pytest.approx(0.495, abs=0.001) and "late" in late.warnings[0]
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_any_jitter_any_loss_any_order_stays_near_the_truth(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    t = np.arange(-0.5, 3.0, 0.01) + rng.uniform(-0.004, 0.004, 350)
+    keep = rng.random(350) > 0.3
+    order = rng.permutation(np.flatnonzero(keep))
+    x = series(t[order], np.sin(t[order]), SignalSpec("/x", max_age_s=0.2))
+    jumps = -np.diff(x.t).min() > 1e9
+    try:
+        found = grid(x)
+    except GroundedError as error:
+        assert jumps and "jumps back" in str(error)
+        return
+    times = 0.05 * np.arange(len(found.states))
+    np.testing.assert_allclose(found.states[:, 0], np.sin(times), atol=5e-3)

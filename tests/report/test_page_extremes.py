@@ -1,0 +1,54 @@
+"""Numbers that no picture was made for: reports are made all the same, without NaN in them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from grounded_cli.terminal import sparkline, table
+from grounded_trials.report.figures.all_figures import all_figures
+from grounded_trials.report.figures.png import png
+from grounded_trials.report.gathering import _drawable
+from grounded_trials.report.page.page import page
+from grounded_trials.report.recording.recording import write_recording
+from grounded_trials.report.report_text import report_text
+from reported import many_flights
+
+
+def _jump(states):
+    states[1500:], states[1501::2] = 1e300, -1e300
+
+
+CASES = {
+    "huge": lambda s: s.fill(1e200),
+    "jumps": _jump,
+    "zero": lambda s: s.fill(0.0),
+    "infinite": lambda s: s[10:].fill(np.inf),
+    "unknown": lambda s: s.fill(np.nan),
+    "tiny": lambda s: s.fill(1e-300),
+    "constant": lambda s: s.fill(1e12),
+    "offset": lambda s: np.copyto(s, 1e9 + 1e-3 * np.random.default_rng(0).random(s.shape)),
+}
+
+
+@pytest.fixture(scope="module")
+def flights():
+    return many_flights(2)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_report_is_made_of_any_numbers(flights, tmp_path, case):
+    runs = []
+    for run in flights.runs:
+        states = np.array(run.trial.states)
+        CASES[case](states)
+        runs.append(replace(run, trial=_drawable(replace(run.trial, states=states))))
+    findings = replace(flights, runs=tuple(runs))
+    text = page(findings)
+    assert "nan" not in text.split("<script>")[0].lower()
+    for figure in all_figures(findings)[:2]:
+        assert len(png(figure)) > 1000
+    write_recording(findings, tmp_path / "r.rrd")
+    assert report_text(findings, table, sparkline).endswith("next: grounded propose")

@@ -1,0 +1,167 @@
+"""The recording: verified by Rerun's own tool, complete, small, and seen in a real viewer."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from grounded_trials.report.gathering import gather
+from grounded_trials.report.recording.recording import rate, write_recording
+from grounded_trials.workspace.folder import Workspace
+from reported import car, cart, many_flights
+
+__all__ = ["car", "cart"]
+pytest.importorskip("rerun", reason="rerun-sdk is not installed")
+RERUN = Path(sys.executable).with_name("rerun")
+needs_tool = pytest.mark.skipif(not RERUN.exists(), reason="the rerun program is not installed")
+
+
+def _rerun(*args: object, timeout: float = 120) -> subprocess.CompletedProcess[str]:
+    command = [str(RERUN), *map(str, args)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=timeout)
+
+
+def _entities(path: Path) -> str:
+    return _rerun("rrd", "print", path).stdout
+
+
+@needs_tool
+def test_rerun_accepts_the_recording_and_finds_all_of_it(cart, tmp_path):
+    path = tmp_path / "cart.rrd"
+    findings = gather(Workspace(cart))
+    write_recording(findings, path)
+    done = _rerun("rrd", "verify", path)
+    assert done.returncode == 0, done.stderr
+    found = _entities(path)
+    for entity in (
+        "/paths/model_policy",
+        "/paths/best/body",
+        "/paths/predicted",
+        "/state/x/desired",
+        "/state/x/best",
+        "/input/force/low",
+        "/bias/v/iteration_0",
+        "/bias/v/left_as_diagnosed",
+        "/utilities",
+        "/summary",
+    ):
+        assert f"{entity} " in found, entity
+    for run in findings.runs:
+        for part in ("path", "predicted", "body", "state", "input", "bias", "explained"):
+            assert f"/trials/{run.trial.id}/{part}" in found
+
+
+@needs_tool
+def test_car_and_aircraft(car, tmp_path):
+    for name, findings in (("car", gather(Workspace(car))), ("aircraft", many_flights(2))):
+        path = tmp_path / f"{name}.rrd"
+        write_recording(findings, path)
+        assert _rerun("rrd", "verify", path).returncode == 0
+        assert "/paths/desired " in _entities(path)
+
+
+@needs_tool
+def test_recordings_of_single_trials_merge_into_one(cart, tmp_path):
+    findings = gather(Workspace(cart))
+    parts = []
+    for run in findings.runs[:2]:
+        parts.append(tmp_path / f"{run.trial.id}.rrd")
+        write_recording(replace(findings, runs=(run,)), parts[-1])
+    whole = tmp_path / "whole.rrd"
+    done = _rerun("rrd", "merge", *parts, "-o", whole)
+    assert done.returncode == 0, done.stderr
+    assert _rerun("rrd", "verify", whole).returncode == 0
+    found = _entities(whole)
+    assert all(f"/trials/{run.trial.id}/state" in found for run in findings.runs[:2])
+    ids = {line for line in found.split() if line.startswith("recording_id")}
+    assert len(ids) <= 1
+
+
+@needs_tool
+def test_a_damaged_recording_is_noticed(cart, tmp_path):
+    path = tmp_path / "cart.rrd"
+    write_recording(gather(Workspace(cart)), path)
+    data = bytearray(path.read_bytes())
+    data[len(data) // 3] ^= 0xFF
+    path.write_bytes(bytes(data[: len(data) // 2]))
+    assert _rerun("rrd", "verify", path).returncode != 0
+
+
+def test_fifty_trials_of_3000_steps_stay_small_and_quick(tmp_path):
+    findings = many_flights(50)
+    path = tmp_path / "many.rrd"
+    start = time.process_time()
+    write_recording(findings, path)
+    assert time.process_time() - start < 5.0
+    assert path.stat().st_size < 40e6
+
+
+def test_a_recording_of_nothing_and_of_runs_with_gaps(tmp_path):
+    findings = many_flights(1)
+    write_recording(replace(findings, runs=()), tmp_path / "none.rrd")
+    run = findings.runs[0]
+    states, inputs = np.array(run.trial.states), np.array(run.trial.inputs)
+    states[100:200] = np.nan
+    states[:, 0] = np.nan
+    gaps = replace(run, trial=replace(run.trial, states=states, inputs=inputs))
+    write_recording(replace(findings, runs=(gaps,)), tmp_path / "gaps.rrd")
+    assert (tmp_path / "gaps.rrd").stat().st_size > 1000
+
+
+def test_an_unwritable_place_is_a_sentence(cart, tmp_path):
+    from grounded.errors import GroundedError
+
+    with pytest.raises(GroundedError, match="can't be written"):
+        write_recording(gather(Workspace(cart)), tmp_path / "missing" / "cart.rrd")
+
+
+def test_the_bias_of_long_trials_is_averaged_not_thinned_out():
+    residual = np.random.default_rng(0).normal(size=(3000, 2))
+    rates, dt = rate(residual, 0.02)
+    assert len(rates) <= 600 and dt == pytest.approx(0.1)
+    np.testing.assert_allclose(rates.mean(axis=0), residual.mean(axis=0) / 0.02)
+    same, dt = rate(residual[:100], 0.02)
+    np.testing.assert_array_equal(same, residual[:100] / 0.02)
+
+
+def _ended(command: list[str], log: Path, seconds: float) -> str:
+    """What a program said; after so many seconds it is ended with all that it started."""
+    with log.open("w") as out:
+        started = subprocess.Popen(command, stdout=out, stderr=out, start_new_session=True)
+        try:
+            started.wait(seconds)
+        except subprocess.TimeoutExpired:
+            os.killpg(started.pid, signal.SIGTERM)
+            started.wait()
+    return log.read_text()
+
+
+@needs_tool
+@pytest.mark.skipif(shutil.which("xvfb-run") is None, reason="xvfb-run is not installed")
+def test_the_viewer_shows_the_paths(car, tmp_path):
+    """Half a minute: the viewer draws in software."""
+    path, shot = tmp_path / "car.rrd", tmp_path / "shot.png"
+    write_recording(gather(Workspace(car)), path)
+    screen = ["xvfb-run", "-a", "-s", "-screen 0 1600x1000x24"]
+    flags = ["--new", "--bind", "127.0.0.1", "--window-size", "1400x900", "--renderer", "vulkan"]
+    command = [*screen, str(RERUN), *flags, "--screenshot-to", str(shot), str(path)]
+    said = _ended(command, tmp_path / "said", 240)
+    if not shot.exists():
+        pytest.skip(f"the viewer can't draw here: {said[-300:]}")
+    assert "ERROR" not in said
+    from PIL import Image
+
+    image = np.asarray(Image.open(shot).convert("RGB")).astype(int)
+    left = image[:, : image.shape[1] // 2]
+    for colour in ((213, 94, 0), (86, 180, 233), (170, 170, 170)):  # model's policy, best, desired
+        near = (np.abs(left - colour).max(axis=2) < 25).sum()
+        assert near > 300, colour

@@ -1,0 +1,282 @@
+"""grounded report: what it says, in what shape, and what it does where files are damaged."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cli import grounded, plain
+from grounded_trials.report.diagnosis_words import calibrated_sentence
+from grounded_trials.report.findings import prediction_error, rms, tracking_error
+from grounded_trials.report.gathering import gather
+from grounded_trials.report.reporting import save_optimum
+from grounded_trials.workspace.diagnosis_file import diagnosis_of
+from grounded_trials.workspace.folder import Workspace
+from reported import DIAGNOSIS, car, cart, copied, damage
+from workspaces import make
+
+__all__ = ["car", "cart"]
+
+
+def test_text_fits_a_terminal_and_ends_with_the_next_command(cart, car):
+    for folder, command in ((cart, "adopt viscous_friction:v"), (car, "propose")):
+        done = grounded("-C", folder, "report")
+        assert done.code == 0, done.err
+        lines = done.out.rstrip("\n").split("\n")
+        assert max(map(len, lines)) <= 80
+        assert plain(done.out).split("\n")[-2] == f"next: grounded {command}"
+        assert "\x1b" not in done.out
+        for heading in ("utility", "trajectories", "bias", "gap to the model"):
+            assert any(line.startswith(heading) for line in lines)
+
+
+def test_text_without_a_diagnosis_says_how_to_get_one(car):
+    assert "not diagnosed yet: grounded diagnose" in plain(grounded("-C", car, "report").out)
+
+
+def test_text_shows_the_diagnosis(cart):
+    out = grounded("-C", cart, "report").out
+    assert "explains 90 % of the gap" in out
+    assert "k = 0.3 +- 0.01 1/s" in out
+    assert "4.10 before, 1.10 after, noise floor 1.00" in out
+
+
+def test_text_and_status_explain_their_columns(cart):
+    for command, words in (("report", "alpha: "), ("status", "damp: ")):
+        lines = grounded("-C", cart, command).out.splitlines()
+        (legend,) = [line for line in lines if line.startswith(f"  {words}")]
+        assert "+-: standard error" in legend and len(legend) <= 80
+
+
+def test_text_says_what_the_error_is_made_of(cart):
+    out = " ".join(grounded("-C", cart, "report").out.split())
+    assert "1 s ahead, 90.5 % of the squared error is explained, 0.4 % is not, 9.1 %" in out
+    assert "what is left of v is no white noise" in out
+    assert "5 whole trials by 3.21, the diagnosed one by 0.0456" in out
+    assert "quadratic_drag:v makes 96.0 %, coulomb_friction:v 80 % of the signal of" in out
+
+
+def test_half_a_number_is_never_shown(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    params = {f"k{i}": {"value": 0.123456, "std": 0.01, "unit": "m/s"} for i in range(4)}
+    entry = {"effect": "patch:v", "params": params, "evidence": 9.0, "gap_after": 1.0}
+    document = DIAGNOSIS | {"ranking": [entry]}
+    (folder / "reports" / "diagnosis.json").write_text(json.dumps(document))
+    (line,) = [x for x in grounded("-C", folder, "report").out.splitlines() if "patch:v" in x]
+    assert line.endswith("k0 = 0.123 +- 0.01 m/s, ...")
+
+
+def test_json_holds_what_the_contract_says(cart):
+    document = grounded("-C", cart, "report", "--json").json
+    status = grounded("-C", cart, "status", "--json").json
+    assert document["utilities"] == status["utilities"]
+    assert document["paths"] == {}
+    assert document["verdict"] == DIAGNOSIS["verdict"]
+    assert document["best"]["candidate"] == status["best"]["candidate"]
+    assert set(document["best"]["tracking_error"]) == {"x", "v"}
+    assert document["best"]["tracking_error"]["v"] is None  # no target: not a number
+
+
+def test_json_names_the_files_that_were_written(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    paths = grounded("-C", folder, "report", "--html", "--rrd", "--png", "--json").json["paths"]
+    files = [paths["html"], paths["rrd"], *paths["png"]]
+    assert all(Path(file).stat().st_size > 1000 for file in files)
+    assert {Path(p).stem for p in paths["png"]} >= {"utility", "paths", "states", "bias", "gap"}
+
+
+def test_a_workspace_without_trials_has_a_report(tmp_path):
+    make(tmp_path / "w")
+    done = grounded("-C", tmp_path / "w", "report", "--html", "--png", "--rrd")
+    assert done.code == 0, done.err
+    assert plain(grounded("-C", tmp_path / "w", "report").out).endswith("next: grounded propose\n")
+
+
+def test_findings_measure_what_they_say(cart):
+    findings = gather(Workspace(cart))
+    task, best = findings.task, findings.best
+    assert best is not None
+    off = best.trial.states[:, 0] - task.target[:, 0]
+    assert rms(tracking_error(task, best.trial))[0] == pytest.approx(np.sqrt(np.mean(off**2)))
+    gap = best.trial.states - best.candidate.predicted_states
+    np.testing.assert_allclose(prediction_error(task, best), gap)
+    step = task.model.system.step(
+        best.trial.states[:-1], best.trial.inputs, task.model.values, task.dt
+    )
+    np.testing.assert_allclose(best.residual, best.trial.states[1:] - step, atol=1e-12)
+
+
+def test_the_diagnosed_effect_leaves_less_of_the_bias(cart):
+    best = gather(Workspace(cart)).best
+    assert best is not None and best.explained is not None
+    assert rms(best.explained)[1] < rms(best.residual)[1]
+
+
+def test_a_damaged_trial_is_left_out_and_named(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    path = damage(folder, "trials/t0002-*")
+    done = grounded("-C", folder, "report")
+    assert done.code == 3
+    assert path.name in done.out and "is damaged" in " ".join(plain(done.out).split())
+    assert plain(done.out).rstrip().split("\n")[-1].startswith("next: grounded ")
+    document = grounded("-C", folder, "report", "--json", "--html", "--rrd")
+    assert document.code == 3
+    assert document.json["lost"][0]["file"] == path.name
+    page = Path(document.json["paths"]["html"]).read_text()
+    assert path.name in page and "This report is not complete" in page
+
+
+def test_a_removed_trial_is_named(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    (path,) = folder.glob("trials/t0002-*")
+    path.unlink()
+    done = grounded("-C", folder, "report")
+    assert done.code == 3
+    assert "t0002: trials/ has no file of the number t0002" in done.out
+
+
+def test_the_first_trial_may_be_lost(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    damage(folder, "trials/t0001-*")
+    done = grounded("-C", folder, "report", "--html", "--png", "--rrd")
+    assert done.code == 3, done.err
+
+
+def test_all_trials_may_be_lost(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    for number, path in enumerate(sorted(folder.glob("trials/*.mcap"))):
+        path.chmod(0o644)
+        path.write_bytes(b"" if number % 2 else b"\x89MCAP0\r\n nonsense")
+    done = grounded("-C", folder, "report", "--html", "--png", "--rrd")
+    assert done.code == 3, done.err
+
+
+def test_a_damaged_candidate_is_taken_from_the_trial_that_ran_it(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    damage(folder, "candidates/c0002.mcap")
+    (folder / "candidates" / "c0001.mcap").unlink()
+    done = grounded("-C", folder, "report", "--json")
+    assert done.code == 0, done.err
+    assert done.json["utilities"] == grounded("-C", cart, "report", "--json").json["utilities"]
+
+
+@pytest.mark.parametrize("text", ["", "[]", '{"verdict": 3}', "\x00", "[" * 100_000])
+def test_a_damaged_diagnosis_is_named(cart, tmp_path, text):
+    folder = copied(cart, tmp_path / "w")
+    (folder / "reports" / "diagnosis.json").write_text(text)
+    done = grounded("-C", folder, "report")
+    assert done.code == 3
+    assert "is not what `grounded diagnose` writes" in " ".join(plain(done.out).split())
+
+
+def test_a_short_trial_is_shown_as_failed(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    workspace = Workspace(folder)
+    from dataclasses import replace
+
+    from grounded_trials.store.trial_file import trial_bytes
+
+    stored = workspace.trials()[-1]
+    states = np.array(stored.trial.states[:11])
+    states[7:] = np.nan
+    short = replace(stored.trial, states=states, inputs=stored.trial.inputs[:10], id="")
+    model = workspace.base_model
+    workspace.store.add(
+        trial_bytes(
+            short,
+            {"kind": "trial", "task": workspace.task.hash},
+            workspace.candidate_bytes(short.candidate),
+            state_units=dict(model.states),
+            input_units=dict(model.inputs),
+            start_ns=0,
+        )
+    )
+    done = grounded("-C", folder, "report", "--html", "--rrd", "--png", "--json")
+    assert done.code == 0, done.err
+    assert "failed" in grounded("-C", folder, "report").out
+
+
+def test_a_trial_that_names_a_file_elsewhere_reads_nothing_there(cart, tmp_path):
+    from dataclasses import replace
+
+    from grounded_trials.store.trial_file import trial_bytes
+
+    folder = copied(cart, tmp_path / "w")
+    workspace = Workspace(folder)
+    (tmp_path / "outside.mcap").write_bytes(workspace.candidate_bytes("c0001"))
+    model = workspace.base_model
+    evil = replace(workspace.trials()[0].trial, candidate="../../outside", id="")
+    units = {"state_units": dict(model.states), "input_units": dict(model.inputs)}
+    workspace.store.add(trial_bytes(evil, {"kind": "trial"}, None, start_ns=0, **units))
+    before = grounded("-C", cart, "report", "--json").json
+    after = grounded("-C", folder, "report", "--json").json
+    assert after["utilities"] == before["utilities"]
+
+
+def test_the_optimum_is_shown_where_a_study_left_it(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    save_optimum(Workspace(folder), -0.0123)
+    assert "optimum -0.01230" in grounded("-C", folder, "report").out
+
+
+def test_nothing_heavy_is_imported_for_text(cart):
+    script = (
+        "import sys; sys.argv = ['grounded', '-C', sys.argv[1], 'report']\n"
+        "from grounded_cli.main import main\n"
+        "try: main()\n"
+        "except SystemExit: pass\n"
+        "heavy = {'rerun', 'PIL', 'matplotlib', 'scipy.optimize'} & set(sys.modules)\n"
+        "print(heavy, file=sys.stderr); sys.exit(bool(heavy))"
+    )
+    done = subprocess.run([sys.executable, "-c", script, str(cart)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_workspace_of_data_only_shows_the_model_against_the_data(cart, tmp_path):
+    folder = tmp_path / "data"
+    make(folder)
+    for path in sorted(cart.glob("trials/t000[12]-*")):
+        assert grounded("-C", folder, "ingest", path, "--data").code == 0
+    done = grounded("-C", folder, "report", "--html", "--png", "--rrd", "--json")
+    assert done.code == 0, done.err
+    assert [Path(p).name for p in done.json["paths"]["png"]] == ["data-t0001.png", "data-t0002.png"]
+    assert "t0001, crude" in Path(done.json["paths"]["html"]).read_text()
+    out = grounded("-C", folder, "report").out
+    assert "2 logs of data" in out and "error of the crude model 1 s ahead" in out
+
+
+def test_a_candidate_that_was_not_run_yet_is_shown_as_predicted(tmp_path):
+    make(tmp_path / "w")
+    assert grounded("-C", tmp_path / "w", "propose").code == 0
+    done = grounded("-C", tmp_path / "w", "report", "--html", "--rrd", "--png", "--json")
+    assert done.code == 0, done.err
+    assert "predicted for c0001" in Path(done.json["paths"]["html"]).read_text()
+    assert plain(grounded("-C", tmp_path / "w", "report").out).endswith("next: grounded run\n")
+
+
+def test_text_says_what_was_calibrated_and_what_the_figures_are_measured_in(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    out = " ".join(grounded("-C", folder, "report").out.split())
+    assert "calibrated beside them: mass 1.00 -> 1.40 kg" in out
+    assert "figures of two diagnoses don't compare" in out
+    assert "from policy to policy the utilities themselves differ by 1.50" in out
+    assert "scatter" not in out and "crude model misses" not in out
+    one = DIAGNOSIS["utility_prediction"] | {"trials": 1, "spread": 0.0}
+    document = DIAGNOSIS | {"utility_prediction": one}
+    (folder / "reports" / "diagnosis.json").write_text(json.dumps(document))
+    assert "from policy to policy" not in " ".join(grounded("-C", folder, "report").out.split())
+
+
+def test_at_most_three_parameters_are_named_the_most_changed_first():
+    table = {f"p{k}": {"value": 1.0 + 0.1 * k, "std": 0.01, "unit": "m"} for k in range(6)}
+    found = diagnosis_of(DIAGNOSIS | {"parameters": table})
+    text = calibrated_sentence(found, dict.fromkeys(table, 1.0))
+    assert text == (
+        "calibrated beside them: p5 1.00 -> 1.50 m, p4 1.00 -> 1.40 m, p3 1.00 -> 1.30 m "
+        "(and 2 more)"
+    )

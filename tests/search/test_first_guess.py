@@ -1,0 +1,77 @@
+"""Where DDP starts: a closed-loop run near the target, for every manoeuvre."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from grounded.experiments.car_tasks import NAMES, car_task, target
+from grounded.experiments.figure8 import flight_task
+from grounded.experiments.pendulum import pendulum_task
+from grounded.models import aircraft, car, pendulum
+from grounded.search.first_policy import filled_target, first_guess
+from grounded.search.improve import first_policy
+from grounded.solve import ddp
+from small_tasks import cart_task, rover_task
+
+TASKS = {
+    **{f"car {name}": (lambda name=name: car_task(name, car.model), 25.0) for name in NAMES},
+    "pendulum": (lambda: pendulum_task(pendulum.model), 3.0),
+    "aircraft": (lambda: flight_task(aircraft.model), 3.0),
+    "cart": (cart_task, 3.5),
+    "rover": (rover_task, 3.0),
+}
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_the_guess_is_finite_and_ddp_is_near_from_it(name):
+    make, factor = TASKS[name]
+    task = make()
+    guess = first_guess(task)
+    policy, result = first_policy(task)
+    assert np.isfinite(guess.cost) and result.status in ("converged", "max iterations")
+    assert result.cost <= guess.cost < factor * result.cost
+    assert (policy.feedforward >= task.low - 1e-12).all()
+    assert (policy.feedforward <= task.high + 1e-12).all()
+    nothing = ddp.solve(
+        task.problem(), np.tile(np.clip(task.past, task.low, task.high), (task.horizon, 1))
+    )
+    assert not result.cost > 1.05 * nothing.cost  # zero inputs lead to nothing better
+
+
+def test_heading_and_speed_are_read_off_the_path():
+    task = car_task("figure8", car.model)
+    blind = np.array(task.target)
+    blind[:, [1, 4]] = np.nan  # position alone
+    reward = replace(task.reward, state=np.array([0, 0, 10.0, 10.0, 0, 0]))
+    x, _ = filled_target(replace(task, target=blind, reward=reward))
+    expected = target("figure8")
+    moving = expected[:, 1] > 0.3
+    assert np.abs(x[moving, 4] - expected[moving, 4]).max() < 0.1  # not off by a turn either
+    assert np.abs(np.diff(x[:, 4])).max() < 0.5
+
+
+def test_a_path_that_starts_at_rest_or_never_moves():
+    task = car_task("turn", car.model)
+    still = np.full_like(task.target, np.nan)
+    still[:, [2, 3]] = 0.0
+    reward = replace(task.reward, state=np.array([0, 0, 10.0, 10.0, 0, 0]))
+    guess = first_guess(replace(task, target=still, reward=reward))
+    assert np.isfinite(guess.cost)
+
+
+def test_the_start_heading_decides_which_turn():
+    task = car_task("circle", car.model)
+    start = np.array(task.start)
+    start[4] = 2 * np.pi
+    blind = np.array(task.target)
+    blind[:, 4] = np.nan
+    reward = replace(task.reward, state=np.array([0, 1.0, 10.0, 10.0, 0, 0]))
+    x, _ = filled_target(replace(task, target=blind, reward=reward, start=start))
+    assert abs(x[0, 4] - 2 * np.pi) < 0.1
+
+
+def test_a_target_that_no_input_reaches_still_gives_a_guess():
+    task = cart_task(low=np.array([-0.01]), high=np.array([0.01]))
+    guess = first_guess(task)
+    assert np.isfinite(guess.cost) and np.abs(guess.inputs).max() <= 0.01 + 1e-12

@@ -1,0 +1,488 @@
+"""Where the search stands: a pure function of candidates and stored trials."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from grounded.errors import GroundedError
+from grounded.plant import Noise, Plant
+from grounded.search.improve import learn, model_fingerprint, propose
+from grounded.search.standing import MAX_CAUTION, Options, standing
+from grounded.search.step_size import Step
+from grounded.trial import Trial, mean_trial
+from grounded.utility import Reward
+from small_tasks import cart_task, drive, other, rover_task
+
+TASK = cart_task()
+PLANT = Plant(other(TASK.model, 1.6), latency={"force": 0.02})
+
+
+def bad(trial, value=30.0):
+    """The same run with a state that is far off: a trial that improves nothing."""
+    states = np.array(trial.states)
+    states[1:, 0] += value
+    return replace(trial, states=states)
+
+
+class Story:
+    """A search whose trials are made to order."""
+
+    def __init__(self, task=TASK, plant=PLANT, **options):
+        self.task, self.plant = task, plant
+        self.options = Options(**{"rerun_incumbent": False} | options)
+        self.candidates, self.trials = [], []
+
+    def propose(self):
+        proposal = propose(self.task, self.candidates, self.trials, self.options)
+        if proposal.is_new:
+            self.candidates.append(proposal.candidate)
+        return proposal
+
+    def add(self, how=lambda trial: trial):
+        proposal = self.propose()
+        assert proposal.candidate is not None, proposal.standing.sentence
+        trial = drive(self.task, self.plant, proposal.candidate, seed=len(self.trials))
+        self.trials.append(how(trial))
+        return self
+
+    @property
+    def now(self):
+        fingerprint = model_fingerprint(self.task)
+        return standing(self.task, self.candidates, self.trials, self.options, fingerprint)
+
+
+def test_an_empty_search_proposes_the_models_own_policy():
+    now = Story().now
+    assert (now.phase, now.iteration, now.incumbent, now.utilities) == ("propose", 0, None, [])
+    assert now.sentence == "the model's own policy comes first"
+
+
+def test_a_candidate_without_a_trial_is_named_again():
+    story = Story()
+    first, again = story.propose(), story.propose()
+    assert first.is_new and not again.is_new and again.candidate is first.candidate
+    assert story.now.phase == "await-trial" and story.now.missing == 1
+    assert story.now.sentence == "c0001 is waiting for 1 trial"
+
+
+def test_an_improvement_is_accepted_and_the_next_starts_from_it():
+    story = Story().add().add()
+    now = story.now
+    assert now.iteration == 1 and now.incumbent.candidate.id == "c0002"
+    assert now.utilities == [story.task.utility(t) for t in story.trials]
+    third = story.propose().candidate
+    assert (third.id, third.iteration, third.base) == ("c0003", 2, "c0002")
+
+
+@pytest.mark.parametrize(
+    ("options", "steps"),
+    [
+        ({"max_halvings": 2}, [(1.0, 1.0), (1.0, 0.5), (1.0, 0.25)]),
+        ({"step": "full", "max_halvings": 3}, [(0.0, a) for a in (1.0, 0.5, 0.25, 0.125)]),
+        ({"method": "policy-gradient", "max_halvings": 0}, [(0.0, 1.0)]),
+    ],
+    ids=["damped", "full", "gradient"],
+)
+def test_trials_that_do_not_improve_halve_alpha_then_end_the_search(options, steps):
+    if options.get("method") == "policy-gradient":
+        pytest.importorskip("grounded.solve.policy_gradient")
+    story = Story(**options, tolerance=0.0).add()
+    for _ in steps:
+        story.add(bad)
+    made = [(c.damping, c.alpha) for c in story.candidates[1:]]
+    assert made == steps and all(c.base == "c0001" for c in story.candidates[1:])
+    last = story.propose()
+    assert last.candidate is None and last.standing.phase == "converged"
+    assert last.standing.sentence == (
+        f"no step improved on c0001 down to alpha = {steps[-1][1]:g}: c0001 is the result (step 7)"
+    )
+
+
+def test_an_equal_utility_is_no_improvement():
+    story = Story().add()
+    same = story.trials[0]
+    story.propose()
+    story.trials.append(replace(same, candidate="c0002"))
+    assert story.now.history[-1].accepted is False and story.now.iteration == 0
+
+
+def test_repeats_are_averaged_and_all_are_needed():
+    noisy = Plant(PLANT.model, noise=Noise(process={"v": 0.02}))
+    story = Story(plant=noisy, repeats=3)
+    for missing in (3, 2, 1):
+        story.propose()
+        assert story.now.missing == missing and story.now.phase == "await-trial"
+        assert f"{missing} trial" in story.now.sentence
+        story.add()
+    story.add().add().add()
+    tried = story.now.history[0]
+    assert len(tried.trials) == 3 and tried.accepted is True
+    each = [story.task.utility(t) for t in tried.trials]
+    assert tried.utility == pytest.approx(np.mean(each)) and len(set(each)) == 3
+    assert tried.standard_error == pytest.approx(np.std(each, ddof=1) / np.sqrt(3))
+    mean = mean_trial(tried.trials, TASK.model.angle_mask)
+    np.testing.assert_allclose(mean.states, np.mean([t.states for t in tried.trials], axis=0))
+    np.testing.assert_allclose(mean.inputs, np.mean([t.inputs for t in tried.trials], axis=0))
+
+
+def test_a_candidate_run_more_often_is_averaged_too():
+    story = Story().add()
+    story.trials.append(bad(story.trials[0], 1.0))
+    each = [story.task.utility(t) for t in story.trials]
+    assert story.now.incumbent.utility == pytest.approx(np.mean(each))
+    assert story.now.trials == 2
+
+
+# a loss that may be luck
+
+
+def worse(by):
+    """A trial whose utility is lower by about so much: the cart stands a little further off."""
+    return lambda trial: bad(trial, by)
+
+
+def test_a_loss_sends_the_incumbent_out_again_before_it_is_believed():
+    story = Story(rerun_incumbent=True, tolerance=0.0).add().add(worse(0.3))
+    now = story.now
+    assert now.phase == "await-trial" and now.outstanding.id == "c0001" and now.missing == 1
+    assert now.history[-1].accepted is None and now.history[-1].in_doubt
+    assert now.sentence == (
+        "c0002 lost to c0001 by less than luck may do: c0001 is waiting for another trial"
+    )
+    story.add()  # the same again: it was no luck
+    now = story.now
+    assert now.history[-1].accepted is False and now.phase == "propose"
+    story.add(worse(0.3))  # scatter is known to be none now: the next loss is believed at once
+    assert story.now.history[-1].accepted is False and len(story.trials) == 4
+
+
+def test_a_lucky_winner_loses_its_luck():
+    """c0001's only trial flattered it; c0002, truly better, wins once c0001 was run again."""
+    story = Story(rerun_incumbent=True).add().add()
+    honest = [story.task.utility(t) for t in story.trials]
+    assert honest[1] > honest[0]
+    lucky = replace(story.trials[1], candidate="c0001")
+    lucky = replace(lucky, states=np.nan_to_num(TASK.target), inputs=0.0 * lucky.inputs)
+    story.trials[0] = lucky
+    assert story.task.utility(lucky) > honest[1]
+    assert story.now.outstanding.id == "c0001"
+    for _ in range(3):
+        story.trials.append(bad(story.trials[1], 2.0))
+        story.trials[-1] = replace(story.trials[-1], candidate="c0001")
+    assert story.now.incumbent.candidate.id == "c0002" and story.now.iteration == 1
+
+
+def test_losses_are_not_checked_for_ever():
+    """At most one trial more for each loss, however much trials scatter."""
+    noisy = Plant(PLANT.model, noise=Noise(process={"v": 0.2}))
+    story = Story(plant=noisy, rerun_incumbent=True, max_trials=60)
+    while story.propose().candidate is not None:
+        story.add()
+    losses: dict[str, int] = {}
+    for tried in story.now.history:
+        if not tried.accepted and tried.candidate.base:
+            losses[tried.candidate.base] = losses.get(tried.candidate.base, 0) + 1
+    for tried in story.now.history:
+        if tried.accepted:
+            assert len(tried.trials) <= 1 + losses.get(tried.candidate.id, 0)
+    assert story.now.phase in ("converged", "stopped") and len(story.trials) <= 60
+
+
+def test_a_crash_and_the_last_trial_are_believed_at_once():
+    story = Story(rerun_incumbent=True).add().add(cut)
+    assert story.now.history[-1].accepted is False and story.now.phase == "propose"
+    story = Story(rerun_incumbent=True, max_trials=2).add().add(worse(0.3))
+    assert story.now.history[-1].accepted is False and story.now.phase == "stopped"
+
+
+# what goes wrong on a robot
+
+
+def cut(trial, T=20):
+    return replace(trial, states=trial.states[: T + 1], inputs=trial.inputs[:T])
+
+
+def with_nan(trial):
+    states = np.array(trial.states)
+    states[25:] = np.nan
+    return replace(trial, states=states)
+
+
+def nothing(trial):
+    return replace(trial, states=trial.states[:1], inputs=trial.inputs[:0])
+
+
+FAILURES = {"short": cut, "nan": with_nan, "nothing": nothing}
+
+
+@pytest.mark.parametrize("how", FAILURES.values(), ids=FAILURES)
+def test_a_crashed_candidate_is_one_that_failed(how):
+    story = Story().add().add(how)
+    assert story.now.history[-1].accepted is False
+    assert story.now.incumbent.candidate.id == "c0001"
+    story.add()  # a more cautious step from the same base
+    assert story.candidates[-1].alpha == 0.5 and story.candidates[-1].base == "c0001"
+    assert story.now.iteration == 1
+
+
+@pytest.mark.parametrize("how", FAILURES.values(), ids=FAILURES)
+def test_a_crash_of_the_first_policy_makes_a_gentler_one(how):
+    story = Story()
+    efforts = []
+    for k in range(MAX_CAUTION + 1):
+        story.add(how)
+        made = story.candidates[-1]
+        assert made.caution == k and made.base == "" and made.iteration == 0
+        efforts.append(float(np.abs(np.diff(made.predicted_inputs, axis=0)).sum()))
+    assert efforts == sorted(efforts, reverse=True) and efforts[1] < 0.7 * efforts[0]
+    last = story.propose()
+    assert last.candidate is None and last.standing.phase == "stopped"
+    assert last.standing.sentence.startswith("the first policy crashed 4 times")
+
+
+def test_after_a_gentler_first_policy_the_search_goes_on():
+    story = Story().add(cut).add().add()
+    assert story.now.iteration == 1 and story.now.incumbent.candidate.id == "c0003"
+
+
+def test_with_repeats_a_single_crash_fails_the_candidate():
+    story = Story(repeats=3).add().add().add().add(cut)
+    assert story.now.history[-1].accepted is False and story.now.history[-1].utility == -np.inf
+    assert story.propose().is_new
+
+
+def test_a_trial_longer_than_the_horizon_counts_up_to_it():
+    def longer(trial):
+        states = np.vstack([trial.states, trial.states[-1:]])
+        return replace(trial, states=states, inputs=np.vstack([trial.inputs, trial.inputs[-1:]]))
+
+    plain, story = Story().add().add(), Story().add(longer).add(longer)
+    assert story.now.utilities == plain.now.utilities
+    a, b = plain.propose().candidate, story.propose().candidate
+    np.testing.assert_array_equal(a.policy.feedforward, b.policy.feedforward)
+
+
+@pytest.mark.parametrize(("off", "repeats", "least"), [(0.02, 3, -0.9), (0.3, 1, -1.35)])
+def test_a_start_away_from_s0_does_not_stop_the_search(off, repeats, least):
+    """The robot is put down a little (or far) off. Without: from -1.349 to -0.881."""
+    rng = np.random.default_rng(0)
+
+    def run(candidate):
+        start = {"x": off * rng.standard_normal(), "v": 0.0}
+        return PLANT.run(candidate.policy, start, rng)
+
+    now, candidates, trials = learn(TASK, run, Options(max_trials=12 * repeats, repeats=repeats))
+    assert now.iteration >= 1 and len(candidates) >= 3
+    assert TASK.utility(drive(TASK, PLANT, now.incumbent.candidate)) > least
+    if repeats == 3:  # scatter is no gain to look for: the search ends before trials run out
+        assert now.phase == "converged" and len(trials) <= 30
+
+
+def test_max_trials_ends_the_search():
+    story = Story(max_trials=3).add().add().add()
+    last = story.propose()
+    assert last.candidate is None and last.standing.phase == "stopped"
+    assert last.standing.sentence == "all 3 trials are used up ([search] max_trials)"
+
+
+def test_repeats_that_do_not_fit_any_more_are_not_begun():
+    story = Story(max_trials=5, repeats=3).add().add().add()
+    assert story.propose().standing.sentence == (
+        "3 of 5 trials are used up; a candidate needs 3 ([search] max_trials)"
+    )
+    with pytest.raises(GroundedError, match="repeats = 3 is more than max_trials = 2"):
+        Options(repeats=3, max_trials=2)
+
+
+def test_a_search_with_nothing_to_gain_ends_before_a_trial_is_spent():
+    story = Story(plant=Plant(TASK.model), tolerance=0.01).add()
+    last = story.propose()
+    assert last.candidate is None and last.standing.phase == "converged"
+    assert "promises less than 1 % more from any step" in last.standing.sentence
+    assert last.standing.sentence.endswith("c0001 is the result")
+
+
+def test_another_model_starts_again_at_alpha_1_from_the_best_policy():
+    story = Story(max_halvings=2).add().add(bad).add(bad)
+    assert story.candidates[-1].alpha == 0.5
+    story.task = story.task.with_model(other(TASK.model, 1.3))  # fitted, say
+    made = story.propose().candidate
+    assert (made.alpha, made.base, made.id) == (1.0, "c0001", "c0004")
+    assert story.now.outstanding is made
+
+
+def test_an_outstanding_candidate_of_another_model_is_made_again():
+    story = Story().add()
+    story.propose()
+    story.task = story.task.with_model(other(TASK.model, 1.3))
+    assert story.now.phase == "propose"
+    made = story.propose()
+    assert made.is_new and made.candidate.id == "c0003" and made.candidate.base == "c0001"
+
+
+def test_trials_of_no_candidate_are_ignored():
+    story = Story().add()
+    before = story.now
+    story.trials += [
+        replace(story.trials[0], candidate=""),
+        replace(story.trials[0], candidate="x"),
+    ]
+    assert story.now.utilities == before.utilities and story.now.trials == 1
+
+
+def test_the_order_of_stored_trials_decides_nothing():
+    noisy = Plant(PLANT.model, noise=Noise(process={"v": 0.02}))
+    story = Story(plant=noisy, repeats=2)
+    for _ in range(6):
+        story.add()
+    made = story.propose().candidate
+    turned = propose(story.task, story.candidates[:3], list(reversed(story.trials)), story.options)
+    assert turned.standing.utilities == pytest.approx(story.now.utilities)
+    np.testing.assert_allclose(
+        turned.candidate.policy.feedforward, made.policy.feedforward, atol=1e-9
+    )
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"max_halvings": -1},
+        {"max_halvings": 31},
+        {"repeats": 0},
+        {"max_trials": 0},
+        {"tolerance": 1.0},
+        {"tolerance": -0.1},
+        {"tolerance": float("nan")},
+    ],
+    ids=str,
+)
+def test_options_out_of_range_are_refused(change):
+    with pytest.raises(GroundedError, match=next(iter(change))):
+        Options(**change)
+
+
+def test_first_steps():
+    assert Options().first_step() == Step(1.0, 1.0)
+    assert Options(step="full").first_step() == Step(0.0, 1.0)
+    assert not Options(method="policy-gradient").damps
+
+
+def test_the_mean_of_one_trial_is_itself_and_held_inputs_are_averaged():
+    a = Trial(np.zeros((3, 2)), np.zeros((2, 1)), 0.05, ("x", "v"), ("force",), start_inputs=[1.0])
+    none = TASK.model.angle_mask
+    assert mean_trial([a], none) is a
+    b = replace(a, start_inputs=np.array([3.0]))
+    np.testing.assert_array_equal(mean_trial([a, b], none).start_inputs, [2.0])
+    assert mean_trial([a, replace(a, start_inputs=None)], none).start_inputs is None
+
+
+def test_headings_that_wrap_between_repeats_do_not_spoil_the_mean():
+    """One log unwrapped, the other a full turn off: their mean is the run, not half a turn off."""
+    task = rover_task()
+    policy = task.policy(np.full((60, 2), 0.5), None, None)
+    one = Plant(task.model).run(policy, {}, np.random.default_rng(0))
+    states = np.array(one.states)
+    states[:, 2] += 2 * np.pi
+    mean = mean_trial([one, replace(one, states=states)], task.model.angle_mask)
+    assert np.abs(task.model.difference(mean.states, one.states)).max() < 1e-9
+
+
+EVENTS = {
+    "good": lambda trial: trial,
+    "bad": bad,
+    "short": cut,
+    "nan": with_nan,
+    "nothing": nothing,
+    "held": lambda trial: replace(trial, start_inputs=np.array([2.0])),
+    "noise": lambda trial: replace(
+        trial, states=trial.states + 0.05 * np.sin(np.arange(82.0)).reshape(41, 2)
+    ),
+    "huge": lambda trial: replace(trial, states=1e200 * (1 + trial.states)),
+    "large": lambda trial: replace(trial, states=1e60 * (1 + trial.states)),
+    "far": lambda trial: replace(trial, states=1e5 * (1 + trial.states)),
+}
+
+
+@given(
+    st.lists(st.sampled_from([*EVENTS, "model", "again", "data"]), max_size=9),
+    st.sampled_from([1, 2]),
+    st.sampled_from(["damped", "full"]),
+)
+@settings(max_examples=40, deadline=None)
+def test_whatever_happens_the_search_goes_on_or_says_why(events, repeats, step):
+    """Any story of crashes, noise, mended models, repeated runs: no exception, no worse policy."""
+    story = Story(repeats=repeats, step=step, max_halvings=2, max_trials=8)
+    for event in events:
+        proposal = story.propose()
+        if event == "model":
+            story.task = story.task.with_model(other(story.task.model, 1.1))
+        elif event == "data":
+            story.trials += [replace(t, candidate="") for t in story.trials[:1]]
+        elif event == "again" and story.trials:
+            story.trials.append(story.trials[-1])
+        elif proposal.candidate is not None and event in EVENTS:
+            trial = drive(story.task, story.plant, proposal.candidate)
+            story.trials.append(EVENTS[event](trial))
+    now = story.now
+    assert now.phase in ("propose", "await-trial", "converged", "stopped") and now.sentence
+    accepted = now.utilities
+    assert accepted == sorted(accepted) and all(np.isfinite(accepted))
+    first, second = (
+        propose(story.task, story.candidates, story.trials, story.options) for _ in "12"
+    )
+    assert (first.candidate is None) == (second.candidate is None)
+    if first.candidate is not None:
+        policy = first.candidate.policy
+        assert policy.feedforward.tobytes() == second.candidate.policy.feedforward.tobytes()
+        assert np.isfinite(policy.feedforward).all() and np.isfinite(policy.gain).all()
+        inside = first.candidate.predicted_inputs
+        assert (inside >= TASK.low).all() and (inside <= TASK.high).all()
+
+
+def weights(state=10.0, terminal=0.0, effort=0.01, change=0.01):
+    return Reward(
+        np.array([state, 0.0]), np.array([terminal, 0.0]), np.array([effort]), np.array([change])
+    )
+
+
+JUMP = np.column_stack([np.repeat([0.0, 1.0], [20, 21]), np.full(41, np.nan)])
+ODD = {
+    "no input weights": {"reward": weights(effort=0.0, change=0.0)},
+    "nothing bounds the inputs": {
+        "reward": weights(effort=0.0, change=0.0),
+        "low": np.array([-np.inf]),
+        "high": np.array([np.inf]),
+    },
+    "terminal weights alone": {"reward": weights(state=0.0, terminal=10.0)},
+    "one step": {"target": TASK.target[:2]},
+    "two steps": {"target": TASK.target[:3]},
+    "a target that jumps": {"target": JUMP},
+    "a target out of reach": {"target": 1000 * JUMP},
+    "huge weights": {"reward": weights(1e12, 0.0, 1e-6, 1e-6)},
+    "tiny weights": {"reward": weights(1e-12, 0.0, 1e-14, 1e-14)},
+    "one limit": {"low": np.array([0.0]), "high": np.array([np.inf])},
+    "latency as long as the manoeuvre": {"latency": np.array([2.5])},
+    "open loop": {"feedback": False},
+    "a far start": {"start": np.array([100.0, 50.0])},
+    "limits that leave no choice": {"low": np.array([0.999]), "high": np.array([1.0])},
+    "held beyond the limits": {"past": np.array([9.0])},
+    "exact planning": {"smoothing": 0.0},
+    "nothing to do": {"target": np.column_stack([np.zeros(41), np.full(41, np.nan)])},
+}
+
+
+@pytest.mark.parametrize("options", [{}, {"step": "full"}, {"method": "policy-gradient"}], ids=str)
+@pytest.mark.parametrize("name", ODD)
+def test_odd_tasks_are_searched_or_ended_with_a_sentence(name, options):
+    task = cart_task(**ODD[name])
+    plant = Plant(other(task.model, 1.5), latency={"force": 0.02})
+    now, _candidates, trials = learn(
+        task, lambda c: drive(task, plant, c), Options(max_trials=4, **options)
+    )
+    assert now.phase in ("converged", "stopped") and now.sentence and trials
+    assert now.utilities == sorted(now.utilities) and all(np.isfinite(now.utilities))
+    for trial in trials:
+        assert (trial.inputs >= task.low).all() and (trial.inputs <= task.high).all()

@@ -1,0 +1,31 @@
+"""The step rule of the search: a promise kept widens the step, a promise broken narrows it."""
+
+import pytest
+
+from grounded.search.step_size import LEAST, Step, after_failure, after_success
+
+
+def test_a_kept_promise_lowers_the_damping_and_a_broken_one_raises_it():
+    assert after_success(Step(0.9), 100.0, 95.0) == Step(pytest.approx(0.03))
+    assert after_success(Step(0.1), 100.0, 60.0) == Step(0.1)
+    assert after_success(Step(0.1), 100.0, 10.0) == Step(1.0)
+    assert after_success(Step(1.0), 100.0, 10.0) == Step(1.0)
+    assert after_success(Step(LEAST), 100.0, 100.0) == Step(LEAST)
+
+
+def test_a_shortened_step_earns_no_wider_one():
+    assert after_success(Step(1.0, 0.5), 100.0, 100.0) == Step(1.0)
+
+
+def test_failures_damp_first_and_halve_then():
+    step, seen = Step(0.01), []
+    while step is not None:
+        seen.append((step.damping, step.alpha))
+        step = after_failure(step, max_halvings=2)
+    assert seen == [
+        (pytest.approx(0.01), 1.0),
+        (pytest.approx(0.1), 1.0),
+        (1.0, 1.0),
+        (1.0, 0.5),
+        (1.0, 0.25),
+    ]

@@ -1,0 +1,90 @@
+"""Matched inputs: the model still replays the trial, and is asked where it agrees with it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from grounded.experiments.bench import bench, optimum
+from grounded.experiments.car_tasks import car_task
+from grounded.experiments.real_car import real_plant
+from grounded.models.car import model as car
+from grounded.search.improve import first_policy, learn
+from grounded.search.standing import Options
+from grounded.solve.bias import ground
+from grounded.solve.levenberg_marquardt import Batch, solve
+
+
+@pytest.fixture(scope="module")
+def trial():
+    task = car_task("circle", car)
+    policy, _ = first_policy(task)
+    start = dict(zip(car.state_names, task.start, strict=True))
+    return task, policy, real_plant().run(policy, start, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_the_model_with_matched_inputs_replays_the_trial(trial, exact):
+    task, policy, run = trial
+    grounding = ground(task, run, exact=exact, match_inputs=True)
+    problem = grounding.on(task.problem(exact=exact))
+    assert np.abs(grounding.shift).max() > 0.01
+    swarm = problem.system.rollout(problem, policy.feedforward, policy.gain, policy.reference)
+    np.testing.assert_allclose(swarm.z[0][:, : car.n], run.states, atol=1e-9)
+    np.testing.assert_allclose(swarm.u[0], run.inputs, atol=1e-9)
+
+
+def test_matched_inputs_leave_less_to_the_bias(trial):
+    task, _, run = trial
+    plain = ground(task, run, exact=True).bias
+    matched = ground(task, run, exact=True, match_inputs=True).bias
+    speed = car.state_names.index("v")
+    assert np.abs(matched[20:, speed]).mean() < 0.2 * np.abs(plain[20:, speed]).mean()
+
+
+def test_a_model_that_is_right_needs_no_shift(trial):
+    task, policy, _ = trial
+    from grounded.plant import Plant
+
+    plant = Plant(car, latency=dict.fromkeys(car.input_names, 0.1), substeps=1)
+    start = dict(zip(car.state_names, task.start, strict=True))
+    run = plant.run(policy, start, np.random.default_rng(0))
+    still = replace(task, smoothing=0.0)
+    assert np.abs(ground(still, run, match_inputs=True).shift).max() < 1e-6
+
+
+def test_one_trial_closes_most_of_the_gap_of_a_miscalibrated_car():
+    shares = {True: [], False: []}
+    for seed in range(4):
+        case = bench("circle", "parametric", seed)
+        best = optimum(case)[1]
+        for matched in shares:
+            number = iter(range(100))
+            options = Options(max_trials=2, match_inputs=matched)
+            _, _, trials = learn(
+                case.task, lambda c, n=number, case=case: case.real(c.policy, next(n)), options
+            )
+            first, second = (case.task.utility(t) for t in trials)
+            shares[matched].append((max(second, first) - first) / (best - first))
+    assert min(shares[True]) > 0.98
+    assert np.median(shares[True]) > np.median(shares[False])
+
+
+def test_levenberg_marquardt_solves_each_row_and_keeps_bounds():
+    goals = np.array([[0.5, -0.2], [3.0, 0.1], [-0.9, 0.7]])
+
+    def residual(w, rows):
+        return np.column_stack([w[:, 0] ** 3 + w[:, 1], w[:, 1]]) - np.column_stack(
+            [goals[rows, 0] ** 3 + goals[rows, 1], goals[rows, 1]]
+        )
+
+    def jacobian(w, rows):
+        J = np.zeros((len(w), 2, 2))
+        J[:, 0, 0], J[:, 0, 1], J[:, 1, 1] = 3 * w[:, 0] ** 2, 1.0, 1.0
+        return J
+
+    bounds = np.array([1.0, 1.0])
+    batch = Batch(residual, jacobian, -bounds, bounds, solved=1e-20)
+    found = solve(batch, np.full((3, 2), 0.3), np.arange(3), 60)
+    np.testing.assert_allclose(found.w[[0, 2]], goals[[0, 2]], atol=1e-6)
+    assert found.w[1, 0] == 1.0 and found.error[1] > 1.0

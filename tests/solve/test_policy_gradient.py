@@ -1,0 +1,180 @@
+"""Eq. (4) against finite differences, for the three kinds of theta, and that its steps ascend."""
+
+import numpy as np
+import pytest
+
+from grounded.compile.run.parametric import ParametricPolicy
+from grounded.errors import GroundedError
+from grounded.model import Model, Param
+from grounded.policy import Policy
+from grounded.rollout import simulate
+from grounded.solve.bias import ground
+from grounded.solve.ddp import solve
+from grounded.solve.policy_gradient import (
+    ascent,
+    class_ascent,
+    class_gradient,
+    gradient,
+    run_class,
+)
+from grounded.task import Task
+from grounded.trial import Trial
+from grounded.utility import Reward
+from problems import SPECS, problem
+
+CASES = [(name, delay) for name in sorted(SPECS) for delay in (0.0, 1.4)]
+
+
+def policy_of(task, u, K=None, zbar=None):
+    spec = {spec["states"]: spec for spec in SPECS.values()}[task.system.states]
+    return Policy(
+        feedforward=u,
+        low=task.low,
+        high=task.high,
+        dt=task.dt,
+        state_names=task.system.states,
+        input_names=spec["inputs"],
+        depths=task.depths,
+        angles=tuple(bool(a) for a in task.angles),
+        past=task.past,
+        gain=K,
+        reference=zbar,
+    )
+
+
+def differences(cost, theta, h=1e-6):
+    slope = np.empty_like(theta)
+    for i in np.ndindex(theta.shape):
+        up, down = theta.copy(), theta.copy()
+        up[i] += h
+        down[i] -= h
+        slope[i] = (cost(up) - cost(down)) / (2 * h)
+    return slope
+
+
+@pytest.mark.parametrize(("name", "delay"), CASES)
+def test_open_loop(name, delay):
+    m = len(SPECS[name]["inputs"])
+    shift = np.full((15, m), 0.05)
+    task = problem(name, 15, delay=np.full(m, delay), smoothing=0.1, input_shift=shift)
+    u = 0.4 + 0.1 * np.random.default_rng(1).normal(size=(15, m))
+    z = task.system.rollout(task, u).z[0]
+    near = differences(lambda v: float(task.system.rollout(task, v).cost[0]), u)
+    found = gradient(task, z, u)
+    assert found.gain is None
+    assert np.allclose(found.inputs, near, rtol=1e-5, atol=1e-6 * np.abs(near).max())
+
+
+@pytest.mark.parametrize(("name", "delay"), CASES)
+def test_feedback_with_limits(name, delay):
+    m = len(SPECS[name]["inputs"])
+    task = problem(
+        name, 8, delay=np.full(m, delay), smoothing=0.1, low=np.full(m, 0.2), high=np.full(m, 0.6)
+    )
+    rng = np.random.default_rng(2)
+    u, K = rng.uniform(0.1, 0.7, (8, m)), 0.2 * rng.normal(size=(8, m, task.nz))
+    zbar = 0.2 * rng.normal(size=(8, task.nz))
+    run = task.system.rollout(task, u, K, zbar)
+
+    def cost(v, gain):
+        return float(task.system.rollout(task, v, gain, zbar).cost[0])
+
+    found = gradient(task, run.z[0], run.u[0], policy_of(task, u, K, zbar))
+    by_u, by_K = differences(lambda v: cost(v, K), u), differences(lambda L: cost(u, L), K)
+    held = (run.u[0] == 0.2) | (run.u[0] == 0.6)
+    assert held.any() and not held.all() and np.all(found.inputs[held] == 0)
+    assert np.allclose(found.inputs, by_u, rtol=1e-5, atol=1e-6 * np.abs(by_u).max())
+    assert np.allclose(found.gain, by_K, rtol=1e-5, atol=1e-6 * np.abs(by_K).max())
+
+
+def steer(s, theta, t):
+    return {
+        "steering": theta.offset + theta.k_psi * (0.2 - s.psi) + theta.k_y * np.sin(s.y),
+        "throttle": theta.gas + 0.1 * np.cos(theta.rate * t) - 0.05 * s.v,
+    }
+
+
+def steer_untraceable(s, theta, t):
+    if s.v > 100.0:
+        return {"steering": 0.0, "throttle": 0.0}
+    return steer(s, theta, t)
+
+
+THETA = np.array([0.1, 0.8, -0.3, 0.5, 2.0])
+NAMES = ("offset", "k_psi", "k_y", "gas", "rate")
+
+
+@pytest.mark.parametrize("function", [steer, steer_untraceable])
+def test_policy_class(function):
+    task = problem("car", 20, delay=np.array([1.4, 0.0]), smoothing=0.1)
+    policy = ParametricPolicy(function, SPECS["car"]["states"], SPECS["car"]["inputs"], NAMES)
+    assert bool(policy.note) == (function is steer_untraceable)
+    run = run_class(task, policy, THETA)
+    assert run.cost == pytest.approx(float(task.system.rollout(task, run.u).cost[0]))
+    found = class_gradient(task, policy, THETA, run.z, run.u)
+    near = differences(lambda theta: run_class(task, policy, theta).cost, THETA)
+    assert np.allclose(found, near, rtol=1e-5, atol=1e-6 * np.abs(near).max())
+    better = class_ascent(task, policy, THETA, run.z, run.u)
+    assert run_class(task, policy, better).cost < run.cost
+
+
+def test_policy_class_with_wrong_names():
+    with pytest.raises(GroundedError, match=r"test_policy_gradient.py:\d+.*'brake'"):
+        ParametricPolicy(
+            lambda s, theta, t: {"steering": 0.0, "brake": 1.0},
+            SPECS["car"]["states"],
+            SPECS["car"]["inputs"],
+            NAMES,
+        )
+    with pytest.raises(GroundedError, match="no parameter 'gain'"):
+        ParametricPolicy(
+            lambda s, theta, t: {"force": theta.gain * s.x},
+            ("x", "v"),
+            ("force",),
+            ("k",),
+        )
+
+
+def cart(feedback):
+    """A cart whose real mass is half of the model's."""
+    spec = SPECS["double_integrator"]
+    model = Model(
+        states={"x": "m", "v": "m/s"},
+        inputs={"force": "N"},
+        params={name: Param(value) for name, value in spec["params"].items()},
+        derivative=spec["function"],
+    )
+    task = Task(
+        model=model,
+        dt=0.1,
+        target=np.column_stack([np.linspace(0, 1, 31), np.full(31, np.nan)]),
+        reward=Reward(np.array([1.0, 0.0]), np.zeros(2), np.array([0.01]), np.array([0.1])),
+        start=np.zeros(2),
+        past=np.zeros(1),
+        low=np.array([-2.0]),
+        high=np.array([2.0]),
+        feedback=feedback,
+    )
+    return task, task.with_model(model.with_values({"mass": 0.75}))
+
+
+@pytest.mark.parametrize("feedback", [False, True])
+def test_ascent_climbs_the_real_utility(feedback):
+    task, real = cart(feedback)
+    H, nz = 30, 3
+    K = np.tile([-0.5, -0.4, 0.0], (H, 1, 1)) if feedback else None
+    zbar = np.zeros((H, nz)) if feedback else None
+    policy = task.policy(np.full((H, 1), 0.2), K, zbar)
+    utilities = [simulate(real.problem(), policy).utility]
+    for _ in range(40):
+        run = simulate(real.problem(), policy)
+        names = task.model.state_names, task.model.input_names
+        d = ascent(task, policy, ground(task, Trial(run.states, run.inputs, task.dt, *names)))
+        for alpha in 0.5 ** np.arange(8):  # steps 6 and 7: halving on the real system
+            better = policy.toward(d, float(alpha))
+            if simulate(real.problem(), better).utility > utilities[-1]:
+                policy = better
+                break
+        utilities.append(simulate(real.problem(), policy).utility)
+    best = -solve(real.problem(), np.zeros((H, 1))).cost
+    assert utilities[-1] > utilities[0] + 0.9 * (best - utilities[0])

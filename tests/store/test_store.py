@@ -1,0 +1,122 @@
+"""The store: content is identity, order survives, nothing is half there."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from grounded.errors import GroundedError
+from grounded_trials.store.store import Store, write_atomically
+
+
+def test_the_same_content_is_kept_once(tmp_path: Path) -> None:
+    store = Store(tmp_path / "trials")
+    first = store.add(b"one")
+    second = store.add(b"two")
+    again = store.add(b"one")
+    assert (first.known, second.known, again.known) == (False, False, True)
+    assert again.path == first.path and (first.id, second.id) == ("t0001", "t0002")
+    assert [s.id for s in store.list()] == ["t0001", "t0002"]
+    assert store.read("t0002") == store.read(second.sha256) == b"two"
+    assert store.verify() == ()
+    assert not [p for p in store.folder.iterdir() if p.suffix == ".tmp"]
+
+
+def test_a_file_is_taken_from_its_path(tmp_path: Path) -> None:
+    log = tmp_path / "log.mcap"
+    log.write_bytes(bytes(3_000_000))
+    added = Store(tmp_path / "s").add(log)
+    assert added.path.read_bytes() == log.read_bytes()
+    assert added.path.stat().st_mode & 0o222 == 0
+    with pytest.raises(GroundedError, match="nowhere"):
+        Store(tmp_path / "s").add(tmp_path / "nowhere")
+
+
+def test_order_survives_a_move_and_a_merge(tmp_path: Path) -> None:
+    a, b = Store(tmp_path / "a"), Store(tmp_path / "b")
+    for i in range(12):
+        a.add(b"a%d" % i)
+    b.add(b"b0")
+    order = [s.digest for s in a.list()]
+    shutil.copytree(a.folder, tmp_path / "moved")
+    assert [s.digest for s in Store(tmp_path / "moved").list()] == order
+    for entry in b.list():
+        shutil.copy(entry.path, a.folder)
+    assert len(a.list()) == 13 and a.list() == Store(a.folder).list()
+    with pytest.raises(GroundedError, match="may be any of"):
+        a.read("t0001")
+    assert a.add(b"more").id == "t0013"
+
+
+def test_damage_is_found_at_every_byte(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    added = store.add(bytes(range(64)))
+    added.path.chmod(0o644)
+    good = added.path.read_bytes()
+    for i in range(len(good)):
+        bad = bytearray(good)
+        bad[i] ^= 1 << (i % 8)
+        added.path.write_bytes(bytes(bad))
+        assert [d.path for d in store.verify()] == [added.path]
+        with pytest.raises(GroundedError, match="does not have the hash in its name"):
+            store.read("t0001")
+    added.path.write_bytes(good[:-1])
+    assert len(store.verify()) == 1
+
+
+def test_ingesting_again_replaces_a_damaged_file_and_keeps_the_damaged_one(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    added = store.add(b"good")
+    store.add(b"other")
+    added.path.chmod(0o644)
+    added.path.write_bytes(b"gosd")
+    healed = store.add(b"good")
+    assert not healed.known and healed.path == added.path and store.read("t0001") == b"good"
+    assert (tmp_path / (added.path.name + ".damaged")).read_bytes() == b"gosd"
+    assert store.verify() == () and [s.number for s in store.list()] == [1, 2]
+
+
+def test_unknown_names(tmp_path: Path) -> None:
+    store = Store(tmp_path / "empty")
+    assert store.list() == () and store.verify() == ()
+    with pytest.raises(GroundedError, match="it is empty"):
+        store.read("t0001")
+    store.add(b"x")
+    with pytest.raises(GroundedError, match="has no file 't0009'; the last is t0001"):
+        store.read("t0009")
+
+
+def test_leftovers_of_a_killed_process_are_removed(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    (tmp_path / ".t-99999.tmp").write_bytes(b"half")
+    store.add(b"x")
+    assert sorted(p.name for p in tmp_path.iterdir() if p.suffix == ".tmp") == []
+
+
+def test_a_folder_that_can_not_be_written(tmp_path: Path) -> None:
+    blocked = tmp_path / "file"
+    blocked.write_bytes(b"")
+    with pytest.raises(GroundedError, match="can't be written"):
+        Store(blocked / "trials").add(b"x")
+    with pytest.raises(GroundedError, match="can't be written"):
+        write_atomically(tmp_path / "no" / "x", b"x")
+    assert not (tmp_path / "no").exists()
+
+
+def test_concurrent_processes_lose_nothing(tmp_path: Path) -> None:
+    code = (
+        "import sys; from grounded_trials.store.store import Store\n"
+        "for i in range(12): Store(sys.argv[1]).add(b'file %d' % ((i + int(sys.argv[2])) % 12))"
+    )
+    running = [
+        subprocess.Popen([sys.executable, "-c", code, str(tmp_path / "s"), str(i)])
+        for i in range(4)
+    ]
+    assert [p.wait() for p in running] == [0] * 4
+    store = Store(tmp_path / "s")
+    assert sorted(store.read(s) for s in store.list()) == sorted(b"file %d" % i for i in range(12))
+    assert [s.number for s in store.list()] == list(range(1, 13))

@@ -1,0 +1,439 @@
+"""What was tried against the files and the store, how often, and what was lost.
+
+Run `python tests/support/reliability.py` for the full counts of docs/reliability.md; the tests run
+the same functions with smaller ones. Each returns (tries, failures): a failure is a wrong number, a
+traceback, an acknowledged file that is gone, or a store that does not verify.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from grounded.errors import GroundedError
+from grounded.policy import Policy
+from grounded.trial import Trial
+from grounded_trials.logs.recover import recover_log
+from grounded_trials.store.candidate_file import candidate_bytes, read_candidate
+from grounded_trials.store.store import Store
+from grounded_trials.store.trial_file import read_trial, trial_bytes
+
+MEMORY = "/dev/shm" if Path("/dev/shm").is_dir() else None  # where syncing costs nothing
+
+
+@dataclass(frozen=True)
+class Outcome:
+    tries: int
+    failures: tuple[str, ...] = ()
+    note: str = ""
+
+
+def a_trial(steps: int = 6, dt: float = 0.5) -> Trial:
+    rng = np.random.default_rng(0)
+    x, u = rng.normal(size=(steps + 1, 2)), rng.normal(size=(steps, 1))
+    return Trial(x, u, dt, ("v", "x"), ("u",), candidate="c0001")
+
+
+def a_candidate() -> tuple[Policy, bytes]:
+    rng = np.random.default_rng(1)
+    policy = Policy(
+        feedforward=rng.normal(size=(4, 1)),
+        low=np.array([-1.0]),
+        high=np.array([np.inf]),
+        dt=0.5,
+        state_names=("v", "psi"),
+        input_names=("u",),
+        depths=(1,),
+        angles=(False, True),
+        past=np.zeros(1),
+        gain=rng.normal(size=(4, 1, 3)),
+        reference=rng.normal(size=(4, 3)),
+    )
+    return policy, candidate_bytes(policy, np.zeros((5, 2)), np.zeros((4, 1)), {"alpha": "1.0"})
+
+
+def damaged(source: bytes, flips: bool, stride: int = 1) -> list[tuple[str, bytes]]:
+    """Every truncation, or every single-bit flip (`stride` leaves some out)."""
+    if not flips:
+        return [(f"cut at {i}", source[:i]) for i in range(0, len(source), stride)]
+    cases = []
+    for k in range(0, 8 * len(source), stride):
+        bad = bytearray(source)
+        bad[k // 8] ^= 1 << (k % 8)
+        cases.append((f"bit {k % 8} of byte {k // 8}", bytes(bad)))
+    return cases
+
+
+def read_damaged(flips: bool, stride: int = 1) -> Outcome:
+    """A damaged trial or candidate is refused with a message, always."""
+    trial = trial_bytes(a_trial(), {"iteration": "1"}, b"a policy")
+    tries, failures = 0, []
+    for source, read in ((trial, read_trial), (a_candidate()[1], read_candidate)):
+        for what, bad in damaged(source, flips, stride):
+            tries += 1
+            try:
+                read(bad)
+            except GroundedError as error:
+                if len(str(error)) > 500:
+                    failures.append(f"{what}: a long message")
+            except Exception as error:
+                failures.append(f"{what}: {error!r}")
+            else:
+                failures.append(f"{what}: not noticed")
+    return Outcome(tries, tuple(failures))
+
+
+def recover_damaged(flips: bool, stride: int = 1) -> Outcome:
+    """What recover saves of a damaged trial is right; it never calls a loss complete."""
+    trial = a_trial(12)
+    source = trial_bytes(trial, {}, b"a policy")
+    failures, saved = [], 0
+    cases = damaged(source, flips, stride)
+    with tempfile.TemporaryDirectory(dir=MEMORY) as folder:
+        bad, good = Path(folder, "bad.mcap"), Path(folder, "good.mcap")
+        for what, content in cases:
+            bad.write_bytes(content)
+            good.unlink(missing_ok=True)
+            try:
+                recovery = recover_log(bad, good)
+            except GroundedError:
+                if good.exists():
+                    failures.append(f"{what}: refused, and left a file")
+                continue
+            except Exception as error:
+                failures.append(f"{what}: {error!r}")
+                continue
+            if not flips and recovery.complete:
+                failures.append(f"{what}: called complete")
+            if recovery.lost_messages and recovery.complete:
+                failures.append(f"{what}: lost messages, called complete")
+            try:
+                back, _, _ = read_trial(good)
+            except GroundedError as error:
+                if "damaged" in str(error) or "checksum" in str(error):
+                    failures.append(f"{what}: what recover wrote is itself damaged: {error}")
+                continue
+            saved += back.steps
+            if not (
+                np.array_equal(back.states, trial.states[: len(back.states)])
+                and np.array_equal(back.inputs, trial.inputs[: len(back.inputs)])
+            ):
+                failures.append(f"{what}: wrong numbers")
+    share = saved / max(1, len(cases) * trial.steps)
+    return Outcome(
+        len(cases), tuple(failures), f"{100 * share:.0f} % of the steps saved on average"
+    )
+
+
+CHILD = """
+import os, random, sys
+from grounded_trials.store.store import Store
+store = Store(sys.argv[1])
+print("ready", flush=True)
+for i in range(int(sys.argv[2]), int(sys.argv[3])):
+    rng = random.Random(i)
+    store.add(b"%d " % i + rng.randbytes(rng.randint(10, 400_000)))
+    print(i, flush=True)
+"""
+
+
+def content(i: int) -> bytes:
+    rng = random.Random(i)
+    return b"%d " % i + rng.randbytes(rng.randint(10, 400_000))
+
+
+def check_store(store: Store, acknowledged: set[int]) -> list[str]:
+    failures = [f"verify: {d.reason}" for d in store.verify()]
+    kept = [int(store.read(entry).split(b" ", 1)[0]) for entry in store.list()]
+    failures += [f"acknowledged file {i} is gone" for i in acknowledged - set(kept)]
+    failures += ["a file is kept twice"] * (len(kept) != len(set(kept)))
+    failures += [f"file {i} has other bytes" for i in acknowledged if content(i) not in _all(store)]
+    return failures
+
+
+def _all(store: Store) -> set[bytes]:
+    return {store.read(entry) for entry in store.list()}
+
+
+def kills(count: int, seed: int = 0) -> Outcome:
+    """kill -9 at a random moment while files are being added, again and again."""
+    rng = random.Random(seed)
+    failures: list[str] = []
+    acknowledged: set[int] = set()
+    with tempfile.TemporaryDirectory() as folder:
+        store, next_file = Store(folder), 0
+        for _ in range(count):
+            arguments = [folder, str(next_file), str(next_file + 10_000)]
+            child = subprocess.Popen(
+                [sys.executable, "-c", CHILD, *arguments], stdout=subprocess.PIPE, text=True
+            )
+            assert child.stdout is not None and child.stdout.readline() == "ready\n"
+            time.sleep(rng.uniform(0, 0.03))
+            child.send_signal(signal.SIGKILL)
+            done = [int(line) for line in child.stdout.read().split()]
+            child.wait()
+            child.stdout.close()
+            acknowledged |= set(done)
+            next_file = max(done, default=next_file - 1) + 1  # the one that was killed comes again
+            failures += [f"verify: {d.reason}" for d in store.verify()]
+        failures += check_store(store, acknowledged)
+        entries = len(store.list())
+    if entries - len(acknowledged) not in (0, 1):
+        failures.append(f"{entries} files for {len(acknowledged)} that were acknowledged")
+    return Outcome(count, tuple(failures), f"{len(acknowledged)} files acknowledged, all there")
+
+
+def concurrent(processes: int = 24, contents: int = 12) -> Outcome:
+    """Many processes add few files: each file is kept once, each process is told so."""
+    code = (
+        "import random, sys\nfrom grounded_trials.store.store import Store\n"
+        "i = int(sys.argv[2]); rng = random.Random(i)\n"
+        "print(Store(sys.argv[1]).add(b'%d ' % i + rng.randbytes(rng.randint(10, 400_000))).sha256)"
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        running = [
+            subprocess.Popen(
+                [sys.executable, "-c", code, folder, str(i % contents)], stdout=subprocess.DEVNULL
+            )
+            for i in range(processes)
+        ]
+        failures = [f"exit {p.returncode}" for p in running if p.wait() != 0]
+        store = Store(folder)
+        failures += check_store(store, set(range(contents)))
+        if [s.number for s in store.list()] != list(range(1, contents + 1)):
+            failures.append("the numbers have holes")
+    return Outcome(processes, tuple(failures), f"{contents} files, each kept once")
+
+
+ADD = """
+import os, sys
+from grounded.errors import GroundedError
+from grounded_trials.store.store import Store
+if len(sys.argv) > 3:
+    os.setuid(int(sys.argv[3]))
+try:
+    added = Store(sys.argv[1]).add(bytes(int(sys.argv[2])))
+except GroundedError as error:
+    print(error)
+    sys.exit(1)
+print("added", added.sha256)
+"""
+
+
+def run_add(folder: str, size: int, user: str = "", **options: object) -> tuple[int, str]:
+    done = subprocess.run(
+        [sys.executable, "-c", ADD, folder, str(size), *([user] if user else [])],
+        capture_output=True,
+        text=True,
+        **options,  # type: ignore[call-overload]
+    )
+    return done.returncode, done.stdout + done.stderr
+
+
+def judge(folder: str, returncode: int, output: str, says: str) -> list[str]:
+    """After a failed add: one clear message, nothing stored, nothing left behind."""
+    failures = []
+    if returncode != 1 or "Traceback" in output or says not in output:
+        failures.append(f"exit {returncode}: {output[-300:]}")
+    left = [p.name for p in Path(folder).iterdir() if p.name != ".lock"] if not failures else []
+    if left:
+        failures.append(f"left behind: {left}")
+    return failures
+
+
+def full_disk() -> Outcome | None:
+    """A disk that is full, of several sizes; None where none can be mounted."""
+    folder = tempfile.mkdtemp()
+    options = "size=300k"
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", options, "none", folder]).returncode:
+        Path(folder).rmdir()
+        return None
+    try:
+        failures = []
+        for size in (400_000, 320_000, 10_000_000):
+            code, output = run_add(folder, size)
+            failures += judge(folder, code, output, "No space left on device; the file is")
+        code, output = run_add(folder, 1000)
+        failures += [output] * (code != 0 or bool(Store(folder).verify()))
+    finally:
+        subprocess.run(["umount", folder], check=True)
+        Path(folder).rmdir()
+    return Outcome(3, tuple(failures), "one message each, and the next small file fits")
+
+
+def size_limit() -> Outcome:
+    """A write that ends early, after any number of bytes."""
+    limits = range(0, 200_000, 20_011)
+    failures = []
+    for limit in limits:
+        with tempfile.TemporaryDirectory() as folder:
+            import resource
+
+            def limited(limit: int = limit) -> None:
+                resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+
+            code, output = run_add(folder, 200_000, preexec_fn=limited)
+            failures += judge(folder, code, output, "File too large; the file is not stored")
+    return Outcome(len(limits), tuple(failures))
+
+
+def read_only() -> Outcome:
+    """A folder that may not be written; as root, by another user."""
+    base = Path(tempfile.mkdtemp())
+    base.chmod(0o755)
+    failures = []
+    user = "65534" if os.geteuid() == 0 else ""
+    try:
+        for name, prepare in (("new", False), ("old", True)):
+            folder = base / name / "trials"
+            if prepare:
+                Store(folder).add(b"x")
+            else:
+                folder.parent.mkdir()
+            for path in (folder.parent, folder):
+                if path.exists():
+                    path.chmod(0o555)
+            code, output = run_add(str(folder), 100, user)
+            if code != 1 or "can't be written: Permission denied" not in output:
+                failures.append(f"{name}: exit {code}: {output[-300:]}")
+            if prepare and Store(folder).read("t0001") != b"x":
+                failures.append("the stored file changed")
+    finally:
+        for path in (*base.rglob("*"), base):
+            if path.is_dir():
+                path.chmod(0o755)
+        shutil.rmtree(base)
+    return Outcome(2, tuple(failures))
+
+
+CALL = re.compile(r"^(?:\d+ +)?(\w+)\(")
+START, STOP = "/grounded-marker-start", "/grounded-marker-stop"
+TRACED = f"""
+import os, sys
+from grounded.errors import GroundedError
+from grounded_trials.store.store import Store
+os.path.exists({START!r})
+try:
+    added = Store(sys.argv[1]).add(b"1 " + bytes(300_000))
+except GroundedError as error:
+    print(error)
+    sys.exit(1)
+os.path.exists({STOP!r})
+print("added")
+"""
+
+
+def system_calls() -> list[tuple[str, int]]:
+    """Each system call that adding a file makes: its name, and which one of that name it is."""
+    with tempfile.TemporaryDirectory() as folder:
+        log = Path(folder, "log")
+        store = Path(folder, "store")
+        Store(store).add(b"0 first")
+        command = ["strace", "-o", str(log), sys.executable, "-c", TRACED, str(store)]
+        subprocess.run(command, check=True, capture_output=True)
+        counts: dict[str, int] = {}
+        found, inside = [], False
+        for line in log.read_text("utf-8", "replace").splitlines():
+            match = CALL.match(line)
+            if not match:
+                continue
+            counts[match[1]] = counts.get(match[1], 0) + 1
+            if STOP in line:
+                break
+            if inside and match[1] not in ("brk", "mmap", "munmap", "mremap", "mprotect"):
+                found.append((match[1], counts[match[1]]))
+            inside |= START in line
+    return found
+
+
+def fault_injection(stride: int = 1) -> Outcome | None:
+    """At each system call of an add: an error, and a kill; None without strace."""
+    if shutil.which("strace") is None:
+        return None
+    failures, tries = [], 0
+    for name, number in system_calls()[::stride]:
+        for fault in ("error=EIO", "error=ENOSPC", "signal=KILL"):
+            tries += 1
+            with tempfile.TemporaryDirectory() as folder:
+                store = Store(folder)
+                store.add(b"0 first")
+                command = ["strace", "-o", "/dev/null", "-e", f"trace={name}"]
+                command += ["-e", f"inject={name}:{fault}:when={number}"]
+                done = subprocess.run(
+                    [*command, sys.executable, "-c", TRACED, folder], capture_output=True, text=True
+                )
+                where = f"{name} {number} {fault}"
+                if "Traceback" in done.stderr:
+                    failures.append(f"{where}: {done.stderr[-400:]}")
+                if store.verify():
+                    failures.append(f"{where}: damaged")
+                kept = [store.read(s) for s in store.list()]
+                if b"0 first" not in kept or (done.stdout == "added\n" and len(kept) != 2):
+                    failures.append(f"{where}: lost")
+                again = store.add(b"1 " + bytes(300_000))
+                if store.read(again.sha256) != b"1 " + bytes(300_000) or len(store.list()) != 2:
+                    failures.append(f"{where}: the next add failed")
+                if list(Path(folder).glob("*.tmp")) + list(Path(folder).glob(".*.tmp")):
+                    failures.append(f"{where}: a temporary file stays")
+    return Outcome(tries, tuple(failures))
+
+
+def verify_flips(stride: int = 1) -> Outcome:
+    """`verify` finds any flipped bit in any stored byte."""
+    source = trial_bytes(a_trial(), {})
+    failures, tries = [], 0
+    with tempfile.TemporaryDirectory(dir=MEMORY) as folder:
+        store = Store(folder)
+        path = store.add(source).path
+        path.chmod(0o644)
+        for what, bad in damaged(source, True, stride):
+            tries += 1
+            path.write_bytes(bad)
+            if [d.path for d in store.verify()] != [path]:
+                failures.append(what)
+    return Outcome(tries, tuple(failures))
+
+
+TABLE: list[tuple[str, Callable[[], Outcome | None]]] = [
+    ("a trial and a candidate cut off at every byte, read", lambda: read_damaged(False)),
+    ("every single bit of both flipped, read", lambda: read_damaged(True)),
+    ("a trial cut off at every byte, recovered", lambda: recover_damaged(False)),
+    ("every single bit of a trial flipped, recovered", lambda: recover_damaged(True)),
+    ("every single bit of a stored file flipped, verified", verify_flips),
+    ("kill -9 at a random moment while files are added", lambda: kills(300)),
+    ("24 processes that add 12 files at once", concurrent),
+    ("a full disk", full_disk),
+    ("a write that ends early", size_limit),
+    ("a folder that may not be written", read_only),
+    ("an I/O error, a full disk, a kill at each system call of an add", fault_injection),
+]
+
+
+def main() -> None:
+    print("| tried | times | failures | |\n|---|---|---|---|")
+    for what, run in TABLE:
+        outcome = run()
+        if outcome is None:
+            print(f"| {what} | – | – | not possible here |")
+            continue
+        print(
+            f"| {what} | {outcome.tries} | {len(outcome.failures)} | {outcome.note} |", flush=True
+        )
+        for failure in outcome.failures[:5]:
+            print("   ", failure, file=sys.stderr)
+
+
+if __name__ == "__main__":
+    main()

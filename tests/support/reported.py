@@ -1,0 +1,165 @@
+"""Workspaces that have something to report, learnt once for all tests that only look."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cli import grounded
+from grounded.experiments.figure8 import flight_task
+from grounded.models import aircraft
+from grounded.policy import Policy
+from grounded.search.standing import Candidate, Options, standing
+from grounded.solve.bias import residuals
+from grounded.trial import Trial
+from grounded_trials.report.findings import Findings, Run
+from workspaces import make
+
+DIAGNOSIS: dict[str, Any] = {
+    "verdict": {
+        "kind": "effect",
+        "effects": ["viscous_friction:v"],
+        "sentence": "Viscous friction on v explains 90 % of the gap.",
+    },
+    "where": {
+        "channels": [{"name": "v", "share": 0.9, "rms": 0.2, "unit": "m/s"}],
+        "times": [{"from": 0.0, "to": 1.0, "share": 0.6}],
+        "regions": [{"when": "v > 0.5", "share": 0.7, "occupancy": 0.3}],
+        "split": {
+            key: {
+                "horizon_s": seconds,
+                "all": {"explained": 0.905, "unexplained": 0.004, "irreducible": 0.091},
+                "channels": [
+                    {"name": "v", "explained": 0.8, "unexplained": 0.05, "irreducible": 0.15}
+                ],
+                "irreducible_from": "noise",
+            }
+            for key, seconds in (("one_step", 0.05), ("horizon", 1.0), ("whole_run", 2.0))
+        },
+        "whiteness": {"x": 0.4, "v": 0.0002},
+    },
+    "ranking": [
+        {
+            "effect": "viscous_friction:v",
+            "params": {"k": {"value": 0.3, "std": 0.01, "interval": [0.29, 0.33], "unit": "1/s"}},
+            "evidence": 40.0,
+            "gap_after": 1.1,
+            "shrinkage": 0.9,
+        },
+        {"effect": "delay:force", "params": {}, "evidence": -2.0, "gap_after": 4.0, "shrinkage": 0},
+    ],
+    "indistinguishable": [["viscous_friction:v", "quadratic_drag:v"]],
+    "gap": {
+        "horizon_s": 1.0,
+        "unit": "noise-normalised rms",
+        "before": 4.1,
+        "after": 1.1,
+        "floor": 1.0,
+        "held_out": True,
+    },
+    "utility_prediction": {"trials": 5, "before": 3.21, "after": 0.0456, "spread": 1.5},
+    "lookalikes": [
+        {"effect": "viscous_friction:v", "like": "quadratic_drag:v", "share": 0.96},
+        {"effect": "viscous_friction:v", "like": "coulomb_friction:v", "share": 0.8},
+    ],
+    "next_trial": "a fast run and a slow one",
+    "parameters": {"mass": {"value": 1.4, "std": 0.02, "interval": [1.36, 1.44], "unit": "kg"}},
+    "leftover": [
+        {
+            "channel": "v",
+            "size": 0.02,
+            "unit": "m/s/s",
+            "evidence": 12.0,
+            "region": {"when": "x > 0.2", "share": 0.6, "occupancy": 0.3},
+        }
+    ],
+}
+
+
+@pytest.fixture(scope="session")
+def cart(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A cart that has learnt and was diagnosed; tests look, or copy it."""
+    folder = tmp_path_factory.mktemp("reported") / "cart"
+    make(folder)
+    assert grounded("-C", folder, "learn").code == 0
+    (folder / "reports").mkdir(exist_ok=True)
+    (folder / "reports" / "diagnosis.json").write_text(json.dumps(DIAGNOSIS))
+    return folder
+
+
+@pytest.fixture(scope="session")
+def car(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An RC car after three trials, not diagnosed."""
+    folder = tmp_path_factory.mktemp("reported") / "car"
+    make(folder, "car-turn")
+    assert grounded("-C", folder, "learn", "--trials", 3).code == 0
+    return folder
+
+
+def copied(workspace: Path, to: Path) -> Path:
+    """A copy that a test may damage."""
+    shutil.copytree(workspace, to)
+    return to
+
+
+def damage(folder: Path, pattern: str) -> Path:
+    """Flips a byte in the middle of the only file that fits the pattern."""
+    (path,) = folder.glob(pattern)
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    path.chmod(0o644)
+    path.write_bytes(bytes(data))
+    return path
+
+
+def many_flights(trials: int = 50) -> Findings:
+    """Findings of the aircraft's figure-8, 3000 steps a trial, noisy, without any file."""
+    task = flight_task(aircraft.model)
+    rng = np.random.default_rng(0)
+    H, n, m = task.horizon, task.model.n, task.model.m
+    target = np.where(np.isfinite(task.target), task.target, 0.0)
+    candidates, runs = [], []
+    for k in range(trials):
+        drift = np.cumsum(rng.normal(0, 0.02, (H + 1, n)), axis=0) / (k + 1)
+        states = target + drift + rng.normal(0, 0.01, (H + 1, n))
+        inputs = np.clip(task.past + rng.normal(0, 0.05, (H, m)), task.low, task.high)
+        policy: Policy = task.policy(inputs, None, None)
+        name = f"c{k + 1:04d}"
+        base = candidates[-1].id if candidates else ""
+        made = Candidate(name, policy, k, 1.0, base, "m", target, inputs, -100.0 / (k + 2))
+        candidates.append(made)
+        trial = Trial(states, inputs, task.dt, task.model.state_names, task.model.input_names)
+        runs.append(replace(trial, id=f"t{k + 1:04d}", candidate=name))
+    now = standing(task, candidates, runs, Options(max_trials=1000), "m")
+    by_id = {t.candidate.id: t for t in now.history}
+    return Findings(
+        name="many",
+        task=task,
+        nominal={},
+        effects=(),
+        method="ddp",
+        standing=now,
+        runs=tuple(
+            Run(
+                run,
+                by_id[run.candidate].candidate,
+                by_id[run.candidate].accepted,
+                task.utility(run),
+                residuals(task, run),
+            )
+            for run in runs
+        ),
+        logs=(),
+        others=0,
+        lost=(),
+        diagnosis=None,
+        optimum=None,
+        noise=float("nan"),
+        next_command="grounded propose",
+    )

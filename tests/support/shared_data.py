@@ -1,0 +1,30 @@
+"""Where the project's shared real data lie; tests that need them skip where they are missing."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+
+def _find() -> Path | None:
+    named = os.environ.get("GROUNDED_SHARED")
+    folders = [Path(named)] if named else [p / "shared" for p in Path(__file__).resolve().parents]
+    return next((f / "data" for f in folders if (f / "data").is_dir()), None)
+
+
+SUPPORT = Path(__file__).parent  # helpers of the tests, for subprocesses
+DATA = _find()
+needs_data = pytest.mark.skipif(
+    DATA is None, reason="../shared/data is not there (GROUNDED_SHARED names its folder)"
+)
+
+
+def files(pattern: str) -> list[Path]:
+    return sorted(DATA.glob(pattern)) if DATA is not None else []
+
+
+def data(*parts: str) -> Path:
+    assert DATA is not None
+    return DATA.joinpath(*parts)

@@ -1,0 +1,57 @@
+"""Models that come by name: those of this package use the door that guests use."""
+
+import importlib
+import pkgutil
+import tomllib
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import pytest
+
+import grounded.models
+from grounded import Model
+from grounded.errors import GroundedError
+from grounded_trials.workspace.model_file import load_module, model_in
+from workspaces import CONFIG, make
+
+ROOT = Path(__file__).resolve().parents[2]
+GROUP = "grounded.models"
+
+
+def declared():
+    """The entry points as pyproject.toml has them."""
+    table = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    points = table["project"]["entry-points"][GROUP]
+    return [EntryPoint(name, value, GROUP) for name, value in points.items()]
+
+
+def test_every_model_of_the_package_has_an_entry_point():
+    modules = [m.name for m in pkgutil.iter_modules(grounded.models.__path__)]
+    with_model = {
+        name
+        for name in modules
+        if isinstance(getattr(importlib.import_module(f"{GROUP}.{name}"), "model", None), Model)
+    }
+    assert with_model == {point.name for point in declared()} == {"aircraft", "car", "pendulum"}
+    assert all(isinstance(point.load(), Model) for point in declared())
+
+
+@pytest.fixture
+def registered(monkeypatch):
+    points = [*declared(), EntryPoint("boat", "grounded.models.car:model", GROUP)]
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: points)
+
+
+@pytest.mark.parametrize("name", ["aircraft", "pendulum", "boat", "grounded.models.pendulum"])
+def test_a_model_is_loaded_by_its_name_or_its_module(registered, tmp_path, name):
+    assert isinstance(model_in(load_module(tmp_path, module=name)), Model)
+
+
+def test_an_unknown_module_names_the_models_there_are(registered, tmp_path):
+    with pytest.raises(GroundedError, match="name one of aircraft, boat, car, pendulum"):
+        load_module(tmp_path, module="boot")
+
+
+def test_a_workspace_takes_a_registered_model(registered, tmp_path):
+    config = CONFIG.replace('file = "model.py"', 'module = "pendulum"')
+    assert make(tmp_path / "w", config=config).base_model.state_names == ("theta", "omega")

@@ -1,0 +1,96 @@
+"""Exports for other languages: a reader with nothing but the file drives the same commands."""
+
+import csv
+import json
+import math
+
+import numpy as np
+import pytest
+
+from grounded.policy import load
+from grounded_trials.workspace.exporting import export_candidate
+from grounded_trials.workspace.proposing import propose_in
+from workspaces import CONFIG, make
+
+
+def exported(w, folder, form):
+    propose_in(w)
+    path = folder / f"c.{form}"
+    assert export_candidate(w, "c0001", form, path) == "c0001"
+    return path
+
+
+def drive_by_json(document, states):
+    """The control law of docs/robot.md in plain Python: z, differences that wrap, clip."""
+    names, sent, out = document["state_names"], {}, []
+    held = dict(zip(document["input_names"], document["past"], strict=True))
+    for t, s in enumerate(states):
+        z = list(s)
+        for name in document["z_names"][len(names) :]:
+            which, back = name[:-1].split("[t-")
+            z.append(sent.get((which, t - int(back)), held[which]))
+        command = []
+        for i, name in enumerate(document["input_names"]):
+            u = document["feedforward"][t][i]
+            for j, value in enumerate(z if "gain" in document else ()):
+                d = value - document["reference"][t][j]
+                if j < len(names) and names[j] in document["angles"]:
+                    d = math.remainder(d, 2 * math.pi)
+                u += document["gain"][t][i][j] * d
+            low, high = document["low"][i], document["high"][i]
+            u = u if low is None else max(u, low)
+            u = u if high is None else min(u, high)
+            sent[name, t] = u
+            command.append(u)
+        out.append(command)
+    return np.array(out)
+
+
+@pytest.mark.parametrize("example", ["cart", "car-circle", "car-turn"])
+def test_a_reader_of_the_json_drives_as_the_runner_does(tmp_path, example):
+    w = make(tmp_path / "w", example)
+    document = json.loads(exported(w, tmp_path, "json").read_text())
+    run = load(exported(w, tmp_path, "npz"))
+    H, n = run.policy.horizon, len(run.policy.state_names)
+    states = np.zeros((H, n)) if run.policy.reference is None else run.policy.reference[:, :n]
+    states = states + 0.2 * np.random.default_rng(0).normal(size=(H, n))
+    expected = [run.action(t * run.policy.dt, states[t]) for t in range(H)]
+    np.testing.assert_allclose(drive_by_json(document, states), expected, atol=1e-9)
+    assert ("gain" in document) == (example != "car-turn")
+
+
+def test_inputs_without_limits_are_null_in_json_and_said_in_csv(tmp_path):
+    w = make(tmp_path / "w", config=CONFIG.replace("force = [-5.0, 5.0]", ""))
+    document = json.loads(exported(w, tmp_path, "json").read_text())
+    assert document["low"] == [None] and document["high"] == [None]
+    text = exported(w, tmp_path, "csv").read_text()
+    assert "limits [none, none]" in text or "limits [-inf, inf]" in text
+    assert np.isinf(load(exported(w, tmp_path, "npz")).policy.low).all()
+
+
+def test_a_csv_is_read_by_any_reader_that_skips_hashes(tmp_path):
+    w = make(tmp_path / "w", "car-circle")
+    lines = exported(w, tmp_path, "csv").read_text().splitlines()
+    head = [line for line in lines if line.startswith("#")]
+    assert head == lines[: len(head)]  # all before the header
+    rows = list(csv.DictReader(lines[len(head) :]))
+    policy = w.candidate("c0001")[0].policy
+    gain = np.array(
+        [
+            [[float(r[f"gain.{u}.{z}"]) for z in policy.z_names] for u in policy.input_names]
+            for r in rows
+        ]
+    )
+    np.testing.assert_array_equal(gain, policy.gain)
+    assert any("psi" in line and "wrap" in line for line in head)
+    assert any("steering: limits" in line and "held before the start" in line for line in head)
+
+
+def test_the_same_candidate_is_the_same_file(tmp_path):
+    w = make(tmp_path / "w")
+    for form in ("json", "csv", "npz"):
+        path = exported(w, tmp_path, form)
+        first = path.read_bytes()
+        export_candidate(w, "c0001", form, path)
+        if form != "npz":  # a zip holds the time
+            assert path.read_bytes() == first

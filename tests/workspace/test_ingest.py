@@ -1,0 +1,180 @@
+"""ingest: our own trials byte for byte, others through [log], each content once."""
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cli import grounded
+from grounded.errors import GroundedError
+from grounded.trial import Trial
+from grounded_trials.store.trial_file import TrialWriter, read_trial, trial_bytes, write_trial
+from grounded_trials.workspace.ingest import ingest_log
+from grounded_trials.workspace.proposing import propose_in, standing_in
+from grounded_trials.workspace.running import run_candidate
+from workspaces import CONFIG, make
+
+
+@pytest.fixture
+def w(tmp_path):
+    return make(tmp_path / "w")
+
+
+def run(w):
+    return run_candidate(w, propose_in(w).proposal.candidate.id)
+
+
+def plain(T=40, **changes):
+    fields = {
+        "states": np.column_stack([np.linspace(0, 1, T + 1), np.zeros(T + 1)]),
+        "inputs": np.zeros((T, 1)),
+        "dt": 0.05,
+        "state_names": ("x", "v"),
+        "input_names": ("force",),
+    }
+    return Trial(**fields | changes)
+
+
+def test_a_trial_of_ours_is_stored_byte_for_byte(w):
+    path = run(w)
+    found = ingest_log(w, path)
+    assert (w.folder / "trials").joinpath(
+        w.store.list()[0].path.name
+    ).read_bytes() == path.read_bytes()
+    assert (found.trial, found.candidate, found.known, found.accepted) == (
+        "t0001",
+        "c0001",
+        False,
+        True,
+    )
+    assert found.utility == w.task.utility(read_trial(path)[0])
+
+
+def test_a_simulated_run_is_a_function_of_the_seed_and_its_number(w):
+    first, again = run(w), run_candidate(w, "c0001")
+    assert (first.name, again.name) == ("c0001-1.mcap", "c0001-2.mcap")
+    assert first.read_bytes() == again.read_bytes()
+    ingest_log(w, first)
+    assert run_candidate(w, "c0001").read_bytes() != again.read_bytes()  # its number is in it
+
+
+def test_repeated_runs_of_a_noiseless_system_are_trials_of_their_own(tmp_path):
+    w = make(tmp_path / "w", config=CONFIG.replace("[search]", "[search]\nrepeats = 2"))
+    for known in (False, False):
+        assert ingest_log(w, run(w)).known is known
+    assert len(w.trials()) == 2 and standing_in(w).history[0].accepted is True
+
+
+def test_a_trial_that_does_not_say_what_it_ran_is_the_outstanding_ones(w, tmp_path):
+    propose_in(w)
+    write_trial(tmp_path / "t.mcap", plain(), {"kind": "trial"})
+    found = ingest_log(w, tmp_path / "t.mcap")
+    assert found.candidate == "c0001"
+    (stored,) = w.trials()
+    assert stored.meta["task"] == w.task.hash and stored.trial.candidate == "c0001"
+    again = ingest_log(w, tmp_path / "t.mcap", "c0001")
+    assert again.known and again.trial == found.trial
+
+
+def test_without_an_outstanding_candidate_it_must_be_named(w, tmp_path):
+    write_trial(tmp_path / "t.mcap", plain(), {"kind": "trial"})
+    with pytest.raises(GroundedError, match="none is waiting for a trial"):
+        ingest_log(w, tmp_path / "t.mcap")
+    with pytest.raises(GroundedError, match="c0001"):
+        ingest_log(w, tmp_path / "t.mcap", "c0001")
+    found = ingest_log(w, tmp_path / "t.mcap", data=True)
+    assert found.candidate == "" and found.utility is None and found.accepted is None
+    assert w.trials()[0].is_data
+
+
+def test_data_never_moves_the_search(w):
+    ingest_log(w, run(w))
+    before = propose_in(w).proposal.candidate
+    (w.folder / "candidates" / "c0002.mcap").unlink()
+    path = run_candidate(w, "c0001")
+    ingest_log(w, path, data=True)
+    after = propose_in(w).proposal.candidate
+    assert before.id == after.id == "c0002"
+    np.testing.assert_array_equal(before.policy.feedforward, after.policy.feedforward)
+    assert standing_in(w).trials == 1
+
+
+def test_a_run_of_another_task_is_kept_as_data_and_old_trials_are_ignored(w):
+    path = run(w)
+    ingest_log(w, path)
+    config = w.config.file.read_text()
+    w.config.file.write_text(config.replace("x = 10.0", "x = 11.0"))
+    other = type(w)(w.folder)
+    now = standing_in(other)
+    assert (now.phase, now.trials, now.utilities) == ("propose", 0, [])
+    made = propose_in(other).proposal.candidate
+    assert (made.id, made.base) == ("c0002", "")
+    w.config.file.write_text(config)
+    assert standing_in(type(w)(w.folder)).trials == 1  # and back again
+
+
+def test_a_recovered_trial_of_a_dead_robot_is_a_failed_candidate(w, tmp_path):
+    """The battery died: the file has no end. recover saves it, ingest takes it as a short run."""
+    propose_in(w)
+    path = tmp_path / "live.mcap"
+    code = (
+        "import os, numpy as np\nfrom grounded_trials.store.trial_file import TrialWriter\n"
+        f"w = TrialWriter({str(path)!r}, 0.05, {{'x': 'm', 'v': 'm/s'}}, {{'force': 'N'}}, {{}}, "
+        "candidate='c0001')\n"
+        "for k in range(30):\n    w.append(0.05 * k, np.zeros(2), np.zeros(1))\n"
+        "os._exit(9)\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=False)
+    refused = grounded("-C", w.folder, "ingest", path)
+    assert refused.code == 1 and "grounded recover" in refused.err
+    saved = grounded("recover", path, "-o", tmp_path / "saved.mcap", "--json")
+    assert saved.code == 3 and saved.json["messages"]["/state"] >= 20
+    done = grounded("-C", w.folder, "ingest", tmp_path / "saved.mcap", "--json")
+    assert done.code == 0, done.err
+    (trial,) = done.json["trials"]
+    assert trial["failed"] and trial["candidate"] == "c0001"
+    assert any("ended after" in warning for warning in trial["warnings"])
+
+
+def test_a_live_trial_is_the_trial_that_was_driven(w, tmp_path):
+    made = propose_in(w).proposal.candidate
+    whole = plain()
+    with TrialWriter(
+        tmp_path / "t.mcap", 0.05, {"x": "m", "v": "m/s"}, {"force": "N"}, {}, candidate=made.id
+    ) as writer:
+        for k in range(41):
+            writer.append(0.05 * k, whole.states[k], whole.inputs[k] if k < 40 else None)
+    ingest_log(w, tmp_path / "t.mcap")
+    np.testing.assert_array_equal(w.trials()[0].trial.states, whole.states)
+
+
+def test_gaps_are_stored_as_they_are_and_bridged_when_read(w, tmp_path):
+    made = propose_in(w).proposal.candidate
+    states = np.array(plain().states)
+    states[10:13] = np.nan
+    trial = plain(states=states, candidate=made.id)
+    write_trial(tmp_path / "t.mcap", trial, {"kind": "trial"})
+    found = ingest_log(w, tmp_path / "t.mcap")
+    assert "6 lost samples" in found.warnings[0] and np.isfinite(found.utility)
+    assert np.isnan(read_trial(w.store.list()[0].path)[0].states).sum() == 6
+    assert np.isfinite(w.trials()[0].trial.states).all()
+
+
+def test_equal_trials_are_equal_bytes(tmp_path):
+    about = {"kind": "trial"}
+    assert trial_bytes(plain(), about) == trial_bytes(plain(), about)
+    assert trial_bytes(plain(), about) != trial_bytes(replace(plain(), candidate="c1"), about)
+
+
+def test_a_trial_of_a_deleted_candidate_still_counts(w):
+    """Its file is lost, but the trial carries the policy that was run."""
+    path = run(w)
+    ingest_log(w, path)
+    Path(w.candidate_path("c0001")).unlink()
+    fresh = type(w)(w.folder)
+    assert standing_in(fresh).incumbent.candidate.id == "c0001"
+    again = run_candidate(fresh, "c0001")
+    assert ingest_log(fresh, again).candidate == "c0001"

@@ -1,0 +1,283 @@
+"""The last line of an output is the command to type next, the same one wherever it is asked."""
+
+import json
+import shlex
+from pathlib import Path
+
+import click
+import pytest
+
+from cli import grounded, plain, process
+from grounded_cli import address
+from grounded_cli.main import COMMANDS, cli
+from grounded_trials.wording import folded
+from grounded_trials.workspace.config import set_in_model
+from grounded_trials.workspace.diagnosis_file import diagnosis_of
+from grounded_trials.workspace.folder import Workspace
+from grounded_trials.workspace.next_step import since_diagnosis
+from reported import DIAGNOSIS, cart, copied
+from workspaces import make
+
+__all__ = ["cart"]
+
+
+def last(done):
+    """The command of the `next:` line, a continued one in one piece."""
+    assert done.code == 0, done.err
+    text = plain(done.out).rstrip().splitlines()[-1]
+    assert text.startswith("next: ")
+    return text.removeprefix("next: ")
+
+
+def diagnosed(folder: Path, **changes):
+    document = {**DIAGNOSIS, **changes}
+    (folder / "reports" / "diagnosis.json").write_text(json.dumps(document))
+
+
+@pytest.mark.parametrize("command", ["status", "report", "learn", "propose"])
+def test_every_command_says_the_same_once_the_search_has_ended(cart, command):
+    assert last(grounded("-C", cart, command)) == "grounded adopt viscous_friction:v"
+
+
+def test_all_claimed_effects_are_adopted_at_once(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    names = ["viscous_friction:v", "delay:force"]
+    late = DIAGNOSIS["ranking"][1] | {"params": {"d": {"value": 0.02, "std": 0.01, "unit": "s"}}}
+    verdict = {"kind": "several", "effects": names, "sentence": "Two."}
+    diagnosed(folder, verdict=verdict, ranking=[DIAGNOSIS["ranking"][0], late])
+    command = last(grounded("-C", folder, "status"))
+    assert command == "grounded adopt viscous_friction:v delay:force"
+    done = grounded("-C", folder, *shlex.split(command)[1:], "--json").json
+    assert [effect["name"] for effect in done["effects"]] == names
+    assert done["params"] == {"mass": 1.4}
+    assert last(grounded("-C", folder, "status")) == "grounded propose"
+
+
+def test_nothing_is_adopted_where_one_name_is_wrong(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    before = (folder / "grounded.toml").read_text()
+    done = grounded("-C", folder, "adopt", "viscous_friction:v", "delay:forse")
+    assert done.code == 1 and "did you mean 'delay:force'" in done.err
+    assert (folder / "grounded.toml").read_text() == before
+
+
+def test_numbers_that_are_wrong_are_fitted(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    verdict = {"kind": "effect", "effects": ["parameter:mass"], "sentence": "One."}
+    diagnosed(folder, verdict=verdict)
+    assert last(grounded("-C", folder, "status")) == "grounded fit"
+
+
+def test_a_diagnosis_of_another_model_is_made_again(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    diagnosed(folder, diagnosed={"trials": [], "adopted": [], "params": {"mass": 9.0}})
+    assert last(grounded("-C", folder, "status")) == "grounded diagnose"
+
+
+def test_nothing_claimed_nothing_to_adopt(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    diagnosed(folder, verdict={"kind": "none", "effects": [], "sentence": "None."})
+    assert last(grounded("-C", folder, "status")) == "grounded export best --format npz"
+
+
+def test_a_damaged_diagnosis_is_made_again(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    (folder / "reports" / "diagnosis.json").write_text("[")
+    assert last(grounded("-C", folder, "status")) == "grounded diagnose"
+
+
+def test_a_new_workspace_begins_with_propose(tmp_path):
+    folder = make(tmp_path / "w").folder
+    assert last(grounded("-C", folder, "status")) == "grounded propose"
+
+
+def test_what_logs_have_shown_is_adopted_before_the_first_candidate(cart, tmp_path):
+    folder = make(tmp_path / "w").folder
+    (folder / "reports").mkdir()
+    diagnosed(folder)
+    assert last(grounded("-C", folder, "status")) == "grounded adopt viscous_friction:v"
+    assert grounded("-C", folder, "adopt", "viscous_friction:v").code == 0
+    assert last(grounded("-C", folder, "status")) == "grounded propose"
+
+
+def test_a_long_command_is_broken_where_a_shell_allows_it():
+    names = [f"first_order_lag:input_number_{k}" for k in range(6)]
+    command = " ".join(["grounded adopt", *names])
+    text = folded(command)
+    assert max(map(len, text.splitlines())) <= 80
+    assert shlex.split(text.removeprefix("next: ").replace("\\\n", " ")) == command.split()
+    assert folded("grounded run") == "next: grounded run"
+    quoted = folded("grounded -C 'my own folder' " + command.removeprefix("grounded "))
+    assert shlex.split(quoted.replace("\\\n", " "))[3] == "my own folder"
+
+
+def test_printed_commands_work_from_where_the_user_is(tmp_path):
+    make(tmp_path / "my cart")
+    for at in (("-C", "my cart", "propose"), ("propose", "-C", "my cart")):
+        done = process(*at, cwd=tmp_path)
+        assert done.out.endswith("\nnext: grounded -C 'my cart' run\n"), done.out
+    for expected in ("ingest", "propose"):
+        words = shlex.split(done.out.rstrip().replace("\\\n", " ").splitlines()[-1])
+        done = process(*words[2:], cwd=tmp_path)
+        assert done.code == 0, done.err
+        assert f"next: grounded -C 'my cart' {expected}" in done.out
+    assert process("propose", cwd=tmp_path / "my cart").out.endswith("next: grounded run\n")
+
+
+def test_a_command_that_is_broken_over_two_lines_is_completed_too():
+    context = click.Context(cli)
+    with context:
+        address.remember(context, "w")
+        text = "one\n  run `grounded\n  diagnose` again"
+        assert address.addressed(text) == "one\n  run `grounded -C w\n  diagnose` again"
+
+
+def test_an_error_names_the_workspace_too_and_init_does_not(tmp_path):
+    make(tmp_path / "cart")
+    done = process("-C", "cart", "adopt", "delay:force", cwd=tmp_path)
+    assert "run `grounded -C cart diagnose` first" in done.err
+    done = process("-C", "cart", "init", "new", "--example", "pendulum", cwd=tmp_path)
+    assert "next: cd new && grounded propose" in done.out
+
+
+def test_the_commands_that_take_a_folder_are_those_that_are_printed_with_it():
+    found = []
+    with click.Context(cli) as ctx:
+        for name in COMMANDS:
+            command = cli.get_command(ctx, name)
+            if any("-C" in option.opts for option in command.params):
+                found.append(name)
+    assert tuple(found) == tuple(n for n in COMMANDS if n in address.COMMANDS)
+    assert set(found) == set(address.COMMANDS)
+
+
+# after a diagnosis
+
+
+def taken_in(folder, *numbers):
+    """Ids of the trials that a diagnosis is said to be made from."""
+    return {"trials": [f"t{k:04d}" for k in numbers], "adopted": [], "params": {}}
+
+
+def test_trials_that_came_after_a_diagnosis_make_it_old(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    count = len(list(folder.glob("trials/*.mcap")))
+    diagnosed(folder, diagnosed=taken_in(folder, *range(1, count + 1)))
+    assert last(grounded("-C", folder, "status")) == "grounded adopt viscous_friction:v"
+    assert "diagnosed with" not in grounded("-C", folder, "report").out
+    diagnosed(folder, diagnosed=taken_in(folder, 1, 2))
+    words = f"diagnosed with 2 of {count} trials; run `grounded diagnose` again"
+    for command in ("status", "report"):
+        done = grounded("-C", folder, command)
+        assert words in " ".join(plain(done.out).split())
+        assert last(done) == "grounded diagnose"
+    page = Path(grounded("-C", folder, "report", "--html", "--json").json["paths"]["html"])
+    assert f"Diagnosed with 2 of {count} trials" in page.read_text()
+
+
+def test_what_was_adopted_is_not_missing_any_more(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    names = ["viscous_friction:v", "delay:force"]
+    verdict = {"kind": "several", "effects": names, "sentence": "Friction; late."}
+    diagnosed(folder, verdict=verdict, diagnosed=taken_in(folder, 1, 2, 3, 4))
+    assert grounded("-C", folder, "adopt", "viscous_friction:v").code == 0
+    out = " ".join(plain(grounded("-C", folder, "report").out).split())
+    assert "adopted since: viscous_friction:v, but not delay:force; run `grounded dia" in out
+    assert "before that: Friction; late." in out
+    assert "crude model" not in out and "what the model without adopted effects lacks" in out
+    page = Path(grounded("-C", folder, "report", "--html", "--json").json["paths"]["html"])
+    text = page.read_text()
+    assert "Before that: Friction" in text and "viscous_friction:v (adopted since)" in text
+    assert "crude model" not in text
+    assert "adopted since" in " ".join(grounded("-C", folder, "status").out.split())
+
+
+def test_nothing_is_said_of_what_one_trial_can_not_know(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    why = "one trial alone confirms nothing; run a second one"
+    verdict = {"kind": "unknown", "effects": [], "sentence": f"No cause is named: {why}."}
+    diagnosed(folder, verdict=verdict, unknowable=[why])
+    done = grounded("-C", folder, "report")
+    assert why in done.out and last(done) == "grounded run best"
+    for words in ("after", "is explained", "delay:force"):
+        assert words not in done.out[done.out.index("gap to the model") :], words
+    page = Path(grounded("-C", folder, "report", "--html", "--json").json["paths"]["html"])
+    assert "of the squared error" not in page.read_text()
+    assert last(grounded("-C", folder, "status")) == "grounded run best"
+
+
+def test_diagnose_of_one_trial_asks_for_another(tmp_path):
+    folder = make(tmp_path / "w").folder
+    assert grounded("-C", folder, "learn", "--trials", 1).code == 0
+    done = grounded("-C", folder, "diagnose")
+    assert "No cause is named" in done.out and last(done) == "grounded propose"
+    assert "before, " not in done.out and "is explained" not in done.out
+
+
+# adopt
+
+
+def test_rivals_are_not_adopted_together(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    before = (folder / "grounded.toml").read_text()
+    done = grounded("-C", folder, "adopt", "viscous_friction:v", "delay:force")
+    assert done.code == 1 and "does not claim delay:force" in done.err
+    assert "one instead of another" in done.err
+    assert "`grounded adopt viscous_friction:v`, or `grounded adopt delay:force`" in plain(done.err)
+    assert (folder / "grounded.toml").read_text() == before
+
+
+def test_one_unclaimed_effect_comes_without_the_parameters_of_others(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    entry = DIAGNOSIS["ranking"][1] | {"params": {"d": {"value": 0.02, "std": 0.01, "unit": "s"}}}
+    diagnosed(folder, ranking=[DIAGNOSIS["ranking"][0], entry])
+    done = grounded("-C", folder, "adopt", "delay:force")
+    assert done.code == 0 and "was not claimed by the last diagnosis" in done.err
+    assert "mass" not in done.out and "params" not in (folder / "grounded.toml").read_text()
+
+
+def test_adopt_prints_every_parameter_that_it_writes(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    same = {"value": 0.2, "std": 0.02, "unit": "N s/m"}
+    diagnosed(folder, parameters=DIAGNOSIS["parameters"] | {"drag": same})
+    out = grounded("-C", folder, "adopt", "viscous_friction:v").out
+    assert "mass       1.000 -> 1.400 kg" in out and "drag       0.2000 -> 0.2000 N s/m" in out
+    assert "[model] params" in " ".join(grounded("adopt", "-h").out.split())
+
+
+def test_nothing_is_adopted_where_too_little_is_known(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    why = "one trial alone confirms nothing; run a second one"
+    verdict = {"kind": "unknown", "effects": [], "sentence": f"No cause is named: {why}."}
+    diagnosed(folder, verdict=verdict, unknowable=[why])
+    done = grounded("-C", folder, "adopt", "viscous_friction:v")
+    assert done.code == 1 and "too little is known" in done.err and "run another trial" in done.err
+
+
+def test_a_candidate_that_another_replaces_is_said_to_be_void(tmp_path):
+    folder = make(tmp_path / "w").folder
+    assert grounded("-C", folder, "learn", "--trials", 1).code == 0
+    assert "void" not in grounded("-C", folder, "propose").err
+    (folder / "reports").mkdir(exist_ok=True)
+    diagnosed(folder)
+    assert grounded("-C", folder, "adopt", "viscous_friction:v").code == 0
+    done = grounded("-C", folder, "propose")
+    assert "c0002 was not run and is void" in done.err and "Run c0003" in done.out
+    assert "void" not in grounded("-C", folder, "propose").err  # it is said once
+
+
+def test_a_delay_more_than_the_adopted_one_is_open_until_it_is_adopted(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    then = {"name": "delay:force", "d": 0.01}
+    made = {"trials": [], "adopted": [then], "params": {}}
+    verdict = {"kind": "effect", "effects": ["delay:force"], "sentence": "Later still."}
+    found = diagnosis_of(DIAGNOSIS | {"verdict": verdict, "diagnosed": made})
+    assert found.open([then]) == ("delay:force",)
+    assert found.open([then | {"d": 0.03}]) == ()
+    workspace = Workspace(folder)
+    assert since_diagnosis(workspace, found, []).changed  # the cart has no effect at all
+    set_in_model(workspace.config.file, effects=[then | {"d": 0.03}])
+    since = since_diagnosis(Workspace(folder), found, [])
+    assert since.changed and since.adopted == ("delay:force",)
+    set_in_model(workspace.config.file, effects=[then])
+    assert since_diagnosis(Workspace(folder), found, []).sentence == ""

@@ -1,0 +1,312 @@
+"""CDR (ROS 2) and ROS 1 messages as nodes: one cursor a message, moved over the type's fields.
+
+Both encodings are the fields one after the other. CDR pads every number to a multiple of its size
+(at most 8, or 4 in its second version), counted from the start of the message; ROS 1 does not. So
+the size of anything without texts and lists depends only on where it starts modulo 8: a table of
+eight sizes moves all cursors over it at once, and doubling the table moves them over 2^k items.
+Lists and texts begin with their count. Nothing is read that is not on the way.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from grounded_trials.formats.mcap_records import windows
+from grounded_trials.formats.messages import (
+    ROW_LIMIT,
+    Array,
+    BadMessage,
+    BadPath,
+    Bools,
+    Field,
+    Floats,
+    Ints,
+    Number,
+    Struct,
+    Text,
+    Type,
+    choose_items,
+    texts_equal,
+)
+
+ITEM_LIMIT = 100_000  # items of a list whose sizes differ: they are stepped over one by one
+ZSTD = b"\x28\xb5\x2f\xfd"  # a message that rosbag2 compressed by itself
+SIZE_LIMIT = 2**40  # [bytes] of a type; positions must not overflow
+
+
+@dataclass(frozen=True)
+class Coding:
+    """How numbers lie in a message."""
+
+    align: int  # largest multiple that numbers are padded to
+    order: str  # "<" or ">"
+    terminated: bool  # texts end with a zero byte, and an empty struct is one byte
+
+
+ROS1 = Coding(1, "<", False)
+_KINDS = {
+    0: Coding(8, ">", True),
+    1: Coding(8, "<", True),
+    6: Coding(4, ">", True),
+    7: Coding(4, "<", True),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class CdrNode:
+    """Row i is the value of `type` at buffer[pos[i]], in a message from base[i] to end[i]."""
+
+    buffer: bytes
+    coding: Coding
+    type: Type
+    rows: Ints
+    base: Ints
+    pos: Ints
+    end: Ints
+
+    def keep(self, chosen: Bools) -> CdrNode:
+        """See `nodes.Node`."""
+        return self._pick(self.type, np.flatnonzero(chosen))
+
+    def numbered(self, rows: Ints) -> CdrNode:
+        """See `nodes.Node`."""
+        return replace(self, rows=rows)
+
+    def names(self) -> tuple[str, ...]:
+        """See `nodes.Node`."""
+        return tuple(self.type.by_name) if isinstance(self.type, Struct) else ()
+
+    def field(self, name: str) -> CdrNode:
+        """See `nodes.Node`."""
+        assert isinstance(self.type, Struct)
+        node = self
+        for part in _before(self.type, name, self.coding):
+            node = node._at(node._after(part))
+        return replace(node, type=self.type.by_name[name].type)
+
+    def items(self, start: int, stop: int) -> CdrNode:
+        """See `nodes.Node`."""
+        assert isinstance(self.type, Array)
+        item = self.type.item
+        counts, body = self._counts()
+        row, index = choose_items(counts, start, stop)
+        if len(row) > ROW_LIMIT:
+            raise BadPath(f"it finds {len(row)} values at once; name the items that are meant")
+        inside = body._pick(item, row)
+        sizes = _sizes(item, self.coding)
+        if sizes is not None:
+            return inside._at(inside._over(sizes, index))
+        return inside._at(body._positions(item, row, index))
+
+    def numbers(self) -> Floats:
+        """See `nodes.Node`."""
+        assert isinstance(self.type, Number)
+        kind = "u1" if self.type.kind == "b1" else self.type.kind
+        values = self._aligned(self.type.size)._read(kind)
+        return np.asarray(values != 0 if self.type.kind == "b1" else values, dtype=np.float64)
+
+    def equals(self, text: str) -> Bools:
+        """See `nodes.Node`."""
+        counts, body = self._counts()
+        length = counts.copy()
+        if self.coding.terminated:
+            octets = np.frombuffer(self.buffer, dtype=np.uint8)
+            last = octets[np.maximum(body.pos + counts - 1, 0)]
+            length -= (counts > 0) & (last == 0)
+        return texts_equal(self.buffer, body.pos, length, text.encode())
+
+    def _pick(self, type: Type, row: Ints) -> CdrNode:
+        return CdrNode(
+            self.buffer,
+            self.coding,
+            type,
+            self.rows[row],
+            self.base[row],
+            self.pos[row],
+            self.end[row],
+        )
+
+    def _at(self, pos: Ints) -> CdrNode:
+        return replace(self, pos=pos)
+
+    def _aligned(self, size: int) -> CdrNode:
+        multiple = min(size, self.coding.align)
+        return self._at(self.pos + ((self.base - self.pos) & (multiple - 1)))
+
+    def _read(self, kind: str) -> NDArray[np.generic]:
+        """The numbers at the cursors, which are aligned."""
+        size = int(kind[1:])
+        self._check(self.pos + size)
+        return windows(self.buffer, self.coding.order + kind)[self.pos]
+
+    def _check(self, stop: Ints) -> None:
+        over = (stop > self.end) | (self.pos < self.base)
+        if over.any():
+            raise BadMessage(self.rows[over][0], f"it ends inside a {self.type}")
+
+    def _counts(self) -> tuple[Ints, CdrNode]:
+        """How many items a list or text has, and the cursors at the first."""
+        if isinstance(self.type, Array) and self.type.count is not None:
+            return np.full(len(self.rows), self.type.count, dtype=np.int64), self
+        node = self._aligned(4)
+        counts = node._read("u4").astype(np.int64)
+        body = node._at(node.pos + 4)
+        body._check(body.pos + counts)  # an item has a byte at least
+        return counts, body
+
+    def _after(self, part: Type | _Table) -> Ints:
+        """Where a value of this type ends."""
+        if isinstance(part, _Table):
+            return self._over(part, None)
+        node = replace(self, type=part)
+        if isinstance(part, Struct):
+            for inner in _parts(part.fields, self.coding):
+                node = node._at(node._after(inner))
+            return node.pos
+        assert isinstance(part, Text | Array)
+        counts, body = node._counts()
+        if isinstance(part, Text):
+            if part.unit == 0:
+                raise BadPath("it lies behind a wstring, whose size is not agreed on")
+            return body.pos + counts
+        sizes = _sizes(part.item, self.coding)
+        if sizes is not None:
+            return body._over(sizes, counts)
+        return body._positions(part.item, np.arange(len(counts)), counts)
+
+    def _over(self, table: _Table, count: Ints | None) -> Ints:
+        """The cursors moved over `count` values of fixed size (None: one)."""
+        if count is None:
+            return np.asarray(self.pos + table.once[(self.pos - self.base) & 7])
+        pos = self.pos.copy()
+        for bit in range(int(count.max(initial=0)).bit_length()):
+            at = (count >> bit) & 1 != 0
+            pos[at] += table.times(bit)[(pos[at] - self.base[at]) & 7]
+        self._check(pos)
+        return pos
+
+    def _positions(self, item: Type, row: Ints, index: Ints) -> Ints:
+        """Where item index[j] of the list that starts at row[j]'s cursor lies."""
+        last = int(index.max(initial=0))
+        if last > ITEM_LIMIT:
+            raise BadMessage(self.rows[0], f"it has a list of more than {ITEM_LIMIT} {item}")
+        found = self.pos[row]
+        node = replace(self, type=item)
+        order = np.argsort(index, kind="stable")
+        ends = np.searchsorted(index[order], np.arange(last + 1), "right")
+        for i in range(last):
+            live = np.unique(row[order[ends[i] :]])
+            moved = node._pick(item, live)
+            pos = node.pos.copy()
+            pos[live] = moved._after(item)
+            node = node._at(pos)
+            here = order[ends[i] : ends[i + 1]]
+            found[here] = pos[row[here]]
+        return found
+
+
+class _Table:
+    """Sizes of a value for each start modulo 8, and of 2^k such values in a row."""
+
+    def __init__(self, once: tuple[int, ...]) -> None:
+        if max(once) > SIZE_LIMIT:
+            raise BadPath(f"its type is larger than {SIZE_LIMIT} bytes")
+        self.once = np.array(once, dtype=np.int64)
+        self.powers = [self.once]
+
+    def times(self, k: int) -> Ints:
+        """Sizes of 2^k values in a row, (8,)."""
+        while len(self.powers) <= k:
+            half = self.powers[-1]
+            self.powers.append(half + half[(np.arange(8) + half) & 7])
+        return self.powers[k]
+
+
+@lru_cache(maxsize=4096)
+def _sizes(type: Type, coding: Coding) -> _Table | None:
+    """The table of a type of fixed size; None where texts and lists decide."""
+    if isinstance(type, Number):
+        multiple = min(type.size, coding.align)
+        return _Table(tuple((-m) % multiple + type.size for m in range(8)))
+    if isinstance(type, Array) and type.count is not None:
+        item = _sizes(type.item, coding)
+        if item is None:
+            return None
+        total = np.zeros(8, dtype=np.int64)
+        for bit in range(type.count.bit_length()):
+            if type.count >> bit & 1 and total.max() <= SIZE_LIMIT:
+                total = total + item.times(bit)[(np.arange(8) + total) & 7]
+        return _Table(tuple(total.tolist()))
+    if not isinstance(type, Struct):
+        return None
+    if not type.fields:
+        return _Table((int(coding.terminated),) * 8)
+    total = np.zeros(8, dtype=np.int64)
+    for field in type.fields:
+        sizes = _sizes(field.type, coding)
+        if sizes is None:
+            return None
+        total = total + sizes.once[(np.arange(8) + total) & 7]
+    return _Table(tuple(total.tolist()))
+
+
+@lru_cache(maxsize=4096)
+def _before(type: Struct, name: str, coding: Coding) -> tuple[Type | _Table, ...]:
+    """What a cursor moves over to reach a field."""
+    index = [field.name for field in type.fields].index(name)
+    return _parts(type.fields[:index], coding)
+
+
+@lru_cache(maxsize=4096)
+def _parts(fields: tuple[Field, ...], coding: Coding) -> tuple[Type | _Table, ...]:
+    """Fields as the fewest steps: those of fixed size next to each other are one table."""
+    parts: list[Type | _Table] = []
+    for field in fields:
+        sizes = _sizes(field.type, coding)
+        if sizes is None:
+            parts.append(field.type)
+        elif parts and isinstance(parts[-1], _Table):
+            before = parts[-1].once
+            total = before + sizes.once[(np.arange(8) + before) & 7]
+            parts[-1] = _Table(tuple(total.tolist()))
+        else:
+            parts.append(sizes)
+    return tuple(parts)
+
+
+def ros1_messages(buffer: bytes, type: Struct, start: Ints, end: Ints) -> CdrNode:
+    """ROS 1 messages of one type at buffer[start[i]:end[i]] as the root of a path."""
+    return CdrNode(buffer, ROS1, type, np.arange(len(start)), start, start, end)
+
+
+def cdr_messages(buffer: bytes, type: Struct, start: Ints, end: Ints) -> CdrNode:
+    """CDR messages of one type at buffer[start[i]:end[i]] as the root of a path.
+
+    Raises:
+        BadMessage: for a message without a header, or in a variant of CDR that can't be read.
+    """
+    short = end - start < 4
+    if short.any():
+        raise BadMessage(int(np.argmax(short)), "it is shorter than its 4 bytes of header")
+    octets = np.frombuffer(buffer, dtype=np.uint8)
+    kinds = octets[start + 1]
+    if len(kinds):
+        other = kinds != kinds[0]
+        if other.any():
+            raise BadMessage(int(np.argmax(other)), "its variant of CDR is not that of the others")
+        if buffer[start[0] : start[0] + 4] == ZSTD:
+            raise BadMessage(
+                0,
+                "it is compressed by itself; use `ros2 bag convert` with compression_mode none",
+            )
+        if int(kinds[0]) not in _KINDS or octets[start].any():
+            raise BadMessage(
+                0, f"its variant of CDR, {int(kinds[0])}, can't be read (plain CDR can)"
+            )
+    coding = _KINDS[int(kinds[0])] if len(kinds) else _KINDS[1]
+    base = start + 4
+    return CdrNode(buffer, coding, type, np.arange(len(start)), base, base, end)

@@ -1,0 +1,197 @@
+"""Writing MCAP: protobuf channels of named doubles, a table of strings, attached files.
+
+The only importer of the mcap package. Files are not compressed: a trial is small, its numbers
+compress badly, and so equal input gives equal bytes whatever the version of a compressor.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping, Sequence
+from typing import IO, Any
+
+import numpy as np
+
+from grounded.frozen import Array
+from grounded_trials.formats.mcap_records import (
+    Attachment,
+    Channel,
+    Header,
+    Messages,
+    Metadata,
+    Schema,
+)
+
+LIBRARY = "grounded"
+
+
+class LogWriter:
+    """Writes one file: metadata and attachments first, then messages, flushed in time."""
+
+    def __init__(self, stream: IO[bytes]) -> None:
+        from mcap.writer import CompressionType, Writer
+
+        self._stream = stream
+        self._writer = Writer(stream, compression=CompressionType.NONE, enable_data_crcs=True)
+        self._writer.start(profile="", library=LIBRARY)
+        self._sequences: dict[int, int] = {}
+
+    def metadata(self, name: str, table: Mapping[str, str]) -> None:
+        """Adds a table of strings."""
+        self._writer.add_metadata(name, dict(table))
+
+    def attachment(self, name: str, media_type: str, data: bytes) -> None:
+        """Adds a file."""
+        self._writer.add_attachment(0, 0, name, media_type, data)
+
+    def channel(
+        self, topic: str, message: str, names: Sequence[str], *, repeated: bool = False
+    ) -> int:
+        """Opens a protobuf channel; its message has one double (or list of doubles) a name."""
+        descriptor = file_descriptor_set(message, names, repeated=repeated)
+        schema = self._writer.register_schema(f"grounded.{message}", "protobuf", descriptor)
+        return self._writer.register_channel(topic, "protobuf", schema)
+
+    def message(self, channel: int, time_ns: int, data: bytes) -> None:
+        """Adds a message that was sampled, and logged, at `time_ns`."""
+        sequence = self._sequences.get(channel, 0)
+        self._sequences[channel] = sequence + 1
+        self._writer.add_message(channel, time_ns, data, time_ns, sequence)
+
+    def flush(self) -> None:
+        """Hands everything written so far to the operating system."""
+        self._writer.flush()  # type: ignore[no-untyped-call]
+
+    def finish(self) -> None:
+        """Ends the file; the stream stays open."""
+        self._writer.finish()  # type: ignore[no-untyped-call]
+        self._stream.flush()
+
+
+class CopyWriter:
+    """Writes records as they were read; ids are given anew."""
+
+    def __init__(self, stream: IO[bytes], header: Header, *, compressed: bool) -> None:
+        from mcap.writer import CompressionType, Writer
+
+        kind = CompressionType.ZSTD if compressed else CompressionType.NONE
+        self._stream = stream
+        self._writer = Writer(stream, compression=kind, enable_data_crcs=True)
+        self._writer.start(profile=header.profile, library=header.library)
+        self._schemas: dict[Schema, int] = {}
+
+    def channel(self, channel: Channel, schema: Schema | None) -> int:
+        """Adds a channel with its schema; returns the id for its messages."""
+        number = 0
+        if schema is not None:
+            if schema not in self._schemas:
+                self._schemas[schema] = self._writer.register_schema(
+                    schema.name, schema.encoding, schema.data
+                )
+            number = self._schemas[schema]
+        return self._writer.register_channel(
+            channel.topic, channel.encoding, number, dict(channel.metadata)
+        )
+
+    def messages(self, batch: Messages, channel: int) -> None:
+        """Adds the messages of a batch, all of one channel."""
+        columns = (batch.starts, batch.ends, batch.log_times, batch.publish_times, batch.sequences)
+        rows = zip(*(column.tolist() for column in columns), strict=True)
+        for start, end, log_time, publish_time, sequence in rows:
+            data = batch.buffer[start:end]
+            self._writer.add_message(channel, log_time, data, publish_time, sequence)
+
+    def metadata(self, record: Metadata) -> None:
+        """Adds a table."""
+        self._writer.add_metadata(record.name, record.data)
+
+    def attachment(self, record: Attachment) -> None:
+        """Adds a file."""
+        self._writer.add_attachment(
+            record.create_time, record.log_time, record.name, record.media_type, record.data
+        )
+
+    def finish(self) -> None:
+        """Ends the file; the stream stays open."""
+        self._writer.finish()  # type: ignore[no-untyped-call]
+        self._stream.flush()
+
+
+def file_descriptor_set(message: str, names: Sequence[str], *, repeated: bool = False) -> bytes:
+    """A serialised FileDescriptorSet of one proto3 message of doubles, numbered from 1.
+
+    Written out here, by the numbers of google/protobuf/descriptor.proto: the protobuf package takes
+    longer to import than to say this.
+    """
+    label, double = (3 if repeated else 1), 1  # LABEL_REPEATED, LABEL_OPTIONAL; TYPE_DOUBLE
+    fields = [
+        _bytes(1, name.encode()) + _integer(3, number) + _integer(4, label) + _integer(5, double)
+        for number, name in enumerate(names, start=1)
+    ]
+    definition = _bytes(1, message.encode()) + b"".join(_bytes(2, field) for field in fields)
+    name = f"grounded/{message}.proto".encode()
+    file = _bytes(1, name) + _bytes(2, b"grounded") + _bytes(4, definition) + _bytes(12, b"proto3")
+    return _bytes(1, file)
+
+
+class DoublesEncoder:
+    """Protobuf messages of `count` doubles, numbered from 1.
+
+    Zeros are written too, so that every message has the same length and -0.0 survives.
+    """
+
+    def __init__(self, count: int) -> None:
+        tags = [_varint(number << 3 | 1) for number in range(1, count + 1)]
+        self._form = struct.Struct("<" + "".join(f"{len(tag)}sd" for tag in tags))
+        self._parts: list[bytes | float] = [0.0] * (2 * count)
+        self._parts[::2] = tags
+
+    def __call__(self, values: Array) -> bytes:
+        """The message of these values (count,)."""
+        self._parts[1::2] = values.tolist()
+        return self._form.pack(*self._parts)
+
+
+def encode_doubles(values: Array) -> list[bytes]:
+    """The messages of `DoublesEncoder` for many rows, (N, count)."""
+    tags = [_varint(number << 3 | 1) for number in range(1, values.shape[1] + 1)]
+    return _encoded(list(zip(tags, values.T[:, :, None], strict=True)), len(values))
+
+
+def encode_lists(lists: Sequence[Array]) -> list[bytes]:
+    """Messages of packed repeated doubles, numbered from 1; an empty list is absent.
+
+    Each list has a row for each message, (N, count).
+    """
+    fields = [
+        (_varint(number << 3 | 2) + _varint(8 * values.shape[1]), values)
+        for number, values in enumerate(lists, start=1)
+        if values.shape[1]
+    ]
+    return _encoded(fields, len(lists[0]))
+
+
+def _encoded(fields: Sequence[tuple[bytes, Array]], count: int) -> list[bytes]:
+    """Rows of fields, each the same prefix and then the row's doubles (N, ...)."""
+    parts = list[np.ndarray[Any, np.dtype[np.uint8]]]()
+    for prefix, values in fields:
+        data = np.ascontiguousarray(values, dtype="<f8").view(np.uint8)
+        parts += [np.tile(np.frombuffer(prefix, np.uint8), (count, 1)), data]
+    return [row.tobytes() for row in np.hstack(parts)]
+
+
+def _bytes(number: int, data: bytes) -> bytes:
+    return _varint(number << 3 | 2) + _varint(len(data)) + data
+
+
+def _integer(number: int, value: int) -> bytes:
+    return _varint(number << 3) + _varint(value)
+
+
+def _varint(value: int) -> bytes:
+    parts = bytearray()
+    while value > 0x7F:
+        parts.append(value & 0x7F | 0x80)
+        value >>= 7
+    parts.append(value)
+    return bytes(parts)

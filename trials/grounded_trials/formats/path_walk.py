@@ -1,0 +1,301 @@
+"""Applying a message path to messages: checked against their type once, then array operations.
+
+`bind` says whether a path fits a type, and where the time stamp of its value lies: in the deepest
+struct on the way that has a `header.stamp`, a `stamp` or a `timestamp`. `evaluate` walks nodes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from grounded.errors import nearest
+from grounded_trials.formats.message_path import (
+    ANGLES,
+    Field,
+    Filter,
+    Function,
+    MessagePath,
+    Slice,
+    Step,
+)
+from grounded_trials.formats.messages import (
+    Array,
+    BadPath,
+    Bools,
+    Dynamic,
+    Floats,
+    Ints,
+    Node,
+    Number,
+    Struct,
+    Text,
+    Type,
+)
+
+SECONDS, NANOSECONDS = ("sec", "secs", "seconds"), ("nanosec", "nsec", "nsecs", "nanos")
+STAMPS = (("header", "stamp"), ("stamp",), ("timestamp",), ("header", "timestamp"))
+QUATERNION = ("x", "y", "z", "w")
+
+
+@dataclass(frozen=True)
+class Bound:
+    """A path that fits a type: the steps to the struct with the stamp, and from there on."""
+
+    before: tuple[Step, ...]
+    after: tuple[Step, ...]
+    stamp: tuple[str, ...] | None  # names from that struct to the stamp; None: it has none
+    functions: tuple[Function, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Values:
+    """What a path found: values[i] in message rows[i], stamped stamps[i] [ns]."""
+
+    rows: Ints
+    values: Floats
+    stamps: Ints | None
+
+
+def bind(path: MessagePath, type: Type) -> Bound:
+    """Checks a path against the type of a topic's messages.
+
+    Raises:
+        BadPath: if it does not fit, naming the nearest that would.
+    """
+    split, stamp = 0, _stamp_in(type)
+    for i, step in enumerate(path.steps):
+        type = _into(type, step)
+        rest = path.steps[i + 1 :]
+        found = _stamp_in(type)
+        if found is not None and all(not isinstance(s, Slice) or s.is_index for s in rest):
+            split, stamp = i + 1, found
+    _check_end(type, path)
+    return Bound(path.steps[:split], path.steps[split:], stamp, path.functions)
+
+
+def _into(type: Type, step: Step) -> Type:
+    if isinstance(type, Dynamic):
+        return type
+    if isinstance(step, Slice):
+        if not isinstance(type, Array):
+            raise BadPath(f"a {type} has no items")
+        return type.item
+    names = (step.name,) if isinstance(step, Field) else step.path
+    inner: Type = type
+    for name in names:
+        inner = _field(inner, name)
+    if isinstance(step, Field):
+        return inner
+    wanted = Text if isinstance(step.value, str) else Number
+    if not isinstance(inner, wanted):
+        raise BadPath(f"the filter compares '{'.'.join(names)}', a {inner}, with {step.value!r}")
+    return type
+
+
+def _field(type: Type, name: str) -> Type:
+    if isinstance(type, Array):
+        raise BadPath(f"'{name}' is asked of a list; say of which item, as in [0] or [:]")
+    if not isinstance(type, Struct):
+        raise BadPath(f"'{name}' is asked of a {type}, which has no fields")
+    if name not in type.by_name:
+        raise BadPath(f"{type} has no field '{name}': {nearest(name, type.by_name)}")
+    return type.by_name[name].type
+
+
+def _check_end(type: Type, path: MessagePath) -> None:
+    if isinstance(type, Dynamic):
+        return
+    name = path.functions[0].name if path.functions else ""
+    if name in ANGLES:
+        fits = isinstance(type, Struct) and all(_is_number(type, part) for part in QUATERNION)
+        if not fits:
+            raise BadPath(f"@rpy needs a quaternion (x, y, z, w), found {type}")
+    elif name == "norm":
+        fits = isinstance(type, Array) and isinstance(type.item, Number)
+        if not fits and not (isinstance(type, Struct) and _numbers_of(type)):
+            raise BadPath(f"@norm needs a vector or a list of numbers, found {type}")
+    elif isinstance(type, Struct):
+        raise BadPath(f"it ends at a {type}; go on to one of: {', '.join(type.by_name)}")
+    elif isinstance(type, Array):
+        raise BadPath(f"it ends at a list, {type}; say which item, as in [0]")
+    elif not isinstance(type, Number):
+        raise BadPath(f"it ends at a {type}, not at a number")
+
+
+def _is_number(type: Struct, name: str) -> bool:
+    return name in type.by_name and isinstance(type.by_name[name].type, Number)
+
+
+def _numbers_of(type: Struct) -> list[str]:
+    return [field.name for field in type.fields if isinstance(field.type, Number)]
+
+
+def _stamp_in(type: Type) -> tuple[str, ...] | None:
+    """Names that lead from a struct to its time stamp."""
+    for names in STAMPS:
+        inner: Type = type
+        for name in names:
+            if not isinstance(inner, Struct) or name not in inner.by_name:
+                break
+            inner = inner.by_name[name].type
+        else:
+            if isinstance(inner, Struct) and is_time(inner):
+                return names
+    return None
+
+
+def is_time(type: Struct) -> bool:
+    """Whether a struct is a time: seconds and nanoseconds, by any of their names."""
+    names = tuple(type.by_name)
+    return len(names) == 2 and names[0] in SECONDS and names[1] in NANOSECONDS
+
+
+def evaluate(root: Node, bound: Bound, stamps: bool) -> Values:
+    """Walks the messages; reads the stamps too where asked for."""
+    node = walk(root, bound.before)
+    messages, numbered = node.rows, node.numbered(np.arange(len(node.rows)))
+    end = walk(numbered, bound.after)
+    rows, values = _apply(end, bound.functions)
+    names = _dynamic_stamp(numbered) if isinstance(root.type, Dynamic) else bound.stamp
+    if not stamps or names is None:
+        return Values(messages[rows], values, None)
+    place, times = read_stamp(walk(numbered, tuple(Field(name) for name in names)))
+    at = np.searchsorted(place, rows)
+    known = np.append(place, -1)[at] == rows
+    return Values(messages[rows[known]], values[known], times[at[known]])
+
+
+def _dynamic_stamp(root: Node) -> tuple[str, ...] | None:
+    """Names that lead to the stamp in JSON messages, whose first one tells."""
+    first = root.keep(np.arange(len(root.rows)) == 0)
+    for names in STAMPS:
+        found = walk(first, tuple(Field(name) for name in names)).names()
+        if any(n in found for n in SECONDS) and any(n in found for n in NANOSECONDS):
+            return names
+    return None
+
+
+def walk(node: Node, steps: Sequence[Step]) -> Node:
+    """Follows steps from a node."""
+    for step in steps:
+        if isinstance(step, Field):
+            node = node.field(step.name)
+        elif isinstance(step, Slice):
+            node = node.items(step.start, step.stop)
+        else:
+            node = node.keep(_passes(node, step))
+    return node
+
+
+def read_stamp(node: Node) -> tuple[Ints, Ints]:
+    """Rows and times [ns]; the parts may be named as ROS 1, ROS 2 or protobuf name them."""
+    names = node.names()
+    parts = [next((n for n in known if n in names), "") for known in (SECONDS, NANOSECONDS)]
+    if "" in parts:
+        none = np.zeros(0, dtype=np.int64)
+        return none, none
+    seconds, rest = (node.field(name) for name in parts)
+    both = np.isin(seconds.rows, rest.rows), np.isin(rest.rows, seconds.rows)
+    seconds, rest = seconds.keep(both[0]), rest.keep(both[1])
+    whole, part = (n.numbers() for n in (seconds, rest))
+    return seconds.rows, whole.astype(np.int64) * 10**9 + part.astype(np.int64)
+
+
+def _passes(node: Node, step: Filter) -> Bools:
+    """Where a filter holds; rows in which its field is absent do not pass."""
+    inner = node.numbered(np.arange(len(node.rows)))
+    for name in step.path:
+        inner = inner.field(name)
+    if isinstance(step.value, str):
+        holds = inner.equals(step.value)
+        holds = ~holds if step.operator == "!=" else holds
+    else:
+        holds = _COMPARE[step.operator](inner.numbers(), step.value)
+    passes = np.zeros(len(node.rows), dtype=np.bool_)
+    passes[inner.rows[holds]] = True
+    return passes
+
+
+_COMPARE: dict[str, Callable[[Floats, float], Bools]] = {
+    "==": lambda a, b: a == b,
+    "!=": lambda a, b: a != b,
+    "<": lambda a, b: a < b,
+    "<=": lambda a, b: a <= b,
+    ">": lambda a, b: a > b,
+    ">=": lambda a, b: a >= b,
+}
+
+
+def _apply(node: Node, functions: Sequence[Function]) -> tuple[Ints, Floats]:
+    """Values at the end of a path, through its functions: (rows, values)."""
+    first, rest = (functions[0].name, functions[1:]) if functions else ("", ())
+    if first in ANGLES:
+        rows, values = node.rows, _angle(first, [_part(node, name) for name in QUATERNION])
+    elif first == "norm":
+        rows, values = node.rows, _norm(node)
+    else:
+        rows, values, rest = node.rows, node.numbers(), tuple(functions)
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        for function in rest:
+            values = _FUNCTIONS[function.name](values, function.argument)
+    return rows, values
+
+
+def _part(node: Node, name: str) -> Floats:
+    """A number of a struct in each row; NaN where it is absent."""
+    inner = node.numbered(np.arange(len(node.rows))).field(name)
+    values = np.full(len(node.rows), np.nan)
+    values[inner.rows] = inner.numbers()
+    return values
+
+
+def _angle(name: str, quaternion: list[Floats]) -> Floats:
+    """Roll, pitch or yaw [rad] of R = Rz(yaw) Ry(pitch) Rx(roll); NaN of a zero quaternion."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        norm = np.sqrt(sum(q**2 for q in quaternion))
+        x, y, z, w = (q / norm for q in quaternion)
+    if name == "pitch":
+        return np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
+    if name == "roll":
+        return np.arctan2(2 * (w * x + y * z), 1 - 2 * (x**2 + y**2))
+    return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))
+
+
+def _norm(node: Node) -> Floats:
+    if isinstance(node.type, Struct):
+        names: Sequence[str] = _numbers_of(node.type)
+    else:
+        names = node.names()
+    if names:
+        return np.sqrt(sum((_part(node, name) ** 2 for name in names), np.zeros(len(node.rows))))
+    items = node.numbered(np.arange(len(node.rows))).items(0, -1)
+    squares = np.bincount(items.rows, items.numbers() ** 2, minlength=len(node.rows))
+    return np.sqrt(squares)
+
+
+_FUNCTIONS: dict[str, Callable[[Floats, float], Floats]] = {
+    "abs": lambda v, c: np.abs(v),
+    "negative": lambda v, c: -v,
+    "sign": lambda v, c: np.sign(v),
+    "sqrt": lambda v, c: np.sqrt(v),
+    "sin": lambda v, c: np.sin(v),
+    "cos": lambda v, c: np.cos(v),
+    "tan": lambda v, c: np.tan(v),
+    "asin": lambda v, c: np.arcsin(v),
+    "acos": lambda v, c: np.arccos(v),
+    "atan": lambda v, c: np.arctan(v),
+    "exp": lambda v, c: np.exp(v),
+    "log": lambda v, c: np.log(v),
+    "ceil": lambda v, c: np.ceil(v),
+    "floor": lambda v, c: np.floor(v),
+    "round": lambda v, c: np.round(v),
+    "deg2rad": lambda v, c: np.deg2rad(v),
+    "rad2deg": lambda v, c: np.rad2deg(v),
+    "add": lambda v, c: v + c,
+    "sub": lambda v, c: v - c,
+    "mul": lambda v, c: v * c,
+    "div": lambda v, c: v / c,
+}

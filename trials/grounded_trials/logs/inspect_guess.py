@@ -1,0 +1,230 @@
+"""A [log] table for an unknown log: which topic's which number is probably which state or input.
+
+Every number of the log is scored against every name: by the words in its path, by what robots
+usually call such a thing, by the shape of its type, and by whether it moves at all. States that
+lie in one message are preferred to states scattered over many. Where the best is not clearly
+better than the rest, the table says so and names the rest.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from grounded_trials.logs.inspect_report import FieldReport, LogReport, TopicReport
+
+SURE = 1.5  # how much better than the next topic's best a guess must be
+LEAST = 2.0  # below this score nothing is proposed
+DRIFT = 2e-4  # of a signal's range: the least deviation that is proposed for it
+SIMULATED_S = 1.0  # header stamps this far from the log's clock are not its time
+
+_YAW = ("@rpy.yaw", "yaw", "heading", "theta", "psi")
+_MEANINGS: dict[str, tuple[str, ...]] = {
+    "x": ("position.x", "translation.x", "x"),
+    "y": ("position.y", "translation.y", "y"),
+    "z": ("position.z", "translation.z", "z", "altitude", "height"),
+    "psi": _YAW,
+    "yaw": _YAW,
+    "heading": _YAW,
+    "theta": ("@rpy.pitch", "@rpy.yaw", "theta", "angle", "pitch"),
+    "pitch": ("@rpy.pitch", "pitch", "theta"),
+    "phi": ("@rpy.roll", "roll", "phi"),
+    "roll": ("@rpy.roll", "roll", "phi"),
+    "v": ("linear.x", "speed", "velocity", "vel", "v"),
+    "speed": ("speed", "linear.x", "velocity", "vel", "v"),
+    "u": ("linear.x", "u"),
+    "w": ("linear.z", "w"),
+    "p": ("angular.x", "angular_velocity.x", "p"),
+    "q": ("angular.y", "angular_velocity.y", "q"),
+    "r": ("angular.z", "angular_velocity.z", "yaw_rate", "r"),
+    "omega": ("angular.z", "angular_velocity.z", "yaw_rate", "omega"),
+    "yaw_rate": ("angular.z", "angular_velocity.z", "yaw_rate"),
+    "delta": ("steering_angle", "delta", "steering"),
+    "steering": ("steering", "steering_angle", "steer", "delta"),
+    "throttle": ("throttle", "gas", "accelerator", "acceleration", "motor"),
+    "thrust": ("thrust", "force.z", "throttle"),
+    "brake": ("brake",),
+    "torque": ("torque", "effort", "tau"),
+}
+_COMMANDED = ("ref", "desired", "des", "target", "setpoint", "goal", "cmd", "command")
+_ANGLES = ("roll", "pitch", "yaw")
+_QUATERNION = tuple(f"{name}.{part}" for name in ("orientation", "rotation") for part in "xyzw")
+_WORD = re.compile(r"[a-z]+")
+
+
+@dataclass(frozen=True)
+class Guess:
+    """What a state or input probably is in the log."""
+
+    name: str
+    path: str  # "" where nothing fits
+    clock: str
+    sure: bool
+    others: tuple[str, ...]  # what else it might be, best first
+    field: FieldReport | None = None
+
+    @property
+    def is_angle(self) -> bool:
+        """Whether its values come from an orientation and wrap."""
+        return self.path.endswith(tuple(f"@rpy.{angle}" for angle in _ANGLES))
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    score: float
+    topic: TopicReport
+    field: FieldReport
+
+
+def guess_mapping(
+    log: LogReport, states: Sequence[str], inputs: Sequence[str]
+) -> tuple[tuple[Guess, ...], tuple[Guess, ...]]:
+    """Guesses for the states and for the inputs, in their order."""
+    scored = {name: _candidates(log, name, is_input=False) for name in states}
+    homes = _homes(scored)
+    found = tuple(_choose(log, name, scored[name], homes) for name in states)
+    taken = {guess.path for guess in found}
+    rest = []
+    for name in inputs:
+        candidates = [c for c in _candidates(log, name, is_input=True) if c.field.path not in taken]
+        rest.append(_choose(log, name, candidates, {}))
+    return found, tuple(rest)
+
+
+def _candidates(log: LogReport, name: str, *, is_input: bool) -> list[_Candidate]:
+    found = []
+    for topic in log.topics:
+        for field in topic.fields:
+            score = _score(name, topic, field, is_input=is_input)
+            if score > 0:
+                found.append(_Candidate(score, topic, field))
+    return sorted(found, key=lambda c: -c.score)
+
+
+def _score(name: str, topic: TopicReport, field: FieldReport, *, is_input: bool) -> float:
+    path = field.path.lower()
+    inside = field.path[len(topic.topic) :].lower().strip('".')
+    best = _fit(name.lower(), inside, topic.topic.lower())
+    if best <= 0:
+        return 0.0
+    words = set(_WORD.findall(path))
+    commanded = any(word in words for word in _COMMANDED)
+    best += (0.5 if is_input else -2.0) * commanded
+    best -= 3.0 if field.low is None else 0.0
+    best -= 1.0 if field.low == field.high else 0.0
+    best -= 1.0 if topic.messages < 3 else 0.0
+    best -= 2.0 if field.not_finite > 0.1 * topic.messages else 0.0
+    best -= 2.0 if "covariance" in path or "layout" in path else 0.0
+    best -= 3.0 if inside.endswith(_QUATERNION) else 0.0  # a part of one says nothing alone
+    best += 0.5 if topic.stamped and not is_input else 0.0
+    return best
+
+
+def _fit(name: str, inside: str, topic: str) -> float:
+    """How well a name fits: by the end of the path, or by the topic where the path says nothing."""
+    best = 0.0
+    meanings = _MEANINGS.get(name, (name,))
+    for rank, meaning in enumerate((name, *meanings)):
+        worth = 4.0 - 0.3 * max(rank - 1, 0)
+        if inside == meaning or inside.endswith("." + meaning):
+            best = max(best, worth + (0.5 if "." in meaning else 0.0))
+        last = re.sub(r"[_\d]+$", "", topic.rsplit("/", 1)[-1])
+        if inside in ("data", "value") and last == meaning:
+            best = max(best, worth)
+        elif inside in ("data", "value") and meaning in _WORD.findall(last) and len(meaning) > 1:
+            best = max(best, worth - 1.0)
+    return best
+
+
+def _homes(scored: dict[str, list[_Candidate]]) -> dict[str, float]:
+    """Topics by how many states each could give; all from one message is better than scattered."""
+    homes: dict[str, float] = {}
+    for candidates in scored.values():
+        for topic in {c.topic.topic for c in candidates if c.score >= LEAST}:
+            homes[topic] = homes.get(topic, 0.0) + 0.75
+    return homes
+
+
+def _choose(
+    log: LogReport, name: str, candidates: list[_Candidate], homes: dict[str, float]
+) -> Guess:
+    ranked = sorted(candidates, key=lambda c: -(c.score + homes.get(c.topic.topic, 0.0) + _rate(c)))
+    ranked = [c for c in ranked if c.score >= LEAST]
+    if not ranked:
+        return Guess(name, "", "", False, tuple(c.field.path for c in candidates[:3]))
+    best = ranked[0]
+    value = best.score + homes.get(best.topic.topic, 0.0)
+    near = [c for c in ranked[1:] if c.score + homes.get(c.topic.topic, 0.0) > value - SURE]
+    clock = "header" if best.topic.stamped and not is_simulated(log) else "log"
+    others = tuple(c.field.path for c in near[:3])
+    return Guess(name, best.field.path, clock, not near, others, best.field)
+
+
+def _rate(candidate: _Candidate) -> float:
+    """A little for how often it comes, which decides between equals."""
+    return 0.1 * float(np.log10(1 + candidate.topic.rate_hz))
+
+
+def is_simulated(log: LogReport) -> bool:
+    """Whether header stamps are on another clock than the log, as in a simulation."""
+    return any(t.skew_s is not None and abs(t.skew_s) > SIMULATED_S for t in log.topics)
+
+
+def mapping_toml(
+    states: Sequence[Guess], inputs: Sequence[Guess], *, simulated: bool = False
+) -> str:
+    """The guesses as a [log] table, with a comment wherever a person should look."""
+    clock = "log" if simulated else "header"
+    lines = ["[log]", f'clock = "{clock}"']
+    if simulated:
+        lines[-1] += "  # header stamps are on another clock (simulation time?)"
+    for kind, guesses in (("state", states), ("input", inputs)):
+        for guess in guesses:
+            lines += ["", *_table(kind, guess, clock)]
+    lines += _estimate(states)
+    return "\n".join(lines) + "\n"
+
+
+def _table(kind: str, guess: Guess, clock: str) -> list[str]:
+    head = f"[log.{kind}.{guess.name}]"
+    others = f"; or {', '.join(guess.others)}" if guess.others else ""
+    if not guess.path:
+        what = "nothing in the log fits" + others
+        return [f"# {head}  # {what}"]
+    lines = [head if guess.sure else f"{head}  # unsure{others}"]
+    lines.append(f"path = {_quote(guess.path)}")
+    if guess.field is not None and guess.field.low is not None:
+        lines[-1] += f"  # {guess.field.low:.4g} to {guess.field.high:.4g} in this log"
+    if guess.clock != clock:
+        lines.append(f'clock = "{guess.clock}"')
+    if guess.is_angle and guess.path.endswith("yaw"):
+        lines.append("unwrap = true")
+    return lines
+
+
+def _estimate(states: Sequence[Guess]) -> list[str]:
+    """An [estimate] table for the states that nothing in the log gives."""
+    missing = [guess.name for guess in states if not guess.path]
+    known = [guess for guess in states if guess.path and guess.field is not None]
+    if not missing or not known:
+        return []
+    deviations = ", ".join(f"{guess.name} = {_deviation(guess):.1g}" for guess in known)
+    return [
+        "",
+        f"[estimate]  # the smoother finds {', '.join(missing)}",
+        f"measured = {{ {deviations} }}  # standard deviations; check them",
+    ]
+
+
+def _deviation(guess: Guess) -> float:
+    """Its noise in this log; not less than a small part of its range, since sensors drift too."""
+    assert guess.field is not None
+    low, high = guess.field.low or 0.0, guess.field.high or 0.0
+    return max(guess.field.noise, DRIFT * (high - low), 1e-6)
+
+
+def _quote(path: str) -> str:
+    return f"'{path}'" if '"' in path and "'" not in path else '"' + path.replace('"', '\\"') + '"'

@@ -1,0 +1,144 @@
+"""The [log] table of grounded.toml: how a foreign log maps to the model's states and inputs.
+
+A foreign log as a trial's arrays: what the [log] table asks for, read and resampled at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, cast
+
+from grounded.errors import GroundedError
+from grounded_trials.formats.message_path import parse_path
+from grounded_trials.logs.resample import Crossing, Gridded, Span, to_grid
+from grounded_trials.logs.signals import Clock, SignalSpec, read_signals
+from grounded_trials.toml_table import Table
+
+CLOCKS = ("header", "log", "publish")
+
+
+def log_mapping(table: Table, states: Sequence[str], inputs: Sequence[str]) -> LogMapping | None:
+    """The mapping, or None when there is no [log] table.
+
+    Raises:
+        GroundedError: for an unknown key or name, or a value of the wrong kind.
+    """
+    if not table.names():
+        return None
+    clock = table.choice("clock", CLOCKS, "header")
+    signals = {}
+    for kind, names in (("state", states), ("input", inputs)):
+        group = table.sub(kind)
+        signals[kind] = {name: _signal(group.sub(name), clock) for name in names if group.has(name)}
+        group.finish(names)
+    span = _span(table.sub("span"))
+    table.finish()
+    return LogMapping(states=signals["state"], inputs=signals["input"], span=span)
+
+
+def _signal(table: Table, clock: str) -> SignalSpec:
+    age = table.take("max_age_s", float) if table.has("max_age_s") else None
+    how = table.choice("resample", ("linear", "hold", ""), "")
+    spec = SignalSpec(
+        path=_path(table),
+        clock=cast(Clock, table.choice("clock", CLOCKS, clock)),
+        unwrap=table.take("unwrap", bool, False),
+        scale=table.take("scale", float, 1.0),
+        offset=table.take("offset", float, 0.0),
+        delay_s=table.take("delay_s", float, 0.0),
+        max_age_s=age,
+        resample=cast('Literal["linear", "hold"] | None', how or None),
+    )
+    table.finish()
+    if spec.max_age_s is not None and spec.max_age_s <= 0:
+        raise table.error("max_age_s", f"must be positive, found {spec.max_age_s:g}")
+    if spec.scale == 0:
+        raise table.error("scale", "must not be 0: the signal would say nothing")
+    return spec
+
+
+def _path(table: Table) -> str:
+    """The message path under `path`, known to be one."""
+    path: str = table.take("path", str)
+    try:
+        parse_path(path)
+    except GroundedError as error:
+        raise table.error("path", str(error)) from None
+    return path
+
+
+def _span(table: Table) -> Span:
+    start = _end(table, "start")
+    end = _end(table, "end")
+    table.finish()
+    if end == "first-input":
+        raise table.error("end", "must be a time in seconds or { path = ..., above = ... }")
+    return Span(start="first-input" if start is None else start, end=cast("Any", end))
+
+
+def _end(table: Table, key: str) -> Any:
+    """None, "first-input", a time, or a crossing."""
+    value = table.peek(key)
+    if value is None:
+        table.has(key)
+        return None
+    if isinstance(value, str):
+        return table.choice(key, ("first-input",), "first-input")
+    if not isinstance(value, dict):
+        return table.take(key, float)
+    crossing = table.sub(key)
+    found = Crossing(
+        path=_path(crossing),
+        above=crossing.take("above", float) if crossing.has("above") else None,
+        below=crossing.take("below", float) if crossing.has("below") else None,
+        clock=cast(Clock, crossing.choice("clock", CLOCKS, "log")),
+    )
+    crossing.finish()
+    if (found.above is None) == (found.below is None):
+        raise table.error(key, "needs exactly one of above = ... and below = ...")
+    return found
+
+
+@dataclass(frozen=True)
+class LogMapping:
+    """The [log] table: where each state and input is found, and which part is the trial."""
+
+    states: Mapping[str, SignalSpec]
+    inputs: Mapping[str, SignalSpec]
+    span: Span = field(default_factory=Span)
+
+
+def read_log(
+    paths: str | Path | Sequence[str | Path],
+    mapping: LogMapping,
+    dt: float,
+    *,
+    states: Sequence[str] | None = None,
+    inputs: Sequence[str] | None = None,
+    angles: Sequence[str] = (),
+    steps: int | None = None,
+) -> Gridded:
+    """Reads a log and samples it every dt.
+
+    Args:
+        paths: an MCAP file, several that follow each other, or the folder of a bag.
+        mapping: where to find what.
+        dt: control interval [s].
+        states: which of the mapped states, in array order; all of them by default.
+        inputs: the same for the inputs.
+        angles: states that are unwrapped.
+        steps: at most this many steps.
+
+    Raises:
+        GroundedError: see `signals.read_signals` and `resample.to_grid`.
+    """
+    states = list(mapping.states) if states is None else states
+    inputs = list(mapping.inputs) if inputs is None else inputs
+    if not states or not inputs:
+        raise GroundedError("[log] maps no state or no input; a trial needs one of each")
+    specs = {name: mapping.states[name] for name in states}
+    specs |= {name: mapping.inputs[name] for name in inputs}
+    series = read_signals(paths, {**specs, **mapping.span.signals()})
+    return to_grid(series, dt, states, inputs, mapping.span, angles=angles, steps=steps)

@@ -1,0 +1,235 @@
+"""What can be saved of a damaged log, written as a good one; and what was lost.
+
+The file is walked record by record. A chunk whose checksum fails is dropped whole, since nobody
+knows which of its numbers are wrong; the message indexes that follow it tell what it held. A chunk
+that the end of the file cuts through gives the messages that lie wholly before the cut. Where the
+chain of records itself is broken, the next place is looked for from which it holds again. Schemas
+and channels are taken from wherever they still stand, the summary included.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+
+from grounded.errors import GroundedError
+from grounded_trials.formats.mcap_records import (
+    Attachment,
+    Channel,
+    Header,
+    Messages,
+    Metadata,
+    Record,
+    Schema,
+)
+from grounded_trials.formats.mcap_writer import LIBRARY, CopyWriter
+from grounded_trials.logs.log_files import open_log
+from grounded_trials.logs.salvage import Salvage
+from grounded_trials.store.candidate_file import read_candidate
+from grounded_trials.store.own_files import TRIAL
+from grounded_trials.store.store import sync_folder
+from grounded_trials.wording import count
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """What was saved, what was not, and what of it no checksum vouches for."""
+
+    source: Path
+    target: Path
+    messages: Mapping[str, int]  # saved, by topic
+    lost_messages: Mapping[str, int]  # known to be lost, by topic
+    losses: tuple[str, ...]  # sentences; empty: the file was not damaged
+    unverified: int  # saved messages without a checksum that fits
+    duration_s: float  # from the first to the last saved message
+    format: str = ""  # of a file of ours: TRIAL or CANDIDATE; "" for any other log
+    candidate: str = ""  # that a trial of ours ran
+    steps: int = 0  # of it that are saved
+    planned: int | None = None  # steps of the policy that it ran, where that is saved too
+    hole: bool = False  # steps before the last one are missing: it can't be read as a trial
+
+    @property
+    def complete(self) -> bool:
+        """Whether nothing was lost and everything saved is known to be right."""
+        return not self.losses
+
+
+def recover_log(source: str | Path, target: str | Path) -> Recovery:
+    """Writes what can be saved of a log to a new file.
+
+    Args:
+        source: the damaged file; it is not changed.
+        target: the file to write; it must not exist.
+
+    Raises:
+        GroundedError: if nothing can be saved, `source` can't be read, or `target` not be written.
+    """
+    source, target = Path(source), Path(target)
+    if target.exists():
+        raise GroundedError(f"{target} exists already; name a file that does not")
+    with open_log(source) as stream:
+        salvage = Salvage(stream, str(source))
+        try:
+            with target.open("xb") as out:
+                copy = _Copy(out)
+                for record in salvage.records():
+                    copy.add(record)
+                copy.finish()
+            sync_folder(target.parent)
+        except OSError as error:
+            target.unlink(missing_ok=True)
+            raise GroundedError(f"{target} can't be written: {error.strerror}") from None
+    if not copy.anything:
+        target.unlink()
+        why = salvage.losses[0] if salvage.losses else "it is a log without messages"
+        raise GroundedError(
+            f"{source}: there is nothing to save: {why}; expected an MCAP log, whole or damaged: "
+            "look for another copy of the recording"
+        )
+    losses = list(salvage.losses)
+    if copy.homeless:
+        these = count(copy.homeless, "message")
+        losses.append(f"{these} of topics whose name and type are lost")
+    losses += copy.without(salvage.dropped)
+    lost = Counter({copy.topic(c): n for c, n in salvage.lost_messages.items()})
+    found = Recovery(
+        source, target, copy.counts, lost, tuple(losses), salvage.unverified, copy.duration_s
+    )
+    return _own(found, copy)
+
+
+def _own(found: Recovery, copy: _Copy) -> Recovery:
+    """What was saved of a file of ours, in steps."""
+    kind = copy.meta.get("format", "")
+    if kind != TRIAL:
+        return replace(found, format=kind)
+    states, inputs = (found.messages.get(topic, 0) for topic in ("/state", "/input"))
+    return replace(
+        found,
+        format=kind,
+        candidate=copy.meta.get("candidate", ""),
+        steps=max(0, min(states - 1, inputs)),
+        planned=_horizon(copy.policy) if copy.policy else None,
+        hole=_hole(copy, states),
+    )
+
+
+def _hole(copy: _Copy, states: int) -> bool:
+    """Whether the saved states do not follow each other from the start, step by step."""
+    try:
+        start, step = int(copy.meta["start_ns"]), float(copy.meta["dt"]) * 1e9
+        first, last = copy.span or (start, start)
+        return first - start > step / 2 or abs((last - first) / step - (states - 1)) > 0.5
+    except (KeyError, ValueError, ZeroDivisionError, OverflowError):
+        return True
+
+
+def _horizon(policy: bytes) -> int | None:
+    try:
+        return read_candidate(policy, "policy")[0].horizon
+    except GroundedError:
+        return None
+
+
+class _Copy:
+    """The file that is being written; messages wait until their channel is known."""
+
+    def __init__(self, out: IO[bytes]) -> None:
+        self.out = out
+        self.writer: CopyWriter | None = None
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        self.numbers: dict[int, int] = {}
+        self.waiting: list[Messages] = []
+        self.counts: Counter[str] = Counter()
+        self.homeless = 0
+        self.anything = False
+        self.span: tuple[int, int] | None = None  # first and last log time [ns]
+        self.meta: dict[str, str] = {}  # our own table, if it has one
+        self.policy = b""  # the attached policy of a trial of ours
+
+    def add(self, record: Record) -> None:
+        """Takes over a record."""
+        if isinstance(record, Header):
+            self.start(record)
+        elif isinstance(record, Schema):
+            self.schemas.setdefault(record.id, record)
+        elif isinstance(record, Channel):
+            self.channels.setdefault(record.id, record)
+        elif isinstance(record, Messages):
+            self.messages(record, final=False)
+        elif isinstance(record, Metadata):
+            self.start().metadata(record)
+            self.anything = True
+            if record.name == "grounded":
+                self.meta = record.data
+        elif isinstance(record, Attachment):
+            self.start().attachment(record)
+            self.anything = True
+            if record.name == "policy":
+                self.policy = record.data
+
+    def start(self, header: Header | None = None) -> CopyWriter:
+        """The writer, opened at the first record."""
+        if self.writer is None:
+            header = header or Header("", "")
+            compressed = not header.library.startswith(LIBRARY)
+            self.writer = CopyWriter(self.out, header, compressed=compressed)
+        return self.writer
+
+    def messages(self, batch: Messages, *, final: bool) -> None:
+        """Writes the messages of known channels, keeps or counts the others."""
+        for identity in np.unique(batch.channels).tolist():
+            own = batch.take(batch.channels == identity)
+            channel = self.channels.get(identity)
+            schema = self.schemas.get(channel.schema_id) if channel else None
+            if channel is None or (schema is None and channel.schema_id):
+                if final:
+                    self.homeless += len(own)
+                else:
+                    self.waiting.append(own)
+                continue
+            if identity not in self.numbers:
+                self.numbers[identity] = self.start().channel(channel, schema)
+            self.start().messages(own, self.numbers[identity])
+            self.counts[channel.topic] += len(own)
+            self.anything = True
+            if len(own):
+                ends = (int(own.log_times.min()), int(own.log_times.max()))
+                first, last = self.span or ends
+                self.span = (min(first, ends[0]), max(last, ends[1]))
+
+    def topic(self, channel: int) -> str:
+        """The name of a channel's topic, if it is known."""
+        known = self.channels.get(channel)
+        return known.topic if known else f"channel {channel}"
+
+    @property
+    def duration_s(self) -> float:
+        """From the first to the last saved message."""
+        return 0.0 if self.span is None else (self.span[1] - self.span[0]) * 1e-9
+
+    def without(self, dropped: Sequence[tuple[int, int]]) -> list[str]:
+        """When the blocks were recorded that were dropped; what they state may be damaged too."""
+        if self.span is None:
+            return []
+        first, last = self.span
+        room = 10 * (last - first)
+        sane = [(a, b) for a, b in dropped if first - room <= a <= b <= last + room]
+        first = min([first, *(a for a, _ in sane)])
+        return [
+            f"second {(a - first) * 1e-9:.2f} to {(b - first) * 1e-9:.2f} of the log"
+            for a, b in sane
+        ]
+
+    def finish(self) -> None:
+        """Writes what waited, and ends the file."""
+        waiting, self.waiting = self.waiting, []
+        for batch in waiting:
+            self.messages(batch, final=True)
+        self.start().finish()

@@ -1,0 +1,216 @@
+"""Asynchronous samples onto the control grid; arrays in, arrays out.
+
+    state k = value at t_k = start + k dt       linear between the samples around t_k
+    input k = value held at t_k + dt / 2        the command in force in the middle of the step
+
+Half a step, because a command's stamp scatters about its t_k: held at t_k itself, every late one
+would be missed and appear a whole step later. Gaps, clocks that jump and clocks that differ are
+refused, since they hide what happened; everything else is counted and reported.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from grounded.errors import GroundedError
+from grounded_trials.formats.messages import Floats
+from grounded_trials.logs.samples import Samples, tidy
+from grounded_trials.logs.signal_report import SignalReport, check_clocks, report_of, warnings_of
+from grounded_trials.logs.signals import Clock, Series, SignalSpec
+
+START, END = "[log.span] start", "[log.span] end"  # names of the series that a span watches
+ABSOLUTE_S = 1e8  # a time beyond this is a stamp, not one that counts from the log's beginning
+STEP_LIMIT = 2_000_000
+REGULAR = 10  # inputs sent more often than this are sent all the time; their end is the trial's
+
+
+@dataclass(frozen=True)
+class Crossing:
+    """The first time a signal is above, or below, a value."""
+
+    path: str
+    above: float | None = None
+    below: float | None = None
+    clock: Clock = "log"
+
+
+@dataclass(frozen=True)
+class Span:
+    """Which part of a log is the trial.
+
+    A number counts in seconds from the first sample of any signal (from 1e8 on it is a stamp).
+    "first-input": when every input has been sent for the first time. No end: as long as every
+    state is known and the inputs are sent.
+    """
+
+    start: Literal["first-input"] | float | Crossing = "first-input"
+    end: float | Crossing | None = None
+
+    def signals(self) -> dict[str, SignalSpec]:
+        """What it watches, to be read along with the states and inputs."""
+        ends = {START: self.start, END: self.end}
+        return {
+            name: SignalSpec(end.path, end.clock)
+            for name, end in ends.items()
+            if isinstance(end, Crossing)
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Gridded:
+    """A log on the control grid, and what was found on the way."""
+
+    states: Floats  # (T + 1, n)
+    inputs: Floats  # (T, m)
+    start_inputs: Floats | None  # (m,) held before t = 0; None where the log does not say
+    start_ns: int  # t = 0 on the signals' clock [ns]
+    late_s: float  # the start was moved by this much, because a state was not known yet
+    reports: tuple[SignalReport, ...]  # of the states, then of the inputs
+    warnings: tuple[str, ...]
+
+
+def to_grid(
+    series: Mapping[str, Series],
+    dt: float,
+    states: Sequence[str],
+    inputs: Sequence[str],
+    span: Span | None = None,
+    *,
+    angles: Sequence[str] = (),
+    steps: int | None = None,
+) -> Gridded:
+    """Samples signals every dt.
+
+    Args:
+        series: the raw samples by name, with those that the span watches as START and END.
+        dt: control interval [s].
+        states: names in array order.
+        inputs: names in array order.
+        span: which part of the log.
+        angles: names that are unwrapped whether their spec says so or not.
+        steps: at most this many steps.
+
+    Raises:
+        GroundedError: for a gap beyond max_age_s, a clock that jumps, signals on clocks that do
+            not fit each other, or a span that is not in the log.
+    """
+    span = span or Span()
+    names = [*states, *inputs]
+    check_clocks({n: series[n] for n in (*names, *span.signals())})
+    samples = {n: tidy(n, series[n], unwrap=n in angles) for n in names}
+    how = {n: samples[n].spec.resample or ("linear" if n in states else "hold") for n in names}
+    for name in names:
+        if how[name] == "linear":
+            samples[name].check_linear()
+    known, until = _extent(samples, states, inputs, dt)
+    origin = min(int(s.t[0]) for s in samples.values())
+    start, late = _start(span, series, samples, inputs, known, origin)
+    stop = min(until, _end(span, series, start, origin, until))
+    count = _steps(start, stop, dt, steps, origin)
+    grid = start + np.round(dt * 1e9 * np.arange(count + 1)).astype(np.int64)
+    middle = start + np.round(dt * 1e9 * (np.arange(count) + 0.5)).astype(np.int64)
+    columns, reports = [], []
+    for name in names:
+        at = grid if name in states else middle
+        value = samples[name].linear if how[name] == "linear" else samples[name].hold
+        columns.append(value(at, dt, start))
+        reports.append(report_of(samples[name], series[name], columns[-1], at, start))
+    held = np.array([samples[n].before(start - round(dt * 0.5e9)) for n in inputs])
+    return Gridded(
+        states=np.column_stack(columns[: len(states)]),
+        inputs=np.column_stack(columns[len(states) :]),
+        start_inputs=held if np.isfinite(held).all() else None,
+        start_ns=start,
+        late_s=late,
+        reports=tuple(reports),
+        warnings=warnings_of(tuple(reports), late),
+    )
+
+
+def _extent(
+    samples: Mapping[str, Samples], states: Sequence[str], inputs: Sequence[str], dt: float
+) -> tuple[int, int]:
+    """From when every state is known, and until when every signal is [ns]."""
+    first, last = [], []
+    for name in states:
+        s = samples[name]
+        held = s.spec.resample == "hold"
+        slack = 0 if held else round(s.slack(dt) * 1e9)
+        first.append(int(s.t[0]) - slack)
+        last.append(int(s.t[-1]) + (round(s.max_gap(dt) * 1e9) if held else slack))
+    for name in inputs:
+        s = samples[name]
+        if s.spec.max_age_s is not None:
+            last.append(int(s.t[-1]) + round(s.spec.max_age_s * 1e9))
+        elif len(s.t) > REGULAR:
+            last.append(int(s.t[-1]) + round(max(s.interval, dt) * 1.5e9))
+    return max(first), min(last)
+
+
+def _start(
+    span: Span,
+    series: Mapping[str, Series],
+    samples: Mapping[str, Samples],
+    inputs: Sequence[str],
+    known: int,
+    origin: int,
+) -> tuple[int, float]:
+    """T = 0 [ns], and by how much it was moved because a state was not known yet [s]."""
+    if isinstance(span.start, Crossing):
+        start = _crossing(span.start, series[START], "start", None)
+    elif isinstance(span.start, str):
+        start = max(int(samples[name].t[0]) for name in inputs)
+    else:
+        start = _time(span.start, origin)
+    return max(start, known), max(0.0, (known - start) * 1e-9)
+
+
+def _end(span: Span, series: Mapping[str, Series], start: int, origin: int, until: int) -> int:
+    if span.end is None:
+        return until
+    if isinstance(span.end, Crossing):
+        return _crossing(span.end, series[END], "end", start)
+    return _time(span.end, origin)
+
+
+def _time(seconds: float, origin: int) -> int:
+    return round(seconds * 1e9) + (0 if abs(seconds) >= ABSOLUTE_S else origin)
+
+
+def _crossing(crossing: Crossing, series: Series, which: str, after: int | None) -> int:
+    """The first stamp at which the watched signal is beyond its value."""
+    order = np.argsort(series.t, kind="stable")
+    t, y = series.t[order], series.values[order]
+    beyond = np.ones(len(t), dtype=np.bool_)
+    if crossing.above is not None:
+        beyond &= y > crossing.above
+    if crossing.below is not None:
+        beyond &= y < crossing.below
+    if after is not None:
+        beyond &= t > after
+    if not beyond.any():
+        limits = {"above": crossing.above, "below": crossing.below}
+        wanted = " and ".join(f"{k} {v}" for k, v in limits.items() if v is not None)
+        raise GroundedError(
+            f"[log.span] {which}: {crossing.path} is never {wanted} in this log; its values go "
+            f"from {y.min():g} to {y.max():g}"
+        )
+    return int(t[np.argmax(beyond)])
+
+
+def _steps(start: int, stop: int, dt: float, most: int | None, origin: int) -> int:
+    count = int(np.floor((stop - start) / (dt * 1e9) + 1e-6))
+    if not 1 <= count <= STEP_LIMIT:
+        raise GroundedError(
+            f"the trial would have {max(count, 0)} steps of {dt} s: it starts {_s(start, origin)} "
+            f"and ends {_s(stop, origin)} after the log's first sample; see [log.span]"
+        )
+    return count if most is None else min(count, most)
+
+
+def _s(time: int, origin: int) -> str:
+    return f"{(time - origin) * 1e-9:.3f} s"

@@ -1,0 +1,303 @@
+"""Reading a damaged file: every record that can be trusted, and a list of what can not.
+
+Finding records again after damage: the next place from which the chain of them holds.
+
+Nothing marks the start of a record, but each says where the next one starts. A place is believed
+when it begins a chunk whose inner lengths fit each other, or the first of several records in a
+row, or the last ones of the file.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections import Counter
+from collections.abc import Iterator
+from struct import Struct
+from typing import BinaryIO
+
+import numpy as np
+
+from grounded_trials.formats.mcap_records import (
+    ATTACHMENT,
+    CHUNK,
+    DATA_END,
+    FOOTER,
+    MESSAGE,
+    MESSAGE_HEADER,
+    MESSAGE_INDEX,
+    METADATA,
+    PARSERS,
+    BadChunk,
+    Fields,
+    Messages,
+    Record,
+    Short,
+    batch,
+    decompress,
+    decompress_part,
+)
+from grounded_trials.formats.mcap_walk import (
+    MAGIC,
+    RECORD_LIMIT,
+    chunk_records,
+    message_positions,
+)
+
+_HEAD = Struct("<BQ")
+_SPAN = Struct("<QQ")  # a chunk's first and last time
+_NAMES = {1: "the header", 3: "a schema", 4: "a channel", 5: "a message", 6: "a block of messages"}
+_NAMES |= {9: "an attached file", 12: "a table of metadata"}
+BATCH = 2**22  # [bytes] of messages outside chunks that are handed on together
+
+
+class Salvage:
+    """One pass over a damaged file.
+
+    `losses` are sentences, `lost_messages` counts by channel what the indexes say was in dropped
+    chunks, `dropped` has the first and last time that such chunks state [ns], `unverified` counts
+    messages that no checksum vouches for.
+    """
+
+    def __init__(self, stream: BinaryIO, name: str) -> None:
+        self.stream, self.name = stream, name
+        self.size = stream.seek(0, 2)
+        self.losses: list[str] = []
+        self.lost_messages: Counter[int] = Counter()
+        self.dropped: list[tuple[int, int]] = []
+        self.unverified = 0
+        self._crc = 0
+        self._outside = 0  # messages outside checked chunks, which only the data checksum covers
+        self._tables = 0  # metadata and attached files, likewise
+        self._ended = False  # the data are over: what follows is an index
+        self._pending: list[bytes] = []  # messages outside chunks
+
+    def records(self) -> Iterator[Record]:
+        """Yields what can be saved, in file order."""
+        pos = self._first()
+        dropped_chunk = False
+        while pos is not None and pos < self.size - len(MAGIC):
+            end = plausible(self.stream, self.size, pos)
+            if end is None:
+                yield from self._flush()
+                cut = self._is_cut_chunk(pos)
+                after = None if cut else next_chain(self.stream, self.size, pos + 1)
+                if after is None:
+                    yield from self._cut(pos)
+                    return
+                self.losses.append(
+                    f"{after - pos} bytes can't be read, from byte {pos} on: what was there is lost"
+                )
+                pos = after
+                continue
+            opcode, content = self._read(pos, end)
+            if opcode == MESSAGE:
+                yield from self._message(content)
+            else:
+                yield from self._flush()
+                if opcode == FOOTER:
+                    self._tail(end)
+                    return
+                if opcode == MESSAGE_INDEX and dropped_chunk:
+                    self._count_lost(content)
+                kept = len(self.losses)
+                yield from self._record(opcode, content, pos)
+                dropped_chunk = opcode == MESSAGE_INDEX and dropped_chunk
+                dropped_chunk |= opcode == CHUNK and len(self.losses) > kept
+            pos = end
+        yield from self._flush()
+        self.losses.append(self._ends_early())
+
+    def _ends_early(self) -> str:
+        if self._ended:
+            return "the index at the end of the file is missing; every message stands before it"
+        return f"the file is cut off at byte {self.size}: what came after that is lost"
+
+    def _first(self) -> int | None:
+        if read_at(self.stream, 0, 8) == MAGIC:
+            self._crc = zlib.crc32(MAGIC)
+            return len(MAGIC)
+        self.losses.append("the beginning of the file is not that of an MCAP file")
+        return next_chain(self.stream, self.size, 0)
+
+    def _read(self, pos: int, end: int) -> tuple[int, bytes]:
+        record = read_at(self.stream, pos, end - pos)
+        if record[0] == DATA_END:
+            self._data_end(record)
+        self._crc = zlib.crc32(record, self._crc)
+        return record[0], record[9:]
+
+    def _record(self, opcode: int, content: bytes, pos: int) -> Iterator[Record]:
+        try:
+            if opcode == CHUNK:
+                yield from self._chunk(content)
+            elif opcode in PARSERS:
+                record = PARSERS[opcode](Fields(content))
+                self._tables += opcode in (METADATA, ATTACHMENT)
+                yield record
+        except (BadChunk, Short, UnicodeDecodeError) as error:
+            what = _NAMES.get(opcode, f"a record of type {opcode}")
+            self.losses.append(f"{what} was dropped, at byte {pos}: {error}")
+            if opcode == CHUNK and len(content) >= 16:
+                self.dropped.append(_SPAN.unpack_from(content))
+
+    def _chunk(self, content: bytes) -> Iterator[Record]:
+        fields = Fields(content)
+        fields.skip(16)
+        size, crc, compression = fields.u64(), fields.u32(), fields.text()
+        data = decompress(compression, fields.blob(), size, RECORD_LIMIT)
+        if crc and zlib.crc32(data) != crc:
+            raise BadChunk("its checksum does not fit its content")
+        for record in list(chunk_records(data)):
+            if isinstance(record, Messages) and not crc:
+                self._outside += len(record)
+            yield record
+
+    def _message(self, content: bytes) -> Iterator[Record]:
+        self._pending.append(_HEAD.pack(MESSAGE, len(content)) + content)
+        self._outside += 1
+        if len(self._pending) * (len(content) + 9) > BATCH:
+            yield from self._flush()
+
+    def _flush(self) -> Iterator[Record]:
+        if self._pending:
+            data = b"".join(self._pending)
+            self._pending = []
+            yield _messages(data)
+
+    def _data_end(self, record: bytes) -> None:
+        stated = int.from_bytes(record[9:13], "little")
+        wrong = bool(stated) and stated != self._crc
+        if wrong and not self.losses and (self._outside or self._tables):
+            these = f"its {self._outside} messages" if self._outside else "what it says of itself"
+            self.losses.append(
+                f"the checksum of the file does not fit: a number in {these} may be wrong, and "
+                "nobody knows which"
+            )
+        if self.losses or not stated:
+            self.unverified += self._outside
+        self._outside, self._ended = 0, True
+
+    def _count_lost(self, content: bytes) -> None:
+        try:
+            fields = Fields(content)
+            channel = fields.u16()
+            self.lost_messages[channel] += fields.u32() // 16
+        except Short:
+            return
+
+    def _is_cut_chunk(self, pos: int) -> bool:
+        """Whether a sound chunk begins here, which the end of the file cuts through."""
+        start = read_at(self.stream, pos, 9 + 64)
+        if len(start) < 49 or start[0] != CHUNK:
+            return False
+        return is_chunk(start[9:], int.from_bytes(start[1:9], "little"))
+
+    def _cut(self, pos: int) -> Iterator[Record]:
+        """The file ends inside the record at `pos`: what of it is whole."""
+        rest = read_at(self.stream, pos, min(self.size - pos, RECORD_LIMIT))
+        saved = 0
+        if len(rest) > 49 and rest[0] == CHUNK:
+            for record in self._cut_chunk(rest[9:]):
+                saved += len(record) if isinstance(record, Messages) else 0
+                yield record
+        self.unverified += saved + self._outside
+        self.losses.append(self._ends_early())
+
+    def _cut_chunk(self, content: bytes) -> Iterator[Record]:
+        try:
+            fields = Fields(content)
+            fields.skip(28)
+            compression = fields.text()
+        except (Short, UnicodeDecodeError):
+            return
+        data = decompress_part(compression, content[fields.pos + 8 :], RECORD_LIMIT)
+        whole = _whole_records(data)
+        try:
+            yield from list(chunk_records(data[:whole]))
+        except (BadChunk, Short, UnicodeDecodeError):
+            return
+
+    def _tail(self, end: int) -> None:
+        if read_at(self.stream, end, 9) != MAGIC:
+            self.losses.append("the file does not end as an MCAP file does")
+
+
+def _messages(data: bytes) -> Messages:
+    positions, _ = message_positions(data, 0, len(data), lambda found, offset: BadChunk(found))
+    return batch(data, positions)
+
+
+def _whole_records(data: bytes) -> int:
+    """Where the last record that is wholly there ends."""
+    pos = 0
+    while len(data) - pos >= 9:
+        _, length = _HEAD.unpack_from(data, pos)
+        if length > len(data) - pos - 9:
+            break
+        pos += 9 + int(length)
+    return pos
+
+
+_BLOCK = 2**20
+CHAIN = 3  # records in a row that make a place believed
+
+
+def read_at(stream: BinaryIO, offset: int, count: int) -> bytes:
+    """Bytes of a file, fewer at its end."""
+    stream.seek(offset)
+    return stream.read(count)
+
+
+def plausible(stream: BinaryIO, size: int, offset: int) -> int | None:
+    """Where the record at `offset` ends, if one may be there."""
+    head = read_at(stream, offset, 9)
+    if len(head) < 9:
+        return None
+    opcode, length = _HEAD.unpack(head)
+    end = offset + 9 + int(length)
+    if opcode == 0 or opcode > DATA_END or length > RECORD_LIMIT or end > size:
+        return None
+    if opcode == MESSAGE and length < MESSAGE_HEADER:
+        return None
+    if opcode == CHUNK and not is_chunk(read_at(stream, offset + 9, 64), int(length)):
+        return None
+    return end
+
+
+def is_chunk(start: bytes, length: int) -> bool:
+    """Whether the content of a chunk of this length may start so: its inner lengths fit."""
+    if len(start) < 40:
+        return False
+    name = int.from_bytes(start[28:32], "little")
+    if name > 8 or start[32 : 32 + name] not in (b"", b"zstd", b"lz4"):
+        return False
+    return int.from_bytes(start[32 + name : 40 + name], "little") == length - 40 - name
+
+
+def next_chain(stream: BinaryIO, size: int, start: int) -> int | None:
+    """The first offset from `start` on where records follow each other again; None: nowhere."""
+    for block in range(start, size, _BLOCK):
+        data = np.frombuffer(read_at(stream, block, _BLOCK + 8), dtype=np.uint8)
+        if len(data) < 9:
+            return None
+        opcodes = data[: len(data) - 8]
+        maybe = (opcodes > 0) & (opcodes <= DATA_END)
+        for i in range(5, 9):  # lengths are below 2^32
+            maybe &= data[i : len(data) - 8 + i] == 0
+        for i in np.flatnonzero(maybe[:_BLOCK]).tolist():
+            if _is_chain(stream, size, block + i):
+                return int(block + i)
+    return None
+
+
+def _is_chain(stream: BinaryIO, size: int, offset: int) -> bool:
+    if read_at(stream, offset, 1) == bytes([CHUNK]):
+        return plausible(stream, size, offset) is not None
+    for _ in range(CHAIN):
+        end = plausible(stream, size, offset)
+        if end is None:
+            return False
+        if end == size - len(MAGIC) and read_at(stream, end, len(MAGIC)) == MAGIC:
+            return True
+        offset = end
+    return True

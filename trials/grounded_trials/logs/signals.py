@@ -1,0 +1,277 @@
+"""Signals out of logs: for each name the samples that its message path finds, in file order.
+
+One pass over the files reads all signals; only what the paths name is decoded and kept. Whatever
+the encoding (cdr, ros1, protobuf, json), a message gives one number or none, and three times: when
+it was logged, when it was published, and its header's stamp.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from grounded.errors import GroundedError, nearest
+from grounded_trials.formats.cdr import cdr_messages, ros1_messages
+from grounded_trials.formats.idl_schema import parse_idl
+from grounded_trials.formats.json_messages import json_messages
+from grounded_trials.formats.mcap_records import Channel, Messages, Schema
+from grounded_trials.formats.mcap_walk import read_records
+from grounded_trials.formats.message_path import MessagePath, parse_path
+from grounded_trials.formats.messages import (
+    BadMessage,
+    BadPath,
+    Dynamic,
+    Floats,
+    Ints,
+    Node,
+    Struct,
+    Type,
+)
+from grounded_trials.formats.path_walk import Bound, Values, bind, evaluate
+from grounded_trials.formats.protobuf import protobuf_messages
+from grounded_trials.formats.protobuf_schema import BadSchema, parse_descriptor_set
+from grounded_trials.formats.ros_schema import parse_ros
+from grounded_trials.logs.log_files import log_files, open_log
+
+Clock = Literal["header", "log", "publish"]
+SAMPLE_LIMIT = 100_000_000  # of one signal
+
+
+@dataclass(frozen=True)
+class SignalSpec:
+    """Where a signal is found in a log, and how its samples become values at times.
+
+    value = scale * number + offset, at stamp - delay_s. Between samples it is interpolated
+    ("linear") or held ("hold"; None: as its kind asks, states linear and inputs held). A gap of
+    more than max_age_s is refused (None: a limit from the signal's own rate, see `resample`).
+    """
+
+    path: str
+    clock: Clock = "header"
+    unwrap: bool = False
+    scale: float = 1.0
+    offset: float = 0.0
+    delay_s: float = 0.0
+    max_age_s: float | None = None
+    resample: Literal["linear", "hold"] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """A signal's raw samples: numbers as logged, before scale and offset, in file order."""
+
+    spec: SignalSpec
+    t: Ints  # (N,) stamp on the spec's clock [ns]
+    values: Floats  # (N,)
+    log_times: Ints  # (N,) [ns]
+    messages: int  # of its topic, whether the path found a number in them or not
+    type: str  # of the topic's messages
+    stamped: bool  # the messages have a header stamp, whether it is the clock or not
+
+
+def read_signals(
+    paths: str | Path | Sequence[str | Path], specs: Mapping[str, SignalSpec]
+) -> dict[str, Series]:
+    """Reads signals from a log: a file, files in order, or the folder of a bag.
+
+    Args:
+        paths: an MCAP file, several that follow each other, or a folder with them.
+        specs: what to read, by name.
+
+    Raises:
+        GroundedError: for a damaged file, a topic or field that is not there, a message with more
+            than one value for a signal, a clock that a topic does not have.
+    """
+    collectors = {name: _Collector(name, spec) for name, spec in specs.items()}
+    for path in log_files(paths):
+        with open_log(path) as stream:
+            log = _Log(str(path), list(collectors.values()))
+            for record in read_records(stream, str(path)):
+                if isinstance(record, Schema):
+                    log.schemas[record.id] = record
+                elif isinstance(record, Channel):
+                    log.channel(record)
+                elif isinstance(record, Messages):
+                    log.messages(record)
+            for collector in collectors.values():
+                collector.topics |= set(log.topics)
+    return {name: collector.series() for name, collector in collectors.items()}
+
+
+class _Log:
+    """One file while it is read: its schemas, and which channel feeds which signals."""
+
+    def __init__(self, name: str, collectors: list[_Collector]) -> None:
+        self.name, self.collectors = name, collectors
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        self.topics: dict[str, str] = {}
+        self.wanted: dict[int, tuple[Decoder, list[_Collector]]] = {}
+
+    def channel(self, channel: Channel) -> None:
+        if channel.id in self.channels:
+            return
+        self.channels[channel.id] = channel
+        schema = self.schemas.get(channel.schema_id)
+        self.topics[channel.topic] = schema.name if schema else channel.encoding
+        wanting = [c for c in self.collectors if c.path.topic == channel.topic]
+        if wanting:
+            try:
+                decoder = decoder_of(channel, schema)
+                for collector in wanting:
+                    collector.bind(decoder)
+            except (BadSchema, BadPath) as error:
+                raise self._misfit(channel, wanting[0], error) from None
+            self.wanted[channel.id] = (decoder, wanting)
+
+    def messages(self, batch: Messages) -> None:
+        present = np.bincount(batch.channels, minlength=1)
+        unknown = [c for c in np.flatnonzero(present).tolist() if c not in self.channels]
+        if unknown:
+            raise GroundedError(
+                f"{self.name}: a message belongs to channel {unknown[0]}, which is not defined; "
+                f"`grounded recover {self.name}` saves the others"
+            )
+        for identity, (decoder, wanting) in self.wanted.items():
+            if identity >= len(present) or not present[identity]:
+                continue
+            own = (
+                batch if present[identity] == len(batch) else batch.take(batch.channels == identity)
+            )
+            for collector in wanting:
+                try:
+                    collector.collect(decoder, own)
+                except BadMessage as error:
+                    raise GroundedError(
+                        f"{self.name}: a message of {decoder.topic} ({decoder.name}) logged at "
+                        f"{own.log_times[error.message] * 1e-9:.3f} s does not fit its "
+                        f"definition: {error}"
+                    ) from None
+                except BadPath as error:
+                    raise self._misfit(self.channels[identity], collector, error) from None
+
+    def _misfit(self, channel: Channel, collector: _Collector, error: Exception) -> GroundedError:
+        name = self.topics[channel.topic]
+        return GroundedError(
+            f"{self.name}: '{collector.name}' is read from '{collector.path.text}', but in "
+            f"{channel.topic} ({name}) {error}"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Decoder:
+    """How a channel's messages become the nodes that paths walk over."""
+
+    topic: str
+    name: str  # of the message type
+    type: Type
+    root: Callable[[bytes, Ints, Ints], Node] = field(repr=False)
+
+
+_READERS: dict[str, Callable[[bytes, Struct, Ints, Ints], Node]] = {
+    "cdr": cdr_messages,
+    "ros1": ros1_messages,
+    "protobuf": protobuf_messages,
+}
+
+
+def decoder_of(channel: Channel, schema: Schema | None) -> Decoder:
+    """The decoder of a channel.
+
+    Raises:
+        BadSchema: if its encoding is not one of cdr, ros1, protobuf, json, or its schema is bad.
+    """
+    encoding, name = channel.encoding, schema.name if schema else ""
+    if encoding == "json":
+        return Decoder(channel.topic, name or "json", Dynamic(), json_messages)
+    if encoding not in _READERS:
+        raise BadSchema(
+            f"the messages are encoded as '{encoding}'; cdr, ros1, protobuf and json can be read"
+        )
+    if schema is None:
+        raise BadSchema(f"the messages are {encoding} without a schema, which says what they hold")
+    type, read = struct_of(schema), _READERS[encoding]
+    return Decoder(channel.topic, name, type, lambda b, s, e: read(b, type, s, e))
+
+
+def struct_of(schema: Schema) -> Struct:
+    """The message type that a schema defines.
+
+    Raises:
+        BadSchema: if it can't be parsed, or its language is unknown.
+    """
+    if schema.encoding == "protobuf":
+        return parse_descriptor_set(schema.data, schema.name)
+    if schema.encoding in ("ros1msg", "ros2msg"):
+        text = schema.data.decode("utf-8", "replace")
+        return parse_ros(text, schema.name, ros1=schema.encoding == "ros1msg")
+    if schema.encoding in ("ros2idl", "omgidl"):
+        return parse_idl(schema.data.decode("utf-8", "replace"), schema.name)
+    raise BadSchema(
+        f"the schema's language '{schema.encoding}' can't be read; ros1msg, ros2msg, ros2idl, "
+        "omgidl and protobuf can"
+    )
+
+
+class _Collector:
+    """Gathers the samples of one signal."""
+
+    def __init__(self, name: str, spec: SignalSpec) -> None:
+        self.name, self.spec = name, spec
+        self.path: MessagePath = parse_path(spec.path)
+        self.bound: dict[int, Bound] = {}
+        self.parts: list[tuple[Ints, Floats, Ints]] = []
+        self.count = self.messages = 0
+        self.type, self.stamped = "", False
+        self.topics: set[str] = set()
+
+    def bind(self, decoder: Decoder) -> None:
+        bound = bind(self.path, decoder.type)
+        self.bound[id(decoder)] = bound
+        self.type, self.stamped = decoder.name, bound.stamp is not None
+        dynamic = isinstance(decoder.type, Dynamic)
+        if self.spec.clock == "header" and not self.stamped and not dynamic:
+            raise BadPath('messages have no header stamp; set clock = "log" (or "publish") for it')
+
+    def collect(self, decoder: Decoder, batch: Messages) -> None:
+        self.messages += len(batch)
+        root = decoder.root(batch.buffer, batch.starts, batch.ends)
+        found = evaluate(root, self.bound[id(decoder)], self.spec.clock == "header")
+        if len(found.rows) > 1 and (np.diff(found.rows) == 0).any():
+            at = int(found.rows[np.argmax(np.diff(found.rows) == 0)])
+            raise BadPath(
+                f"the message logged at {batch.log_times[at] * 1e-9:.3f} s has several values for "
+                'it; name one item, or add a filter such as {name=="arm"}'
+            )
+        self.count += len(found.rows)
+        if self.count > SAMPLE_LIMIT:
+            raise BadPath(f"it has more than {SAMPLE_LIMIT} samples")
+        self.parts.append((self._times(batch, found), found.values, batch.log_times[found.rows]))
+
+    def _times(self, batch: Messages, found: Values) -> Ints:
+        if self.spec.clock == "log":
+            return batch.log_times[found.rows]
+        if self.spec.clock == "publish":
+            return batch.publish_times[found.rows]
+        if found.stamps is None:
+            raise BadPath('messages have no header stamp; set clock = "log" (or "publish") for it')
+        return found.stamps
+
+    def series(self) -> Series:
+        if not self.type:
+            raise GroundedError(
+                f"'{self.name}' is read from '{self.path.text}', but the log has no topic "
+                f"'{self.path.topic}': {nearest(self.path.topic, sorted(self.topics))}"
+            )
+        columns = [np.concatenate(part) for part in zip(*self.parts, strict=True)]
+        if not columns or not len(columns[0]):
+            what = "no messages" if not self.messages else f"{self.messages} messages, none with it"
+            raise GroundedError(
+                f"'{self.name}' is read from '{self.path.text}', but {self.path.topic} has {what}"
+            )
+        t, values, log_times = columns
+        return Series(self.spec, t, values, log_times, self.messages, self.type, self.stamped)

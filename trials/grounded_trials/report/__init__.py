@@ -1,0 +1,6 @@
+"""What a workspace shows of itself: text, page, pictures, recording.
+
+Read `findings.py` first (all that is shown, as values) and `gathering.py` (how it is read).
+`figures/` says what is drawn, `page/` and `recording/` lay it out for a browser and for Rerun,
+`studies/` draws the paper's studies; `reporting.py` writes the files.
+"""

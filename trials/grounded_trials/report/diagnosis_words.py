@@ -1,0 +1,125 @@
+"""What a diagnosis says of the error itself, as sentences for terminal and page.
+
+explained      what the effects take away on held-out trials
+unexplained    what they leave above the noise
+noise          what no model predicts
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+
+from grounded_trials.wording import count, figure, percent, with_unit
+from grounded_trials.workspace.diagnosis_error import Split, coloured
+from grounded_trials.workspace.diagnosis_file import Diagnosis, Gap
+
+MOST = 3  # parameters that are named
+
+
+def error_lines(diagnosis: Diagnosis, before: Mapping[str, float]) -> list[tuple[str, str]]:
+    """(title, text): the gap, what the error is made of, whether the rest is noise, and so on.
+
+    Nothing where no cause could be named: with too little data, what was fitted is no finding.
+
+    Args:
+        diagnosis: what was found.
+        before: the values of the model's parameters before it.
+    """
+    if diagnosis.no_cause:
+        return []
+    found = []
+    if diagnosis.gap is not None:
+        found.append(("gap", gap_sentence(diagnosis.gap)))
+    if text := calibrated_sentence(diagnosis, before):
+        found.append(("parameters", text))
+    if diagnosis.split:
+        found.append(("error", parts_sentence(diagnosis.split)))
+    if diagnosis.whiteness:
+        found.append(("rest", whiteness_sentence(diagnosis.whiteness)))
+    if diagnosis.utility_prediction is not None:
+        found.append(("utility", utility_sentence(diagnosis)))
+    for effect in dict.fromkeys(one.effect for one in diagnosis.lookalikes):
+        like = [
+            f"{one.like} {'makes ' * (k == 0)}{percent(one.share)}"
+            for k, one in enumerate(o for o in diagnosis.lookalikes if o.effect == effect)
+        ]
+        found.append(("alike", f"{', '.join(like)} of the signal of {effect}"))
+    return found
+
+
+def gap_sentence(gap: Gap) -> str:
+    """The gap before and after, and what it is measured in."""
+    held = "held out" if gap.held_out else "not held out, too few trials"
+    return (
+        f"{figure(gap.before, 3)} before, {figure(gap.after, 3)} after, noise floor "
+        f"{figure(gap.floor, 3)} ({gap.horizon_s:g} s ahead, {held}; in units of the noise that "
+        "this diagnosis estimates: figures of two diagnoses don't compare)"
+    )
+
+
+def calibrated_sentence(diagnosis: Diagnosis, before: Mapping[str, float]) -> str:
+    """The model's own parameters that were fitted beside the effects, most changed first."""
+    if all(name.startswith("parameter:") for name in diagnosis.effects):
+        return ""
+    moved, then = [], {**before, **dict(diagnosis.nominal)}
+    for v in diagnosis.parameters:
+        old = then.get(v.name, math.nan)
+        if abs(v.value - old) > 1e-6 * max(abs(v.value), abs(old)):
+            change = abs(v.value - old) / abs(old) if old else math.inf
+            text = with_unit(f"{v.name} {figure(old, 3)} -> {figure(v.value, 3)}", v.unit)
+            moved.append((-change, text))
+    named = [text for _, text in sorted(moved)[:MOST]]
+    more = f" (and {len(moved) - MOST} more)" * (len(moved) > MOST)
+    return f"calibrated beside them: {', '.join(named)}{more}" if named else ""
+
+
+def main_horizon(splits: tuple[Split, ...]) -> Split:
+    """The horizon that the gap is measured at."""
+    return next((one for one in splits if one.key == "horizon"), splits[0])
+
+
+def parts_sentence(splits: tuple[Split, ...]) -> str:
+    """`1 s ahead 99.7 % of the squared error is explained, 0.1 % is not, 0.2 % is noise`."""
+    main = main_horizon(splits)
+    parts = main.whole
+    return (
+        f"{main.ahead} ahead, {percent(parts.explained)} of the squared error is explained, "
+        f"{percent(parts.unexplained)} is not, {percent(parts.irreducible)} is noise"
+    )
+
+
+def whiteness_sentence(whiteness: tuple[tuple[str, float], ...]) -> str:
+    """Whether what the effects leave of each state is noise, or still has a pattern."""
+    names, total = coloured(whiteness), len(whiteness)
+    if not names:
+        return "what is left of every state looks like white noise (Ljung-Box, p >= 0.01)"
+    which = "every state" if len(names) == total else f"{', '.join(names)}"
+    return (
+        f"what is left of {which} is no white noise (Ljung-Box, p < 0.01): "
+        "a part of it follows a pattern that is not in the model"
+    )
+
+
+def utility_sentence(diagnosis: Diagnosis) -> str:
+    """How well utilities of whole trials are predicted; "" where none was."""
+    found = diagnosis.utility_prediction
+    if found is None:
+        return ""
+    without, better = (
+        f"by {figure(value, 3)}" if math.isfinite(value) else "beyond all measure"
+        for value in (found.before, found.after)
+    )
+    text = f"the model misses the utility of {count(found.trials, 'whole trial')} {without}"
+    if diagnosis.effects:
+        text += f", the diagnosed one {better}"
+    if found.trials < 2:
+        return f"{text} (rms)"
+    spread = figure(found.spread, 3)
+    return f"{text} (rms; from policy to policy the utilities themselves differ by {spread})"
+
+
+def sentences(text: str) -> list[str]:
+    """A verdict's sentences, for a line each: they say different things."""
+    return re.split(r"(?<=\.) (?=[A-Z`])", text)

@@ -1,0 +1,141 @@
+"""The figure of the search: utility by candidate, what the model promised, and the step sizes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from grounded.search.standing import Tried
+from grounded_trials.report.figures.figure import Band, Curve, Dot, Figure, Key, Panel, Rule
+from grounded_trials.report.findings import Findings, standard_error
+from grounded_trials.wording import figure, verdict
+
+STEEP = 8.0  # worst over best utility from which on the axis is logarithmic
+NEAR = 4  # candidates from which on the better half has a panel of its own
+
+
+def search_figure(findings: Findings) -> Figure | None:
+    """Utility per candidate with the model's own prediction; alpha below it."""
+    tried = [t for t in findings.history if t.utilities]
+    if not tried:
+        return None
+    number = {t.candidate.id: k + 1 for k, t in enumerate(findings.history)}
+    whole = _utility(findings, tried, number)
+    near = (_near(whole),) if whole.loss and len(tried) > NEAR else ()
+    panels = (whole, *near, _steps(findings, number))
+    key = [
+        Key("best", "first or better", "disc"),
+        Key("other", "no better", "ring"),
+        Key("predicted", "predicted by the model", "dash"),
+        Key("best", "best so far"),
+    ]
+    if any(not math.isfinite(t.utility) for t in tried):
+        key.append(Key("model", "failed", "cross"))
+    if findings.optimum is not None:
+        key.append(Key("accepted", "optimum of the real system"))
+    if math.isfinite(findings.noise):
+        key.append(Key("other", "±2 standard errors of the best", "band"))
+    caption = (
+        "Each candidate is run on the real system; it becomes the best so far when its utility, a "
+        "sum of rewards, is higher. A dash is what the model, made to replay the trial before, "
+        "promised for it."
+    )
+    return Figure("utility", "Utility", caption, panels, tuple(key))
+
+
+def _utility(findings: Findings, tried: list[Tried], number: dict[str, int]) -> Panel:
+    dots = [d for t in tried for d in _dots(findings, t, number[t.candidate.id])]
+    rules, bands = [], []
+    values = [d.y for d in dots if math.isfinite(d.y)]
+    if findings.optimum is not None:
+        rules.append(Rule(findings.optimum, "accepted", "optimum"))
+        values.append(findings.optimum)
+    best = findings.standing.incumbent
+    if best is not None and math.isfinite(findings.noise):
+        error = 2 * findings.noise / math.sqrt(len(best.utilities))
+        note = f"{figure(best.utility)} ± {figure(error, 2)}: two standard errors of the best"
+        bands.append(Band(best.utility - error, best.utility + error, "other", note))
+    loss = bool(values) and max(values) < 0 and min(values) < STEEP * max(values)
+    return Panel(
+        title="Utility of each candidate" + (", logarithmic" if loss else ""),
+        x_name="candidate",
+        y_name="utility",
+        curves=_record(tried, number),
+        dots=tuple(dots),
+        rules=tuple(rules),
+        bands=tuple(bands),
+        loss=loss,
+        whole=True,
+    )
+
+
+def _near(whole: Panel) -> Panel:
+    """The same for the better two thirds of the candidates, on a linear axis."""
+    values = sorted(d.y for d in whole.dots if math.isfinite(d.y) and d.shape != "dash")
+    low, high = values[len(values) // 3], max(d.y for d in whole.dots if d.y == d.y)
+    high = min(high, values[-1] + 0.5 * (values[-1] - low))
+    room = 0.08 * (high - low) or 0.05 * abs(high)
+    dots = tuple(d for d in whole.dots if low <= d.y <= high)
+    title = "The better two thirds of them, linear"
+    bounds = (low - room, high + room)
+    return replace(whole, title=title, dots=dots, loss=False, y_range=bounds)
+
+
+def _dots(findings: Findings, tried: Tried, at: int) -> list[Dot]:
+    candidate = tried.candidate
+    real = figure(tried.utility)
+    became = verdict(tried, tried is findings.history[-1])
+    note = (
+        f"{candidate.id}, iteration {candidate.iteration}, α = {candidate.alpha:g}\n"
+        f"utility {real}, predicted {figure(candidate.predicted_utility)}\n{became}"
+    )
+    error = standard_error(tried)
+    if math.isfinite(error):
+        note += f", ± {figure(error, 2)} over {len(tried.trials)} trials"
+    if not math.isfinite(tried.utility):
+        return [Dot(at, math.nan, "model", f"{note}: the run failed", "cross")]
+    shape, role = ("disc", "best") if tried.accepted else ("ring", "other")
+    dots = [Dot(at, tried.utility, role, note, shape, error if math.isfinite(error) else 0.0)]
+    if math.isfinite(candidate.predicted_utility):
+        dots.insert(0, Dot(at, candidate.predicted_utility, "predicted", note, "dash"))
+    return dots
+
+
+def _record(tried: list[Tried], number: dict[str, int]) -> tuple[Curve, ...]:
+    """The best utility so far, as steps."""
+    best = -math.inf
+    x: list[float] = []
+    y: list[float] = []
+    for t in tried:
+        if t.accepted and t.utility > best:
+            if x:
+                x.append(float(number[t.candidate.id]))
+                y.append(best)
+            best = t.utility
+            x.append(float(number[t.candidate.id]))
+            y.append(best)
+    if not x:
+        return ()
+    x.append(float(max(number.values())))
+    y.append(best)
+    return (Curve(np.array(x), np.array(y), "best", "", 1.2),)
+
+
+def _steps(findings: Findings, number: dict[str, int]) -> Panel:
+    dots = []
+    for t in findings.history:
+        c = t.candidate
+        shape, role = ("disc", "best") if t.accepted else ("ring", "other")
+        note = f"{c.id}: α = {c.alpha:g}, damping {c.damping:.2g}"
+        dots.append(Dot(number[c.id], math.log2(max(c.alpha, 2.0**-30)), role, note, shape))
+    low = min(d.y for d in dots)
+    return Panel(
+        title="Step size: log₂ α (0: the whole step, −1: half of it)",
+        x_name="candidate",
+        y_name="log₂ α",
+        dots=tuple(dots),
+        whole=True,
+        y_range=(min(low, -1.0) - 0.4, 0.6),
+    )

@@ -1,0 +1,179 @@
+"""Findings: all that a report shows, read once, in the words in which it is shown.
+
+Text, page, pictures and recording are four ways to show the same findings; none reads a file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from grounded.frozen import Array
+from grounded.search.planner import Planner
+from grounded.search.standing import Candidate, Standing, Tried
+from grounded.task import Task
+from grounded.trial import Trial, mean_trial
+from grounded_trials.workspace.adopting import Better
+from grounded_trials.workspace.diagnosis_file import Diagnosis
+from grounded_trials.workspace.next_step import Since
+
+
+@dataclass(frozen=True)
+class Lost:
+    """A file that should be there, or be read, and why it is not in the report."""
+
+    file: str
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A trial, what the crude model lacks along it, and what had been predicted."""
+
+    trial: Trial  # .id is its short name
+    candidate: Candidate
+    accepted: bool | None
+    utility: float
+    residual: Array  # (T, n): s_{t+1} - f(s_t, a_t) of the crude model; NaN where not finite
+    explained: Array | None = None  # (T, n): the same of the better model
+
+    @property
+    def label(self) -> str:
+        """For a legend: t0007 (c0005)."""
+        return f"{self.trial.id} ({self.candidate.id})" if self.trial.id else self.candidate.id
+
+
+@dataclass(frozen=True, eq=False)
+class Log:
+    """A log that ran no candidate: for fitting and diagnosis."""
+
+    trial: Trial
+    residual: Array  # (T, n), as a run's
+
+
+@dataclass(frozen=True, eq=False)
+class Findings:
+    """A workspace as a report shows it; `lost` says what could not be shown."""
+
+    name: str
+    task: Task  # with the crude model, which judges and is measured; effects are named beside it
+    nominal: Mapping[str, float]  # parameters as model.py has them, before [model] params
+    effects: tuple[str, ...]  # adopted
+    method: str  # the [search] table in a few words
+    standing: Standing
+    runs: tuple[Run, ...]  # trials of this task's candidates, in order of arrival
+    logs: tuple[Log, ...]  # data of this robot that ran no candidate
+    others: int  # stored trials of earlier tasks or other robots
+    lost: tuple[Lost, ...]
+    diagnosis: Diagnosis | None
+    optimum: float | None  # of the real system, where a study computed it
+    noise: float  # standard deviation of one trial's utility, NaN while unknown
+    next_command: str
+    better: Better | None = None  # the model as diagnosed, or with adopted effects
+    since: Since = field(default_factory=Since)  # the diagnosis
+
+    @property
+    def crude(self) -> Planner:
+        """The task with the crude model."""
+        return Planner(self.task, self.task)
+
+    @property
+    def plain(self) -> str:
+        """What the model is called that judges: nothing that was adopted is in it."""
+        return "model without adopted effects" if self.effects else "crude model"
+
+    @property
+    def values(self) -> dict[str, float]:
+        """The model's parameters as they are now, by name."""
+        return {name: param.value for name, param in self.task.model.params.items()}
+
+    @property
+    def history(self) -> tuple[Tried, ...]:
+        """Every candidate with its trials, in order of proposal."""
+        return self.standing.history
+
+    def runs_of(self, candidate: str) -> tuple[Run, ...]:
+        """The runs of a candidate."""
+        return tuple(r for r in self.runs if r.candidate.id == candidate)
+
+    @cached_property
+    def first(self) -> Run | None:
+        """The model's own policy on the real system: the first candidate that has a trial."""
+        run = next((t for t in self.history if t.trials), None)
+        return None if run is None or run.candidate.base else self._mean(run.candidate.id)
+
+    @cached_property
+    def best(self) -> Run | None:
+        """The best candidate so far; several trials of it are averaged."""
+        best = self.standing.incumbent
+        return None if best is None else self._mean(best.candidate.id)
+
+    @cached_property
+    def latest(self) -> Run | None:
+        """The last trial that came back."""
+        return self.runs[-1] if self.runs else None
+
+    @cached_property
+    def improvements(self) -> tuple[Run, ...]:
+        """The accepted candidates, by iteration: the model's policy, then each better one."""
+        found = [self._mean(t.candidate.id) for t in self.history if t.accepted]
+        return tuple(run for run in found if run is not None)
+
+    def _mean(self, candidate: str) -> Run | None:
+        runs = self.runs_of(candidate)
+        if not runs:
+            return None
+        if len(runs) == 1 or len({r.trial.steps for r in runs}) > 1:
+            return runs[0]
+        trial = mean_trial([r.trial for r in runs], self.task.model.angle_mask)
+        explained = [r.explained for r in runs if r.explained is not None]
+        return Run(
+            trial,
+            runs[0].candidate,
+            runs[0].accepted,
+            float(np.mean([r.utility for r in runs])),
+            np.mean([r.residual for r in runs], axis=0),
+            np.mean(explained, axis=0) if len(explained) == len(runs) else None,
+        )
+
+
+def standard_error(tried: Tried) -> float:
+    """Of a candidate's mean utility; NaN for fewer than two trials, or when one of them failed."""
+    return tried.standard_error if np.isfinite(tried.utility) else float("nan")
+
+
+def tracked(task: Task) -> list[int]:
+    """States with a target."""
+    return [i for i in range(task.model.n) if np.isfinite(task.target[:, i]).all()]
+
+
+def tracking_error(task: Task, trial: Trial) -> Array:
+    """s_t - target_t, (T + 1, n), angles wrapped; NaN where there is no target."""
+    return task.model.difference(trial.states, task.target[: trial.steps + 1])
+
+
+def prediction_error(task: Task, run: Run) -> Array:
+    """The real states minus those predicted for the same policy, (T + 1, n), angles wrapped."""
+    T = run.trial.steps
+    return task.model.difference(run.trial.states, run.candidate.predicted_states[: T + 1])
+
+
+def rms(values: Array) -> Array:
+    """Root mean square of each column over its finite rows; NaN where there is none."""
+    finite = np.isfinite(values)
+    count = finite.sum(axis=0)
+    total = np.where(finite, values, 0.0) ** 2
+    return np.asarray(
+        np.sqrt(np.where(count > 0, total.sum(axis=0) / np.maximum(count, 1), np.nan))
+    )
+
+
+def selection(runs: tuple[Run, ...], most: int) -> tuple[Run, ...]:
+    """At most `most` of them: the first, the last, and those between that are evenly spread."""
+    if len(runs) <= most:
+        return runs
+    index = np.unique(np.rint(np.linspace(0, len(runs) - 1, most)).astype(int))
+    return tuple(runs[i] for i in index)

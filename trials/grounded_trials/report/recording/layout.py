@@ -1,0 +1,145 @@
+"""The recording's blueprint: which views the viewer opens with, and where it looks from."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from grounded.frozen import Array
+from grounded_trials.report.findings import Findings
+from grounded_trials.report.scene import Scene
+from grounded_trials.wording import labelled, per_second
+
+TRIALS = 60  # that get a tab of their own
+NAMES = {"state": "states", "input": "inputs", "bias": "bias"}
+FIRST = 4  # states in the overview; all of them have a tab
+
+
+def blueprint(findings: Findings, scene: Scene) -> Any:
+    """Overview, states, inputs, bias, and a tab for each trial."""
+    import rerun.blueprint as rrb
+
+    model = findings.task.model
+    states = [_plot(f"/state/{n}", labelled(n, u)) for n, u in model.states.items()]
+    inputs = [_plot(f"/input/{n}", labelled(n, u)) for n, u in model.inputs.items()]
+    biases = [_plot(f"/bias/{n}", labelled(n, per_second(u))) for n, u in model.states.items()]
+    tabs = [
+        _overview(findings, scene),
+        rrb.Grid(*states, name="States"),
+        rrb.Grid(*inputs, name="Inputs"),
+        rrb.Grid(*biases, name="Bias"),
+        rrb.Tabs(*_trials(findings, scene), name="By trial"),
+    ]
+    return rrb.Blueprint(
+        rrb.Tabs(*tabs, active_tab=4 if findings.logs and not findings.runs else 0),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.TimePanel(state="collapsed", timeline="time"),
+        auto_views=False,
+        auto_layout=False,
+    )
+
+
+def _overview(findings: Findings, scene: Scene) -> Any:
+    import rerun.blueprint as rrb
+
+    model = findings.task.model
+    chosen = _interesting(findings)
+    named = [(f"/state/{n}", f"{n} [{model.states[n]}]") for n in chosen]
+    named += [(f"/input/{n}", labelled(n, u)) for n, u in list(model.inputs.items())[:2]]
+    named += [
+        (f"/bias/{n}", labelled(f"bias of {n}", per_second(model.states[n]))) for n in chosen[:2]
+    ]
+    plots = [_plot(origin, name, legend=False) for origin, name in named]
+    left = rrb.Vertical(
+        _space(findings, scene, "/", ["/paths/**"], _axes(scene)),
+        rrb.Horizontal(
+            rrb.BarChartView(
+                origin="/utilities",
+                name="Utility by iteration",
+                plot_legend=rrb.PlotLegend(visible=False),
+            ),
+            rrb.TextDocumentView(origin="/summary", name="Summary"),
+        ),
+        row_shares=[3, 2],
+    )
+    return rrb.Horizontal(
+        left, rrb.Grid(*plots, grid_columns=2), name="Overview", column_shares=[1, 1]
+    )
+
+
+def _axes(scene: Scene) -> str:
+    axes = [labelled(name, unit) for name, unit in zip(scene.names, scene.units, strict=True)]
+    return "Paths: " + " over ".join(reversed(axes)) if len(axes) == 2 else "Paths"
+
+
+def _interesting(findings: Findings) -> list[str]:
+    """The states with a weight in the reward, then the others."""
+    task = findings.task
+    weight = task.reward.state + task.reward.terminal
+    order = sorted(range(task.model.n), key=lambda i: (weight[i] == 0, i))
+    return [task.model.state_names[i] for i in order[:FIRST]]
+
+
+def _trials(findings: Findings, scene: Scene) -> list[Any]:
+    import rerun.blueprint as rrb
+
+    tabs = []
+    for run in findings.runs[-TRIALS:]:
+        at = f"/trials/{run.trial.id}"
+        contents = ["/paths/desired", f"{at}/path", f"{at}/predicted", f"{at}/body"]
+        names = dict(NAMES)
+        if run.explained is not None:
+            names["explained"] = "bias that is left after the diagnosis"
+        plots = [_plot(f"{at}/{key}", name) for key, name in names.items()]
+        space = _space(findings, scene, "/", contents, f"{run.label}, utility {run.utility:.4g}")
+        tabs.append(rrb.Horizontal(space, rrb.Vertical(*plots), name=run.trial.id))
+    for log in findings.logs[-TRIALS:]:
+        at = f"/data/{log.trial.id}"
+        plots = [_plot(f"{at}/{key}", name) for key, name in NAMES.items()]
+        contents = ["/paths/desired", f"{at}/path", f"{at}/body"]
+        space = _space(findings, scene, "/", contents, f"{log.trial.id}, data")
+        tabs.append(rrb.Horizontal(space, rrb.Vertical(*plots), name=log.trial.id))
+    return tabs
+
+
+def _plot(origin: str, name: str, legend: bool = True) -> Any:
+    import rerun.blueprint as rrb
+
+    key = rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend)
+    return rrb.TimeSeriesView(origin=origin, name=name, plot_legend=key)
+
+
+def _space(findings: Findings, scene: Scene, origin: str, contents: list[str], name: str) -> Any:
+    """A view of space: from above for a plane (so that y points up), from the side for a volume."""
+    import rerun.blueprint as rrb
+
+    centre, extent = _bounds(findings, scene)
+    direction = np.array([0.0, -1.0, 0.7]) if scene.volume else np.array([0.0, 0.0, 1.0])
+    distance = max(extent, 1e-3) * 1.1
+    eye = rrb.EyeControls3D(
+        kind=rrb.Eye3DKind.Orbital,
+        position=centre + distance * direction / np.linalg.norm(direction),
+        look_target=centre,
+        eye_up=(0, 0, 1) if scene.volume else (0, 1, 0),
+    )
+    spacing = 10.0 ** math.floor(math.log10(max(extent, 1e-3) / 2))
+    grid = rrb.LineGrid3D(visible=True, spacing=spacing, color=(90, 90, 90, 60))
+    return rrb.Spatial3DView(
+        origin=origin, contents=contents, name=name, eye_controls=eye, line_grid=grid
+    )
+
+
+def _bounds(findings: Findings, scene: Scene) -> tuple[Array, float]:
+    """The middle and the size of all that is drawn, without runs that went astray."""
+    shown = [findings.task.target] if findings.task.target is not None else []
+    shown += [run.trial.states for run in (findings.best, findings.first) if run is not None]
+    shown += [log.trial.states for log in findings.logs] if not findings.runs else []
+    points = np.vstack([scene.points(s) for s in shown])
+    points = points[np.isfinite(points).all(axis=1)]
+    if not len(points):
+        return np.zeros(3), 1.0
+    low, high = points.min(axis=0), points.max(axis=0)
+    return (low + high) / 2, float((high - low).max() or 1.0)

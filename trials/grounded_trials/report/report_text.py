@@ -1,0 +1,232 @@
+"""The report for a terminal: 80 columns, aligned numbers, the next command as its last line."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from grounded.search.standing import Tried
+from grounded_trials.report.diagnosis_words import error_lines, sentences
+from grounded_trials.report.findings import (
+    Findings,
+    prediction_error,
+    rms,
+    selection,
+    standard_error,
+    tracking_error,
+)
+from grounded_trials.report.forecast import SECONDS, forecast_error
+from grounded_trials.wording import (
+    WIDTH,
+    count,
+    figure,
+    folded,
+    per_second,
+    shown,
+    verdict,
+    with_unit,
+    wrapped,
+)
+from grounded_trials.workspace.diagnosis_file import Value
+
+ROWS = 12  # candidates in the table; the others are counted
+ITERATIONS = 5  # of the bias
+EFFECTS = 5
+VALUES = 34  # columns for an effect's parameters
+LEGEND = "alpha: the part of the step that was run; +-: standard error"
+
+Table = Callable[[Sequence[Sequence[str]], Sequence[str]], str]
+
+
+def report_text(findings: Findings, table: Table, bars: Callable[[Sequence[float]], str]) -> str:
+    """The whole report.
+
+    Args:
+        findings: what is shown.
+        table: aligns rows under a header.
+        bars: a sparkline of utilities.
+    """
+    parts = [_head(findings), _utilities(findings, table, bars)]
+    if findings.best is not None:
+        parts += [_trajectories(findings, table), _biases(findings, table)]
+    parts.append(_diagnosis(findings, table))
+    if findings.logs:
+        parts.append(_logs(findings, table))
+    if findings.lost:
+        lines = ["left out of this report"]
+        for one in findings.lost:
+            lines += _wrapped(f"{one.file}: {one.reason}", "  ")
+        parts.append("\n".join(lines))
+    parts.append(folded(findings.next_command))
+    return "\n\n".join(parts)
+
+
+def _head(findings: Findings) -> str:
+    task = findings.task
+    runs = len(findings.runs)
+    text = (
+        f"{findings.name}: {task.model.name}, {task.horizon} steps of {task.dt:g} s "
+        f"({task.horizon * task.dt:g} s), {'closed loop' if task.feedback else 'open loop'}; "
+        f"{count(runs, 'trial')}"
+    )
+    if findings.logs:
+        text += f", {count(len(findings.logs), 'log')} of data"
+    if findings.effects:
+        text += "; adopted: " + ", ".join(findings.effects)
+    return "\n".join(wrapped(text, "", ""))
+
+
+def _utilities(findings: Findings, table: Table, bars: Callable[[Sequence[float]], str]) -> str:
+    history = findings.history
+    if not history:
+        return "utility\n  no candidate was proposed yet"
+    few, left = _rows(history)
+    rows = [_candidate(t, t is history[-1]) for t in few]
+    header = ("candidate", "iter.", "alpha", "predicted", "real", "+-", "trials", "")
+    lines = ["utility", table(rows, header), f"  {LEGEND}"]
+    if left:
+        lines.append(f"  ({left} more between them: grounded status shows all)")
+    spark = bars(spaced([t.utility for t in history if t.utilities][-WIDTH // 2 :]))
+    if spark:
+        lines.append(f"\n  {spark}  by candidate, higher is better")
+    first, best = findings.first, findings.best
+    if first is not None and best is not None:
+        text = f"model's policy {figure(first.utility)}, "
+        text += f"best {best.candidate.id} {figure(best.utility)}"
+        if math.isfinite(first.utility) and first.utility < 0:
+            text += f", {100 * (1 - best.utility / first.utility):.1f} % better"
+        if findings.optimum is not None:
+            text += f", optimum {figure(findings.optimum)}"
+        lines += _wrapped(text, "  ")
+    lines += _wrapped(f"{findings.standing.phase}: {findings.standing.sentence}", "  ")
+    return "\n".join(lines)
+
+
+def spaced(utilities: Sequence[float]) -> list[float]:
+    """Utilities for bars: by their logarithm where the worst would flatten all the others."""
+    known = [u for u in utilities if math.isfinite(u)]
+    if not known or max(known) >= 0 or min(known) > 5 * max(known):
+        return list(utilities)
+    return [-math.log(-u) if math.isfinite(u) else u for u in utilities]
+
+
+def _rows(history: Sequence[Tried]) -> tuple[list[Tried], int]:
+    """At most ROWS candidates: the first, then improvements, then the latest ones."""
+    if len(history) <= ROWS:
+        return list(history), 0
+    keep = {0, len(history) - 1}
+    accepted = [k for k, t in enumerate(history) if t.accepted]
+    if len(accepted) > ROWS - 2:
+        index = np.unique(np.rint(np.linspace(0, len(accepted) - 1, ROWS - 2)).astype(int))
+        accepted = [accepted[i] for i in index]
+    keep |= set(accepted)
+    for k in range(len(history) - 1, -1, -1):
+        if len(keep) < ROWS:
+            keep.add(k)
+    return [history[k] for k in sorted(keep)], len(history) - len(keep)
+
+
+def _candidate(tried: Tried, last: bool) -> tuple[str, ...]:
+    error = standard_error(tried)
+    return (
+        tried.candidate.id,
+        str(tried.candidate.iteration),
+        f"{tried.candidate.alpha:g}",
+        figure(tried.candidate.predicted_utility),
+        figure(tried.utility),
+        figure(error, 2),
+        str(len(tried.trials)),
+        verdict(tried, last),
+    )
+
+
+def _trajectories(findings: Findings, table: Table) -> str:
+    """Distance to the target, and what the model had promised, rms over the run."""
+    task, first, best = findings.task, findings.first, findings.best
+    assert best is not None
+    runs = [run for run in (first, best) if run is not None]
+    if first is not None and first.candidate is best.candidate:
+        runs = [best]
+    columns = [rms(tracking_error(task, run.trial)) for run in runs]
+    columns += [rms(prediction_error(task, run)) for run in runs]
+    rows = [
+        (name, shown(unit), *(figure(float(c[i]), 3) for c in columns))
+        for i, (name, unit) in enumerate(task.model.states.items())
+    ]
+    ids = [run.candidate.id for run in runs]
+    header = ("state", "unit", *(f"{i} off" for i in ids), *(f"{i} gap" for i in ids))
+    note = "  off: from the desired path; gap: from what the model predicted for that run"
+    return "trajectories, rms over the run\n" + table(rows, header) + "\n" + note
+
+
+def _biases(findings: Findings, table: Table) -> str:
+    task = findings.task
+    runs = selection(findings.improvements, ITERATIONS)
+    if not runs:
+        return "bias\n  no whole trial yet"
+    columns = [rms(run.residual) / task.dt for run in runs]
+    rows = [
+        (name, per_second(unit), *(figure(float(c[i]), 3) for c in columns))
+        for i, (name, unit) in enumerate(task.model.states.items())
+    ]
+    header = ("state", "unit", *(f"iter. {run.candidate.iteration}" for run in runs))
+    return f"bias: what the {findings.plain} lacks, rms over the run\n" + table(rows, header)
+
+
+def _diagnosis(findings: Findings, table: Table) -> str:
+    diagnosis, since = findings.diagnosis, findings.since
+    if diagnosis is None:
+        return "gap to the model\n  not diagnosed yet: grounded diagnose"
+    lines = ["gap to the model"]
+    if since.sentence:
+        lines += _wrapped(since.sentence, "  ")
+    then = "before that: " * bool(since.adopted)
+    for k, sentence in enumerate(sentences(diagnosis.sentence or diagnosis.kind)):
+        lines += _wrapped(then * (k == 0) + sentence, "  ")
+    before = {} if since.changed else findings.values
+    for title, text in error_lines(diagnosis, before):
+        lines += _wrapped(f"{title}: {text}", "  ")
+    if diagnosis.ranking and not diagnosis.no_cause:
+        rows = [
+            (
+                r.effect[:30],
+                figure(r.evidence, 3),
+                figure(r.gap_after, 3),
+                _fitting(list(map(_value, r.params)), VALUES).ljust(VALUES),
+            )
+            for r in diagnosis.ranking[:EFFECTS]
+        ]
+        lines.append(table(rows, ("effect", "nats", "gap after", "parameters".ljust(VALUES))))
+    return "\n".join(lines)
+
+
+def _fitting(values: list[str], width: int) -> str:
+    """As many of them as fit, and dots for the others: half a number would be a wrong one."""
+    for kept in range(len(values), 0, -1):
+        text = ", ".join(values[:kept]) + ", ..." * (kept < len(values))
+        if len(text) <= width:
+            return text
+    return "..." if values else ""
+
+
+def _logs(findings: Findings, table: Table) -> str:
+    """How far the crude model is off 1 s ahead on logs that ran no candidate."""
+    logs = findings.logs[-ITERATIONS:]
+    columns = [forecast_error(findings.crude, log.trial) for log in logs]
+    rows = [
+        (name, shown(unit), *(figure(float(c[i]), 3) for c in columns))
+        for i, (name, unit) in enumerate(findings.task.model.states.items())
+    ]
+    title = f"data: error of the {findings.plain} {SECONDS:g} s ahead, rms\n"
+    return title + table(rows, ("state", "unit", *(log.trial.id for log in logs)))
+
+
+def _value(value: Value) -> str:
+    spread = f" +- {value.std:.2g}" if 0 < value.std < math.inf else ""
+    return with_unit(f"{value.name} = {value.value:.3g}{spread}", value.unit)
+
+
+def _wrapped(text: str, indent: str) -> list[str]:
+    return wrapped(text, indent, indent + "  ")

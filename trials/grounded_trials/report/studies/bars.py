@@ -1,0 +1,166 @@
+"""Pictures of tables: bars with their numbers, one below the other."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from grounded.experiments.baselines import BUDGET, SHARES, BaselinesResult, Line
+from grounded.experiments.car import PAPER
+from grounded.experiments.estimated import CAMERA, WAYS, EstimatedResult, EstimatedRun
+from grounded.experiments.fit_car import FitCarResult
+from grounded.experiments.footnote9 import Footnote9Result
+from grounded.experiments.jobs import improvement
+from grounded.experiments.nondeterminism import NondeterminismResult
+from grounded_trials.report.figures.figure import Bar, Bars, Figure, Key
+
+LEVEL = 2  # of SHARES: what the picture of the baselines counts trials to
+PAPER_SPREAD = 50.0  # [cm] the largest that the paper saw
+KINDS = {
+    "parametric": "parametric error",
+    "structural": "structural error",
+    "noise": "structural error and noise",
+}
+WORDS = {"camera": "estimated", "true": "true states"}
+QUANTITIES = (("Position", "mm", 1e3), ("Heading", "mrad", 1e3), ("Speed", "m/s", 1.0))
+
+
+def footnote9_figure(result: Footnote9Result) -> Figure:
+    """Shares of the optimum for each b: the model's policy, one iteration, policy gradient."""
+    kinds = (("model", "model-based"), ("best", "one iteration"), ("other", "policy gradient"))
+    bars = [
+        Bar(f"b = {row.b:g}, {name}", value, f"{value:.3g}", role)
+        for row in result.rows
+        for (role, name), value in zip(
+            kinds, (row.model_based, row.solved, row.gradient), strict=True
+        )
+    ]
+    key = tuple(Key(role, name, "disc") for role, name in kinds)
+    title = "Footnote 9: a model that is wrong by b"
+    panel = Bars("Real utility as a share of the optimum", tuple(bars))
+    return Figure("footnote9", title, "", (panel,), key)
+
+
+def nondeterminism_figure(result: NondeterminismResult) -> Figure:
+    """The largest distance between end-points, by scatter and sequence, on one scale."""
+    roles = ("other", "best", "model")
+    levels = sorted({s.level for s in result.spreads})
+    bars = [
+        Bar(
+            f"{s.sequence}, x{level:g}",
+            100 * s.largest,
+            f"{100 * s.largest:.1f} cm",
+            roles[min(i, len(roles) - 1)],
+        )
+        for i, level in enumerate(levels)
+        for s in result.spreads
+        if s.level == level
+    ]
+    bars.append(Bar("the paper’s car, at most", PAPER_SPREAD, f"{PAPER_SPREAD:.0f} cm", "desired"))
+    keys = [
+        Key(roles[min(i, len(roles) - 1)], f"scatter x{level:g}", "disc")
+        for i, level in enumerate(levels)
+    ]
+    panel = Bars(f"Largest distance between end-points, {result.runs} runs of 2 s", tuple(bars))
+    return Figure("nondeterminism", "The same inputs, again and again", "", (panel,), tuple(keys))
+
+
+def baselines_figure(result: BaselinesResult) -> Figure:
+    """Real trials that each method needs, a panel a manoeuvre and error; long bars are cut."""
+    cases = dict.fromkeys((line.manoeuvre, line.kind) for line in result.lines)
+    panels = []
+    for manoeuvre, kind in cases:
+        own = [li for li in result.lines if (li.manoeuvre, li.kind) == (manoeuvre, kind)]
+        methods = dict.fromkeys(line.method for line in own)
+        bars = [_method([line for line in own if line.method == m]) for m in methods]
+        panels.append(Bars(f"{manoeuvre}, {KINDS.get(kind, kind)}", tuple(bars)))
+    key = (
+        Key("best", "this tool", "disc"),
+        Key("other", "other methods", "disc"),
+        Key("model", "most seeds never get there", "disc"),
+    )
+    title = f"Real trials to close {SHARES[LEVEL]:.0%} of the gap, median; bars end at {BUDGET}"
+    return Figure("baselines", title, "", tuple(panels), key)
+
+
+def _method(lines: Sequence[Line]) -> Bar:
+    counts = [np.inf if li.trials[LEVEL] is None else float(li.trials[LEVEL] or 0) for li in lines]
+    median, name = float(np.median(counts)), lines[0].method
+    if not np.isfinite(median):
+        end = float(np.median([line.final for line in lines]))
+        return Bar(name, float(BUDGET), f"never: ends at {end:.1%}", "model")
+    role = "best" if name == "grounded" else "other"
+    return Bar(name, min(median, BUDGET), f"{median:g}", role)
+
+
+def fit_car_figure(result: FitCarResult) -> Figure:
+    """By parameter: whether intervals hold, what the fit adds, and whether its std is honest."""
+    held, gained, honest = [], [], []
+    count = len(result.runs)
+    for name, share in result.coverage.items():
+        each = [run["params"][name] for run in result.runs]
+        first, last = (
+            float(np.sqrt(np.mean([(p[key] - p["true"]) ** 2 for p in each])))
+            for key in ("first", "value")
+        )
+        z = float(np.sqrt(np.mean([((p["value"] - p["true"]) / p["std"]) ** 2 for p in each])))
+        held.append(Bar(name, share, f"{round(share * count)} of {count}"))
+        ratio = last / first if first > 0 else np.nan
+        text = f"{last:.2g} {each[0]['unit']}".removesuffix(" 1")
+        gained.append(Bar(name, ratio, f"{ratio:.1%}: {text}"))
+        honest.append(Bar(name, z, f"{z:.2f}"))
+    panels = (
+        Bars("Cars whose 95 % interval holds the true value", tuple(held)),
+        Bars("Rms error of the fit, as a share of the first value’s", tuple(gained)),
+        Bars("Error of each fit in its own stated standard deviations, rms", tuple(honest)),
+    )
+    title = f"Parameters from {result.minutes:g} minutes of driving, {count} cars"
+    return Figure("fit-car", title, "", panels)
+
+
+def estimated_figure(result: EstimatedResult) -> Figure:
+    """Improvement on estimated beside true states, and the errors of the estimates."""
+    names = list(dict.fromkeys(run.manoeuvre for run in result.runs))
+    bars = [bar for name in names for bar in _gains(result, name)]
+    panels = [Bars("Share of the model’s cost that is gone", tuple(bars))]
+    filmed = {name: [r for r in result.of(name, "camera") if r.live] for name in names}
+    for i, (what, unit, factor) in enumerate(QUANTITIES):
+        rows = [bar for name in names for bar in _errors(name, filmed[name], i, unit, factor)]
+        if rows:
+            panels.append(Bars(f"{what}: error of the estimates, rms", tuple(rows)))
+    key = (
+        Key("best", "on estimated states", "disc"),
+        Key("accepted", "on true states", "disc"),
+        Key("other", "optimum, and the paper’s car", "disc"),
+    )
+    title = f"The closed loop on estimated states, markers ±{1e3 * CAMERA:g} mm"
+    return Figure("estimated", title, "", tuple(panels), key)
+
+
+def _gains(result: EstimatedResult, name: str) -> list[Bar]:
+    bars, best = [], math.nan
+    for way, role in zip(WAYS, ("best", "accepted"), strict=True):
+        runs = result.of(name, way)
+        if runs:
+            gain = float(np.mean([run.improvement for run in runs]))
+            bars.append(Bar(f"{name}, {WORDS[way]}", gain, f"{gain:.1%}", role))
+            best = float(np.mean([improvement(run.true[0], run.true[2]) for run in runs]))
+    bars.append(Bar(f"{name}, optimum", best, f"{best:.1%}", "other"))
+    return [*bars, Bar(f"{name}, the paper’s", PAPER[name], f"{PAPER[name]:.0%}", "other")]
+
+
+def _errors(
+    name: str, runs: Sequence[EstimatedRun], which: int, unit: str, factor: float
+) -> list[Bar]:
+    if not runs:
+        return []
+    bars = []
+    for words, found in (
+        ("live filter", [run.live for run in runs]),
+        ("smoother", [run.smoothed for run in runs]),
+    ):
+        rms = factor * float(np.sqrt(np.mean(np.array(found, dtype=float)[:, which] ** 2)))
+        bars.append(Bar(f"{name}, {words}", rms, f"{rms:.3g} {unit}"))
+    return bars

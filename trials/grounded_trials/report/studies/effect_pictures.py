@@ -1,0 +1,154 @@
+"""A picture of each family's signature.
+
+Made by `python -m grounded_trials.report.studies.effect_pictures docs`.
+
+A car is driven by the same commands in the model (grey) and in the model with one effect (orange);
+shown is the state that the effect changes most, in units of its own range: one that moves fast
+(speed, steering angle, heading rate) where it changes those, else a position. Strengths are chosen
+so that the change is seen: about a quarter of the range.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from grounded.effects import (
+    Effect,
+    InputFamily,
+    Library,
+    MemoryFamily,
+    ParamFamily,
+    RateFamily,
+    memory_start,
+    places,
+    scales_of,
+    wrap,
+)
+from grounded.frozen import Array
+from grounded.model import Model
+from grounded.models.car import model as car
+from grounded.trial import Trial
+
+DT, STEPS = 0.05, 160
+WIDE, HIGH, GAP, TOP = 170, 84, 14, 18  # of a panel [px]
+ROW = 4  # panels side by side
+SEEN = 0.25  # of a state's range
+
+
+def commands() -> Array:
+    """Steering and throttle, lively and of both signs, with steps."""
+    t = np.arange(STEPS) * DT
+    steering = 0.5 * np.sin(2.0 * t) * np.where(t > 4, 1.0, np.sign(np.sin(2.0 * t)))
+    throttle = 0.45 + 0.3 * np.sign(np.sin(1.3 * t))
+    return np.stack([steering, throttle], axis=1)
+
+
+def run(model: Model, base: Model, inputs: Array) -> Array:
+    """States of the base model's names under the commands, (T + 1, n)."""
+    start = np.full(base.n, 0.1)
+    still = Trial(np.tile(start, (2, 1)), inputs[:1], DT, base.state_names, base.input_names)
+    x = start if model.n == base.n else np.hstack([start, memory_start(model, base, still)])
+    found = [x]
+    for row in inputs:
+        found.append(model.system.step(found[-1][None], row[None], model.values, DT)[0])
+    return np.array(found)[:, : base.n]
+
+
+def settings(effect: Effect) -> list[dict[str, float]]:
+    """Values to try: strengths that double at the middle of the grid, or the grid itself."""
+    linear = [q for q in effect.free if not q.grid]
+    scanned = {q.name: np.sort(q.grid) for q in effect.free if q.grid}
+    if not linear:
+        most = max(map(len, scanned.values()))
+        return [{n: float(g[min(k, len(g) - 1)]) for n, g in scanned.items()} for k in range(most)]
+    middle = {name: float(grid[len(grid) // 2]) for name, grid in scanned.items()}
+    strengths = (0.01 * 2**k for k in range(12))
+    return [middle | {q.name: float(np.clip(s, q.low, q.high)) for q in linear} for s in strengths]
+
+
+def signature(effect: Effect, inputs: Array, plain: Array) -> tuple[str, Array, Array]:
+    """The state that changes most: its name, without and with the effect (T + 1,)."""
+    size = np.maximum(np.ptp(plain, axis=0), 1e-9)
+    fast = [car.state_names.index(name) for name in places.dynamic(car)]
+    found = []
+    for values in settings(effect):
+        changed = run(wrap(effect, values, DT), car, inputs)
+        change = np.abs(changed - plain).max(axis=0) / size
+        if change[fast].max() > 0.02:
+            change = np.where(np.isin(np.arange(car.n), fast), change, 0.0)
+        i = int(np.argmax(change))
+        found.append((abs(float(change[i]) - SEEN), car.state_names[i], plain[:, i], changed[:, i]))
+    return min(found, key=lambda each: each[0])[1:]
+
+
+def panel(title: str, state: str, plain: Array, changed: Array, x: float, y: float) -> str:
+    """One small plot."""
+    both = np.stack([plain, changed])
+    low, size = both.min(), max(float(np.ptp(both)), 1e-9)
+    lines = []
+    for values, colour in ((plain, "#999999"), (changed, "#d9480f")):
+        across = x + WIDE * np.arange(len(values)) / (len(values) - 1)
+        up = y + TOP + HIGH * (1 - (values - low) / size)
+        points = " ".join(f"{a:.0f},{b:.1f}" for a, b in zip(across, up, strict=True))
+        lines.append(
+            f'<polyline points="{points}" fill="none" stroke="{colour}" stroke-width="1.6"/>'
+        )
+    words = f'<text x="{x:.0f}" y="{y + 12:.0f}" fill="#777777">{title} ({state})</text>'
+    return words + "".join(lines)
+
+
+def strip(named: Mapping[str, tuple[str, Array, Array]]) -> str:
+    """Panels in rows, as one SVG."""
+    rows = -(-len(named) // ROW)
+    step = TOP + HIGH + GAP
+    body = [
+        panel(name, *drawn, (i % ROW) * (WIDE + GAP), (i // ROW) * step)
+        for i, (name, drawn) in enumerate(named.items())
+    ]
+    wide = min(len(named), ROW) * (WIDE + GAP)
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{wide}" height="{rows * step}" '
+        f'font-family="sans-serif" font-size="11">{"".join(body)}</svg>\n'
+    )
+
+
+def kind_of(effect: Effect) -> str:
+    """The section of docs/effects.md."""
+    kinds = {InputFamily: "input", MemoryFamily: "memory", RateFamily: "rate", ParamFamily: "param"}
+    name = next((k for cls, k in kinds.items() if isinstance(effect.family, cls)), "sensor")
+    return "sensor" if effect.family.name == "odometry_scale" else name
+
+
+def draw_all(folder: Path) -> list[Path]:
+    """Writes effects-KIND.svg for every kind; returns their paths."""
+    inputs = commands()
+    plain = run(car, car, inputs)
+    scales = scales_of(car, plain, inputs, DT, STEPS * DT)
+    strips: dict[str, dict[str, tuple[str, Array, Array]]] = {}
+    for effect in Library().candidates(car, scales):
+        named = strips.setdefault(kind_of(effect), {})
+        drawn = signature(effect, inputs, plain)
+        before = named.get(effect.family.name)
+        if before is None or _change(drawn) > _change(before):  # the target where it shows
+            named[effect.family.name] = drawn
+    paths = []
+    for kind, named in strips.items():
+        paths.append(folder / f"effects-{kind}.svg")
+        paths[-1].write_text(strip(named), encoding="utf-8")
+    return paths
+
+
+def _change(drawn: tuple[str, Array, Array]) -> float:
+    """How far apart the lines are, in units of the first one's range; at most SEEN counts."""
+    _, plain, changed = drawn
+    far = float(np.abs(changed - plain).max() / max(float(np.ptp(plain)), 1e-9))
+    return far if far < 2 else 0.0
+
+
+if __name__ == "__main__":
+    for path in draw_all(Path(sys.argv[1] if len(sys.argv) > 1 else "docs")):
+        print(path)

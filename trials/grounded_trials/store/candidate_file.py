@@ -1,0 +1,203 @@
+"""A candidate as a file: the policy a robot runs and its predicted run.
+
+The format is described in this folder's `__init__`.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from grounded.errors import GroundedError
+from grounded.frozen import Array
+from grounded.policy import Policy
+from grounded_trials.store.own_files import (
+    CANDIDATE,
+    Meta,
+    OwnFile,
+    Target,
+    Units,
+    deliver,
+    read_own,
+    rows,
+    with_meta,
+    with_units,
+)
+
+DEPTH_LIMIT = 10_000  # past values of one input
+
+
+def candidate_bytes(
+    policy: Policy,
+    predicted_states: Array,
+    predicted_inputs: Array,
+    meta: Meta,
+    *,
+    state_units: Units | None = None,
+    input_units: Units | None = None,
+) -> bytes:
+    """A candidate as the bytes of a file; equal arguments give equal bytes."""
+    from grounded_trials.formats.mcap_writer import LogWriter, encode_doubles, encode_lists
+
+    _refuse_unfinite(policy)
+    states = rows(predicted_states, policy.horizon + 1, len(policy.state_names))
+    inputs = rows(predicted_inputs, policy.horizon, len(policy.input_names))
+    table = {
+        "format": CANDIDATE,
+        "dt": repr(float(policy.dt)),
+        "states": json.dumps(with_units(policy.state_names, state_units)),
+        "inputs": json.dumps(with_units(policy.input_names, input_units)),
+        "steps": str(policy.horizon),
+        "policy": json.dumps(_policy_table(policy)),
+    }
+    stream = io.BytesIO()
+    log = LogWriter(stream)
+    log.metadata("grounded", with_meta(table, meta))
+    log.attachment("about", "text/plain", _ABOUT)
+    topic = log.channel("/policy", "Policy", ["feedforward", "gain", "reference"], repeated=True)
+    state = log.channel("/predicted_state", "State", policy.state_names)
+    input = log.channel("/predicted_input", "Input", policy.input_names)
+    controls, moves = encode_lists(_controls(policy)), encode_doubles(inputs)
+    for k, reached in enumerate(encode_doubles(states)):
+        time = round(k * policy.dt * 1e9)
+        if k < policy.horizon:
+            log.message(topic, time, controls[k])
+            log.message(input, time, moves[k])
+        log.message(state, time, reached)
+    log.finish()
+    return stream.getvalue()
+
+
+def write_candidate(
+    target: Target,
+    policy: Policy,
+    predicted_states: Array,
+    predicted_inputs: Array,
+    meta: Meta,
+    *,
+    state_units: Units | None = None,
+    input_units: Units | None = None,
+) -> None:
+    """Writes a candidate; the file appears complete or not at all.
+
+    Args:
+        target: a path (replaced if it exists) or a writable binary stream.
+        policy: what the robot runs.
+        predicted_states: (H+1, n).
+        predicted_inputs: (H, m).
+        meta: entries of the metadata record besides the reserved ones.
+        state_units: name -> unit; "1" where missing.
+        input_units: the same for the inputs.
+
+    Raises:
+        GroundedError: if the file can't be written, or the policy holds a number that is
+            not finite.
+    """
+    data = candidate_bytes(
+        policy,
+        predicted_states,
+        predicted_inputs,
+        meta,
+        state_units=state_units,
+        input_units=input_units,
+    )
+    deliver(target, data)
+
+
+def read_candidate(
+    source: str | Path | bytes, name: str = "candidate"
+) -> tuple[Policy, Array, Array, dict[str, str]]:
+    """Reads a candidate back: (policy, predicted states, predicted inputs, metadata).
+
+    The prediction has shapes (H+1, n) and (H, m).
+
+    Raises:
+        GroundedError: for a file that is damaged or not a candidate of ours.
+    """
+    own = read_own(source, name, CANDIDATE)
+    states, inputs = own.names("states"), own.names("inputs")
+    table = own.json("policy", dict)
+    n, m = len(states), len(inputs)
+    depths = _depths(own, own.floats(table.get("depths"), "policy.depths", m))
+    nz = n + sum(depths)
+    lists = own.lists("/policy", {"feedforward": m, "gain": m * nz, "reference": nz})
+    feedforward, gain, reference = lists
+    H, steps = len(feedforward), own.integer("steps")
+    if gain.size == 0 and reference.size == 0:
+        feedback: tuple[Array | None, Array | None] = (None, None)
+    else:
+        feedback = (gain.reshape(H, m, nz), reference)
+    policy = Policy(
+        feedforward=feedforward,
+        low=own.floats(table.get("low"), "policy.low", m, null=-np.inf),
+        high=own.floats(table.get("high"), "policy.high", m, null=np.inf),
+        dt=own.number("dt"),
+        state_names=tuple(states),
+        input_names=tuple(inputs),
+        depths=depths,
+        angles=tuple(bool(a) for a in own.floats(table.get("angles"), "policy.angles", n)),
+        past=own.floats(table.get("past"), "policy.past", m),
+        gain=feedback[0],
+        reference=feedback[1],
+    )
+    _refuse_unfinite(policy, own.name)
+    x, u = own.doubles("/predicted_state", states), own.doubles("/predicted_input", inputs)
+    if (len(x), H, len(u)) != (steps + 1, steps, steps):
+        raise GroundedError(
+            f"{own.name}: a policy of {steps} steps needs {steps} messages of it, {steps + 1} "
+            f"predicted states and {steps} inputs; found {H}, {len(x)} and {len(u)}"
+        )
+    for topic in ("/policy", "/predicted_state", "/predicted_input"):
+        own.check_grid(topic, 0, policy.dt)
+    return policy, x, u, own.meta
+
+
+_ABOUT = b"""A candidate policy of grounded. At step k (t = k dt) send
+  u = clip(feedforward + gain (z - reference), low, high),   gain: m rows of nz numbers,
+z = the measured states, then for each input its depths[j] last sent values, newest first.
+Differences of states marked in `angles` are wrapped to [-pi, pi]. Names, units, limits: see the
+metadata record `grounded`.
+"""
+
+
+def _controls(policy: Policy) -> list[Array]:
+    """Feed-forward, gain and reference, a row a step; the last two are empty without feedback."""
+    H, none = policy.horizon, np.zeros((policy.horizon, 0))
+    gain = none if policy.gain is None else policy.gain.reshape(H, -1)
+    return [policy.feedforward, gain, none if policy.reference is None else policy.reference]
+
+
+def _depths(own: OwnFile, depths: Array) -> tuple[int, ...]:
+    if not all(d.is_integer() and 0 <= d <= DEPTH_LIMIT for d in depths.tolist()):
+        raise GroundedError(
+            f"{own.name}: its metadata 'policy.depths' must be integers from 0 to {DEPTH_LIMIT}"
+        )
+    return tuple(int(d) for d in depths)
+
+
+def _policy_table(policy: Policy) -> dict[str, Any]:
+    return {
+        "low": [None if v == -np.inf else v for v in policy.low.tolist()],
+        "high": [None if v == np.inf else v for v in policy.high.tolist()],
+        "past": policy.past.tolist(),
+        "depths": list(policy.depths),
+        "angles": [bool(a) for a in policy.angles],
+        "z": list(policy.z_names),
+    }
+
+
+def _refuse_unfinite(policy: Policy, name: str = "candidate") -> None:
+    for part in ("feedforward", "gain", "reference", "past"):
+        values = getattr(policy, part)
+        if values is not None and not np.isfinite(values).all():
+            k = int(np.argwhere(~np.isfinite(values))[0][0])
+            raise GroundedError(
+                f"{name}: {part} is not a finite number at step {k} ({k * policy.dt:.3f} s); "
+                "such a policy is not safe to run and is not written"
+            )
+    if np.isnan(policy.low).any() or np.isnan(policy.high).any():
+        raise GroundedError(f"{name}: a limit of an input is not a number")

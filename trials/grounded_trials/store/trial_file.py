@@ -1,0 +1,256 @@
+"""A trial as a file: written whole or while it runs, read back exactly.
+
+The format is described in this folder's `__init__`.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import IO
+
+import numpy as np
+
+from grounded.errors import GroundedError
+from grounded.frozen import Array
+from grounded.trial import Trial
+from grounded_trials.store.own_files import (
+    TRIAL,
+    Meta,
+    Target,
+    Units,
+    deliver,
+    read_own,
+    with_meta,
+    with_units,
+)
+
+FLUSH_NS = 10**9  # at most this much trial time is lost when the robot's battery is
+
+
+class TrialWriter:
+    """Writes a trial while it runs; what was appended up to a second ago survives a crash.
+
+    Args:
+        target: a path (an existing file is refused) or a writable binary stream.
+        dt: control interval [s].
+        states, inputs: name -> unit, in array order.
+        meta: further entries of the metadata record.
+        candidate: the candidate that is run, "" for none.
+        policy: the bytes of its file.
+        start_inputs: (m,) held before t = 0; None: zero.
+        start_ns: absolute time of t = 0 [ns], for display.
+
+    Raises:
+        GroundedError: if the file can't be written or an entry of `meta` is reserved.
+    """
+
+    def __init__(
+        self,
+        target: Target,
+        dt: float,
+        states: Units,
+        inputs: Units,
+        meta: Meta,
+        *,
+        candidate: str = "",
+        policy: bytes | None = None,
+        start_inputs: Array | None = None,
+        start_ns: int = 0,
+    ) -> None:
+        from grounded_trials.formats.mcap_writer import DoublesEncoder, LogWriter
+
+        held = None if start_inputs is None else np.asarray(start_inputs, float).tolist()
+        table = {
+            "format": TRIAL,
+            "dt": repr(float(dt)),
+            "states": json.dumps(dict(states)),
+            "inputs": json.dumps(dict(inputs)),
+            "candidate": candidate,
+            "start_inputs": json.dumps(held),
+            "start_ns": str(int(start_ns)),
+        }
+        table = with_meta(table, meta)
+        self._n, self._m, self._start_ns = len(states), len(inputs), start_ns
+        self._owned = isinstance(target, str | Path)
+        self._stream = _create(Path(target)) if isinstance(target, str | Path) else target
+        self._closed = False
+        self._encode_state, self._encode_input = DoublesEncoder(self._n), DoublesEncoder(self._m)
+        self._log = LogWriter(self._stream)
+        self._log.metadata("grounded", table)
+        if policy is None:
+            self._log.attachment("about", "text/plain", b"A trial; no policy was run.")
+        else:
+            self._log.attachment("policy", "application/octet-stream", policy)
+        self._state = self._log.channel("/state", "State", list(states))
+        self._input = self._log.channel("/input", "Input", list(inputs))
+        self._flushed = start_ns
+        self._log.flush()
+
+    def append(self, t: float, state: Array, input: Array | None) -> None:
+        """Adds the state (n,) at t seconds after the start, and the input (m,) sent then.
+
+        The last state of a trial has no input.
+
+        Raises:
+            GroundedError: if the shapes do not fit, or the file can't be written.
+        """
+        time = self._start_ns + round(t * 1e9)
+        with self._writing():
+            self._log.message(self._state, time, self._encode_state(_row(state, self._n)))
+            if input is not None:
+                self._log.message(self._input, time, self._encode_input(_row(input, self._m)))
+            if time - self._flushed >= FLUSH_NS:
+                self._log.flush()
+                self._flushed = time
+
+    def close(self) -> None:
+        """Ends the file; a second call does nothing.
+
+        Raises:
+            GroundedError: if it can't be written, as on a full disk.
+        """
+        if not self._closed:
+            self._closed = True
+            with self._writing():
+                self._log.finish()
+                if self._owned:
+                    self._stream.close()
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise GroundedError(
+                f"the trial can't be written: {error.strerror}; what is in the file already can be "
+                "saved with `grounded recover`"
+            ) from None
+
+    def __enter__(self) -> TrialWriter:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+def trial_bytes(
+    trial: Trial,
+    meta: Meta,
+    policy: bytes | None = None,
+    *,
+    state_units: Units | None = None,
+    input_units: Units | None = None,
+    start_ns: int = 0,
+) -> bytes:
+    """A trial as the bytes of a file; equal arguments give equal bytes."""
+    stream = io.BytesIO()
+    with TrialWriter(
+        stream,
+        trial.dt,
+        with_units(trial.state_names, state_units),
+        with_units(trial.input_names, input_units),
+        meta,
+        candidate=trial.candidate,
+        policy=policy,
+        start_inputs=trial.start_inputs,
+        start_ns=start_ns,
+    ) as writer:
+        for k, state in enumerate(trial.states):
+            writer.append(k * trial.dt, state, trial.inputs[k] if k < trial.steps else None)
+    return stream.getvalue()
+
+
+def write_trial(
+    target: Target,
+    trial: Trial,
+    meta: Meta,
+    policy: bytes | None = None,
+    *,
+    state_units: Units | None = None,
+    input_units: Units | None = None,
+    start_ns: int = 0,
+) -> None:
+    """Writes a whole trial; the file appears complete or not at all.
+
+    Args:
+        target: a path (replaced if it exists) or a writable binary stream.
+        trial: states (T+1, n) and inputs (T, m).
+        meta: entries of the metadata record besides the reserved ones.
+        policy: the bytes of the candidate's file that was run.
+        state_units: name -> unit; "1" where missing.
+        input_units: the same for the inputs.
+        start_ns: absolute time of t = 0 [ns].
+
+    Raises:
+        GroundedError: if the file can't be written or an entry of `meta` is reserved.
+    """
+    data = trial_bytes(
+        trial, meta, policy, state_units=state_units, input_units=input_units, start_ns=start_ns
+    )
+    deliver(target, data)
+
+
+def read_trial(
+    source: str | Path | bytes, name: str = "trial"
+) -> tuple[Trial, dict[str, str], bytes | None]:
+    """Reads a trial back: (trial, metadata, the bytes of the policy's file or None).
+
+    `trial.id` is the SHA-256 of the file. `name` stands for the file in messages when `source` is
+    its bytes.
+
+    Raises:
+        GroundedError: for a file that is damaged, not a trial of ours, or whose samples do not lie
+            on its time grid.
+    """
+    own = read_own(source, name, TRIAL)
+    states, inputs = own.names("states"), own.names("inputs")
+    dt = own.number("dt")
+    x, u = own.doubles("/state", states), own.doubles("/input", inputs)
+    if len(x) == 0:
+        raise GroundedError(
+            f"{own.name}: the trial has no states; it ended before its first sample"
+        )
+    if len(u) == len(x):  # stopped between the last input and the state that it would have led to
+        u = u[:-1]
+    if len(u) != len(x) - 1:
+        raise GroundedError(f"{own.name}: {len(x)} states need {len(x) - 1} inputs, found {len(u)}")
+    for topic in ("/state", "/input"):
+        own.check_grid(topic, own.integer("start_ns"), dt)
+    held = own.json("start_inputs", list, optional=True)
+    trial = Trial(
+        states=x,
+        inputs=u,
+        dt=dt,
+        state_names=tuple(states),
+        input_names=tuple(inputs),
+        id=own.sha256,
+        candidate=own.meta.get("candidate", ""),
+        start_inputs=None if held is None else own.floats(held, "start_inputs", len(inputs)),
+    )
+    return trial, own.meta, own.attachments.get("policy")
+
+
+def _row(values: Array, size: int) -> Array:
+    row = np.asarray(values, dtype=np.float64)
+    if row.shape != (size,):
+        raise GroundedError(f"expected {size} numbers, got an array of shape {row.shape}")
+    return row
+
+
+def _create(path: Path) -> IO[bytes]:
+    try:
+        return path.open("xb")
+    except FileExistsError:
+        raise GroundedError(f"{path} exists already; a trial is never overwritten") from None
+    except OSError as error:
+        raise GroundedError(f"{path} can't be written: {error.strerror}") from None

@@ -1,0 +1,99 @@
+"""Numbers, units and verdicts in words for people."""
+
+from __future__ import annotations
+
+import math
+import re
+from textwrap import TextWrapper
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from grounded.search.standing import Tried
+
+WIDTH = 80  # columns of a terminal
+_WORD = re.compile(r"""(?:'[^']*'|"[^"]*"|\S)+""")  # of a command; what is quoted stays whole
+
+
+def figure(value: float | None, digits: int = 4) -> str:
+    """`digits` significant digits; "failed" for minus infinity, "-" where there is none."""
+    if value is None or math.isnan(value):
+        return "-"
+    if value == -math.inf:
+        return "failed"
+    if value != 0 and not 1e-3 <= abs(value) < 1e6:
+        return f"{value:.{digits - 1}e}"
+    decimals = max(digits - 1 - math.floor(math.log10(abs(value))) if value else digits - 1, 0)
+    return f"{value:,.{decimals}f}"
+
+
+def percent(share: float) -> str:
+    """A share as a percentage; a tenth of a percent where it is small or nearly all."""
+    if math.isnan(share):
+        return "-"
+    value = 100 * share
+    if 0 < value < 0.05 or 99.95 <= value < 100:
+        return "< 0.1 %" if value < 50 else "> 99.9 %"
+    return f"{value:.0f} %" if 10 <= value <= 90 else f"{value:.1f} %"
+
+
+def count(number: int, word: str, many: str = "") -> str:
+    """`1 trial`, `2 trials`; `many` where the plural is another one."""
+    return f"{number} {word if number == 1 else many or word + 's'}"
+
+
+def shown(unit: str) -> str:
+    """A unit for a table: nothing where there is none, for a "1" beside a number is a digit."""
+    return "" if unit == "1" else unit
+
+
+def with_unit(text: str, unit: str) -> str:
+    """A number and its unit."""
+    return f"{text} {shown(unit)}".rstrip()
+
+
+def labelled(name: str, unit: str) -> str:
+    """`v [m/s]`; the name alone where there is no unit."""
+    return f"{name} [{unit}]" if shown(unit) else name
+
+
+def per_second(unit: str) -> str:
+    """The unit of a rate of change."""
+    return f"{unit} per s" if shown(unit) else "1/s"
+
+
+def wrapped(text: str, first: str, rest: str) -> list[str]:
+    """Lines of a terminal's width, the first and the others begun as said.
+
+    A number keeps its %, a bound its number, a path its parts.
+    """
+    whole = re.sub(r"(?<=[<>]) (?=[\d.])| (?=%)", "\xa0", text)
+    wrapper = TextWrapper(WIDTH, initial_indent=first, subsequent_indent=rest)
+    wrapper.break_on_hyphens = wrapper.break_long_words = False
+    return [line.replace("\xa0", " ") for line in wrapper.wrap(whole)]
+
+
+def folded(command: str, lead: str = "next: ") -> str:
+    """A command after its lead, broken as a shell allows where it is wider than a terminal."""
+    lines = [lead]
+    for word in _WORD.findall(command):
+        if len(lines[-1]) + len(word) + 3 > WIDTH and lines[-1].strip():
+            lines[-1] = lines[-1].rstrip() + " \\"
+            lines.append("    ")
+        lines[-1] += word + " "
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def verdict(tried: Tried, last: bool = True) -> str:
+    """What became of a candidate: first, better, no better; or why that is not decided.
+
+    Args:
+        tried: the candidate with its trials.
+        last: whether it is the latest one; an earlier one without a trial will get none.
+    """
+    if tried.in_doubt:
+        return "in doubt"
+    if tried.accepted is None:
+        return "waiting" if last or tried.trials else "no trial"
+    if not tried.accepted:
+        return "no better"
+    return "better" if tried.candidate.base else "first"

@@ -1,0 +1,106 @@
+"""Effects that grounded.toml says were adopted, as part of the model that plans.
+
+    [model]
+    effects = [ { name = "dead_zone:throttle", c = 0.146 } ]
+
+A pure delay becomes latency of the task, a queue that the robot's runner knows; everything else
+wraps the model (`grounded.effects`), with memory states where the effect has a memory.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from grounded.effects.family import Effect, Family, Scales, Site
+from grounded.effects.registry import Library
+from grounded.effects.wrap import wrap, wrapping_order
+from grounded.errors import GroundedError
+from grounded.model import Model
+from grounded.search.planner import Planner, planner_for
+from grounded.task import Task
+
+
+def planner_with(
+    task: Task, effects: Sequence[Mapping[str, Any]], library: Library | None = None
+) -> Planner:
+    """The planner of a task whose model got these effects, in the order in which they act.
+
+    Raises:
+        GroundedError: for an unknown effect, or a quantity that is missing or unknown.
+    """
+    library = library or Library()
+    assert task.latency is not None
+    model, latency = task.model, np.array(task.latency)
+    families = [library.family(str(entry["name"]).partition(":")[0]) for entry in effects]
+    for i in wrapping_order(families):
+        entry = effects[i]
+        name = str(entry["name"])
+        targets = name.partition(":")[2].split("+")
+        if families[i].name == "delay":
+            reached = [_input(task, name, one) for one in targets]
+            effect = _effect(families[i], task.model, targets, Scales())
+            latency[reached] += _checked(effect, entry)["d"]
+            continue
+        effect = library.effect(name, model)
+        model = wrap(effect, _checked(effect, entry), task.dt)
+    return planner_for(task, model, latency)
+
+
+def _checked(effect: Effect, entry: Mapping[str, Any]) -> Mapping[str, float]:
+    """The quantities of an effect as grounded.toml has them: numbers, all there, in bounds."""
+    where = f"grounded.toml: [model] effects: {effect.name}"
+    values = {key: value for key, value in entry.items() if key != "name"}
+    for key, value in values.items():
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not number or not math.isfinite(value):
+            raise GroundedError(f"{where}: {key} must be a number, found {value!r}")
+    try:
+        whole = effect.complete(values)
+    except GroundedError as error:
+        raise GroundedError(f"grounded.toml: [model] effects: {error}") from None
+    for name, (low, high) in _bounds(effect).items():
+        room = 1e-6 * abs(whole[name])
+        if not low - room <= whole[name] <= high + room:
+            at_most = f" and at most {high:g}" * math.isfinite(high)
+            at_least = f"at least {low:g}" if math.isfinite(low) else "a number"
+            raise GroundedError(
+                f"{where}: {name} = {whole[name]:g} can't be: expected {at_least}{at_most}; "
+                "correct it, or take the effect out"
+            )
+    return whole
+
+
+def _bounds(effect: Effect) -> dict[str, tuple[float, float]]:
+    """Bounds that are a quantity's own; those that a scan chose by the data's scale are left out.
+
+    They are told apart by building the effect for data of another size.
+    """
+    model, targets = effect.site.model, effect.site.targets
+    names = (*model.state_names, *model.input_names)
+    small, large = (
+        _effect(effect.family, model, targets, scales)
+        for scales in (
+            Scales(),
+            Scales(dict.fromkeys(names, -1e3), dict.fromkeys(names, 1e3), dt=1.0, duration=1e4),
+        )
+    )
+    return {
+        q.name: (q.low if q.low == p.low else -math.inf, q.high if q.high == p.high else math.inf)
+        for q, p in zip(small.quantities, large.quantities, strict=True)
+        if not q.fixed
+    }
+
+
+def _effect(family: Family, model: Model, targets: Sequence[str], scales: Scales) -> Effect:
+    site = Site(model, tuple(targets), scales)
+    return Effect(family, site, family.quantities(site))
+
+
+def _input(task: Task, name: str, target: str) -> int:
+    if target not in task.model.input_names:
+        raise GroundedError(f"grounded.toml: [model] effects: '{name}': '{target}' is not an input")
+    return task.model.input_names.index(target)

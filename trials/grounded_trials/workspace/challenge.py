@@ -1,0 +1,272 @@
+"""The blind challenge on disk: workspaces to diagnose, and their labels sealed apart.
+
+    DIR/single-0007/       a workspace: module, parameters, target, trials; nothing says the answer
+    DIR/manifest.json      for each case the SHA-256 of its label and of each of its trials
+    LABELS/single-0007.json  the answer; it is opened only if it has the announced hash
+
+Labels belong on another disk while the cases are diagnosed.
+
+A challenge's cases as independent jobs: diagnosed without labels, scored with them.
+
+Both run on one machine or on a Dask cluster that sees the same disk (`grounded.experiments.jobs`).
+A diagnosis is kept in its own workspace, so a run that was cut off goes on where it was; what it
+cost is kept beside the manifest, in times.json.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from grounded.errors import GroundedError
+from grounded_trials.store.store import DIGITS, Store, write_atomically
+from grounded_trials.store.trial_file import trial_bytes
+from grounded_trials.workspace.config import FILE
+from grounded_trials.workspace.diagnosing import diagnose_in
+from grounded_trials.workspace.diagnosis_file import FILE as DIAGNOSIS
+from grounded_trials.workspace.examples import toml_of
+from grounded_trials.workspace.folder import Workspace
+from grounded_trials.workspace.task_file import write_target
+
+if TYPE_CHECKING:
+    from grounded.challenge import Case
+    from grounded.experiments.jobs import Engine, Progress
+
+
+MANIFEST = "manifest.json"
+
+
+def write_cases(
+    cases: Iterator[Case], folder: Path, labels: Path, tick: Callable[[int], None]
+) -> list[str]:
+    """Writes the workspaces, then the labels, then the manifest; returns the cases' names.
+
+    The manifest comes last: a folder without one was interrupted, and the same cases go on in it.
+
+    Raises:
+        GroundedError: if the folder holds a challenge already, or cases that are others, or the
+            labels would lie inside it.
+    """
+    if (folder / MANIFEST).exists():
+        raise GroundedError(f"{folder} holds a challenge already: name another folder")
+    if labels.resolve().is_relative_to(folder.resolve()):
+        raise GroundedError(f"the labels ({labels}) must lie outside {folder}: they are sealed")
+    for place in (folder, labels):
+        try:
+            place.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise GroundedError(
+                f"{place} can't be made: {error.strerror}; name a folder that can"
+            ) from None
+    entries: dict[str, Any] = {}
+    for number, case in enumerate(cases, start=1):
+        trials = _write_case(case, folder / case.name)
+        text = json.dumps(case.label, sort_keys=True)
+        write_atomically(labels / f"{case.name}.json", text.encode())
+        label = hashlib.sha256(text.encode()).hexdigest()
+        entries[case.name] = {"label_sha256": label, "trials_sha256": trials}
+        tick(number)
+    document = json.dumps({"format": "grounded challenge 1", "cases": entries}, indent=1)
+    write_atomically(folder / MANIFEST, document.encode())
+    return list(entries)
+
+
+def _write_case(case: Case, folder: Path) -> list[str]:
+    """A case as a workspace; the hashes of its trials."""
+    from grounded.challenge import task_of
+
+    store = Store(folder / "trials")
+    files = [trial_bytes(trial, {"kind": "data"}) for trial in case.trials]
+    hashes = [hashlib.sha256(data).hexdigest() for data in files]
+    stored = [entry.digest for entry in store.list()]
+    if stored != [digest[:DIGITS] for digest in hashes[: len(stored)]]:
+        raise GroundedError(
+            f"{folder} holds trials of another challenge: make the same one again, or name another "
+            "folder"
+        )
+    folder.mkdir(parents=True, exist_ok=True)
+    task, names = task_of(case), case.model.state_names
+    columns = {name: case.target[:, i] for i, name in enumerate(names)}
+    write_target(folder / "target.csv", case.dt, columns)
+    values = ", ".join(
+        f"{name} = {float(value)!r}"
+        for name, value in zip(case.model.param_names, case.model.values, strict=True)
+    )
+    lines = toml_of(task, case.name).split("\n")
+    at = next(i for i, line in enumerate(lines) if line.startswith("file ="))
+    lines[at : at + 1] = [f'module = "grounded.models.{case.system}"', f"params = {{ {values} }}"]
+    system = next(i for i, line in enumerate(lines) if line.startswith("[system]"))
+    write_atomically(folder / FILE, ("\n".join(lines[:system]) + "\n").encode())
+    return [store.add(data).sha256 for data in files]
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """The cases of a challenge.
+
+    Raises:
+        GroundedError: if there is none.
+    """
+    path, advice = folder / MANIFEST, "name the folder that `grounded challenge make` wrote"
+    if not folder.is_dir():
+        raise GroundedError(f"there is no folder {folder}: {advice}")
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+        return dict(document["cases"])
+    except FileNotFoundError:
+        raise GroundedError(
+            f"{folder} holds no challenge, it has no {MANIFEST}: {advice}"
+        ) from None
+    except OSError as error:
+        raise GroundedError(f"{path} can't be read: {error.strerror}; {advice}") from None
+    except (ValueError, KeyError, TypeError):
+        raise GroundedError(f"{path} is not the list of a challenge's cases: {advice}") from None
+
+
+def open_label(labels: Path, name: str, entry: dict[str, Any]) -> dict[str, Any]:
+    """A case's label, if it is the one that was announced.
+
+    Raises:
+        GroundedError: if it is missing or was changed.
+    """
+    path = labels / f"{name}.json"
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        there = f"{labels} holds no {path.name}" if labels.is_dir() else f"there is no {labels}"
+        raise GroundedError(
+            f"{there}: expected the folder in which `grounded challenge make` put the label of "
+            f"every case; look for {path.name}"
+        ) from None
+    except OSError as error:
+        raise GroundedError(
+            f"{path} can't be read: {error.strerror}; make it readable, it is the case's label"
+        ) from None
+    if hashlib.sha256(data).hexdigest() != entry["label_sha256"]:
+        raise GroundedError(f"{path} is not the label that the manifest announced: it was changed")
+    return dict(json.loads(data))
+
+
+def score_case(folder: Path, labels: Path, name: str, entry: dict[str, Any]) -> dict[str, Any]:
+    """One case's marks, from its reports/diagnosis.json.
+
+    Raises:
+        GroundedError: if it was not diagnosed, or a trial or label was changed.
+    """
+    from grounded.challenge import judge, oracle
+
+    workspace = Workspace(folder / name)
+    hashes = [hashlib.sha256(workspace.store.read(s)).hexdigest() for s in workspace.store.list()]
+    if hashes != entry["trials_sha256"]:
+        raise GroundedError(f"{folder / name}: its trials are not those that were made")
+    path = workspace.reports / "diagnosis.json"
+    try:
+        diagnosis = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        raise GroundedError(
+            f"{folder / name} was not diagnosed: run `grounded challenge run {folder}`"
+        ) from None
+    label = open_label(labels, name, entry)
+    task = workspace.task
+    latency = np.zeros(task.model.m) if task.latency is None else task.latency
+    known = oracle(task.model, workspace.task_trials(), latency, label)
+    return judge(label, diagnosis, known)
+
+
+TIMES = "times.json"
+
+
+def diagnose_cases(
+    folder: Path,
+    *,
+    without: Sequence[str] = (),
+    again: bool = False,
+    engine: Engine | None = None,
+    progress: Progress | None = None,
+) -> dict[str, float]:
+    """Diagnoses every case that was not; CPU seconds of each that is known [s].
+
+    Args:
+        folder: the challenge.
+        without: families of the built-in library that may not be blamed.
+        again: those that were diagnosed before too.
+        engine: where the jobs run.
+        progress: called with jobs done and jobs in all.
+
+    Raises:
+        GroundedError: if the folder holds no challenge, or workers keep dying.
+    """
+    from grounded.experiments.jobs import Job, run_jobs
+
+    names = undiagnosed(folder, again=again)
+    jobs = [
+        Job(
+            diagnose_case,
+            {"folder": str(folder.resolve()), "name": name, "without": list(without)},
+        )
+        for name in names
+    ]
+    times = read_times(folder)
+    found = run_jobs(jobs, engine, progress=progress)
+    times |= {str(one["case"]): float(one["cpu_s"]) for one in found}
+    write_atomically(folder / TIMES, json.dumps(times, indent=1, sort_keys=True).encode())
+    return times
+
+
+def undiagnosed(folder: Path, *, again: bool = False) -> list[str]:
+    """The cases that were not diagnosed yet, or all of them.
+
+    Raises:
+        GroundedError: if the folder holds no challenge.
+    """
+    names = list(read_manifest(folder))
+    return [n for n in names if again or not (folder / n / "reports" / DIAGNOSIS).is_file()]
+
+
+def diagnose_case(folder: str, name: str, without: Sequence[str]) -> dict[str, Any]:
+    """A job: one case, diagnosed in its workspace."""
+    from grounded.effects import Library
+
+    begin = time.process_time()
+    diagnose_in(Workspace(Path(folder) / name), library=Library().without(without))
+    return {"case": name, "cpu_s": time.process_time() - begin}
+
+
+def score_cases(
+    folder: Path,
+    labels: Path,
+    *,
+    engine: Engine | None = None,
+    progress: Progress | None = None,
+) -> list[dict[str, Any]]:
+    """The marks of every case, beside an oracle that knows its label; with CPU time [s] if known.
+
+    Raises:
+        GroundedError: if a case was not diagnosed, or a trial or label was changed.
+    """
+    from grounded.experiments.jobs import Job, run_jobs
+
+    entries = read_manifest(folder)
+    where = {"folder": str(folder.resolve()), "labels": str(labels.resolve())}
+    jobs = [Job(score_one, where | {"name": name, "entry": e}) for name, e in entries.items()]
+    times = read_times(folder)
+    marks = run_jobs(jobs, engine, progress=progress)
+    return [m | {"cpu_s": times[m["case"]]} if m["case"] in times else m for m in marks]
+
+
+def score_one(folder: str, labels: str, name: str, entry: dict[str, Any]) -> dict[str, Any]:
+    """A job: one case's marks."""
+    return score_case(Path(folder), Path(labels), name, entry)
+
+
+def read_times(folder: Path) -> dict[str, float]:
+    """CPU seconds by case; nothing where the file is missing or can't be read."""
+    try:
+        return dict(json.loads((folder / TIMES).read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError):
+        return {}

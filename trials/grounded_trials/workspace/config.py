@@ -1,0 +1,222 @@
+"""grounded.toml: the task, the search, how to reach the real system, how to read its logs.
+
+Only shapes and names are checked here that need no model; names of states and inputs are checked
+in `workspace`, once the model is loaded. docs/configuration.md lists every key.
+Changes (tomlkit) leave the user's comments and layout alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from grounded.errors import GroundedError
+from grounded.search.standing import Options
+from grounded_trials.store.store import write_atomically
+from grounded_trials.toml_table import Table, read_toml
+
+FILE = "grounded.toml"
+
+
+@dataclass(frozen=True)
+class ModelTable:
+    """[model]: where the crude model is, and what is changed in it."""
+
+    file: str = ""
+    module: str = ""
+    params: Mapping[str, float] = field(default_factory=dict)
+    effects: tuple[Mapping[str, Any], ...] = ()
+    smoothing: float = 0.05
+
+
+@dataclass(frozen=True)
+class TaskTable:
+    """[task]: the time grid, the target and the start."""
+
+    dt: float
+    horizon: int
+    target: str
+    start: Mapping[str, float]
+    feedback: bool
+    latency: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class SystemTable:
+    """[system]: a command of the user's, or a simulated system."""
+
+    command: str = ""
+    model: str = ""
+    noise: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Config:
+    """A checked grounded.toml; tables that need the model's names stay tables."""
+
+    file: Path
+    model: ModelTable
+    task: TaskTable
+    reward: Table
+    limits: Table
+    safety: Table
+    search: Options
+    system: SystemTable
+    log: Table
+    estimate: Table
+
+
+def read_config(folder: Path) -> Config:
+    """Reads and checks the workspace's grounded.toml.
+
+    Raises:
+        GroundedError: naming the key, what was found and what would be right.
+    """
+    table = read_toml(folder / FILE)
+    table.expect(*(field.name for field in fields(Config) if field.name != "file"))
+    config = Config(
+        file=folder / FILE,
+        model=_model(table.sub("model")),
+        task=_task(table.sub("task")),
+        reward=table.sub("reward"),
+        limits=table.sub("limits"),
+        safety=table.sub("safety"),
+        search=_search(table.sub("search")),
+        system=_system(table.sub("system")),
+        log=table.sub("log"),
+        estimate=table.sub("estimate"),
+    )
+    return config
+
+
+def _model(table: Table) -> ModelTable:
+    table.expect(*(field.name for field in fields(ModelTable)))
+    params = table.sub("params")
+    effects = table.take("effects", list, [])
+    for effect in effects:
+        if not isinstance(effect, dict) or not isinstance(effect.get("name"), str):
+            raise table.error(
+                "effects",
+                f'must hold tables like {{ name = "dead_zone:throttle" }}, found {effect!r}',
+            )
+    found = ModelTable(
+        file=table.take("file", str, ""),
+        module=table.take("module", str, ""),
+        params={name: params.take(name, float) for name in params.names()},
+        effects=tuple(effects),
+        smoothing=table.take("smoothing", float, 0.05),
+    )
+    if bool(found.file) == bool(found.module):
+        raise table.error(
+            "file", 'give exactly one of file = "model.py" and module = "package.name"'
+        )
+    if found.smoothing < 0:
+        raise table.error("smoothing", f"must not be negative, found {found.smoothing:g}")
+    return found
+
+
+def _task(table: Table) -> TaskTable:
+    table.expect(*(field.name for field in fields(TaskTable)))
+    start, latency = table.sub("start"), table.sub("latency")
+    found = TaskTable(
+        dt=table.take("dt", float),
+        horizon=table.take("horizon", int),
+        target=table.take("target", str),
+        start={name: start.take(name, float) for name in start.names()},
+        feedback=table.take("feedback", bool, True),
+        latency={name: latency.take(name, float) for name in latency.names()},
+    )
+    if found.dt <= 0:
+        raise table.error("dt", f"must be a positive number of seconds, found {found.dt:g}")
+    if found.horizon < 1:
+        raise table.error("horizon", f"must be at least 1 step, found {found.horizon}")
+    return found
+
+
+def _search(table: Table) -> Options:
+    defaults = Options()
+    method = table.choice("method", ("ddp", "policy-gradient"), defaults.method)
+    step = table.choice("step", ("damped", "full"), defaults.step)
+    options = {
+        "match_inputs": table.take("match_inputs", bool, defaults.match_inputs),
+        "refit": table.take("refit", bool, defaults.refit),
+        "rerun_incumbent": table.take("rerun_incumbent", bool, defaults.rerun_incumbent),
+        "max_halvings": table.take("max_halvings", int, defaults.max_halvings),
+        "repeats": table.take("repeats", int, defaults.repeats),
+        "max_trials": table.take("max_trials", int, defaults.max_trials),
+        "tolerance": table.take("tolerance", float, defaults.tolerance),
+    }
+    table.finish()
+    try:
+        return Options(method=method, step=step, **options)  # type: ignore[arg-type]
+    except GroundedError as error:
+        raise GroundedError(f"{table.file.name}: {error}") from None
+
+
+def _system(table: Table) -> SystemTable:
+    noise = table.sub("noise")
+    kinds = {}
+    for kind in ("start", "process", "measurement"):
+        inner = noise.sub(kind)
+        kinds[kind] = {name: inner.take(name, float) for name in inner.names()}
+        for name, std in kinds[kind].items():
+            if std < 0:
+                raise inner.error(name, f"must not be negative, found {std:g}")
+    noise.finish()
+    found = SystemTable(
+        command=table.take("command", str, ""),
+        model=table.take("model", str, ""),
+        noise=kinds,
+        seed=table.take("seed", int, 0),
+    )
+    table.finish()
+    if found.command and found.model:
+        raise table.error("command", "give command or model, not both")
+    if found.seed < 0:
+        raise table.error("seed", f"must not be negative, found {found.seed}")
+    return found
+
+
+def set_in_model(
+    file: Path,
+    params: Mapping[str, float] | None = None,
+    effects: Sequence[Mapping[str, Any]] | None = None,
+) -> None:
+    """Replaces [model] params and/or effects; the rest of the file stays as it is.
+
+    Raises:
+        GroundedError: if the file can't be written.
+    """
+    import tomlkit
+
+    document = tomlkit.parse(file.read_text(encoding="utf-8"))
+    model: Any = document["model"]
+    if params is not None:
+        model["params"] = _inline(params)
+    if effects is not None:
+        array = tomlkit.array()
+        for effect in effects:
+            array.append(_inline(effect))
+        model["effects"] = array.multiline(len(effects) > 1)
+    write_atomically(file, tomlkit.dumps(document).encode())
+
+
+def set_latency(file: Path, latency: Mapping[str, float]) -> None:
+    """Replaces [task] latency."""
+    import tomlkit
+
+    document = tomlkit.parse(file.read_text(encoding="utf-8"))
+    task: Any = document["task"]
+    task["latency"] = _inline(latency)
+    write_atomically(file, tomlkit.dumps(document).encode())
+
+
+def _inline(values: Mapping[str, Any]) -> Any:
+    import tomlkit
+
+    table = tomlkit.inline_table()
+    table.update(dict(values))
+    return table

@@ -1,0 +1,177 @@
+"""diagnose in a workspace: which trials, which model, where the result is kept.
+
+The stored trials that a diagnosis can use: gaps in single states stay, what diverged goes.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from grounded.errors import GroundedError, nearest
+from grounded.trial import Trial
+from grounded_trials.store.store import write_atomically
+from grounded_trials.workspace.diagnosis_file import FILE
+from grounded_trials.workspace.folder import Workspace
+
+if TYPE_CHECKING:
+    from grounded.diagnosis.report import Diagnosis
+    from grounded.effects import Library
+    from grounded.trial import Trial
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnosed:
+    """A diagnosis, its document as CONTRACT.md has it, and the probe that was written, if any."""
+
+    diagnosis: Diagnosis
+    document: dict[str, Any]
+    probe: str  # a candidate's id, "" for none
+
+
+def diagnose_in(
+    workspace: Workspace,
+    *,
+    trials: Sequence[str] = (),
+    max_effects: int = 3,
+    library: Library | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Diagnosed:
+    """Diagnoses the gap between the model and the stored trials; keeps reports/diagnosis.json.
+
+    Args:
+        workspace: the model is diagnosed with the effects that were adopted.
+        trials: short names; all usable ones by default.
+        max_effects: at most so many effects at once.
+        library: the effects that may be blamed.
+        progress: told of each stage.
+
+    Raises:
+        GroundedError: for an unknown trial, or where there is none to learn from.
+    """
+    from grounded.diagnosis.diagnose import Options, diagnose
+    from grounded.effects import Library
+
+    names = [str(effect["name"]) for effect in workspace.config.model.effects]
+    adopted = {name for name in names if not name.startswith("delay:")}  # whose d is no parameter
+    library = library or Library()
+    planner, used = workspace.planner, _chosen(workspace, trials)
+    memory = planner.plan.model.state_names[planner.task.model.n :]
+    options = Options(library=library, max_effects=max_effects, hidden=tuple(memory), but=adopted)
+    lifted = [planner.lift(trial) for trial in used]
+    found = diagnose(planner.plan, lifted, options, progress=progress)
+    document = found.to_dict()
+    document["diagnosed"] = {
+        "trials": [trial.id for trial in used],
+        "adopted": [dict(effect) for effect in workspace.config.model.effects],
+        "params": dict(workspace.config.model.params),
+        "nominal": {name: p.value for name, p in planner.plan.model.params.items()},
+    }
+    _keep(workspace, document)
+    probe = _probe(workspace, found, lifted, library)
+    if probe:
+        document["next_trial"] = f"{probe[1]} ({probe[0]}: grounded run {probe[0]})"
+        document["probe"] = probe[0]
+        _keep(workspace, document)
+    return Diagnosed(found, document, probe[0] if probe else "")
+
+
+def _keep(workspace: Workspace, document: dict[str, Any]) -> None:
+    workspace.reports.mkdir(exist_ok=True)
+    text = json.dumps(_finite(document), indent=1, ensure_ascii=False, allow_nan=False)
+    write_atomically(workspace.reports / FILE, (text + "\n").encode())
+
+
+def _chosen(workspace: Workspace, names: Sequence[str]) -> list[Trial]:
+    """The trials to diagnose: gaps in a state stay, what a smoother made of them is no evidence."""
+    used = diagnosable(workspace)
+    if not used:
+        raise GroundedError(
+            "there is no trial to learn from: ingest some, runs of candidates or logs with --data"
+        )
+    known = [trial.id for trial in used]
+    for name in names:
+        if name not in known:
+            raise GroundedError(f"there is no usable trial '{name}': {nearest(name, known)}")
+    guessed = {t.stored.id: t.meta.get("estimated", "") for t in workspace.trials()}
+    return [
+        _measured(trial, [name for name in guessed[trial.id].split(",") if name])
+        for trial in used
+        if not names or trial.id in names
+    ]
+
+
+def _measured(trial: Trial, guessed: Sequence[str]) -> Trial:
+    """A trial without the states that it did not measure."""
+    states = trial.states.copy()
+    states[:, [trial.state_names.index(name) for name in guessed]] = math.nan
+    return replace(trial, states=states)
+
+
+def _probe(
+    workspace: Workspace, found: Diagnosis, trials: Sequence[Trial], library: Library
+) -> tuple[str, str] | None:
+    """Writes the candidate that would tell two tied effects apart: (id, sentence)."""
+    planner = workspace.planner
+    task = planner.plan
+    if not found.indistinguishable:
+        return None
+    from grounded.diagnosis.excitation import probe
+    from grounded.rollout import simulate
+    from grounded.search.improve import model_fingerprint
+    from grounded.search.standing import Candidate
+    from grounded_trials.workspace.proposing import standing_in
+
+    best = standing_in(workspace).incumbent
+    if best is None:
+        return None
+    base = planner.widened(best.candidate.policy)
+    made = probe(task, base, found, trials, library)
+    if made is None:
+        return None
+    policy = planner.narrowed(made.policy)
+    predicted = simulate(task.problem(exact=True), planner.widened(policy))
+    candidate = Candidate(
+        id=workspace.next_id(),
+        policy=policy,
+        iteration=0,
+        alpha=1.0,
+        base=best.candidate.id,
+        model=model_fingerprint(task),
+        predicted_states=predicted.states[:, : planner.task.model.n],
+        predicted_inputs=predicted.inputs,
+        predicted_utility=predicted.utility,
+    )
+    workspace.save_candidate(candidate, workspace.task, kind="probe")
+    return candidate.id, made.sentence
+
+
+def _finite(value: Any) -> Any:
+    """JSON has no NaN and no infinity: null instead."""
+    if isinstance(value, dict):
+        return {str(key): _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    if isinstance(value, bool) or value is None or isinstance(value, str | int):
+        return value
+    number = float(value)
+    return number if math.isfinite(number) else None
+
+
+LEAST_STEPS = 2
+
+
+def diagnosable(workspace: Workspace) -> list[Trial]:
+    """In order of arrival, up to the first missing input or number beyond all bounds.
+
+    A fit needs whole states; a diagnosis only needs some, so a sensor that dropped out for a while
+    costs its samples, not the rest of the trial.
+
+    Raises:
+        GroundedError: if a stored file is damaged.
+    """
+    cut = [trial.until(trial.known_steps) for trial in workspace.task_trials(measured=True)]
+    return [trial for trial in cut if trial.steps >= LEAST_STEPS]

@@ -1,0 +1,220 @@
+"""Example workspaces, written as files that a user would write: model.py, real.py, target.csv."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+
+from grounded.errors import GroundedError, nearest
+from grounded.task import Task
+from grounded_trials.store.store import write_atomically
+from grounded_trials.workspace.config import FILE
+from grounded_trials.workspace.task_file import write_target
+
+
+@dataclass(frozen=True)
+class Example:
+    """One example: its line in the list, and what its files say."""
+
+    text: str
+    task: Callable[[], Task]
+    model: str  # import name of the crude model's module, copied to model.py
+    real: str  # text of real.py
+    optimum: str = ""  # import name of `optimum() -> float`, for the demo
+
+
+_REAL_CAR = '''"""The simulated REAL car, in place of your robot. The search never sees it."""
+
+from grounded.experiments.real_car import LATENCY, real_car
+
+model = real_car()
+latency = LATENCY  # [s]; the crude model's task assumes 0.1
+'''
+
+_REAL_AIRCRAFT = '''"""The simulated REAL aircraft: other parameters than the crude model's."""
+
+import numpy as np
+
+from grounded.experiments.figure8 import perturbed
+from grounded.models import aircraft
+
+model = perturbed(aircraft.model, np.random.default_rng(4))
+substeps = 1
+'''
+
+_REAL_PENDULUM = '''"""The simulated REAL pendulum: heavier, with dry friction in its bearing."""
+
+from grounded.experiments.pendulum import model
+'''
+
+
+def _car(name: str) -> Callable[[], Task]:
+    def task() -> Task:
+        from grounded.experiments.car_tasks import car_task
+        from grounded.models.car import model
+
+        return car_task(name, model)
+
+    return task
+
+
+def _flight() -> Task:
+    from grounded.experiments.figure8 import flight_task
+    from grounded.models.aircraft import model
+
+    return flight_task(model)
+
+
+def _pendulum() -> Task:
+    from grounded.experiments.pendulum import pendulum_task
+    from grounded.models.pendulum import model
+
+    return pendulum_task(model)
+
+
+_CAR = "grounded.models.car"
+EXAMPLES: Mapping[str, Example] = {
+    "car-turn": Example(
+        "RC car, open loop: a quarter turn from standstill", _car("turn"), _CAR, _REAL_CAR
+    ),
+    "car-circle": Example(
+        "RC car, closed loop: 1.4 m/s on a 1 m circle", _car("circle"), _CAR, _REAL_CAR
+    ),
+    "car-figure8": Example(
+        "RC car, closed loop: a figure-8, 1.4 m/s straights, 1.0 m/s turns",
+        _car("figure8"),
+        _CAR,
+        _REAL_CAR,
+    ),
+    "flight-figure8": Example(
+        "fixed-wing aircraft, 60 s: a figure-8 at fixed altitude",
+        _flight,
+        "grounded.models.aircraft",
+        _REAL_AIRCRAFT,
+    ),
+    "pendulum": Example(
+        "pendulum: swing up to standing, the smallest example",
+        _pendulum,
+        "grounded.models.pendulum",
+        _REAL_PENDULUM,
+    ),
+}
+
+
+def example(name: str) -> Example:
+    """The example of a name.
+
+    Raises:
+        GroundedError: if there is none.
+    """
+    if name not in EXAMPLES:
+        raise GroundedError(f"there is no example '{name}': {nearest(name, EXAMPLES)}")
+    return EXAMPLES[name]
+
+
+def write_example(folder: Path, name: str) -> None:
+    """Writes a workspace; an existing file is never overwritten.
+
+    Raises:
+        GroundedError: if the folder already holds a workspace, or can't be written.
+    """
+    chosen = example(name)
+    files = (FILE, "model.py", "real.py", "target.csv")
+    for file in files:
+        if (folder / file).exists():
+            raise GroundedError(
+                f"{folder / file} exists already: name another folder, or remove it first"
+            )
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "trials").mkdir(exist_ok=True)
+        (folder / "candidates").mkdir(exist_ok=True)
+    except OSError as error:
+        raise GroundedError(f"{folder} can't be made: {error.strerror}") from None
+    import importlib
+
+    task, module = chosen.task(), importlib.import_module(chosen.model)
+    columns = {
+        state: task.target[:, i]
+        for i, state in enumerate(task.model.state_names)
+        if np.isfinite(task.target[:, i]).all()
+    }
+    write_target(folder / "target.csv", task.dt, columns)
+    write_atomically(folder / "model.py", _source(module).encode())
+    write_atomically(folder / "real.py", chosen.real.encode())
+    write_atomically(folder / FILE, toml_of(task, name).encode())
+
+
+def _source(module: ModuleType) -> str:
+    return f"# From {module.__name__}: yours to change.\n" + inspect.getsource(module)
+
+
+def toml_of(task: Task, name: str) -> str:
+    """The grounded.toml of a task, with a comment on each table."""
+    states, inputs = task.model.state_names, task.model.input_names
+    first = np.where(np.isfinite(task.target[0]), task.target[0], 0.0)
+    start = {s: v for s, v, f in zip(states, task.start, first, strict=True) if v != f}
+    start |= {i: v for i, v in zip(inputs, task.past, strict=True) if v != 0}
+    assert task.latency is not None
+    latency = {i: v for i, v in zip(inputs, task.latency, strict=True) if v > 0}
+    reward = task.reward
+    weights = {
+        "state": dict(zip(states, reward.state, strict=True)),
+        "terminal": dict(zip(states, reward.terminal, strict=True)),
+        "input": dict(zip(inputs, reward.input, strict=True)),
+        "input_change": dict(zip(inputs, reward.input_change, strict=True)),
+    }
+    limits = [
+        f"{i} = [{_number(low)}, {_number(high)}]"
+        for i, low, high in zip(inputs, task.low, task.high, strict=True)
+        if np.isfinite(low) and np.isfinite(high)
+    ]
+    lines = [
+        f"# {name}: {EXAMPLES[name].text}" if name in EXAMPLES else f"# {name}",
+        "",
+        "[model]",
+        'file = "model.py"             # the crude model, plain NumPy',
+        f"smoothing = {_number(task.smoothing)}              # width over which planning blends "
+        "np.where, abs ...",
+        "",
+        "[task]",
+        f"dt = {_number(task.dt)}                     # [s] control interval",
+        f"horizon = {task.horizon}                 # steps",
+        'target = "target.csv"         # states without a column are free',
+        f"start = {_table(start)}",
+        f"feedback = {'true' if task.feedback else 'false'}               # false: open loop",
+        f"latency = {_table(latency)}",
+        "",
+        "[reward]                      # quadratic weights; utility = -sum",
+        *(f"{k} = {_table({n: w for n, w in v.items() if w})}" for k, v in weights.items()),
+        "",
+        "[limits]                      # hard limits of the real inputs",
+        *limits,
+        "",
+        "[search]",
+        'method = "ddp"                # or "policy-gradient"',
+        'step = "damped"               # or "full": the paper\'s, DDP to convergence',
+        "repeats = 1                   # trials a candidate, averaged",
+        "rerun_incumbent = true        # after a loss that may be luck",
+        "max_trials = 40",
+        "",
+        "[system]                      # how `grounded run` reaches the real system",
+        'model = "real.py"             # yours: command = "python drive.py {candidate} {trial}"',
+        "seed = 0",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def _number(value: float) -> str:
+    return repr(round(float(value), 12))
+
+
+def _table(values: Mapping[str, float]) -> str:
+    inside = ", ".join(f"{name} = {_number(value)}" for name, value in values.items())
+    return f"{{ {inside} }}" if inside else "{ }"

@@ -1,0 +1,295 @@
+"""ingest: what came back from the real system is checked, resampled and stored.
+
+A trial of ours is stored byte for byte. A foreign log is mapped to the states and inputs of the
+model ([log]), sampled on the control grid, and stored as a trial of ours that names its source by
+hash; the log itself stays where it is. The same input gives the same bytes, so that a second ingest
+finds the first.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from grounded.errors import GroundedError
+from grounded.search.standing import Tried
+from grounded.trial import Trial
+from grounded_trials.formats.mcap_walk import read_records
+from grounded_trials.logs.log_files import kind_of, log_files, open_log
+from grounded_trials.logs.log_table import log_mapping, read_log
+from grounded_trials.logs.signal_report import SignalReport
+from grounded_trials.store.own_files import CANDIDATE, FILE_LIMIT, TRIAL, read_file
+from grounded_trials.store.trial_file import read_trial, trial_bytes
+from grounded_trials.wording import verdict
+from grounded_trials.workspace.config import FILE
+from grounded_trials.workspace.folder import Workspace
+from grounded_trials.workspace.proposing import standing_in
+from grounded_trials.workspace.trial_check import warnings_about
+
+
+@dataclass(frozen=True, eq=False)
+class Ingested:
+    """One log that was taken in."""
+
+    trial: str  # its short name, t0007
+    sha256: str
+    known: bool  # it had been stored before
+    candidate: str  # "" for data
+    utility: float | None  # None for data; -inf for a run that failed
+    accepted: bool | None  # None: data, or not decided yet
+    warnings: tuple[str, ...]
+    signals: tuple[SignalReport, ...]  # for a foreign log
+    verdict: str = ""  # a word of `words.verdict`, run again, probe; "" for data
+
+
+@dataclass(frozen=True, eq=False)
+class _Read:
+    trial: Trial
+    data: bytes
+    warnings: tuple[str, ...] = ()
+    signals: tuple[SignalReport, ...] = ()
+
+
+def ingest_log(
+    workspace: Workspace, path: Path, candidate: str | None = None, *, data: bool = False
+) -> Ingested:
+    """Checks a log and stores it as a trial.
+
+    Args:
+        workspace: whose model names the states and inputs.
+        path: a trial of ours, an MCAP log, or the folder of a bag.
+        candidate: which candidate was run; by default the trial's own, or the outstanding one.
+        data: the log ran no candidate: for fitting and diagnosis only.
+
+    Raises:
+        GroundedError: for a log that can't be used, with the reason; nothing is stored then.
+    """
+    kind = "" if path.is_dir() else kind_of(path)
+    if kind == CANDIDATE:
+        raise GroundedError(
+            f"{path} is a candidate, the policy to run, not the trial that came back from it"
+        )
+    if candidate is not None and data:
+        raise GroundedError("--data is for a log that ran no candidate; drop it or --candidate")
+    read = (_own if kind == TRIAL else _foreign)(workspace, path, candidate, data)
+    added = workspace.store.add(read.data)
+    workspace.forget()
+    trial = replace(read.trial, id=added.id)
+    warnings = (*read.warnings, *warnings_about(workspace, trial))
+    tried = _tried(workspace, trial)
+    return Ingested(
+        trial=added.id,
+        sha256=added.sha256,
+        known=added.known,
+        candidate=trial.candidate,
+        utility=workspace.task.utility(_bridged(trial)) if trial.candidate else None,
+        accepted=tried.accepted if tried else None,
+        warnings=warnings,
+        signals=read.signals,
+        verdict=_verdict(trial, tried, workspace.config.search.repeats),
+    )
+
+
+def _verdict(trial: Trial, tried: Tried | None, repeats: int) -> str:
+    if tried is None:
+        return "probe" if trial.candidate else ""
+    ran = [one.id for one in tried.trials[:repeats]]
+    return "run again" if tried.accepted and trial.id not in ran else verdict(tried)
+
+
+def _bridged(trial: Trial) -> Trial:
+    from grounded.trial import bridge
+
+    return bridge(trial).trial
+
+
+def _tried(workspace: Workspace, trial: Trial) -> Tried | None:
+    """How the trial's candidate fares now."""
+    if not trial.candidate:
+        return None
+    history = standing_in(workspace).history
+    return next((t for t in history if t.candidate.id == trial.candidate), None)
+
+
+def _own(workspace: Workspace, path: Path, candidate: str | None, data: bool) -> _Read:
+    """A trial of ours: every name, the time grid and the task must be this workspace's."""
+    content = read_file(path, FILE_LIMIT)
+    trial, meta, policy = read_trial(content, str(path))
+    model, dt = workspace.base_model, workspace.config.task.dt
+    for what, found, own in (
+        ("states", trial.state_names, model.state_names),
+        ("inputs", trial.input_names, model.input_names),
+    ):
+        if found != own:
+            raise GroundedError(
+                f"{path} has the {what} {', '.join(found)}; this workspace's model has "
+                f"{', '.join(own)}: it is a trial of another robot"
+            )
+    if abs(trial.dt - dt) > 1e-9:
+        raise GroundedError(
+            f"{path} was recorded every {trial.dt:g} s, this workspace's [task] dt is {dt:g} s: "
+            "it belongs to another task"
+        )
+    if data:
+        if not trial.candidate:
+            return _Read(trial, content)
+        about = {
+            k: v for k, v in meta.items() if k in ("system", "source", "source_sha256", "estimated")
+        }
+        about |= {"kind": "data", "ran": trial.candidate}
+        trial = replace(trial, candidate="")
+        return _Read(trial, _encode(workspace, trial, about, None))
+    if candidate is not None and trial.candidate not in ("", candidate):
+        raise GroundedError(f"{path} says that it ran {trial.candidate}, not {candidate}")
+    if not trial.candidate:
+        return _claimed(workspace, path, trial, candidate)
+    _check_candidate(workspace, path, trial.candidate, meta.get("task", ""), policy)
+    return _Read(trial, content)
+
+
+def _claimed(workspace: Workspace, path: Path, trial: Trial, candidate: str | None) -> _Read:
+    """A trial of ours that doesn't say what it ran."""
+    chosen = candidate or _outstanding(workspace, path)
+    trial = replace(trial, candidate=chosen)
+    _check_candidate(workspace, path, chosen, "", None)
+    return _Read(trial, _encode(workspace, trial, _about(workspace, chosen), chosen))
+
+
+def _check_candidate(
+    workspace: Workspace, path: Path, candidate: str, task: str, policy: bytes | None
+) -> None:
+    """The candidate must be one of this workspace and task, the policy the one in its file."""
+    if candidate not in workspace.candidate_ids():
+        raise GroundedError(
+            f"{path} ran {candidate}, which this workspace never proposed; take it in with --data "
+            "to use it for fitting and diagnosis"
+        )
+    own = workspace.task.hash
+    _, meta = workspace.candidate(candidate)
+    if meta.get("task") != own or task not in ("", own):
+        raise GroundedError(
+            f"{path} ran {candidate} for another task (other target, reward, limits, start or "
+            "horizon); its utility can't be compared. Take it in with --data to use it for fitting "
+            "and diagnosis"
+        )
+    if policy is not None and policy != workspace.candidate_bytes(candidate):
+        raise GroundedError(
+            f"{path} carries a policy that is not the {candidate} of this workspace: it comes from "
+            "another one, or the candidate was made again since. Take it in with --data"
+        )
+
+
+def _foreign(workspace: Workspace, path: Path, candidate: str | None, data: bool) -> _Read:
+    """Somebody else's log, through [log]."""
+    model, task = workspace.base_model, workspace.config.task
+    files = log_files(path)
+    mapping = log_mapping(workspace.config.log, model.state_names, model.input_names)
+    if mapping is None:
+        _check_is_log(path, files)
+        raise GroundedError(
+            f"{path} is not a trial that grounded wrote, and grounded.toml has no [log] table to "
+            f"map it: `grounded inspect {path}` prints one"
+        )
+    chosen = "" if data else candidate or _outstanding(workspace, path)
+    estimated: tuple[str, ...] = ()
+    if workspace.config.estimate.names():
+        from grounded_trials.workspace.unmeasured import read_with_estimates
+
+        found, estimated = read_with_estimates(workspace, files, mapping, data=data)
+    else:
+        missing = [s for s in model.state_names if s not in mapping.states]
+        missing += [i for i in model.input_names if i not in mapping.inputs]
+        if missing:
+            raise GroundedError(
+                f"[log] maps no '{missing[0]}': map it, or let the smoother find a state that is "
+                "not measured with an [estimate] table (docs/real-logs.md)"
+            )
+        found = read_log(
+            files,
+            mapping,
+            task.dt,
+            states=model.state_names,
+            inputs=model.input_names,
+            angles=model.angles,
+            steps=None if data else task.horizon,
+        )
+    if chosen and found.late_s > task.dt / 2:
+        raise GroundedError(
+            f"{path}: the run starts {found.late_s:.2f} s before every state is known: the "
+            "trial's time would not be the candidate's. Start recording before the run, or take "
+            "it in with --data"
+        )
+    trial = Trial(
+        states=found.states,
+        inputs=found.inputs,
+        dt=task.dt,
+        state_names=model.state_names,
+        input_names=model.input_names,
+        candidate=chosen,
+        start_inputs=found.start_inputs,
+    )
+    about = _about(workspace, chosen) | {"source": path.name, "source_sha256": _hashed(files)}
+    if estimated:
+        about["estimated"] = ",".join(estimated)
+    if chosen:
+        _check_candidate(workspace, path, chosen, "", None)
+    encoded = _encode(workspace, trial, about, chosen, found.start_ns)
+    return _Read(trial, encoded, found.warnings, found.reports)
+
+
+def _check_is_log(path: Path, files: Sequence[Path]) -> None:
+    """Says of what is no log at all that it is none."""
+    if (path / FILE).is_file():
+        raise GroundedError(f"{path} is a workspace: name the log, or its folder, inside")
+    for file in files:
+        with open_log(file) as stream:
+            next(iter(read_records(stream, str(file))), None)
+
+
+def _hashed(files: Sequence[Path]) -> str:
+    """SHA-256 over a log's files, or over their hashes when there are several."""
+    hashes = []
+    for file in files:
+        with file.open("rb") as stream:
+            hashes.append(hashlib.file_digest(stream, "sha256").hexdigest())
+    joined = "".join(hashes).encode()
+    return hashes[0] if len(hashes) == 1 else hashlib.sha256(joined).hexdigest()
+
+
+def _outstanding(workspace: Workspace, path: Path) -> str:
+    waiting = standing_in(workspace).outstanding
+    if waiting is None:
+        raise GroundedError(
+            f"{path} doesn't say which candidate it ran, and none is waiting for a trial: name it "
+            "with --candidate ID, or use --data for a log that ran none"
+        )
+    return waiting.id
+
+
+def _about(workspace: Workspace, candidate: str) -> dict[str, str]:
+    """The metadata of a trial that is written here."""
+    if not candidate:
+        return {"kind": "data"}
+    _, meta = workspace.candidate(candidate)
+    return {"kind": "trial", "task": workspace.task.hash} | {
+        key: meta[key] for key in ("iteration", "alpha")
+    }
+
+
+def _encode(
+    workspace: Workspace,
+    trial: Trial,
+    about: dict[str, str],
+    candidate: str | None,
+    start_ns: int = 0,
+) -> bytes:
+    return trial_bytes(
+        trial,
+        about,
+        workspace.candidate_bytes(candidate) if candidate else None,
+        state_units=dict(workspace.base_model.states),
+        input_units=dict(workspace.base_model.inputs),
+        start_ns=start_ns,
+    )

@@ -1,0 +1,163 @@
+"""run: hand a candidate to the real system and get a trial file back.
+
+The system is a command of the user's (a robot, another simulator) that is given the paths of the
+candidate and of the trial it must write; or a simulated one, a model in the workspace.
+
+The optimum of a SIMULATED real system, for studies and demos: the search never sees it.
+
+The same search, given the true model and the true latency as its crude model, on the quiet system.
+"""
+
+from __future__ import annotations
+
+import shlex
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from grounded.errors import GroundedError, nearest
+from grounded.plant import Noise, Plant
+from grounded.search.improve import learn
+from grounded.search.standing import Candidate, Options
+from grounded.trial import Trial
+from grounded_trials.store.trial_file import write_trial
+from grounded_trials.workspace.folder import Workspace
+from grounded_trials.workspace.model_file import load_module, model_in
+
+
+def run_candidate(workspace: Workspace, identity: str) -> Path:
+    """Runs a candidate once and returns the new trial file, runs/cNNNN-K.mcap.
+
+    Raises:
+        GroundedError: if no system is configured, it failed, or it wrote no trial.
+    """
+    system = workspace.config.system
+    workspace.candidate_bytes(identity)
+    path = _next_run(workspace.folder / "runs", identity)
+    if system.command:
+        _call(workspace, system.command, identity, path)
+    elif system.model:
+        _simulate(workspace, identity, path)
+    else:
+        raise GroundedError(
+            "grounded.toml has no [system]: run the candidate "
+            f"{workspace.candidate_path(identity)} on your robot by hand and `grounded ingest` its "
+            'log, or give [system] command = "python drive.py {candidate} {trial}"'
+        )
+    return path
+
+
+def simulated_plant(workspace: Workspace) -> Plant:
+    """The simulated system of [system] model.
+
+    Raises:
+        GroundedError: if its file holds no model.
+    """
+    system = workspace.config.system
+    module = load_module(workspace.folder, file=system.model, key="[system] model")
+    model = model_in(module)
+    for kind, values in system.noise.items():
+        for name in values:
+            if name not in model.states:
+                raise GroundedError(
+                    f"grounded.toml: [system.noise.{kind}] {name}: {system.model} has no such "
+                    "state: " + nearest(name, model.states)
+                )
+    noise = Noise(**{kind: dict(values) for kind, values in system.noise.items()})
+    latency = getattr(module, "latency", {})
+    return Plant(
+        model=model,
+        latency=dict(latency),
+        noise=noise,
+        substeps=int(getattr(module, "substeps", 5)),
+    )
+
+
+def _next_run(folder: Path, identity: str) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    taken = [p.stem.rsplit("-", 1)[-1] for p in folder.glob(f"{identity}-*.mcap")]
+    number = max((int(t) for t in taken if t.isdigit()), default=0) + 1
+    return folder / f"{identity}-{number}.mcap"
+
+
+def _call(workspace: Workspace, command: str, identity: str, path: Path) -> None:
+    """The user's command, its output passed on to stderr."""
+    words = {
+        "candidate": str(workspace.candidate_path(identity).resolve()),
+        "trial": str(path.resolve()),
+    }
+    for name in words:
+        if "{" + name + "}" not in command:
+            raise GroundedError(f"[system] command must contain {{{name}}}, found: {command}")
+    try:
+        parts = shlex.split(command)
+    except ValueError as error:
+        raise GroundedError(
+            f"[system] command can't be split into words ({error}): {command}"
+        ) from None
+    for name, text in words.items():
+        parts = [part.replace("{" + name + "}", text) for part in parts]
+    try:
+        done = subprocess.run(parts, cwd=workspace.folder, stdout=2, check=False)
+    except OSError as error:
+        raise GroundedError(f"[system] command '{parts[0]}' can't be run: {error}") from None
+    if done.returncode != 0:
+        hint = f"; what it wrote is kept in {path}" if path.exists() else ""
+        raise GroundedError(
+            f"[system] command ended with exit code {done.returncode}: {shlex.join(parts)}{hint}"
+        )
+    if not path.exists():
+        raise GroundedError(f"[system] command ended well but wrote no trial to {{trial}} = {path}")
+
+
+def _simulate(workspace: Workspace, identity: str, path: Path) -> None:
+    candidate, meta = workspace.candidate(identity)
+    task, plant = workspace.task, simulated_plant(workspace)
+    start = dict(zip(task.model.state_names, map(float, task.start), strict=True))
+    number = len(workspace.store.list()) + 1
+    rng = np.random.default_rng([workspace.config.system.seed, number])
+    trial = plant.run(candidate.policy, start, rng)
+    from dataclasses import replace
+
+    write_trial(
+        path,
+        replace(trial, candidate=identity),
+        {
+            "kind": "trial",
+            "iteration": meta["iteration"],
+            "alpha": meta["alpha"],
+            "task": meta["task"],
+            "system": f"simulated: {workspace.config.system.model}",
+            "number": str(number),
+        },
+        policy=workspace.candidate_bytes(identity),
+        state_units=dict(task.model.states),
+        input_units=dict(task.model.inputs),
+    )
+
+
+TRIALS = 30
+
+
+def optimum(workspace: Workspace) -> float | None:
+    """The best utility found with the true model; None where the system is not simulated.
+
+    Also None where the true model has other states than the crude one: then no task fits it.
+    """
+    if not workspace.config.system.model:
+        return None
+    task, plant = workspace.task, replace(simulated_plant(workspace), noise=Noise())
+    model = plant.model
+    if (model.state_names, model.input_names) != (task.model.state_names, task.model.input_names):
+        return None
+    delays = np.array([plant.latency.get(name, 0.0) for name in model.input_names])
+    truth = replace(task.with_model(model), latency=delays)
+    start = dict(zip(model.state_names, map(float, task.start), strict=True))
+
+    def run(candidate: Candidate) -> Trial:
+        return plant.run(candidate.policy, start, np.random.default_rng(0))
+
+    standing, _, _ = learn(truth, run, Options(max_trials=TRIALS, tolerance=1e-4))
+    return standing.incumbent.utility if standing.incumbent else None

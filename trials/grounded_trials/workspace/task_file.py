@@ -1,0 +1,204 @@
+"""From a checked grounded.toml and a loaded model to the Task of the method.
+
+target.csv: what the states are to do, a row a control step; a state without a column is free.
+"""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+
+from grounded.errors import GroundedError, nearest
+from grounded.frozen import Array
+from grounded.model import Model
+from grounded.task import Task
+from grounded.utility import Reward
+from grounded_trials.workspace.config import Config
+from grounded_trials.workspace.model_file import check_names
+
+
+def build_task(config: Config, model: Model, folder: Path) -> Task:
+    """The task that the files describe; errors name the file and the key.
+
+    Raises:
+        GroundedError: for a name that is not in the model, or sizes that do not fit.
+    """
+    try:
+        return _build(config, model, folder)
+    except GroundedError as error:
+        named = str(error).startswith((config.file.name, str(folder), config.task.target))
+        raise GroundedError(f"{'' if named else config.file.name + ': '}{error}") from None
+
+
+def _build(config: Config, model: Model, folder: Path) -> Task:
+    states, inputs = list(model.state_names), list(model.input_names)
+    table = config.task
+    check_names(table.start, [*states, *inputs], "[task] start: state")
+    check_names(table.latency, inputs, "[task] latency: input")
+    path = (folder / table.target).resolve()
+    if not path.is_relative_to(folder.resolve()):
+        raise GroundedError(f"[task] target = '{table.target}' lies outside the workspace")
+    target, input_target = target_arrays(path, states, inputs, table.dt, table.horizon)
+    first = np.where(np.isfinite(target[0]), target[0], 0.0)
+    start = np.array([table.start.get(s, first[i]) for i, s in enumerate(states)])
+    low, high = _limits(config, inputs)
+    held = np.zeros(len(inputs)) if input_target is None else input_target[0]
+    past = np.array([table.start.get(name, held[i]) for i, name in enumerate(inputs)])
+    safety = config.safety.pairs(states)
+    safe = np.array([safety.get(s, (-np.inf, np.inf)) for s in states])
+    return Task(
+        model=model,
+        dt=table.dt,
+        target=target,
+        reward=_reward(config, states, inputs),
+        start=start,
+        past=np.clip(past, low, high),
+        low=low,
+        high=high,
+        feedback=table.feedback,
+        latency=np.array([table.latency.get(name, 0.0) for name in inputs]),
+        input_target=input_target,
+        safety_low=safe[:, 0],
+        safety_high=safe[:, 1],
+        smoothing=config.model.smoothing,
+    )
+
+
+def _limits(config: Config, inputs: list[str]) -> tuple[Array, Array]:
+    pairs = config.limits.pairs(inputs)
+    both = np.array([pairs.get(name, (-np.inf, np.inf)) for name in inputs])
+    return both[:, 0], both[:, 1]
+
+
+def _reward(config: Config, states: list[str], inputs: list[str]) -> Reward:
+    table = config.reward
+    kinds = {"state": states, "terminal": states, "input": inputs, "input_change": inputs}
+    weights = {}
+    for kind, names in kinds.items():
+        given = table.numbers(kind, names)
+        weights[kind] = np.array([given.get(name, 0.0) for name in names])
+    table.finish()
+    if not any(w.any() for w in (weights["state"], weights["terminal"])):
+        raise GroundedError(
+            "[reward] weighs no state: there is nothing to follow; add for example "
+            f"state = {{ {states[0]} = 1.0 }}"
+        )
+    return Reward(**weights)
+
+
+ROW_LIMIT = 200_002
+
+
+def read_target(path: Path) -> tuple[list[str], Array]:
+    """The columns' names (first `t`) and the values, (rows, columns).
+
+    Raises:
+        GroundedError: naming the line and column that is not a number.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            reader = csv.reader(stream)
+            names = [name.strip() for name in next(reader, [])]
+            _check_header(path, names)
+            rows: list[list[float]] = []
+            for line, row in enumerate(reader, start=2):
+                if not any(cell.strip() for cell in row):
+                    continue
+                if len(rows) > ROW_LIMIT:
+                    raise GroundedError(f"{path.name} has more than {ROW_LIMIT} rows")
+                rows.append(_numbers(path, line, names, row))
+    except FileNotFoundError:
+        raise GroundedError(f"{path} does not exist; [task] target asks for it") from None
+    except IsADirectoryError:
+        raise GroundedError(f"{path} is a folder; [task] target must name a CSV file") from None
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise GroundedError(f"{path} can't be read as CSV: {error}") from None
+    return names, np.array(rows, dtype=float).reshape(len(rows), len(names))
+
+
+def _check_header(path: Path, names: list[str]) -> None:
+    if not names or names[0] != "t":
+        found = names[0] if names else "nothing"
+        raise GroundedError(
+            f"{path.name}: the first column must be 't', found '{found}'; columns are separated by "
+            "commas"
+        )
+    twice = [name for name in names if names.count(name) > 1]
+    if twice:
+        raise GroundedError(f"{path.name}: the column '{twice[0]}' is there twice")
+
+
+def _numbers(path: Path, line: int, names: list[str], row: list[str]) -> list[float]:
+    if len(row) != len(names):
+        raise GroundedError(
+            f"{path.name} line {line}: {len(row)} values for {len(names)} columns "
+            f"({', '.join(names)})"
+        )
+    values = []
+    for name, cell in zip(names, row, strict=True):
+        try:
+            value = float(cell)
+        except ValueError:
+            raise GroundedError(
+                f"{path.name} line {line}: '{cell}' in column '{name}' is not a number"
+            ) from None
+        if not np.isfinite(value):
+            raise GroundedError(
+                f"{path.name} line {line}: {cell.strip()} in column '{name}'; every tracked value "
+                "must be finite, leave out the column of a state that is free"
+            )
+        values.append(value)
+    return values
+
+
+def target_arrays(
+    path: Path, states: list[str], inputs: list[str], dt: float, horizon: int
+) -> tuple[Array, Array | None]:
+    """The target (H + 1, n), NaN in free columns, and the inputs' target (H, m) if there is one.
+
+    Raises:
+        GroundedError: for an unknown column, too few rows, or times off the control grid.
+    """
+    names, values = read_target(path)
+    for name in names[1:]:
+        if name not in states and name not in inputs:
+            raise GroundedError(
+                f"{path.name}: column '{name}' is neither a state nor an input of the model: "
+                + nearest(name, [*states, *inputs])
+            )
+    if len(values) < horizon + 1:
+        raise GroundedError(
+            f"{path.name} has {len(values)} rows, a horizon of {horizon} steps needs "
+            f"{horizon + 1}: add rows or set [task] horizon = {max(len(values) - 1, 0)}"
+        )
+    t = values[: horizon + 1, 0]
+    off = np.abs(t - t[0] - dt * np.arange(horizon + 1))
+    if off.max() > 0.01 * dt:
+        i = int(np.argmax(off > 0.01 * dt))
+        raise GroundedError(
+            f"{path.name} line {i + 2}: t = {t[i]:g} s, expected {t[0] + i * dt:g} s: rows must be "
+            f"[task] dt = {dt:g} s apart"
+        )
+    target = np.full((horizon + 1, len(states)), np.nan)
+    given = {name: values[: horizon + 1, names.index(name)] for name in names[1:]}
+    for i, name in enumerate(states):
+        if name in given:
+            target[:, i] = given[name]
+    if not any(name in given for name in inputs):
+        return target, None
+    columns = [given.get(name, np.zeros(horizon + 1))[:horizon] for name in inputs]
+    return target, np.stack(columns, axis=1)
+
+
+def write_target(path: Path, dt: float, columns: dict[str, Array]) -> None:
+    """Writes a target; `columns` are states in the order of the file, (H + 1,) each."""
+    from grounded_trials.store.store import write_atomically
+
+    H = len(next(iter(columns.values())))
+    lines = [",".join(["t", *columns])]
+    for i in range(H):
+        row = [f"{i * dt:.10g}", *(f"{values[i]:.9g}" for values in columns.values())]
+        lines.append(",".join(row))
+    write_atomically(path, ("\n".join(lines) + "\n").encode())
