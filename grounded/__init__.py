@@ -11,4 +11,6 @@ from grounded.model import Model, Param
 from grounded.policy import Policy
 from grounded.trial import Trial
 
-__all__ = ["GroundedError", "Model", "Param", "Policy", "Trial"]
+__version__ = "0.2.0"
+
+__all__ = ["GroundedError", "Model", "Param", "Policy", "Trial", "__version__"]

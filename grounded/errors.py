@@ -7,10 +7,33 @@ is a mistake of ours and keeps its traceback.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class NextCommand:
+    """A command of `grounded` that helps now, as data: the command line renders it, with its -C.
+
+    Args:
+        verb: the command, `diagnose`.
+        arguments: its words, unquoted.
+    """
+
+    verb: str
+    arguments: tuple[str, ...] = ()
 
 
 class GroundedError(Exception):
-    """A misuse or a bad input; the message is complete and meant for a person."""
+    """A misuse or a bad input; the message is complete and meant for a person.
+
+    Args:
+        message: what was found, what was expected, what to do.
+        then: the command that mends it, where there is one; the message doesn't repeat it.
+    """
+
+    def __init__(self, message: str, then: NextCommand | None = None) -> None:
+        super().__init__(message)
+        self.then = then
 
 
 def nearest(name: str, valid: Iterable[str]) -> str:

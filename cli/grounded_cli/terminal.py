@@ -14,6 +14,7 @@ from typing import Any
 
 import click
 
+from grounded.result import plain
 from grounded_cli.address import addressed
 from grounded_trials.wording import WIDTH, wrapped
 from grounded_trials.wording import figure as number
@@ -64,21 +65,7 @@ def harmless(text: str) -> str:
 
 def show_json(document: dict[str, Any]) -> None:
     """One JSON document on stdout; a number that JSON doesn't have becomes null."""
-    click.echo(json.dumps(_clean(document), indent=1, ensure_ascii=False, allow_nan=False))
-
-
-def _clean(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {str(key): _clean(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_clean(item) for item in value]
-    if isinstance(value, bool) or value is None or isinstance(value, str):
-        return value
-    if hasattr(value, "tolist"):
-        return _clean(value.tolist())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return value if isinstance(value, int) else str(value)
+    click.echo(json.dumps(plain(document), indent=1, ensure_ascii=False, allow_nan=False))
 
 
 def field(label: str, text: str, indent: str = "") -> str:

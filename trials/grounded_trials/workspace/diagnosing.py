@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from grounded.errors import GroundedError, nearest
+from grounded.result import plain
 from grounded.trial import Trial
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.diagnosis_file import FILE
@@ -81,7 +82,7 @@ def diagnose_in(
 
 def _keep(workspace: Workspace, document: dict[str, Any]) -> None:
     workspace.reports.mkdir(exist_ok=True)
-    text = json.dumps(_finite(document), indent=1, ensure_ascii=False, allow_nan=False)
+    text = json.dumps(plain(document), indent=1, ensure_ascii=False, allow_nan=False)
     write_atomically(workspace.reports / FILE, (text + "\n").encode())
 
 
@@ -147,18 +148,6 @@ def _probe(
     )
     workspace.save_candidate(candidate, workspace.task, kind="probe")
     return candidate.id, made.sentence
-
-
-def _finite(value: Any) -> Any:
-    """JSON has no NaN and no infinity: null instead."""
-    if isinstance(value, dict):
-        return {str(key): _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    if isinstance(value, bool) or value is None or isinstance(value, str | int):
-        return value
-    number = float(value)
-    return number if math.isfinite(number) else None
 
 
 LEAST_STEPS = 2
