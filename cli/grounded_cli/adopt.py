@@ -39,8 +39,7 @@ def command(effects: tuple[str, ...], effect_only: bool, folder: str | None, jso
 
     done = adopt_effects(workspace, effects, parameters=not effect_only)
     if json_:
-        found = [dict(one) for one in done.effects]
-        show_json({"effects": found, "params": dict(done.params), "claimed": done.claimed})
+        show_json(done.to_json())
         return
     for name in dict.fromkeys(effects):
         show(f"{name} is part of the model now ({workspace.config.file})")

@@ -9,6 +9,7 @@ import click
 
 from grounded.errors import NextCommand
 from grounded_cli import completion as complete
+from grounded_cli.address import given
 from grounded_cli.options import as_json, in_workspace, library_of, open_workspace
 from grounded_cli.terminal import field, names_in, number, show, show_json, stages, table
 from grounded_trials.wording import folded, rendered, with_unit
@@ -89,7 +90,9 @@ def _tell(found: Diagnosis, before: dict[str, float]) -> None:
     _places(found.where)
     if not found.no_cause:
         _effects(found)
-    show("\n" + field("next trial", found.next_trial))
+    run = NextCommand("run", (found.probe,))
+    text = found.next_trial.replace(rendered(run), rendered(run, given()))
+    show("\n" + field("next trial", text))
 
 
 def _verdict(kind: str, text: str) -> str:

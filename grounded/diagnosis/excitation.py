@@ -23,7 +23,7 @@ from grounded.diagnosis.hypothesis import Hypothesis, Predictor
 from grounded.diagnosis.noise import Noise, Structure
 from grounded.diagnosis.refine import refine
 from grounded.diagnosis.report import Diagnosis
-from grounded.effects import Effect, Library, scales_of, wrap, wrapping_order
+from grounded.effects import Effect, Library, memory_start, scales_of, wrap, wrapping_order
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.policy import Policy, Runner
@@ -173,7 +173,7 @@ def _run(task: Task, h: Hypothesis, policy: Policy) -> Trial | None:
         task.model.input_names,
         start_inputs=task.past,
     )
-    extra = _memory_start(model, task.model, start)
+    extra = memory_start(model, task.model, start)
     z, runner = np.concatenate([task.start, extra]), Runner(policy)
     states, inputs = [task.start], np.zeros((policy.horizon, model.m))
     for t in range(policy.horizon):
@@ -208,12 +208,6 @@ def _wrapped(task: Task, h: Hypothesis) -> Model:
         current = Library((effect.family,)).effect(effect.name, model, effect.site.scales)
         model = wrap(current, h.values[i], task.dt)
     return model
-
-
-def _memory_start(wrapped: Model, base: Model, trial: Trial) -> Array:
-    from grounded.effects import memory_start
-
-    return memory_start(wrapped, base, trial)
 
 
 def _safe(task: Task, run: Trial | None) -> bool:

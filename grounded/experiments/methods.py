@@ -42,7 +42,7 @@ class Kept:
 
 
 def search(case: Bench, options: Options, refit: Refit | None = None) -> list[Kept]:
-    """This algorithm, through the function behind `grounded propose`."""
+    """This algorithm, through the function that proposes candidates."""
     candidates: list[Candidate] = []
     trials: list[Trial] = []
     kept: list[Kept] = []

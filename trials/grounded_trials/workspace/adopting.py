@@ -15,6 +15,7 @@ from typing import Any
 
 from grounded.diagnosis.report import Diagnosis
 from grounded.errors import GroundedError, NextCommand, nearest
+from grounded.result import Document
 from grounded.search.planner import Planner
 from grounded_trials.workspace.config import set_in_model
 from grounded_trials.workspace.diagnosing import read_diagnosis
@@ -24,8 +25,8 @@ Effect = dict[str, Any]  # {"name": "dead_zone:throttle", "c": 0.146}
 AGAIN = NextCommand("diagnose")
 
 
-@dataclass(frozen=True)
-class Adopted:
+@dataclass(frozen=True, eq=False)
+class Adopted(Document):
     """What the model has now."""
 
     effects: tuple[Mapping[str, Any], ...]  # all that are adopted
