@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from grounded_cli import completion as complete
-from grounded_cli.options import as_json, in_workspace, library_of, open_workspace
+from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
 from grounded_cli.terminal import field, names_in, number, show, show_json, stages, table
-from grounded_trials.wording import folded, with_unit
+from grounded_trials.wording import with_unit
 
 if TYPE_CHECKING:
+    from grounded.errors import NextCommand
+    from grounded_trials import Workspace
     from grounded_trials.workspace.diagnosing import Diagnosed
-    from grounded_trials.workspace.folder import Workspace
 
 
 @click.command("diagnose")
@@ -34,50 +35,44 @@ if TYPE_CHECKING:
 @click.option("--without", multiple=True, metavar="F1,F2,...", help="Families not to blame.")
 @in_workspace
 @as_json
-def command(
-    trials: str | None, max_effects: int, without: tuple[str, ...], folder: str | None, json_: bool
-) -> None:
+def command(trials: str | None, max_effects: int, without: tuple[str, ...], json_: bool) -> None:
     """Explain the sim-to-real gap from the stored trials; keeps reports/diagnosis.json.
 
     The verdict is one effect, several, none (the model explains the data down to the noise) or
     unknown (a gap that no known effect explains). Where two effects tie, a probe candidate that
     would tell them apart is written.
     """
-    workspace = open_workspace(folder)
+    workspace = open_workspace()
     from grounded.errors import GroundedError
-    from grounded_trials.workspace.diagnosing import diagnose_in
 
     chosen = names_in(trials)
     if trials is not None and not chosen:
         raise GroundedError(
             "--trials names no trial: expected some, like t0001,t0002; leave it out to take all"
         )
-    library = library_of(tuple(name for text in without for name in names_in(text)))
+    families = [name for text in without for name in names_in(text)]
     with stages() as tell:
-        found = diagnose_in(
-            workspace, trials=chosen, max_effects=max_effects, library=library, progress=tell
-        )
+        found = workspace.diagnose(chosen, max_effects=max_effects, without=families, progress=tell)
     if json_:
         show_json(found.document)
     else:
         params = workspace.base_model.params
         _tell(found.document, {name: param.value for name, param in params.items()})
-        show(f"\n{_follow(workspace, found)}")
+        show(f"\n{next_line(_follow(workspace, found))}")
 
 
-def _follow(workspace: Workspace, found: Diagnosed) -> str:
+def _follow(workspace: Workspace, found: Diagnosed) -> NextCommand:
     """The command that follows: adopt what was claimed, run another trial, or see the whole."""
+    from grounded.errors import NextCommand
     from grounded_trials.workspace.diagnosis_file import diagnosis_of
     from grounded_trials.workspace.next_step import after_diagnosis, another_trial
     from grounded_trials.workspace.proposing import standing_in
 
     diagnosis = diagnosis_of(found.document)
     if diagnosis.no_cause:
-        return folded(another_trial(workspace, standing_in(workspace, ahead=True)))
-    command = after_diagnosis(workspace, diagnosis)
-    if not command and found.probe:
-        command = f"grounded run {found.probe}"
-    return folded(command or "grounded report --html")
+        return another_trial(workspace, standing_in(workspace, ahead=True))
+    probe = NextCommand("run", (found.probe,)) if found.probe else None
+    return after_diagnosis(workspace, diagnosis) or probe or NextCommand("report", ("--html",))
 
 
 def _tell(document: dict[str, Any], before: dict[str, float]) -> None:

@@ -24,6 +24,7 @@ from grounded_trials.wording import (
     figure,
     folded,
     per_second,
+    rendered,
     shown,
     verdict,
     with_unit,
@@ -59,7 +60,7 @@ def report_text(findings: Findings, table: Table, bars: Callable[[Sequence[float
         for one in findings.lost:
             lines += _wrapped(f"{one.file}: {one.reason}", "  ")
         parts.append("\n".join(lines))
-    parts.append(folded(findings.next_command))
+    parts.append(folded(rendered(findings.then, findings.folder)))
     return "\n\n".join(parts)
 
 
@@ -87,7 +88,7 @@ def _utilities(findings: Findings, table: Table, bars: Callable[[Sequence[float]
     header = ("candidate", "iter.", "alpha", "predicted", "real", "+-", "trials", "")
     lines = ["utility", table(rows, header), f"  {LEGEND}"]
     if left:
-        lines.append(f"  ({left} more between them: grounded status shows all)")
+        lines.append(f"  ({left} more between them: {findings.command('status')} shows all)")
     spark = bars(spaced([t.utility for t in history if t.utilities][-WIDTH // 2 :]))
     if spark:
         lines.append(f"\n  {spark}  by candidate, higher is better")
@@ -178,7 +179,7 @@ def _biases(findings: Findings, table: Table) -> str:
 def _diagnosis(findings: Findings, table: Table) -> str:
     diagnosis, since = findings.diagnosis, findings.since
     if diagnosis is None:
-        return "gap to the model\n  not diagnosed yet: grounded diagnose"
+        return f"gap to the model\n  not diagnosed yet: {findings.command('diagnose')}"
     lines = ["gap to the model"]
     if since.sentence:
         lines += _wrapped(since.sentence, "  ")

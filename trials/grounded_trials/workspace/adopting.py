@@ -13,11 +13,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from grounded.errors import GroundedError, nearest
+from grounded.errors import GroundedError, NextCommand, nearest
 from grounded.search.planner import Planner
 from grounded_trials.workspace.config import set_in_model
 from grounded_trials.workspace.diagnosis_file import FILE, MALFORMED, Diagnosis, diagnosis_of
-from grounded_trials.workspace.folder import Workspace
+from grounded_trials.workspace.folder import Folder
 
 Effect = dict[str, Any]  # {"name": "dead_zone:throttle", "c": 0.146}
 
@@ -31,9 +31,7 @@ class Adopted:
     claimed: bool  # the diagnosis claims the new ones; else one was taken by itself
 
 
-def adopt_effects(
-    workspace: Workspace, names: Sequence[str], *, parameters: bool = True
-) -> Adopted:
+def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool = True) -> Adopted:
     """Adds diagnosed effects to [model] effects, and the parameters that belong to them.
 
     Where the diagnosis calibrated the model's own parameters beside the effects that it claims,
@@ -68,7 +66,7 @@ def adopt_effects(
     return Adopted(tuple(adopted), own, claimed)
 
 
-def _nominal(document: Mapping[str, Any], workspace: Workspace, name: str) -> float:
+def _nominal(document: Mapping[str, Any], workspace: Folder, name: str) -> float:
     """A parameter's value when the diagnosis was made."""
     values = document.get("diagnosed", {}).get("nominal", {})
     if name in values:
@@ -95,7 +93,7 @@ def _settled(
 
 
 def _check(
-    names: Sequence[str], known: Sequence[str], workspace: Workspace, before: Mapping[str, Any]
+    names: Sequence[str], known: Sequence[str], workspace: Folder, before: Mapping[str, Any]
 ) -> None:
     """Each must have been weighed, and not be adopted since."""
     adopted = [e["name"] for e in workspace.config.model.effects if e["name"] not in before]
@@ -139,7 +137,7 @@ def _rounded(value: float) -> float:
     return float(f"{float(value):.8g}")
 
 
-def _document(workspace: Workspace) -> dict[str, Any]:
+def _document(workspace: Folder) -> dict[str, Any]:
     path = workspace.reports / FILE
     try:
         document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
@@ -147,7 +145,7 @@ def _document(workspace: Workspace) -> dict[str, Any]:
         for entry in document["ranking"]:
             _ = str(entry["effect"]), entry["params"].items()
     except FileNotFoundError:
-        raise GroundedError("nothing was diagnosed yet: run `grounded diagnose` first") from None
+        raise GroundedError("nothing was diagnosed yet", NextCommand("diagnose")) from None
     except (OSError, *MALFORMED) as error:
         raise GroundedError(
             f"{path} can't be read ({error}): run `grounded diagnose` again"
@@ -163,7 +161,7 @@ class Better:
     name: str
 
 
-def better_model(workspace: Workspace, diagnosis: Diagnosis | None) -> Better | None:
+def better_model(workspace: Folder, diagnosis: Diagnosis | None) -> Better | None:
     """The diagnosed model, or else the one with adopted effects; None where there is neither.
 
     Raises:
@@ -193,7 +191,7 @@ def _new(diagnosis: Diagnosis | None, adopted: set[str]) -> list[dict[str, Any]]
     ]
 
 
-def _parameters(workspace: Workspace, diagnosis: Diagnosis | None) -> dict[str, float]:
+def _parameters(workspace: Folder, diagnosis: Diagnosis | None) -> dict[str, float]:
     """The model's parameters as the diagnosis estimated them; its own names only."""
     known = workspace.task.model.params
     found = diagnosis.parameters if diagnosis is not None else ()

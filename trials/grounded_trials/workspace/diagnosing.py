@@ -16,7 +16,7 @@ from grounded.result import plain
 from grounded.trial import Trial
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.diagnosis_file import FILE
-from grounded_trials.workspace.folder import Workspace
+from grounded_trials.workspace.folder import Folder
 
 if TYPE_CHECKING:
     from grounded.diagnosis.report import Diagnosis
@@ -34,7 +34,7 @@ class Diagnosed:
 
 
 def diagnose_in(
-    workspace: Workspace,
+    workspace: Folder,
     *,
     trials: Sequence[str] = (),
     max_effects: int = 3,
@@ -80,13 +80,13 @@ def diagnose_in(
     return Diagnosed(found, document, probe[0] if probe else "")
 
 
-def _keep(workspace: Workspace, document: dict[str, Any]) -> None:
+def _keep(workspace: Folder, document: dict[str, Any]) -> None:
     workspace.reports.mkdir(exist_ok=True)
     text = json.dumps(plain(document), indent=1, ensure_ascii=False, allow_nan=False)
     write_atomically(workspace.reports / FILE, (text + "\n").encode())
 
 
-def _chosen(workspace: Workspace, names: Sequence[str]) -> list[Trial]:
+def _chosen(workspace: Folder, names: Sequence[str]) -> list[Trial]:
     """The trials to diagnose: gaps in a state stay, what a smoother made of them is no evidence."""
     used = diagnosable(workspace)
     if not used:
@@ -113,7 +113,7 @@ def _measured(trial: Trial, guessed: Sequence[str]) -> Trial:
 
 
 def _probe(
-    workspace: Workspace, found: Diagnosis, trials: Sequence[Trial], library: Library
+    workspace: Folder, found: Diagnosis, trials: Sequence[Trial], library: Library
 ) -> tuple[str, str] | None:
     """Writes the candidate that would tell two tied effects apart: (id, sentence)."""
     planner = workspace.planner
@@ -153,7 +153,7 @@ def _probe(
 LEAST_STEPS = 2
 
 
-def diagnosable(workspace: Workspace) -> list[Trial]:
+def diagnosable(workspace: Folder) -> list[Trial]:
     """In order of arrival, up to the first missing input or number beyond all bounds.
 
     A fit needs whole states; a diagnosis only needs some, so a sensor that dropped out for a while

@@ -10,17 +10,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from grounded.errors import NextCommand
 from grounded.search.standing import Standing
 from grounded_trials.workspace.diagnosing import diagnosable
 from grounded_trials.workspace.diagnosis_file import Diagnosis
-from grounded_trials.workspace.folder import Workspace
+from grounded_trials.workspace.folder import Folder
 
-EXPORT = "grounded export best --format npz"
+EXPORT = NextCommand("export", ("best", "--format", "npz"))
 
 
 def next_command(
-    workspace: Workspace, now: Standing, diagnosis: Diagnosis | None, usable: Sequence[str]
-) -> str:
+    workspace: Folder, now: Standing, diagnosis: Diagnosis | None, usable: Sequence[str]
+) -> NextCommand:
     """What a person does next, given where the search stands and what was diagnosed.
 
     Args:
@@ -32,40 +33,40 @@ def next_command(
     if now.phase == "await-trial":
         return another_trial(workspace, now)
     if diagnosis is None:
-        return "grounded propose" if now.phase == "propose" else "grounded diagnose"
+        return NextCommand("propose") if now.phase == "propose" else NextCommand("diagnose")
     since = since_diagnosis(workspace, diagnosis, usable)
     follow = after_diagnosis(workspace, diagnosis)
     if now.phase == "propose":  # what logs have shown is adopted before the first candidate
         if now.history or since.changed or not follow:
-            return "grounded propose"
-        return "grounded diagnose" if since.newer else follow
+            return NextCommand("propose")
+        return NextCommand("diagnose") if since.newer else follow
     if since.changed or since.newer:
-        return "grounded diagnose"
+        return NextCommand("diagnose")
     if diagnosis.no_cause:
         return another_trial(workspace, now)
     return follow or EXPORT
 
 
-def another_trial(workspace: Workspace, now: Standing) -> str:
+def another_trial(workspace: Folder, now: Standing) -> NextCommand:
     """How to get one more trial: of what waits, of what comes next, or of the best again."""
     system = workspace.config.system
     here = bool(system.command or system.model)
     if now.phase == "await-trial":
-        return "grounded run" if here else "grounded ingest TRIAL.mcap"
+        return NextCommand("run") if here else NextCommand("ingest", ("TRIAL.mcap",))
     if now.phase == "propose" or now.incumbent is None:
-        return "grounded propose"
-    return "grounded run best" if here else "grounded ingest TRIAL.mcap"
+        return NextCommand("propose")
+    return NextCommand("run", ("best",)) if here else NextCommand("ingest", ("TRIAL.mcap",))
 
 
-def after_diagnosis(workspace: Workspace, diagnosis: Diagnosis) -> str:
-    """What to do about the effects that a diagnosis claims, "" where there is nothing to do."""
+def after_diagnosis(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
+    """What to do about the effects that a diagnosis claims, None where there is nothing to do."""
     new = diagnosis.open(workspace.config.model.effects)
     if diagnosis.kind not in ("effect", "several") or not new:
-        return ""
+        return None
     own = {f"parameter:{name}" for name in workspace.base_model.params}
     if own.issuperset(new):
-        return "grounded fit"  # the model's form is right: all of its numbers at once
-    return " ".join(["grounded adopt", *new])
+        return NextCommand("fit")  # the model's form is right: all of its numbers at once
+    return NextCommand("adopt", tuple(new))
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,7 @@ class Since:
         return "; ".join([*parts, "run `grounded diagnose` again"]) if parts else ""
 
 
-def usable_ids(workspace: Workspace) -> list[str]:
+def usable_ids(workspace: Folder) -> list[str]:
     """The trials that a diagnosis can use, in order of arrival.
 
     Raises:
@@ -102,7 +103,7 @@ def usable_ids(workspace: Workspace) -> list[str]:
     return [trial.id for trial in diagnosable(workspace)]
 
 
-def since_diagnosis(workspace: Workspace, diagnosis: Diagnosis, usable: Sequence[str]) -> Since:
+def since_diagnosis(workspace: Folder, diagnosis: Diagnosis, usable: Sequence[str]) -> Since:
     """What a diagnosis does not know.
 
     Args:
