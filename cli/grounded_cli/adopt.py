@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import click
 
-from grounded.errors import NextCommand
 from grounded_cli import completion as complete
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
 from grounded_cli.terminal import field, number, remark, show, show_json
@@ -37,8 +36,7 @@ def command(effects: tuple[str, ...], effect_only: bool, json_: bool) -> None:
     workspace = open_workspace()
     done = workspace.adopt(*effects, parameters=not effect_only)
     if json_:
-        found = [dict(one) for one in done.effects]
-        show_json({"effects": found, "params": dict(done.params), "claimed": done.claimed})
+        show_json(done.to_json())
         return
     for name in dict.fromkeys(effects):
         show(f"{name} is part of the model now ({workspace.config.file})")
@@ -50,4 +48,4 @@ def command(effects: tuple[str, ...], effect_only: bool, json_: bool) -> None:
     for name, value in done.params.items():
         text = with_unit(f"{number(before[name].value)} -> {number(value)}", before[name].unit)
         show(field(name, text, "  "))
-    show(f"\n{next_line(NextCommand('propose'))}")
+    show(f"\n{next_line(done.then)}")

@@ -50,7 +50,7 @@ def command(name: str, folder: str | None, json_: bool) -> None:
         "trials": status.standing.trials,
         "phase": status.standing.phase,
         "optimum": best,
-        "verdict": diagnosed.document["verdict"],
+        "verdict": diagnosed.verdict.to_json(),
         "paths": report.to_json()["paths"],
     }
     if json_:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from grounded_cli.options import as_json, given, in_workspace, next_line
+from grounded_cli.options import as_json, given, in_workspace, next_line, typed
 from grounded_cli.terminal import number, progress, remark, show, show_json, table
 from grounded_trials.wording import count
 
@@ -86,10 +86,9 @@ def _next(found: Inspected) -> str:
     """What to do with the file."""
     from grounded_trials.store.own_files import TRIAL
 
-    line = next_line(found.then, "WORKSPACE" if found.then.verb == "inspect" else None)
     if found.log_table:
-        command = line.removeprefix("next: ")
-        return f"# next: put this table into grounded.toml, then: {command}"
+        return f"# next: put this table into grounded.toml, then: {typed(found.then)}"
+    line = next_line(found.then, "WORKSPACE" if found.then.verb == "inspect" else None)
     if found.format != TRIAL or found.report.damage:
         return line
     stored = "is stored already, and " * found.stored

@@ -91,8 +91,8 @@ def open_workspace() -> Workspace:
     return Workspace(given() or ".")
 
 
-def next_line(then: NextCommand, folder: str | None = None) -> str:
-    """The last line of an output: the command to type next, as it works from where the user is.
+def typed(then: NextCommand, folder: str | None = None) -> str:
+    """A command as it works from where the user is.
 
     Args:
         then: the command.
@@ -100,4 +100,9 @@ def next_line(then: NextCommand, folder: str | None = None) -> str:
     """
     if folder is None and then.verb not in ELSEWHERE:
         folder = given()
-    return folded(rendered(then, folder))
+    return rendered(then, folder)
+
+
+def next_line(then: NextCommand, folder: str | None = None) -> str:
+    """The last line of an output: the command to type next, see `typed`."""
+    return folded(typed(then, folder))

@@ -20,11 +20,11 @@ from typing import TYPE_CHECKING, Self
 from grounded_trials.workspace.folder import Folder
 
 if TYPE_CHECKING:
+    from grounded.diagnosis.report import Diagnosis
     from grounded.effects import Library
     from grounded.search.standing import Candidate
     from grounded_trials.report.reporting import Report
     from grounded_trials.workspace.adopting import Adopted
-    from grounded_trials.workspace.diagnosing import Diagnosed
     from grounded_trials.workspace.exporting import Exported
     from grounded_trials.workspace.fitting import Fitted
     from grounded_trials.workspace.ingest import Ingested
@@ -104,9 +104,8 @@ class Workspace(Folder):
         from grounded_trials.workspace.proposing import candidate_named
 
         here = self._afresh()
-        return ingest_log(
-            here, Path(path), candidate and candidate_named(here, candidate), data=data
-        )
+        ran = candidate and candidate_named(here, candidate)
+        return ingest_log(here, Path(path), ran, data=data)
 
     def learn(
         self,
@@ -154,7 +153,7 @@ class Workspace(Folder):
         without: Sequence[str] = (),
         library: Library | None = None,
         progress: Callable[[str], None] | None = None,
-    ) -> Diagnosed:
+    ) -> Diagnosis:
         """Explains the gap between model and trials; keeps reports/diagnosis.json.
 
         Args:

@@ -11,6 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
+from grounded.diagnosis.report import Diagnosis
 from grounded.errors import NextCommand
 from grounded.frozen import Array
 from grounded.search.planner import Planner
@@ -19,7 +20,6 @@ from grounded.task import Task
 from grounded.trial import Trial, mean_trial
 from grounded_trials.wording import rendered
 from grounded_trials.workspace.adopting import Better
-from grounded_trials.workspace.diagnosis_file import Diagnosis
 from grounded_trials.workspace.folder import Lost
 from grounded_trials.workspace.next_step import Since
 
@@ -75,10 +75,6 @@ class Findings:
     def next_command(self) -> str:
         """What to type next, in the workspace's own folder."""
         return rendered(self.then)
-
-    def command(self, verb: str) -> str:
-        """A command as it is typed from where the user is."""
-        return rendered(NextCommand(verb), self.folder)
 
     @property
     def crude(self) -> Planner:

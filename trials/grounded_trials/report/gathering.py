@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from grounded.diagnosis.report import Diagnosis
 from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.search.certainty import utility_noise
@@ -23,8 +24,7 @@ from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.report.findings import Findings, Log, Run
 from grounded_trials.workspace.adopting import Better, better_model
-from grounded_trials.workspace.diagnosing import LEAST_STEPS
-from grounded_trials.workspace.diagnosis_file import Diagnosis, read_diagnosis
+from grounded_trials.workspace.diagnosing import LEAST_STEPS, read_diagnosis
 from grounded_trials.workspace.folder import Contents, Folder, Lost
 from grounded_trials.workspace.next_step import Since, next_command, since_diagnosis
 from grounded_trials.workspace.proposing import standing_in

@@ -7,6 +7,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from grounded.diagnosis.report import Estimate
+from grounded.errors import NextCommand
 from grounded.search.standing import Tried
 from grounded_trials.report.diagnosis_words import error_lines, sentences
 from grounded_trials.report.findings import (
@@ -30,7 +32,7 @@ from grounded_trials.wording import (
     with_unit,
     wrapped,
 )
-from grounded_trials.workspace.diagnosis_file import Value
+from grounded_trials.workspace.next_step import DIAGNOSE
 
 ROWS = 12  # candidates in the table; the others are counted
 ITERATIONS = 5  # of the bias
@@ -88,7 +90,8 @@ def _utilities(findings: Findings, table: Table, bars: Callable[[Sequence[float]
     header = ("candidate", "iter.", "alpha", "predicted", "real", "+-", "trials", "")
     lines = ["utility", table(rows, header), f"  {LEGEND}"]
     if left:
-        lines.append(f"  ({left} more between them: {findings.command('status')} shows all)")
+        status = rendered(NextCommand("status"), findings.folder)
+        lines += _wrapped(f"({left} more between them: {status} shows all)", "  ")
     spark = bars(spaced([t.utility for t in history if t.utilities][-WIDTH // 2 :]))
     if spark:
         lines.append(f"\n  {spark}  by candidate, higher is better")
@@ -179,10 +182,10 @@ def _biases(findings: Findings, table: Table) -> str:
 def _diagnosis(findings: Findings, table: Table) -> str:
     diagnosis, since = findings.diagnosis, findings.since
     if diagnosis is None:
-        return f"gap to the model\n  not diagnosed yet: {findings.command('diagnose')}"
+        command = rendered(DIAGNOSE, findings.folder)
+        return "\n".join(["gap to the model", *_wrapped(f"not diagnosed yet: {command}", "  ")])
     lines = ["gap to the model"]
-    if since.sentence:
-        lines += _wrapped(since.sentence, "  ")
+    lines += _wrapped(since.told(findings.folder), "  ")
     then = "before that: " * bool(since.adopted)
     for k, sentence in enumerate(sentences(diagnosis.sentence or diagnosis.kind)):
         lines += _wrapped(then * (k == 0) + sentence, "  ")
@@ -195,7 +198,7 @@ def _diagnosis(findings: Findings, table: Table) -> str:
                 r.effect[:30],
                 figure(r.evidence, 3),
                 figure(r.gap_after, 3),
-                _fitting(list(map(_value, r.params)), VALUES).ljust(VALUES),
+                _fitting([_value(*one) for one in r.params.items()], VALUES).ljust(VALUES),
             )
             for r in diagnosis.ranking[:EFFECTS]
         ]
@@ -224,9 +227,9 @@ def _logs(findings: Findings, table: Table) -> str:
     return title + table(rows, ("state", "unit", *(log.trial.id for log in logs)))
 
 
-def _value(value: Value) -> str:
+def _value(name: str, value: Estimate) -> str:
     spread = f" +- {value.std:.2g}" if 0 < value.std < math.inf else ""
-    return with_unit(f"{value.name} = {value.value:.3g}{spread}", value.unit)
+    return with_unit(f"{name} = {value.value:.3g}{spread}", value.unit)
 
 
 def _wrapped(text: str, indent: str) -> list[str]:

@@ -145,11 +145,9 @@ def propose_in(workspace: Folder) -> Proposed:
         workspace.save_candidate(candidate, workspace.task)
     if void := _void(proposal):
         proposal = replace(proposal, notes=(*proposal.notes, void))
-    system = workspace.config.system
-    by_hand = NextCommand("ingest", ("TRIAL.mcap",))
-    return Proposed(
-        proposal, path, NextCommand("run") if system.command or system.model else by_hand
-    )
+    here = workspace.config.system.reachable
+    then = NextCommand("run") if here else NextCommand("ingest", ("TRIAL.mcap",))
+    return Proposed(proposal, path, then)
 
 
 def _void(proposal: Proposal) -> str:
@@ -198,7 +196,7 @@ def status_of(workspace: Folder, standing: Standing, notes: tuple[str, ...] = ()
     Raises:
         GroundedError: if a stored file is damaged.
     """
-    from grounded_trials.workspace.diagnosis_file import read_diagnosis
+    from grounded_trials.workspace.diagnosing import read_diagnosis
     from grounded_trials.workspace.next_step import next_command, since_diagnosis, usable_ids
 
     usable = usable_ids(workspace)
@@ -206,8 +204,13 @@ def status_of(workspace: Folder, standing: Standing, notes: tuple[str, ...] = ()
         found = read_diagnosis(workspace.reports)
     except GroundedError:  # a damaged one is made again
         found = None
-    outdated = since_diagnosis(workspace, found, usable).sentence if found else ""
-    return Status(standing, next_command(workspace, standing, found, usable), outdated, notes)
+    since = since_diagnosis(workspace, found, usable) if found else None
+    return Status(
+        standing,
+        next_command(workspace, standing, found, usable),
+        since.told(workspace.address) if since else "",
+        notes,
+    )
 
 
 def candidate_named(workspace: Folder, name: str) -> str:
