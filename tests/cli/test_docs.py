@@ -53,6 +53,7 @@ MARK = re.compile(
 RUN = ("console", "python", "bash", "sh", "shell", "toml", "json")
 SHOWN = ("", "text", "mermaid", "cpp", "c++", "c", "cmake", "csv", "diff", "yaml", "xml", "html")
 ALL = os.environ.get("GROUNDED_DOCS") == "all"
+LONG = ("commands.md",)  # pages that take more than ten seconds
 
 
 @dataclass(frozen=True)
@@ -206,7 +207,11 @@ def _write_trial(path: Path) -> None:
     write_trial(path, trial, {"kind": "trial"})
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
+@pytest.mark.parametrize(
+    "page",
+    [pytest.param(p, marks=pytest.mark.slow) if p.name in LONG else p for p in PAGES],
+    ids=[str(p.relative_to(ROOT)) for p in PAGES],
+)
 def test_every_block_of_the_page_runs(page, tmp_path):
     runner, skipped = Page(tmp_path), []
     for block in blocks_of(page.read_text()):
