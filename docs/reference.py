@@ -1,8 +1,8 @@
 """Generates the site's reference: a page for every room, from its docstrings (a hook of MkDocs).
 
-A room is a folder with an `__init__.py`. Its page opens with what the room is for and in which order
-to read it, then shows the public names of each of its modules. Rooms are found, not listed: a new
-one has its page at once.
+A room is a folder with an `__init__.py`. Its page opens with what the room is for and in which
+order to read it, then shows the public names of each of its modules. Rooms are found, not listed: a
+new one has its page at once.
 """
 
 from __future__ import annotations
