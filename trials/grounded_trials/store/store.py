@@ -26,7 +26,7 @@ try:
     import fcntl
 except ImportError:
     raise GroundedError(
-        "trials can be stored on Linux and macOS only: the store locks its folder by Python's fcntl, "
+        "trials can be stored on Linux and macOS only: the store locks its folder with fcntl, "
         "which Windows lacks. Use WSL; grounded.policy, which drives a robot, works here as well"
     ) from None
 
