@@ -66,17 +66,21 @@ def page(room: str) -> str:
     return "\n\n".join(opening + front + [f"::: {module}" for module in modules(room)]) + "\n"
 
 
-class PlainUnderscores(Extension):
-    """Leaves underscores alone: in x_t and u_t they are indices, not emphasis."""
+class PlainMaths(Extension):
+    """Leaves x_t and [W][m] alone: they are indices and shapes, not emphasis and links."""
 
     def extendMarkdown(self, md: Markdown) -> None:
-        """Takes a single underscore for itself, after code and links and before emphasis."""
-        md.inlinePatterns.register(SimpleTextInlineProcessor("(_)"), "plain underscore", 65)
+        """Takes such text for itself, after code and before links and emphasis."""
+        for name, pattern, priority in (
+            ("shapes", r"((?:\[[^\]\[.`]*\] ?){2,})", 189.5),
+            ("underscores", "(_)", 65),
+        ):
+            md.inlinePatterns.register(SimpleTextInlineProcessor(pattern), name, priority)
 
 
 def on_config(config: Any) -> Any:
     """Adds the reference to the navigation."""
-    config.markdown_extensions.append(PlainUnderscores())
+    config.markdown_extensions.append(PlainMaths())
     for package in SOURCES:
         pages = [{room: f"reference/{room}.md"} for room in rooms(package)]
         config.nav.append({f"Reference: {package}": pages})

@@ -11,7 +11,7 @@ and backwards, channels in reverse,
     z = e / s - g'r,  r += h z,  N += h (1/s + g'N g) h' - h (N g)' - (N g) h',          g = b / s
     r = A' r,         N = A' N A
 
-A trial's numbers lie as `[group][time][entry][lane]`. Rows of a matrix are a loop, entries of a row
+A trial's numbers lie as [group][time][entry][lane]. Rows of a matrix are a loop, entries of a row
 are unrolled: the text grows with n^2.
 """
 

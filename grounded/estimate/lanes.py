@@ -1,6 +1,6 @@
 """Batches in the layout of the compiled recursions, and calls of those.
 
-`[group][time][entry][lane]`: W trials side by side in a group, the last trial repeated to fill it.
+[group][time][entry][lane]: W trials side by side in a group, the last trial repeated to fill it.
 """
 
 from __future__ import annotations

@@ -47,7 +47,7 @@ def start_table(f: Writer, words: Words, d: Dynamics) -> str:
 def gather_rows(
     f: Writer, arrays: Sequence[tuple[str, int, str]], first: str, count: str, width: int
 ) -> None:
-    """Rows first .. first + W - 1 of (count, size) arrays to `[size][W]`, the last row repeated.
+    """Rows first .. first + W - 1 of (count, size) arrays to [size][W], the last row repeated.
 
     Args:
         f: where to write.

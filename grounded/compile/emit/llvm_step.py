@@ -170,7 +170,7 @@ class StepWriter:
         return body, c
 
     def jacobian(self, out: str) -> None:
-        """From x and u to next, and the values of the Jacobian's places to out, `[places][W]`."""
+        """From x and u to next, and the values of the Jacobian's places to out, [places][W]."""
         f, d, w = self.f, self.d, self.width
         if not d.stages:
             self.step()
@@ -292,7 +292,7 @@ def stage_tables(d: Dynamics) -> str:
 
 
 def jacobian_function(d: Dynamics, width: int) -> str:
-    """`i64 @jacobian(xu, table, next, out)`: `xu[n + m][W]`, `next[n][W]`, `out[places][W]`."""
+    """`i64 @jacobian(xu, table, next, out)`: xu is [n + m][W], next [n][W], out [places][W]."""
     f = Writer("i64 @jacobian(ptr %xu, ptr %table, ptr %next, ptr %out)")
     writer = StepWriter(f, d, width, "%table")
     writer.x, writer.u, writer.next = "%xu", f.at("%xu", d.n * width), "%next"

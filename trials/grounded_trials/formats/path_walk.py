@@ -52,7 +52,7 @@ class Bound:
 
 @dataclass(frozen=True, eq=False)
 class Values:
-    """What a path found: values[i] in message rows[i], stamped stamps[i] in ns."""
+    """What a path found: values[i] in message rows[i], stamped stamps[i] [ns]."""
 
     rows: Ints
     values: Floats
