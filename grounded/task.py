@@ -35,11 +35,13 @@ class Task:
         reward: quadratic weights.
         start: s_0 (n,).
         past: the input held before t = 0 (m,).
-        low, high: hard limits of the inputs (m,), infinite where there is none.
+        low: hard lower limits of the inputs (m,), infinite where there is none.
+        high: hard upper limits, likewise.
         feedback: False for an open-loop sequence of inputs.
         latency: transport delay of each input [s] (m,).
         input_target: (H, m), what the input penalty compares with; None for zero.
-        safety_low, safety_high: bounds on predicted states (n,), infinite where there is none.
+        safety_low: lower bounds on predicted states (n,), infinite where there is none.
+        safety_high: upper bounds, likewise.
         smoothing: width over which the PLANNING model blends indicator terms (`np.where`, `abs`).
 
     Raises:

@@ -14,9 +14,12 @@ from shared_data import DATA
 
 @pytest.fixture(scope="session", autouse=True)
 def _cache_of_this_session(tmp_path_factory: pytest.TempPathFactory):
-    """Compiled models go to a folder of this session, here and in subprocesses."""
+    """Compiled models go to a folder of this session, here, in its workers and in subprocesses."""
     before = os.environ.get("GROUNDED_CACHE")
-    os.environ["GROUNDED_CACHE"] = str(tmp_path_factory.mktemp("kernels"))
+    folder = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        folder = folder.parent
+    os.environ["GROUNDED_CACHE"] = str(folder / "kernels")
     yield
     if before is None:
         del os.environ["GROUNDED_CACHE"]

@@ -40,7 +40,8 @@ class Quantity:
         name: short name, `c`.
         unit: SI unit.
         grid: values to scan; empty for a linear coefficient.
-        low, high: bounds that an estimate keeps.
+        low: lower bound that an estimate keeps.
+        high: upper bound, likewise.
         fixed: a constant of the effect, not estimated; its value is `start`.
         start: value at which the effect is absent (or, fixed, the value itself).
         places: how many independent values the grid looks at, for the price of looking.
@@ -65,7 +66,8 @@ class Scales:
     """Typical sizes of the signals: what a grid or a smoothing width is measured in.
 
     Args:
-        low, high: smallest and largest value of each state and input, by name.
+        low: smallest value of each state and input, by name.
+        high: largest value, likewise.
         quantiles: (21,) quantiles of the absolute values of each signal, by name.
         dt: control step [s].
         duration: longest trial [s].

@@ -27,6 +27,7 @@ import ast
 import importlib.util
 import json
 import os
+import pkgutil
 import re
 import subprocess
 import sys
@@ -44,6 +45,7 @@ from workspaces import make
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [p for p in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))) if p.is_file()]
+NOTES = [p for p in (ROOT / "CONTRIBUTING.md", ROOT / "SECURITY.md") if p.is_file()]
 FENCE = re.compile(r"^( *)```+ *(\S*).*?\n(.*?)^\1```+ *$", re.M | re.S)
 MARK = re.compile(
     r"<!--\s*(not run|file|trial|workspace|needs|exit|slow|demo-command|test-command)"
@@ -53,6 +55,7 @@ MARK = re.compile(
 RUN = ("console", "python", "bash", "sh", "shell", "toml", "json")
 SHOWN = ("", "text", "mermaid", "cpp", "c++", "c", "cmake", "csv", "diff", "yaml", "xml", "html")
 ALL = os.environ.get("GROUNDED_DOCS") == "all"
+LONG = ("commands.md",)  # pages that take more than ten seconds
 
 
 @dataclass(frozen=True)
@@ -206,7 +209,11 @@ def _write_trial(path: Path) -> None:
     write_trial(path, trial, {"kind": "trial"})
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
+@pytest.mark.parametrize(
+    "page",
+    [pytest.param(p, marks=pytest.mark.slow) if p.name in LONG else p for p in PAGES],
+    ids=[str(p.relative_to(ROOT)) for p in PAGES],
+)
 def test_every_block_of_the_page_runs(page, tmp_path):
     runner, skipped = Page(tmp_path), []
     for block in blocks_of(page.read_text()):
@@ -252,10 +259,26 @@ def test_the_two_set_up_commands_are_complete():
 
 
 def test_links_between_pages_lead_somewhere():
-    for page in PAGES:
+    for page in [*PAGES, *NOTES]:
         text = FENCE.sub("", page.read_text())
         for target in re.findall(r"\]\(([^)#:\s]+)(?:#[^)]*)?\)", text):
             assert (page.parent / target).exists(), f"{page.name}: {target} is not there"
+
+
+@pytest.mark.skipif(not (ROOT / "grounded").is_dir(), reason="only a checkout has the code's files")
+@pytest.mark.parametrize("page", [*PAGES, *NOTES], ids=lambda p: p.name)
+def test_files_and_modules_that_a_page_names_are_there(page):
+    text = page.read_text()
+    ours = r"\b(?:grounded|trials/grounded_trials|cli|tests|benchmarks)/[\w./-]*[\w/]"
+    for path in re.findall(ours, text):
+        assert path.endswith("NAME.py") or (ROOT / path).exists(), f"{path} is not there"
+    folders = ("grounded", "trials", "cli", "tests", "benchmarks")
+    files = {path.name for folder in folders for path in (ROOT / folder).rglob("*.py")}
+    files |= {"model.py", "real.py", "drive.py"}  # a user's own
+    for name in re.findall(r"`(\w+\.py)`", text):
+        assert name in files, f"{name} is not there"
+    for name in set(re.findall(r"\bgrounded(?:_trials|_cli)?(?:\.[a-z]\w*)+", text)):
+        assert name == "grounded.toml" or pkgutil.resolve_name(name) is not None
 
 
 def test_every_command_is_documented():

@@ -205,6 +205,7 @@ def test_lanes_fit_the_machine():
     assert jit.lanes() in (4, 8)
 
 
+@pytest.mark.slow
 def test_a_hundred_states_are_interpreted_and_forty_run_in_a_thread():
     big = wide(100, 2, True)
     assert big.system.how == "traced" and "100 states" in big.system.note

@@ -93,6 +93,7 @@ def points(count=40, seed=0):
     return rng.normal(size=(count, 2)), rng.normal(size=(count, 1)), np.array([0.7])
 
 
+@pytest.mark.filterwarnings("ignore:Bitwise inversion")  # of one bool; Python 3.12 says so
 @pytest.mark.parametrize("function", TRACED, ids=lambda f: getattr(f, "__qualname__", "partial"))
 def test_everyday_idioms_are_traced_and_mean_the_same(function):
     system = make(function)

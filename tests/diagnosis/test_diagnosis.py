@@ -368,6 +368,7 @@ def test_a_probe_tells_two_explanations_apart():
     assert probe(task, base, found, trials) is None or found.indistinguishable
 
 
+@pytest.mark.slow
 def test_blind_cases_follow_from_their_seed_and_are_judged():
     (case,) = make("single", 1, 4, only="pendulum")
     (again,) = make("single", 1, 4, only="pendulum")

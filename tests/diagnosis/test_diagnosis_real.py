@@ -50,6 +50,7 @@ def values(document, effect):
     return {name: estimate["value"] for name, estimate in row["params"].items()}
 
 
+@pytest.mark.slow
 @needs_data
 def test_emps_has_dry_and_viscous_friction_of_the_published_size(tmp_path):
     found = diagnosed(EMPS, tmp_path / "emps")
@@ -60,6 +61,7 @@ def test_emps_has_dry_and_viscous_friction_of_the_published_size(tmp_path):
     assert found["gap"]["held_out"] and found["gap"]["before"] > 20 * found["gap"]["after"]
 
 
+@pytest.mark.slow
 @needs_data
 def test_the_servo_has_a_speed_limit_and_a_delay(tmp_path):
     """Published: 40 ms, 1.56/s. The filter's r is lower: the servo also needs time to speed up."""
@@ -69,6 +71,7 @@ def test_the_servo_has_a_speed_limit_and_a_delay(tmp_path):
     assert 0.035 < values(found, "delay:command")["d"] < 0.05
 
 
+@pytest.mark.slow
 @needs_data
 def test_the_dart_steers_late(tmp_path):
     found = diagnosed(DART_STEERING, tmp_path / "dart")
@@ -78,6 +81,7 @@ def test_the_dart_steers_late(tmp_path):
     assert 0.05 < next(iter(values(found, late[0]).values())) < 0.18
 
 
+@pytest.mark.slow
 @needs_data
 def test_the_dart_throttle_has_a_dead_zone(tmp_path):
     found = diagnosed(DART_THROTTLE, tmp_path / "dart")

@@ -130,6 +130,7 @@ def _address(text):
     return found.group(1) if found else None
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # of Dask and tornado, about themselves
 def test_a_cluster_that_loses_a_worker_half_way_gives_the_same_bits(cluster):
     address, workers = cluster

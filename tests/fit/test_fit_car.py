@@ -13,6 +13,7 @@ def found():
     return fit_car([3], minutes=2.0)
 
 
+@pytest.mark.slow
 def test_the_car_is_recovered_from_what_the_camera_saw(found):
     (run,) = found.runs
     assert run["status"].startswith("converged")
@@ -24,6 +25,7 @@ def test_the_car_is_recovered_from_what_the_camera_saw(found):
     assert sum(p["inside"] for p in run["params"].values()) >= 8
 
 
+@pytest.mark.slow
 def test_the_result_is_plain_and_makes_a_table(found):
     plain = found.to_json()
     assert set(plain["coverage"]) == set(found.runs[0]["params"])

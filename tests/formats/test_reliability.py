@@ -59,5 +59,6 @@ def test_a_folder_that_may_not_be_written() -> None:
     fine(reliability.read_only())
 
 
+@pytest.mark.slow
 def test_faults_at_each_system_call() -> None:
     fine(reliability.fault_injection(1 if FULL else 6), "strace is not there")

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from facts import holding
 from grounded.errors import GroundedError
 from grounded.utility import Reward
 from small_tasks import cart, cart_task, other, rover_task
@@ -52,9 +53,7 @@ def test_what_does_not_fit_is_refused(change, match):
 def test_a_weighted_state_needs_a_target():
     target = np.array(cart_task().target)
     target[5, 0] = np.nan
-    with pytest.raises(
-        GroundedError, match="weighs state 'x', but the target has no value for it at step 5"
-    ):
+    with pytest.raises(GroundedError, match=holding("'x'", "step 5")):
         cart_task(target=target)
 
 

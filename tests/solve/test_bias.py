@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from facts import holding
 from grounded.errors import GroundedError
 from grounded.experiments.car_tasks import car_task
 from grounded.experiments.figure8 import flight_task, perturbed
@@ -160,9 +161,9 @@ def test_effective_inputs_by_hand():
 def test_a_short_or_unfinite_trial_has_no_bias_and_says_so():
     task = cart_task()
     cut = Trial(np.zeros((31, 2)), np.zeros((30, 1)), 0.05, ("x", "v"), ("force",))
-    with pytest.raises(GroundedError, match="whole trial of 40 steps; this one is finite for 30"):
+    with pytest.raises(GroundedError, match=holding(40, 30)):
         ground(task, cut)
     states = np.zeros((41, 2))
     states[7, 1] = np.nan
-    with pytest.raises(GroundedError, match="finite for 6"):
+    with pytest.raises(GroundedError, match=holding(40, 6)):
         ground(task, Trial(states, np.zeros((40, 1)), 0.05, ("x", "v"), ("force",)))

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from facts import holding
 from grounded.errors import GroundedError
 from grounded.model import Model
 from grounded.plant import Noise, Plant
@@ -81,13 +82,13 @@ def test_a_run_that_diverges_ends_early():
 
 def test_names_that_the_system_does_not_have():
     task = cart_task()
-    with pytest.raises(GroundedError, match="the simulated system has no 'v'"):
+    with pytest.raises(GroundedError, match=holding("'v'")):
         Plant(rover).run(step_policy(task), {}, np.random.default_rng(0))
-    with pytest.raises(GroundedError, match="has no 'speeed': did you mean 'speed'"):
+    with pytest.raises(GroundedError, match=holding("'speeed'", "'speed'")):
         Plant(rover, latency={"speeed": 0.1}).run(
             step_policy(rover_task()), {}, np.random.default_rng(0)
         )
-    with pytest.raises(GroundedError, match="has no 'xx'"):
+    with pytest.raises(GroundedError, match=holding("'xx'")):
         Plant(cart, noise=Noise(start={"xx": 0.1})).run(
             step_policy(task), {}, np.random.default_rng(0)
         )

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from facts import holding
 from grounded.compile.run.parametric import ParametricPolicy
 from grounded.errors import GroundedError
 from grounded.model import Model, Param
@@ -126,7 +127,7 @@ def test_policy_class_with_wrong_names():
             SPECS["car"]["inputs"],
             NAMES,
         )
-    with pytest.raises(GroundedError, match="no parameter 'gain'"):
+    with pytest.raises(GroundedError, match=holding("'gain'")):
         ParametricPolicy(
             lambda s, theta, t: {"force": theta.gain * s.x},
             ("x", "v"),

@@ -5,11 +5,13 @@ from __future__ import annotations
 import shutil
 import subprocess
 import sys
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 
 import pytest
 
 from grounded.errors import GroundedError
+from grounded_trials.store import store
 from grounded_trials.store.store import Store, write_atomically
 
 
@@ -120,3 +122,12 @@ def test_concurrent_processes_lose_nothing(tmp_path: Path) -> None:
     store = Store(tmp_path / "s")
     assert sorted(store.read(s) for s in store.list()) == sorted(b"file %d" % i for i in range(12))
     assert [s.number for s in store.list()] == list(range(1, 13))
+
+
+def test_a_system_without_file_locks_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "fcntl", None)  # as on Windows
+    assert store.__file__ is not None
+    spec = spec_from_file_location("store_elsewhere", store.__file__)
+    assert spec is not None and spec.loader is not None
+    with pytest.raises(GroundedError, match="fcntl"):
+        spec.loader.exec_module(module_from_spec(spec))

@@ -12,7 +12,6 @@ behind is a temporary file, which the next one removes.
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import os
 import re
@@ -22,6 +21,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from grounded.errors import GroundedError
+
+try:
+    import fcntl
+except ImportError:
+    raise GroundedError(
+        "trials can be stored on Linux and macOS only: the store locks its folder with fcntl, "
+        "which Windows lacks. Use WSL; grounded.policy, which drives a robot, works here as well"
+    ) from None
 
 DIGITS = 16  # hex digits of the hash in a name
 _NAME = re.compile(r"^([a-z]+)(\d{4,})-([0-9a-f]{16})(\.\w+)$")

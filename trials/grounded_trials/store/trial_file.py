@@ -38,7 +38,8 @@ class TrialWriter:
     Args:
         target: a path (an existing file is refused) or a writable binary stream.
         dt: control interval [s].
-        states, inputs: name -> unit, in array order.
+        states: name -> unit, in array order.
+        inputs: name -> unit, in array order.
         meta: further entries of the metadata record.
         candidate: the candidate that is run, "" for none.
         policy: the bytes of its file.

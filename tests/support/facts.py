@@ -1,0 +1,21 @@
+"""What a message must hold, however it is worded: names, numbers, the key that is meant."""
+
+from __future__ import annotations
+
+import re
+
+
+def holding(*facts: object) -> str:
+    """A pattern for `pytest.raises(match=...)`: all of these as whole words, in any order."""
+    return "(?s)" + "".join(rf"(?=.*{_word(str(fact))})" for fact in facts)
+
+
+def holds(text: str, *facts: object) -> bool:
+    """Whether a text has all of these as whole words."""
+    return re.match(holding(*facts), text) is not None
+
+
+def _word(fact: str) -> str:
+    before = r"(?<!\w)" if re.match(r"\w", fact) else ""
+    after = r"(?!\w)" if re.search(r"\w$", fact) else ""
+    return before + re.escape(fact) + after
