@@ -9,8 +9,7 @@ Nothing in `grounded.diagnosis` outside this folder imports it: the diagnosis ca
 from __future__ import annotations
 
 from grounded.challenge.cases import KINDS, Case, make, sealed
-from grounded.challenge.score import Oracle, judge, oracle, summary
-from grounded.challenge.study import study, task_of
+from grounded.challenge.score import Oracle, judge, oracle, study, summary, task_of
 
 __all__ = [
     "KINDS",

@@ -15,8 +15,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from grounded.challenge import systems, withheld
-from grounded.challenge.draws import draw, values_of
+from grounded.challenge import systems
+from grounded.challenge.draws import draw, draw_withheld, values_of
 from grounded.challenge.truth import Disturbance, Truth
 from grounded.effects import Effect, ParamFamily, scales_of
 from grounded.errors import GroundedError
@@ -220,7 +220,7 @@ def _truth(
     if kind == "withheld":
         driven = "v" if system.name == "car" else ("omega" if system.name == "pendulum" else "q")
         rate = float(np.quantile(np.abs(np.diff(states[:, model.state_names.index(driven)])), 0.9))
-        hidden = withheld.draw(
+        hidden = draw_withheld(
             rng,
             model,
             np.abs(inputs - inputs.mean(axis=0)).max(axis=0) + 0.5 * np.abs(inputs).max(axis=0),

@@ -21,19 +21,23 @@ import numpy as np
 
 from grounded.diagnosis.attribution import attribute
 from grounded.diagnosis.claims import Claims
-from grounded.diagnosis.confirm import confirmed, noise_confirmed
 from grounded.diagnosis.data import prepare
 from grounded.diagnosis.delays import delays_of
 from grounded.diagnosis.fitted import Fit
+from grounded.diagnosis.held_out import (
+    confirmed,
+    noise_confirmed,
+    shrinkage,
+    utility_prediction,
+    whole_runs,
+)
 from grounded.diagnosis.hypothesis import Hypothesis
 from grounded.diagnosis.leftover import Leftover, leftovers, whiteness
 from grounded.diagnosis.limits import Limits, knowable, limits
 from grounded.diagnosis.prediction_error import Horizon, by_region, by_time, explained, horizon
 from grounded.diagnosis.report import Diagnosis, Remainder
 from grounded.diagnosis.search import Search
-from grounded.diagnosis.shrinkage import shrinkage, whole_runs
 from grounded.diagnosis.split import repeated, split
-from grounded.diagnosis.utility_prediction import utility_prediction
 from grounded.diagnosis.verdict import next_trial, verdict
 from grounded.effects import Library
 from grounded.model import Model

@@ -21,8 +21,8 @@ from grounded.diagnosis.data import Data
 from grounded.diagnosis.delays import delays_of
 from grounded.diagnosis.fitted import Fit
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor
-from grounded.diagnosis.initial_state import widened
 from grounded.diagnosis.leftover import filter_of
+from grounded.diagnosis.linearise import widened
 from grounded.frozen import Array
 
 MOST_STARTS = 400

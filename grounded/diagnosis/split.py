@@ -21,9 +21,9 @@ import numpy as np
 
 from grounded.diagnosis.data import Data
 from grounded.diagnosis.fitted import Fit
+from grounded.diagnosis.held_out import held_out
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor
 from grounded.diagnosis.prediction_error import Horizon, errors
-from grounded.diagnosis.shrinkage import held_out
 from grounded.frozen import Array
 
 MOST_MOMENTS = 40  # at which repeats are compared

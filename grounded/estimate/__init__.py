@@ -12,13 +12,14 @@ sensors and controllers of different rates, transport delays of any fraction of 
 
 from __future__ import annotations
 
-from grounded.estimate.consistency import Consistency, consistency
 from grounded.estimate.likelihood import NoiseEstimate
 from grounded.estimate.measurement import Measurement, Noise, of_function, of_states
 from grounded.estimate.record import Record, cut, merged, record_of
 from grounded.estimate.tracker import Tracker
 from grounded.estimate.trials import (
+    Consistency,
     Estimated,
+    consistency,
     filter_trials,
     noise_of,
     smooth_trials,

@@ -17,15 +17,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from grounded.compile import System
-from grounded.estimate import lanes
-from grounded.estimate.batch import Batch, batch_of
+from grounded.estimate import kernel
 from grounded.estimate.filter import run
-from grounded.estimate.filtered import Filtered
 from grounded.estimate.measurement import Measurement, Noise
-from grounded.estimate.record import Record
-from grounded.estimate.recursion import recursion
-from grounded.estimate.smoother import smooth
-from grounded.estimate.steps import ModelSteps, fixed_steps
+from grounded.estimate.record import Batch, Record, batch_of
+from grounded.estimate.recursion import Filtered, fixed_steps, recursion, smooth
+from grounded.estimate.steps import ModelSteps
 from grounded.frozen import Array
 
 FLOOR = 1e-4  # of the visible scatter: below it a std is zero
@@ -165,9 +162,9 @@ def _climb(
         std = np.exp(0.5 * theta)
         there = Noise(std[:n], std[n:], dt)
         if about.done is not None:
-            done = lanes.forward(about.done.linearised, there)
+            done = kernel.forward(about.done.linearised, there)
             loglik = done.loglik
-            slope = lanes.variance_slopes(done, there) if np.isfinite(loglik) else None
+            slope = kernel.variance_slopes(done, there) if np.isfinite(loglik) else None
         else:
             filtered = recursion(batch, measurement, there, fixed_steps(about))
             loglik = filtered.loglik
@@ -189,7 +186,7 @@ def _climb(
 def _slope(filtered: Filtered, batch: Batch, noise: Noise) -> Array:
     """Slope of the log-likelihood by the log variances, (n + ny,)."""
     if filtered.done is not None:
-        return lanes.variance_slopes(filtered.done, noise)
+        return kernel.variance_slopes(filtered.done, noise)
     back = smooth(filtered, batch)
     by_q = np.sum(back.process_slope * batch.dt[..., None] / noise.dt, axis=(0, 1))
     by_r = np.sum(back.measurement_slope, axis=(0, 1))

@@ -21,7 +21,7 @@ import numpy as np
 
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded.models.aircraft_trim import trim
+from grounded.models.aircraft import trim
 from grounded.task import Task
 from grounded.utility import Reward
 

@@ -1,4 +1,6 @@
-"""Levenberg and Marquardt's climb of the likelihood for a given noise, within bounds.
+"""What is fitted: parameters of the model and delays of its inputs, as one vector theta.
+
+Levenberg and Marquardt's climb of the likelihood for a given noise, within bounds.
 
     delta = -(W'W + lambda diag(W'W))^-1 W' eps,       theta <- clip(theta + delta)
 
@@ -17,19 +19,116 @@ measurements does not bias the fit, as it does in one-step least squares (errors
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from grounded.compile import System
+from grounded.errors import GroundedError, nearest
 from grounded.estimate import Measurement, Noise, Record
-from grounded.estimate.batch import Batch, batch_of
 from grounded.estimate.filter import run, sensitivity
-from grounded.estimate.filtered import Filtered
+from grounded.estimate.record import Batch, batch_of
+from grounded.estimate.recursion import Filtered
 from grounded.estimate.steps import ModelSteps
-from grounded.fit.unknowns import Unknowns
 from grounded.frozen import Array
+from grounded.model import Model
+
+Latency = Literal["known", "common", "each"]
+LONGEST = 0.5  # [s] no latency is sought beyond
+
+
+@dataclass(frozen=True, eq=False)
+class Unknowns:
+    """theta = [parameters, latencies]: names, bounds, scales, and the way back to the model.
+
+    The scale is a natural size of a change: the width of the bounds where both are given.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    start: Array  # (k,)
+    low: Array  # (k,) may be -inf
+    high: Array  # (k,) may be inf
+    scale: Array  # (k,)
+    columns: tuple[int, ...]  # of the model's parameters that are fitted
+    delayed: tuple[tuple[int, ...], ...]  # inputs that each fitted latency delays
+    values: Array  # all parameters of the model
+    latency: Array  # (m,) [s] of all inputs
+
+    @property
+    def k(self) -> int:
+        """Number of unknowns."""
+        return len(self.names)
+
+    def unpack(self, theta: Array) -> tuple[Array, Array]:
+        """All parameter values and all latencies [s] at theta."""
+        p, latency = self.values.copy(), self.latency.copy()
+        p[list(self.columns)] = theta[: len(self.columns)]
+        for value, inputs in zip(theta[len(self.columns) :], self.delayed, strict=True):
+            latency[list(inputs)] = value
+        return p, latency
+
+    def clipped(self, theta: Array) -> Array:
+        """Theta within the bounds."""
+        return np.asarray(np.clip(theta, self.low, self.high))
+
+
+def unknowns_of(
+    model: Model, names: Sequence[str] | None, latency: Array, fit_latency: Latency
+) -> Unknowns:
+    """Checks the names and gathers bounds.
+
+    Args:
+        model: gives values and bounds.
+        names: parameters to fit; None: all.
+        latency: of each input [s], known or where to begin, (m,).
+        fit_latency: "known" (not fitted), "common" (one for all inputs), or "each".
+
+    Raises:
+        GroundedError: for a name that is not a parameter, or nothing to fit.
+    """
+    names = model.param_names if names is None else tuple(names)
+    for name in names:
+        if name not in model.params:
+            raise GroundedError(
+                f"'{name}' is not a parameter of model '{model.name}': "
+                + nearest(name, model.params)
+            )
+    if fit_latency not in ("known", "common", "each"):
+        raise GroundedError(f"fit_latency must be known, common or each, got '{fit_latency}'")
+    params = [model.params[name] for name in names]
+    choices: dict[str, list[tuple[int, ...]]] = {
+        "known": [],
+        "common": [tuple(range(model.m))],
+        "each": [(j,) for j in range(model.m)],
+    }
+    delayed = choices[fit_latency]
+    labels = ["latency"] if fit_latency == "common" else []
+    if fit_latency == "each":
+        labels = [f"latency:{name}" for name in model.input_names]
+    if not names and not labels:
+        raise GroundedError(f"model '{model.name}' has no parameter to fit")
+    low = [-np.inf if p.low is None else p.low for p in params] + [0.0] * len(delayed)
+    high = [np.inf if p.high is None else p.high for p in params] + [LONGEST] * len(delayed)
+    start = [p.value for p in params] + [float(latency[inputs[0]]) for inputs in delayed]
+    width = np.array(high) - np.array(low)
+    size = np.maximum(np.abs(start), 1e-3)
+    return Unknowns(
+        names=(*names, *labels),
+        units=(*(p.unit for p in params), *("s" for _ in delayed)),
+        start=np.array(start, float),
+        low=np.array(low, float),
+        high=np.array(high, float),
+        scale=np.where(np.isfinite(width), width, size),
+        columns=tuple(model.param_names.index(name) for name in names),
+        delayed=tuple(delayed),
+        values=np.array(model.values),
+        latency=np.array(latency, float),
+    )
+
 
 ENOUGH = 0.002  # [nats] a step that promises less, a sixteenth of a std, is the last
 NOTHING = 1e-9  # of the largest eigenvalue (scaled): below it the data say nothing

@@ -17,10 +17,10 @@ import numpy as np
 from grounded.errors import GroundedError
 from grounded.estimate import Measurement, Record, of_states
 from grounded.estimate.record import part, records_of
+from grounded.fit.gauss_newton import Latency, Unknowns, unknowns_of
 from grounded.fit.prediction import PredictionError, prediction_error
 from grounded.fit.result import Fit, report
 from grounded.fit.search import Found, data_of, first_search, search
-from grounded.fit.unknowns import Latency, Unknowns, unknowns_of
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.task import Task

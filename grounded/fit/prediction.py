@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from grounded.estimate import Measurement, Noise, Record, noise_of, of_states
-from grounded.estimate.batch import Batch, batch_of
 from grounded.estimate.filter import run
-from grounded.estimate.record import records_of
-from grounded.estimate.smoother import smooth
+from grounded.estimate.record import Batch, batch_of, records_of
+from grounded.estimate.recursion import smooth
 from grounded.estimate.steps import ModelSteps
 from grounded.frozen import Array
 from grounded.model import Model

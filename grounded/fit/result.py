@@ -21,11 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from grounded.estimate import Noise
-from grounded.fit.gauss_newton import Linear
+from grounded.fit.gauss_newton import Linear, Unknowns
 from grounded.fit.prediction import PredictionError
-from grounded.fit.scan import likelihood_interval, quiet
-from grounded.fit.search import Found
-from grounded.fit.unknowns import Unknowns
+from grounded.fit.search import Found, likelihood_interval, quiet
 from grounded.frozen import Array
 from grounded.model import Model
 

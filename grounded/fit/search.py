@@ -4,6 +4,16 @@ Three kinds of unknown are moved in turn until the likelihood stops rising: para
 (Gauss-Newton, `gauss_newton`), thresholds (`scan`), and the noise (`grounded.estimate.likelihood`).
 The noise is not a nuisance: it decides what is an error of the model and what is not. It starts
 large, while the model is wrong, and shrinks with it.
+
+Unknowns that Gauss and Newton can't move: thresholds, and delays that start far off.
+
+A threshold (the car's stall) changes the likelihood in steps: its slope is zero almost everywhere.
+It is scanned over its bounds, coarse first, then between the neighbours of the best. At each value
+the other unknowns are credited with what their own linear problem promises, so that a delay is
+compared with the best lag beside it, not with the lag of another delay.
+
+The interval of a threshold is the set of values whose log-likelihood lies within DROP of the best:
+3.67 nats, the 95 % point for a threshold (Hansen 2000), more than the 1.92 of a smooth unknown.
 """
 
 from __future__ import annotations
@@ -15,11 +25,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from grounded.estimate import Measurement, Noise, Record, cut
-from grounded.estimate.batch import batch_of
 from grounded.estimate.likelihood import enough, first_noise, maximum_likelihood
-from grounded.fit.gauss_newton import Climb, Data, Linear, Point, climb, linear, point
-from grounded.fit.scan import coarse_to_fine, quiet, scan
-from grounded.fit.unknowns import Unknowns
+from grounded.estimate.record import batch_of
+from grounded.fit.gauss_newton import (
+    Climb,
+    Data,
+    Linear,
+    Point,
+    Unknowns,
+    climb,
+    direction,
+    linear,
+    point,
+)
 from grounded.frozen import Array
 from grounded.model import Model
 
@@ -131,3 +149,151 @@ def _delays(data: Data, noise: Noise, at: Point) -> Point:
         grid = np.arange(0.0, data.unknowns.high[i] + 1e-9, max(noise.dt, 0.02))
         at = scan(data, noise, at, i, grid, free)[0]
     return at
+
+
+COARSE, FINE, ROUNDS = 21, 5, 4
+DROP = 3.67  # [nats]
+GRID = 10  # points between a value that is as good and one that is not
+LEVEL = 0.05  # [nats] as good as equal
+QUIET = 1e-2  # information over the whole range below which a slope says nothing
+
+
+def quiet(data: Data, slopes: Linear) -> NDArray[np.bool_]:
+    """Unknowns (k,) on which the innovations do not depend to first order."""
+    information = np.sum(slopes.W**2, axis=0) * data.unknowns.scale**2
+    return np.asarray(information < QUIET)
+
+
+def scan(
+    data: Data,
+    noise: Noise,
+    at: Point,
+    i: int,
+    grid: Array,
+    free: NDArray[np.bool_] | None,
+) -> tuple[Point, Array]:
+    """The best point with unknown i on a grid, and the profile (len(grid),) [nats].
+
+    The other unknowns are moved by one step of theirs if that is better than leaving them.
+
+    Args:
+        data: the records.
+        noise: held fixed.
+        at: where the others are.
+        i: the unknown that is scanned.
+        grid: its values.
+        free: which others may move, (k,); None: none.
+    """
+    others = np.zeros(data.unknowns.k, dtype=bool) if free is None else free.copy()
+    others[i] = False
+    profile, best, score = np.full(len(grid), -np.inf), at, at.loglik
+    for g, value in enumerate(grid):
+        theta = at.theta.copy()
+        theta[i] = value
+        here = point(data, noise, theta, at)
+        profile[g] = here.loglik
+        if not np.isfinite(here.loglik):
+            continue
+        if others.any():
+            delta, promise = direction(data, theta, linear(data, here), others, 1e-3)
+            profile[g] += promise
+        if profile[g] > score:
+            best, score = here, float(profile[g])
+            if others.any():
+                moved = point(data, noise, theta + delta, here)
+                best = moved if moved.loglik > here.loglik else here
+    return best, profile
+
+
+def coarse_to_fine(
+    data: Data, noise: Noise, at: Point, i: int, free: NDArray[np.bool_], width: float | None = None
+) -> Point:
+    """The best value of unknown i: over its bounds, or within `width` of where it is.
+
+    Stays where it is if nothing is better.
+    """
+    low, high = data.unknowns.low[i], data.unknowns.high[i]
+    if width is not None:
+        low, high = max(low, at.theta[i] - width), min(high, at.theta[i] + width)
+    grid, best = np.linspace(low, high, COARSE), at
+    for round_ in range(ROUNDS):
+        others = free if round_ == 0 else None  # later steps are too small to matter to them
+        best, profile = scan(data, noise, best, i, grid, others)
+        top = np.flatnonzero(profile > profile.max() - LEVEL)
+        step = grid[1] - grid[0]
+        if len(top) > 2:
+            break
+        low, high = max(low, grid[top[0]] - step), min(high, grid[top[-1]] + step)
+        grid = np.linspace(low, high, 2 * FINE + 1)
+    if best.loglik < at.loglik + LEVEL:
+        return at
+    return _centred(data, noise, best, i, grid[top])
+
+
+def _centred(data: Data, noise: Noise, best: Point, i: int, level: Array) -> Point:
+    """The middle of the values that are as good as the best: the likelihood is flat between them.
+
+    An end of the level is where the next sample lies, and nothing says that it is the threshold.
+    """
+    beside = level[np.argsort(np.abs(level - np.median(level)))]
+    for value in beside:
+        theta = best.theta.copy()
+        theta[i] = value
+        there = point(data, noise, theta, best)
+        if there.loglik > best.loglik - LEVEL:
+            return there
+    return best
+
+
+def likelihood_interval(
+    data: Data, noise: Noise, at: Point, i: int, inflation: float = 1.0
+) -> tuple[float, float]:
+    """The values of unknown i around the best whose log-likelihood is within DROP of it.
+
+    The likelihood of a threshold is rough: the outermost such value counts, sought as far as it has
+    fallen for good. A bound of the unknown is returned where it never falls that far.
+
+    Args:
+        data: the records.
+        noise: held fixed.
+        at: the best point.
+        i: the unknown.
+        inflation: what DROP is multiplied by where innovations are correlated.
+    """
+    drop = DROP * inflation
+    ends = (float(data.unknowns.low[i]), float(data.unknowns.high[i]))
+    low, high = (_end(data, noise, at, i, bound, drop) for bound in ends)
+    return low, high
+
+
+def _end(data: Data, noise: Noise, at: Point, i: int, bound: float, drop: float) -> float:
+    best = float(at.theta[i])
+    span = abs(bound - best)
+    if span == 0 or _loglik(data, noise, at, i, bound) > at.loglik - drop:
+        return bound
+    sign, step, good = np.sign(bound - best), 1e-3 * span, 0.0
+    while step < span:
+        fallen = at.loglik - _loglik(data, noise, at, i, best + sign * step)
+        good = step if fallen < drop else good
+        if fallen > 3 * drop:
+            break
+        step *= 2
+    far = min(step, span)
+    grid = np.linspace(good, far, GRID + 1)[1:-1]
+    inside = [g for g in grid if _loglik(data, noise, at, i, best + sign * g) > at.loglik - drop]
+    width = (far - good) / GRID
+    good = max([good, *inside])
+    outside = min(far, good + width)
+    for _ in range(3):
+        middle = 0.5 * (good + outside)
+        if _loglik(data, noise, at, i, best + sign * middle) > at.loglik - drop:
+            good = middle
+        else:
+            outside = middle
+    return float(best + sign * outside)
+
+
+def _loglik(data: Data, noise: Noise, at: Point, i: int, value: float) -> float:
+    theta = at.theta.copy()
+    theta[i] = value
+    return point(data, noise, theta, at).loglik

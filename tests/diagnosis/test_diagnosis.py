@@ -11,7 +11,7 @@ from grounded.challenge import judge, make, oracle, sealed, summary
 from grounded.diagnosis import confirm
 from grounded.diagnosis import filter as kalman
 from grounded.diagnosis.attribution import attribute
-from grounded.diagnosis.calibration import loss
+from grounded.diagnosis.claims import loss
 from grounded.diagnosis.data import prepare, shifted
 from grounded.diagnosis.diagnose import Options, diagnose
 from grounded.diagnosis.excitation import probe

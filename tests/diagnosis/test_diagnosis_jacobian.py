@@ -9,8 +9,7 @@ from grounded.challenge.cases import make
 from grounded.diagnosis.data import prepare
 from grounded.diagnosis.hypotheses import price
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor
-from grounded.diagnosis.jacobian import sensitivities
-from grounded.diagnosis.linearise import jacobian
+from grounded.diagnosis.linearise import jacobian, sensitivities
 from grounded.diagnosis.search import Search
 from grounded.effects import Library
 

@@ -8,11 +8,11 @@ from grounded.diagnosis.data import prepare
 from grounded.diagnosis.delayed_measurement import Late
 from grounded.diagnosis.delays import delays_of
 from grounded.diagnosis.filter import UNKNOWN, Adjoint, gains, innovations, smoother, transition
+from grounded.diagnosis.held_out import held_out
 from grounded.diagnosis.hypothesis import Hypothesis
 from grounded.diagnosis.noise import Noise, Structure
 from grounded.diagnosis.prediction_error import horizon, normalised
 from grounded.diagnosis.search import Search
-from grounded.diagnosis.shrinkage import held_out
 from grounded.effects import Library
 from grounded.models.pendulum import model as pendulum
 from grounded.trial import Trial

@@ -7,7 +7,7 @@ from grounded import Trial
 from grounded.diagnosis import filter as kalman
 from grounded.diagnosis.data import prepare
 from grounded.diagnosis.diagnose import diagnose
-from grounded.diagnosis.initial_state import prior, smoothed, widened
+from grounded.diagnosis.linearise import prior, smoothed, widened
 from grounded.diagnosis.search import Search
 from grounded.models.pendulum import model as pendulum
 

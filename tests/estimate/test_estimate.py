@@ -17,11 +17,10 @@ from grounded.estimate import (
     record_of,
     smooth_trials,
 )
-from grounded.estimate.batch import batch_of
 from grounded.estimate.filter import run, sensitivity
 from grounded.estimate.likelihood import _slope
-from grounded.estimate.recursion import recursion
-from grounded.estimate.smoother import smooth
+from grounded.estimate.record import batch_of
+from grounded.estimate.recursion import recursion, smooth
 from grounded.estimate.steps import ModelSteps, fixed_steps
 from grounded.estimate.tracker import nearest_step
 from grounded.model import Model, Param

@@ -10,8 +10,7 @@ import pytest
 from grounded.errors import GroundedError
 from grounded.estimate import Noise, of_states, record_of
 from grounded.fit import fit, prediction_error
-from grounded.fit.gauss_newton import Data, linear, point
-from grounded.fit.unknowns import unknowns_of
+from grounded.fit.gauss_newton import Data, linear, point, unknowns_of
 from grounded.model import Model, Param
 from grounded.models.pendulum import model as pendulum
 from grounded.trial import Trial

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from grounded.experiments.driving import drive
-from grounded.experiments.first_values import first_values
-from grounded.experiments.fit_car import bench, fit_car, true_car
+from grounded.experiments.fit_car import bench, first_values, fit_car, true_car
 
 
 @pytest.fixture(scope="module")

@@ -7,8 +7,7 @@ import pytest
 
 from grounded.errors import GroundedError
 from grounded.experiments.figure8 import DT, figure8_target, flight_task, perturbed
-from grounded.models.aircraft import PARAMS, dynamics, lift_coefficient, model
-from grounded.models.aircraft_trim import trim
+from grounded.models.aircraft import PARAMS, dynamics, lift_coefficient, model, trim
 from grounded.models.pendulum import model as pendulum
 
 VALUES = SimpleNamespace(**{name: param.value for name, param in PARAMS.items()})
