@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from grounded.challenge import systems
-from grounded.challenge.draws import draw, draw_withheld, values_of
+from grounded.challenge.draws import draw_effect, draw_withheld, values_of
 from grounded.challenge.truth import Disturbance, Truth
 from grounded.effects import Effect, ParamFamily, scales_of
 from grounded.errors import GroundedError
@@ -233,7 +233,7 @@ def _truth(
         return truth, {"effects": [], "withheld": label}
     effects: list[tuple[Effect, dict[str, float]]] = []
     while len(effects) < (2 if kind == "double" else 1):
-        effect = draw(model, scales, rng)
+        effect = draw_effect(model, scales, rng)
         if effect.name not in [e.name for e, _ in effects]:
             effects.append((effect, values_of(effect, scales, rng, states)))
     true_model = model

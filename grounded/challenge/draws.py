@@ -29,7 +29,7 @@ from grounded.model import Model
 SMALLEST, LARGEST = 0.04, 0.35  # of the signals an effect acts on
 
 
-def draw(model: Model, scales: Any, rng: np.random.Generator) -> Effect:
+def draw_effect(model: Model, scales: Any, rng: np.random.Generator) -> Effect:
     """A family at random, then one of its targets."""
     by_family: dict[str, list[Effect]] = {}
     for effect in Library().candidates(model, scales):

@@ -18,11 +18,11 @@ import numpy as np
 
 from grounded.challenge.cases import Case, Kind, make
 from grounded.diagnosis.data import prepare
-from grounded.diagnosis.diagnose import Options, diagnose
-from grounded.diagnosis.held_out import held_out
+from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
+from grounded.diagnosis.held_out import held_out_errors
 from grounded.diagnosis.hypothesis import Hypothesis
 from grounded.diagnosis.prediction_error import horizon, normalised
-from grounded.diagnosis.search import Search
+from grounded.diagnosis.search import HypothesisSearch
 from grounded.effects import Library
 from grounded.frozen import Array
 from grounded.model import Model
@@ -54,7 +54,7 @@ def oracle(
         {q.name: float(e["params"][q.name]) for q in effect.free}
         for e, effect in zip(label["effects"], effects, strict=True)
     ]
-    search = Search(data, Library().candidates(model, data.scales))
+    search = HypothesisSearch(data, Library().candidates(model, data.scales))
     search.nulls()
 
     def fitted(which: Sequence[int]) -> float:
@@ -83,11 +83,11 @@ def oracle(
         each[effect.name] = whole - below
     best = search.of_size(len(effects))[0]
     where = horizon(search.predictor, best, 1.0)
-    gap = normalised(held_out(search.predictor, best, best.track, where), where)
+    gap = normalised(held_out_errors(search.predictor, best, best.track, where), where)
     return Oracle(whole - search.score(search.best_null()), gap, each)
 
 
-def _plain(search: Search) -> list[Any]:
+def _plain(search: HypothesisSearch) -> list[Any]:
     """Fits without effects under white noise with exact parameters."""
     return [
         f
@@ -220,7 +220,7 @@ def study(
     count: int,
     seed: int,
     *,
-    options: Options | None = None,
+    options: DiagnosisOptions | None = None,
     only: str | None = None,
     param_error: float | None = None,
     noise: str | None = None,

@@ -80,9 +80,9 @@ def _swing(rng: np.random.Generator, t: Array, model: Model) -> tuple[Array, Arr
 
 
 def _fly(rng: np.random.Generator, t: Array, model: Model) -> tuple[Array, Array]:
-    from grounded.models.aircraft import trim
+    from grounded.models.aircraft import level_trim
 
-    level = trim(model, np.array([10.0]), np.array([0.0]), float(t[1] - t[0]))
+    level = level_trim(model, np.array([10.0]), np.array([0.0]), float(t[1] - t[0]))
     u = np.tile(level.inputs[0], (len(t), 1))
     names = model.input_names
     u[:, names.index("throttle")] += 0.15 * steps(rng, t, -1, 1, 2.0)

@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis.data import Data
-from grounded.diagnosis.fitted import Fit, calibrated, standard_deviations
-from grounded.diagnosis.held_out import gaps_of, held_out
+from grounded.diagnosis.fitted import Fitted, calibrated, standard_deviations
+from grounded.diagnosis.held_out import gaps_of, held_out_errors
 from grounded.diagnosis.hypotheses import TIE, parametric
 from grounded.diagnosis.hypothesis import param_scale
 from grounded.diagnosis.limits import Limits
@@ -32,7 +32,7 @@ from grounded.diagnosis.report import (
     Estimate,
     Ranked,
 )
-from grounded.diagnosis.search import Search
+from grounded.diagnosis.search import HypothesisSearch
 from grounded.frozen import Array
 
 ENOUGH = 3.0  # nats that the parameters that are not named may still hold
@@ -58,7 +58,7 @@ def loss(H: Array, b: Array, free: list[int]) -> float:
     return 0.5 * float(left @ block @ left)
 
 
-def blamed(data: Data, fit: Fit) -> tuple[Blame, ...]:
+def blamed(data: Data, fit: Fitted) -> tuple[Blame, ...]:
     """The parameters of a calibrated fit that have to differ, most important first."""
     h = fit.hypothesis
     if h.spread == 0 or h.shift is None:
@@ -83,7 +83,9 @@ SAME = 0.95  # share of a parameter's signal from which an effect is the same th
 class Claims:
     """What the best hypothesis blames: effects, or parameters where calibrating them is enough."""
 
-    def __init__(self, search: Search, best: Fit, known: Limits, *, left: bool) -> None:
+    def __init__(
+        self, search: HypothesisSearch, best: Fitted, known: Limits, *, left: bool
+    ) -> None:
         self.search, self.best, self.known = search, best, known
         self.predictor, self.data = search.predictor, search.data
         self.null = search.best_null()
@@ -101,7 +103,9 @@ class Claims:
         """The claimed effects first (by what would be lost without each), then what lost."""
         search, rows = self.search, []
         parts = self.parts()
-        after = normalised(held_out(self.predictor, self.best, self.best.track, where), where)
+        after = normalised(
+            held_out_errors(self.predictor, self.best, self.best.track, where), where
+        )
         for name in sorted(self.names, key=lambda n: -parts[n]):
             claimed = not self.known.no_cause
             rows.append(self._row(self.best, name, parts[name], after, before, claimed=claimed))
@@ -153,7 +157,7 @@ class Claims:
         return found
 
     def _row(
-        self, fit: Fit, name: str, evidence: float, gap: float, before: float, *, claimed: bool
+        self, fit: Fitted, name: str, evidence: float, gap: float, before: float, *, claimed: bool
     ) -> Ranked:
         index = fit.hypothesis.names.index(name)
         effect = fit.hypothesis.effects[index]
@@ -167,7 +171,7 @@ class Claims:
             claimed=claimed,
         )
 
-    def estimates(self, fit: Fit) -> list[dict[str, Estimate]]:
+    def estimates(self, fit: Fitted) -> list[dict[str, Estimate]]:
         """Values with intervals, effect by effect."""
         stds, halves = standard_deviations(fit, self.data.trial_of)
         found, at = [], 0

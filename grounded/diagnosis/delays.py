@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis.data import Data
-from grounded.diagnosis.delayed_measurement import Late
+from grounded.diagnosis.delayed_measurement import Delayed
 from grounded.diagnosis.filter import UNKNOWN, Adjoint
 from grounded.diagnosis.hypothesis import Hypothesis
-from grounded.diagnosis.noise import Noise
+from grounded.diagnosis.noise import NoiseModel
 from grounded.effects import SensorDelayFamily
 from grounded.frozen import Array
 
@@ -39,10 +39,10 @@ class Delays:
     whole: tuple[int, ...]
     part: Array  # (D,)
 
-    def late(self) -> Late:
+    def late(self) -> Delayed:
         """For the filter, every run the same."""
         B = len(self.data.valid)
-        return Late(np.tile(self.channel, (B, 1)), np.tile(self.part, (B, 1)))
+        return Delayed(np.tile(self.channel, (B, 1)), np.tile(self.part, (B, 1)))
 
     def moved(self, h: Hypothesis) -> Delays:
         """With the delays of another hypothesis but the samples of this one: p may leave 0 .. 1."""
@@ -87,14 +87,14 @@ class Delays:
                 values[..., i] = self._carried(values[..., i], (at, there), (own, run), 0.0)
         return replace(adjoint, **found)
 
-    def noise(self, noise: Noise) -> Noise:
+    def noise(self, noise: NoiseModel) -> NoiseModel:
         """The same noise with the weights of the moved samples."""
         if isinstance(noise.weight_v, float):
             return noise
         return replace(noise, weight_v=self.aligned(noise.weight_v, 1.0))
 
     def before(
-        self, noise: Noise, entry: Array | None, track: Array, white: Array, whiten: Array
+        self, noise: NoiseModel, entry: Array | None, track: Array, white: Array, whiten: Array
     ) -> float:
         """Log density of the samples that show what was before the trials; without log 2 pi [nats].
 
@@ -122,7 +122,7 @@ class Delays:
             total += max(least, *(self._drifted(noise, i, drift, p * pace) for p in (0.0, 1.0)))
         return total
 
-    def _drifted(self, noise: Noise, i: int, drift: Array, pace: Array) -> float:
+    def _drifted(self, noise: NoiseModel, i: int, drift: Array, pace: Array) -> float:
         """Log density of the first samples, the state going `pace` (B,) a step, spread by `drift`.
 
         A Kalman filter of one state; drift (k, B) are the variances of its steps.

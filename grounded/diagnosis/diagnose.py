@@ -23,7 +23,7 @@ from grounded.diagnosis.attribution import attribute
 from grounded.diagnosis.claims import Claims
 from grounded.diagnosis.data import prepare
 from grounded.diagnosis.delays import delays_of
-from grounded.diagnosis.fitted import Fit
+from grounded.diagnosis.fitted import Fitted
 from grounded.diagnosis.held_out import (
     confirmed,
     noise_confirmed,
@@ -36,7 +36,7 @@ from grounded.diagnosis.leftover import Leftover, leftovers, whiteness
 from grounded.diagnosis.limits import Limits, knowable, limits
 from grounded.diagnosis.prediction_error import Horizon, by_region, by_time, explained, horizon
 from grounded.diagnosis.report import Diagnosis, Remainder
-from grounded.diagnosis.search import Search
+from grounded.diagnosis.search import HypothesisSearch
 from grounded.diagnosis.split import repeated, split
 from grounded.diagnosis.verdict import next_trial, verdict
 from grounded.effects import Library
@@ -46,7 +46,7 @@ from grounded.trial import Trial
 
 
 @dataclass(frozen=True)
-class Options:
+class DiagnosisOptions:
     """How to diagnose.
 
     Args:
@@ -67,7 +67,7 @@ class Options:
 def diagnose(
     subject: Task | Model,
     trials: Sequence[Trial],
-    options: Options | None = None,
+    options: DiagnosisOptions | None = None,
     *,
     progress: Callable[[str], None] | None = None,
 ) -> Diagnosis:
@@ -82,7 +82,7 @@ def diagnose(
     Raises:
         GroundedError: for trials that don't fit the model, or with nothing in them.
     """
-    options, tick = options or Options(), progress or (lambda word: None)
+    options, tick = options or DiagnosisOptions(), progress or (lambda word: None)
     model = subject.model if isinstance(subject, Task) else subject
     latency = subject.latency if isinstance(subject, Task) else None
     past = subject.past if isinstance(subject, Task) else None
@@ -107,11 +107,11 @@ class _Writer:
 
     def __init__(
         self,
-        search: Search,
-        best: Fit,
+        search: HypothesisSearch,
+        best: Fitted,
         left: list[Leftover],
         known: Limits,
-        options: Options,
+        options: DiagnosisOptions,
         tick: Callable[[str], None],
         task: Task | None,
         trials: Sequence[Trial],

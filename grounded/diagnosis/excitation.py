@@ -20,7 +20,7 @@ import numpy as np
 
 from grounded.diagnosis.data import prepare, shifted
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor
-from grounded.diagnosis.noise import Noise, Structure
+from grounded.diagnosis.noise import NoiseModel, Structure
 from grounded.diagnosis.refine import refine
 from grounded.diagnosis.report import Diagnosis
 from grounded.effects import Effect, Library, scales_of, wrap, wrapping_order
@@ -153,12 +153,12 @@ def _hypotheses(
     return found[0], found[1]
 
 
-def _noise(model: Model, diagnosis: Diagnosis) -> Noise:
+def _noise(model: Model, diagnosis: Diagnosis) -> NoiseModel:
     def logs(kind: str) -> Array:
         return np.array([2 * np.log(diagnosis.noise[kind][n] + 1e-12) for n in model.state_names])
 
     q, r = logs("process"), logs("measurement")
-    return Noise(Structure(), q, r, q.copy(), np.full(model.n, -60.0))
+    return NoiseModel(Structure(), q, r, q.copy(), np.full(model.n, -60.0))
 
 
 def _run(task: Task, h: Hypothesis, policy: Policy) -> Trial | None:
@@ -223,7 +223,9 @@ def _safe(task: Task, run: Trial | None) -> bool:
     return bool(inside.all())
 
 
-def _evidence(task: Task, run: Trial, true: Hypothesis, rival: Hypothesis, noise: Noise) -> float:
+def _evidence(
+    task: Task, run: Trial, true: Hypothesis, rival: Hypothesis, noise: NoiseModel
+) -> float:
     """What the rival, its values free, fails to explain of a run [nats]."""
     data = prepare(task.model, [run], task.latency, task.past)
     predictor = Predictor(data)

@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis import kernels
-from grounded.diagnosis.delayed_measurement import Late, System
+from grounded.diagnosis.delayed_measurement import Delayed, FilterSystem
 from grounded.frozen import Array
 
 UNKNOWN = 1e6  # standard deviations: how little is known of a state that was not measured at t = 0
@@ -51,7 +51,7 @@ class Gains:
     logdet: Array  # (L, B) log det S over what was seen
     seen: Array  # (L + 1, B, n) 1.0 or 0.0
     G: Array | None = None  # (L, B, n, n) how noise enters; None: as it is
-    late: Late | None = None  # which measurements are late
+    late: Delayed | None = None  # which measurements are late
 
 
 def transition(F: Array, phi: float | None, G: Array | None = None) -> Array:
@@ -77,7 +77,7 @@ def gains(
     seen: Array,
     start: Array,
     G: Array | None = None,
-    late: Late | None = None,
+    late: Delayed | None = None,
 ) -> Gains:
     """The covariance recursion.
 
@@ -95,13 +95,13 @@ def gains(
     """
     L, B, N, _ = A.shape
     Q, R = np.broadcast_to(Q, (L, B, N)), np.broadcast_to(R, (L + 1, B, seen.shape[-1]))
-    given = System(A, Q, R, seen, start, G)
+    given = FilterSystem(A, Q, R, seen, start, G)
     if late is None:
         return _gains(given)
     return replace(_gains(late.system(given)), late=late)
 
 
-def _gains(given: System) -> Gains:
+def _gains(given: FilterSystem) -> Gains:
     A, Q, R, seen, start, G = given
     (L, B, N, _), n = A.shape, seen.shape[-1]
     first = np.concatenate([R[0] * np.where(seen[0] > 0, 1.0, UNKNOWN), start], axis=1)
@@ -148,7 +148,9 @@ def _compiled_gains(
     values: dict[str, Any] = {"A": A, "seen": seen}
     values |= {"Q": np.ascontiguousarray(Q), "R": np.ascontiguousarray(R)}
     values |= {"start": np.ascontiguousarray(first), "G": 0 if G is None else G}
-    kernels.run("gains", n, N, G is not None, {**values, "L": L, "B": B, "K": K, "W": whiten})
+    kernels.run_kernel(
+        "gains", n, N, G is not None, {**values, "L": L, "B": B, "K": K, "W": whiten}
+    )
     diagonal = np.einsum("tbii->tbi", whiten)
     if not np.isfinite(diagonal).all():
         raise np.linalg.LinAlgError("a covariance is not finite")
@@ -200,14 +202,14 @@ def _compiled_innovations(
     g: Gains, d: Array, r: Array, *, track: bool
 ) -> tuple[Array, Array | None]:
     L, B, n, C = d.shape
-    lanes, wide = kernels.lanes(n), whole(C, n)
+    lanes, wide = kernels.columns_together(n), whole(C, n)
     d, r = _widened(d, (L, B, n, wide)), _widened(r, (L + 1, B, n, wide))
     out = np.empty((L, B, n, wide))
     filtered = np.empty((L + 1, B, n, wide)) if track else None
     values: dict[str, Any] = {"A": g.A, "K": g.K, "W": g.whiten, "d": d, "r": r, "seen": g.seen}
     values |= {"L": L, "B": B, "blocks": wide // lanes, "C": wide, "out": out}
     values |= {"track": 0 if filtered is None else filtered}
-    kernels.run("innovations", n, g.A.shape[-1], g.G is not None, values)
+    kernels.run_kernel("innovations", n, g.A.shape[-1], g.G is not None, values)
     return out[..., :C], None if filtered is None else filtered[..., :C]
 
 
@@ -215,7 +217,7 @@ def whole(count: int, n: int) -> int:
     """So many columns that they are filtered without being copied."""
     if not kernels.available(n):
         return count
-    return -(-count // kernels.lanes(n)) * kernels.lanes(n)
+    return -(-count // kernels.columns_together(n)) * kernels.columns_together(n)
 
 
 def _widened(columns: Array, shape: tuple[int, ...]) -> Array:
@@ -266,7 +268,7 @@ def _smoother(g: Gains, white: Array) -> Adjoint:
         }
         values |= {"seen": g.seen, "G": 0 if g.G is None else g.G, "L": L, "B": B}
         values |= {"u": u, "D": D, "r": r, "N": Nd}
-        kernels.run("smoother", n, N, g.G is not None, values)
+        kernels.run_kernel("smoother", n, N, g.G is not None, values)
         return Adjoint(u, D, r, Nd)
     q, Nq = np.zeros((B, N)), np.zeros((B, N, N))
     for t in range(L - 1, -1, -1):

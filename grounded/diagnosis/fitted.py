@@ -15,12 +15,12 @@ import numpy as np
 
 from grounded.diagnosis.data import Data
 from grounded.diagnosis.hypothesis import Hypothesis, param_scale
-from grounded.diagnosis.noise import Noise
+from grounded.diagnosis.noise import NoiseModel
 from grounded.frozen import Array
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class Fitted:
     """A hypothesis at its most likely values.
 
     Per run (B): `gram` (B, C, C), `score` (B, C), `rss` (B,), `logdet` (B,) of the whitened columns
@@ -28,7 +28,7 @@ class Fit:
     """
 
     hypothesis: Hypothesis
-    noise: Noise
+    noise: NoiseModel
     track: Array  # (L + 1, B, n)
     loglik: float  # of the data
     evidence: float  # log p(y | h): the shifts integrated out
@@ -95,7 +95,7 @@ T: tuple[float, ...] = (
 T += (2.12, 2.11, 2.10, 2.09, 2.09, 2.08, 2.07, 2.07, 2.06, 2.06, 2.06, 2.05, 2.05, 2.05, 2.04)
 
 
-def leave_one_out(fit: Fit, trial_of: Array) -> tuple[Array, Array]:
+def leave_one_out(fit: Fitted, trial_of: Array) -> tuple[Array, Array]:
     """Changes of all values without each trial (S, C), and that trial's rss under them (S,).
 
     One Newton step each: theta_{-i} = theta + (G - G_i)^-1 s_i.
@@ -116,7 +116,7 @@ def leave_one_out(fit: Fit, trial_of: Array) -> tuple[Array, Array]:
     return shifts, rss
 
 
-def standard_deviations(fit: Fit, trial_of: Array) -> tuple[Array, Array]:
+def standard_deviations(fit: Fitted, trial_of: Array) -> tuple[Array, Array]:
     """Of every free value: standard deviation, half-width of the 95 % interval, (C,) each."""
     C = fit.gram.shape[-1]
     if C == 0:

@@ -33,11 +33,11 @@ from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis.fitted import Fit, calibrated, leave_one_out
+from grounded.diagnosis.fitted import Fitted, calibrated, leave_one_out
 from grounded.diagnosis.hypotheses import CLAIM
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor, param_scale
 from grounded.diagnosis.prediction_error import Horizon, errors, horizon, normalised
-from grounded.diagnosis.search import Search
+from grounded.diagnosis.search import HypothesisSearch
 from grounded.frozen import Array
 from grounded.task import Task
 from grounded.trial import Trial
@@ -62,13 +62,13 @@ class Shrinkage:
         return normalised(self.after, self.where)
 
 
-def shrinkage(predictor: Predictor, fit: Fit, bare: Array, where: Horizon) -> Shrinkage:
+def shrinkage(predictor: Predictor, fit: Fitted, bare: Array, where: Horizon) -> Shrinkage:
     """Held-out errors before, from the states `bare` (L + 1, B, n), and after, from its own."""
     before = errors(predictor, Hypothesis(), bare, where)
-    return Shrinkage(where, before, held_out(predictor, fit, fit.track, where))
+    return Shrinkage(where, before, held_out_errors(predictor, fit, fit.track, where))
 
 
-def held_out(predictor: Predictor, fit: Fit, track: Array, where: Horizon) -> Array:
+def held_out_errors(predictor: Predictor, fit: Fitted, track: Array, where: Horizon) -> Array:
     """Errors of each trial with values from the others, (M, n)."""
     data, h = predictor.data, fit.hypothesis
     if not h.effects and h.spread == 0:
@@ -113,9 +113,9 @@ def whole_runs(predictor: Predictor, h: Hypothesis, track: Array) -> Array:
     return np.asarray(np.sqrt(total / np.maximum(count, 1)))
 
 
-def gaps_of(predictor: Predictor, fits: Sequence[Fit], where: Horizon) -> list[float]:
+def gaps_of(predictor: Predictor, fits: Sequence[Fitted], where: Horizon) -> list[float]:
     """The gap that each of several hypotheses leaves, held out."""
-    return [normalised(held_out(predictor, fit, fit.track, where), where) for fit in fits]
+    return [normalised(held_out_errors(predictor, fit, fit.track, where), where) for fit in fits]
 
 
 FAR = 1e6  # a state beyond it has diverged
@@ -149,7 +149,7 @@ def _rms(error: Array) -> float | None:
 
 
 def utility_prediction(
-    predictor: Predictor, fit: Fit, bare: Array, task: Task, trials: Sequence[Trial]
+    predictor: Predictor, fit: Fitted, bare: Array, task: Task, trials: Sequence[Trial]
 ) -> UtilityPrediction:
     """Real and predicted utilities of the trials that ran to the horizon.
 
@@ -203,7 +203,9 @@ WORSE = 1.1  # times the gap without the effects
 TRIES = 6  # hypotheses that are looked at
 
 
-def noise_confirmed(search: Search, best: Fit, most: int, seconds: float) -> tuple[Search, Fit]:
+def noise_confirmed(
+    search: HypothesisSearch, best: Fitted, most: int, seconds: float
+) -> tuple[HypothesisSearch, Fitted]:
     """The search and its best hypothesis, under the noise whose claims predict held-out trials.
 
     Another structure of noise, or exact parameters, is preferred to the likeliest one only where
@@ -236,7 +238,7 @@ def noise_confirmed(search: Search, best: Fit, most: int, seconds: float) -> tup
     return other, other.chosen(most)
 
 
-def confirmed(search: Search, best: Fit, seconds: float) -> Fit:
+def confirmed(search: HypothesisSearch, best: Fitted, seconds: float) -> Fitted:
     """The best hypothesis, or the likeliest one below it that predicts held-out trials.
 
     Args:
@@ -259,7 +261,7 @@ def confirmed(search: Search, best: Fit, seconds: float) -> Fit:
     return null
 
 
-def _pruned(search: Search, fit: Fit, held: Shrinkage, where: Horizon) -> Fit:
+def _pruned(search: HypothesisSearch, fit: Fitted, held: Shrinkage, where: Horizon) -> Fitted:
     """Without the effects that hardly matter: in a misfit, or beside one that makes all the gap."""
     gap, slight = held.gap_after, SLIGHT * held.gap_before
     while fit.hypothesis.effects and (gap > MISFIT or slight > max(gap, 1.0)):

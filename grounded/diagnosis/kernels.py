@@ -133,18 +133,18 @@ def _trouble() -> str:
     return jit.trouble()
 
 
-def lanes(n: int) -> int:
+def columns_together(n: int) -> int:
     """Columns that are computed together."""
     return 4 if n <= 4 else jit.lanes()
 
 
-def run(name: str, n: int, N: int, through: bool, values: Mapping[str, Any]) -> None:
+def run_kernel(name: str, n: int, N: int, through: bool, values: Mapping[str, Any]) -> None:
     """Calls a kernel; `through`: whether noise enters through a matrix G."""
-    wide = -(-N // lanes(n)) * lanes(n)
-    each = {"gains": N * wide, "innovations": N * lanes(n) * values.get("blocks", 1)}
+    wide = -(-N // columns_together(n)) * columns_together(n)
+    each = {"gains": N * wide, "innovations": N * columns_together(n) * values.get("blocks", 1)}
     state = np.zeros(values["B"] * each.get(name, (N + 1) * wide))
     values = {**values, "state": state}
-    call(_library(n, N, through, lanes(n))[name], NAMES[name], values)
+    call(_library(n, N, through, columns_together(n))[name], NAMES[name], values)
 
 
 @cache

@@ -20,9 +20,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from grounded.diagnosis import filter as kalman
-from grounded.diagnosis.fitted import Fit
+from grounded.diagnosis.fitted import Fitted
 from grounded.diagnosis.hypothesis import Predictor
-from grounded.diagnosis.linearise import gains_of, jacobian
+from grounded.diagnosis.linearise import gains_of, step_jacobian
 from grounded.effects import places
 from grounded.effects.family import per
 from grounded.frozen import Array
@@ -45,7 +45,7 @@ class Leftover:
     improvement: Array  # (L, B) held-out gain of each step [nats]
 
 
-def leftovers(predictor: Predictor, fit: Fit) -> list[Leftover]:
+def leftovers(predictor: Predictor, fit: Fitted) -> list[Leftover]:
     """The channels in which a flexible model predicts held-out trials better, most first."""
     data = predictor.data
     if data.count < 2:
@@ -64,7 +64,7 @@ def leftovers(predictor: Predictor, fit: Fit) -> list[Leftover]:
     return sorted(found, key=lambda left: -left.gain)
 
 
-def flexible(predictor: Predictor, fit: Fit) -> Array:
+def flexible(predictor: Predictor, fit: Fitted) -> Array:
     """Features of every step, (L, B, K), each of unit size."""
     data, h = predictor.data, fit.hypothesis
     model = data.model
@@ -118,7 +118,9 @@ def _bins(value: Array, count: int) -> list[Array]:
     return [column for column in inside if column.mean() > 0.01]
 
 
-def _channel(predictor: Predictor, fit: Fit, features: Array, i: int) -> tuple[float, Array, Array]:
+def _channel(
+    predictor: Predictor, fit: Fitted, features: Array, i: int
+) -> tuple[float, Array, Array]:
     """Held-out gain of correcting one channel's rate: total, by step (L, B); the weights."""
     data = predictor.data
     gains = filter_of(predictor, fit)
@@ -153,13 +155,13 @@ def _channel(predictor: Predictor, fit: Fit, features: Array, i: int) -> tuple[f
     return best
 
 
-def filter_of(predictor: Predictor, fit: Fit) -> kalman.Gains:
+def filter_of(predictor: Predictor, fit: Fitted) -> kalman.Gains:
     """The gains of a fit's filter."""
-    F = jacobian(predictor, fit.hypothesis, fit.track)
+    F = step_jacobian(predictor, fit.hypothesis, fit.track)
     return gains_of(predictor, fit.hypothesis, fit.noise, fit.track, F)
 
 
-def whiteness(fit: Fit, seen: Array) -> dict[str, float]:
+def whiteness(fit: Fitted, seen: Array) -> dict[str, float]:
     """Ljung-Box of each channel's whitened innovations over 10 lags: p-values by index."""
     found = {}
     L, _, n = fit.white.shape

@@ -40,18 +40,18 @@ import numpy as np
 
 from grounded.diagnosis import filter as kalman
 from grounded.diagnosis.data import Data
-from grounded.diagnosis.delayed_measurement import Late, System
+from grounded.diagnosis.delayed_measurement import Delayed, FilterSystem
 from grounded.diagnosis.delays import delays_of
 from grounded.diagnosis.filter import UNKNOWN
-from grounded.diagnosis.fitted import Fit, calibrated
+from grounded.diagnosis.fitted import Fitted, calibrated
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor, limits_of, param_scale, rates_of
-from grounded.diagnosis.noise import Noise
+from grounded.diagnosis.noise import NoiseModel
 from grounded.effects import ParamFamily
 from grounded.frozen import Array
 from grounded.model import Model
 
 
-def linearised(predictor: Predictor, h: Hypothesis, track: Array) -> tuple[Array, Array, Array]:
+def linearise(predictor: Predictor, h: Hypothesis, track: Array) -> tuple[Array, Array, Array]:
     """F (L, B, n, n); columns of d and r: the residual first, then each value, then each shift."""
     data = predictor.data
     model = data.model
@@ -91,7 +91,7 @@ def linearised(predictor: Predictor, h: Hypothesis, track: Array) -> tuple[Array
 def _sensitivities(predictor: Predictor, h: Hypothesis, x: Array, u: Array) -> tuple[Array, Array]:
     """F (L, B, n, n) and what each shift adds to a step, (L, B, n, k); k = 0 without shifts."""
     if h.spread == 0:
-        return jacobian(predictor, h, x), np.zeros((*x.shape, 0))
+        return step_jacobian(predictor, h, x), np.zeros((*x.shape, 0))
     which = calibrated(predictor.data)
     F, f_p = sensitivities_of(predictor, h, x, u)
     return F, f_p[..., which] * param_scale(predictor.data.model)[which]
@@ -108,7 +108,7 @@ def sensitivities_of(
     return F, passed(predictor, h, x, u, f_p.reshape(L, B, n, -1))
 
 
-def jacobian(predictor: Predictor, h: Hypothesis, track: Array) -> Array:
+def step_jacobian(predictor: Predictor, h: Hypothesis, track: Array) -> Array:
     """F of every step along a track (L or more, B, n), (L, B, n, n)."""
     data, u = predictor.data, predictor.inputs(h)
     model, (L, B) = data.model, data.time.shape
@@ -132,9 +132,9 @@ def noise_entry(predictor: Predictor, h: Hypothesis, track: Array) -> Array | No
     return G
 
 
-def system_of(
-    predictor: Predictor, h: Hypothesis, noise: Noise, track: Array, F: Array
-) -> tuple[System, Late | None]:
+def filter_system(
+    predictor: Predictor, h: Hypothesis, noise: NoiseModel, track: Array, F: Array
+) -> tuple[FilterSystem, Delayed | None]:
     """What the filter of a hypothesis is made of; F (L, B, n, n)."""
     data = predictor.data
     (L, B, n, _), delays = F.shape, delays_of(h, data)
@@ -145,20 +145,20 @@ def system_of(
     A = kalman.transition(F, noise.structure.phi(data.dt), G)
     Q = np.broadcast_to(noise.process(data.dt), (L, B, A.shape[-1]))
     R = widened(data, np.broadcast_to(noise.measurement(L), (L + 1, B, n)), seen)
-    return System(A, Q, R, seen, noise.start(B), G), late
+    return FilterSystem(A, Q, R, seen, noise.start(B), G), late
 
 
 def gains_of(
-    predictor: Predictor, h: Hypothesis, noise: Noise, track: Array, F: Array
+    predictor: Predictor, h: Hypothesis, noise: NoiseModel, track: Array, F: Array
 ) -> kalman.Gains:
     """The gains of a hypothesis' filter; F (L, B, n, n)."""
-    system, late = system_of(predictor, h, noise, track, F)
+    system, late = filter_system(predictor, h, noise, track, F)
     return kalman.gains(*system, late)
 
 
-def base_columns(predictor: Predictor, fit: Fit) -> tuple[Array, Array]:
+def base_columns(predictor: Predictor, fit: Fitted) -> tuple[Array, Array]:
     """What a fit's own values and shifts add to d and r: (L, B, n, C), (L + 1, B, n, C)."""
-    _, d, r = linearised(predictor, fit.hypothesis, fit.track)
+    _, d, r = linearise(predictor, fit.hypothesis, fit.track)
     return d[..., 1:], r[..., 1:]
 
 
@@ -213,12 +213,12 @@ def with_effects(predictor: Predictor, h: Hypothesis, x: Array, u: Array, F: Arr
     if not rates_of(h):
         return F
     after, half, mean = predictor.advance(h, x, u, data.time), 0.5 * data.dt, (F - one) / data.dt
-    first = slopes(predictor, h, x, u, data.time, mean)
-    direct = slopes(predictor, h, after, u, data.time + data.dt, None)
+    first = rate_slopes(predictor, h, x, u, data.time, mean)
+    direct = rate_slopes(predictor, h, after, u, data.time + data.dt, None)
     later = F + half * direct @ F
     if any(e.family.needs_own for e, _ in rates_of(h)):
         # at the end the model's own rate is still the mean of the step: a function of its start
-        later += half * (slopes(predictor, h, after, u, data.time + data.dt, mean) - direct)
+        later += half * (rate_slopes(predictor, h, after, u, data.time + data.dt, mean) - direct)
     found = later @ (one + half * first)
     for heading, rate in predictor.tied():
         row = heading_slope(predictor, h, after, u, data.time + data.dt, heading, rate)
@@ -260,7 +260,7 @@ def passed(
     return np.asarray(slopes + held[..., None] * (slopes - still))
 
 
-def slopes(
+def rate_slopes(
     predictor: Predictor, h: Hypothesis, x: Array, u: Array, t: Array, of_own: Array | None
 ) -> Array:
     """Slope of the added rates (L, B, n, n) [1/s] at x (L, B, n).
@@ -299,7 +299,7 @@ def heading_slope(
     own = ((f_x - np.eye(n)) / short).reshape(*x.shape, n)
     slope, name = own[..., heading, :].copy(), data.model.state_names[heading]
     if any(name in e.site.targets or f"{name}<-" in e.name for e, _ in rates_of(h)):
-        slope += slopes(predictor, h, x, u, t, own)[..., heading, :]
+        slope += rate_slopes(predictor, h, x, u, t, own)[..., heading, :]
     slope[..., [heading, rate]] = 0.0
     return np.asarray(slope)
 

@@ -19,7 +19,7 @@ import numpy as np
 from grounded.diagnosis import filter as kalman
 from grounded.diagnosis.data import Data
 from grounded.diagnosis.delays import delays_of
-from grounded.diagnosis.fitted import Fit
+from grounded.diagnosis.fitted import Fitted
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor
 from grounded.diagnosis.leftover import filter_of
 from grounded.diagnosis.linearise import widened
@@ -41,7 +41,7 @@ class Horizon:
     spread: Array
 
 
-def horizon(predictor: Predictor, fit: Fit, seconds: float) -> Horizon:
+def horizon(predictor: Predictor, fit: Fitted, seconds: float) -> Horizon:
     """Starting points spread over all runs, and the floor under their errors.
 
     Args:
@@ -63,7 +63,7 @@ def horizon(predictor: Predictor, fit: Fit, seconds: float) -> Horizon:
     return Horizon(steps, at, run, _spread(predictor, fit, at, run, steps))
 
 
-def _spread(predictor: Predictor, fit: Fit, at: Any, run: Any, steps: int) -> Array:
+def _spread(predictor: Predictor, fit: Fitted, at: Any, run: Any, steps: int) -> Array:
     """Standard deviation that noise alone gives the log `steps` after the moments (M,), (M, n)."""
     data, noise = predictor.data, fit.noise
     (L, B), n = data.time.shape, data.model.n
@@ -146,7 +146,7 @@ def normalised(error: Array, where: Horizon) -> float:
     return float(np.sqrt(np.nanmean((error / where.spread) ** 2)))
 
 
-def explained(predictor: Predictor, null: Hypothesis, best: Fit) -> Array:
+def explained(predictor: Predictor, null: Hypothesis, best: Fitted) -> Array:
     """What `best` gains over the bare model at every step and channel, (L, B, n) [nats].
 
     Both are filtered with the noise of `best`: the bare model's innovations would hide the gap in a
@@ -179,7 +179,7 @@ def by_time(gain: Array, data: Data, parts: int = 8) -> list[dict[str, float]]:
 
 
 def by_region(
-    gain: Array, predictor: Predictor, fit: Fit, most: int = 3
+    gain: Array, predictor: Predictor, fit: Fitted, most: int = 3
 ) -> list[dict[str, float | str]]:
     """Half-spaces of a state or an input that hold most of the gap in little of the time."""
     data = predictor.data

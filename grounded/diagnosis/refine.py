@@ -27,12 +27,19 @@ import numpy as np
 
 from grounded.diagnosis import filter as kalman
 from grounded.diagnosis.data import Data
-from grounded.diagnosis.delayed_measurement import Late, System, joined
+from grounded.diagnosis.delayed_measurement import Delayed, FilterSystem, joined
 from grounded.diagnosis.delays import Delays, delays_of
-from grounded.diagnosis.fitted import Fit, calibrated, shift_precision
+from grounded.diagnosis.fitted import Fitted, calibrated, shift_precision
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor, param_scale
-from grounded.diagnosis.linearise import gains_of, linearised, smoothed, step_sizes, system_of
-from grounded.diagnosis.noise import Noise, average, cleaned, climbed, slopes, working
+from grounded.diagnosis.linearise import filter_system, gains_of, linearise, smoothed, step_sizes
+from grounded.diagnosis.noise import (
+    NoiseModel,
+    average,
+    cleaned,
+    climbed,
+    likelihood_slopes,
+    working,
+)
 from grounded.effects import SensorDelayFamily
 from grounded.frozen import Array
 
@@ -41,13 +48,13 @@ SHORTEST = 0.05  # part of a step that is still tried
 
 
 @dataclass(eq=False)
-class Step:
+class ProposedStep:
     """A step proposed at the best point: of values, shifts, track; the noise it leads to."""
 
     theta: Array
     shift: Array  # in units of param_scale
     track: Array
-    noise: Noise
+    noise: NoiseModel
 
 
 @dataclass(eq=False)
@@ -55,10 +62,10 @@ class Work:
     """One hypothesis on its way: mutable, private to this module."""
 
     h: Hypothesis
-    noise: Noise
+    noise: NoiseModel
     track: Array
-    best: Fit | None = None
-    step: Step | None = None
+    best: Fitted | None = None
+    step: ProposedStep | None = None
     part: float = 1.0  # of the step that is taken
     still: int = 0
     age: int = 0  # points that were better than all before
@@ -97,7 +104,7 @@ class Work:
         self.track = best.track + step.track if self.moving else best.track
 
 
-def proposed(data: Data, fit: Fit, filtered: Array, noise: Noise) -> Step:
+def proposed(data: Data, fit: Fitted, filtered: Array, noise: NoiseModel) -> ProposedStep:
     """Gauss-Newton in values and shifts, scoring in the noise, the filtered track as the track."""
     h = fit.hypothesis
     G = fit.gram.sum(axis=0) + np.diag(fit.prior)
@@ -111,7 +118,7 @@ def proposed(data: Data, fit: Fit, filtered: Array, noise: Noise) -> Step:
         theta, shift = delta[:k], delta[k:]
         moved = delta != 0
         track = track + filtered[..., 1:][..., moved] @ delta[moved]
-    return Step(theta, shift, track, noise)
+    return ProposedStep(theta, shift, track, noise)
 
 
 def _bounded(G: Array, slope: Array, low: Array, high: Array) -> Array:
@@ -176,12 +183,12 @@ def _bounds(data: Data) -> tuple[Array, Array]:
 
 def refine(
     predictor: Predictor,
-    starts: Sequence[Fit | tuple[Hypothesis, Noise, Array]],
+    starts: Sequence[Fitted | tuple[Hypothesis, NoiseModel, Array]],
     *,
     iterations: int = 6,
     tick: Callable[[], None] | None = None,
     fixed_noise: bool = False,
-) -> list[Fit]:
+) -> list[Fitted]:
     """Refines hypotheses that share a noise structure; the result has the same order.
 
     Args:
@@ -193,7 +200,7 @@ def refine(
     """
     data = predictor.data
     works = [
-        Work(s.hypothesis, s.noise, s.track) if isinstance(s, Fit) else Work(*s) for s in starts
+        Work(s.hypothesis, s.noise, s.track) if isinstance(s, Fitted) else Work(*s) for s in starts
     ]
     if not works:
         return []
@@ -222,11 +229,11 @@ def _iterate(predictor: Predictor, works: list[Work], fixed_noise: bool) -> None
     data = predictor.data
     B = data.time.shape[1]
     late = [delays_of(work.h, data) for work in works]
-    parts = [linearised(predictor, work.h, work.track) for work in works]
+    parts = [linearise(predictor, work.h, work.track) for work in works]
     width = kalman.whole(max(part[1].shape[-1] for part in parts), data.model.n)
     d, r = (_side_by_side([part[k] for part in parts], width) for k in (1, 2))
     systems = [
-        system_of(predictor, work.h, work.noise, work.track, part[0])
+        filter_system(predictor, work.h, work.noise, work.track, part[0])
         for work, part in zip(works, parts, strict=True)
     ]
     system, delayed = joined(systems)
@@ -269,10 +276,10 @@ def _climbed(
     data: Data,
     works: list[Work],
     late: list[Delays | None],
-    systems: list[tuple[System, Late | None]],
+    systems: list[tuple[FilterSystem, Delayed | None]],
     g: kalman.Gains,
     white: Array,
-) -> list[Noise]:
+) -> list[NoiseModel]:
     """Each work's noise after one step up the likelihood."""
     B, width = data.time.shape[1], data.model.n
     adjoints = kalman.smoother(g, white).parts(B)
@@ -288,18 +295,18 @@ def _climbed(
     for i, (work, delays, adjoint) in enumerate(zip(works, late, adjoints, strict=True)):
         info = average(columns[:, i * B : (i + 1) * B, :, :K])
         in_log = adjoint if delays is None else delays.restored(adjoint)
-        slope = slopes(work.noise, in_log, data.dt)
+        slope = likelihood_slopes(work.noise, in_log, data.dt)
         found.append(climbed(work.noise, slope, info, int(data.valid.sum())))
     return found
 
 
-def clean(predictor: Predictor, fit: Fit, rounds: int = 8) -> Fit:
+def clean(predictor: Predictor, fit: Fitted, rounds: int = 8) -> Fitted:
     """The same hypothesis with outliers weighed down, its noise fitted to the rest."""
     work = Work(fit.hypothesis, fit.noise, fit.track)
     for _ in range(rounds):
         if not np.isfinite(work.track).all():
             return fit
-        F, d, r = linearised(predictor, work.h, work.track)
+        F, d, r = linearise(predictor, work.h, work.track)
         try:
             g = gains_of(predictor, work.h, work.noise, work.track, F)
         except np.linalg.LinAlgError:
@@ -333,7 +340,7 @@ def _update(
     white: Array,
     logdet: Array,
     filtered: Array,
-    climbed: Noise,
+    climbed: NoiseModel,
     before: float,
 ) -> None:
     """Scores the point where the work stands, keeps it if it is the best, and moves on."""
@@ -361,7 +368,7 @@ def _scored(
     logdet: Array,
     error: Array,
     before: float,
-) -> Fit:
+) -> Fitted:
     data, h = predictor.data, work.h
     L, B, n, C = columns.shape
     by_run = np.ascontiguousarray(columns.swapaxes(0, 1)).reshape(B, L * n, C)
@@ -380,7 +387,7 @@ def _scored(
         G = gram.sum(axis=0)[k:, k:] / np.sqrt(np.outer(precision, precision))
         evidence -= 0.5 * float(np.sum(precision * np.square(shift)))
         evidence -= 0.5 * float(np.linalg.slogdet(np.eye(C - k) + G)[1])
-    return Fit(
+    return Fitted(
         hypothesis=h,
         noise=work.noise,
         track=work.track,

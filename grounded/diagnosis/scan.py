@@ -26,9 +26,9 @@ import numpy as np
 from grounded.compile import Named
 from grounded.diagnosis import filter as kalman
 from grounded.diagnosis.delays import delays_of
-from grounded.diagnosis.fitted import Fit
+from grounded.diagnosis.fitted import Fitted
 from grounded.diagnosis.hypothesis import Predictor, sensor_offset
-from grounded.diagnosis.linearise import base_columns, sensitivities_of, system_of
+from grounded.diagnosis.linearise import base_columns, filter_system, sensitivities_of
 from grounded.effects import (
     Effect,
     InputFamily,
@@ -63,7 +63,7 @@ class _Column:
     r: Array  # (L + 1, B, n) or empty
 
 
-def scan(predictor: Predictor, fit: Fit, candidates: Sequence[Effect]) -> list[Look]:
+def scan_candidates(predictor: Predictor, fit: Fitted, candidates: Sequence[Effect]) -> list[Look]:
     """Every candidate beside what `fit` already holds; same order as the candidates."""
     context = _Context(predictor, fit)
     results: dict[tuple[int, int], list[tuple[str, float, Array, Array]]] = {}
@@ -84,7 +84,7 @@ def scan(predictor: Predictor, fit: Fit, candidates: Sequence[Effect]) -> list[L
 class _Context:
     """What all candidates share: the fit's track, Jacobian and gains."""
 
-    def __init__(self, predictor: Predictor, fit: Fit) -> None:
+    def __init__(self, predictor: Predictor, fit: Fitted) -> None:
         self.predictor, self.fit = predictor, fit
         data, h = predictor.data, fit.hypothesis
         self.x = fit.track[:-1]
@@ -93,7 +93,7 @@ class _Context:
         self.after = predictor.advance(h, self.x, self.u, data.time)
         self.ahead = np.concatenate([fit.track[:1], self.after])
         self.F, self.f_p = sensitivities_of(predictor, h, self.x, self.u)
-        system, late = system_of(predictor, h, fit.noise, fit.track, self.F)
+        system, late = filter_system(predictor, h, fit.noise, fit.track, self.F)
         self.G, self.gains = system.G, kalman.gains(*system, late)
         self.delays = delays_of(h, data)
         self.white = fit.white

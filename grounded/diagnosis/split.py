@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis.data import Data
-from grounded.diagnosis.fitted import Fit
-from grounded.diagnosis.held_out import held_out
+from grounded.diagnosis.fitted import Fitted
+from grounded.diagnosis.held_out import held_out_errors
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor
 from grounded.diagnosis.prediction_error import Horizon, errors
 from grounded.frozen import Array
@@ -80,7 +80,7 @@ def _named(shares: Array) -> dict[str, float]:
 
 
 def split(
-    predictor: Predictor, fit: Fit, bare: Array, where: Horizon, repeats: Sequence[Sequence[int]]
+    predictor: Predictor, fit: Fitted, bare: Array, where: Horizon, repeats: Sequence[Sequence[int]]
 ) -> Split:
     """The parts of the error at one horizon.
 
@@ -92,7 +92,7 @@ def split(
         repeats: groups of trials (indices) that ran the same candidate.
     """
     before = errors(predictor, Hypothesis(), bare, where)
-    after = held_out(predictor, fit, fit.track, where)
+    after = held_out_errors(predictor, fit, fit.track, where)
     return Split(
         where.steps * predictor.data.dt,
         _mean_square(before),
@@ -109,7 +109,7 @@ def _mean_square(error: Array) -> Array:
 
 
 def scatter(
-    predictor: Predictor, fit: Fit, steps: int, repeats: Sequence[Sequence[int]]
+    predictor: Predictor, fit: Fitted, steps: int, repeats: Sequence[Sequence[int]]
 ) -> Array | None:
     """Variance of prediction errors among repeats of one candidate, (n,); None without repeats."""
     data = predictor.data

@@ -59,7 +59,7 @@ def speed(model: Model) -> str | None:
     return next((s for s in SPEEDS if s in model.state_names), None)
 
 
-def per_second(model: Model) -> list[str]:
+def velocities(model: Model) -> list[str]:
     """States whose unit is per second: velocities, linear or angular."""
     return [n for n, u in model.states.items() if u.endswith("/s") or u.endswith("/ s")]
 

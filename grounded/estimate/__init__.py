@@ -13,7 +13,7 @@ sensors and controllers of different rates, transport delays of any fraction of 
 from __future__ import annotations
 
 from grounded.estimate.likelihood import NoiseEstimate
-from grounded.estimate.measurement import Measurement, Noise, of_function, of_states
+from grounded.estimate.measurement import Measurement, NoiseLevels, of_function, of_states
 from grounded.estimate.record import Record, cut, merged, record_of
 from grounded.estimate.tracker import Tracker
 from grounded.estimate.trials import (
@@ -29,8 +29,8 @@ __all__ = [
     "Consistency",
     "Estimated",
     "Measurement",
-    "Noise",
     "NoiseEstimate",
+    "NoiseLevels",
     "Record",
     "Tracker",
     "consistency",

@@ -32,8 +32,8 @@ from dataclasses import replace
 import numpy as np
 
 from grounded.estimate import kernel
-from grounded.estimate.measurement import Measurement, Noise
-from grounded.estimate.record import Batch
+from grounded.estimate.measurement import Measurement, NoiseLevels
+from grounded.estimate.record import RecordBatch
 from grounded.estimate.recursion import Filtered, recursion
 from grounded.estimate.steps import ModelSteps
 from grounded.frozen import Array
@@ -44,10 +44,10 @@ STILL = 1e-3  # [nats] or the likelihood; at a kink a track may flip for ever,
 ENOUGH = 0.05  # [nats] and then this is enough after SWEEPS
 
 
-def run(
-    batch: Batch,
+def filter_batch(
+    batch: RecordBatch,
     measurement: Measurement,
-    noise: Noise,
+    noise: NoiseLevels,
     steps: ModelSteps,
     about: Filtered | None = None,
 ) -> Filtered:
@@ -79,9 +79,9 @@ def run(
 
 
 def _sweeps(
-    batch: Batch,
+    batch: RecordBatch,
     measurement: Measurement,
-    noise: Noise,
+    noise: NoiseLevels,
     steps: ModelSteps,
     track: Array,
     std: Array,
@@ -98,7 +98,7 @@ def _sweeps(
             H, e0 = _seen(batch, measurement, xbar)
             if not all(np.isfinite(array).all() for array in (f, A, H, e0)):
                 return None
-            lin = kernel.linearised(batch, A, f, more, track, H, e0, xbar)
+            lin = kernel.packed(batch, A, f, more, track, H, e0, xbar)
             done = kernel.forward(lin, noise)
             if not np.isfinite(done.loglik):
                 return None
@@ -125,7 +125,7 @@ def _sweeps(
     return None
 
 
-def _seen(batch: Batch, measurement: Measurement, x: Array) -> tuple[Array, Array]:
+def _seen(batch: RecordBatch, measurement: Measurement, x: Array) -> tuple[Array, Array]:
     """H (T + 1, B, ny, n) and y - h(x) (T + 1, B, ny) along a track, zero where not seen."""
     flat = x.reshape(-1, x.shape[-1])
     e = measurement.innovation(batch.y, measurement.function(flat).reshape(batch.y.shape))

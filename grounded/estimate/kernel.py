@@ -33,8 +33,8 @@ from numpy.typing import NDArray
 from grounded.compile.emit.llvm_batch import Words
 from grounded.compile.emit.llvm_text import Writer, declarations, splat
 from grounded.compile.run import jit
-from grounded.estimate.measurement import Noise
-from grounded.estimate.record import Batch
+from grounded.estimate.measurement import NoiseLevels
+from grounded.estimate.record import RecordBatch
 from grounded.frozen import Array
 
 
@@ -64,7 +64,7 @@ def unpack(array: Array, B: int, *tail: int) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Linearised:
+class LinearisedBatch:
     """A linearisation in lanes: f + A (x - track), h + H (x - xbar), and the batch's own arrays."""
 
     arrays: dict[str, Array]
@@ -86,15 +86,22 @@ class Linearised:
 class Pass:
     """What a forward pass leaves, in lanes."""
 
-    linearised: Linearised
+    linearised: LinearisedBatch
     out: dict[str, Array]
     r: Array  # (G, T + 1, ny, W) variance of the measurements, 1 where not seen
     loglik: float
 
 
-def linearised(
-    batch: Batch, A: Array, f: Array, more: Array, track: Array, H: Array, e0: Array, xbar: Array
-) -> Linearised:
+def packed(
+    batch: RecordBatch,
+    A: Array,
+    f: Array,
+    more: Array,
+    track: Array,
+    H: Array,
+    e0: Array,
+    xbar: Array,
+) -> LinearisedBatch:
     """Packs a linearisation along a track.
 
     Args:
@@ -115,7 +122,7 @@ def linearised(
     arrays["x0"] = pack(batch.start[None], width)[:, 0]
     dt = np.where(batch.valid, batch.dt, 0.0)[..., None]
     filled = np.arange(len(arrays["x0"]) * width) < B
-    return Linearised(
+    return LinearisedBatch(
         arrays=arrays,
         seen=pack(batch.seen.astype(float), width) > 0,
         dt=pack(dt, width),
@@ -126,7 +133,7 @@ def linearised(
     )
 
 
-def forward(lin: Linearised, noise: Noise) -> Pass:
+def forward(lin: LinearisedBatch, noise: NoiseLevels) -> Pass:
     """The filter along a linearisation."""
     from grounded.compile.run.compiled import call
 
@@ -139,7 +146,7 @@ def forward(lin: Linearised, noise: Noise) -> Pass:
     shapes = {"x": n, "x_prior": n, "P_prior": n * n, "e": ny, "s": ny, "g": ny * n}
     out = {name: np.empty((G, T + 1, size, width)) for name, size in shapes.items()}
     given: dict[str, Any] = {"G": G, "T": T, "q": np.ascontiguousarray(q), "r": r, "P0": P0}
-    call(library(n, ny)["forward"], FORWARD, given | lin.arrays | out)
+    call(recursion_library(n, ny)["forward"], FORWARD, given | lin.arrays | out)
     with np.errstate(all="ignore"):
         each = np.where(lin.seen, out["e"] ** 2 / out["s"] + np.log(2 * np.pi * out["s"]), 0.0)
         total = -0.5 * float(np.sum(each * lin.weight))
@@ -166,11 +173,11 @@ def backward(done: Pass) -> dict[str, Array]:
     out = {name: np.empty((G, T + 1, size, width)) for name, size in shapes.items()}
     given: dict[str, Any] = {"G": G, "T": T, "A": lin.arrays["A"], "H": lin.arrays["H"]}
     given |= {name: done.out[name] for name in ("e", "s", "g")}
-    call(library(n, ny)["backward"], BACKWARD, given | out)
+    call(recursion_library(n, ny)["backward"], BACKWARD, given | out)
     return out
 
 
-def variance_slopes(done: Pass, noise: Noise) -> Array:
+def variance_slopes(done: Pass, noise: NoiseLevels) -> Array:
     """Slope of the log-likelihood by the log variances of process and measurements, (n + ny,)."""
     back, lin = backward(done), done.linearised
     _, _, n, ny, _ = lin.sizes
@@ -191,7 +198,7 @@ BACKWARD = (*SIZES, "A", "H", "e", "s", "g", "ry", "Ny", "r_slope")
 
 
 @cache
-def library(n: int, ny: int) -> Any:
+def recursion_library(n: int, ny: int) -> Any:
     """The compiled `forward` and `backward` for n states and ny channels, W lanes."""
     text = Path(__file__).read_bytes()
     key = f"estimate {hashlib.sha256(text).hexdigest()} {jit.writers()} {n} {ny} {jit.lanes()}"

@@ -18,9 +18,9 @@ import numpy as np
 
 from grounded.compile import System
 from grounded.estimate import kernel
-from grounded.estimate.filter import run
-from grounded.estimate.measurement import Measurement, Noise
-from grounded.estimate.record import Batch, Record, batch_of
+from grounded.estimate.filter import filter_batch
+from grounded.estimate.measurement import Measurement, NoiseLevels
+from grounded.estimate.record import Record, RecordBatch, batch_of
 from grounded.estimate.recursion import Filtered, fixed_steps, recursion, smooth
 from grounded.estimate.steps import ModelSteps
 from grounded.frozen import Array
@@ -36,7 +36,7 @@ ROWS = 8_000  # more samples than this teach the noise little
 class NoiseEstimate:
     """The noise, its log-likelihood, what is seen of it, and how the search ended."""
 
-    noise: Noise
+    noise: NoiseLevels
     loglik: float
     process_seen: tuple[bool, ...]  # (n,) False: at the floor, or nothing says anything about it
     measurement_seen: tuple[bool, ...]  # (ny,)
@@ -46,9 +46,9 @@ class NoiseEstimate:
 def maximum_likelihood(
     system: System,
     p: Array,
-    batch: Batch,
+    batch: RecordBatch,
     measurement: Measurement,
-    start: Noise,
+    start: NoiseLevels,
     *,
     rounds: int = ROUNDS,
     wide: bool = False,
@@ -73,7 +73,7 @@ def maximum_likelihood(
             status = best.status
             break
         trial, seen = _climb(batch, measurement, noise, best, start)
-        after = run(batch, measurement, trial, steps, best)
+        after = filter_batch(batch, measurement, trial, steps, best)
         gain = after.loglik - best.loglik
         if gain > 0:
             noise, best = trial, after
@@ -88,13 +88,13 @@ def maximum_likelihood(
 
 
 def _expectation(
-    batch: Batch, measurement: Measurement, noise: Noise, steps: ModelSteps, rounds: int
-) -> tuple[Noise, Filtered]:
+    batch: RecordBatch, measurement: Measurement, noise: NoiseLevels, steps: ModelSteps, rounds: int
+) -> tuple[NoiseLevels, Filtered]:
     """Expectation-maximisation: each variance becomes what the smoother expects of it.
 
     Slow near the end, but sure-footed far from it, where it also mends the track.
     """
-    best = run(batch, measurement, noise, steps)
+    best = filter_batch(batch, measurement, noise, steps)
     steps_seen = max(int(batch.valid.sum()), 1)
     samples = np.maximum(batch.seen.sum(axis=(0, 1)), 1)
     for _ in range(rounds):
@@ -107,15 +107,15 @@ def _expectation(
         share = np.concatenate([np.full(n, steps_seen), samples])
         factor = np.clip(1 + 2 * slope / share, 1e-2, 1e2)
         std = np.sqrt(variance * factor)
-        trial = Noise(std[:n], std[n:], noise.dt)
-        after = run(batch, measurement, trial, steps, best)
+        trial = NoiseLevels(std[:n], std[n:], noise.dt)
+        after = filter_batch(batch, measurement, trial, steps, best)
         if not after.loglik > best.loglik:
             break
         noise, best = trial, after
     return noise, best
 
 
-def first_noise(batch: Batch, measurement: Measurement, dt: float) -> Noise:
+def first_noise(batch: RecordBatch, measurement: Measurement, dt: float) -> NoiseLevels:
     """A rough noise, from how smooth the measurements are: robust, and only a place to begin.
 
     Second differences of a smooth signal are measurement noise (times sqrt 6), fourth differences
@@ -133,7 +133,7 @@ def first_noise(batch: Batch, measurement: Measurement, dt: float) -> Noise:
         r[c] = max(min(_spread(np.diff(y, n=k, axis=0)) / v**0.5 for k, v in orders), least)
         if i >= 0 and np.isfinite(one).any():
             q[i] = max(0.1 * _spread(one), least)
-    return Noise(q, r, dt)
+    return NoiseLevels(q, r, dt)
 
 
 def enough(records: Sequence[Record], rng: np.random.Generator | None = None) -> list[Record]:
@@ -151,8 +151,12 @@ def enough(records: Sequence[Record], rng: np.random.Generator | None = None) ->
 
 
 def _climb(
-    batch: Batch, measurement: Measurement, noise: Noise, about: Filtered, start: Noise
-) -> tuple[Noise, Array]:
+    batch: RecordBatch,
+    measurement: Measurement,
+    noise: NoiseLevels,
+    about: Filtered,
+    start: NoiseLevels,
+) -> tuple[NoiseLevels, Array]:
     """The best noise for a fixed linearisation, and which variances the data see."""
     from scipy.optimize import minimize
 
@@ -160,7 +164,7 @@ def _climb(
 
     def cost(theta: Array) -> tuple[float, Array]:
         std = np.exp(0.5 * theta)
-        there = Noise(std[:n], std[n:], dt)
+        there = NoiseLevels(std[:n], std[n:], dt)
         if about.done is not None:
             done = kernel.forward(about.done.linearised, there)
             loglik = done.loglik
@@ -180,10 +184,10 @@ def _climb(
     options = {"maxiter": 60, "ftol": 1e-9, "gtol": 1e-6}
     found = minimize(cost, theta, jac=True, method="L-BFGS-B", bounds=bounds, options=options).x
     std = np.exp(0.5 * found)
-    return Noise(std[:n], std[n:], dt), found > low + 2.0
+    return NoiseLevels(std[:n], std[n:], dt), found > low + 2.0
 
 
-def _slope(filtered: Filtered, batch: Batch, noise: Noise) -> Array:
+def _slope(filtered: Filtered, batch: RecordBatch, noise: NoiseLevels) -> Array:
     """Slope of the log-likelihood by the log variances, (n + ny,)."""
     if filtered.done is not None:
         return kernel.variance_slopes(filtered.done, noise)

@@ -120,7 +120,7 @@ def _differenced(function: Callable[[Array], Array]) -> Callable[[Array], Array]
 
 
 @dataclass(frozen=True, eq=False)
-class Noise:
+class NoiseLevels:
     """Standard deviations, in the units of the states and of the channels.
 
     Args:

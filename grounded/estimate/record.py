@@ -241,7 +241,7 @@ START_STD = 1.0  # of a first state that nothing measures, in its unit
 
 
 @dataclass(frozen=True, eq=False)
-class Batch:
+class RecordBatch:
     """B records of at most T steps; n states, m inputs, ny channels."""
 
     y: Array  # (T + 1, B, ny), zero where not seen
@@ -274,7 +274,9 @@ class Batch:
         return tuple((float(h), np.abs(self.dt - h) < 1e-9) for h in sizes)
 
 
-def batch_of(records: Sequence[Record], measurement: Measurement, n: int, latency: Array) -> Batch:
+def batch_of(
+    records: Sequence[Record], measurement: Measurement, n: int, latency: Array
+) -> RecordBatch:
     """Records side by side.
 
     Args:
@@ -307,7 +309,7 @@ def batch_of(records: Sequence[Record], measurement: Measurement, n: int, latenc
     start, var, channel = (np.array(column) for column in zip(*starts, strict=True))
     lengths = np.array([r.steps for r in records])
     valid = np.arange(T)[:, None] < lengths
-    return Batch(y, seen, u, slope, dt, valid, lengths, start, var, channel)
+    return RecordBatch(y, seen, u, slope, dt, valid, lengths, start, var, channel)
 
 
 def _start(

@@ -24,8 +24,8 @@ from functools import cached_property
 import numpy as np
 
 from grounded.estimate.kernel import Pass, backward, unpack
-from grounded.estimate.measurement import Measurement, Noise
-from grounded.estimate.record import Batch
+from grounded.estimate.measurement import Measurement, NoiseLevels
+from grounded.estimate.record import RecordBatch
 from grounded.estimate.steps import Advance
 from grounded.frozen import Array
 
@@ -78,7 +78,9 @@ class Filtered:
         return np.asarray((self.C @ self.e[..., None])[..., 0])
 
 
-def recursion(batch: Batch, measurement: Measurement, noise: Noise, advance: Advance) -> Filtered:
+def recursion(
+    batch: RecordBatch, measurement: Measurement, noise: NoiseLevels, advance: Advance
+) -> Filtered:
     """One pass over a batch, linearising at each state that it reaches."""
     T, B, n, ny = len(batch.dt), len(batch.lengths), batch.start.shape[1], measurement.ny
     R = noise.measurement**2
@@ -159,7 +161,7 @@ def _room(T: int, B: int, n: int, ny: int) -> dict[str, Array]:
     }
 
 
-def _start_covariance(batch: Batch, R: Array) -> Array:
+def _start_covariance(batch: RecordBatch, R: Array) -> Array:
     channel = batch.start_channel
     var = batch.start_var + np.where(channel >= 0, R[np.maximum(channel, 0)], 0.0)
     return var[..., None] * np.eye(var.shape[1])
@@ -180,7 +182,7 @@ class Smoothed:
     start_slope: Array  # d loglik / d P_0, (B, n) (diagonal)
 
 
-def smooth(filtered: Filtered, batch: Batch) -> Smoothed:
+def smooth(filtered: Filtered, batch: RecordBatch) -> Smoothed:
     """One pass backwards over a filter pass that got through."""
     B, n = filtered.x.shape[1:]
     if filtered.done is not None:

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from grounded.compile import System
-from grounded.estimate.record import Batch
+from grounded.estimate.record import RecordBatch
 from grounded.frozen import Array
 
 # t, x (B, n) and its standard deviation (B, n) -> f (B, n), A (B, n, n), added variance (B, n)
@@ -46,7 +46,7 @@ class ModelSteps:
 
     system: System
     p: Array
-    batch: Batch
+    batch: RecordBatch
     wide: bool = False
 
     def at(self, t: int, x: Array, std: Array) -> tuple[Array, Array, Array]:

@@ -18,10 +18,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from grounded.errors import GroundedError
-from grounded.estimate.filter import run
+from grounded.estimate.filter import filter_batch
 from grounded.estimate.likelihood import NoiseEstimate, noise_of_records
-from grounded.estimate.measurement import Measurement, Noise, of_states
-from grounded.estimate.record import Batch, Record, batch_of, records_of
+from grounded.estimate.measurement import Measurement, NoiseLevels, of_states
+from grounded.estimate.record import Record, RecordBatch, batch_of, records_of
 from grounded.estimate.recursion import Filtered, smooth
 from grounded.estimate.steps import ModelSteps
 from grounded.frozen import Array
@@ -54,7 +54,7 @@ class Estimated:
 def filter_trials(
     model: Model,
     trials: Sequence[Trial | Record],
-    noise: Noise,
+    noise: NoiseLevels,
     *,
     latency: Array | None = None,
     measurement: Measurement | None = None,
@@ -78,7 +78,7 @@ def filter_trials(
 def smooth_trials(
     model: Model,
     trials: Sequence[Trial | Record],
-    noise: Noise,
+    noise: NoiseLevels,
     *,
     latency: Array | None = None,
     measurement: Measurement | None = None,
@@ -119,10 +119,10 @@ def noise_of(
 def _passed(
     model: Model,
     trials: Sequence[Trial | Record],
-    noise: Noise,
+    noise: NoiseLevels,
     latency: Array | None,
     measurement: Measurement | None,
-) -> tuple[list[Record], Batch, Filtered, Measurement]:
+) -> tuple[list[Record], RecordBatch, Filtered, Measurement]:
     measurement = of_states(model) if measurement is None else measurement
     if len(noise.process) != model.n or len(noise.measurement) != measurement.ny:
         raise GroundedError(
@@ -133,11 +133,11 @@ def _passed(
     delay = np.zeros(model.m) if latency is None else np.asarray(latency, float)
     batch = batch_of(records, measurement, model.n, delay)
     steps = ModelSteps(model.system, model.values, batch)
-    return records, batch, run(batch, measurement, noise, steps), measurement
+    return records, batch, filter_batch(batch, measurement, noise, steps), measurement
 
 
 def _estimates(
-    records: list[Record], batch: Batch, filtered: Filtered, x: Array, P: Array
+    records: list[Record], batch: RecordBatch, filtered: Filtered, x: Array, P: Array
 ) -> list[Estimated]:
     found = []
     for b, record in enumerate(records):

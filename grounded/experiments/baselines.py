@@ -30,7 +30,7 @@ import numpy as np
 from grounded.experiments.bench import KINDS, Bench, bench, optimum, standing_still, true_utility
 from grounded.experiments.car_tasks import NAMES
 from grounded.experiments.ilc import gradient_of, lifted, update
-from grounded.experiments.jobs import Engine, Job, Progress, Table, run_jobs
+from grounded.experiments.jobs import Engine, Job, Progress, StudyTable, run_jobs
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.policy import Policy
@@ -51,7 +51,7 @@ class Kept:
     utility: float
 
 
-def search(case: Bench, options: Options, refit: Refit | None = None) -> list[Kept]:
+def paper_search(case: Bench, options: Options, refit: Refit | None = None) -> list[Kept]:
     """This algorithm, through the function behind `grounded propose`."""
     candidates: list[Candidate] = []
     trials: list[Trial] = []
@@ -69,7 +69,7 @@ def search(case: Bench, options: Options, refit: Refit | None = None) -> list[Ke
         trials.append(replace(trial, candidate=proposal.candidate.id))
 
 
-def fitted(task: Task, trials: Sequence[Trial]) -> Model:
+def fitted_model(task: Task, trials: Sequence[Trial]) -> Model:
     """The model with all its parameters fitted to whole trials."""
     from grounded.fit import fit
 
@@ -86,7 +86,7 @@ def refit_alone(case: Bench, options: Options, rounds: int = 6) -> list[Kept]:
         trials += repeats
         utility = float(np.mean([case.task.utility(trial) for trial in repeats]))
         kept.append(Kept(len(trials), policy, utility))
-        task = case.task.with_model(fitted(case.task, trials))
+        task = case.task.with_model(fitted_model(case.task, trials))
     return kept
 
 
@@ -152,13 +152,13 @@ def differences(case: Bench, options: Options, budget: int = 5000) -> list[Kept]
 def run_method(name: str, case: Bench, options: Options) -> list[Kept]:
     """The policies that a method keeps, in the order of real trials."""
     if name == "grounded":
-        return search(case, options)
+        return paper_search(case, options)
     if name == "paper":
-        return search(case, replace(options, step="full", match_inputs=False))
+        return paper_search(case, replace(options, step="full", match_inputs=False))
     if name == "refit+bias":
-        return search(case, replace(options, refit=True), fitted)
+        return paper_search(case, replace(options, refit=True), fitted_model)
     if name == "gradient":
-        return search(case, replace(options, method="policy-gradient"))
+        return paper_search(case, replace(options, method="policy-gradient"))
     if name == "refit":
         return refit_alone(case, options)
     if name == "ilc":
@@ -198,12 +198,12 @@ class BaselinesResult:
         """Lines by name."""
         return {"shares": list(SHARES), "lines": [vars(line) for line in self.lines]}
 
-    def tables(self) -> list[Table]:
+    def tables(self) -> list[StudyTable]:
         """Median trials to 50/90/97/99 % and the median and worst share reached, by method."""
         cases = dict.fromkeys((line.manoeuvre, line.kind) for line in self.lines)
         return [self._table(manoeuvre, kind) for manoeuvre, kind in cases]
 
-    def _table(self, manoeuvre: str, kind: str) -> Table:
+    def _table(self, manoeuvre: str, kind: str) -> StudyTable:
         rows = []
         chosen = [li for li in self.lines if (li.manoeuvre, li.kind) == (manoeuvre, kind)]
         for method in dict.fromkeys(line.method for line in chosen):
@@ -213,7 +213,7 @@ class BaselinesResult:
             rows.append((method, counts, f"{np.median(finals):.1%}", f"{min(finals):.1%}"))
         title = f"{manoeuvre}, {kind} error: median of {len(chosen) // max(len(rows), 1)} seeds"
         head = ("method", "trials to 50/90/97/99 %", "gap closed", "worst")
-        return Table(title, head, tuple(rows))
+        return StudyTable(title, head, tuple(rows))
 
 
 def median_trials(trials: Sequence[int | None]) -> str:
@@ -234,7 +234,7 @@ def run(
 ) -> BaselinesResult:
     """Every method on every case; a job is one of them."""
     jobs = [
-        Job(one, {"method": method, "manoeuvre": manoeuvre, "kind": kind, "seed": seed})
+        Job(baselines_job, {"method": method, "manoeuvre": manoeuvre, "kind": kind, "seed": seed})
         for manoeuvre in manoeuvres
         for kind in kinds
         for method in methods
@@ -247,7 +247,7 @@ def run(
     )
 
 
-def one(method: str, manoeuvre: str, kind: str, seed: int) -> dict[str, Any]:
+def baselines_job(method: str, manoeuvre: str, kind: str, seed: int) -> dict[str, Any]:
     """A job: one method, one case."""
     case = bench(manoeuvre, kind, seed)
     noisy = kind == "noise"

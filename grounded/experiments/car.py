@@ -20,7 +20,15 @@ import numpy as np
 
 from grounded.experiments.bench import Bench, optimum, true_utility
 from grounded.experiments.car_tasks import NAMES, car_task
-from grounded.experiments.jobs import Engine, Job, Progress, Table, improvement, mean_se, run_jobs
+from grounded.experiments.jobs import (
+    Engine,
+    Job,
+    Progress,
+    StudyTable,
+    improvement,
+    mean_se,
+    run_jobs,
+)
 from grounded.experiments.real_car import LATENCY, real_car, real_plant
 from grounded.models.car import model as car
 from grounded.search.improve import learn
@@ -73,7 +81,7 @@ class CarResult:
         figures = {name: some[0].paths for name in NAMES if (some := self.of(name, True))}
         return {"runs": runs, "figures": figures, "paper": PAPER}
 
-    def tables(self) -> list[Table]:
+    def tables(self) -> list[StudyTable]:
         """Improvement and trials beside the paper's, quiet and with scatter."""
         rows = []
         for name in dict.fromkeys(run.manoeuvre for run in self.runs):
@@ -89,7 +97,7 @@ class CarResult:
             "trials an iteration",
             "paper",
         )
-        return [Table(f"RC car, up to {ITERATIONS} iterations", head, tuple(rows))]
+        return [StudyTable(f"RC car, up to {ITERATIONS} iterations", head, tuple(rows))]
 
 
 def _cells(runs: list[CarRun]) -> tuple[str, str, str]:
@@ -114,7 +122,7 @@ def run(
 ) -> CarResult:
     """Every manoeuvre once without scatter and once for each seed with it."""
     jobs = [
-        Job(one, {"manoeuvre": manoeuvre, "seed": seed, "noisy": noisy})
+        Job(car_job, {"manoeuvre": manoeuvre, "seed": seed, "noisy": noisy})
         for manoeuvre in manoeuvres
         for noisy, some in ((False, [0]), (True, seeds))
         for seed in some
@@ -136,7 +144,7 @@ def real_case(manoeuvre: str, seed: int, noisy: bool) -> Bench:
     return Bench(task, truth, real_plant(noisy), seed)
 
 
-def one(manoeuvre: str, seed: int, noisy: bool) -> dict[str, Any]:
+def car_job(manoeuvre: str, seed: int, noisy: bool) -> dict[str, Any]:
     """A job: one repetition of one manoeuvre."""
     case = real_case(manoeuvre, seed, noisy)
     options = Options(max_trials=BUDGET)

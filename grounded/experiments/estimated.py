@@ -33,11 +33,19 @@ from typing import Any
 
 import numpy as np
 
-from grounded.estimate import Measurement, Noise, Record, Tracker, noise_of, smooth_trials
+from grounded.estimate import Measurement, NoiseLevels, Record, Tracker, noise_of, smooth_trials
 from grounded.experiments.bench import Bench, optimum, standing_still
 from grounded.experiments.car import BUDGET, ITERATIONS, PAPER, real_case
 from grounded.experiments.driving import RATE, START, film, hands, markers
-from grounded.experiments.jobs import Engine, Job, Progress, Table, improvement, mean_se, run_jobs
+from grounded.experiments.jobs import (
+    Engine,
+    Job,
+    Progress,
+    StudyTable,
+    improvement,
+    mean_se,
+    run_jobs,
+)
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.plant import Plant
@@ -77,7 +85,7 @@ class Filmed:
     plant: Plant
     see: Measurement
     camera: float
-    noise: Noise
+    noise: NoiseLevels
 
     def run(self, policy: Policy, rng: np.random.Generator, *, estimated: bool = True) -> Flown:
         """Executes a policy once; `estimated` False: the controller is given the true states.
@@ -247,7 +255,7 @@ class EstimatedResult:
             "paper": {name: PAPER[name] for name in NAMES},
         }
 
-    def tables(self) -> list[Table]:
+    def tables(self) -> list[StudyTable]:
         """Improvement on estimated beside true states, and how good the estimates were."""
         names = dict.fromkeys(run.manoeuvre for run in self.runs)
         groups = [(name, way, self.of(name, way)) for name in names for way in WAYS]
@@ -267,8 +275,8 @@ class EstimatedResult:
             row for name, _, runs in groups if runs and runs[0].live for row in _errors(name, runs)
         ]
         return [
-            Table(title, head, tuple(rows)),
-            Table("Errors of the estimates, rms over all trials", head2, tuple(rows2)),
+            StudyTable(title, head, tuple(rows)),
+            StudyTable("Errors of the estimates, rms over all trials", head2, tuple(rows2)),
         ]
 
 
@@ -305,7 +313,7 @@ def run(
 ) -> EstimatedResult:
     """Every manoeuvre for each seed, on estimated and on true states."""
     jobs = [
-        Job(one, {"manoeuvre": manoeuvre, "seed": int(seed), "states": states})
+        Job(estimated_job, {"manoeuvre": manoeuvre, "seed": int(seed), "states": states})
         for manoeuvre in manoeuvres
         for states in WAYS
         for seed in seeds
@@ -320,7 +328,7 @@ def _read(result: dict[str, Any]) -> EstimatedRun:
     return EstimatedRun(**(result | tuples))
 
 
-def assumed_noise(case: Bench, see: Measurement, seed: int) -> Noise:
+def assumed_noise(case: Bench, see: Measurement, seed: int) -> NoiseLevels:
     """Process and measurement noise of the crude model on manual driving of the real car."""
     rng = np.random.default_rng([seed, 13])
     plant, task = case.plant, case.task
@@ -338,7 +346,7 @@ def assumed_noise(case: Bench, see: Measurement, seed: int) -> Noise:
     return noise_of(task.model, films, latency=task.latency, measurement=see).noise
 
 
-def one(manoeuvre: str, seed: int, states: str) -> dict[str, Any]:
+def estimated_job(manoeuvre: str, seed: int, states: str) -> dict[str, Any]:
     """A job: one search on estimated ("camera") or true states."""
     case = real_case(manoeuvre, seed, True)
     see = markers(SPACING)

@@ -21,7 +21,7 @@ import numpy as np
 
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded.models.aircraft import trim
+from grounded.models.aircraft import level_trim
 from grounded.task import Task
 from grounded.utility import Reward
 
@@ -91,7 +91,7 @@ def flight_task(model: Model, started_by: Model | None = None) -> Task:
     target[:, columns] = path
     weights = np.zeros(model.n)
     weights[columns] = POSITION
-    start = trim(model if started_by is None else started_by, speed[:1], np.zeros(1), DT)
+    start = level_trim(model if started_by is None else started_by, speed[:1], np.zeros(1), DT)
     low, high = np.array([LIMITS[name] for name in model.input_names]).T
     ones = np.ones(model.m)
     return Task(

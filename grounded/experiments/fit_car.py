@@ -29,7 +29,7 @@ import numpy as np
 
 from grounded.estimate import Record
 from grounded.experiments.driving import RATE, drive, markers
-from grounded.experiments.jobs import Engine, Job, Progress, Table, run_jobs
+from grounded.experiments.jobs import Engine, Job, Progress, StudyTable, run_jobs
 from grounded.fit import fit
 from grounded.frozen import Array
 from grounded.model import Model
@@ -166,7 +166,7 @@ class FitCarResult:
             "coverage_all": float(np.mean(every)),
         }
 
-    def tables(self) -> list[Table]:
+    def tables(self) -> list[StudyTable]:
         """Per parameter: error of the first value, of the fit, the stated std, the coverage."""
         rows = []
         for name, share in self.coverage.items():
@@ -178,7 +178,7 @@ class FitCarResult:
             rows.append((f"{name} [{each[0]['unit']}]", *row))
         head = ("parameter", "first value's error", "fit's error", "stated std", "inside 95 %")
         title = f"Parameters from {self.minutes:g} minutes of driving, {len(self.runs)} cars"
-        return [Table(title, head, tuple(rows))]
+        return [StudyTable(title, head, tuple(rows))]
 
 
 def fit_car(
@@ -198,18 +198,18 @@ def fit_car(
         finished: results of earlier jobs.
         progress: called with jobs done and jobs in all.
     """
-    jobs = [Job(one_car, {"seed": int(seed), "minutes": minutes}) for seed in seeds]
+    jobs = [Job(fit_car_job, {"seed": int(seed), "minutes": minutes}) for seed in seeds]
     found = run_jobs(jobs, engine, finished=finished, progress=progress)
     return FitCarResult(tuple(found), minutes)
 
 
-def one_car(seed: int, minutes: float) -> dict[str, Any]:
+def fit_car_job(seed: int, minutes: float) -> dict[str, Any]:
     """One car: driven, filmed, estimated."""
     rng = np.random.default_rng(seed)
     truth, latency = true_car(rng)
     records = drive(truth, latency, minutes, rng)
     length = truth.params["L"].value
-    first = first_values(records, length, bench(truth, rng))
+    first = first_values(records, length, bench_angles(truth, rng))
     begin = np.full(2, first.pop("latency"))
     start = car.with_values({**first, "L": length})
     found = fit(
@@ -244,7 +244,7 @@ def true_car(rng: np.random.Generator) -> tuple[Model, float]:
     return car.with_values(values), float(rng.uniform(0.08, 0.12))
 
 
-def bench(truth: Model, rng: np.random.Generator) -> tuple[Array, Array]:
+def bench_angles(truth: Model, rng: np.random.Generator) -> tuple[Array, Array]:
     """Steering angles [rad] measured by hand for inputs from -1 to 1, car standing."""
     u = np.linspace(-1, 1, 9)
     p = truth.params

@@ -25,7 +25,7 @@ from grounded.experiments.jobs import (
     Engine,
     Job,
     Progress,
-    Table,
+    StudyTable,
     improvement,
     jsonable,
     mean_se,
@@ -125,7 +125,7 @@ class FlightResult:
         whole = {"runs": runs, **self.summary(), "figure": figure, "paper": PAPER}
         return dict(jsonable(whole))
 
-    def tables(self) -> list[Table]:
+    def tables(self) -> list[StudyTable]:
         """Table 1 beside the paper's."""
         found = self.summary()
         gain = found["improvement"]
@@ -148,7 +148,7 @@ class FlightResult:
             ("discarded", f"{found['discarded']} of {len(self.runs)}", "about 20 %"),
         )
         title = f"Table 1: flight simulator, {len(self.flown)} runs, mean (± one standard error)"
-        return [Table(title, ("", "here", "paper"), rows)]
+        return [StudyTable(title, ("", "here", "paper"), rows)]
 
 
 def run(
@@ -179,11 +179,11 @@ def run(
         if len(found) >= 5 * count:
             raise GroundedError(f"{len(found)} models and fewer than {count} flyable ones")
         missing = count - sum(not r.discarded for r in found)
-        jobs = [Job(one, {"seed": s, "step": step}) for s in range(seed, seed + missing)]
+        jobs = [Job(flight_job, {"seed": s, "step": step}) for s in range(seed, seed + missing)]
         seed += missing
         found += [_read(r) for r in run_jobs(jobs, engine, finished=finished, progress=progress)]
     path, _, _ = figure8_target()
-    return FlightResult(tuple(found), optimum(), path[::FIGURE_STEP].tolist())
+    return FlightResult(tuple(found), flight_optimum(), path[::FIGURE_STEP].tolist())
 
 
 def _read(result: dict[str, Any]) -> FlightRun:
@@ -191,13 +191,13 @@ def _read(result: dict[str, Any]) -> FlightRun:
     return FlightRun(**result)
 
 
-def optimum() -> float:
+def flight_optimum() -> float:
     """Utility of DDP on the true parameters."""
     _, result = first_policy(flight_task(aircraft))
     return -result.cost
 
 
-def one(seed: int, step: str) -> dict[str, Any]:
+def flight_job(seed: int, step: str) -> dict[str, Any]:
     """A job: one approximate model, five iterations."""
     truth = flight_task(aircraft)
     crude = perturbed(aircraft, np.random.default_rng(seed))

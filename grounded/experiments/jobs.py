@@ -228,7 +228,7 @@ def _import(name: str, remedy: str) -> Any:
 
 
 @dataclass(frozen=True)
-class Table:
+class StudyTable:
     """A title, column heads and rows of text, for the terminal and for docs/experiments.md."""
 
     title: str
@@ -258,7 +258,7 @@ def jsonable(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def slope(x: Sequence[float], y: Sequence[float]) -> tuple[float, float]:
+def loglog_slope(x: Sequence[float], y: Sequence[float]) -> tuple[float, float]:
     """Least-squares slope of log y over log x, and its standard error."""
     u, v = np.log(np.asarray(x, dtype=float)), np.log(np.asarray(y, dtype=float))
     centred = u - u.mean()

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from grounded.experiments.bench import bench, optimum, scaled, true_utility
-from grounded.experiments.jobs import Engine, Job, Progress, Table, mean_se, run_jobs
+from grounded.experiments.jobs import Engine, Job, Progress, StudyTable, mean_se, run_jobs
 from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.search.improve import propose
@@ -39,7 +39,7 @@ FRESH = 30  # runs that judge a policy
 
 
 @dataclass(frozen=True)
-class Rule:
+class LineSearchRule:
     """How trials decide."""
 
     name: str
@@ -50,13 +50,13 @@ class Rule:
 
 
 RULES = (
-    Rule("single trials, alpha to 1/64", 1, 6),
-    Rule("single trials, alpha to 1/8", 1, 3),
-    Rule("single trials, incumbent again", 1, 3, again=True),
-    Rule("losses checked, alpha to 1/64", 1, 6, checked=True),
-    Rule("losses checked, alpha to 1/8", 1, 3, checked=True),
-    Rule("2 trials, alpha to 1/8", 2, 3),
-    Rule("3 trials, alpha to 1/8", 3, 3),
+    LineSearchRule("single trials, alpha to 1/64", 1, 6),
+    LineSearchRule("single trials, alpha to 1/8", 1, 3),
+    LineSearchRule("single trials, incumbent again", 1, 3, again=True),
+    LineSearchRule("losses checked, alpha to 1/64", 1, 6, checked=True),
+    LineSearchRule("losses checked, alpha to 1/8", 1, 3, checked=True),
+    LineSearchRule("2 trials, alpha to 1/8", 2, 3),
+    LineSearchRule("3 trials, alpha to 1/8", 3, 3),
 )
 
 
@@ -115,7 +115,7 @@ class NoiseResult:
         )
         return np.array([values[-1] for values in own])
 
-    def _summary(self) -> Table:
+    def _summary(self) -> StudyTable:
         rows, recommended = [], self.recommended
         for rule in self._rules:
             closed, early, trials = (
@@ -133,19 +133,19 @@ class NoiseResult:
                 )
             )
         head = ("rule (*: recommended)", "gap closed", "worst", f"after {EARLY}", "trials")
-        return Table("all cases: means", head, tuple(rows))
+        return StudyTable("all cases: means", head, tuple(rows))
 
     def _of(self, rule: str, manoeuvre: str, level: float) -> list[Outcome]:
         wanted = (rule, manoeuvre, level)
         return [o for o in self.outcomes if (o.rule, o.manoeuvre, o.level) == wanted]
 
-    def tables(self) -> list[Table]:
+    def tables(self) -> list[StudyTable]:
         """By manoeuvre and level: false acceptances, share closed, flattery; then all cases."""
         cases = dict.fromkeys((o.manoeuvre, o.level) for o in self.outcomes)
         each = [self._table(manoeuvre, level) for manoeuvre, level in cases]
         return [*each, self._summary()]
 
-    def _table(self, manoeuvre: str, level: float) -> Table:
+    def _table(self, manoeuvre: str, level: float) -> StudyTable:
         rows = []
         for rule in self._rules:
             own = self._of(rule, manoeuvre, level)
@@ -166,7 +166,7 @@ class NoiseResult:
             )
         after = f"after {EARLY}"
         head = ("rule", "false acceptances", "gap closed", "worst", after, "flattered by", "trials")
-        return Table(f"{manoeuvre}, scatter x{level:g}", head, tuple(rows))
+        return StudyTable(f"{manoeuvre}, scatter x{level:g}", head, tuple(rows))
 
 
 def run(
@@ -174,14 +174,14 @@ def run(
     *,
     manoeuvres: Sequence[str] = MANOEUVRES,
     levels: Sequence[float] = LEVELS,
-    rules: Sequence[Rule] = RULES,
+    rules: Sequence[LineSearchRule] = RULES,
     engine: Engine | None = None,
     finished: MutableMapping[str, dict[str, Any]] | None = None,
     progress: Progress | None = None,
 ) -> NoiseResult:
     """Every rule on every case; a job is one of them."""
     jobs = [
-        Job(one, {"rule": vars(rule), "manoeuvre": manoeuvre, "level": level, "seed": seed})
+        Job(repeats_job, {"rule": vars(rule), "manoeuvre": manoeuvre, "level": level, "seed": seed})
         for manoeuvre in manoeuvres
         for level in levels
         for rule in rules
@@ -191,9 +191,9 @@ def run(
     return NoiseResult(tuple(Outcome(**result) for result in found))
 
 
-def one(rule: dict[str, Any], manoeuvre: str, level: float, seed: int) -> dict[str, Any]:
+def repeats_job(rule: dict[str, Any], manoeuvre: str, level: float, seed: int) -> dict[str, Any]:
     """A job: one rule, one case."""
-    how = Rule(**rule)
+    how = LineSearchRule(**rule)
     case = bench(manoeuvre, "noise", seed)
     best, _ = optimum(case)
     case = replace(case, plant=scaled(case.plant, level))
@@ -220,7 +220,7 @@ def one(rule: dict[str, Any], manoeuvre: str, level: float, seed: int) -> dict[s
 
 
 def _search(
-    rule: Rule, real: Callable[[Policy, int], Trial], task: Task
+    rule: LineSearchRule, real: Callable[[Policy, int], Trial], task: Task
 ) -> tuple[list[tuple[int, Policy]], float, int]:
     """The policies kept in turn and after how many trials, what the last one claims, trials run."""
     options = Options(

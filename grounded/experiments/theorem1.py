@@ -31,11 +31,11 @@ from grounded.experiments.jobs import (
     Engine,
     Job,
     Progress,
-    Table,
+    StudyTable,
     jsonable,
+    loglog_slope,
     mean_se,
     run_jobs,
-    slope,
 )
 from grounded.frozen import Array
 from grounded.model import Model, Param
@@ -83,8 +83,8 @@ class Theorem1Result:
         for seed in dict.fromkeys(row.seed for row in self.rows):
             own = [row for row in self.rows if row.seed == seed]
             x = [row.epsilon for row in own]
-            found["gradient_error"].append(slope(x, [row.error for row in own])[0])
-            found["squared_gradient"].append(slope(x, [row.squared for row in own])[0])
+            found["gradient_error"].append(loglog_slope(x, [row.error for row in own])[0])
+            found["squared_gradient"].append(loglog_slope(x, [row.squared for row in own])[0])
         return {name: mean_se(values) for name, values in found.items()}
 
     def to_json(self) -> dict[str, Any]:
@@ -96,7 +96,7 @@ class Theorem1Result:
         found |= {"largest_ratio_to_bound": worst, "paper": paper}
         return dict(jsonable(found))
 
-    def tables(self) -> list[Table]:
+    def tables(self) -> list[StudyTable]:
         """Medians by epsilon, and the slopes beside the theorem's."""
         rows = []
         for epsilon in dict.fromkeys(row.epsilon for row in self.rows):
@@ -126,8 +126,8 @@ class Theorem1Result:
         seeds = len(self.rows) // max(len(rows), 1)
         title = f"Theorem 1: medians of {seeds} seeds" if seeds > 1 else "Theorem 1: one seed"
         return [
-            Table(title, head, tuple(rows)),
-            Table("Slopes (± one standard error)", ("", "here", "theorem"), slopes),
+            StudyTable(title, head, tuple(rows)),
+            StudyTable("Slopes (± one standard error)", ("", "here", "theorem"), slopes),
         ]
 
 
@@ -144,7 +144,9 @@ def run(
     progress: Progress | None = None,
 ) -> Theorem1Result:
     """A search for each epsilon and seed; the seed draws the shape of the model's error."""
-    jobs = [Job(one, {"epsilon": float(e), "seed": seed}) for e in epsilons for seed in seeds]
+    jobs = [
+        Job(theorem1_job, {"epsilon": float(e), "seed": seed}) for e in epsilons for seed in seeds
+    ]
     found = run_jobs(jobs, engine, finished=finished, progress=progress)
     return Theorem1Result(tuple(Theorem1Row(**result) for result in found))
 
@@ -185,7 +187,7 @@ def theorem1_task(epsilon: float, seed: int) -> Task:
     )
 
 
-def one(epsilon: float, seed: int) -> dict[str, Any]:
+def theorem1_job(epsilon: float, seed: int) -> dict[str, Any]:
     """A job: one search to its end."""
     task = theorem1_task(epsilon, seed)
     truth = task.with_model(task.model.with_values({"eps": 0.0}))

@@ -8,6 +8,6 @@ from __future__ import annotations
 
 from grounded.fit.parameters import fit
 from grounded.fit.prediction import PredictionError, prediction_error
-from grounded.fit.result import Estimate, Fit
+from grounded.fit.result import Fit, FittedValue
 
-__all__ = ["Estimate", "Fit", "PredictionError", "fit", "prediction_error"]
+__all__ = ["Fit", "FittedValue", "PredictionError", "fit", "prediction_error"]

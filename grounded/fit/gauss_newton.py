@@ -28,9 +28,9 @@ from numpy.typing import NDArray
 
 from grounded.compile import System
 from grounded.errors import GroundedError, nearest
-from grounded.estimate import Measurement, Noise, Record
-from grounded.estimate.filter import run, sensitivity
-from grounded.estimate.record import Batch, batch_of
+from grounded.estimate import Measurement, NoiseLevels, Record
+from grounded.estimate.filter import filter_batch, sensitivity
+from grounded.estimate.record import RecordBatch, batch_of
 from grounded.estimate.recursion import Filtered
 from grounded.estimate.steps import ModelSteps
 from grounded.frozen import Array
@@ -145,8 +145,8 @@ class Climb:
 
 
 def climb(
-    data: Data,
-    noise: Noise,
+    data: FitData,
+    noise: NoiseLevels,
     start: Point,
     free: NDArray[np.bool_],
     max_steps: int = 20,
@@ -170,15 +170,15 @@ def climb(
 
 
 def _step(
-    data: Data,
-    noise: Noise,
+    data: FitData,
+    noise: NoiseLevels,
     at: Point,
     slopes: Linear,
     free: NDArray[np.bool_],
     damping: float,
 ) -> tuple[Point, Linear, float, str]:
     for _ in range(12):
-        delta, promise = direction(data, at.theta, slopes, free, damping)
+        delta, promise = damped_step(data, at.theta, slopes, free, damping)
         if promise < ENOUGH:
             return at, slopes, damping, "converged"
         there = point(data, noise, data.unknowns.clipped(at.theta + delta), at)
@@ -193,8 +193,8 @@ def _step(
     return at, slopes, damping, "no step rises further"
 
 
-def direction(
-    data: Data, theta: Array, slopes: Linear, free: NDArray[np.bool_], damping: float
+def damped_step(
+    data: FitData, theta: Array, slopes: Linear, free: NDArray[np.bool_], damping: float
 ) -> tuple[Array, float]:
     """The damped step (k,) and the gain in nats that the linear problem promises of it."""
     unknowns = data.unknowns
@@ -215,7 +215,7 @@ def direction(
 
 
 @dataclass(frozen=True, eq=False)
-class Data:
+class FitData:
     """Records with what measures them: all that a likelihood needs beside theta and the noise."""
 
     system: System
@@ -223,7 +223,7 @@ class Data:
     measurement: Measurement
     unknowns: Unknowns
 
-    def batch(self, theta: Array) -> Batch:
+    def batch(self, theta: Array) -> RecordBatch:
         """The records side by side, inputs delayed as theta says."""
         latency = self.unknowns.unpack(theta)[1]
         return batch_of(self.records, self.measurement, self.system.n, latency)
@@ -234,7 +234,7 @@ class Point:
     """The likelihood at one theta."""
 
     theta: Array
-    batch: Batch
+    batch: RecordBatch
     filtered: Filtered
 
     @property
@@ -252,16 +252,16 @@ class Linear:
     block: NDArray[np.int64]  # (rows,) the piece of time that a row belongs to
 
 
-def point(data: Data, noise: Noise, theta: Array, near: Point | None = None) -> Point:
+def point(data: FitData, noise: NoiseLevels, theta: Array, near: Point | None = None) -> Point:
     """One pass of the filter at theta; `near`: a point not far from it, which saves time."""
     batch = data.batch(theta)
     p = data.unknowns.unpack(theta)[0]
     steps = ModelSteps(data.system, p, batch, wide=True)
     about = None if near is None else near.filtered
-    return Point(theta, batch, run(batch, data.measurement, noise, steps, about))
+    return Point(theta, batch, filter_batch(batch, data.measurement, noise, steps, about))
 
 
-def linear(data: Data, at: Point, blocks: int = 60) -> Linear:
+def linear(data: FitData, at: Point, blocks: int = 60) -> Linear:
     """Slopes at a point whose filter got through.
 
     Args:
@@ -275,7 +275,7 @@ def linear(data: Data, at: Point, blocks: int = 60) -> Linear:
     return Linear(W[seen], at.filtered.eps[seen], _blocks(at.batch, blocks)[seen])
 
 
-def _change_of_the_next_state(data: Data, at: Point) -> Array:
+def _change_of_the_next_state(data: FitData, at: Point) -> Array:
     """f_theta along the filtered track, (T, B, n, k)."""
     unknowns, batch, (T, B, n) = data.unknowns, at.batch, at.filtered.f.shape
     p = unknowns.unpack(at.theta)[0]
@@ -294,7 +294,7 @@ def _change_of_the_next_state(data: Data, at: Point) -> Array:
     return out
 
 
-def _blocks(batch: Batch, blocks: int) -> NDArray[np.int64]:
+def _blocks(batch: RecordBatch, blocks: int) -> NDArray[np.int64]:
     """A block number for each sample, (T + 1, B, ny): contiguous in time, within one record."""
     T1, B, ny = batch.seen.shape
     each = max(1, round(blocks / B))

@@ -20,7 +20,7 @@ from grounded.estimate.record import part, records_of
 from grounded.fit.gauss_newton import Latency, Unknowns, unknowns_of
 from grounded.fit.prediction import PredictionError, prediction_error
 from grounded.fit.result import Fit, report
-from grounded.fit.search import Found, data_of, first_search, search
+from grounded.fit.search import SearchEnd, data_of, first_search, search_parameters
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.task import Task
@@ -65,12 +65,12 @@ def fit(
     if max(r.steps for r in records) < 3:
         raise GroundedError("a fit needs a trial of at least 3 steps")
     rng = np.random.default_rng(0) if rng is None else rng
-    train, test = held_out(records, hold_out, horizon_s, measurement)
+    train, test = split_in_time(records, hold_out, horizon_s, measurement)
     first = first_search(data_of(model, train, measurement, unknowns), rng)
     before = after = None
     if test and np.isfinite(first.climb.at.loglik):
         before, after = judged(model, test, measurement, unknowns, first, horizon_s)
-        last = search(
+        last = search_parameters(
             data_of(model, records, measurement, unknowns), first.climb.at.theta, first.noise, rng
         )
     else:
@@ -78,7 +78,7 @@ def fit(
     return report(model, unknowns, last, before, after)
 
 
-def held_out(
+def split_in_time(
     records: Sequence[Record], share: float, horizon_s: float, measurement: Measurement
 ) -> tuple[list[Record], list[Record]]:
     """The first and the last part of every record.
@@ -108,7 +108,7 @@ def judged(
     test: Sequence[Record],
     measurement: Measurement,
     unknowns: Unknowns,
-    found: Found,
+    found: SearchEnd,
     horizon_s: float,
 ) -> tuple[PredictionError, PredictionError]:
     """Held-out prediction errors of the model before and after, each with its own noise."""

@@ -24,17 +24,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from grounded.estimate import Measurement, Noise, Record, cut
+from grounded.estimate import Measurement, NoiseLevels, Record, cut
 from grounded.estimate.likelihood import enough, first_noise, maximum_likelihood
 from grounded.estimate.record import batch_of
 from grounded.fit.gauss_newton import (
     Climb,
-    Data,
+    FitData,
     Linear,
     Point,
     Unknowns,
     climb,
-    direction,
+    damped_step,
     linear,
     point,
 )
@@ -48,20 +48,20 @@ LONG = 400  # steps; longer records are cut, so that the filter runs over the pi
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class SearchEnd:
     """Where a search ended: the last climb, the noise then and at its start, and why."""
 
-    data: Data
+    data: FitData
     climb: Climb
-    noise: Noise
-    start_noise: Noise
+    noise: NoiseLevels
+    start_noise: NoiseLevels
     thresholds: NDArray[np.bool_]  # (k,) unknowns that a scan has moved
     status: str
 
 
 def data_of(
     model: Model, records: Sequence[Record], measurement: Measurement, unknowns: Unknowns
-) -> Data:
+) -> FitData:
     """Records for a search; long ones whose states are measured directly are cut into pieces."""
     pieces: list[Record] = []
     direct = all(i >= 0 for i in measurement.states)  # else a piece would not know its start
@@ -69,29 +69,31 @@ def data_of(
         span = float(record.times[-1] - record.times[0])
         many = -(-record.steps // LONG) if direct else 1
         pieces += [record] if many <= 1 else cut(record, span / many)
-    return Data(model.system, tuple(pieces), measurement, unknowns)
+    return FitData(model.system, tuple(pieces), measurement, unknowns)
 
 
-def first_search(data: Data, rng: np.random.Generator) -> Found:
+def first_search(data: FitData, rng: np.random.Generator) -> SearchEnd:
     """From the start values; much data are searched on a draw of them first."""
     draw = enough(data.records, rng)
     if 2 * sum(r.steps for r in draw) > sum(r.steps for r in data.records):
-        return search(data, data.unknowns.start, None, rng)
-    rough = search(replace(data, records=tuple(draw)), data.unknowns.start, None, rng)
+        return search_parameters(data, data.unknowns.start, None, rng)
+    rough = search_parameters(replace(data, records=tuple(draw)), data.unknowns.start, None, rng)
     if not np.isfinite(rough.climb.at.loglik):
         return rough
-    found = search(data, rough.climb.at.theta, rough.noise, rng)
+    found = search_parameters(data, rough.climb.at.theta, rough.noise, rng)
     return replace(found, start_noise=rough.start_noise)
 
 
-def search(data: Data, theta: Array, noise: Noise | None, rng: np.random.Generator) -> Found:
+def search_parameters(
+    data: FitData, theta: Array, noise: NoiseLevels | None, rng: np.random.Generator
+) -> SearchEnd:
     """Parameters, thresholds and noise in turn until the likelihood stops rising."""
     new = noise is None
     noise = _noise(data, theta, None, rng) if noise is None else noise
     at, start_noise = point(data, noise, theta), noise
     thresholds = np.zeros(len(theta), dtype=bool)
     if not np.isfinite(at.loglik):
-        return Found(data, _stopped(at), noise, noise, thresholds, at.filtered.status)
+        return SearchEnd(data, _stopped(at), noise, noise, thresholds, at.filtered.status)
     if new:
         at = _delays(data, noise, at)
     status = "still rising"
@@ -114,7 +116,7 @@ def search(data: Data, theta: Array, noise: Noise | None, rng: np.random.Generat
         if there.loglik > at.loglik:
             at, noise = there, later
     found = Climb(at, linear(data, at), 0, status)
-    return Found(data, found, noise, start_noise, thresholds, status)
+    return SearchEnd(data, found, noise, start_noise, thresholds, status)
 
 
 def _stopped(at: Point) -> Climb:
@@ -123,7 +125,9 @@ def _stopped(at: Point) -> Climb:
     return Climb(at, nothing, 0, at.filtered.status)
 
 
-def _noise(data: Data, theta: Array, noise: Noise | None, rng: np.random.Generator) -> Noise:
+def _noise(
+    data: FitData, theta: Array, noise: NoiseLevels | None, rng: np.random.Generator
+) -> NoiseLevels:
     """The most likely noise at theta, from where it was or from scratch."""
     p, latency = data.unknowns.unpack(theta)
     records = enough(data.records, rng)
@@ -132,7 +136,7 @@ def _noise(data: Data, theta: Array, noise: Noise | None, rng: np.random.Generat
     if noise is None:
         noise = rough
     else:  # a variance that sank while the model was wrong would not rise again by itself
-        noise = Noise(
+        noise = NoiseLevels(
             np.maximum(noise.process, REVIVE * rough.process),
             np.maximum(noise.measurement, REVIVE * rough.measurement),
             noise.dt,
@@ -141,13 +145,13 @@ def _noise(data: Data, theta: Array, noise: Noise | None, rng: np.random.Generat
     return found.noise
 
 
-def _delays(data: Data, noise: Noise, at: Point) -> Point:
+def _delays(data: FitData, noise: NoiseLevels, at: Point) -> Point:
     """Each fitted latency from a scan over whole steps: it may begin far off."""
     first = len(data.unknowns.columns)
     free = ~quiet(data, linear(data, at))
     for i in range(first, data.unknowns.k):
         grid = np.arange(0.0, data.unknowns.high[i] + 1e-9, max(noise.dt, 0.02))
-        at = scan(data, noise, at, i, grid, free)[0]
+        at = profile_of(data, noise, at, i, grid, free)[0]
     return at
 
 
@@ -158,15 +162,15 @@ LEVEL = 0.05  # [nats] as good as equal
 QUIET = 1e-2  # information over the whole range below which a slope says nothing
 
 
-def quiet(data: Data, slopes: Linear) -> NDArray[np.bool_]:
+def quiet(data: FitData, slopes: Linear) -> NDArray[np.bool_]:
     """Unknowns (k,) on which the innovations do not depend to first order."""
     information = np.sum(slopes.W**2, axis=0) * data.unknowns.scale**2
     return np.asarray(information < QUIET)
 
 
-def scan(
-    data: Data,
-    noise: Noise,
+def profile_of(
+    data: FitData,
+    noise: NoiseLevels,
     at: Point,
     i: int,
     grid: Array,
@@ -195,7 +199,7 @@ def scan(
         if not np.isfinite(here.loglik):
             continue
         if others.any():
-            delta, promise = direction(data, theta, linear(data, here), others, 1e-3)
+            delta, promise = damped_step(data, theta, linear(data, here), others, 1e-3)
             profile[g] += promise
         if profile[g] > score:
             best, score = here, float(profile[g])
@@ -206,7 +210,12 @@ def scan(
 
 
 def coarse_to_fine(
-    data: Data, noise: Noise, at: Point, i: int, free: NDArray[np.bool_], width: float | None = None
+    data: FitData,
+    noise: NoiseLevels,
+    at: Point,
+    i: int,
+    free: NDArray[np.bool_],
+    width: float | None = None,
 ) -> Point:
     """The best value of unknown i: over its bounds, or within `width` of where it is.
 
@@ -218,7 +227,7 @@ def coarse_to_fine(
     grid, best = np.linspace(low, high, COARSE), at
     for round_ in range(ROUNDS):
         others = free if round_ == 0 else None  # later steps are too small to matter to them
-        best, profile = scan(data, noise, best, i, grid, others)
+        best, profile = profile_of(data, noise, best, i, grid, others)
         top = np.flatnonzero(profile > profile.max() - LEVEL)
         step = grid[1] - grid[0]
         if len(top) > 2:
@@ -230,7 +239,7 @@ def coarse_to_fine(
     return _centred(data, noise, best, i, grid[top])
 
 
-def _centred(data: Data, noise: Noise, best: Point, i: int, level: Array) -> Point:
+def _centred(data: FitData, noise: NoiseLevels, best: Point, i: int, level: Array) -> Point:
     """The middle of the values that are as good as the best: the likelihood is flat between them.
 
     An end of the level is where the next sample lies, and nothing says that it is the threshold.
@@ -246,7 +255,7 @@ def _centred(data: Data, noise: Noise, best: Point, i: int, level: Array) -> Poi
 
 
 def likelihood_interval(
-    data: Data, noise: Noise, at: Point, i: int, inflation: float = 1.0
+    data: FitData, noise: NoiseLevels, at: Point, i: int, inflation: float = 1.0
 ) -> tuple[float, float]:
     """The values of unknown i around the best whose log-likelihood is within DROP of it.
 
@@ -266,7 +275,7 @@ def likelihood_interval(
     return low, high
 
 
-def _end(data: Data, noise: Noise, at: Point, i: int, bound: float, drop: float) -> float:
+def _end(data: FitData, noise: NoiseLevels, at: Point, i: int, bound: float, drop: float) -> float:
     best = float(at.theta[i])
     span = abs(bound - best)
     if span == 0 or _loglik(data, noise, at, i, bound) > at.loglik - drop:
@@ -293,7 +302,7 @@ def _end(data: Data, noise: Noise, at: Point, i: int, bound: float, drop: float)
     return float(best + sign * outside)
 
 
-def _loglik(data: Data, noise: Noise, at: Point, i: int, value: float) -> float:
+def _loglik(data: FitData, noise: NoiseLevels, at: Point, i: int, value: float) -> float:
     theta = at.theta.copy()
     theta[i] = value
     return point(data, noise, theta, at).loglik

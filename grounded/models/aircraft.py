@@ -215,7 +215,7 @@ class Trim:
         object.__setattr__(self, "inputs", readonly(self.inputs))
 
 
-def trim(model: Model, speed: Array, turn_rate: Array, dt: float = 0.02) -> Trim:
+def level_trim(model: Model, speed: Array, turn_rate: Array, dt: float = 0.02) -> Trim:
     """Steady level flight for each pair of airspeed and turn rate.
 
     Args:

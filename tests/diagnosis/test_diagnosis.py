@@ -13,7 +13,7 @@ from grounded.diagnosis import filter as kalman
 from grounded.diagnosis.attribution import attribute
 from grounded.diagnosis.claims import loss
 from grounded.diagnosis.data import prepare, shifted
-from grounded.diagnosis.diagnose import Options, diagnose
+from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.excitation import probe
 from grounded.diagnosis.leftover import chi2_tail
 from grounded.diagnosis.prediction_error import _stump
@@ -271,7 +271,7 @@ def test_a_threshold_that_is_zero_but_for_rounding_reads_zero(scale):
 def test_without_the_family_a_look_alike_is_marked_by_what_it_leaves():
     model, trials = cart(dead=0.25, trials=6)
     library = Library().without(["dead_zone", "stall", "backlash", "stiction", "coulomb_friction"])
-    found = diagnose(model, trials, Options(library=library))
+    found = diagnose(model, trials, DiagnosisOptions(library=library))
     assert found.kind == "unknown" or found.leftover or found.gap["after"] < 1.3
 
 

@@ -53,7 +53,7 @@ def diagnose_in(
     Raises:
         GroundedError: for an unknown trial, or where there is none to learn from.
     """
-    from grounded.diagnosis.diagnose import Options, diagnose
+    from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
     from grounded.effects import Library
 
     names = [str(effect["name"]) for effect in workspace.config.model.effects]
@@ -61,7 +61,9 @@ def diagnose_in(
     library = library or Library()
     planner, used = workspace.planner, _chosen(workspace, trials)
     memory = planner.plan.model.state_names[planner.task.model.n :]
-    options = Options(library=library, max_effects=max_effects, hidden=tuple(memory), but=adopted)
+    options = DiagnosisOptions(
+        library=library, max_effects=max_effects, hidden=tuple(memory), but=adopted
+    )
     lifted = [planner.lift(trial) for trial in used]
     found = diagnose(planner.plan, lifted, options, progress=progress)
     document = found.to_dict()
