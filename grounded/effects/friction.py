@@ -20,29 +20,15 @@ from grounded.effects import places
 from grounded.effects.family import Quantity, RateFamily, Site, Values, per
 
 
-def _viscous(site: Site) -> tuple[Quantity, ...]:
-    return (Quantity("k", "1/s"),)
-
-
-def _width(site: Site, part: float) -> float:
-    return part * site.scales.peak(site.target)
-
-
 def _coulomb(site: Site) -> tuple[Quantity, ...]:
-    unit = site.unit(site.target)
-    return (
-        Quantity("c", per(unit)),
-        Quantity("width", unit, fixed=True, start=_width(site, 0.01), tunable=True),
-    )
+    unit, width = site.unit(site.target), 0.01 * site.scales.peak(site.target)
+    constant = Quantity("width", unit, fixed=True, start=width, tunable=True)
+    return (Quantity("c", per(unit)), constant)
 
 
 def _quadratic(site: Site) -> tuple[Quantity, ...]:
     unit = site.unit(site.target)
-    return (Quantity("k", _inverse(unit)),)
-
-
-def _inverse(unit: str) -> str:
-    return {"m/s": "1/m", "rad/s": "1/rad"}.get(unit, f"1/({unit} s)")
+    return (Quantity("k", {"m/s": "1/m", "rad/s": "1/rad"}.get(unit, f"1/({unit} s)")),)
 
 
 def _stiction(site: Site) -> tuple[Quantity, ...]:
@@ -52,19 +38,6 @@ def _stiction(site: Site) -> tuple[Quantity, ...]:
         Quantity("c", per(unit), grid, 0.0, np.inf, places=6),
         Quantity("v_s", unit, fixed=True, start=0.05 * peak),
     )
-
-
-def _viscous_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
-    return {site.target: -c["k"] * s[site.target]}
-
-
-def _coulomb_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
-    return {site.target: -c["c"] * np.tanh(s[site.target] / c["width"])}
-
-
-def _quadratic_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
-    v = s[site.target]
-    return {site.target: -c["k"] * v * np.abs(v)}
 
 
 def _stiction_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
@@ -80,9 +53,9 @@ viscous_friction = RateFamily(
     equation="v' = model - k v",
     sentence="{target} is damped by {k}",
     targets=places.velocities,
-    quantities=_viscous,
+    quantities=lambda site: (Quantity("k", "1/s"),),
     lookalikes=("quadratic_drag", "coulomb_friction", "input_gain", "parameter"),
-    rate=_viscous_rate,
+    rate=lambda s, a, own, t, c, site: {site.target: -c["k"] * s[site.target]},
 )
 
 coulomb_friction = RateFamily(
@@ -92,7 +65,9 @@ coulomb_friction = RateFamily(
     targets=places.velocities,
     quantities=_coulomb,
     lookalikes=("dead_zone", "viscous_friction", "offset", "stiction"),
-    rate=_coulomb_rate,
+    rate=lambda s, a, own, t, c, site: {
+        site.target: -c["c"] * np.tanh(s[site.target] / c["width"])
+    },
 )
 
 quadratic_drag = RateFamily(
@@ -102,7 +77,9 @@ quadratic_drag = RateFamily(
     targets=places.velocities,
     quantities=_quadratic,
     lookalikes=("viscous_friction", "coulomb_friction", "saturation"),
-    rate=_quadratic_rate,
+    rate=lambda s, a, own, t, c, site: {
+        site.target: -c["k"] * s[site.target] * np.abs(s[site.target])
+    },
 )
 
 stiction = RateFamily(

@@ -3,14 +3,12 @@
 Third parties add families by the entry point group `grounded.effects` (read once, by the command
 line's options.py); here a library is a plain value.
 
-The model is right in form: one of its own parameters differs from its nominal value.
+To the families of the other modules it adds `parameter`, p = nominal + d: the model is right in
+form, and one of its own parameters differs from its nominal value.
 
-p = nominal + d
-
-Effects that are the very same thing in a model: one name is offered, the one that says most.
-
-A constant rate on a state may be just what a bias of an input does, or a parameter of the model; a
-gain of a rate just what a time constant or a wheelbase does. Such a rate has no name of its own:
+Where two effects are the very same thing in a model, the name is offered that says most. A constant
+rate on a state may be just what a bias of an input does, or a parameter of the model; a gain of a
+rate just what a time constant or a wheelbase does. Such a rate has no name of its own (`aliases`):
 
     offset:s, rate_gain:s   dropped where   d rate / d p  or  d rate / d u   is k times its own rate
 
@@ -24,26 +22,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from grounded.effects import (
-    friction,
-    geometry,
-    input,
-    memory,
-    places,
-    rate,
-    sensor,
-)
+from grounded.effects import actuator, friction, geometry, places, rate, sensor
 from grounded.effects.family import Effect, Family, ParamFamily, Quantity, RateFamily, Scales, Site
 from grounded.errors import GroundedError, nearest
 from grounded.frozen import Array
-from grounded.model import Model
+from grounded.model import Model, Param
+
+
+def _bounds(param: Param) -> tuple[float, float]:
+    low = -np.inf if param.low is None else param.low
+    return low, np.inf if param.high is None else param.high
 
 
 def _shift(site: Site) -> tuple[Quantity, ...]:
     param = site.model.params[site.target]
-    low = -np.inf if param.low is None else param.low - param.value
-    high = np.inf if param.high is None else param.high - param.value
-    return (Quantity("d", param.unit, low=low, high=high),)
+    low, high = _bounds(param)
+    return (Quantity("d", param.unit, low=low - param.value, high=high - param.value),)
 
 
 parameter = ParamFamily(
@@ -56,8 +50,7 @@ parameter = ParamFamily(
 )
 
 BUILT_IN: tuple[Family, ...] = (
-    *input.FAMILIES,
-    *memory.FAMILIES,
+    *actuator.FAMILIES,
     *rate.FAMILIES,
     *friction.FAMILIES,
     *geometry.FAMILIES,
@@ -88,12 +81,8 @@ class Library:
         Raises:
             GroundedError: for a name that is not in it.
         """
-        gone = set(names)
-        known = [family.name for family in self.families]
-        for name in gone:
-            if name not in known:
-                raise GroundedError(f"there is no effect family '{name}': {nearest(name, known)}")
-        return Library(tuple(family for family in self.families if family.name not in gone))
+        gone = [self.family(name) for name in set(names)]
+        return Library(tuple(family for family in self.families if family not in gone))
 
     def family(self, name: str) -> Family:
         """The family of that name.
@@ -125,7 +114,7 @@ class Library:
 
     def candidates(self, model: Model, scales: Scales | None = None) -> tuple[Effect, ...]:
         """Every effect that can apply to a model, in the library's order."""
-        found = []
+        found, offered = [], [family.name for family in self.families]
         idle, outright = derived_states(model), outright_states(model)
         integrals, same = integrated_states(model), aliases(model, idle | outright)
         for family in self.families:
@@ -137,15 +126,10 @@ class Library:
                     continue
                 if driven[2] and integrals.get(driven[0]) == driven[2]:
                     continue  # it would be rate_gain under another name
-                if _offered(self, same.get(f"{family.name}:{target}", "")):
+                if same.get(f"{family.name}:{target}", "").partition(":")[0] in offered:
                     continue
                 found.append(_build(family, target, model, scales or Scales()))
         return tuple(found)
-
-
-def _offered(library: Library, name: str) -> bool:
-    """Whether the family of an effect is in the library."""
-    return name.partition(":")[0] in [family.name for family in library.families]
 
 
 def _build(family: Family, target: str, model: Model, scales: Scales) -> Effect:
@@ -161,10 +145,7 @@ def derived_states(model: Model) -> set[str]:
     named = places.role(model, "heading_rate")
     if not named:
         return set()
-    rng = np.random.default_rng(0)
-    x = rng.uniform(0.2, 1.0, (3, model.n))
-    u = rng.uniform(0.2, 1.0, (3, model.m))
-    f_x, _ = model.system.linearise(x, u, model.values, 0.01)
+    f_x, _ = model.system.linearise(*places.samples(model), model.values, 0.01)
     i = model.state_names.index(named[0])
     others = np.delete(f_x[:, :, i], i, axis=1)
     return {named[0]} if float(np.abs(others).max()) < 1e-12 else set()
@@ -172,8 +153,7 @@ def derived_states(model: Model) -> set[str]:
 
 def integrated_states(model: Model) -> dict[str, str]:
     """States whose rate is another state, times a constant: an angle and its angular velocity."""
-    rng, dt = np.random.default_rng(0), 1e-6
-    x, u = rng.uniform(0.2, 1.0, (3, model.n)), rng.uniform(0.2, 1.0, (3, model.m))
+    (x, u), dt = places.samples(model), 1e-6
     f_x, f_u = model.system.linearise(x, u, model.values, dt)
     rates = (f_x - np.eye(model.n)) / dt
     moved = (model.system.step(x, u, model.values, dt) - x) / dt
@@ -192,9 +172,7 @@ def integrated_states(model: Model) -> dict[str, str]:
 
 def outright_states(model: Model) -> set[str]:
     """States that the model sets outright, whatever they were: they have no rate of their own."""
-    rng = np.random.default_rng(0)
-    x, u = rng.uniform(0.2, 1.0, (3, model.n)), rng.uniform(0.2, 1.0, (3, model.m))
-    f_x, _ = model.system.linearise(x, u, model.values, 0.01)
+    f_x, _ = model.system.linearise(*places.samples(model), model.values, 0.01)
     own = np.abs(f_x[:, np.arange(model.n), np.arange(model.n)]).max(axis=0)
     return {name for name, size in zip(model.state_names, own, strict=True) if size < 1e-9}
 
@@ -224,7 +202,8 @@ def aliases(model: Model, idle: Iterable[str] = ()) -> dict[str, str]:
     x, u = rng.uniform(-1, 1, (SAMPLES, n)), rng.uniform(-1, 1, (SAMPLES, model.m))
     kept = [i for i, name in enumerate(model.state_names) if name not in set(idle)]
     found: dict[str, str] = {}
-    here, there = (_Rates(model, x, u, p, kept) for p in (model.values, _beside(model)))
+    beside = np.where(model.values == 0, 0.1, BESIDE * model.values)
+    here, there = (_Rates(model, x, u, p, kept) for p in (model.values, beside))
     for name, own in here.named.items():
         for other, slope in here.slopes.items():
             same = _along(slope, own) and _along(there.slopes[other], there.named[name])
@@ -260,18 +239,12 @@ def _along(slope: Array, own: Array) -> bool:
     return bool(lengths > 0 and np.isfinite(lengths) and (a @ b) ** 2 > (1 - SAME) * lengths)
 
 
-def _beside(model: Model) -> Array:
-    """Other values of all parameters."""
-    return np.where(model.values == 0, 0.1, BESIDE * model.values)
-
-
 def _free(model: Model, name: str) -> bool:
     """Whether a parameter may halve and double, so that it can stand for the effect."""
     family, _, target = name.partition(":")
     if family != "parameter":
         return True
     param = model.params[target]
-    low = -np.inf if param.low is None else param.low
-    high = np.inf if param.high is None else param.high
+    low, high = _bounds(param)
     ends = (0.5 * param.value, 2 * param.value) if param.value else (-0.05, 0.05)
     return bool(low <= min(ends) and high >= max(ends))
