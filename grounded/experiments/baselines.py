@@ -1,4 +1,4 @@
-"""Ways to learn a manoeuvre, each as a list of the policies that it would keep, by real trials.
+"""Baselines: how many real trials each of seven methods needs, and where it ends.
 
     paper        this algorithm as the paper has it: the bias alone, DDP to convergence
     grounded     this algorithm as the tool recommends it: matched inputs, damped steps
@@ -11,62 +11,39 @@
 A method sees the task with the crude model and a function that runs a policy on the real system;
 `differences` is told the true gradient, and charged the trials that differencing would have cost.
 
-Baselines: how many real trials each method needs, and where it ends.
-
-Three manoeuvres of the car, three kinds of error (`bench`), a number of seeds. Of each policy that
-a method keeps, the TRUE utility counts: in a quiet world that of its trial, with noise the mean of
-fresh runs, because a winner's own trials flatter it. Zero is the model's own policy (the eighth
-method: model-based alone), one the optimum that knows the real car.
+They meet on three manoeuvres of the car, three kinds of error (`bench`), a number of seeds. Of each
+policy that a method keeps, the TRUE utility counts: in a quiet world that of its trial, with noise
+the mean of fresh runs, because a winner's own trials flatter it. Zero is the model's own policy
+(the eighth method: model-based alone), one the optimum that knows the real car.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, MutableMapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
-from grounded.experiments.bench import KINDS, Bench, bench, optimum, standing_still, true_utility
+from grounded.experiments.bench import (
+    KINDS,
+    Bench,
+    Kept,
+    bench,
+    optimum,
+    searched,
+    standing_still,
+    true_utility,
+)
 from grounded.experiments.car_tasks import NAMES
 from grounded.experiments.ilc import gradient_of, lifted, update
-from grounded.experiments.jobs import Engine, Job, Progress, StudyTable, run_jobs
+from grounded.experiments.jobs import Job, Running, StudyTable, run_jobs
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded.policy import Policy
-from grounded.search.improve import first_policy, propose
-from grounded.search.standing import Candidate, Options
+from grounded.search.improve import first_policy
+from grounded.search.standing import Options
 from grounded.task import Task
 from grounded.trial import Trial, mean_trial
-
-Refit = Callable[[Task, Sequence[Trial]], Model]
-
-
-@dataclass(frozen=True, eq=False)
-class Kept:
-    """A policy that a method would return after so many trials, and the utility it measured."""
-
-    trials: int
-    policy: Policy
-    utility: float
-
-
-def paper_search(case: Bench, options: Options, refit: Refit | None = None) -> list[Kept]:
-    """This algorithm, through the function behind `grounded propose`."""
-    candidates: list[Candidate] = []
-    trials: list[Trial] = []
-    kept: list[Kept] = []
-    while True:
-        proposal = propose(case.task, candidates, trials, options, refit=refit)
-        best = proposal.standing.incumbent
-        if best is not None and (not kept or kept[-1].policy is not best.candidate.policy):
-            kept.append(Kept(len(trials), best.candidate.policy, best.utility))
-        if proposal.candidate is None:
-            return kept
-        if proposal.is_new:
-            candidates.append(proposal.candidate)
-        trial = case.real(proposal.candidate.policy, len(trials))
-        trials.append(replace(trial, candidate=proposal.candidate.id))
 
 
 def fitted_model(task: Task, trials: Sequence[Trial]) -> Model:
@@ -151,20 +128,17 @@ def differences(case: Bench, options: Options, budget: int = 5000) -> list[Kept]
 
 def run_method(name: str, case: Bench, options: Options) -> list[Kept]:
     """The policies that a method keeps, in the order of real trials."""
-    if name == "grounded":
-        return paper_search(case, options)
-    if name == "paper":
-        return paper_search(case, replace(options, step="full", match_inputs=False))
-    if name == "refit+bias":
-        return paper_search(case, replace(options, refit=True), fitted_model)
-    if name == "gradient":
-        return paper_search(case, replace(options, method="policy-gradient"))
-    if name == "refit":
-        return refit_alone(case, options)
-    if name == "ilc":
-        return learning_control(case, options)
-    assert name == "differences", name
-    return differences(case, options)
+    ours: dict[str, dict[str, Any]] = {
+        "paper": {"step": "full", "match_inputs": False},
+        "grounded": {},
+        "refit+bias": {"refit": True},
+        "gradient": {"method": "policy-gradient"},
+    }
+    if name in ours:
+        refit = fitted_model if name == "refit+bias" else None
+        return searched(case, replace(options, **ours[name]), refit=refit)[0]
+    others = {"refit": refit_alone, "ilc": learning_control, "differences": differences}
+    return others[name](case, options)
 
 
 METHODS = ("paper", "grounded", "refit+bias", "gradient", "refit", "ilc", "differences")
@@ -228,9 +202,7 @@ def run(
     manoeuvres: Sequence[str] = NAMES,
     kinds: Sequence[str] = KINDS,
     methods: Sequence[str] = METHODS,
-    engine: Engine | None = None,
-    finished: MutableMapping[str, dict[str, Any]] | None = None,
-    progress: Progress | None = None,
+    **how: Unpack[Running],
 ) -> BaselinesResult:
     """Every method on every case; a job is one of them."""
     jobs = [
@@ -241,7 +213,7 @@ def run(
         for seed in seeds
         if not (method == "differences" and kind == "noise")  # it was given the true gradient
     ]
-    found = run_jobs(jobs, engine, finished=finished, progress=progress)
+    found = run_jobs(jobs, **how)
     return BaselinesResult(
         tuple(Line(**(result | {"trials": tuple(result["trials"])})) for result in found)
     )
@@ -270,12 +242,5 @@ def baselines_job(method: str, manoeuvre: str, kind: str, seed: int) -> dict[str
         for i, level in enumerate(SHARES):
             if reached[i] is None and share >= level:
                 reached[i] = used
-    return {
-        "method": method,
-        "manoeuvre": manoeuvre,
-        "kind": kind,
-        "seed": seed,
-        "trials": reached,
-        "final": share,
-        "used": used,
-    }
+    case_of = {"method": method, "manoeuvre": manoeuvre, "kind": kind, "seed": seed}
+    return case_of | {"trials": reached, "final": share, "used": used}

@@ -12,23 +12,15 @@ knows the real car. One quiet repetition, without scatter, shows the method by i
 
 from __future__ import annotations
 
-from collections.abc import MutableMapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
 from grounded.experiments.bench import Bench, optimum, true_utility
 from grounded.experiments.car_tasks import NAMES, car_task
-from grounded.experiments.jobs import (
-    Engine,
-    Job,
-    Progress,
-    StudyTable,
-    improvement,
-    mean_se,
-    run_jobs,
-)
+from grounded.experiments.jobs import Job, Running, StudyTable, improvement, mean_se, run_jobs
 from grounded.experiments.real_car import LATENCY, real_car, real_plant
 from grounded.models.car import model as car
 from grounded.search.improve import learn
@@ -116,9 +108,7 @@ def run(
     seeds: Sequence[int] = range(4),
     *,
     manoeuvres: Sequence[str] = NAMES,
-    engine: Engine | None = None,
-    finished: MutableMapping[str, dict[str, Any]] | None = None,
-    progress: Progress | None = None,
+    **how: Unpack[Running],
 ) -> CarResult:
     """Every manoeuvre once without scatter and once for each seed with it."""
     jobs = [
@@ -127,7 +117,7 @@ def run(
         for noisy, some in ((False, [0]), (True, seeds))
         for seed in some
     ]
-    found = run_jobs(jobs, engine, finished=finished, progress=progress)
+    found = run_jobs(jobs, **how)
     return CarResult(tuple(_read(result) for result in found))
 
 

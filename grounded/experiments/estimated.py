@@ -1,35 +1,29 @@
-"""One closed-loop run of the car on ESTIMATED states (footnotes 15 and 18).
+"""The closed-loop car on ESTIMATED states: circle and figure-8 (footnotes 15 and 18).
+
+The same search as in `car`, on the same simulated real car with its scatter, twice: on estimated
+states (camera), and, for comparison, on the true states at the same instants (true).
 
     camera, 30 Hz     front and rear marker, each with noise   -> extended Kalman filter (`Tracker`)
     each new estimate the controller of the nearest 20 Hz step -> command, sent at once
     afterwards        the smoother over all frames             -> the stored trial, 20 Hz
 
 The filter knows the CRUDE model with its modelled latency; the car and its delays are the real
-ones. A trial's inputs are the means of what was sent over each control step.
+ones. A trial's inputs are the means of what was sent over each control step. No marker shows the
+heading rate: disturbances move delta and v without it, and its estimate drifts away. As in the
+paper, rigid-body kinematics gives it: psi_rate = v sin(delta) / L of the estimate.
 
-No marker shows the heading rate: disturbances move delta and v without it, and its estimate drifts
-away. As in the paper, rigid-body kinematics gives it: psi_rate = v sin(delta) / L of the estimate.
-
-The closed-loop car on ESTIMATED states: circle and figure-8 (footnotes 15 and 18).
-
-The same search as in `car`, on the same simulated real car with its scatter, twice:
-
-    camera   controller and search see what an extended Kalman filter and a smoother make of two
-             markers, each wrong by CAMERA, filmed at 30 Hz (`filmed`)
-    true     both are given the true states at the same instants
-
-Both are judged by the TRUE utility, that of the true states in fresh runs, flown as the search
-flew. "Optimum" is the policy of a search that knows the true model, planned without disturbances:
-a local optimum, which the trials may beat. The noise that the filter assumes is estimated from two
-minutes of manual driving: what the crude model gets wrong counts as process noise. Nothing is tuned
-by manoeuvre or seed.
+Both searches are judged by the TRUE utility, that of the true states in fresh runs, flown as the
+search flew. "Optimum" is the policy of a search that knows the true model, planned without
+disturbances: a local optimum, which the trials may beat. The noise that the filter assumes is
+estimated from two minutes of manual driving: what the crude model gets wrong counts as process
+noise. Nothing is tuned by manoeuvre or seed.
 """
 
 from __future__ import annotations
 
-from collections.abc import MutableMapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
@@ -37,15 +31,7 @@ from grounded.estimate import Measurement, NoiseLevels, Record, Tracker, noise_o
 from grounded.experiments.bench import Bench, optimum, standing_still
 from grounded.experiments.car import BUDGET, ITERATIONS, PAPER, real_case
 from grounded.experiments.driving import RATE, START, film, hands, markers
-from grounded.experiments.jobs import (
-    Engine,
-    Job,
-    Progress,
-    StudyTable,
-    improvement,
-    mean_se,
-    run_jobs,
-)
+from grounded.experiments.jobs import Job, Running, StudyTable, improvement, mean_se, run_jobs
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.plant import Plant
@@ -259,15 +245,7 @@ class EstimatedResult:
         """Improvement on estimated beside true states, and how good the estimates were."""
         names = dict.fromkeys(run.manoeuvre for run in self.runs)
         groups = [(name, way, self.of(name, way)) for name in names for way in WAYS]
-        head = (
-            "manoeuvre",
-            "states",
-            "true utility",
-            "improvement",
-            "optimum",
-            "trials an iteration",
-            "paper",
-        )
+        told = ("true utility", "improvement", "optimum", "trials an iteration", "paper")
         rows = [(name, way, *_cells(runs), f"{PAPER[name]:.0%}") for name, way, runs in groups]
         title = f"Closed loop on estimated states, markers ±{1e3 * CAMERA:g} mm at {RATE} Hz"
         head2 = ("manoeuvre", "estimate", "position [mm]", "heading [mrad]", "speed [m/s]", "NIS")
@@ -275,7 +253,7 @@ class EstimatedResult:
             row for name, _, runs in groups if runs and runs[0].live for row in _errors(name, runs)
         ]
         return [
-            StudyTable(title, head, tuple(rows)),
+            StudyTable(title, ("manoeuvre", "states", *told), tuple(rows)),
             StudyTable("Errors of the estimates, rms over all trials", head2, tuple(rows2)),
         ]
 
@@ -307,9 +285,7 @@ def run(
     seeds: Sequence[int] = range(4),
     *,
     manoeuvres: Sequence[str] = NAMES,
-    engine: Engine | None = None,
-    finished: MutableMapping[str, dict[str, Any]] | None = None,
-    progress: Progress | None = None,
+    **how: Unpack[Running],
 ) -> EstimatedResult:
     """Every manoeuvre for each seed, on estimated and on true states."""
     jobs = [
@@ -318,7 +294,7 @@ def run(
         for states in WAYS
         for seed in seeds
     ]
-    found = run_jobs(jobs, engine, finished=finished, progress=progress)
+    found = run_jobs(jobs, **how)
     return EstimatedResult(tuple(_read(result) for result in found))
 
 
@@ -387,20 +363,15 @@ def _quality(flights: Sequence[Flown]) -> dict[str, Any]:
     whole = [f for f in flights if np.isfinite(f.nis)]
     if not whole:
         return {"nis": None, "live": None, "smoothed": None}
-    live = np.concatenate([f.live - f.truth.states for f in whole])
-    smoothed = np.concatenate([f.trial.states - f.truth.states for f in whole])
     return {
         "nis": float(np.mean([f.nis for f in whole])),
-        "live": _rms(live),
-        "smoothed": _rms(smoothed),
+        "live": _rms(np.concatenate([f.live - f.truth.states for f in whole])),
+        "smoothed": _rms(np.concatenate([f.trial.states - f.truth.states for f in whole])),
     }
 
 
 def _rms(error: Array) -> list[float]:
     """Of position [m], heading [rad] and speed [m/s], from errors (rows, 6)."""
     square = np.mean(error**2, axis=0)
-    return [
-        float(np.sqrt(square[2] + square[3])),
-        float(np.sqrt(square[4])),
-        float(square[1] ** 0.5),
-    ]
+    at, heading, speed = np.sqrt(square[2] + square[3]), np.sqrt(square[4]), square[1] ** 0.5
+    return [float(at), float(heading), float(speed)]

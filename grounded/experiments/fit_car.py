@@ -1,35 +1,29 @@
-"""First values of the car's parameters, as footnote 17 got them: regressions and step responses.
+"""The car's parameters from half an hour of manual driving (footnote 17).
 
-    a1, b1          a line through steering angles measured on the bench
+As the paper did it: the wheelbase is measured with a tape, steering angles on the bench for various
+inputs; 30 minutes of driving are filmed at 30 Hz. The film gives first values (`first_values`):
+
+    a1, b1          a line through the steering angles measured on the bench
     a2, a3, b2      linear regression over stretches of steady speed
     stall           the largest throttle at which the car stood
     tau_delta, latency, tau_v, a4   from how heading rate and speed follow the inputs
 
-They are where the climb of the likelihood begins, not what is reported.
-
-The car's parameters from half an hour of manual driving (footnote 17).
-
-As the paper did it: the wheelbase is measured with a tape; the steering angle is measured on the
-bench for various inputs (linear regression: a1, b1); 30 minutes of driving are filmed at 30 Hz;
-linear regression over stretches of steady speed gives a2, a3, b2, and step responses give
-tau_delta, tau_v, a4 and the latency. From these first values `grounded.fit` climbs the likelihood
-of all the data, parameters, stall threshold and latency together.
-
-Every seed is another car (each parameter +-20 %), another driver and other noise. The check: the
-stated 95 % intervals hold the true values.
+From these `grounded.fit` climbs the likelihood of all the data, parameters, stall threshold and
+latency together. Every seed is another car (each parameter +-20 %), another driver and other noise.
+The check: the stated 95 % intervals hold the true values.
 """
 
 from __future__ import annotations
 
-from collections.abc import MutableMapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
 from grounded.estimate import Record
 from grounded.experiments.driving import RATE, drive, markers
-from grounded.experiments.jobs import Engine, Job, Progress, StudyTable, run_jobs
+from grounded.experiments.jobs import Job, Running, StudyTable, run_jobs
 from grounded.fit import fit
 from grounded.frozen import Array
 from grounded.model import Model
@@ -185,21 +179,17 @@ def fit_car(
     seeds: Sequence[int],
     *,
     minutes: float = 30.0,
-    engine: Engine | None = None,
-    finished: MutableMapping[str, dict[str, Any]] | None = None,
-    progress: Progress | None = None,
+    **how: Unpack[Running],
 ) -> FitCarResult:
     """The study, one job a seed.
 
     Args:
         seeds: of the cars, drivers and noise.
         minutes: of driving.
-        engine: where the jobs run.
-        finished: results of earlier jobs.
-        progress: called with jobs done and jobs in all.
+        how: where the jobs run, see `run_jobs`.
     """
     jobs = [Job(fit_car_job, {"seed": int(seed), "minutes": minutes}) for seed in seeds]
-    found = run_jobs(jobs, engine, finished=finished, progress=progress)
+    found = run_jobs(jobs, **how)
     return FitCarResult(tuple(found), minutes)
 
 
@@ -227,11 +217,7 @@ def fit_car_job(seed: int, minutes: float) -> dict[str, Any]:
         params[name] = {
             "true": true,
             "first": estimate.start,
-            "value": estimate.value,
-            "std": estimate.std,
-            "low": estimate.low,
-            "high": estimate.high,
-            "unit": estimate.unit,
+            **{key: getattr(estimate, key) for key in ("value", "std", "low", "high", "unit")},
             "inside": bool(estimate.low <= true <= estimate.high),
         }
     return {"seed": seed, "params": params, "status": found.sentence, "samples": found.samples}

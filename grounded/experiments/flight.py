@@ -13,26 +13,17 @@ optimum is DDP on the true parameters, which the search never sees.
 from __future__ import annotations
 
 import math
-from collections.abc import MutableMapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
 from grounded.errors import GroundedError
 from grounded.experiments.figure8 import RADIUS, figure8_target, flight_task, perturbed
-from grounded.experiments.jobs import (
-    Engine,
-    Job,
-    Progress,
-    StudyTable,
-    improvement,
-    jsonable,
-    mean_se,
-    run_jobs,
-)
+from grounded.experiments.jobs import Job, Running, StudyTable, improvement, mean_se, run_jobs
 from grounded.frozen import Array
 from grounded.models.aircraft import model as aircraft
+from grounded.result import plain
 from grounded.rollout import simulate
 from grounded.search.improve import first_policy, learn, propose
 from grounded.search.standing import Candidate, Options
@@ -110,20 +101,12 @@ class FlightResult:
     def to_json(self) -> dict[str, Any]:
         """See CONTRACT.md."""
         runs = [
-            {
-                "seed": run.seed,
-                "discarded": run.discarded,
-                "utilities": list(run.utilities),
-                "trials": run.trials,
-                "alphas": list(run.alphas),
-                "optimum": self.optimum,
-            }
+            {k: v for k, v in vars(run).items() if k != "paths"} | {"optimum": self.optimum}
             for run in self.runs
         ]
         shown = self.representative
         figure = {"seed": shown.seed, "desired": self.desired, **shown.paths}
-        whole = {"runs": runs, **self.summary(), "figure": figure, "paper": PAPER}
-        return dict(jsonable(whole))
+        return dict(plain({"runs": runs, **self.summary(), "figure": figure, "paper": PAPER}))
 
     def tables(self) -> list[StudyTable]:
         """Table 1 beside the paper's."""
@@ -155,20 +138,16 @@ def run(
     count: int = 10,
     *,
     first_seed: int = 0,
-    engine: Engine | None = None,
-    finished: MutableMapping[str, dict[str, Any]] | None = None,
-    progress: Progress | None = None,
     step: str = "damped",
+    **how: Unpack[Running],
 ) -> FlightResult:
     """Table 1 with `count` runs that were not discarded: seeds first_seed, first_seed + 1 ...
 
     Args:
         count: runs that count.
         first_seed: of the approximate models.
-        engine: where the jobs run.
-        finished: results kept from before, by job.
-        progress: called with jobs done and in all.
         step: "damped" or "full", as in [search].
+        how: where the jobs run, see `run_jobs`.
 
     Raises:
         GroundedError: if more than four of five models are discarded.
@@ -181,7 +160,7 @@ def run(
         missing = count - sum(not r.discarded for r in found)
         jobs = [Job(flight_job, {"seed": s, "step": step}) for s in range(seed, seed + missing)]
         seed += missing
-        found += [_read(r) for r in run_jobs(jobs, engine, finished=finished, progress=progress)]
+        found += [_read(r) for r in run_jobs(jobs, **how)]
     path, _, _ = figure8_target()
     return FlightResult(tuple(found), flight_optimum(), path[::FIGURE_STEP].tolist())
 

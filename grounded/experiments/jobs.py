@@ -10,24 +10,24 @@ through Dask's own joblib backend (extra `grounded[cluster]`); there is no sched
                 holds a hash of our sources, so that results of two versions are never mixed.
     lost worker its job is run again (by Dask itself, or here after a process died), not the study.
 
-Numbers that studies report: means with standard errors, improvements, slopes, tables.
-
-Improvement of a utility (never positive) from U_0 to U: (U - U_0) / |U_0|, so 0.76 means that 76 %
-of the cost is gone. The paper does not say whether its 76 % is a mean of ratios or a ratio of
-means; both are given.
+At the end stand the numbers that studies report: means with standard errors, improvements, slopes,
+tables. The improvement of a utility (never positive) from U_0 to U is (U - U_0) / |U_0|, so 0.76
+means that 76 % of the cost is gone. The paper does not say whether its 76 % is a mean of ratios or
+a ratio of means; both are given.
 """
 
 from __future__ import annotations
 
 import hashlib
+import importlib
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
+from collections.abc import Callable, Iterator, MutableMapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 
@@ -85,6 +85,14 @@ class Engine:
             raise GroundedError(
                 "--engine dask needs the scheduler's --address (tcp://host:8786), and only it does"
             )
+
+
+class Running(TypedDict, total=False):
+    """How a study runs its jobs: the keyword arguments of `run_jobs`."""
+
+    engine: Engine | None
+    finished: MutableMapping[str, dict[str, Any]] | None
+    progress: Progress | None
 
 
 def run_jobs(
@@ -204,8 +212,6 @@ class _Cluster(AbstractContextManager[None]):
 
 def _lost() -> tuple[type[BaseException], ...]:
     """The errors that say a worker died, not that a job failed; asked for after an error only."""
-    import importlib
-
     kinds: list[type[BaseException]] = []
     for module, name in (
         ("joblib.externals.loky.process_executor", "TerminatedWorkerError"),
@@ -219,8 +225,6 @@ def _lost() -> tuple[type[BaseException], ...]:
 
 
 def _import(name: str, remedy: str) -> Any:
-    import importlib
-
     try:
         return importlib.import_module(name)
     except ImportError as error:
@@ -247,15 +251,6 @@ def mean_se(values: Sequence[float]) -> tuple[float, float]:
     if len(data) < 2:
         return (float(data.mean()) if len(data) else math.nan), math.nan
     return float(data.mean()), float(data.std(ddof=1) / math.sqrt(len(data)))
-
-
-def jsonable(value: Any) -> Any:
-    """The same with null for numbers that JSON does not have (nan, infinities)."""
-    if isinstance(value, Mapping):
-        return {key: jsonable(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [jsonable(inner) for inner in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def loglog_slope(x: Sequence[float], y: Sequence[float]) -> tuple[float, float]:

@@ -8,15 +8,15 @@ sequence from starts that scatter, with its disturbances; the spread of the end-
 
 from __future__ import annotations
 
-from collections.abc import MutableMapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Unpack
 
 import numpy as np
 
 from grounded.experiments.bench import scaled
 from grounded.experiments.car_tasks import DT, car_task
-from grounded.experiments.jobs import Engine, Job, Progress, StudyTable, run_jobs
+from grounded.experiments.jobs import Job, Running, StudyTable, run_jobs
 from grounded.experiments.real_car import real_plant
 from grounded.frozen import Array
 from grounded.models.car import model as car
@@ -81,9 +81,7 @@ def run(
     *,
     levels: Sequence[float] = LEVELS,
     seed: int = 0,
-    engine: Engine | None = None,
-    finished: MutableMapping[str, dict[str, Any]] | None = None,
-    progress: Progress | None = None,
+    **how: Unpack[Running],
 ) -> NondeterminismResult:
     """Repeats every sequence `runs` times at each level of scatter."""
     jobs = [
@@ -91,7 +89,7 @@ def run(
         for name in sequences()
         for level in levels
     ]
-    found = run_jobs(jobs, engine, finished=finished, progress=progress)
+    found = run_jobs(jobs, **how)
     return NondeterminismResult(tuple(EndPointSpread(**result) for result in found), runs)
 
 
@@ -100,7 +98,7 @@ def nondeterminism_job(sequence: str, level: float, runs: int, seed: int) -> dic
     inputs = sequences()[sequence]
     task = car_task("turn", car)
     policy = task.policy(np.zeros((task.horizon, 2)), None, None)
-    policy = type(policy)(**{**vars(policy), "feedforward": inputs})
+    policy = replace(policy, feedforward=inputs)
     plant = scaled(real_plant(noisy=True), level)
     ends = []
     for i in range(runs):

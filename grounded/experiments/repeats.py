@@ -16,20 +16,17 @@ lucky winner loses its luck; "losses checked" does so only after a loss that may
 
 from __future__ import annotations
 
-from collections.abc import Callable, MutableMapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
-from grounded.experiments.bench import bench, optimum, scaled, true_utility
-from grounded.experiments.jobs import Engine, Job, Progress, StudyTable, mean_se, run_jobs
+from grounded.experiments.bench import bench, optimum, scaled, searched, true_utility
+from grounded.experiments.jobs import Job, Running, StudyTable, mean_se, run_jobs
 from grounded.frozen import Array
 from grounded.policy import Policy
-from grounded.search.improve import propose
-from grounded.search.standing import Candidate, Options
-from grounded.task import Task
-from grounded.trial import Trial
+from grounded.search.standing import Options
 
 LEVELS = (0.5, 1.0, 2.0, 3.0)
 MANOEUVRES = ("turn", "figure8")
@@ -175,9 +172,7 @@ def run(
     manoeuvres: Sequence[str] = MANOEUVRES,
     levels: Sequence[float] = LEVELS,
     rules: Sequence[LineSearchRule] = RULES,
-    engine: Engine | None = None,
-    finished: MutableMapping[str, dict[str, Any]] | None = None,
-    progress: Progress | None = None,
+    **how: Unpack[Running],
 ) -> NoiseResult:
     """Every rule on every case; a job is one of them."""
     jobs = [
@@ -187,7 +182,7 @@ def run(
         for rule in rules
         for seed in seeds
     ]
-    found = run_jobs(jobs, engine, finished=finished, progress=progress)
+    found = run_jobs(jobs, **how)
     return NoiseResult(tuple(Outcome(**result) for result in found))
 
 
@@ -201,9 +196,15 @@ def repeats_job(rule: dict[str, Any], manoeuvre: str, level: float, seed: int) -
     def truly(policy: Policy) -> float:
         return true_utility(case.task, case.plant, policy, FRESH, seed)
 
-    accepted, claimed, trials = _search(how, case.real, case.task)
-    utilities = [truly(policy) for _, policy in accepted]
-    early = [u for (ran, _), u in zip(accepted, utilities, strict=True) if ran <= EARLY][-1]
+    options = Options(
+        max_trials=BUDGET,
+        repeats=how.repeats,
+        max_halvings=how.max_halvings,
+        rerun_incumbent=how.checked,
+    )
+    accepted, claimed, trials = searched(case, options, again=how.again)
+    utilities = [truly(kept.policy) for kept in accepted]
+    early = [u for kept, u in zip(accepted, utilities, strict=True) if kept.trials <= EARLY][-1]
     gap = truly(best) - utilities[0]
     return {
         "rule": how.name,
@@ -217,33 +218,3 @@ def repeats_job(rule: dict[str, Any], manoeuvre: str, level: float, seed: int) -
         "flattered": (claimed - utilities[-1]) / gap,
         "trials": trials,
     }
-
-
-def _search(
-    rule: LineSearchRule, real: Callable[[Policy, int], Trial], task: Task
-) -> tuple[list[tuple[int, Policy]], float, int]:
-    """The policies kept in turn and after how many trials, what the last one claims, trials run."""
-    options = Options(
-        max_trials=BUDGET,
-        repeats=rule.repeats,
-        max_halvings=rule.max_halvings,
-        rerun_incumbent=rule.checked,
-    )
-    candidates: list[Candidate] = []
-    trials: list[Trial] = []
-    accepted: list[tuple[int, Policy]] = []
-    while True:
-        proposal = propose(task, candidates, trials, options)
-        best = proposal.standing.incumbent
-        if best is not None and (not accepted or accepted[-1][1] is not best.candidate.policy):
-            accepted.append((len(trials), best.candidate.policy))
-        if proposal.candidate is None or len(trials) >= BUDGET:
-            assert best is not None
-            return accepted, best.utility, len(trials)
-        if proposal.is_new:
-            candidates.append(proposal.candidate)
-            if rule.again and best is not None:
-                again = real(best.candidate.policy, len(trials))
-                trials.append(replace(again, candidate=best.candidate.id))
-        trial = real(proposal.candidate.policy, len(trials))
-        trials.append(replace(trial, candidate=proposal.candidate.id))

@@ -20,25 +20,17 @@ K^2 epsilon^2 / (2 M).)
 from __future__ import annotations
 
 import math
-from collections.abc import MutableMapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
 from grounded.compile import Problem
-from grounded.experiments.jobs import (
-    Engine,
-    Job,
-    Progress,
-    StudyTable,
-    jsonable,
-    loglog_slope,
-    mean_se,
-    run_jobs,
-)
+from grounded.experiments.jobs import Job, Running, StudyTable, loglog_slope, mean_se, run_jobs
 from grounded.frozen import Array
 from grounded.model import Model, Param
+from grounded.result import plain
 from grounded.solve.bias import ground
 from grounded.solve.policy_gradient import gradient
 from grounded.task import Task
@@ -94,7 +86,7 @@ class Theorem1Result:
         paper = {"gradient_error": 1, "squared_gradient": 2}
         found: dict[str, Any] = {"rows": [vars(r) for r in self.rows], "slopes": slopes}
         found |= {"largest_ratio_to_bound": worst, "paper": paper}
-        return dict(jsonable(found))
+        return dict(plain(found))
 
     def tables(self) -> list[StudyTable]:
         """Medians by epsilon, and the slopes beside the theorem's."""
@@ -139,15 +131,13 @@ def run(
     seeds: Sequence[int] = range(8),
     *,
     epsilons: Sequence[float] = EPSILONS,
-    engine: Engine | None = None,
-    finished: MutableMapping[str, dict[str, Any]] | None = None,
-    progress: Progress | None = None,
+    **how: Unpack[Running],
 ) -> Theorem1Result:
     """A search for each epsilon and seed; the seed draws the shape of the model's error."""
     jobs = [
         Job(theorem1_job, {"epsilon": float(e), "seed": seed}) for e in epsilons for seed in seeds
     ]
-    found = run_jobs(jobs, engine, finished=finished, progress=progress)
+    found = run_jobs(jobs, **how)
     return Theorem1Result(tuple(Theorem1Row(**result) for result in found))
 
 
