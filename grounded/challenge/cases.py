@@ -119,8 +119,7 @@ def _case(
         same_task=bool(rng.random() < 0.3),
         kind=noise or str(drawn),
     )
-    error = param_error
-    if error is None:
+    if (error := param_error) is None:
         error = 0.05 if kind == "single" and rng.random() < 0.33 else 0.0
     crude = _with_errors(system.model, error, rng)
     plans = _plans(system, crude, setting, rng)
@@ -131,13 +130,8 @@ def _case(
     )
     truth, label = _truth(kind, system, plans, setting, disturbance, rng)
     runs = [_run(system, truth, plan, setting, rng) for plan in plans]
-    label |= {
-        "noise": setting.kind,
-        "level": setting.level,
-        "roughness": setting.roughness,
-        "param_error": error,
-    }
-    label |= {"system": system.name, "kind": kind, "case": name}
+    label |= {"noise": setting.kind, "level": setting.level, "roughness": setting.roughness}
+    label |= {"param_error": error, "system": system.name, "kind": kind, "case": name}
     return Case(
         name=name,
         system=system.name,

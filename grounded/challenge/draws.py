@@ -1,6 +1,7 @@
 """What a blind case's effect is and how large: drawn by family, from barely visible to large.
 
-Effects that are NOT in the library: what the diagnosis must meet without a name for it.
+`draw_effect` draws from the library. `draw_withheld` draws what is NOT in the library, and the
+diagnosis must meet without a name for it:
 
 resonance     the actuator rings: u_eff'' = w^2 (u - u_eff) - 2 zeta w u_eff'
 asymmetric    a different gain for positive and negative commands
@@ -29,18 +30,17 @@ from grounded.model import Model
 SMALLEST, LARGEST = 0.04, 0.35  # of the signals an effect acts on
 
 
-def draw_effect(model: Model, scales: Any, rng: np.random.Generator) -> Effect:
+def draw_effect(model: Model, scales: Scales, rng: np.random.Generator) -> Effect:
     """A family at random, then one of its targets."""
     by_family: dict[str, list[Effect]] = {}
     for effect in Library().candidates(model, scales):
         by_family.setdefault(effect.family.name, []).append(effect)
-    family = rng.choice(sorted(by_family))
-    options = by_family[family]
+    options = by_family[rng.choice(sorted(by_family))]
     return options[int(rng.integers(0, len(options)))]
 
 
 def values_of(
-    effect: Effect, scales: Any, rng: np.random.Generator, visited: Array
+    effect: Effect, scales: Scales, rng: np.random.Generator, visited: Array
 ) -> dict[str, float]:
     """A size from barely visible to large, as a part of the signals it acts on.
 
@@ -54,26 +54,24 @@ def values_of(
     """
     size = float(np.exp(rng.uniform(np.log(SMALLEST), np.log(LARGEST))))
     sign = float(rng.choice([-1, 1]))
-    target, values = effect.site.target, dict(effect.fixed)
-    model = effect.site.model
-    duration = scales.duration
+    family, values = effect.family.name, dict(effect.fixed)
+    top = _rate_scale(scales, effect.site.target) * size
     for q in effect.free:
-        values[q.name] = _value(effect, q.name, size, sign, scales, rng, model, target, duration)
-    if effect.family.name == "periodic":
-        phase, amplitude = rng.uniform(0, 2 * np.pi), _rate_scale(scales, target) * size
-        values |= {"A": amplitude * np.cos(phase), "B": amplitude * np.sin(phase)}
-    if effect.family.name in ("drift_world", "drift_body", "slope"):
+        values[q.name] = _value(effect, q.name, size, sign, scales, rng)
+    if family == "periodic":
+        phase = rng.uniform(0, 2 * np.pi)
+        values |= {"A": top * np.cos(phase), "B": top * np.sin(phase)}
+    if family in ("drift_world", "drift_body", "slope"):
         angle = rng.uniform(0, 2 * np.pi)
-        top = _rate_scale(scales, target) * size
         values |= {"a": top * np.cos(angle), "b": top * np.sin(angle)}
-    if effect.family.name == "patch":
+    if family == "patch":
         where = visited[int(rng.integers(0, len(visited)))]
-        names = model.state_names
+        names = effect.site.model.state_names
         values |= {q: where[names.index(q[:-1])] for q in values if q[:-1] in names}
     return {name: float(v) for name, v in values.items()}
 
 
-def _rate_scale(scales: Any, name: str) -> float:
+def _rate_scale(scales: Scales, name: str) -> float:
     """A typical rate of a state: its spread over two seconds."""
     return float(scales.spread(name)) / 2.0
 
@@ -85,11 +83,8 @@ def _value(
     sign: float,
     scales: Scales,
     rng: np.random.Generator,
-    model: Model,
-    target: str,
-    duration: float,
 ) -> float:
-    family = effect.family.name
+    family, target = effect.family.name, effect.site.target
     if family in ("dead_zone", "stall"):
         return size * scales.peak(target)
     if family == "saturation":
@@ -105,18 +100,18 @@ def _value(
     if family in ("input_bias", "sensor_bias"):
         return sign * 0.5 * size * scales.spread(target)
     if family == "input_fade":
-        return size / duration
+        return size / scales.duration
     if family in ("input_gain", "rate_gain", "odometry_scale", "sensor_scale"):
         return sign * size
     if family == "parameter":
-        value = model.params[target].value
+        value = effect.site.model.params[target].value
         return sign * size * (abs(value) if value else 0.2)
     if family in ("viscous_friction", "quadratic_drag", "coulomb_friction", "stiction"):
         speed = scales.peak(target)
         over = {"viscous_friction": 1.0, "quadratic_drag": speed}.get(family, 1 / speed)
         return size * 2.0 / over
     if family == "understeer":
-        speed = max(scales.peak(n) for n in ("v",) if n in scales.high) if scales.high else 1.0
+        speed = scales.peak("v") if scales.high else 1.0
         return float(size / speed**2)
     if family == "side_slip":
         return 0.3 * size / max(scales.peak("v"), 0.3)
@@ -124,7 +119,7 @@ def _value(
         driven, _, source = target.partition("<-")
         return sign * size * _rate_scale(scales, driven) / scales.peak(source)
     if family == "trend":
-        return sign * size * _rate_scale(scales, target) / duration
+        return sign * size * _rate_scale(scales, target) / scales.duration
     if family == "periodic" and quantity == "omega":
         return 2 * np.pi * float(np.exp(rng.uniform(np.log(0.3), np.log(2.0))))
     if family == "patch" and quantity == "c":
@@ -168,40 +163,44 @@ def draw_withheld(
         return _gusts(rng, driven, rate, duration)
     if kind == len(makers) + 1:
         return _hysteresis(rng, driven, rate)
-    return makers[kind](rng, j, model, float(peak[j]), duration)
+    maker = makers[kind]
+    params, act = maker(rng, j, model.m, float(peak[j]), duration)
+    name = maker.__name__.removeprefix("_")
+    return Withheld(name, model.input_names[j], params, actuators=(act,))
 
 
-def _named(name: str, model: Model, j: int, params: dict[str, float], f: Actuator) -> Withheld:
-    return Withheld(name, model.input_names[j], params, actuators=(f,))
+_Made = tuple[dict[str, float], Actuator]  # what is sealed, what acts
 
 
-def _resonance(rng: np.random.Generator, j: int, model: Model, peak: float, T: float) -> Withheld:
+def _on(j: int, delivered: Callable[[Array, dict[str, Any], float, float], float]) -> Actuator:
+    """An actuator that changes input j alone."""
+
+    def act(u: Array, own: dict[str, Any], t: float, dt: float) -> Array:
+        out = u.copy()
+        out[j] = delivered(u, own, t, dt)
+        return out
+
+    return act
+
+
+def _resonance(rng: np.random.Generator, j: int, m: int, peak: float, T: float) -> _Made:
     w, zeta = 2 * np.pi * rng.uniform(0.7, 2.0), rng.uniform(0.05, 0.25)
 
-    def act(u: Array, own: dict[str, Any], t: float, dt: float) -> Array:
+    def ring(u: Array, own: dict[str, Any], t: float, dt: float) -> float:
         z, rate = own.get("resonance", (u[j], 0.0))
         rate = rate + dt * (w * w * (u[j] - z) - 2 * zeta * w * rate)
-        z = z + dt * rate
-        own["resonance"] = (z, rate)
-        out = u.copy()
-        out[j] = z
-        return out
+        own["resonance"] = (z + dt * rate, rate)
+        return float(z + dt * rate)
 
-    return _named("resonance", model, j, {"omega": w, "zeta": zeta}, act)
+    return {"omega": w, "zeta": zeta}, _on(j, ring)
 
 
-def _asymmetric(rng: np.random.Generator, j: int, model: Model, peak: float, T: float) -> Withheld:
-    gain = rng.choice([-1, 1]) * rng.uniform(0.1, 0.4)
-
-    def act(u: Array, own: dict[str, Any], t: float, dt: float) -> Array:
-        out = u.copy()
-        out[j] = u[j] * (1 + gain) if u[j] > 0 else u[j]
-        return out
-
-    return _named("asymmetric", model, j, {"gain": float(gain)}, act)
+def _asymmetric(rng: np.random.Generator, j: int, m: int, peak: float, T: float) -> _Made:
+    gain = float(rng.choice([-1, 1]) * rng.uniform(0.1, 0.4))
+    return {"gain": gain}, _on(j, lambda u, own, t, dt: u[j] * (1 + gain) if u[j] > 0 else u[j])
 
 
-def _dropouts(rng: np.random.Generator, j: int, model: Model, peak: float, T: float) -> Withheld:
+def _dropouts(rng: np.random.Generator, j: int, m: int, peak: float, T: float) -> _Made:
     rate = rng.uniform(0.3, 1.0)
 
     def act(u: Array, own: dict[str, Any], t: float, dt: float) -> Array:
@@ -213,52 +212,28 @@ def _dropouts(rng: np.random.Generator, j: int, model: Model, peak: float, T: fl
         own["dropouts"] = (until, held)
         return np.array(held)
 
-    return _named("dropouts", model, j, {"per_second": rate}, act)
+    return {"per_second": rate}, act
 
 
-def _fault(rng: np.random.Generator, j: int, model: Model, peak: float, T: float) -> Withheld:
+def _fault(rng: np.random.Generator, j: int, m: int, peak: float, T: float) -> _Made:
     begin, loss = T * rng.uniform(0.4, 0.6), rng.uniform(0.15, 0.5)
-
-    def act(u: Array, own: dict[str, Any], t: float, dt: float) -> Array:
-        out = u.copy()
-        out[j] = u[j] * (1 - loss) if t > begin else u[j]
-        return out
-
-    return _named("fault", model, j, {"begin": begin, "loss": loss}, act)
+    act = _on(j, lambda u, own, t, dt: u[j] * (1 - loss) if t > begin else u[j])
+    return {"begin": begin, "loss": loss}, act
 
 
-def _expo(rng: np.random.Generator, j: int, model: Model, peak: float, T: float) -> Withheld:
+def _expo(rng: np.random.Generator, j: int, m: int, peak: float, T: float) -> _Made:
     e = rng.uniform(0.2, 0.7)
-
-    def act(u: Array, own: dict[str, Any], t: float, dt: float) -> Array:
-        out = u.copy()
-        out[j] = (1 - e) * u[j] + e * u[j] ** 3 / peak**2
-        return out
-
-    return _named("expo", model, j, {"e": e}, act)
+    return {"e": e}, _on(j, lambda u, own, t, dt: (1 - e) * u[j] + e * u[j] ** 3 / peak**2)
 
 
-def _quantised(rng: np.random.Generator, j: int, model: Model, peak: float, T: float) -> Withheld:
+def _quantised(rng: np.random.Generator, j: int, m: int, peak: float, T: float) -> _Made:
     size = peak * rng.uniform(0.15, 0.5)
-
-    def act(u: Array, own: dict[str, Any], t: float, dt: float) -> Array:
-        out = u.copy()
-        out[j] = size * np.rint(u[j] / size)
-        return out
-
-    return _named("quantised", model, j, {"step": size}, act)
+    return {"step": size}, _on(j, lambda u, own, t, dt: size * np.rint(u[j] / size))
 
 
-def _crosstalk(rng: np.random.Generator, j: int, model: Model, peak: float, T: float) -> Withheld:
-    other = (j + 1) % model.m
-    leak = rng.choice([-1, 1]) * rng.uniform(0.1, 0.4)
-
-    def act(u: Array, own: dict[str, Any], t: float, dt: float) -> Array:
-        out = u.copy()
-        out[j] = u[j] + leak * u[other] ** 2
-        return out
-
-    return _named("crosstalk", model, j, {"leak": float(leak)}, act)
+def _crosstalk(rng: np.random.Generator, j: int, m: int, peak: float, T: float) -> _Made:
+    leak = float(rng.choice([-1, 1]) * rng.uniform(0.1, 0.4))
+    return {"leak": leak}, _on(j, lambda u, own, t, dt: u[j] + leak * u[(j + 1) % m] ** 2)
 
 
 def _gusts(rng: np.random.Generator, driven: str, rate: float, T: float) -> Withheld:

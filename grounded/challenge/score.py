@@ -2,9 +2,7 @@
 
 The oracle fits the true effects (values free, noise and parameters as in a diagnosis) and nothing
 else: a case counts as detectable where its evidence exceeds 3 nats, and its held-out gap is what a
-diagnosis is compared with.
-
-A whole study in memory: cases made, diagnosed, judged. Files and seals are the CLI's.
+diagnosis is compared with. `study` makes, diagnoses and judges cases in memory, without files.
 """
 
 from __future__ import annotations

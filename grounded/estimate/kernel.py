@@ -1,10 +1,6 @@
-"""Batches in the layout of the compiled recursions, and calls of those.
+"""The filter and the smoother as machine code, for a linearisation that is known.
 
-[group][time][entry][lane]: W trials side by side in a group, the last trial repeated to fill it.
-
-The filter and the smoother as machine code, for a linearisation that is known.
-
-The same recursions as in `filter.py` and `smoother.py`, W trials in the lanes of a vector, one
+The same recursions as in `recursion.py`, W trials side by side in the lanes of a vector, one
 measured channel after the other (diagonal R), so that no matrix is inverted:
 
     b = P h,  s = h'b + r,  e = e0 - h'(x - xbar),  x += b e / s,  P -= b b' / s     each channel
@@ -15,8 +11,8 @@ and backwards, channels in reverse,
     z = e / s - g'r,  r += h z,  N += h (1/s + g'N g) h' - h (N g)' - (N g) h',          g = b / s
     r = A' r,         N = A' N A
 
-A trial's numbers lie as [group][time][entry][lane]. Rows of a matrix are a loop, entries of a row
-are unrolled: the text grows with n^2.
+Numbers lie as [group][time][entry][lane], the last trial repeated to fill its group. Rows of a
+matrix are a loop, entries of a row are unrolled: the text grows with n^2.
 """
 
 from __future__ import annotations
@@ -40,8 +36,6 @@ from grounded.frozen import Array
 
 def usable(T: int, n: int, ny: int) -> bool:
     """Whether the compiled recursions can run here, for these sizes."""
-    from grounded.compile.run import jit
-
     return T > 0 and 0 < n <= LARGEST and 0 < ny <= LARGEST and not jit.trouble()
 
 
@@ -114,8 +108,6 @@ def packed(
         e0: y - h(xbar), (T + 1, B, ny), zero where not seen.
         xbar: predicted states about which H holds, (T + 1, B, n).
     """
-    from grounded.compile.run import jit
-
     width, B = jit.lanes(), len(batch.lengths)
     given = {"A": A, "f": f, "more": more, "track": track, "H": H, "e0": e0, "xbar": xbar}
     arrays = {name: pack(value, width) for name, value in given.items()}
@@ -206,7 +198,9 @@ def recursion_library(n: int, ny: int) -> Any:
     def write() -> str:
         width = jit.lanes()
         return (
-            declarations({width}) + _Forward(n, ny, width).text() + _Backward(n, ny, width).text()
+            declarations({width})
+            + _Forward("forward", FORWARD, n, ny, width).text()
+            + _Backward("backward", BACKWARD, n, ny, width).text()
         )
 
     return jit.library(key, write, ("forward", "backward"))
@@ -276,9 +270,6 @@ class _Kernel:
 
 
 class _Forward(_Kernel):
-    def __init__(self, n: int, ny: int, width: int) -> None:
-        super().__init__("forward", FORWARD, n, ny, width)
-
     def text(self) -> str:
         w, n, W = self.w, self.n, self.W
         x, P, M, b = w.room(n * W), w.room(n * n * W), w.room(n * n * W), w.room(n * W)
@@ -350,9 +341,6 @@ class _Forward(_Kernel):
 
 
 class _Backward(_Kernel):
-    def __init__(self, n: int, ny: int, width: int) -> None:
-        super().__init__("backward", BACKWARD, n, ny, width)
-
     def text(self) -> str:
         w, n, W = self.w, self.n, self.W
         r, N, M, v = w.room(n * W), w.room(n * n * W), w.room(n * n * W), w.room(n * W)

@@ -1,4 +1,4 @@
-"""Record: what was measured and what was commanded, each on its own clock.
+"""Record: what was measured and what was commanded, each on its own clock; and many side by side.
 
     y_i = h(x(t_i)) + v_i,         u_j(t) = command_j(t - latency_j)
 
@@ -8,23 +8,22 @@ A camera at 30 Hz and a controller at 20 Hz are one record: states are estimated
 `grounded.compile.problem`, any fraction of a step included; it is piecewise linear in the latency,
 whose derivative is therefore known. A sample that was lost is NaN.
 
-Records side by side: time first, then trial, padded to the longest, gaps marked.
-
-A filter is a recursion over time; running it over all trials at once is what makes it fast in
-NumPy. Padding and lost samples are rows that are not `seen`, steps that are not `valid`.
+A filter is a recursion over time; running it over all trials at once is what makes it fast. So
+records become a `RecordBatch`: time first, then trial, padded to the longest. Padding and lost
+samples are rows that are not `seen`, steps that are not `valid`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from grounded.errors import GroundedError
+from grounded.errors import GroundedError, nearest
 from grounded.estimate.measurement import Measurement
 from grounded.frozen import Array, readonly
 from grounded.model import Model
@@ -132,8 +131,6 @@ def record_of(model: Model, trial: Trial) -> Record:
     Raises:
         GroundedError: if the trial lacks an input of the model or has none of its states.
     """
-    from grounded.errors import nearest
-
     for name in model.input_names:
         if name not in trial.input_names:
             raise GroundedError(
@@ -206,17 +203,9 @@ def cut(record: Record, seconds: float) -> list[Record]:
 
 def part(record: Record, first: int, last: int) -> Record:
     """Rows first .. last of a record; the commands stay whole, so that latency needs no start."""
-    keep_start = record.start if first == 0 else None
-    return Record(
-        record.times[first : last + 1],
-        record.measured[first : last + 1],
-        record.command_times,
-        record.commands,
-        record.past,
-        keep_start,
-        record.start_std,
-        record.id,
-    )
+    rows = slice(first, last + 1)
+    start = record.start if first == 0 else None
+    return replace(record, times=record.times[rows], measured=record.measured[rows], start=start)
 
 
 def records_of(model: Model, trials: Sequence[Trial | Record]) -> list[Record]:
@@ -254,11 +243,6 @@ class RecordBatch:
     start: Array  # (B, n)
     start_var: Array  # (B, n) without the measurement noise
     start_channel: NDArray[np.int64]  # (B, n) the channel whose noise the start has; -1: none
-
-    @cached_property
-    def whole(self) -> bool:
-        """Every channel seen at every row but the first."""
-        return bool(self.seen[1:].all())
 
     @cached_property
     def count(self) -> int:

@@ -1,10 +1,8 @@
-"""What a pass of the filter leaves behind; notation as in `grounded.estimate.filter`.
+"""The filter in NumPy, step by step, what a pass of it leaves behind, and the smoother back.
 
-The filter in NumPy, step by step: the reference, and the way where nothing can be compiled.
-
-The smoother for stored trials, and what it says about the noise.
-
-Backwards through a filter pass (Bryson and Frazier's form; it inverts no covariance):
+The reference for the compiled recursions, and the way where nothing can be compiled; notation as in
+`grounded.estimate.filter`. The smoother goes backwards through a filter pass (Bryson and Frazier's
+form; it inverts no covariance):
 
     r^-_t = H' S^-1 e_t + (I-KH)' r_t,                  r_{t-1} = A' r^-_t,         r_T = 0
     N^-_t = H' S^-1 H   + (I-KH)' N_t (I-KH),           N_{t-1} = A' N^-_t A
@@ -20,6 +18,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -119,7 +118,7 @@ def recursion(
             out["f"][t], out["A"][t], out["more"][t] = f, A, more
             x, P = f, A @ P @ A.transpose(0, 2, 1) + scale[t] + more[..., None] * eye
     loglik -= 0.5 * np.log(2 * np.pi) * batch.count
-    return made(out, loglik if np.isfinite(loglik) else -np.inf, "filtered")
+    return Filtered(**out, loglik=loglik if np.isfinite(loglik) else -np.inf)
 
 
 def fixed_steps(filtered: Filtered) -> Advance:
@@ -133,32 +132,11 @@ def fixed_steps(filtered: Filtered) -> Advance:
     return advance
 
 
-def made(out: dict[str, Array], loglik: float, status: str) -> Filtered:
-    """A pass from its arrays (spelt out, so that the type checker sees each field)."""
-    return Filtered(
-        x=out["x"],
-        std=out["std"],
-        x_prior=out["x_prior"],
-        P_prior=out["P_prior"],
-        e=out["e"],
-        H=out["H"],
-        R=out["R"],
-        A=out["A"],
-        f=out["f"],
-        more=out["more"],
-        loglik=loglik,
-        status=status,
-    )
-
-
-def _room(T: int, B: int, n: int, ny: int) -> dict[str, Array]:
+def _room(T: int, B: int, n: int, ny: int) -> dict[str, Any]:
     tails = {"x": (n,), "std": (n,), "x_prior": (n,), "P_prior": (n, n), "e": (ny,), "H": (ny, n)}
+    by_step = {"A": (n, n), "f": (n,), "more": (n,)}
     room = {name: np.zeros((T + 1, B, *tail)) for name, tail in tails.items()}
-    return room | {
-        "A": np.zeros((T, B, n, n)),
-        "f": np.zeros((T, B, n)),
-        "more": np.zeros((T, B, n)),
-    }
+    return room | {name: np.zeros((T, B, *tail)) for name, tail in by_step.items()}
 
 
 def _start_covariance(batch: RecordBatch, R: Array) -> Array:
@@ -167,8 +145,9 @@ def _start_covariance(batch: RecordBatch, R: Array) -> Array:
     return var[..., None] * np.eye(var.shape[1])
 
 
-def _failed(out: dict[str, Array], t: int) -> Filtered:
-    return made(out, -np.inf, f"the filter left the finite numbers at step {t}")
+def _failed(out: dict[str, Any], t: int) -> Filtered:
+    status = f"the filter left the finite numbers at step {t}"
+    return Filtered(**out, loglik=-np.inf, status=status)
 
 
 @dataclass(frozen=True, eq=False)

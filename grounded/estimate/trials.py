@@ -1,6 +1,6 @@
 """The front door for stored trials: a model and trials in, states with their certainty out.
 
-Is what the filter claims true?
+`consistency` says whether what the filter claims is true:
 
     NIS   e_t' S_t^-1 e_t / ny         mean 1 if the innovations are as large as claimed
     NEES  (x - xhat)' P^-1 (x - xhat) / n    mean 1 if the states are as uncertain as claimed
@@ -175,11 +175,8 @@ class Consistency:
     @property
     def consistent(self) -> bool:
         """All that is known lies in its band."""
-        pairs = (
-            (self.nis, self.nis_band),
-            (self.lag_one, self.lag_one_band),
-            (self.nees, self.nees_band),
-        )
+        bands = (self.nis_band, self.lag_one_band, self.nees_band)
+        pairs = zip((self.nis, self.lag_one, self.nees), bands, strict=True)
         return all(low <= value <= high for value, (low, high) in pairs if np.isfinite(value))
 
 
@@ -203,9 +200,9 @@ def consistency(
         both = seen[1:] & seen[:-1]
         products += float(np.sum((eps[1:] * eps[:-1])[both]))
         pairs += int(both.sum())
-    nees, nees_band = (
-        (np.nan, (np.nan, np.nan)) if truth is None else _nees(estimated, truth, states)
-    )
+    nees, nees_band = np.nan, (np.nan, np.nan)
+    if truth is not None:
+        nees, nees_band = _nees(estimated, truth, states)
     width = 1.96 / np.sqrt(max(pairs, 1))
     return Consistency(
         nis=squares / max(count, 1),

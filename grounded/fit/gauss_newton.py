@@ -1,20 +1,18 @@
-"""What is fitted: parameters of the model and delays of its inputs, as one vector theta.
+"""Levenberg and Marquardt's climb of the likelihood for a given noise, within bounds.
 
-Levenberg and Marquardt's climb of the likelihood for a given noise, within bounds.
+What is fitted, parameters of the model and delays of its inputs, is one vector theta (`Unknowns`).
+The least-squares problem are the whitened innovations of the filter and their slopes,
 
-    delta = -(W'W + lambda diag(W'W))^-1 W' eps,       theta <- clip(theta + delta)
+    eps(theta): the filter's, with f(.; theta);      W = d eps / d theta  (`estimate.sensitivity`)
+    delta = -(W'W + lambda diag(W'W))^-1 W' eps,     theta <- clip(theta + delta)
+
+The sum of squares of eps is what is left unexplained, measured in the noise; the log-likelihood
+adds the log-determinants; W'W is the information that the data hold about theta. Because every step
+of a trial starts from what the filter knows, noise of the measurements does not bias the fit, as it
+does in one-step least squares (errors in variables).
 
 A step counts if the log-likelihood rises; else lambda grows. Unknowns at a bound that would leave
 it are held; directions of which the data say nothing are not moved.
-
-The least-squares problem behind a fit: whitened innovations eps(theta) and their slopes.
-
-    eps(theta): the filter's, with f(.; theta);      W = d eps / d theta  (`estimate.sensitivity`)
-
-Their sum of squares is what is left unexplained, measured in the noise; the log-likelihood adds the
-log-determinants. Gauss and Newton's step is -(W'W)^-1 W' eps, and W'W is the information that the
-data hold about theta. Because every step of a trial starts from what the filter knows, noise of the
-measurements does not bias the fit, as it does in one-step least squares (errors in variables).
 """
 
 from __future__ import annotations

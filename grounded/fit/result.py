@@ -1,6 +1,6 @@
 """What a fit found, each value with its interval, and the sentence that says how it ended.
 
-How sure a fit is of each unknown.
+How sure a fit is of each unknown is judged twice:
 
     information I = W'W,            covariance I^-1                 (noise as modelled)
     sandwich    I^-1 (sum_b g_b g_b') I^-1,   g_b = W_b' eps_b      (blocks b of time)

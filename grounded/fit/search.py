@@ -1,16 +1,15 @@
 """The search for the most likely parameters, delays, thresholds and noise.
 
 Three kinds of unknown are moved in turn until the likelihood stops rising: parameters and delays
-(Gauss-Newton, `gauss_newton`), thresholds (`scan`), and the noise (`grounded.estimate.likelihood`).
+(Gauss-Newton, `gauss_newton`), thresholds (scanned), the noise (`grounded.estimate.likelihood`).
 The noise is not a nuisance: it decides what is an error of the model and what is not. It starts
 large, while the model is wrong, and shrinks with it.
 
-Unknowns that Gauss and Newton can't move: thresholds, and delays that start far off.
-
-A threshold (the car's stall) changes the likelihood in steps: its slope is zero almost everywhere.
-It is scanned over its bounds, coarse first, then between the neighbours of the best. At each value
-the other unknowns are credited with what their own linear problem promises, so that a delay is
-compared with the best lag beside it, not with the lag of another delay.
+A threshold (the car's stall) changes the likelihood in steps: its slope is zero almost everywhere,
+and Gauss and Newton can't move it. It is scanned over its bounds, coarse first, then between the
+neighbours of the best; so are delays that may start far off. At each value the other unknowns are
+credited with what their own linear problem promises, so that a delay is compared with the best lag
+beside it, not with the lag of another delay.
 
 The interval of a threshold is the set of values whose log-likelihood lies within DROP of the best:
 3.67 nats, the 95 % point for a threshold (Hansen 2000), more than the 1.92 of a smooth unknown.
@@ -155,7 +154,7 @@ def _delays(data: FitData, noise: NoiseLevels, at: Point) -> Point:
     return at
 
 
-COARSE, FINE, ROUNDS = 21, 5, 4
+COARSE, FINE, ZOOMS = 21, 5, 4
 DROP = 3.67  # [nats]
 GRID = 10  # points between a value that is as good and one that is not
 LEVEL = 0.05  # [nats] as good as equal
@@ -225,7 +224,7 @@ def coarse_to_fine(
     if width is not None:
         low, high = max(low, at.theta[i] - width), min(high, at.theta[i] + width)
     grid, best = np.linspace(low, high, COARSE), at
-    for round_ in range(ROUNDS):
+    for round_ in range(ZOOMS):
         others = free if round_ == 0 else None  # later steps are too small to matter to them
         best, profile = profile_of(data, noise, best, i, grid, others)
         top = np.flatnonzero(profile > profile.max() - LEVEL)

@@ -20,11 +20,9 @@ elevator or rudder pitches the nose down, yaws it left; here a positive aileron 
     alpha = atan2(w, u),  beta = asin(v / V),  V = |(u, v, w)|,  qbar = rho V^2 / 2
     T = rho S_prop C_prop ((k_motor throttle)^2 - V^2) / 2
 
-Trim: the states and inputs that an aircraft holds in steady level flight, straight or turning.
-
-Level flight at airspeed V and turn rate omega without sideslip: twelve equations for the eight
-states u, v, w, phi, theta, p, q, r and the four inputs (Stevens & Lewis 2003, section 3.6; the
-turn is coordinated by beta = 0),
+`level_trim` gives the states and inputs that it holds in level flight at airspeed V and turn rate
+omega without sideslip: twelve equations for the eight states u, v, w, phi, theta, p, q, r and the
+four inputs (Stevens & Lewis 2003, section 3.6; the turn is coordinated by beta = 0),
 
     u' = v' = w' = phi' = theta' = p' = q' = r' = altitude' = 0,  psi' = omega,  |V| = V,  v = 0,
 
