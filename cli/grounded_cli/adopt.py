@@ -7,7 +7,7 @@ import click
 from grounded_cli import completion as complete
 from grounded_cli.options import as_json, in_workspace, open_workspace
 from grounded_cli.terminal import field, number, remark, show, show_json
-from grounded_trials.wording import with_unit
+from grounded_trials.wording import folded, rendered, with_unit
 
 UNCLAIMED = (
     "was not claimed by the last diagnosis: its values were fitted by themselves, in place of what "
@@ -35,6 +35,7 @@ def command(effects: tuple[str, ...], effect_only: bool, folder: str | None, jso
     """
     workspace = open_workspace(folder)
     from grounded_trials.workspace.adopting import adopt_effects
+    from grounded_trials.workspace.next_step import PROPOSE
 
     done = adopt_effects(workspace, effects, parameters=not effect_only)
     if json_:
@@ -51,4 +52,4 @@ def command(effects: tuple[str, ...], effect_only: bool, folder: str | None, jso
     for name, value in done.params.items():
         text = with_unit(f"{number(before[name].value)} -> {number(value)}", before[name].unit)
         show(field(name, text, "  "))
-    show("\nnext: grounded propose")
+    show("\n" + folded(rendered(PROPOSE)))

@@ -51,7 +51,7 @@ def trials(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[
 def effects(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
     """The effects that the last diagnosis weighed, best first."""
     from grounded.errors import GroundedError
-    from grounded_trials.workspace.diagnosis_file import read_diagnosis
+    from grounded_trials.workspace.diagnosing import read_diagnosis
 
     try:
         found = read_diagnosis(_folder(ctx) / "reports")

@@ -85,11 +85,11 @@ def _optimum(workspace: Workspace) -> float | None:
         return optimum(workspace)
 
 
-def _diagnosis(workspace: Workspace) -> dict[str, Any] | None:
+def _diagnosis(workspace: Workspace) -> dict[str, Any]:
     from grounded_trials.workspace.diagnosing import diagnose_in
 
     with progress("diagnosing the gap"):
-        return dict(diagnose_in(workspace).document["verdict"])
+        return diagnose_in(workspace).verdict.to_json()
 
 
 def _report(workspace: Workspace) -> dict[str, str]:

@@ -81,9 +81,12 @@ class LazyGroup(click.Group):
 
             if not isinstance(error, GroundedError):
                 raise
-            from grounded_cli.address import addressed
+            from grounded_cli.address import addressed, given
+            from grounded_trials.wording import folded, rendered
 
-            raise GroundedError(addressed(str(error), fit=False)) from None
+            then = error.then
+            mend = "" if then is None else f"\n{folded(rendered(then, given()))}"
+            raise GroundedError(addressed(str(error), fit=False) + mend) from None
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
         """Names for the TAB key without importing any command."""

@@ -9,11 +9,11 @@ import click
 
 from grounded_cli.options import as_json, in_workspace, open_workspace
 from grounded_cli.terminal import field, number, progress, show, show_json, sparkline, table
-from grounded_trials.wording import folded, verdict
+from grounded_trials.wording import folded, rendered, verdict
 
 if TYPE_CHECKING:
+    from grounded.diagnosis.report import Diagnosis
     from grounded.search.standing import Standing, Tried
-    from grounded_trials.workspace.diagnosis_file import Diagnosis
     from grounded_trials.workspace.folder import Workspace
 
 LEGEND = "damp: penalty on leaving the last trial's inputs; +-: standard error"
@@ -131,12 +131,12 @@ def next_line(workspace: Workspace, standing: Standing) -> str:
     from grounded_trials.workspace.next_step import next_command, usable_ids
 
     usable = usable_ids(workspace)
-    return folded(next_command(workspace, standing, _diagnosis(workspace), usable))
+    return folded(rendered(next_command(workspace, standing, _diagnosis(workspace), usable)))
 
 
 def _diagnosis(workspace: Workspace) -> Diagnosis | None:
     from grounded.errors import GroundedError
-    from grounded_trials.workspace.diagnosis_file import read_diagnosis
+    from grounded_trials.workspace.diagnosing import read_diagnosis
 
     try:
         return read_diagnosis(workspace.reports)

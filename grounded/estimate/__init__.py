@@ -17,7 +17,7 @@ same as machine code), `likelihood` (the noise). `tracker` stands by itself.
 from __future__ import annotations
 
 from grounded.estimate.likelihood import NoiseEstimate
-from grounded.estimate.measurement import Measurement, NoiseLevels, of_function, of_states
+from grounded.estimate.measurement import Measurement, NoiseStd, of_function, of_states
 from grounded.estimate.record import Record, cut, merged, record_of
 from grounded.estimate.tracker import Tracker
 from grounded.estimate.trials import (
@@ -34,7 +34,7 @@ __all__ = [
     "Estimated",
     "Measurement",
     "NoiseEstimate",
-    "NoiseLevels",
+    "NoiseStd",
     "Record",
     "Tracker",
     "consistency",

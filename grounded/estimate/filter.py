@@ -32,7 +32,7 @@ from dataclasses import replace
 import numpy as np
 
 from grounded.estimate import kernel
-from grounded.estimate.measurement import Measurement, NoiseLevels
+from grounded.estimate.measurement import Measurement, NoiseStd
 from grounded.estimate.record import RecordBatch
 from grounded.estimate.recursion import Filtered, recursion
 from grounded.estimate.steps import ModelSteps
@@ -47,7 +47,7 @@ ENOUGH = 0.05  # [nats] and then this is enough after SWEEPS
 def filter_batch(
     batch: RecordBatch,
     measurement: Measurement,
-    noise: NoiseLevels,
+    noise: NoiseStd,
     steps: ModelSteps,
     about: Filtered | None = None,
 ) -> Filtered:
@@ -81,7 +81,7 @@ def filter_batch(
 def _sweeps(
     batch: RecordBatch,
     measurement: Measurement,
-    noise: NoiseLevels,
+    noise: NoiseStd,
     steps: ModelSteps,
     track: Array,
     std: Array,

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from grounded.compile.emit.llvm_batch import Words
 from grounded.compile.emit.llvm_text import Writer, declarations, splat
 from grounded.compile.run import jit
-from grounded.estimate.measurement import NoiseLevels
+from grounded.estimate.measurement import NoiseStd
 from grounded.estimate.record import RecordBatch
 from grounded.frozen import Array
 
@@ -125,7 +125,7 @@ def packed(
     )
 
 
-def forward(lin: LinearisedBatch, noise: NoiseLevels) -> Pass:
+def forward(lin: LinearisedBatch, noise: NoiseStd) -> Pass:
     """The filter along a linearisation."""
     from grounded.compile.run.compiled import call
 
@@ -169,7 +169,7 @@ def backward(done: Pass) -> dict[str, Array]:
     return out
 
 
-def variance_slopes(done: Pass, noise: NoiseLevels) -> Array:
+def variance_slopes(done: Pass, noise: NoiseStd) -> Array:
     """Slope of the log-likelihood by the log variances of process and measurements, (n + ny,)."""
     back, lin = backward(done), done.linearised
     _, _, n, ny, _ = lin.sizes

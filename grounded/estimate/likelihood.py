@@ -19,7 +19,7 @@ import numpy as np
 from grounded.compile import System
 from grounded.estimate import kernel
 from grounded.estimate.filter import filter_batch
-from grounded.estimate.measurement import Measurement, NoiseLevels
+from grounded.estimate.measurement import Measurement, NoiseStd
 from grounded.estimate.record import Record, RecordBatch, batch_of
 from grounded.estimate.recursion import Filtered, fixed_steps, recursion, smooth
 from grounded.estimate.steps import ModelSteps
@@ -36,7 +36,7 @@ ROWS = 8_000  # more samples than this teach the noise little
 class NoiseEstimate:
     """The noise, its log-likelihood, what is seen of it, and how the search ended."""
 
-    noise: NoiseLevels
+    noise: NoiseStd
     loglik: float
     process_seen: tuple[bool, ...]  # (n,) False: at the floor, or nothing says anything about it
     measurement_seen: tuple[bool, ...]  # (ny,)
@@ -48,7 +48,7 @@ def maximum_likelihood(
     p: Array,
     batch: RecordBatch,
     measurement: Measurement,
-    start: NoiseLevels,
+    start: NoiseStd,
     *,
     rounds: int = ROUNDS,
     wide: bool = False,
@@ -88,8 +88,8 @@ def maximum_likelihood(
 
 
 def _expectation(
-    batch: RecordBatch, measurement: Measurement, noise: NoiseLevels, steps: ModelSteps, rounds: int
-) -> tuple[NoiseLevels, Filtered]:
+    batch: RecordBatch, measurement: Measurement, noise: NoiseStd, steps: ModelSteps, rounds: int
+) -> tuple[NoiseStd, Filtered]:
     """Expectation-maximisation: each variance becomes what the smoother expects of it.
 
     Slow near the end, but sure-footed far from it, where it also mends the track.
@@ -107,7 +107,7 @@ def _expectation(
         share = np.concatenate([np.full(n, steps_seen), samples])
         factor = np.clip(1 + 2 * slope / share, 1e-2, 1e2)
         std = np.sqrt(variance * factor)
-        trial = NoiseLevels(std[:n], std[n:], noise.dt)
+        trial = NoiseStd(std[:n], std[n:], noise.dt)
         after = filter_batch(batch, measurement, trial, steps, best)
         if not after.loglik > best.loglik:
             break
@@ -115,7 +115,7 @@ def _expectation(
     return noise, best
 
 
-def first_noise(batch: RecordBatch, measurement: Measurement, dt: float) -> NoiseLevels:
+def first_noise(batch: RecordBatch, measurement: Measurement, dt: float) -> NoiseStd:
     """A rough noise, from how smooth the measurements are: robust, and only a place to begin.
 
     Second differences of a smooth signal are measurement noise (times sqrt 6), fourth differences
@@ -133,7 +133,7 @@ def first_noise(batch: RecordBatch, measurement: Measurement, dt: float) -> Nois
         r[c] = max(min(_spread(np.diff(y, n=k, axis=0)) / v**0.5 for k, v in orders), least)
         if i >= 0 and np.isfinite(one).any():
             q[i] = max(0.1 * _spread(one), least)
-    return NoiseLevels(q, r, dt)
+    return NoiseStd(q, r, dt)
 
 
 def enough(records: Sequence[Record], rng: np.random.Generator | None = None) -> list[Record]:
@@ -153,10 +153,10 @@ def enough(records: Sequence[Record], rng: np.random.Generator | None = None) ->
 def _climb(
     batch: RecordBatch,
     measurement: Measurement,
-    noise: NoiseLevels,
+    noise: NoiseStd,
     about: Filtered,
-    start: NoiseLevels,
-) -> tuple[NoiseLevels, Array]:
+    start: NoiseStd,
+) -> tuple[NoiseStd, Array]:
     """The best noise for a fixed linearisation, and which variances the data see."""
     from scipy.optimize import minimize
 
@@ -164,7 +164,7 @@ def _climb(
 
     def cost(theta: Array) -> tuple[float, Array]:
         std = np.exp(0.5 * theta)
-        there = NoiseLevels(std[:n], std[n:], dt)
+        there = NoiseStd(std[:n], std[n:], dt)
         if about.done is not None:
             done = kernel.forward(about.done.linearised, there)
             loglik = done.loglik
@@ -184,10 +184,10 @@ def _climb(
     options = {"maxiter": 60, "ftol": 1e-9, "gtol": 1e-6}
     found = minimize(cost, theta, jac=True, method="L-BFGS-B", bounds=bounds, options=options).x
     std = np.exp(0.5 * found)
-    return NoiseLevels(std[:n], std[n:], dt), found > low + 2.0
+    return NoiseStd(std[:n], std[n:], dt), found > low + 2.0
 
 
-def _slope(filtered: Filtered, batch: RecordBatch, noise: NoiseLevels) -> Array:
+def _slope(filtered: Filtered, batch: RecordBatch, noise: NoiseStd) -> Array:
     """Slope of the log-likelihood by the log variances, (n + ny,)."""
     if filtered.done is not None:
         return kernel.variance_slopes(filtered.done, noise)

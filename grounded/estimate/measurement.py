@@ -117,7 +117,7 @@ def _differenced(function: Callable[[Array], Array]) -> Callable[[Array], Array]
 
 
 @dataclass(frozen=True, eq=False)
-class NoiseLevels:
+class NoiseStd:
     """Standard deviations, in the units of the states and of the channels.
 
     Args:

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from grounded.estimate.kernel import Pass, backward, unpack
-from grounded.estimate.measurement import Measurement, NoiseLevels
+from grounded.estimate.measurement import Measurement, NoiseStd
 from grounded.estimate.record import RecordBatch
 from grounded.estimate.steps import Advance
 from grounded.frozen import Array
@@ -78,7 +78,7 @@ class Filtered:
 
 
 def recursion(
-    batch: RecordBatch, measurement: Measurement, noise: NoiseLevels, advance: Advance
+    batch: RecordBatch, measurement: Measurement, noise: NoiseStd, advance: Advance
 ) -> Filtered:
     """One pass over a batch, linearising at each state that it reaches."""
     T, B, n, ny = len(batch.dt), len(batch.lengths), batch.start.shape[1], measurement.ny

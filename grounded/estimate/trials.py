@@ -20,7 +20,7 @@ import numpy as np
 from grounded.errors import GroundedError
 from grounded.estimate.filter import filter_batch
 from grounded.estimate.likelihood import NoiseEstimate, noise_of_records
-from grounded.estimate.measurement import Measurement, NoiseLevels, of_states
+from grounded.estimate.measurement import Measurement, NoiseStd, of_states
 from grounded.estimate.record import Record, RecordBatch, batch_of, records_of
 from grounded.estimate.recursion import Filtered, smooth
 from grounded.estimate.steps import ModelSteps
@@ -54,7 +54,7 @@ class Estimated:
 def filter_trials(
     model: Model,
     trials: Sequence[Trial | Record],
-    noise: NoiseLevels,
+    noise: NoiseStd,
     *,
     latency: Array | None = None,
     measurement: Measurement | None = None,
@@ -78,7 +78,7 @@ def filter_trials(
 def smooth_trials(
     model: Model,
     trials: Sequence[Trial | Record],
-    noise: NoiseLevels,
+    noise: NoiseStd,
     *,
     latency: Array | None = None,
     measurement: Measurement | None = None,
@@ -119,7 +119,7 @@ def noise_of(
 def _passed(
     model: Model,
     trials: Sequence[Trial | Record],
-    noise: NoiseLevels,
+    noise: NoiseStd,
     latency: Array | None,
     measurement: Measurement | None,
 ) -> tuple[list[Record], RecordBatch, Filtered, Measurement]:

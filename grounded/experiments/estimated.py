@@ -27,7 +27,7 @@ from typing import Any, Unpack
 
 import numpy as np
 
-from grounded.estimate import Measurement, NoiseLevels, Record, Tracker, noise_of, smooth_trials
+from grounded.estimate import Measurement, NoiseStd, Record, Tracker, noise_of, smooth_trials
 from grounded.experiments.bench import Bench, optimum, standing_still
 from grounded.experiments.car import BUDGET, ITERATIONS, PAPER, real_case
 from grounded.experiments.driving import RATE, START, film, hands, markers
@@ -71,7 +71,7 @@ class Filmed:
     plant: Plant
     see: Measurement
     camera: float
-    noise: NoiseLevels
+    noise: NoiseStd
 
     def run(self, policy: Policy, rng: np.random.Generator, *, estimated: bool = True) -> Flown:
         """Executes a policy once; `estimated` False: the controller is given the true states.
@@ -304,7 +304,7 @@ def _read(result: dict[str, Any]) -> EstimatedRun:
     return EstimatedRun(**(result | tuples))
 
 
-def assumed_noise(case: Bench, see: Measurement, seed: int) -> NoiseLevels:
+def assumed_noise(case: Bench, see: Measurement, seed: int) -> NoiseStd:
     """Process and measurement noise of the crude model on manual driving of the real car."""
     rng = np.random.default_rng([seed, 13])
     plant, task = case.plant, case.task

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from grounded.compile import System
 from grounded.errors import GroundedError, nearest
-from grounded.estimate import Measurement, NoiseLevels, Record
+from grounded.estimate import Measurement, NoiseStd, Record
 from grounded.estimate.filter import filter_batch, sensitivity
 from grounded.estimate.record import RecordBatch, batch_of
 from grounded.estimate.recursion import Filtered
@@ -144,7 +144,7 @@ class Climb:
 
 def climb(
     data: FitData,
-    noise: NoiseLevels,
+    noise: NoiseStd,
     start: Point,
     free: NDArray[np.bool_],
     max_steps: int = 20,
@@ -169,7 +169,7 @@ def climb(
 
 def _step(
     data: FitData,
-    noise: NoiseLevels,
+    noise: NoiseStd,
     at: Point,
     slopes: Linear,
     free: NDArray[np.bool_],
@@ -250,7 +250,7 @@ class Linear:
     block: NDArray[np.int64]  # (rows,) the piece of time that a row belongs to
 
 
-def point(data: FitData, noise: NoiseLevels, theta: Array, near: Point | None = None) -> Point:
+def point(data: FitData, noise: NoiseStd, theta: Array, near: Point | None = None) -> Point:
     """One pass of the filter at theta; `near`: a point not far from it, which saves time."""
     batch = data.batch(theta)
     p = data.unknowns.unpack(theta)[0]

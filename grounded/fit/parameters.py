@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from grounded.errors import GroundedError
-from grounded.estimate import Measurement, NoiseLevels, Record, of_states
+from grounded.estimate import Measurement, NoiseStd, Record, of_states
 from grounded.estimate.record import part, records_of
 from grounded.fit.gauss_newton import Latency, Unknowns, unknowns_of
 from grounded.fit.prediction import PredictionError, prediction_error
@@ -106,7 +106,7 @@ def judged(
 ) -> tuple[PredictionError, PredictionError]:
     """Held-out prediction errors of the model before and after, each with its own noise."""
 
-    def error(theta: Array, noise: NoiseLevels) -> PredictionError:
+    def error(theta: Array, noise: NoiseStd) -> PredictionError:
         p, latency = unknowns.unpack(theta)
         there = model.with_values(dict(zip(model.param_names, p.tolist(), strict=True)))
         return prediction_error(

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from grounded.estimate import Measurement, NoiseLevels, Record, noise_of, of_states
+from grounded.estimate import Measurement, NoiseStd, Record, noise_of, of_states
 from grounded.estimate.filter import filter_batch
 from grounded.estimate.record import RecordBatch, batch_of, records_of
 from grounded.estimate.recursion import smooth
@@ -43,7 +43,7 @@ def prediction_error(
     *,
     latency: Array | None = None,
     measurement: Measurement | None = None,
-    noise: NoiseLevels | None = None,
+    noise: NoiseStd | None = None,
 ) -> PredictionError:
     """One-step and `horizon_s` open-loop prediction error of a model on trials.
 

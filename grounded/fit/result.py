@@ -20,7 +20,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from grounded.estimate import NoiseLevels
+from grounded.estimate import NoiseStd
 from grounded.fit.gauss_newton import Linear, Unknowns
 from grounded.fit.prediction import PredictionError
 from grounded.fit.search import SearchEnd, likelihood_interval, quiet
@@ -51,7 +51,7 @@ class Fit:
     params: Mapping[str, FittedValue]
     model: Model  # with the fitted values
     latency: Array  # (m,) [s]
-    noise: NoiseLevels
+    noise: NoiseStd
     loglik: float
     status: str  # converged, still rising, or why it stopped
     sentence: str

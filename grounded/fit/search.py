@@ -23,7 +23,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from grounded.estimate import Measurement, NoiseLevels, Record, cut
+from grounded.estimate import Measurement, NoiseStd, Record, cut
 from grounded.estimate.likelihood import enough, first_noise, maximum_likelihood
 from grounded.estimate.record import batch_of
 from grounded.fit.gauss_newton import (
@@ -52,8 +52,8 @@ class SearchEnd:
 
     data: FitData
     climb: Climb
-    noise: NoiseLevels
-    start_noise: NoiseLevels
+    noise: NoiseStd
+    start_noise: NoiseStd
     thresholds: NDArray[np.bool_]  # (k,) unknowns that a scan has moved
     status: str
 
@@ -84,7 +84,7 @@ def first_search(data: FitData, rng: np.random.Generator) -> SearchEnd:
 
 
 def search_parameters(
-    data: FitData, theta: Array, noise: NoiseLevels | None, rng: np.random.Generator
+    data: FitData, theta: Array, noise: NoiseStd | None, rng: np.random.Generator
 ) -> SearchEnd:
     """Parameters, thresholds and noise in turn until the likelihood stops rising."""
     new = noise is None
@@ -125,8 +125,8 @@ def _stopped(at: Point) -> Climb:
 
 
 def _noise(
-    data: FitData, theta: Array, noise: NoiseLevels | None, rng: np.random.Generator
-) -> NoiseLevels:
+    data: FitData, theta: Array, noise: NoiseStd | None, rng: np.random.Generator
+) -> NoiseStd:
     """The most likely noise at theta, from where it was or from scratch."""
     p, latency = data.unknowns.unpack(theta)
     records = enough(data.records, rng)
@@ -135,7 +135,7 @@ def _noise(
     if noise is None:
         noise = rough
     else:  # a variance that sank while the model was wrong would not rise again by itself
-        noise = NoiseLevels(
+        noise = NoiseStd(
             np.maximum(noise.process, REVIVE * rough.process),
             np.maximum(noise.measurement, REVIVE * rough.measurement),
             noise.dt,
@@ -144,7 +144,7 @@ def _noise(
     return found.noise
 
 
-def _delays(data: FitData, noise: NoiseLevels, at: Point) -> Point:
+def _delays(data: FitData, noise: NoiseStd, at: Point) -> Point:
     """Each fitted latency from a scan over whole steps: it may begin far off."""
     first = len(data.unknowns.columns)
     free = ~quiet(data, linear(data, at))
@@ -169,7 +169,7 @@ def quiet(data: FitData, slopes: Linear) -> NDArray[np.bool_]:
 
 def profile_of(
     data: FitData,
-    noise: NoiseLevels,
+    noise: NoiseStd,
     at: Point,
     i: int,
     grid: Array,
@@ -210,7 +210,7 @@ def profile_of(
 
 def coarse_to_fine(
     data: FitData,
-    noise: NoiseLevels,
+    noise: NoiseStd,
     at: Point,
     i: int,
     free: NDArray[np.bool_],
@@ -238,7 +238,7 @@ def coarse_to_fine(
     return _centred(data, noise, best, i, grid[top])
 
 
-def _centred(data: FitData, noise: NoiseLevels, best: Point, i: int, level: Array) -> Point:
+def _centred(data: FitData, noise: NoiseStd, best: Point, i: int, level: Array) -> Point:
     """The middle of the values that are as good as the best: the likelihood is flat between them.
 
     An end of the level is where the next sample lies, and nothing says that it is the threshold.
@@ -254,7 +254,7 @@ def _centred(data: FitData, noise: NoiseLevels, best: Point, i: int, level: Arra
 
 
 def likelihood_interval(
-    data: FitData, noise: NoiseLevels, at: Point, i: int, inflation: float = 1.0
+    data: FitData, noise: NoiseStd, at: Point, i: int, inflation: float = 1.0
 ) -> tuple[float, float]:
     """The values of unknown i around the best whose log-likelihood is within DROP of it.
 
@@ -274,7 +274,7 @@ def likelihood_interval(
     return low, high
 
 
-def _end(data: FitData, noise: NoiseLevels, at: Point, i: int, bound: float, drop: float) -> float:
+def _end(data: FitData, noise: NoiseStd, at: Point, i: int, bound: float, drop: float) -> float:
     best = float(at.theta[i])
     span = abs(bound - best)
     if span == 0 or _loglik(data, noise, at, i, bound) > at.loglik - drop:
@@ -301,7 +301,7 @@ def _end(data: FitData, noise: NoiseLevels, at: Point, i: int, bound: float, dro
     return float(best + sign * outside)
 
 
-def _loglik(data: FitData, noise: NoiseLevels, at: Point, i: int, value: float) -> float:
+def _loglik(data: FitData, noise: NoiseStd, at: Point, i: int, value: float) -> float:
     theta = at.theta.copy()
     theta[i] = value
     return point(data, noise, theta, at).loglik

@@ -15,9 +15,9 @@ from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.limits import limits
 from grounded.diagnosis.search import HypothesisSearch
 from grounded.effects import Library, memory_of, wrap
+from grounded.errors import NextCommand
 from grounded_trials.store.trial_file import write_trial
-from grounded_trials.workspace.diagnosing import _chosen, diagnosable
-from grounded_trials.workspace.diagnosis_file import diagnosis_of
+from grounded_trials.workspace.diagnosing import _chosen, diagnosable, read_diagnosis
 from grounded_trials.workspace.folder import Workspace
 from grounded_trials.workspace.next_step import after_diagnosis
 
@@ -67,8 +67,8 @@ def test_what_is_left_beside_an_adopted_lag_is_named():
     found = diagnose(better, lifted, options)
     assert found.effects == ("coulomb_friction:v",)
     assert found.ranking[0].params["c"].value == pytest.approx(0.4, rel=0.05)
-    assert 0.8 < found.gap["after"] < 1.2
-    text = json.dumps(found.to_dict())
+    assert 0.8 < found.gap.after < 1.2
+    text = json.dumps(found.to_json())
     assert memory[0] not in text.replace("first_order_lag_u_tau", "")
 
 
@@ -76,7 +76,7 @@ def test_nothing_is_left_beside_what_is_all():
     model, runs = lagging(0.0)
     better, lifted, memory = adopted(model, runs)
     found = diagnose(better, lifted, DiagnosisOptions(hidden=memory, but={"first_order_lag:u"}))
-    assert found.kind == "none" and not found.leftover and found.gap["after"] < 1.2
+    assert found.kind == "none" and not found.leftover and found.gap.after < 1.2
 
 
 def test_a_memory_is_known_at_the_start_and_disturbed_by_nothing():
@@ -143,9 +143,10 @@ def test_more_of_an_adopted_effect_changes_its_numbers(tmp_path):
         [row("parameter:viscous_friction_omega_k", d=0.05), row("parameter:l", d=0.01)],
     )
     names = ["parameter:viscous_friction_omega_k", "parameter:l"]
-    read = diagnosis_of(json.loads((tmp_path / "ws" / "reports" / "diagnosis.json").read_text()))
+    read = read_diagnosis(tmp_path / "ws" / "reports")
+    assert read is not None
     advice = after_diagnosis(Workspace(tmp_path / "ws"), read)
-    assert advice == f"grounded adopt {' '.join(names)}"  # fit knows the model's own numbers only
+    assert advice == NextCommand("adopt", tuple(names))  # fit knows the model's own numbers only
     for _ in range(2):  # twice is once
         done = grounded("-C", tmp_path / "ws", "adopt", *names)
         assert done.code == 0, done.err

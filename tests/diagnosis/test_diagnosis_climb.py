@@ -58,7 +58,7 @@ def test_a_parameter_at_its_bound_does_not_hold_up_the_others():
     assert row.fixed["width"] == pytest.approx(0.05, rel=0.2)  # it builds up over 0.05 rad/s
     same = {"input_gain:torque", "parameter:m", "rate_gain:omega"}  # what a mass does to a torque
     assert set(found.effects) <= {"coulomb_friction:omega", *same}
-    assert found.gap["before"] > 50 * found.gap["after"] and found.gap["after"] < 3
+    assert found.gap.before > 50 * found.gap.after and found.gap.after < 3
 
 
 def test_without_noise_the_demo_names_the_friction_alone():

@@ -5,7 +5,7 @@ import pytest
 
 from grounded.errors import GroundedError
 from grounded.estimate import (
-    NoiseLevels,
+    NoiseStd,
     Tracker,
     consistency,
     cut,
@@ -42,7 +42,7 @@ SPRING = Model(
     params={"k": Param(4.0, "1/s^2", 0.1, 20.0), "d": Param(0.5, "1/s", 0.0, 5.0)},
     derivative=_spring,
 )
-SPRING_NOISE = NoiseLevels(np.array([0.002, 0.02]), np.array([0.01, 0.05]), DT)
+SPRING_NOISE = NoiseStd(np.array([0.002, 0.02]), np.array([0.01, 0.05]), DT)
 
 
 def simulated(model, rng, noise, *, B=4, T=100, latency=0.0, low=-1.0, high=1.0):
@@ -128,7 +128,7 @@ def test_sensitivities_of_the_innovations_match_differences():
         assert np.allclose(W[..., i], moved, atol=2e-3 * np.abs(moved).max())
 
 
-CAR_NOISE = NoiseLevels(
+CAR_NOISE = NoiseStd(
     np.array([0.003, 0.01, 0.001, 0.001, 0.002, 0.02]),
     np.array([0.01, 0.03, 0.003, 0.003, 0.01, 0.05]),
     DT,
@@ -150,7 +150,7 @@ def test_slopes_by_the_variances_match_differences():
 
     def at(theta):
         std = np.exp(theta / 2)
-        noise = NoiseLevels(std[:2], std[2:], DT)
+        noise = NoiseStd(std[:2], std[2:], DT)
         return noise, recursion(batch, measurement, noise, fixed_steps(base))
 
     theta = 2 * np.log(np.concatenate([SPRING_NOISE.process, SPRING_NOISE.measurement]))
@@ -175,7 +175,7 @@ def test_the_compiled_pass_is_the_recursion(width):
     batch, measurement = batched(car, trials, np.array([0.1, 0.07]))
     steps = ModelSteps(car.system, car.values, batch)
     plain = recursion(batch, measurement, CAR_NOISE, steps.at)
-    near = NoiseLevels(1.2 * CAR_NOISE.process, 0.9 * CAR_NOISE.measurement, DT)
+    near = NoiseStd(1.2 * CAR_NOISE.process, 0.9 * CAR_NOISE.measurement, DT)
     fast = filter_batch(
         batch, measurement, CAR_NOISE, steps, recursion(batch, measurement, near, steps.at)
     )
@@ -229,7 +229,7 @@ def test_the_noise_is_recovered_and_the_filter_is_consistent():
 
 def test_a_filter_with_the_wrong_noise_is_called_inconsistent():
     truth, trials = simulated(SPRING, np.random.default_rng(12), SPRING_NOISE)
-    wrong = NoiseLevels(SPRING_NOISE.process / 3, SPRING_NOISE.measurement, DT)
+    wrong = NoiseStd(SPRING_NOISE.process / 3, SPRING_NOISE.measurement, DT)
     assert not consistency(filter_trials(SPRING, trials, wrong), truth).consistent
     assert consistency(filter_trials(SPRING, trials, SPRING_NOISE), truth).consistent
 
@@ -254,7 +254,7 @@ def test_camera_at_30_hz_and_control_at_20_hz_from_two_markers():
     rng = np.random.default_rng(7)
     L, sigma = 0.15, 0.003
     steps = 600  # of 1/60 s
-    noise = NoiseLevels(np.array([1e-3, 5e-3, 2e-4, 2e-4, 5e-4, 1e-3]), np.full(4, sigma), 1 / 60)
+    noise = NoiseStd(np.array([1e-3, 5e-3, 2e-4, 2e-4, 5e-4, 1e-3]), np.full(4, sigma), 1 / 60)
 
     def markers(x):
         front = x[:, 2:4] + L * np.stack([np.cos(x[:, 4]), np.sin(x[:, 4])], axis=1)
@@ -336,10 +336,10 @@ def test_pieces_of_a_record_keep_their_latency_and_cover_it():
 def test_misuse_says_what_to_do():
     _, trials = simulated(SPRING, np.random.default_rng(11), SPRING_NOISE, B=1)
     with pytest.raises(GroundedError, match="2 states and 2 channels"):
-        filter_trials(SPRING, trials, NoiseLevels(np.ones(3), np.ones(2), DT))
+        filter_trials(SPRING, trials, NoiseStd(np.ones(3), np.ones(2), DT))
     with pytest.raises(GroundedError, match="ingest at least one"):
         filter_trials(SPRING, [], SPRING_NOISE)
     with pytest.raises(GroundedError, match="no input 'steering'"):
         filter_trials(car, trials, CAR_NOISE)
     with pytest.raises(GroundedError, match="finite standard"):
-        NoiseLevels(np.array([np.nan]), np.ones(1), DT)
+        NoiseStd(np.array([np.nan]), np.ones(1), DT)

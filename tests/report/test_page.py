@@ -11,10 +11,11 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
+from grounded.diagnosis.report import Diagnosis
+from grounded.errors import NextCommand
 from grounded_trials.report.findings import Lost
 from grounded_trials.report.gathering import gather
 from grounded_trials.report.page.page import page
-from grounded_trials.workspace.diagnosis_file import diagnosis_of
 from grounded_trials.workspace.folder import Workspace
 from page_browser import browser, missing
 from reported import DIAGNOSIS, car, cart, many_flights
@@ -115,7 +116,7 @@ def test_page_of_an_older_diagnosis_leaves_out_what_it_lacks(cart):
     new = ("split", "whiteness")
     where = {key: value for key, value in DIAGNOSIS["where"].items() if key not in new}
     old = {k: v for k, v in DIAGNOSIS.items() if k not in ("utility_prediction", "lookalikes")}
-    text = page(replace(findings, diagnosis=diagnosis_of(old | {"where": where})))
+    text = page(replace(findings, diagnosis=Diagnosis.from_json(old | {"where": where})))
     for words in ("What the error is made of", "Is the rest noise", "Look-alikes", "predicted<"):
         assert words not in text
 
@@ -163,8 +164,8 @@ def hostile(folder):
         method=EVIL,
         standing=standing,
         lost=(Lost(EVIL, EVIL),),
-        diagnosis=diagnosis_of(document),
-        next_command=EVIL,
+        diagnosis=Diagnosis.from_json(document),
+        then=NextCommand(EVIL),
     )
 
 
@@ -280,6 +281,6 @@ def test_a_value_without_an_interval_is_said_to_be_undetermined(cart, interval):
     value = {"value": 0.3, "std": 0.01, "unit": "1/s", "interval": interval}
     entry = DIAGNOSIS["ranking"][0] | {"params": {"k": value}}
     findings = gather(Workspace(cart))
-    text = page(replace(findings, diagnosis=diagnosis_of(DIAGNOSIS | {"ranking": [entry]})))
+    text = page(replace(findings, diagnosis=Diagnosis.from_json(DIAGNOSIS | {"ranking": [entry]})))
     assert "k = –, not determined by these trials<" in text
     assert "0.280 to 0.320" not in text

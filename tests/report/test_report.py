@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from cli import grounded, plain
+from grounded.diagnosis.report import Diagnosis
 from grounded_trials.report.diagnosis_words import calibrated_sentence
 from grounded_trials.report.findings import prediction_error, rms, tracking_error
 from grounded_trials.report.gathering import gather
 from grounded_trials.report.reporting import save_optimum
-from grounded_trials.workspace.diagnosis_file import diagnosis_of
 from grounded_trials.workspace.folder import Workspace
 from reported import DIAGNOSIS, car, cart, copied, damage
 from workspaces import make
@@ -169,9 +169,10 @@ def test_a_damaged_candidate_is_taken_from_the_trial_that_ran_it(cart, tmp_path)
 def test_a_damaged_diagnosis_is_named(cart, tmp_path, text):
     folder = copied(cart, tmp_path / "w")
     (folder / "reports" / "diagnosis.json").write_text(text)
-    done = grounded("-C", folder, "report")
+    done = grounded("-C", folder, "report", "--json")
     assert done.code == 3
-    assert "is not what `grounded diagnose` writes" in " ".join(plain(done.out).split())
+    (lost,) = done.json["lost"]
+    assert lost["file"] == "diagnosis.json" and "can't be read" in lost["reason"]
 
 
 def test_a_short_trial_is_shown_as_failed(cart, tmp_path):
@@ -274,7 +275,7 @@ def test_text_says_what_was_calibrated_and_what_the_figures_are_measured_in(cart
 
 def test_at_most_three_parameters_are_named_the_most_changed_first():
     table = {f"p{k}": {"value": 1.0 + 0.1 * k, "std": 0.01, "unit": "m"} for k in range(6)}
-    found = diagnosis_of(DIAGNOSIS | {"parameters": table})
+    found = Diagnosis.from_json(DIAGNOSIS | {"parameters": table})
     text = calibrated_sentence(found, dict.fromkeys(table, 1.0))
     assert text == (
         "calibrated beside them: p5 1.00 -> 1.50 m, p4 1.00 -> 1.40 m, p3 1.00 -> 1.30 m "

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from cli import grounded
+from grounded.errors import NextCommand
 from grounded.experiments.figure8 import flight_task
 from grounded.models import aircraft
 from grounded.policy import Policy
@@ -161,5 +162,5 @@ def many_flights(trials: int = 50) -> Findings:
         diagnosis=None,
         optimum=None,
         noise=float("nan"),
-        next_command="grounded propose",
+        then=NextCommand("propose"),
     )

@@ -8,11 +8,11 @@ import click
 import pytest
 
 from cli import grounded, plain, process
+from grounded.diagnosis.report import Diagnosis
 from grounded_cli import address
 from grounded_cli.main import COMMANDS, cli
 from grounded_trials.wording import folded
 from grounded_trials.workspace.config import set_in_model
-from grounded_trials.workspace.diagnosis_file import diagnosis_of
 from grounded_trials.workspace.folder import Workspace
 from grounded_trials.workspace.next_step import since_diagnosis
 from reported import DIAGNOSIS, cart, copied
@@ -135,7 +135,7 @@ def test_a_command_that_is_broken_over_two_lines_is_completed_too():
 def test_an_error_names_the_workspace_too_and_init_does_not(tmp_path):
     make(tmp_path / "cart")
     done = process("-C", "cart", "adopt", "delay:force", cwd=tmp_path)
-    assert "run `grounded -C cart diagnose` first" in done.err
+    assert done.err.endswith("\nnext: grounded -C cart diagnose\n")
     done = process("-C", "cart", "init", "new", "--example", "pendulum", cwd=tmp_path)
     assert "next: cd new && grounded propose" in done.out
 
@@ -223,7 +223,8 @@ def test_rivals_are_not_adopted_together(cart, tmp_path):
     done = grounded("-C", folder, "adopt", "viscous_friction:v", "delay:force")
     assert done.code == 1 and "does not claim delay:force" in done.err
     assert "one instead of another" in done.err
-    assert "`grounded adopt viscous_friction:v`, or `grounded adopt delay:force`" in plain(done.err)
+    assert "those that it claims (viscous_friction:v), or one alone" in plain(done.err)
+    assert plain(done.err).endswith("\nnext: grounded adopt viscous_friction:v\n")
     assert (folder / "grounded.toml").read_text() == before
 
 
@@ -271,7 +272,7 @@ def test_a_delay_more_than_the_adopted_one_is_open_until_it_is_adopted(cart, tmp
     then = {"name": "delay:force", "d": 0.01}
     made = {"trials": [], "adopted": [then], "params": {}}
     verdict = {"kind": "effect", "effects": ["delay:force"], "sentence": "Later still."}
-    found = diagnosis_of(DIAGNOSIS | {"verdict": verdict, "diagnosed": made})
+    found = Diagnosis.from_json(DIAGNOSIS | {"verdict": verdict, "diagnosed": made})
     assert found.open([then]) == ("delay:force",)
     assert found.open([then | {"d": 0.03}]) == ()
     workspace = Workspace(folder)

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from grounded.diagnosis.report import Diagnosis
 from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.search.certainty import utility_noise
@@ -25,8 +26,7 @@ from grounded.trial import Trial, bridge
 from grounded_trials.report.findings import Findings, Log, Lost, Run
 from grounded_trials.store.trial_file import read_trial
 from grounded_trials.workspace.adopting import Better, better_model
-from grounded_trials.workspace.diagnosing import LEAST_STEPS
-from grounded_trials.workspace.diagnosis_file import Diagnosis, read_diagnosis
+from grounded_trials.workspace.diagnosing import LEAST_STEPS, read_diagnosis
 from grounded_trials.workspace.folder import Workspace, candidate_of
 from grounded_trials.workspace.next_step import Since, next_command, since_diagnosis
 
@@ -62,7 +62,7 @@ def gather(workspace: Workspace) -> Findings:
         diagnosis=diagnosis,
         optimum=_optimum(workspace.reports),
         noise=utility_noise(now.history)[0],
-        next_command=next_command(workspace, now, diagnosis, usable),
+        then=next_command(workspace, now, diagnosis, usable),
         better=better,
         since=since_diagnosis(workspace, diagnosis, usable) if diagnosis else Since(),
     )

@@ -28,8 +28,8 @@ from grounded.errors import GroundedError
 from grounded_trials.store.store import DIGITS, Store, write_atomically
 from grounded_trials.store.trial_file import trial_bytes
 from grounded_trials.workspace.config import FILE
+from grounded_trials.workspace.diagnosing import FILE as DIAGNOSIS
 from grounded_trials.workspace.diagnosing import diagnose_in
-from grounded_trials.workspace.diagnosis_file import FILE as DIAGNOSIS
 from grounded_trials.workspace.examples import toml_of
 from grounded_trials.workspace.folder import Workspace
 from grounded_trials.workspace.task_file import write_target
