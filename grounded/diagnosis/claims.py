@@ -1,15 +1,14 @@
-"""Which of the model's own parameters are off, where calibrating them explains the gap.
+"""What is claimed, with values and intervals; what lost; what ties; what is nearly the same.
 
-Around the calibrated fit the log-posterior of the shifts is a parabola, H its curvature. With only
-a set S of the parameters free the best that is left is lower by
+Where calibrating the model's own parameters explains the gap, those that are off are named. Around
+the calibrated fit the log-posterior of the shifts is a parabola, H its curvature. With only a set S
+of the parameters free the best that is left is lower by
 
     loss(S) = 1/2 b' (H_rr - H_rS H_SS^-1 H_Sr) b,        r: the others, b: their shifts
 
 Parameters are taken into S one by one, each time the one that lowers the loss most, until what the
 others would add is not worth a claim. So two parameters that only one combination of the data
 knows (a gain and a time constant) are not both blamed for it.
-
-What is claimed, with values and intervals; what lost; what ties; what is nearly the same.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""A late measurement in the filter: one state more, and its three passes stay as they are.
+"""A delayed measurement in the filter: one state more, and its three passes stay as they are.
 
-    r_i(s) = (1 - p) e_i(s) + p e_i(s - 1) + v(s)         of a late channel i, 0 <= p < 1
+    r_i(s) = (1 - p) e_i(s) + p e_i(s - 1) + v(s)         of a delayed channel i, 0 <= p < 1
 
 Slot i of the widened state is what is measured, z_i(s) = (1 - p) e_i(s) + p e_i(s - 1); slot n + j
 is e_i(s) itself, as a channel that is never measured. So H stays the identity of what is seen, and
@@ -10,7 +10,7 @@ is e_i(s) itself, as a channel that is never measured. So H stays the identity o
 
 where F takes e_i from slot n + j. Noise enters by G of n + D rows. Coloured noise follows, as ever.
 
-Shapes: L steps, B runs, n channels, D late ones, n' = n + D, N' = n' or 2 n'.
+Shapes: L steps, B runs, n channels, D delayed ones, n' = n + D, N' = n' or 2 n'.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ class Delayed:
         return A
 
     def _led(self, rows: Array, n: int) -> Array:
-        """Rows of e (L, B, n', C), those of late channels led to slot n + j and, by 1 - p, to i."""
+        """Rows of e (L, B, n', C), delayed channels led to slot n + j and, times 1 - p, to i."""
         found, run = rows.copy(), np.arange(rows.shape[1])
         found[:, :, n:] = np.take_along_axis(rows, self.channel[None, :, :, None], 2)
         for j in range(self.count):
@@ -131,14 +131,14 @@ class Delayed:
 def joined(
     parts: Sequence[tuple[FilterSystem, Delayed | None]],
 ) -> tuple[FilterSystem, Delayed | None]:
-    """Systems with as many late channels each as one, their runs one after the other."""
+    """Systems with as many delayed channels each as one, their runs one after the other."""
     systems = [system for system, _ in parts]
     A, Q, R, seen = (np.concatenate([one[k] for one in systems], axis=1) for k in range(4))
     entries = [one.G for one in systems if one.G is not None]
     G = np.concatenate(entries, axis=1) if entries else None
     whole = FilterSystem(A, Q, R, seen, np.concatenate([one.start for one in systems]), G)
-    each = [late for _, late in parts if late is not None]
+    each = [delayed for _, delayed in parts if delayed is not None]
     if not each:
         return whole, None
-    channel, part = [late.channel for late in each], [late.part for late in each]
+    channel, part = [delayed.channel for delayed in each], [delayed.part for delayed in each]
     return whole, Delayed(np.concatenate(channel), np.concatenate(part))

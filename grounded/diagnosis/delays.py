@@ -4,9 +4,10 @@
     y_i(s + k) = (1 - p) x_i(s) + p x_i(s - 1)
 
 So under a hypothesis with a delay the log of its channel is moved by k steps, and the filter takes
-care of p (`late.py`). The first k samples of a trial show what was before it, which no model
-predicts. All hypotheses are judged by the same data, so they count too (`before`): as samples of a
-state that drifted into the trial at rest, or at the pace of its beginning, whichever is likelier.
+care of p (`delayed_measurement`). The first k samples of a trial show what was before it, which no
+model predicts. All hypotheses are judged by the same data, so they count too (`before`): as samples
+of a state that drifted into the trial at rest, or at the pace of its beginning, whichever is
+likelier.
 
 Noise (its weights) and adjoints belong to samples: outside the filter they stay in the log's order.
 """
@@ -32,14 +33,14 @@ UNLIKE = 1.0  # nats that a sample of what was before a trial costs at most more
 
 @dataclass(frozen=True, eq=False)
 class Delays:
-    """The late channels of a hypothesis, D of them: which, k and p of each."""
+    """The delayed channels of a hypothesis, D of them: which, k and p of each."""
 
     data: Data
     channel: tuple[int, ...]
     whole: tuple[int, ...]
     part: Array  # (D,)
 
-    def late(self) -> Delayed:
+    def in_filter(self) -> Delayed:
         """For the filter, every run the same."""
         B = len(self.data.valid)
         return Delayed(np.tile(self.channel, (B, 1)), np.tile(self.part, (B, 1)))
@@ -190,6 +191,6 @@ def _named(h: Hypothesis, data: Data) -> list[tuple[int, float]]:
     """Channels and delays [s]."""
     return [
         (data.model.state_names.index(effect.site.target), float(values["d"]))
-        for effect, values in zip(h.effects, h.values, strict=True)
+        for effect, values in h.pairs
         if isinstance(effect.family, SensorDelayFamily)
     ]

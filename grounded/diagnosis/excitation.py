@@ -23,7 +23,7 @@ from grounded.diagnosis.hypothesis import Hypothesis, Predictor
 from grounded.diagnosis.noise import NoiseModel, Structure
 from grounded.diagnosis.refine import refine
 from grounded.diagnosis.report import Diagnosis
-from grounded.effects import Effect, Library, scales_of, wrap, wrapping_order
+from grounded.effects import Library, memory_start, scales_of, wrap, wrapping_order
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.policy import Policy, Runner
@@ -140,17 +140,13 @@ def _hypotheses(
     inputs = np.concatenate([trial.inputs for trial in trials])
     duration = max(trial.steps for trial in trials) * task.dt
     scales = scales_of(task.model, states, inputs, task.dt, duration)
-    built: dict[str, Effect] = {}
-    for name in {*diagnosis.effects, first, second}:
-        built[name] = library.effect(name, task.model, scales)
-    rest = [n for n in diagnosis.effects if n not in (first, second)]
-    found = []
-    for name in (first, second):
-        h = Hypothesis()
-        for n in [*rest, name]:
-            h = h.plus(built[n], diagnosis.values(n))
-        found.append(h)
-    return found[0], found[1]
+    h = Hypothesis()
+    for name in diagnosis.effects:
+        if name not in (first, second):
+            h = h.plus(library.effect(name, task.model, scales), diagnosis.values(name))
+    built = (library.effect(name, task.model, scales) for name in (first, second))
+    one, other = (h.plus(effect, diagnosis.values(effect.name)) for effect in built)
+    return one, other
 
 
 def _noise(model: Model, diagnosis: Diagnosis) -> NoiseModel:
@@ -165,39 +161,21 @@ def _run(task: Task, h: Hypothesis, policy: Policy) -> Trial | None:
     """A run of the policy in the model with a hypothesis, without noise; None if it diverges."""
     model = _wrapped(task, h)
     assert task.latency is not None
-    start = Trial(
-        task.start[None],
-        np.empty((0, task.model.m)),
-        task.dt,
-        task.model.state_names,
-        task.model.input_names,
-        start_inputs=task.past,
-    )
-    extra = _memory_start(model, task.model, start)
-    z, runner = np.concatenate([task.start, extra]), Runner(policy)
-    states, inputs = [task.start], np.zeros((policy.horizon, model.m))
+    names = (task.model.state_names, task.model.input_names)
+    nothing = np.empty((0, task.model.m))
+    start = Trial(task.start[None], nothing, task.dt, *names, start_inputs=task.past)
+    z = np.concatenate([task.start, memory_start(model, task.model, start)])
+    states, inputs, runner = [task.start], np.zeros((policy.horizon, model.m)), Runner(policy)
+    late, past = task.latency / task.dt, task.past[:, None]
     for t in range(policy.horizon):
         inputs[t] = runner.action(t * policy.dt, states[-1])
-        received = np.array(
-            [
-                shifted(inputs[None, : t + 1, j], task.past[j : j + 1], task.latency[j] / task.dt)[
-                    0, -1
-                ]
-                for j in range(model.m)
-            ]
-        )
-        z = model.system.step(z[None], received[None], model.values, task.dt)[0]
+        sent = inputs[None, : t + 1]
+        received = [shifted(sent[..., j], past[j], late[j])[0, -1] for j in range(model.m)]
+        z = model.system.step(z[None], np.array([received]), model.values, task.dt)[0]
         if not np.isfinite(z).all():
             return None
         states.append(z[: task.model.n])
-    return Trial(
-        np.array(states),
-        inputs,
-        task.dt,
-        task.model.state_names,
-        task.model.input_names,
-        start_inputs=task.past,
-    )
+    return Trial(np.array(states), inputs, task.dt, *names, start_inputs=task.past)
 
 
 def _wrapped(task: Task, h: Hypothesis) -> Model:
@@ -208,12 +186,6 @@ def _wrapped(task: Task, h: Hypothesis) -> Model:
         current = Library((effect.family,)).effect(effect.name, model, effect.site.scales)
         model = wrap(current, h.values[i], task.dt)
     return model
-
-
-def _memory_start(wrapped: Model, base: Model, trial: Trial) -> Array:
-    from grounded.effects import memory_start
-
-    return memory_start(wrapped, base, trial)
 
 
 def _safe(task: Task, run: Trial | None) -> bool:

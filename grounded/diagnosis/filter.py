@@ -17,8 +17,8 @@ N_t their covariances, d loglik / d R = (u u' - D) / 2 and d loglik / d Q = (r r
 Where a state is only carried along (a heading rate that is a function of steering and speed), what
 disturbs those disturbs it too: the noises enter through G_t (n, n), c + w -> G (c + w).
 
-A measurement that is late (`late.py`) shows the state of an earlier moment; one more state each
-remembers it. Callers see none of that: arrays go in and come out as without.
+A delayed measurement (`delayed_measurement`) shows the state of an earlier moment; one more state
+each remembers it. Callers see none of that: arrays go in and come out as without.
 
 Arrays are time-major: L steps, B runs, N states of the filter (n, or 2 n with coloured noise), C
 columns. A missing measurement is a False in `seen`.
@@ -42,7 +42,7 @@ UNKNOWN = 1e6  # standard deviations: how little is known of a state that was no
 class Gains:
     """What does not depend on the data: A (L, B, N, N), K (L, B, N, n), whitener (L, B, n, n).
 
-    Where measurements are late, all of them are those of the widened state.
+    Where measurements are delayed, all of them are those of the widened state.
     """
 
     A: Array
@@ -51,7 +51,7 @@ class Gains:
     logdet: Array  # (L, B) log det S over what was seen
     seen: Array  # (L + 1, B, n) 1.0 or 0.0
     G: Array | None = None  # (L, B, n, n) how noise enters; None: as it is
-    late: Delayed | None = None  # which measurements are late
+    delayed: Delayed | None = None  # which measurements are delayed
 
 
 def transition(F: Array, phi: float | None, G: Array | None = None) -> Array:
@@ -77,7 +77,7 @@ def gains(
     seen: Array,
     start: Array,
     G: Array | None = None,
-    late: Delayed | None = None,
+    delayed: Delayed | None = None,
 ) -> Gains:
     """The covariance recursion.
 
@@ -88,7 +88,7 @@ def gains(
         seen: (L + 1, B, n), 1.0 where a measurement is there.
         start: (B, N - n) variance of the coloured noise at t = 0.
         G: (L, B, n, n) how the noise enters, None for the identity.
-        late: channels whose measurement is late.
+        delayed: channels whose measurement is delayed.
 
     Raises:
         numpy.linalg.LinAlgError: when a covariance is not finite.
@@ -96,9 +96,9 @@ def gains(
     L, B, N, _ = A.shape
     Q, R = np.broadcast_to(Q, (L, B, N)), np.broadcast_to(R, (L + 1, B, seen.shape[-1]))
     given = FilterSystem(A, Q, R, seen, start, G)
-    if late is None:
+    if delayed is None:
         return _gains(given)
-    return replace(_gains(late.system(given)), late=late)
+    return replace(_gains(delayed.system(given)), delayed=delayed)
 
 
 def _gains(given: FilterSystem) -> Gains:
@@ -166,11 +166,11 @@ def innovations(g: Gains, d: Array, r: Array, *, track: bool = False) -> tuple[A
         r: what each column adds to a measurement (L + 1, B, n, C), or (L + 1, 1, 1, 1) of zeros.
         track: also return the filtered errors.
     """
-    if g.late is None:
+    if g.delayed is None:
         return _innovations(g, d, r, track=track)
-    white, filtered = _innovations(g, *g.late.columns(d, r), track=track)
+    white, filtered = _innovations(g, *g.delayed.columns(d, r), track=track)
     own = np.ascontiguousarray(white[:, :, : d.shape[2]])
-    return own, None if filtered is None else g.late.errors(filtered)
+    return own, None if filtered is None else g.delayed.errors(filtered)
 
 
 def _innovations(g: Gains, d: Array, r: Array, *, track: bool) -> tuple[Array, Array | None]:
@@ -246,11 +246,11 @@ class Adjoint:
 
 def smoother(g: Gains, white: Array) -> Adjoint:
     """The backward pass for one column of whitened innovations, (L, B, n)."""
-    if g.late is None:
+    if g.delayed is None:
         return _smoother(g, white)
-    n, late = white.shape[-1], g.late
-    found = _smoother(g, np.pad(white, [(0, 0), (0, 0), (0, late.count)]))
-    r, N = late.disturbances(found.r, n), late.disturbances(found.N, n)
+    n, delayed = white.shape[-1], g.delayed
+    found = _smoother(g, np.pad(white, [(0, 0), (0, 0), (0, delayed.count)]))
+    r, N = delayed.disturbances(found.r, n), delayed.disturbances(found.N, n)
     return Adjoint(found.u[..., :n], found.D[..., :n], r, N)
 
 

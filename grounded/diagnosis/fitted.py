@@ -1,8 +1,6 @@
-"""A hypothesis at its most likely values: what `refine` returns.
+"""A hypothesis at its most likely values (`refine` returns it), and how sure these values are.
 
-How sure a value is: Fisher information, jackknifed over trials.
-
-The Fisher information trusts the noise model; the jackknife asks the trials themselves, each left
+The Fisher information believes the noise model; the jackknife asks the trials themselves, each left
 out once (Efron & Tibshirani 1993, ch. 11). The larger of the two is reported.
 """
 
@@ -59,9 +57,7 @@ class Fitted:
         """Precision of each column, (C,): zero for effects."""
         h = self.hypothesis
         k = len(h.theta)
-        return np.concatenate(
-            [np.zeros(k), shift_precision(self.hypothesis, self.gram.shape[-1] - k)]
-        )
+        return np.concatenate([np.zeros(k), shift_precision(h, self.gram.shape[-1] - k)])
 
 
 def shift_precision(h: Hypothesis, count: int) -> Array:
@@ -72,27 +68,6 @@ def shift_precision(h: Hypothesis, count: int) -> Array:
 def calibrated(data: Data) -> Any:
     """Parameters that have a scale, as indices: those that a shift makes sense for."""
     return np.flatnonzero(param_scale(data.model) > 0)
-
-
-# 97.5 % quantiles of Student's t for 1 to 30 degrees of freedom
-T: tuple[float, ...] = (
-    12.71,
-    4.30,
-    3.18,
-    2.78,
-    2.57,
-    2.45,
-    2.36,
-    2.31,
-    2.26,
-    2.23,
-    2.20,
-    2.18,
-    2.16,
-    2.14,
-    2.13,
-)
-T += (2.12, 2.11, 2.10, 2.09, 2.09, 2.08, 2.07, 2.07, 2.06, 2.06, 2.06, 2.05, 2.05, 2.05, 2.04)
 
 
 def leave_one_out(fit: Fitted, trial_of: Array) -> tuple[Array, Array]:
@@ -118,8 +93,9 @@ def leave_one_out(fit: Fitted, trial_of: Array) -> tuple[Array, Array]:
 
 def standard_deviations(fit: Fitted, trial_of: Array) -> tuple[Array, Array]:
     """Of every free value: standard deviation, half-width of the 95 % interval, (C,) each."""
-    C = fit.gram.shape[-1]
-    if C == 0:
+    from scipy.special import stdtrit
+
+    if fit.gram.shape[-1] == 0:
         return np.zeros(0), np.zeros(0)
     fisher = _fisher(fit.gram.sum(axis=0) + np.diag(fit.prior))
     shifts, _ = leave_one_out(fit, trial_of)
@@ -128,7 +104,7 @@ def standard_deviations(fit: Fitted, trial_of: Array) -> tuple[Array, Array]:
         return fisher, 1.96 * fisher
     spread = shifts - shifts.mean(axis=0)
     jack = np.sqrt((S - 1) / S * (spread**2).sum(axis=0))
-    t = T[min(S - 2, 29)]
+    t = float(stdtrit(S - 1, 0.975))  # Student's quantile
     return np.maximum(fisher, jack), np.maximum(1.96 * fisher, t * jack)
 
 

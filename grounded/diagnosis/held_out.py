@@ -1,20 +1,14 @@
-"""How far the gap shrinks: predictions of trials that had no part in the values.
+"""How far the gap shrinks on trials that had no part in the values; no claim that these contradict.
 
 For each trial the values are estimated from the other trials (one Newton step from the estimate on
 all), and the trial is predicted from many of its moments, a second ahead, with the commands that
-were really sent. Errors are in units of what noise alone would make of them; 1 is the floor.
+were really sent. Errors are in units of what noise alone would make of them; 1 is the floor. What
+matters to the search is the utility: so each trial is also run again from its start, and the
+utility of that run is compared with the real one (`utility_prediction`).
 
-How well the utility of a trial is predicted, with and without the effects.
-
-Each trial is run again in the model from where it started, with the commands that were really sent
-and values that were estimated from the other trials; the utility of that run is compared with the
-real one. What matters to the search is the utility, not a state a second ahead.
-
-No claim that held-out trials contradict: evidence alone does not see that.
-
-Four ways in which the likeliest hypothesis can be wrong, most of them where predictions miss by far
-more than noise makes: something is wrong then that is not in the library, and likelihoods are those
-of a wrong model.
+Evidence alone does not see when the likeliest hypothesis is wrong (`noise_confirmed`, `confirmed`).
+There are four ways, most of them where predictions miss by far more than noise makes: something is
+wrong then that is not in the library, and likelihoods are those of a wrong model.
 
 Noise that is allowed to be coloured, or parameters that are allowed to move, explain a lasting
 effect away that predictions a second ahead still miss (a bias of a motor, a friction that is lower

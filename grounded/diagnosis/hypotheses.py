@@ -1,8 +1,8 @@
-"""What an attribution has found so far: which hypotheses were fitted, their evidence, the best.
+"""Which hypotheses an attribution has fitted so far, their evidence, the best of them.
 
-evidence(h) = log p(y | h) - what its effects cost (`price.py`) - what the noise structure costs
+    evidence(h) = log p(y | h) - what naming its effects costs - what the noise structure costs
 
-What naming an effect costs: the price of its numbers, of looking for it, of where it might be.
+What naming an effect costs, the price of its numbers, of looking for it, of where it might be:
 
     price = k/2 ln N + ln(places looked at) + ln(targets of the family)
 
@@ -51,7 +51,7 @@ class FittedHypotheses:
     def score(self, fit: Fitted) -> float:
         """Evidence of a fit in nats, up to a constant of the data."""
         h = fit.hypothesis
-        paid = sum(self.price(e, dict(v)) for e, v in zip(h.effects, h.values, strict=True))
+        paid = sum(self.price(e, v) for e, v in h.pairs)
         extra = fit.noise.structure.numbers(self.data.model.n)
         calibration = 1.0 if h.spread > 0 else 0.0
         return fit.evidence - paid - 0.5 * extra * math.log(self.N) - calibration

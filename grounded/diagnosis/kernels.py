@@ -1,6 +1,4 @@
-"""What the filter's kernels are written with: arguments, rooms, the loops they share.
-
-The Kalman filter's three passes as compiled kernels: the twin of `filter.py`, but faster.
+"""The Kalman filter's three passes as compiled kernels: the twin of `filter.py`, but faster.
 
 A run's covariance is a few dozen numbers: NumPy spends its time on calls. Here all runs go through
 time together (memory is read in order), matrices with rows padded to whole vectors. Everything is
@@ -87,12 +85,12 @@ class Pen:
                     total = f.fma(a, f.load(right[0], k * right[1] + c, w), total, w)
                 f.store(total, to, c, w)
 
-    def copied(self, source: str, rows: int, columns: int, to: str, step: int) -> None:
-        """A plain matrix into padded rows."""
+    def copied(self, source: str, step: int, to: str, to_step: int, size: tuple[int, int]) -> None:
+        """A matrix (rows, columns), its rows so many numbers apart here and there."""
         f = self.f
-        with f.loop(rows) as i:
-            a, b = f.at(source, f.integer("mul", i, columns)), f.at(to, f.integer("mul", i, step))
-            for c in range(columns):
+        with f.loop(size[0]) as i:
+            a, b = f.at(source, f.integer("mul", i, step)), f.at(to, f.integer("mul", i, to_step))
+            for c in range(size[1]):
                 f.store(f.load(a, c), b, c)
 
     def turned(
@@ -105,14 +103,6 @@ class Pen:
             for c in range(size[1]):
                 value = f.load(a, c)
                 f.store(f.neg(value) if minus else value, b, c * wide)
-
-    def unpadded(self, source: str, rows: int, columns: int, step: int, to: str) -> None:
-        """Padded rows into a plain matrix."""
-        f = self.f
-        with f.loop(rows) as i:
-            a, b = f.at(source, f.integer("mul", i, step)), f.at(to, f.integer("mul", i, columns))
-            for c in range(columns):
-                f.store(f.load(a, c), b, c)
 
     def end(self) -> str:
         """The finished kernel."""
@@ -162,9 +152,7 @@ def _version() -> str:
     import hashlib
     from pathlib import Path
 
-    ours = [Path(__file__).with_name(name) for name in ("kernels.py", "kernel_pen.py")]
-    text = b"".join(path.read_bytes() for path in ours)
-    return hashlib.sha256(text).hexdigest()[:16] + jit.writers()
+    return hashlib.sha256(Path(__file__).read_bytes()).hexdigest()[:16] + jit.writers()
 
 
 def _gains(n: int, N: int, through: bool, width: int) -> str:
@@ -192,10 +180,10 @@ def _gains(n: int, N: int, through: bool, width: int) -> str:
             place = i * wide + i
             f.store(f.add(f.load(P, place), f.load(q, i)), P, place)
         _factorised(pen, P, R, seen, W, WT)
-        pen.unpadded(W, n, n, short, pen.at("W", t, b, n * n))
+        pen.copied(W, short, pen.at("W", t, b, n * n), n, (n, n))
         pen.product((half, N, short), (P, wide, 1), (WT, short), n)
         pen.product((K, N, short), (half, short, 1), (W, short), n)
-        pen.unpadded(K, N, n, short, pen.at("K", t, b, N * n))
+        pen.copied(K, short, pen.at("K", t, b, N * n), n, (N, n))
         pen.turned(half, (N, n), short, turned, wide, minus=True)
         pen.product((P, N, wide), (half, short, 1), (turned, wide), n, onto=P)
     return pen.end()
@@ -316,9 +304,9 @@ def _smoother(n: int, N: int, through: bool, width: int) -> str:
         raw = pen.at("K", t, b, N * n)
         rawW, white = pen.at("W", t, b, n * n), pen.at("white", t, b, n)
         seen = pen.at("seen", f.integer("add", t, 1), b, n)
-        pen.copied(pen.at("A", t, b, N * N), N, N, A, wide)
-        pen.copied(raw, N, n, K, short)
-        pen.copied(rawW, n, n, W, short)
+        pen.copied(pen.at("A", t, b, N * N), N, A, wide, (N, N))
+        pen.copied(raw, n, K, short, (N, n))
+        pen.copied(rawW, n, W, short, (n, n))
         pen.product((NK, N, short), (Nq, wide, 1), (K, short), N)
         pen.product((D, n, short), (W, 1, short), (W, short), n)
         pen.product((D, n, short), (K, 1, short), (NK, short), N, onto=D)
@@ -382,7 +370,7 @@ def _answer(pen: Pen, through: bool, t: str, b: str, rooms: tuple[str, str, str,
     if not through:
         return
     raw = pen.at("G", t, b, n * n)
-    pen.copied(raw, n, n, G, short)
+    pen.copied(raw, n, G, short, (n, n))
     pen.product((spare, 1, short), (q, wide, 1), (G, short), n)
     for i in range(n):
         f.store(f.load(spare, i), r_out, i)

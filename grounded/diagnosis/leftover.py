@@ -72,11 +72,7 @@ def flexible(predictor: Predictor, fit: Fitted) -> Array:
     names = [n for n in places.dynamic(model) if n in model.state_names]
     states = [_scaled(x[..., model.state_names.index(n)]) for n in names][:6]
     inputs = [_scaled(u[..., j]) for j in range(model.m)]
-    lagged = [
-        _scaled(np.abs(_late(u[..., j], k)) * np.sign(_late(u[..., j], k)))
-        for j in range(model.m)
-        for k in LAGS
-    ]
+    lagged = [_scaled(_lagged(u[..., j], k)) for j in range(model.m) for k in LAGS]
     clock = data.time / max(float(data.time.max()), data.dt)
     columns: list[Array] = [np.ones_like(clock)]
     for value in inputs:
@@ -101,7 +97,7 @@ def _scaled(value: Array) -> Array:
     return np.asarray(np.clip((value - value.mean()) / max(spread, 1e-12), -3, 3))
 
 
-def _late(value: Array, steps: int) -> Array:
+def _lagged(value: Array, steps: int) -> Array:
     return np.concatenate([np.repeat(value[:1], steps, axis=0), value[:-steps]])[: len(value)]
 
 
@@ -163,6 +159,8 @@ def filter_of(predictor: Predictor, fit: Fitted) -> kalman.Gains:
 
 def whiteness(fit: Fitted, seen: Array) -> dict[str, float]:
     """Ljung-Box of each channel's whitened innovations over 10 lags: p-values by index."""
+    from scipy.special import chdtrc
+
     found = {}
     L, _, n = fit.white.shape
     lags = min(RHO_LAGS, L // 4)
@@ -174,15 +172,5 @@ def whiteness(fit: Fitted, seen: Array) -> dict[str, float]:
             rho = float((e[k:] * e[:-k]).sum()) / max(power, 1e-300)
             q += rho**2 / max(count - k, 1.0)
         q *= count * (count + 2)
-        found[str(i)] = chi2_tail(q, lags)
+        found[str(i)] = float(chdtrc(lags, q)) if lags else 1.0
     return found
-
-
-def chi2_tail(q: float, dof: int) -> float:
-    """P(chi2_dof > q), by Wilson and Hilferty's cube root."""
-    from math import erfc, sqrt
-
-    if dof <= 0 or q <= 0:
-        return 1.0
-    z = ((q / dof) ** (1 / 3) - (1 - 2 / (9 * dof))) / sqrt(2 / (9 * dof))
-    return 0.5 * erfc(z / sqrt(2))

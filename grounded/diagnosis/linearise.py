@@ -3,32 +3,26 @@
     e_{t+1} = F_t e_t + d_t,   r_t = y_t - x_t - offset_t
 
 d and r as columns: the residual first, then the derivative by each value and each shift. Where a
-sensor is late, r_t is that of the sample that shows the state at t (`delays.py`).
-
-How an error passes through a step of a hypothesis: the model's Jacobian, its effects' too.
+sensor is delayed, r_t is that of the sample that shows the state at t (`delays`). An error passes
+through a step by the model's Jacobian and those of its effects,
 
     F_h = (1 + dt/2 A_1) F (1 + dt/2 A_0),     A = d rate / d x at the start, at the end
 
 An added rate that depends on the state (a coupling, a friction) moves errors as the model does:
 left out, the noise of one state shows up unexplained in another. Effects in proportion to the
 model's own rates take their slope from F. A heading rate that is only carried along is the
-heading's rate, effects and all: its row follows from the heading's slope.
-
-A dry friction's slope at rest is as steep as its smoothing is narrow; it is bounded, so that no
-error turns its sign within half a step.
-
-The slope of one step in the model's parameters, thresholds included.
+heading's rate, effects and all: its row follows from the heading's slope. A dry friction's slope at
+rest is as steep as its smoothing is narrow; it is bounded, so that no error turns its sign within
+half a step.
 
 A threshold (the throttle below which a motor stalls) has no derivative: a small change moves no
-sample across it. Where a parameter's derivative is zero at every sample, the secant over a few
-per cent of its size takes its place, so that a threshold that is off is found like any other
+sample across it. Where a parameter's derivative is zero at every sample, the finite difference over
+a few per cent of its size takes its place, so that a threshold that is off is found like any other
 parameter, and not blamed on an effect.
-
-States that nobody measured when a run began: how little is known of them, what the run tells.
 
 A run starts with the state as it was measured. What was not measured (a speed that the log does not
 hold, a sensor that had dropped out) starts anywhere: a wide prior about the track, and with every
-pass the track's start moves to where the whole run puts it,
+pass the track's start moves to where the whole run puts it (`smoothed`),
 
     E[e_0 | y] = - P_0 sum_t w_t nu_t,        nu, w: whitened innovations of the residual, and of a
                                               unit of e_0 entering the first step (columns of F_0)
@@ -101,21 +95,18 @@ def sensitivities_of(
     predictor: Predictor, h: Hypothesis, x: Array, u: Array
 ) -> tuple[Array, Array]:
     """Of a hypothesis' steps from x (L, B, n): F (L, B, n, n), slope in all parameters (..., k)."""
-    data, (L, B, n) = predictor.data, x.shape
-    flat = (np.ascontiguousarray(x.reshape(-1, n)), np.ascontiguousarray(u.reshape(L * B, -1)))
+    data, n = predictor.data, x.shape[-1]
+    flat = predictor.flat(x, u)
     f_x, f_p = sensitivities(data.model, *flat, predictor.params(h), data.dt)
-    F = with_effects(predictor, h, x, u, f_x.reshape(L, B, n, n))
-    return F, passed(predictor, h, x, u, f_p.reshape(L, B, n, -1))
+    F = with_effects(predictor, h, x, u, f_x.reshape(*x.shape, n))
+    return F, passed(predictor, h, x, u, f_p.reshape(*x.shape, -1))
 
 
 def step_jacobian(predictor: Predictor, h: Hypothesis, track: Array) -> Array:
     """F of every step along a track (L or more, B, n), (L, B, n, n)."""
     data, u = predictor.data, predictor.inputs(h)
-    model, (L, B) = data.model, data.time.shape
-    flat_x = np.ascontiguousarray(track[:L].reshape(-1, model.n))
-    flat_u = np.ascontiguousarray(u.reshape(-1, model.m))
-    f_x, _ = model.system.linearise(flat_x, flat_u, predictor.params(h), data.dt)
-    return with_effects(predictor, h, track[:L], u, f_x.reshape(L, B, model.n, model.n))
+    x = track[: len(data.time)]
+    return with_effects(predictor, h, x, u, predictor.slope(x, u, predictor.params(h)))
 
 
 def noise_entry(predictor: Predictor, h: Hypothesis, track: Array) -> Array | None:
@@ -138,22 +129,22 @@ def filter_system(
     """What the filter of a hypothesis is made of; F (L, B, n, n)."""
     data = predictor.data
     (L, B, n, _), delays = F.shape, delays_of(h, data)
-    seen, late = data.seen, None
+    seen, delayed = data.seen, None
     if delays is not None:
-        noise, seen, late = delays.noise(noise), delays.samples()[1], delays.late()
+        noise, seen, delayed = delays.noise(noise), delays.samples()[1], delays.in_filter()
     G = noise_entry(predictor, h, track)
     A = kalman.transition(F, noise.structure.phi(data.dt), G)
     Q = np.broadcast_to(noise.process(data.dt), (L, B, A.shape[-1]))
     R = widened(data, np.broadcast_to(noise.measurement(L), (L + 1, B, n)), seen)
-    return FilterSystem(A, Q, R, seen, noise.start(B), G), late
+    return FilterSystem(A, Q, R, seen, noise.start(B), G), delayed
 
 
 def gains_of(
     predictor: Predictor, h: Hypothesis, noise: NoiseModel, track: Array, F: Array
 ) -> kalman.Gains:
     """The gains of a hypothesis' filter; F (L, B, n, n)."""
-    system, late = filter_system(predictor, h, noise, track, F)
-    return kalman.gains(*system, late)
+    system, delayed = filter_system(predictor, h, noise, track, F)
+    return kalman.gains(*system, delayed)
 
 
 def base_columns(predictor: Predictor, fit: Fitted) -> tuple[Array, Array]:
@@ -165,7 +156,7 @@ def base_columns(predictor: Predictor, fit: Fitted) -> tuple[Array, Array]:
 def step_sizes(h: Hypothesis) -> list[float]:
     """Half a step of the difference quotient of each free value."""
     sizes = []
-    for effect, values in zip(h.effects, h.values, strict=True):
+    for effect, values in h.pairs:
         for q in effect.free:
             if q.grid:
                 grid = np.sort(np.array(q.grid))
@@ -180,25 +171,21 @@ def step_sizes(h: Hypothesis) -> list[float]:
 def _tried(h: Hypothesis) -> list[tuple[float, ...]]:
     """The step of each free value; for a parameter that may be a threshold a larger one beside."""
     effects = [effect for effect in h.effects for _ in effect.free]
-    found: list[tuple[float, ...]] = []
-    for effect, size in zip(effects, step_sizes(h), strict=True):
+    found: list[tuple[float, ...]] = [(size,) for size in step_sizes(h)]
+    for j, effect in enumerate(effects):
         if isinstance(effect.family, ParamFamily):
             value = effect.site.model.params[effect.site.target].value
-            found.append((size, PART * abs(value)))
-        else:
-            found.append((size,))
+            found[j] = (*found[j], PART * abs(value))
     return found
 
 
 def _nudged(h: Hypothesis, theta: Array, j: int, size: float) -> tuple[Hypothesis, float]:
-    up = theta.copy()
-    up[j] += size
-    other = h.with_theta(up)
-    moved = float(other.theta[j] - theta[j])
-    if moved == 0:
-        up[j] = theta[j] - size
+    for step in (size, -size):
+        up = theta.copy()
+        up[j] += step
         other = h.with_theta(up)
-        moved = float(other.theta[j] - theta[j])
+        if moved := float(other.theta[j] - theta[j]):
+            break
     return other, moved
 
 
@@ -291,12 +278,9 @@ def heading_slope(
     predictor: Predictor, h: Hypothesis, x: Array, u: Array, t: Array, heading: int, rate: int
 ) -> Array:
     """Slope of the heading's rate of this very moment, effects and all, (L, B, n) [1/s]."""
-    data, n = predictor.data, x.shape[-1]
-    short = 1e-3 * data.dt
-    flat = np.ascontiguousarray(x.reshape(-1, n))
-    inputs = np.ascontiguousarray(u.reshape(-1, u.shape[-1]))
-    f_x, _ = data.model.system.linearise(flat, inputs, predictor.params(h), short)
-    own = ((f_x - np.eye(n)) / short).reshape(*x.shape, n)
+    data, short = predictor.data, 1e-3 * predictor.data.dt
+    f_x = predictor.slope(x, u, predictor.params(h), short)
+    own = (f_x - np.eye(x.shape[-1])) / short
     slope, name = own[..., heading, :].copy(), data.model.state_names[heading]
     if any(name in e.site.targets or f"{name}<-" in e.name for e, _ in rates_of(h)):
         slope += rate_slopes(predictor, h, x, u, t, own)[..., heading, :]

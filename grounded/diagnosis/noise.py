@@ -11,16 +11,10 @@ which real noise differs from the textbook's, allowed before an effect is claime
                the same ones, so that outliers count for little and favour nobody.
 
 Variances climb the likelihood by scoring: with the smoother's adjoint r and its covariance N,
-d loglik / d log q = q sum(r^2 - N) / 2, all of them together by their average information
-(`information.py`), since what is a disturbance of one channel can pass for measurement noise of
-another.
-
-What the data know of the noise: the average information of all log variances together.
-
-Channels share their noise: an encoder's noise can pass for a disturbance of the speed behind it. So
-the variances step together, by the average of observed and expected information (Gilmour, Thompson
-& Cullis 1995, "Average information REML"). With P the inverse covariance of the data and V_i what
-noise i adds to it,
+d loglik / d log q = q sum(r^2 - N) / 2. Channels share their noise: an encoder's noise can pass for
+a disturbance of the speed behind it. So all variances step together, by the average of observed and
+expected information (Gilmour, Thompson & Cullis 1995, "Average information REML"). With P the
+inverse covariance of the data and V_i what noise i adds to it,
 
     AI_ij = 1/2 (V_i P y)' P (V_j P y)
 

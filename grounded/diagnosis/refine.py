@@ -1,15 +1,11 @@
-"""One hypothesis on its way up: the step that is proposed, the part of it that is taken.
-
-Gauss-Newton in the effects' values and the parameters' shifts, scoring in the noise, the filtered
-track as the new track: together, from the best point so far. A step that does not rise is taken in
-part, so that nothing is lost by boldness.
-
-Maximum likelihood of many hypotheses at once: effects, parameters, noise and track together.
+"""Maximum likelihood of many hypotheses at once: effects, parameters, noise and track together.
 
 For each hypothesis, again and again until nothing rises: predict along its own track; whiten by the
 Kalman filter; one Gauss-Newton step in the effects' values and the parameters' shifts; one scoring
-step in the noise; take the filtered track as the new track. A track that was filtered with a wrong
-model hides what is wrong with it, so every hypothesis gets its own.
+step in the noise; take the filtered track as the new track. All steps start from the best point so
+far, and one that does not rise is taken in part, so that nothing is lost by boldness (`Work`). A
+track that was filtered with a wrong model hides what is wrong with it, so every hypothesis gets its
+own.
 
 The shifts of the model's parameters have a normal prior and are integrated out (Laplace):
 
@@ -69,9 +65,7 @@ class Work:
     part: float = 1.0  # of the step that is taken
     still: int = 0
     age: int = 0  # points that were better than all before
-    moving: bool = (
-        True  # whether the track is updated too: where the model has kinks it may not help
-    )
+    moving: bool = True  # the track too: where the model has kinks that may not help
 
     def done(self) -> bool:
         """Whether it no longer rises."""
@@ -217,18 +211,18 @@ def refine(
 
 
 def _of_one_shape(works: list[Work]) -> list[list[Work]]:
-    """Works whose filters have states of one size: as many sensors are late."""
-    late = [sum(isinstance(e.family, SensorDelayFamily) for e in work.h.effects) for work in works]
-    return [
-        [work for work, n in zip(works, late, strict=True) if n == count]
-        for count in sorted(set(late))
-    ]
+    """Works whose filters have states of one size: as many sensors are delayed."""
+    groups: dict[int, list[Work]] = {}
+    for work in works:
+        count = sum(isinstance(e.family, SensorDelayFamily) for e in work.h.effects)
+        groups.setdefault(count, []).append(work)
+    return [groups[count] for count in sorted(groups)]
 
 
 def _iterate(predictor: Predictor, works: list[Work], fixed_noise: bool) -> None:
     data = predictor.data
     B = data.time.shape[1]
-    late = [delays_of(work.h, data) for work in works]
+    each = [delays_of(work.h, data) for work in works]
     parts = [linearise(predictor, work.h, work.track) for work in works]
     width = kalman.whole(max(part[1].shape[-1] for part in parts), data.model.n)
     d, r = (_side_by_side([part[k] for part in parts], width) for k in (1, 2))
@@ -254,10 +248,10 @@ def _iterate(predictor: Predictor, works: list[Work], fixed_noise: bool) -> None
         filtered[0, ..., 0] += started
     steps = [work.noise for work in works]
     if not fixed_noise:
-        steps = _climbed(data, works, late, systems, g, white[..., 0])
+        steps = _climbed(data, works, each, systems, g, white[..., 0])
     for i, work in enumerate(works):
         own = slice(i * B, (i + 1) * B)
-        columns, before, delays = parts[i][1].shape[-1], 0.0, late[i]
+        columns, before, delays = parts[i][1].shape[-1], 0.0, each[i]
         if delays is not None:
             entry, residual = systems[i][0].G, white[:, own, :, 0]
             before = delays.before(work.noise, entry, work.track, residual, g.whiten[:, own])
@@ -275,7 +269,7 @@ def _iterate(predictor: Predictor, works: list[Work], fixed_noise: bool) -> None
 def _climbed(
     data: Data,
     works: list[Work],
-    late: list[Delays | None],
+    delays_each: list[Delays | None],
     systems: list[tuple[FilterSystem, Delayed | None]],
     g: kalman.Gains,
     white: Array,
@@ -284,7 +278,7 @@ def _climbed(
     B, width = data.time.shape[1], data.model.n
     adjoints = kalman.smoother(g, white).parts(B)
     each = []
-    for work, delays, (own, _), adjoint in zip(works, late, systems, adjoints, strict=True):
+    for work, delays, (own, _), adjoint in zip(works, delays_each, systems, adjoints, strict=True):
         noise = work.noise if delays is None else delays.noise(work.noise)
         each.append(working(noise, adjoint, own.G, data.dt))
     K = each[0][0].shape[-1]
@@ -292,7 +286,7 @@ def _climbed(
     d, r = (_side_by_side([part[k] for part in each], wide) for k in (0, 1))
     columns = kalman.innovations(g, d, r)[0]
     found = []
-    for i, (work, delays, adjoint) in enumerate(zip(works, late, adjoints, strict=True)):
+    for i, (work, delays, adjoint) in enumerate(zip(works, delays_each, adjoints, strict=True)):
         info = average(columns[:, i * B : (i + 1) * B, :, :K])
         in_log = adjoint if delays is None else delays.restored(adjoint)
         slope = likelihood_slopes(work.noise, in_log, data.dt)

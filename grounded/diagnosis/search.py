@@ -1,4 +1,8 @@
-"""What one attribution tries: fits from where, under which noise, with what beside."""
+"""The search of one attribution: fits started from where, under which noise, with what beside.
+
+`HypothesisSearch` adds to the hypotheses that were fitted (`hypotheses`); `attribution` says in
+which order. `tune` sets constants of large effects, which are no parameters.
+"""
 
 from __future__ import annotations
 
