@@ -6,7 +6,7 @@ out once (Efron & Tibshirani 1993, ch. 11). The larger of the two is reported.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -68,6 +68,18 @@ def shift_precision(h: Hypothesis, count: int) -> Array:
 def calibrated(data: Data) -> Any:
     """Parameters that have a scale, as indices: those that a shift makes sense for."""
     return np.flatnonzero(param_scale(data.model) > 0)
+
+
+def moved(data: Data, h: Hypothesis, delta: Array) -> Hypothesis:
+    """A hypothesis with its values, and its shifts in units of their scale, moved by (C,)."""
+    k = len(h.theta)
+    other = h.with_theta(h.theta + delta[:k])
+    if len(delta) == k:
+        return other
+    which = calibrated(data)
+    shift = np.zeros(data.model.system.k) if h.shift is None else h.shift.copy()
+    shift[which] += delta[k:] * param_scale(data.model)[which]
+    return replace(other, shift=shift)
 
 
 def leave_one_out(fit: Fitted, trial_of: Array) -> tuple[Array, Array]:

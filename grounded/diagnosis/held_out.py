@@ -26,9 +26,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from grounded.diagnosis.fitted import Fitted, calibrated, leave_one_out
+from grounded.diagnosis.fitted import Fitted, leave_one_out, moved
 from grounded.diagnosis.hypotheses import CLAIM
-from grounded.diagnosis.hypothesis import Hypothesis, Predictor, param_scale
+from grounded.diagnosis.hypothesis import Hypothesis, Predictor
 from grounded.diagnosis.prediction_error import Horizon, errors, horizon, normalised
 from grounded.diagnosis.report import UtilityPrediction
 from grounded.diagnosis.search import HypothesisSearch
@@ -74,20 +74,8 @@ def held_out_errors(predictor: Predictor, fit: Fitted, track: Array, where: Hori
         own = np.flatnonzero(of_start == trial)
         if len(own):
             part = Horizon(where.steps, where.at[own], where.run[own], where.spread[own])
-            found[own] = errors(predictor, moved(predictor, h, shift), track, part)
+            found[own] = errors(predictor, moved(data, h, shift), track, part)
     return found
-
-
-def moved(predictor: Predictor, h: Hypothesis, shift: Array) -> Hypothesis:
-    """A hypothesis with its values and parameters moved by (C,)."""
-    k = len(h.theta)
-    other = h.with_theta(h.theta + shift[:k])
-    if h.spread == 0 or h.shift is None:
-        return other
-    which = calibrated(predictor.data)
-    params = h.shift.copy()
-    params[which] += shift[k:] * param_scale(predictor.data.model)[which]
-    return replace(other, shift=params)
 
 
 def whole_runs(predictor: Predictor, h: Hypothesis, track: Array) -> Array:
@@ -159,7 +147,7 @@ def utility_prediction(
         first = int(np.flatnonzero(data.trial_of == i)[0])
         if data.time[0, first] > 0:  # the run that it began with was left out
             continue
-        own = h if shifts is None else moved(predictor, h, shifts[groups.index(i)])
+        own = h if shifts is None else moved(data, h, shifts[groups.index(i)])
         pairs = [(Hypothesis(), bare[0, first]), (own, fit.track[0, first])]
         parts = [task.utility(_again(predictor, g, trial, start, i)) for g, start in pairs]
         rows.append([real, *parts])

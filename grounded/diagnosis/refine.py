@@ -25,7 +25,7 @@ from grounded.diagnosis import filter as kalman
 from grounded.diagnosis.data import Data
 from grounded.diagnosis.delayed_measurement import Delayed, FilterSystem, joined
 from grounded.diagnosis.delays import Delays, delays_of
-from grounded.diagnosis.fitted import Fitted, calibrated, shift_precision
+from grounded.diagnosis.fitted import Fitted, calibrated, moved, shift_precision
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor, param_scale
 from grounded.diagnosis.linearise import filter_system, gains_of, linearise, smoothed, step_sizes
 from grounded.diagnosis.noise import (
@@ -47,8 +47,7 @@ SHORTEST = 0.05  # part of a step that is still tried
 class ProposedStep:
     """A step proposed at the best point: of values, shifts, track; the noise it leads to."""
 
-    theta: Array
-    shift: Array  # in units of param_scale
+    delta: Array  # (C,) of the values, then of the shifts in units of param_scale
     track: Array
     noise: NoiseModel
 
@@ -63,13 +62,8 @@ class Work:
     best: Fitted | None = None
     step: ProposedStep | None = None
     part: float = 1.0  # of the step that is taken
-    still: int = 0
-    age: int = 0  # points that were better than all before
+    still: bool = False  # it no longer rises
     moving: bool = True  # the track too: where the model has kinks that may not help
-
-    def done(self) -> bool:
-        """Whether it no longer rises."""
-        return self.still >= 1
 
     def shorten(self, data: Data) -> None:
         """The same step about the track as it was; then parts of it; then the end."""
@@ -78,7 +72,7 @@ class Work:
         else:
             self.part *= 0.4
         if self.best is None or self.part < SHORTEST:
-            self.still = 1
+            self.still = True
         else:
             self.go(data)
 
@@ -87,13 +81,9 @@ class Work:
         assert self.best is not None
         assert self.step is not None
         best, step, part = self.best, self.step, self.part
-        h = best.hypothesis
-        self.h = h.with_theta(h.theta + part * step.theta)
-        if len(step.shift):
-            which = calibrated(data)
-            shift = np.zeros(data.model.system.k) if h.shift is None else h.shift.copy()
-            shift[which] += part * step.shift * param_scale(data.model)[which]
-            self.h = replace(self.h, shift=_inside(data, shift))
+        self.h = moved(data, best.hypothesis, part * step.delta)
+        if len(step.delta) > len(self.h.theta) and self.h.shift is not None:
+            self.h = replace(self.h, shift=_inside(data, self.h.shift))
         self.noise = best.noise.towards(step.noise, part)
         self.track = best.track + step.track if self.moving else best.track
 
@@ -103,16 +93,14 @@ def proposed(data: Data, fit: Fitted, filtered: Array, noise: NoiseModel) -> Pro
     h = fit.hypothesis
     G = fit.gram.sum(axis=0) + np.diag(fit.prior)
     slope = fit.score.sum(axis=0) + fit.prior_pull(data)
-    k, track = len(h.theta), filtered[..., 0]
-    theta, shift = np.zeros(k), np.zeros(len(slope) - k)
+    k, track, delta = len(h.theta), filtered[..., 0], np.zeros(len(slope))
     if len(slope):
         delta = _bounded(G, slope, *_room(data, h, k, len(slope)))
         delta[:k] = _limited(h, delta[:k])
         delta[k:] = np.clip(delta[k:], -0.3, 0.3)
-        theta, shift = delta[:k], delta[k:]
-        moved = delta != 0
-        track = track + filtered[..., 1:][..., moved] @ delta[moved]
-    return ProposedStep(theta, shift, track, noise)
+        by = delta != 0
+        track = track + filtered[..., 1:][..., by] @ delta[by]
+    return ProposedStep(delta, track, noise)
 
 
 def _bounded(G: Array, slope: Array, low: Array, high: Array) -> Array:
@@ -202,7 +190,7 @@ def refine(
     wide = n if works[0].noise.structure.tau is None else 2 * n
     size = max(1, int(MOST_NUMBERS / (L * B * wide * wide)))
     for _ in range(iterations):
-        for alike in _of_one_shape([work for work in works if not work.done()]):
+        for alike in _of_one_shape([work for work in works if not work.still]):
             for at in range(0, len(alike), size):
                 _iterate(predictor, alike[at : at + size], fixed_noise)
         if tick is not None:
@@ -234,11 +222,10 @@ def _iterate(predictor: Predictor, works: list[Work], fixed_noise: bool) -> None
     try:
         g = kalman.gains(*system, delayed)
     except np.linalg.LinAlgError:
-        for work in works:
-            work.still = 1
-        if len(works) > 1:  # one of them diverged: each alone
+        if len(works) == 1:
+            works[0].still = True
+        else:  # one of them diverged: each alone
             for work in works:
-                work.still = 0
                 _iterate(predictor, [work], fixed_noise)
         return
     white, filtered = kalman.innovations(g, d, r, track=True)
@@ -345,10 +332,9 @@ def _update(
     if not (rise > 0 and np.isfinite(fit.evidence)):
         work.shorten(data)
         return
-    work.still = 0 if rise > 0.03 else 1
+    work.still = not rise > 0.03
     work.moving = work.moving or rise > 1.0
     work.part = min(1.0, 2 * work.part)
-    work.age += 1
     work.best = fit
     work.step = proposed(data, fit, filtered, climbed)
     work.go(data)

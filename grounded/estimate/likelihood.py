@@ -20,7 +20,7 @@ from grounded.compile import System
 from grounded.estimate import kernel
 from grounded.estimate.filter import filter_batch
 from grounded.estimate.measurement import Measurement, NoiseStd
-from grounded.estimate.record import Record, RecordBatch, batch_of
+from grounded.estimate.record import Record, RecordBatch
 from grounded.estimate.recursion import Filtered, fixed_steps, recursion, smooth
 from grounded.estimate.steps import ModelSteps
 from grounded.frozen import Array
@@ -115,14 +115,14 @@ def _expectation(
     return noise, best
 
 
-def first_noise(batch: RecordBatch, measurement: Measurement, dt: float) -> NoiseStd:
+def first_noise(batch: RecordBatch, measurement: Measurement) -> NoiseStd:
     """A rough noise, from how smooth the measurements are: robust, and only a place to begin.
 
     Second differences of a smooth signal are measurement noise (times sqrt 6), fourth differences
     (times sqrt 70) also of one that turns; a tenth of the first differences is what the model may
     miss in a step.
     """
-    n = batch.start.shape[1]
+    n, dt = batch.start.shape[1], round(float(np.median(batch.dt[batch.valid])), 9)
     r, q = np.empty(measurement.ny), np.full(n, 0.05 * np.sqrt(dt))
     for c, i in enumerate(measurement.states):
         y = np.where(batch.seen[..., c], batch.y[..., c], np.nan)
@@ -206,17 +206,3 @@ def _spread(values: Array) -> float:
         return 0.0
     mad = 1.4826 * float(np.median(np.abs(finite - np.median(finite))))
     return mad if mad > 0 else float(np.std(finite))
-
-
-def noise_of_records(
-    system: System,
-    p: Array,
-    records: Sequence[Record],
-    measurement: Measurement,
-    latency: Array,
-    rng: np.random.Generator | None = None,
-) -> NoiseEstimate:
-    """Noise of records from scratch; see `grounded.estimate.noise_of` for the arguments."""
-    batch = batch_of(enough(records, rng), measurement, system.n, latency)
-    dt = round(float(np.median(batch.dt[batch.valid])), 9)
-    return maximum_likelihood(system, p, batch, measurement, first_noise(batch, measurement, dt))

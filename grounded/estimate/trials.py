@@ -19,7 +19,7 @@ import numpy as np
 
 from grounded.errors import GroundedError
 from grounded.estimate.filter import filter_batch
-from grounded.estimate.likelihood import NoiseEstimate, noise_of_records
+from grounded.estimate.likelihood import NoiseEstimate, enough, first_noise, maximum_likelihood
 from grounded.estimate.measurement import Measurement, NoiseStd, of_states
 from grounded.estimate.record import Record, RecordBatch, batch_of, records_of
 from grounded.estimate.recursion import Filtered, smooth
@@ -113,7 +113,9 @@ def noise_of(
     if max(r.steps for r in records) < 2:
         raise GroundedError("noise can't be estimated: no trial has more than two samples")
     delay = np.zeros(model.m) if latency is None else np.asarray(latency, float)
-    return noise_of_records(model.system, model.values, records, measurement, delay, rng)
+    batch = batch_of(enough(records, rng), measurement, model.n, delay)
+    start = first_noise(batch, measurement)
+    return maximum_likelihood(model.system, model.values, batch, measurement, start)
 
 
 def _passed(

@@ -37,7 +37,7 @@ from grounded.experiments.bench import (
 )
 from grounded.experiments.car_tasks import NAMES
 from grounded.experiments.ilc import gradient_of, lifted, update
-from grounded.experiments.jobs import Job, Running, StudyTable, run_jobs
+from grounded.experiments.jobs import Running, StudyTable, run_study
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.search.improve import first_policy
@@ -205,18 +205,15 @@ def run(
     **how: Unpack[Running],
 ) -> BaselinesResult:
     """Every method on every case; a job is one of them."""
-    jobs = [
-        Job(baselines_job, {"method": method, "manoeuvre": manoeuvre, "kind": kind, "seed": seed})
+    cases = (
+        {"method": method, "manoeuvre": manoeuvre, "kind": kind, "seed": seed}
         for manoeuvre in manoeuvres
         for kind in kinds
         for method in methods
         for seed in seeds
         if not (method == "differences" and kind == "noise")  # it was given the true gradient
-    ]
-    found = run_jobs(jobs, **how)
-    return BaselinesResult(
-        tuple(Line(**(result | {"trials": tuple(result["trials"])})) for result in found)
     )
+    return BaselinesResult(run_study(Line, baselines_job, cases, **how))
 
 
 def baselines_job(method: str, manoeuvre: str, kind: str, seed: int) -> dict[str, Any]:
@@ -242,5 +239,4 @@ def baselines_job(method: str, manoeuvre: str, kind: str, seed: int) -> dict[str
         for i, level in enumerate(SHARES):
             if reached[i] is None and share >= level:
                 reached[i] = used
-    case_of = {"method": method, "manoeuvre": manoeuvre, "kind": kind, "seed": seed}
-    return case_of | {"trials": reached, "final": share, "used": used}
+    return vars(Line(method, manoeuvre, kind, seed, tuple(reached), share, used))

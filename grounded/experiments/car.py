@@ -20,7 +20,7 @@ import numpy as np
 
 from grounded.experiments.bench import Bench, optimum, true_utility
 from grounded.experiments.car_tasks import NAMES, car_task
-from grounded.experiments.jobs import Job, Running, StudyTable, improvement, mean_se, run_jobs
+from grounded.experiments.jobs import Running, StudyTable, improvement, mean_text, run_study
 from grounded.experiments.real_car import LATENCY, real_car, real_plant
 from grounded.models.car import model as car
 from grounded.search.improve import learn
@@ -95,9 +95,8 @@ class CarResult:
 def _cells(runs: list[CarRun]) -> tuple[str, str, str]:
     if not runs:
         return "", "", ""
-    mean, se = mean_se([run.improvement for run in runs])
     best = np.mean([improvement(run.true[0], run.optimum) for run in runs])
-    shown = f"{mean:.1%}" if len(runs) < 2 else f"{mean:.1%} (±{se:.1%})"
+    shown = mean_text([run.improvement for run in runs])
     if not runs[0].noisy:
         return shown, f"{best:.1%}", f"{runs[0].trials}"
     each = np.mean([run.trials / max(len(run.utilities), 1) for run in runs])
@@ -111,19 +110,13 @@ def run(
     **how: Unpack[Running],
 ) -> CarResult:
     """Every manoeuvre once without scatter and once for each seed with it."""
-    jobs = [
-        Job(car_job, {"manoeuvre": manoeuvre, "seed": seed, "noisy": noisy})
+    cases = (
+        {"manoeuvre": manoeuvre, "seed": seed, "noisy": noisy}
         for manoeuvre in manoeuvres
         for noisy, some in ((False, [0]), (True, seeds))
         for seed in some
-    ]
-    found = run_jobs(jobs, **how)
-    return CarResult(tuple(_read(result) for result in found))
-
-
-def _read(result: dict[str, Any]) -> CarRun:
-    listed = {key: tuple(result[key]) for key in ("utilities", "true", "alphas")}
-    return CarRun(**(result | listed))
+    )
+    return CarResult(run_study(CarRun, car_job, cases, **how))
 
 
 def real_case(manoeuvre: str, seed: int, noisy: bool) -> Bench:
@@ -157,14 +150,7 @@ def car_job(manoeuvre: str, seed: int, noisy: bool) -> dict[str, Any]:
     paths = {"target": case.task.target[:, columns].tolist()}
     for i, tried in enumerate(kept):
         paths[f"iteration {i}"] = tried.trials[0].states[:, columns].tolist()
-    return {
-        "manoeuvre": manoeuvre,
-        "seed": seed,
-        "noisy": noisy,
-        "utilities": standing.utilities,
-        "true": true[:2],
-        "optimum": true[2],
-        "trials": len(trials),
-        "alphas": [candidate.alpha for candidate in candidates],
-        "paths": paths,
-    }
+    utilities, alphas = tuple(standing.utilities), tuple(c.alpha for c in candidates)
+    first, last, top = true
+    run = (manoeuvre, seed, noisy, utilities, (first, last), top, len(trials), alphas, paths)
+    return vars(CarRun(*run))

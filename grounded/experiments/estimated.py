@@ -31,7 +31,7 @@ from grounded.estimate import Measurement, NoiseStd, Record, Tracker, noise_of, 
 from grounded.experiments.bench import Bench, optimum, standing_still
 from grounded.experiments.car import BUDGET, ITERATIONS, PAPER, real_case
 from grounded.experiments.driving import RATE, START, film, hands, markers
-from grounded.experiments.jobs import Job, Running, StudyTable, improvement, mean_se, run_jobs
+from grounded.experiments.jobs import Running, StudyTable, improvement, mean_text, run_study
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.plant import Plant
@@ -261,11 +261,10 @@ class EstimatedResult:
 def _cells(runs: list[EstimatedRun]) -> tuple[str, str, str, str]:
     if not runs:
         return "", "", "", ""
-    mean, se = mean_se([run.improvement for run in runs])
     best = np.mean([improvement(run.true[0], run.true[2]) for run in runs])
     each = np.mean([run.trials / max(len(run.utilities), 1) for run in runs])
     first, final, _ = np.mean([run.true for run in runs], axis=0)
-    shown = f"{mean:.1%}" if len(runs) < 2 else f"{mean:.1%} (±{se:.2%})"
+    shown = mean_text([run.improvement for run in runs], of_error=".2%")
     return f"{first:.2f} to {final:.2f}", shown, f"{best:.1%}", f"{each:.1f}"
 
 
@@ -288,20 +287,13 @@ def run(
     **how: Unpack[Running],
 ) -> EstimatedResult:
     """Every manoeuvre for each seed, on estimated and on true states."""
-    jobs = [
-        Job(estimated_job, {"manoeuvre": manoeuvre, "seed": int(seed), "states": states})
+    cases = (
+        {"manoeuvre": manoeuvre, "seed": int(seed), "states": states}
         for manoeuvre in manoeuvres
         for states in WAYS
         for seed in seeds
-    ]
-    found = run_jobs(jobs, **how)
-    return EstimatedResult(tuple(_read(result) for result in found))
-
-
-def _read(result: dict[str, Any]) -> EstimatedRun:
-    listed = ("utilities", "true", "live", "smoothed")
-    tuples = {key: result[key] and tuple(result[key]) for key in listed}
-    return EstimatedRun(**(result | tuples))
+    )
+    return EstimatedResult(run_study(EstimatedRun, estimated_job, cases, **how))
 
 
 def assumed_noise(case: Bench, see: Measurement, seed: int) -> NoiseStd:

@@ -12,7 +12,6 @@ optimum is DDP on the true parameters, which the search never sees.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any, Unpack
 
@@ -20,7 +19,7 @@ import numpy as np
 
 from grounded.errors import GroundedError
 from grounded.experiments.figure8 import RADIUS, figure8_target, flight_task, perturbed
-from grounded.experiments.jobs import Job, Running, StudyTable, improvement, mean_se, run_jobs
+from grounded.experiments.jobs import Running, StudyTable, improvement, mean_se, run_study
 from grounded.frozen import Array
 from grounded.models.aircraft import model as aircraft
 from grounded.result import plain
@@ -158,16 +157,11 @@ def run(
         if len(found) >= 5 * count:
             raise GroundedError(f"{len(found)} models and fewer than {count} flyable ones")
         missing = count - sum(not r.discarded for r in found)
-        jobs = [Job(flight_job, {"seed": s, "step": step}) for s in range(seed, seed + missing)]
+        cases = ({"seed": s, "step": step} for s in range(seed, seed + missing))
+        found += run_study(FlightRun, flight_job, cases, **how)
         seed += missing
-        found += [_read(r) for r in run_jobs(jobs, **how)]
     path, _, _ = figure8_target()
     return FlightResult(tuple(found), flight_optimum(), path[::FIGURE_STEP].tolist())
-
-
-def _read(result: dict[str, Any]) -> FlightRun:
-    result = result | {key: tuple(result[key]) for key in ("utilities", "alphas")}
-    return FlightRun(**result)
 
 
 def flight_optimum() -> float:
@@ -184,30 +178,19 @@ def flight_job(seed: int, step: str) -> dict[str, Any]:
     options = Options(step="full" if step == "full" else "damped")
     first = propose(task, [], [], options).candidate
     if first is None or unstable(truth, flown := real_flight(truth, first)):
-        utility = [] if first is None else [_finite(truth.utility(flown))]
-        return {
-            "seed": seed,
-            "discarded": True,
-            "utilities": utility,
-            "trials": 1,
-            "alphas": [1.0],
-            "paths": {} if first is None else _paths(model=flown),
-        }
+        if first is None:
+            return vars(FlightRun(seed, True, (), 1, (1.0,), {}))
+        claimed = plain([truth.utility(flown)])  # JSON has no infinity
+        return vars(FlightRun(seed, True, claimed, 1, (1.0,), _paths(model=flown)))
 
     def fly(candidate: Candidate) -> Trial:
         return real_flight(truth, candidate)
 
     standing, candidates, trials = learn(task, fly, options, max_iterations=ITERATIONS)
     assert standing.incumbent is not None
-    best = standing.incumbent.trials[0]
-    return {
-        "seed": seed,
-        "discarded": False,
-        "utilities": standing.utilities,
-        "trials": len(trials),
-        "alphas": [candidate.alpha for candidate in candidates],
-        "paths": _paths(model=trials[0], learned=best),
-    }
+    paths = _paths(model=trials[0], learned=standing.incumbent.trials[0])
+    utilities, alphas = tuple(standing.utilities), tuple(c.alpha for c in candidates)
+    return vars(FlightRun(seed, False, utilities, len(trials), alphas, paths))
 
 
 def real_flight(truth: Task, candidate: Candidate) -> Trial:
@@ -231,10 +214,6 @@ def unstable(truth: Task, flight: Trial) -> bool:
         return True
     error: Array = flight.states[:, :3] - truth.target[:, :3]
     return bool(np.linalg.norm(error, axis=1).max() > RADIUS)
-
-
-def _finite(utility: float) -> float | None:
-    return utility if math.isfinite(utility) else None  # JSON has no infinity
 
 
 def _paths(**flights: Trial) -> dict[str, list[list[float]]]:

@@ -22,12 +22,12 @@ import hashlib
 import importlib
 import json
 import math
-from collections.abc import Callable, Iterator, MutableMapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, MutableMapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any, TypedDict, TypeVar, Unpack
 
 import numpy as np
 
@@ -36,6 +36,7 @@ from grounded.errors import GroundedError
 Progress = Callable[[int, int], None]  # jobs done, jobs in all
 CONNECT_S = 10.0  # for a cluster's scheduler to answer
 ROUNDS = 5  # times that jobs of lost workers are handed out again
+R = TypeVar("R")
 
 
 @cache
@@ -135,6 +136,25 @@ def run_jobs(
         f"{len(waiting)} of {total} jobs lost their worker {ROUNDS} times (out of memory?); the "
         f"finished ones are kept, run the study again with fewer --jobs: {lost}"
     )
+
+
+def run_study(
+    kind: type[R],
+    function: Callable[..., dict[str, Any]],
+    cases: Iterable[dict[str, Any]],
+    **how: Unpack[Running],
+) -> tuple[R, ...]:
+    """Runs one job a case and reads each result as a `kind`, JSON's lists as tuples.
+
+    Args:
+        kind: a dataclass that has the result's names as fields.
+        function: of the jobs.
+        cases: its arguments.
+        how: where the jobs run, see `run_jobs`.
+    """
+    found = run_jobs([Job(function, case) for case in cases], **how)
+    tuples = ({k: tuple(v) if isinstance(v, list) else v for k, v in r.items()} for r in found)
+    return tuple(kind(**result) for result in tuples)
 
 
 def _round(
@@ -243,6 +263,12 @@ class StudyTable:
 def improvement(before: float, after: float) -> float:
     """Share of the cost that is gone."""
     return (after - before) / abs(before)
+
+
+def mean_text(values: Sequence[float], digits: str = ".1%", of_error: str = ".1%") -> str:
+    """`76.1% (±0.4%)`; the mean alone where there is one value."""
+    mean, se = mean_se(values)
+    return f"{mean:{digits}}" if len(values) < 2 else f"{mean:{digits}} (±{se:{of_error}})"
 
 
 def mean_se(values: Sequence[float]) -> tuple[float, float]:

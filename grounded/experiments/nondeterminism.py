@@ -16,7 +16,7 @@ import numpy as np
 
 from grounded.experiments.bench import scaled
 from grounded.experiments.car_tasks import DT, car_task
-from grounded.experiments.jobs import Job, Running, StudyTable, run_jobs
+from grounded.experiments.jobs import Running, StudyTable, run_study
 from grounded.experiments.real_car import real_plant
 from grounded.frozen import Array
 from grounded.models.car import model as car
@@ -84,13 +84,13 @@ def run(
     **how: Unpack[Running],
 ) -> NondeterminismResult:
     """Repeats every sequence `runs` times at each level of scatter."""
-    jobs = [
-        Job(nondeterminism_job, {"sequence": name, "level": level, "runs": runs, "seed": seed})
+    cases = (
+        {"sequence": name, "level": level, "runs": runs, "seed": seed}
         for name in sequences()
         for level in levels
-    ]
-    found = run_jobs(jobs, **how)
-    return NondeterminismResult(tuple(EndPointSpread(**result) for result in found), runs)
+    )
+    spreads = run_study(EndPointSpread, nondeterminism_job, cases, **how)
+    return NondeterminismResult(spreads, runs)
 
 
 def nondeterminism_job(sequence: str, level: float, runs: int, seed: int) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from typing import Any, Unpack
 import numpy as np
 
 from grounded.experiments.bench import bench, optimum, scaled, searched, true_utility
-from grounded.experiments.jobs import Job, Running, StudyTable, mean_se, run_jobs
+from grounded.experiments.jobs import Running, StudyTable, mean_se, run_study
 from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.search.standing import Options
@@ -175,15 +175,14 @@ def run(
     **how: Unpack[Running],
 ) -> NoiseResult:
     """Every rule on every case; a job is one of them."""
-    jobs = [
-        Job(repeats_job, {"rule": vars(rule), "manoeuvre": manoeuvre, "level": level, "seed": seed})
+    cases = (
+        {"rule": vars(rule), "manoeuvre": manoeuvre, "level": level, "seed": seed}
         for manoeuvre in manoeuvres
         for level in levels
         for rule in rules
         for seed in seeds
-    ]
-    found = run_jobs(jobs, **how)
-    return NoiseResult(tuple(Outcome(**result) for result in found))
+    )
+    return NoiseResult(run_study(Outcome, repeats_job, cases, **how))
 
 
 def repeats_job(rule: dict[str, Any], manoeuvre: str, level: float, seed: int) -> dict[str, Any]:

@@ -27,7 +27,7 @@ from typing import Any, Unpack
 import numpy as np
 
 from grounded.compile import Problem
-from grounded.experiments.jobs import Job, Running, StudyTable, loglog_slope, mean_se, run_jobs
+from grounded.experiments.jobs import Running, StudyTable, loglog_slope, mean_se, run_study
 from grounded.frozen import Array
 from grounded.model import Model, Param
 from grounded.result import plain
@@ -134,11 +134,8 @@ def run(
     **how: Unpack[Running],
 ) -> Theorem1Result:
     """A search for each epsilon and seed; the seed draws the shape of the model's error."""
-    jobs = [
-        Job(theorem1_job, {"epsilon": float(e), "seed": seed}) for e in epsilons for seed in seeds
-    ]
-    found = run_jobs(jobs, **how)
-    return Theorem1Result(tuple(Theorem1Row(**result) for result in found))
+    cases = ({"epsilon": float(e), "seed": seed} for e in epsilons for seed in seeds)
+    return Theorem1Result(run_study(Theorem1Row, theorem1_job, cases, **how))
 
 
 def _dynamics(s: Any, a: Any, p: Any) -> dict[str, Any]:
@@ -194,14 +191,7 @@ def theorem1_job(epsilon: float, seed: int) -> dict[str, Any]:
         better = _line_search(real, u, -guess, float(swarm.cost[0]))
         if better is None or iterations >= ITERATIONS:
             squared = float((own**2).sum())
-            return {
-                "epsilon": epsilon,
-                "seed": seed,
-                "error": first,
-                "squared": squared,
-                "K": K,
-                "iterations": iterations,
-            }
+            return vars(Theorem1Row(epsilon, seed, first, squared, K, iterations))
         u, iterations = better, iterations + 1
 
 

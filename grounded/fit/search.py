@@ -131,7 +131,7 @@ def _noise(
     p, latency = data.unknowns.unpack(theta)
     records = enough(data.records, rng)
     batch = batch_of(records, data.measurement, data.system.n, latency)
-    rough = first_noise(batch, data.measurement, round(float(np.median(batch.dt[batch.valid])), 9))
+    rough = first_noise(batch, data.measurement)
     if noise is None:
         noise = rough
     else:  # a variance that sank while the model was wrong would not rise again by itself
@@ -191,19 +191,17 @@ def profile_of(
     others[i] = False
     profile, best, score = np.full(len(grid), -np.inf), at, at.loglik
     for g, value in enumerate(grid):
-        theta = at.theta.copy()
-        theta[i] = value
-        here = point(data, noise, theta, at)
+        here = _with(data, noise, at, i, value)
         profile[g] = here.loglik
         if not np.isfinite(here.loglik):
             continue
         if others.any():
-            delta, promise = damped_step(data, theta, linear(data, here), others, 1e-3)
+            delta, promise = damped_step(data, here.theta, linear(data, here), others, 1e-3)
             profile[g] += promise
         if profile[g] > score:
             best, score = here, float(profile[g])
             if others.any():
-                moved = point(data, noise, theta + delta, here)
+                moved = point(data, noise, here.theta + delta, here)
                 best = moved if moved.loglik > here.loglik else here
     return best, profile
 
@@ -245,9 +243,7 @@ def _centred(data: FitData, noise: NoiseStd, best: Point, i: int, level: Array) 
     """
     beside = level[np.argsort(np.abs(level - np.median(level)))]
     for value in beside:
-        theta = best.theta.copy()
-        theta[i] = value
-        there = point(data, noise, theta, best)
+        there = _with(data, noise, best, i, value)
         if there.loglik > best.loglik - LEVEL:
             return there
     return best
@@ -277,31 +273,34 @@ def likelihood_interval(
 def _end(data: FitData, noise: NoiseStd, at: Point, i: int, bound: float, drop: float) -> float:
     best = float(at.theta[i])
     span = abs(bound - best)
-    if span == 0 or _loglik(data, noise, at, i, bound) > at.loglik - drop:
+    if span == 0 or _with(data, noise, at, i, bound).loglik > at.loglik - drop:
         return bound
     sign, step, good = np.sign(bound - best), 1e-3 * span, 0.0
     while step < span:
-        fallen = at.loglik - _loglik(data, noise, at, i, best + sign * step)
+        fallen = at.loglik - _with(data, noise, at, i, best + sign * step).loglik
         good = step if fallen < drop else good
         if fallen > 3 * drop:
             break
         step *= 2
     far = min(step, span)
     grid = np.linspace(good, far, GRID + 1)[1:-1]
-    inside = [g for g in grid if _loglik(data, noise, at, i, best + sign * g) > at.loglik - drop]
+    inside = [
+        g for g in grid if _with(data, noise, at, i, best + sign * g).loglik > at.loglik - drop
+    ]
     width = (far - good) / GRID
     good = max([good, *inside])
     outside = min(far, good + width)
     for _ in range(3):
         middle = 0.5 * (good + outside)
-        if _loglik(data, noise, at, i, best + sign * middle) > at.loglik - drop:
+        if _with(data, noise, at, i, best + sign * middle).loglik > at.loglik - drop:
             good = middle
         else:
             outside = middle
     return float(best + sign * outside)
 
 
-def _loglik(data: FitData, noise: NoiseStd, at: Point, i: int, value: float) -> float:
+def _with(data: FitData, noise: NoiseStd, at: Point, i: int, value: float) -> Point:
+    """The same point but for unknown i."""
     theta = at.theta.copy()
     theta[i] = value
-    return point(data, noise, theta, at).loglik
+    return point(data, noise, theta, at)
