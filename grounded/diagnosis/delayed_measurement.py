@@ -47,10 +47,6 @@ class Delayed:
         """D."""
         return int(self.channel.shape[1])
 
-    def tiled(self, times: int) -> Delayed:
-        """The same for every run of a batch that holds the runs several times."""
-        return Delayed(np.tile(self.channel, (times, 1)), np.tile(self.part, (times, 1)))
-
     def system(self, of: FilterSystem) -> FilterSystem:
         """The widened system."""
         n, D = of.seen.shape[-1], self.count

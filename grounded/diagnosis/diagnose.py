@@ -1,14 +1,14 @@
 """START HERE: the sim-to-real gap, diagnosed. Trials and a crude model in, a verdict out.
 
-limits       what can't be known from these data
-attribution  which effects, by evidence                      (effects/, search, scan, refine, noise)
-claims       what is claimed, what ties, what is nearly the same   (calibration, lookalike)
-leftover     what no effect explains
-gap          where the gap lies: channels, times, regions
-split        what the error is made of: explained, unexplained, irreducible
-shrinkage    how far it shrinks on trials that were left out     (utility_prediction)
-verdict      all of it in sentences                              (words)
-excitation   what to run next, where two explanations tie
+limits            what can't be known from these data
+attribution       which effects, by evidence       (search, hypotheses, scan, refine, noise, fitted)
+held_out          no claim that held-out trials contradict; how far the gap shrinks on them
+claims            what is claimed, what ties, what is nearly the same    (lookalike)
+leftover          what no effect explains
+prediction_error  where the gap lies: channels, times, regions
+split             what the error is made of: explained, unexplained, irreducible
+verdict           all of it in sentences; `report` is the result as data
+excitation        what to run next, where two explanations tie
 """
 
 from __future__ import annotations

@@ -98,7 +98,7 @@ def _sweeps(
             H, e0 = _seen(batch, measurement, xbar)
             if not all(np.isfinite(array).all() for array in (f, A, H, e0)):
                 return None
-            lin = kernel.packed(batch, A, f, more, track, H, e0, xbar)
+            lin = kernel.in_lanes(batch, A, f, more, track, H, e0, xbar)
             done = kernel.forward(lin, noise)
             if not np.isfinite(done.loglik):
                 return None

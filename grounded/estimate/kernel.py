@@ -86,7 +86,7 @@ class Pass:
     loglik: float
 
 
-def packed(
+def in_lanes(
     batch: RecordBatch,
     A: Array,
     f: Array,

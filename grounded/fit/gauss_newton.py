@@ -176,7 +176,7 @@ def _step(
     damping: float,
 ) -> tuple[Point, Linear, float, str]:
     for _ in range(12):
-        delta, promise = damped_step(data, at.theta, slopes, free, damping)
+        delta, promise = marquardt_step(data, at.theta, slopes, free, damping)
         if promise < ENOUGH:
             return at, slopes, damping, "converged"
         there = point(data, noise, data.unknowns.clipped(at.theta + delta), at)
@@ -191,7 +191,7 @@ def _step(
     return at, slopes, damping, "no step rises further"
 
 
-def damped_step(
+def marquardt_step(
     data: FitData, theta: Array, slopes: Linear, free: NDArray[np.bool_], damping: float
 ) -> tuple[Array, float]:
     """The damped step (k,) and the gain in nats that the linear problem promises of it."""

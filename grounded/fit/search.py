@@ -33,8 +33,8 @@ from grounded.fit.gauss_newton import (
     Point,
     Unknowns,
     climb,
-    damped_step,
     linear,
+    marquardt_step,
     point,
 )
 from grounded.frozen import Array
@@ -196,7 +196,7 @@ def profile_of(
         if not np.isfinite(here.loglik):
             continue
         if others.any():
-            delta, promise = damped_step(data, here.theta, linear(data, here), others, 1e-3)
+            delta, promise = marquardt_step(data, here.theta, linear(data, here), others, 1e-3)
             profile[g] += promise
         if profile[g] > score:
             best, score = here, float(profile[g])
