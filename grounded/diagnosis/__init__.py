@@ -4,7 +4,7 @@ Read `diagnose` first; its docstring lists the stages. Below them lie, from the 
 
     data                  trials as one record, cut into runs of equal length
     hypothesis            effects with their values, and what they predict
-    filter, kernels       the Kalman filter along all runs (NumPy; compiled), its likelihood's slopes
+    filter, kernels       the Kalman filter along all runs (NumPy; compiled), and its smoother
     delays, delayed_measurement     a sensor that shows an earlier state
     noise                 the noise, estimated beside everything else
     linearise             a hypothesis to first order: the columns that are filtered

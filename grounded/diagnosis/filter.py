@@ -143,14 +143,9 @@ def _compiled_gains(
     L, B, N, _ = A.shape
     n = seen.shape[-1]
     K, whiten = np.empty((L, B, N, n)), np.zeros((L, B, n, n))
-    A, seen = np.ascontiguousarray(A), np.ascontiguousarray(seen, float)
-    G = None if G is None else np.ascontiguousarray(G)
-    values: dict[str, Any] = {"A": A, "seen": seen}
-    values |= {"Q": np.ascontiguousarray(Q), "R": np.ascontiguousarray(R)}
-    values |= {"start": np.ascontiguousarray(first), "G": 0 if G is None else G}
-    kernels.run_kernel(
-        "gains", n, N, G is not None, {**values, "L": L, "B": B, "K": K, "W": whiten}
-    )
+    values: dict[str, Any] = {"A": A, "Q": Q, "R": R, "seen": seen, "start": first, "L": L, "B": B}
+    values |= {"G": 0 if G is None else G, "K": K, "W": whiten}
+    kernels.run_kernel("gains", n, N, G is not None, values)
     diagonal = np.einsum("tbii->tbi", whiten)
     if not np.isfinite(diagonal).all():
         raise np.linalg.LinAlgError("a covariance is not finite")
@@ -221,9 +216,9 @@ def whole(count: int, n: int) -> int:
 
 
 def _widened(columns: Array, shape: tuple[int, ...]) -> Array:
-    """Contiguous, with columns of zeros up to a shape."""
+    """With columns of zeros up to a shape."""
     if columns.shape == shape:
-        return np.ascontiguousarray(columns)
+        return columns
     whole = np.zeros(shape)
     whole[..., : columns.shape[-1]] = columns
     return whole
@@ -260,12 +255,7 @@ def _smoother(g: Gains, white: Array) -> Adjoint:
     u, D = np.empty((L, B, n)), np.empty((L, B, n))
     r, Nd = np.empty((L, B, N)), np.empty((L, B, N))
     if kernels.available(n):
-        values: dict[str, Any] = {
-            "A": g.A,
-            "K": g.K,
-            "W": g.whiten,
-            "white": np.ascontiguousarray(white),
-        }
+        values: dict[str, Any] = {"A": g.A, "K": g.K, "W": g.whiten, "white": white}
         values |= {"seen": g.seen, "G": 0 if g.G is None else g.G, "L": L, "B": B}
         values |= {"u": u, "D": D, "r": r, "N": Nd}
         kernels.run_kernel("smoother", n, N, g.G is not None, values)

@@ -129,11 +129,12 @@ def columns_together(n: int) -> int:
 
 
 def run_kernel(name: str, n: int, N: int, through: bool, values: Mapping[str, Any]) -> None:
-    """Calls a kernel; `through`: whether noise enters through a matrix G."""
+    """Calls a kernel on arrays, made contiguous; `through`: noise enters through a matrix G."""
     wide = -(-N // columns_together(n)) * columns_together(n)
     each = {"gains": N * wide, "innovations": N * columns_together(n) * values.get("blocks", 1)}
     state = np.zeros(values["B"] * each.get(name, (N + 1) * wide))
-    values = {**values, "state": state}
+    arrays = {k: np.ascontiguousarray(v, float) for k, v in values.items() if np.ndim(v)}
+    values = {**values, **arrays, "state": state}
     call(_library(n, N, through, columns_together(n))[name], NAMES[name], values)
 
 

@@ -17,6 +17,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -152,24 +153,20 @@ class _Context:
         t = data.time if when == 0 else data.time + data.dt
         own: Any = {}
         if effect.family.needs_own:  # type: ignore[attr-defined]
-            own = self._instant(when) if instant else self._mean()
+            own = self.instants[when] if instant else self.mean
         return self.predictor.added_rate([(effect, values)], x, self.u, t, own)
 
-    def _mean(self) -> Named:
-        """The model's own rates, mean over every step; computed once."""
-        if "mean" not in self.__dict__:
-            ahead = self.predictor.step(self.x, self.u, self.p)
-            self.mean = self.predictor.named((ahead - self.x) / self.predictor.data.dt)
-        return self.mean
+    @cached_property
+    def mean(self) -> Named:
+        """The model's own rates, mean over every step."""
+        ahead = self.predictor.step(self.x, self.u, self.p)
+        return self.predictor.named((ahead - self.x) / self.predictor.data.dt)
 
-    def _instant(self, when: int) -> Named:
-        """The same at the start or the end of every step."""
-        cache = self.__dict__.setdefault("instants", {})
-        if when not in cache:
-            x = self.x if when == 0 else self.after
-            cache[when] = self.predictor.named(self.predictor.instant(x, self.u, self.p))
-        found: Named = cache[when]
-        return found
+    @cached_property
+    def instants(self) -> tuple[Named, Named]:
+        """The same at the start and at the end of every step."""
+        start, end = (self.predictor.instant(x, self.u, self.p) for x in (self.x, self.after))
+        return self.predictor.named(start), self.predictor.named(end)
 
     def _step(self, i: int, point: int, effect: Effect, grid: dict[str, float]) -> list[_Column]:
         """The whole step again, with the candidate in it."""
@@ -208,8 +205,7 @@ class _Context:
         white, _ = kalman.innovations(self.gains, d, r)
         flat = white.reshape(-1, wide)
         against = flat.T @ self.white.reshape(-1)
-        base = self._base_white()
-        cross = flat.T @ base
+        cross = flat.T @ self.base_white
         own = flat.T @ flat
         places = [(column.effect, column.point) for column in block]
         for j, (column, place) in enumerate(zip(block, places, strict=True)):
@@ -217,18 +213,20 @@ class _Context:
             entry = (column.name, float(against[j]), cross[j], own[j, mates])
             results.setdefault(place, []).append(entry)
 
-    def _base_white(self) -> Array:
+    @cached_property
+    def base_white(self) -> Array:
         """Whitened columns of what the fit estimates, (L B n, C)."""
-        if "base_white" not in self.__dict__:
-            d, r = base_columns(self.predictor, self.fit)
-            if d.shape[-1]:
-                white, _ = kalman.innovations(self.gains, d, r)
-            else:
-                white = np.zeros((*d.shape[:-1], 0))
-            self.base_white = white.reshape(self.white.size, d.shape[-1])
-            self.base_score = self.base_white.T @ self.white.reshape(-1)
-            self.base_score = self.base_score + self.fit.prior_pull(self.predictor.data)
-        return self.base_white
+        d, r = base_columns(self.predictor, self.fit)
+        white = np.zeros((*d.shape[:-1], 0))
+        if d.shape[-1]:
+            white, _ = kalman.innovations(self.gains, d, r)
+        return white.reshape(self.white.size, d.shape[-1])
+
+    @cached_property
+    def base_score(self) -> Array:
+        """Slope of the log-posterior by what the fit estimates, (C,); zero at its best."""
+        score = self.base_white.T @ self.white.reshape(-1)
+        return np.asarray(score + self.fit.prior_pull(self.predictor.data))
 
     def best(self, i: int, effect: Effect, results: _Results) -> Look:
         """The grid point with the largest gain, its linear values solved."""

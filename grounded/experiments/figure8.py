@@ -19,6 +19,7 @@ import math
 
 import numpy as np
 
+from grounded.experiments.car_tasks import hann_smoothed
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.models.aircraft import level_trim
@@ -54,13 +55,6 @@ def figure8_profile() -> tuple[Array, Array]:
     left = (t >= corners[2]) & (t < corners[3])
     right = (t >= corners[6]) & (t < corners[7])
     return speed, (right * 1.0 - left * 1.0) / RADIUS
-
-
-def hann_smoothed(signal: Array, width: int) -> Array:
-    """Weighted mean over `width` + 1 samples; the ends are continued by their last value."""
-    window = np.hanning(width + 3)[1:-1]
-    padded = np.pad(signal, width // 2, mode="edge")
-    return np.convolve(padded, window / window.sum(), mode="valid")
 
 
 def figure8_target() -> tuple[Array, Array, Array]:

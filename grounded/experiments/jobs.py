@@ -23,7 +23,7 @@ import importlib
 import json
 import math
 from collections.abc import Callable, Iterable, Iterator, MutableMapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -200,11 +200,14 @@ def _results(jobs: Sequence[Job], engine: Engine) -> Iterator[tuple[str, dict[st
         yield from parallel(joblib.delayed(_call)(job) for job in jobs)
 
 
-def _backend(engine: Engine, joblib: Any) -> AbstractContextManager[Any]:
+@contextmanager
+def _backend(engine: Engine, joblib: Any) -> Iterator[None]:
+    """Sets where joblib runs; a connection to a Dask cluster is closed at the end, it stays."""
     if engine.name == "local":
         # One BLAS thread a worker: results don't depend on how many workers share the machine.
-        config = joblib.parallel_config(backend="loky", inner_max_num_threads=1)
-        return config if config is not None else nullcontext()
+        with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
+            yield
+        return
     distributed = _import("distributed", 'pip install "grounded[cluster]"')
     try:
         client = distributed.Client(engine.address, timeout=CONNECT_S)
@@ -212,22 +215,11 @@ def _backend(engine: Engine, joblib: Any) -> AbstractContextManager[Any]:
         raise GroundedError(
             f"no Dask scheduler answers at {engine.address}: is it running? ({error})"
         ) from error
-    return _Cluster(client, joblib)
-
-
-class _Cluster(AbstractContextManager[None]):
-    """A connection to a running Dask cluster, closed at the end; the cluster stays."""
-
-    def __init__(self, client: Any, joblib: Any) -> None:
-        self.client, self.joblib = client, joblib
-
-    def __enter__(self) -> None:
-        self.config = self.joblib.parallel_config(backend="dask", client=self.client)
-        self.config.__enter__()
-
-    def __exit__(self, *error: object) -> None:
-        self.config.__exit__(*error)
-        self.client.close()
+    try:
+        with joblib.parallel_config(backend="dask", client=client):
+            yield
+    finally:
+        client.close()
 
 
 def _lost() -> tuple[type[BaseException], ...]:
