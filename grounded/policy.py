@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from grounded.errors import GroundedError
+from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import Array, readonly
 
 
@@ -231,7 +231,7 @@ def load(
     inputs: tuple[str, ...] | None = None,
     task: str | None = None,
 ) -> Runner:
-    """A runner from an exported candidate (`grounded export ID --format npz`).
+    """A runner from a candidate that was exported as .npz.
 
     Args:
         path: the .npz file; it is data, nothing in it is executed.
@@ -244,7 +244,10 @@ def load(
     """
     data = _archive(path)
     if str(data.get("format", "")) != FORMAT:
-        raise GroundedError(f"{path} is not a candidate exported by `grounded export --format npz`")
+        raise GroundedError(
+            f"{path} is not a candidate: expected one that was exported as npz",
+            then=NextCommand("export", ("best", "--format", "npz")),
+        )
     try:
         policy = Policy(
             **{name: data[name] for name in _NUMBERS},

@@ -12,6 +12,7 @@ from pathlib import Path
 import click
 from click.shell_completion import CompletionItem, get_completion_class
 
+from grounded_cli.options import given
 from grounded_cli.terminal import show
 
 SHELLS = ("bash", "zsh", "fish")
@@ -86,8 +87,4 @@ def _items(names: Iterable[str], incomplete: str) -> list[CompletionItem]:
 
 def _folder(ctx: click.Context) -> Path:
     """The workspace that -C names, at the command or before it."""
-    for context in (ctx, ctx.find_root()):
-        folder = context.params.get("folder")
-        if isinstance(folder, str):
-            return Path(folder)
-    return Path()
+    return Path(given(ctx) or ".")

@@ -9,13 +9,13 @@ import click
 
 from grounded.errors import NextCommand
 from grounded_cli import completion as complete
-from grounded_cli.options import as_json, in_workspace, library_of, open_workspace
+from grounded_cli.options import as_json, in_workspace, next_line, open_workspace, typed
 from grounded_cli.terminal import field, names_in, number, show, show_json, stages, table
-from grounded_trials.wording import folded, rendered, with_unit
+from grounded_trials.wording import rendered, with_unit
 
 if TYPE_CHECKING:
     from grounded.diagnosis.report import Diagnosis, Ranked, Where
-    from grounded_trials.workspace.folder import Workspace
+    from grounded_trials import Workspace
 
 
 @click.command("diagnose")
@@ -35,35 +35,30 @@ if TYPE_CHECKING:
 @click.option("--without", multiple=True, metavar="F1,F2,...", help="Families not to blame.")
 @in_workspace
 @as_json
-def command(
-    trials: str | None, max_effects: int, without: tuple[str, ...], folder: str | None, json_: bool
-) -> None:
+def command(trials: str | None, max_effects: int, without: tuple[str, ...], json_: bool) -> None:
     """Explain the sim-to-real gap from the stored trials; keeps reports/diagnosis.json.
 
     The verdict is one effect, several, none (the model explains the data down to the noise) or
     unknown (a gap that no known effect explains). Where two effects tie, a probe candidate that
     would tell them apart is written.
     """
-    workspace = open_workspace(folder)
+    workspace = open_workspace()
     from grounded.errors import GroundedError
-    from grounded_trials.workspace.diagnosing import diagnose_in
 
     chosen = names_in(trials)
     if trials is not None and not chosen:
         raise GroundedError(
             "--trials names no trial: expected some, like t0001,t0002; leave it out to take all"
         )
-    library = library_of(tuple(name for text in without for name in names_in(text)))
+    families = [name for text in without for name in names_in(text)]
     with stages() as tell:
-        found = diagnose_in(
-            workspace, trials=chosen, max_effects=max_effects, library=library, progress=tell
-        )
+        found = workspace.diagnose(chosen, max_effects=max_effects, without=families, progress=tell)
     if json_:
         show_json(found.to_json())
     else:
         params = workspace.base_model.params
         _tell(found, {name: param.value for name, param in params.items()})
-        show(f"\n{folded(rendered(_follow(workspace, found)))}")
+        show(f"\n{next_line(_follow(workspace, found))}")
 
 
 def _follow(workspace: Workspace, found: Diagnosis) -> NextCommand:
@@ -89,7 +84,9 @@ def _tell(found: Diagnosis, before: dict[str, float]) -> None:
     _places(found.where)
     if not found.no_cause:
         _effects(found)
-    show("\n" + field("next trial", found.next_trial))
+    run = NextCommand("run", (found.probe,))
+    text = found.next_trial.replace(rendered(run), typed(run))
+    show("\n" + field("next trial", text))
 
 
 def _verdict(kind: str, text: str) -> str:

@@ -15,7 +15,6 @@ from typing import Any
 import click
 
 from grounded.result import plain
-from grounded_cli.address import addressed
 from grounded_trials.wording import WIDTH, wrapped
 from grounded_trials.wording import figure as number
 
@@ -45,12 +44,12 @@ def style(text: str, **how: Any) -> str:
 
 def say(text: str) -> None:
     """Narration, on stderr."""
-    click.echo(harmless(addressed(text)), err=True)
+    click.echo(harmless(text), err=True)
 
 
 def show(text: str = "") -> None:
     """Data, on stdout."""
-    click.echo(harmless(addressed(text)))
+    click.echo(harmless(text))
 
 
 def harmless(text: str) -> str:
@@ -71,12 +70,12 @@ def show_json(document: dict[str, Any]) -> None:
 def field(label: str, text: str, indent: str = "") -> str:
     """A label and its text, wrapped to 80 columns under itself; a number keeps its %."""
     head = f"{indent}{label:<10} "
-    return "\n".join(wrapped(addressed(text), head, " " * len(head)) or [head.rstrip()])
+    return "\n".join(wrapped(text, head, " " * len(head)) or [head.rstrip()])
 
 
 def remark(kind: str, text: str) -> None:
     """Narration with a word ahead, `note: ...`, wrapped to 80 columns."""
-    say("\n".join(wrapped(addressed(text), f"{kind}: ", "  ")))
+    say("\n".join(wrapped(text, f"{kind}: ", "  ")))
 
 
 def names_in(text: str | None) -> list[str]:
@@ -99,12 +98,12 @@ def progress(text: str) -> Iterator[None]:
 
 @contextmanager
 def stages() -> Iterator[Callable[[str], None]]:
-    """A function that shows which stage a long command is in; only on a terminal."""
+    """A function that shows which stage a long command is in, "" for none; only on a terminal."""
     live = sys.stderr.isatty()
 
     def tell(stage: str) -> None:
         if live:
-            click.echo(f"\r\033[K{stage} ...", err=True, nl=False)
+            click.echo(f"\r\033[K{stage and stage + ' ...'}", err=True, nl=False)
 
     try:
         yield tell

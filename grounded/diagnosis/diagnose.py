@@ -246,7 +246,7 @@ class _Writer:
             "whole_run": horizon(self.predictor, self.best, np.inf),
         }
         return {
-            name: split(self.predictor, self.best, bare, one, repeats).shared_out(self.data)
+            name: split(self.predictor, self.best, bare, one, repeats)
             for name, one in horizons.items()
         }
 

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -30,51 +29,22 @@ from grounded.frozen import Array
 MOST_MOMENTS = 40  # at which repeats are compared
 
 
-@dataclass(frozen=True, eq=False)
-class SquaredErrors:
-    """Mean squared errors of each state (n,) at one horizon; `noise` is the filter's estimate."""
+def shares(before: Array, after: Array, floor: Array) -> Array:
+    """explained, unexplained, irreducible: the shares of each mean squared error, (3, ...).
 
-    horizon: float  # [s]
-    before: Array
-    after: Array
-    noise: Array
-    repeats: Array | None  # from repeated trials
-
-    @property
-    def irreducible(self) -> Array:
-        """The part that no model predicts."""
-        return self.noise if self.repeats is None else self.repeats
-
-    def shares(self, weight: Array | None = None) -> Any:
-        """explained, unexplained, irreducible: of each channel (3, n), or of their sum (3,)."""
-        w = np.ones_like(self.before) if weight is None else weight
-        parts = [np.nan_to_num(w * p) for p in (self.before, self.after, self.irreducible)]
-        before, after, floor = parts if weight is None else [p.sum() for p in parts]
-        after = np.minimum(after, before)
-        floor = np.minimum(floor, after)
-        return np.stack([before - after, after - floor, floor]) / np.maximum(before, 1e-300)
-
-    def shared_out(self, data: Data) -> Split:
-        """The shares of each state and in all, where each counts in units of its noise."""
-        model, each = data.model, self.shares()
-        channels = [
-            ChannelParts(
-                name,
-                model.states[name],
-                float(np.sqrt(np.nan_to_num(self.before[i]))),
-                *map(float, each[:, i]),
-            )
-            for i, name in enumerate(model.state_names)
-            if i not in data.hidden
-        ]
-        whole = Parts(*map(float, self.shares(1 / np.maximum(self.noise, 1e-300))))
-        source = "noise" if self.repeats is None else "repeats"
-        return Split(self.horizon, whole, tuple(channels), source)
+    Args:
+        before: of the bare model.
+        after: with the effects.
+        floor: what no model predicts.
+    """
+    after = np.minimum(after, before)
+    floor = np.minimum(floor, after)
+    return np.stack([before - after, after - floor, floor]) / np.maximum(before, 1e-300)
 
 
 def split(
     predictor: Predictor, fit: Fitted, bare: Array, where: Horizon, repeats: Sequence[Sequence[int]]
-) -> SquaredErrors:
+) -> Split:
     """The parts of the error at one horizon.
 
     Args:
@@ -84,15 +54,23 @@ def split(
         where: the horizon (`gap.horizon`).
         repeats: groups of trials (indices) that ran the same candidate.
     """
-    before = errors(predictor, Hypothesis(), bare, where)
-    after = held_out_errors(predictor, fit, fit.track, where)
-    return SquaredErrors(
-        where.steps * predictor.data.dt,
-        _mean_square(before),
-        _mean_square(after),
-        (where.spread**2).mean(axis=0),
-        scatter(predictor, fit, where.steps, repeats),
+    data = predictor.data
+    before = _mean_square(errors(predictor, Hypothesis(), bare, where))
+    after = _mean_square(held_out_errors(predictor, fit, fit.track, where))
+    noise = (where.spread**2).mean(axis=0)
+    repeated = scatter(predictor, fit, where.steps, repeats)
+    parts = before, after, noise if repeated is None else repeated
+    each = shares(*map(np.nan_to_num, parts))
+    units = 1 / np.maximum(noise, 1e-300)  # in all, each state counts in units of its noise
+    whole = shares(*(np.nan_to_num(units * part).sum() for part in parts))
+    rms = np.sqrt(np.nan_to_num(before))
+    channels = tuple(
+        ChannelParts(name, data.model.states[name], float(rms[i]), *map(float, each[:, i]))
+        for i, name in enumerate(data.model.state_names)
+        if i not in data.hidden
     )
+    source = "noise" if repeated is None else "repeats"
+    return Split(where.steps * data.dt, Parts(*map(float, whole)), channels, source)
 
 
 def _mean_square(error: Array) -> Array:

@@ -101,7 +101,7 @@ class Kept:
 def searched(
     case: Bench, options: Options, *, refit: Refit | None = None, again: bool = False
 ) -> tuple[list[Kept], float, int]:
-    """This algorithm on the bench, through the function behind `grounded propose`.
+    """This algorithm on the bench, through the function that proposes candidates.
 
     Args:
         case: what is learned.

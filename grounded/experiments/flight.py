@@ -6,8 +6,8 @@
     discarded        models whose first controller is unstable in the real system: the flight leaves
                      the finite numbers or the target by more than the radius of the turns
 
-The search is the one that `grounded propose` and `ingest` drive, with its default options; the
-optimum is DDP on the true parameters, which the search never sees.
+The search is the one that the command line drives, with its default options; the optimum is DDP on
+the true parameters, which the search never sees.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ true states.
 | step | paper                                          | here                                    |
 |------|------------------------------------------------|-----------------------------------------|
 | 1, 2 | optimal policy of the crude model              | `first_policy` (`first_guess`, `ddp`)   |
-| 3    | run it, record the trial                       | people, robots: `grounded run`, `ingest`|
+| 3    | run it, record the trial                       | people, robots: `run`, `ingest`         |
 | 4    | add a bias to the ORIGINAL model               | `bias.ground`                           |
 | 5    | direction d from algorithm A in that model     | `direction` (`ddp`, `policy_gradient`)  |
 | 6    | theta + alpha d, line search on the real system| `Policy.toward`, `line_search`          |

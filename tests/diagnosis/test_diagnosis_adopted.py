@@ -18,7 +18,7 @@ from grounded.effects import Library, memory_of, wrap
 from grounded.errors import NextCommand
 from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace.diagnosing import _chosen, diagnosable, read_diagnosis
-from grounded_trials.workspace.folder import Workspace
+from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.next_step import after_diagnosis
 
 LAG = 0.12
@@ -145,7 +145,7 @@ def test_more_of_an_adopted_effect_changes_its_numbers(tmp_path):
     names = ["parameter:viscous_friction_omega_k", "parameter:l"]
     read = read_diagnosis(tmp_path / "ws" / "reports")
     assert read is not None
-    advice = after_diagnosis(Workspace(tmp_path / "ws"), read)
+    advice = after_diagnosis(Folder(tmp_path / "ws"), read)
     assert advice == NextCommand("adopt", tuple(names))  # fit knows the model's own numbers only
     for _ in range(2):  # twice is once
         done = grounded("-C", tmp_path / "ws", "adopt", *names)
@@ -184,7 +184,7 @@ def test_gaps_in_a_state_and_guesses_cost_their_samples_only(tmp_path):
         write_trial(path, run, meta)
         done = grounded("-C", tmp_path / "ws", "ingest", "--data", path)
         assert done.code == 0, done.err
-    workspace = Workspace(tmp_path / "ws")
+    workspace = Folder(tmp_path / "ws")
     assert [trial.steps for trial in diagnosable(workspace)] == [40, 40, 40]
     known = [np.isfinite(trial.states).sum(axis=0).tolist() for trial in _chosen(workspace, ())]
     assert known == [[41, 41], [41, 31], [41, 0]]

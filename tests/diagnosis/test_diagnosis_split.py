@@ -7,7 +7,7 @@ import pytest
 from test_diagnosis import DT, cart
 
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
-from grounded.diagnosis.split import SquaredErrors, repeated
+from grounded.diagnosis.split import repeated, shares
 from grounded.effects import Library
 from grounded.task import Task
 from grounded.utility import Reward
@@ -93,8 +93,8 @@ def test_groups_of_repeats():
 
 def test_shares_are_of_what_there_was():
     before, after, noise = np.array([4.0, 1.0]), np.array([1.0, 2.0]), np.array([0.5, 0.4])
-    found = SquaredErrors(1.0, before, after, noise, None).shares()
+    found = shares(before, after, noise)
     np.testing.assert_allclose(found[:, 0], [0.75, 0.125, 0.125])
     np.testing.assert_allclose(found[:, 1], [0.0, 0.6, 0.4])
-    by_trials = SquaredErrors(1.0, before, after, noise, np.array([1.0, 0.4])).shares()
+    by_trials = shares(before, after, np.array([1.0, 0.4]))
     np.testing.assert_allclose(by_trials[:, 0], [0.75, 0.0, 0.25])

@@ -87,7 +87,7 @@ def test_without_an_outstanding_candidate_it_must_be_named(w, tmp_path):
         ingest_log(w, tmp_path / "t.mcap", "c0001")
     found = ingest_log(w, tmp_path / "t.mcap", data=True)
     assert found.candidate == "" and found.utility is None and found.accepted is None
-    assert w.trials()[0].is_data
+    assert not w.trials()[0].trial.candidate
 
 
 def test_data_never_moves_the_search(w):

@@ -9,11 +9,11 @@ import pytest
 
 from cli import grounded, plain, process
 from grounded.diagnosis.report import Diagnosis
-from grounded_cli import address
 from grounded_cli.main import COMMANDS, cli
+from grounded_cli.options import ELSEWHERE
 from grounded_trials.wording import folded
 from grounded_trials.workspace.config import set_in_model
-from grounded_trials.workspace.folder import Workspace
+from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.next_step import since_diagnosis
 from reported import DIAGNOSIS, cart, copied
 from workspaces import make
@@ -124,18 +124,10 @@ def test_printed_commands_work_from_where_the_user_is(tmp_path):
     assert process("propose", cwd=tmp_path / "my cart").out.endswith("next: grounded run\n")
 
 
-def test_a_command_that_is_broken_over_two_lines_is_completed_too():
-    context = click.Context(cli)
-    with context:
-        address.remember(context, "w")
-        text = "one\n  run `grounded\n  diagnose` again"
-        assert address.addressed(text) == "one\n  run `grounded -C w\n  diagnose` again"
-
-
 def test_an_error_names_the_workspace_too_and_init_does_not(tmp_path):
     make(tmp_path / "cart")
     done = process("-C", "cart", "adopt", "delay:force", cwd=tmp_path)
-    assert done.err.endswith("\nnext: grounded -C cart diagnose\n")
+    assert done.err.endswith("next: grounded -C cart diagnose\n")
     done = process("-C", "cart", "init", "new", "--example", "pendulum", cwd=tmp_path)
     assert "next: cd new && grounded propose" in done.out
 
@@ -147,8 +139,7 @@ def test_the_commands_that_take_a_folder_are_those_that_are_printed_with_it():
             command = cli.get_command(ctx, name)
             if any("-C" in option.opts for option in command.params):
                 found.append(name)
-    assert tuple(found) == tuple(n for n in COMMANDS if n in address.COMMANDS)
-    assert set(found) == set(address.COMMANDS)
+    assert set(found) == set(COMMANDS) - ELSEWHERE
 
 
 # after a diagnosis
@@ -275,10 +266,10 @@ def test_a_delay_more_than_the_adopted_one_is_open_until_it_is_adopted(cart, tmp
     found = Diagnosis.from_json(DIAGNOSIS | {"verdict": verdict, "diagnosed": made})
     assert found.open([then]) == ("delay:force",)
     assert found.open([then | {"d": 0.03}]) == ()
-    workspace = Workspace(folder)
+    workspace = Folder(folder)
     assert since_diagnosis(workspace, found, []).changed  # the cart has no effect at all
     set_in_model(workspace.config.file, effects=[then | {"d": 0.03}])
-    since = since_diagnosis(Workspace(folder), found, [])
+    since = since_diagnosis(Folder(folder), found, [])
     assert since.changed and since.adopted == ("delay:force",)
     set_in_model(workspace.config.file, effects=[then])
-    assert since_diagnosis(Workspace(folder), found, []).sentence == ""
+    assert since_diagnosis(Folder(folder), found, []).sentence == ""

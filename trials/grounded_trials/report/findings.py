@@ -20,15 +20,8 @@ from grounded.task import Task
 from grounded.trial import Trial, mean_trial
 from grounded_trials.wording import rendered
 from grounded_trials.workspace.adopting import Better
+from grounded_trials.workspace.folder import Lost
 from grounded_trials.workspace.next_step import Since
-
-
-@dataclass(frozen=True)
-class Lost:
-    """A file that should be there, or be read, and why it is not in the report."""
-
-    file: str
-    reason: str
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from grounded.diagnosis.report import Estimate
+from grounded.errors import NextCommand
 from grounded.search.standing import Tried
 from grounded_trials.report.diagnosis_words import error_lines, sentences
 from grounded_trials.report.findings import (
@@ -89,7 +90,8 @@ def _utilities(findings: Findings, table: Table, bars: Callable[[Sequence[float]
     header = ("candidate", "iter.", "alpha", "predicted", "real", "+-", "trials", "")
     lines = ["utility", table(rows, header), f"  {LEGEND}"]
     if left:
-        lines.append(f"  ({left} more between them: grounded status shows all)")
+        status = rendered(NextCommand("status"), findings.folder)
+        lines += _wrapped(f"({left} more between them: {status} shows all)", "  ")
     spark = bars(spaced([t.utility for t in history if t.utilities][-WIDTH // 2 :]))
     if spark:
         lines.append(f"\n  {spark}  by candidate, higher is better")
@@ -181,7 +183,7 @@ def _diagnosis(findings: Findings, table: Table) -> str:
     diagnosis, since = findings.diagnosis, findings.since
     if diagnosis is None:
         command = rendered(DIAGNOSE, findings.folder)
-        return f"gap to the model\n  not diagnosed yet: {command}"
+        return "\n".join(["gap to the model", *_wrapped(f"not diagnosed yet: {command}", "  ")])
     lines = ["gap to the model"]
     lines += _wrapped(since.told(findings.folder), "  ")
     then = "before that: " * bool(since.adopted)

@@ -15,27 +15,31 @@ from typing import Any
 
 from grounded.diagnosis.report import Diagnosis
 from grounded.errors import GroundedError, NextCommand, nearest
+from grounded.result import Document
 from grounded.search.planner import Planner
 from grounded_trials.workspace.config import set_in_model
 from grounded_trials.workspace.diagnosing import read_diagnosis
-from grounded_trials.workspace.folder import Workspace
+from grounded_trials.workspace.folder import Folder
 
 Effect = dict[str, Any]  # {"name": "dead_zone:throttle", "c": 0.146}
-AGAIN = NextCommand("diagnose")
+AGAIN, PROPOSE = NextCommand("diagnose"), NextCommand("propose")
 
 
-@dataclass(frozen=True)
-class Adopted:
+@dataclass(frozen=True, eq=False)
+class Adopted(Document):
     """What the model has now."""
 
     effects: tuple[Mapping[str, Any], ...]  # all that are adopted
     params: Mapping[str, float]  # of the model, written with them
     claimed: bool  # the diagnosis claims the new ones; else one was taken by itself
 
+    @property
+    def then(self) -> NextCommand:
+        """The search goes on with the better model."""
+        return PROPOSE
 
-def adopt_effects(
-    workspace: Workspace, names: Sequence[str], *, parameters: bool = True
-) -> Adopted:
+
+def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool = True) -> Adopted:
     """Adds diagnosed effects to [model] effects, and the parameters that belong to them.
 
     Where the diagnosis calibrated the model's own parameters beside the effects that it claims,
@@ -72,7 +76,7 @@ def adopt_effects(
     return Adopted(tuple(adopted), own, claimed)
 
 
-def _nominal(found: Diagnosis, workspace: Workspace, name: str) -> float:
+def _nominal(found: Diagnosis, workspace: Folder, name: str) -> float:
     """A parameter's value when the diagnosis was made."""
     if found.made is not None and name in found.made.nominal:
         return found.made.nominal[name]
@@ -99,7 +103,7 @@ def _settled(
 
 
 def _check(
-    names: Sequence[str], known: Sequence[str], workspace: Workspace, before: Mapping[str, Any]
+    names: Sequence[str], known: Sequence[str], workspace: Folder, before: Mapping[str, Any]
 ) -> None:
     """Each must have been weighed, and not be adopted since."""
     adopted = [e["name"] for e in workspace.config.model.effects if e["name"] not in before]
@@ -146,7 +150,7 @@ class Better:
     name: str
 
 
-def better_model(workspace: Workspace, diagnosis: Diagnosis | None) -> Better | None:
+def better_model(workspace: Folder, diagnosis: Diagnosis | None) -> Better | None:
     """The diagnosed model, or else the one with adopted effects; None where there is neither.
 
     Raises:
@@ -175,7 +179,7 @@ def _new(diagnosis: Diagnosis | None, adopted: set[str]) -> list[Effect]:
     ]
 
 
-def _parameters(workspace: Workspace, diagnosis: Diagnosis | None) -> dict[str, float]:
+def _parameters(workspace: Folder, diagnosis: Diagnosis | None) -> dict[str, float]:
     """The model's parameters as the diagnosis estimated them; its own names only."""
     known = workspace.task.model.params
     found = diagnosis.parameters if diagnosis is not None else {}

@@ -52,6 +52,11 @@ class SystemTable:
     noise: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     seed: int = 0
 
+    @property
+    def reachable(self) -> bool:
+        """Whether `run` can reach the system; else candidates are run by hand."""
+        return bool(self.command or self.model)
+
 
 @dataclass(frozen=True)
 class Config:

@@ -22,14 +22,14 @@ from grounded_trials.wording import rendered
 if TYPE_CHECKING:
     from grounded.effects import Library
     from grounded.trial import Trial
-    from grounded_trials.workspace.folder import Workspace
+    from grounded_trials.workspace.folder import Folder
 
 FILE = "diagnosis.json"
 LEAST_STEPS = 2
 
 
 def diagnose_in(
-    workspace: Workspace,
+    workspace: Folder,
     *,
     trials: Sequence[str] = (),
     max_effects: int = 3,
@@ -80,7 +80,7 @@ def diagnose_in(
     return found
 
 
-def _keep(workspace: Workspace, found: Diagnosis) -> None:
+def _keep(workspace: Folder, found: Diagnosis) -> None:
     workspace.reports.mkdir(exist_ok=True)
     text = json.dumps(found.to_json(), indent=1, ensure_ascii=False, allow_nan=False)
     write_atomically(workspace.reports / FILE, (text + "\n").encode())
@@ -103,7 +103,7 @@ def read_diagnosis(folder: Path) -> Diagnosis | None:
         ) from None
 
 
-def _chosen(workspace: Workspace, names: Sequence[str]) -> list[Trial]:
+def _chosen(workspace: Folder, names: Sequence[str]) -> list[Trial]:
     """The trials to diagnose: gaps in a state stay, what a smoother made of them is no evidence."""
     used = diagnosable(workspace)
     if not used:
@@ -130,7 +130,7 @@ def _measured(trial: Trial, guessed: Sequence[str]) -> Trial:
 
 
 def _probe(
-    workspace: Workspace, found: Diagnosis, trials: Sequence[Trial], library: Library
+    workspace: Folder, found: Diagnosis, trials: Sequence[Trial], library: Library
 ) -> tuple[str, str] | None:
     """Writes the candidate that would tell two tied effects apart: (id, sentence)."""
     if not found.indistinguishable:
@@ -167,7 +167,7 @@ def _probe(
     return candidate.id, made.sentence
 
 
-def diagnosable(workspace: Workspace) -> list[Trial]:
+def diagnosable(workspace: Folder) -> list[Trial]:
     """In order of arrival, up to the first missing input or number beyond all bounds.
 
     A fit needs whole states; a diagnosis only needs some, so a sensor that dropped out for a while

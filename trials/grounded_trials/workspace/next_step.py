@@ -14,7 +14,7 @@ from grounded.errors import NextCommand
 from grounded.search.standing import Standing
 from grounded_trials.wording import rendered
 from grounded_trials.workspace.diagnosing import diagnosable
-from grounded_trials.workspace.folder import Workspace
+from grounded_trials.workspace.folder import Folder
 
 PROPOSE = NextCommand("propose")
 DIAGNOSE = NextCommand("diagnose")
@@ -22,7 +22,7 @@ EXPORT = NextCommand("export", ("best", "--format", "npz"))
 
 
 def next_command(
-    workspace: Workspace, now: Standing, diagnosis: Diagnosis | None, usable: Sequence[str]
+    workspace: Folder, now: Standing, diagnosis: Diagnosis | None, usable: Sequence[str]
 ) -> NextCommand:
     """What a person does next, given where the search stands and what was diagnosed.
 
@@ -49,18 +49,17 @@ def next_command(
     return follow or EXPORT
 
 
-def another_trial(workspace: Workspace, now: Standing) -> NextCommand:
+def another_trial(workspace: Folder, now: Standing) -> NextCommand:
     """How to get one more trial: of what waits, of what comes next, or of the best again."""
     waiting = now.phase == "await-trial"
     if not waiting and (now.phase == "propose" or now.incumbent is None):
         return PROPOSE
-    system = workspace.config.system
-    if not (system.command or system.model):
+    if not workspace.config.system.reachable:
         return NextCommand("ingest", ("TRIAL.mcap",))
     return NextCommand("run", () if waiting else ("best",))
 
 
-def after_diagnosis(workspace: Workspace, diagnosis: Diagnosis) -> NextCommand | None:
+def after_diagnosis(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
     """What to do about the effects that a diagnosis claims, None where there is nothing to do."""
     new = diagnosis.open(workspace.config.model.effects)
     if diagnosis.kind not in ("effect", "several") or not new:
@@ -105,7 +104,7 @@ class Since:
         return "; ".join([*parts, again]) if parts else ""
 
 
-def usable_ids(workspace: Workspace) -> list[str]:
+def usable_ids(workspace: Folder) -> list[str]:
     """The trials that a diagnosis can use, in order of arrival.
 
     Raises:
@@ -114,7 +113,7 @@ def usable_ids(workspace: Workspace) -> list[str]:
     return [trial.id for trial in diagnosable(workspace)]
 
 
-def since_diagnosis(workspace: Workspace, diagnosis: Diagnosis, usable: Sequence[str]) -> Since:
+def since_diagnosis(workspace: Folder, diagnosis: Diagnosis, usable: Sequence[str]) -> Since:
     """What a diagnosis does not know.
 
     Args:
