@@ -3,14 +3,15 @@
     for case in make("single", 200, seed): write its trials; seal its label elsewhere
     judge(label, diagnosis, oracle(...)), summary(marks)
 
-Nothing in `grounded.diagnosis` outside this folder imports it: the diagnosis can't reach the truth.
+Read `cases` first (what a case is and how it is drawn), then `systems` (what is driven), `draws`
+(the effects, in the library and not), `truth` (the simulated real system), `score` (oracle and
+marks). Nothing in `grounded.diagnosis` imports this folder: the diagnosis can't reach the truth.
 """
 
 from __future__ import annotations
 
 from grounded.challenge.cases import KINDS, Case, make, sealed
-from grounded.challenge.score import Oracle, judge, oracle, summary
-from grounded.challenge.study import study, task_of
+from grounded.challenge.score import Oracle, judge, oracle, study, summary, task_of
 
 __all__ = [
     "KINDS",

@@ -15,8 +15,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from grounded.challenge import systems, withheld
-from grounded.challenge.draws import draw, values_of
+from grounded.challenge import systems
+from grounded.challenge.draws import draw_effect, draw_withheld, values_of
 from grounded.challenge.truth import Disturbance, Truth
 from grounded.effects import Effect, ParamFamily, scales_of
 from grounded.errors import GroundedError
@@ -119,8 +119,7 @@ def _case(
         same_task=bool(rng.random() < 0.3),
         kind=noise or str(drawn),
     )
-    error = param_error
-    if error is None:
+    if (error := param_error) is None:
         error = 0.05 if kind == "single" and rng.random() < 0.33 else 0.0
     crude = _with_errors(system.model, error, rng)
     plans = _plans(system, crude, setting, rng)
@@ -131,13 +130,8 @@ def _case(
     )
     truth, label = _truth(kind, system, plans, setting, disturbance, rng)
     runs = [_run(system, truth, plan, setting, rng) for plan in plans]
-    label |= {
-        "noise": setting.kind,
-        "level": setting.level,
-        "roughness": setting.roughness,
-        "param_error": error,
-    }
-    label |= {"system": system.name, "kind": kind, "case": name}
+    label |= {"noise": setting.kind, "level": setting.level, "roughness": setting.roughness}
+    label |= {"param_error": error, "system": system.name, "kind": kind, "case": name}
     return Case(
         name=name,
         system=system.name,
@@ -220,7 +214,7 @@ def _truth(
     if kind == "withheld":
         driven = "v" if system.name == "car" else ("omega" if system.name == "pendulum" else "q")
         rate = float(np.quantile(np.abs(np.diff(states[:, model.state_names.index(driven)])), 0.9))
-        hidden = withheld.draw(
+        hidden = draw_withheld(
             rng,
             model,
             np.abs(inputs - inputs.mean(axis=0)).max(axis=0) + 0.5 * np.abs(inputs).max(axis=0),
@@ -233,7 +227,7 @@ def _truth(
         return truth, {"effects": [], "withheld": label}
     effects: list[tuple[Effect, dict[str, float]]] = []
     while len(effects) < (2 if kind == "double" else 1):
-        effect = draw(model, scales, rng)
+        effect = draw_effect(model, scales, rng)
         if effect.name not in [e.name for e, _ in effects]:
             effects.append((effect, values_of(effect, scales, rng, states)))
     true_model = model

@@ -1,11 +1,28 @@
-"""What a blind case's effect is and how large: drawn by family, from barely visible to large."""
+"""What a blind case's effect is and how large: drawn by family, from barely visible to large.
+
+`draw_effect` draws from the library. `draw_withheld` draws what is NOT in the library, and the
+diagnosis must meet without a name for it:
+
+resonance     the actuator rings: u_eff'' = w^2 (u - u_eff) - 2 zeta w u_eff'
+asymmetric    a different gain for positive and negative commands
+dropouts      commands get lost for 0.1 to 0.4 s; the last one is held
+fault         from half of the trial on an actuator gives less
+expo          an exponential stick curve: u_eff = (1 - e) u + e u^3 / peak^2
+crosstalk     one input leaks, squared, into another
+quantised     commands arrive in coarse steps
+gusts         pushes of half a second at random times
+hysteresis    drag that depends on whether the speed rises or falls
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from grounded.challenge.truth import Actuator
 from grounded.effects import Effect, Library, Scales
 from grounded.frozen import Array
 from grounded.model import Model
@@ -13,18 +30,17 @@ from grounded.model import Model
 SMALLEST, LARGEST = 0.04, 0.35  # of the signals an effect acts on
 
 
-def draw(model: Model, scales: Any, rng: np.random.Generator) -> Effect:
+def draw_effect(model: Model, scales: Scales, rng: np.random.Generator) -> Effect:
     """A family at random, then one of its targets."""
     by_family: dict[str, list[Effect]] = {}
     for effect in Library().candidates(model, scales):
         by_family.setdefault(effect.family.name, []).append(effect)
-    family = rng.choice(sorted(by_family))
-    options = by_family[family]
+    options = by_family[rng.choice(sorted(by_family))]
     return options[int(rng.integers(0, len(options)))]
 
 
 def values_of(
-    effect: Effect, scales: Any, rng: np.random.Generator, visited: Array
+    effect: Effect, scales: Scales, rng: np.random.Generator, visited: Array
 ) -> dict[str, float]:
     """A size from barely visible to large, as a part of the signals it acts on.
 
@@ -38,26 +54,24 @@ def values_of(
     """
     size = float(np.exp(rng.uniform(np.log(SMALLEST), np.log(LARGEST))))
     sign = float(rng.choice([-1, 1]))
-    target, values = effect.site.target, dict(effect.fixed)
-    model = effect.site.model
-    duration = scales.duration
+    family, values = effect.family.name, dict(effect.fixed)
+    top = _rate_scale(scales, effect.site.target) * size
     for q in effect.free:
-        values[q.name] = _value(effect, q.name, size, sign, scales, rng, model, target, duration)
-    if effect.family.name == "periodic":
-        phase, amplitude = rng.uniform(0, 2 * np.pi), _rate_scale(scales, target) * size
-        values |= {"A": amplitude * np.cos(phase), "B": amplitude * np.sin(phase)}
-    if effect.family.name in ("drift_world", "drift_body", "slope"):
+        values[q.name] = _value(effect, q.name, size, sign, scales, rng)
+    if family == "periodic":
+        phase = rng.uniform(0, 2 * np.pi)
+        values |= {"A": top * np.cos(phase), "B": top * np.sin(phase)}
+    if family in ("drift_world", "drift_body", "slope"):
         angle = rng.uniform(0, 2 * np.pi)
-        top = _rate_scale(scales, target) * size
         values |= {"a": top * np.cos(angle), "b": top * np.sin(angle)}
-    if effect.family.name == "patch":
+    if family == "patch":
         where = visited[int(rng.integers(0, len(visited)))]
-        names = model.state_names
+        names = effect.site.model.state_names
         values |= {q: where[names.index(q[:-1])] for q in values if q[:-1] in names}
     return {name: float(v) for name, v in values.items()}
 
 
-def _rate_scale(scales: Any, name: str) -> float:
+def _rate_scale(scales: Scales, name: str) -> float:
     """A typical rate of a state: its spread over two seconds."""
     return float(scales.spread(name)) / 2.0
 
@@ -69,11 +83,8 @@ def _value(
     sign: float,
     scales: Scales,
     rng: np.random.Generator,
-    model: Model,
-    target: str,
-    duration: float,
 ) -> float:
-    family = effect.family.name
+    family, target = effect.family.name, effect.site.target
     if family in ("dead_zone", "stall"):
         return size * scales.peak(target)
     if family == "saturation":
@@ -89,18 +100,18 @@ def _value(
     if family in ("input_bias", "sensor_bias"):
         return sign * 0.5 * size * scales.spread(target)
     if family == "input_fade":
-        return size / duration
+        return size / scales.duration
     if family in ("input_gain", "rate_gain", "odometry_scale", "sensor_scale"):
         return sign * size
     if family == "parameter":
-        value = model.params[target].value
+        value = effect.site.model.params[target].value
         return sign * size * (abs(value) if value else 0.2)
     if family in ("viscous_friction", "quadratic_drag", "coulomb_friction", "stiction"):
         speed = scales.peak(target)
         over = {"viscous_friction": 1.0, "quadratic_drag": speed}.get(family, 1 / speed)
         return size * 2.0 / over
     if family == "understeer":
-        speed = max(scales.peak(n) for n in ("v",) if n in scales.high) if scales.high else 1.0
+        speed = scales.peak("v") if scales.high else 1.0
         return float(size / speed**2)
     if family == "side_slip":
         return 0.3 * size / max(scales.peak("v"), 0.3)
@@ -108,7 +119,7 @@ def _value(
         driven, _, source = target.partition("<-")
         return sign * size * _rate_scale(scales, driven) / scales.peak(source)
     if family == "trend":
-        return sign * size * _rate_scale(scales, target) / duration
+        return sign * size * _rate_scale(scales, target) / scales.duration
     if family == "periodic" and quantity == "omega":
         return 2 * np.pi * float(np.exp(rng.uniform(np.log(0.3), np.log(2.0))))
     if family == "patch" and quantity == "c":
@@ -116,3 +127,130 @@ def _value(
     if family == "patch":
         return 0.12 * max(effect.free[-1].grid) / 0.16  # of the radius; the place is drawn apart
     return sign * size * _rate_scale(scales, target)
+
+
+Rate = Callable[[Any, Any, float, Mapping[str, Any]], Mapping[str, float]]
+
+
+@dataclass(frozen=True, eq=False)
+class Withheld:
+    """One withheld effect at work."""
+
+    name: str
+    target: str
+    params: dict[str, float]
+    actuators: tuple[Actuator, ...] = ()
+    rates: tuple[Rate, ...] = ()
+
+
+def draw_withheld(
+    rng: np.random.Generator, model: Model, peak: Array, driven: str, rate: float, duration: float
+) -> Withheld:
+    """A random withheld effect for a model.
+
+    Args:
+        rng: randomness.
+        model: the system.
+        peak: typical size of each input (m,).
+        driven: the state that gusts and hysteresis act on.
+        rate: typical size of that state's rate.
+        duration: of a trial [s].
+    """
+    makers = [_resonance, _asymmetric, _dropouts, _fault, _expo, _quantised, _crosstalk]
+    kind = int(rng.integers(0, len(makers) + 2))
+    j = int(rng.integers(0, model.m))
+    if kind == len(makers) or (model.m == 1 and kind == len(makers) - 1):
+        return _gusts(rng, driven, rate, duration)
+    if kind == len(makers) + 1:
+        return _hysteresis(rng, driven, rate)
+    maker = makers[kind]
+    params, act = maker(rng, j, model.m, float(peak[j]), duration)
+    name = maker.__name__.removeprefix("_")
+    return Withheld(name, model.input_names[j], params, actuators=(act,))
+
+
+_Made = tuple[dict[str, float], Actuator]  # what is sealed, what acts
+
+
+def _on(j: int, delivered: Callable[[Array, dict[str, Any], float, float], float]) -> Actuator:
+    """An actuator that changes input j alone."""
+
+    def act(u: Array, own: dict[str, Any], t: float, dt: float) -> Array:
+        out = u.copy()
+        out[j] = delivered(u, own, t, dt)
+        return out
+
+    return act
+
+
+def _resonance(rng: np.random.Generator, j: int, m: int, peak: float, T: float) -> _Made:
+    w, zeta = 2 * np.pi * rng.uniform(0.7, 2.0), rng.uniform(0.05, 0.25)
+
+    def ring(u: Array, own: dict[str, Any], t: float, dt: float) -> float:
+        z, rate = own.get("resonance", (u[j], 0.0))
+        rate = rate + dt * (w * w * (u[j] - z) - 2 * zeta * w * rate)
+        own["resonance"] = (z + dt * rate, rate)
+        return float(z + dt * rate)
+
+    return {"omega": w, "zeta": zeta}, _on(j, ring)
+
+
+def _asymmetric(rng: np.random.Generator, j: int, m: int, peak: float, T: float) -> _Made:
+    gain = float(rng.choice([-1, 1]) * rng.uniform(0.1, 0.4))
+    return {"gain": gain}, _on(j, lambda u, own, t, dt: u[j] * (1 + gain) if u[j] > 0 else u[j])
+
+
+def _dropouts(rng: np.random.Generator, j: int, m: int, peak: float, T: float) -> _Made:
+    rate = rng.uniform(0.3, 1.0)
+
+    def act(u: Array, own: dict[str, Any], t: float, dt: float) -> Array:
+        until, held = own.get("dropouts", (-1.0, u))
+        if t >= until:
+            held = u.copy()
+            if own["rng"].random() < rate * dt:
+                until = t + own["rng"].uniform(0.1, 0.4)
+        own["dropouts"] = (until, held)
+        return np.array(held)
+
+    return {"per_second": rate}, act
+
+
+def _fault(rng: np.random.Generator, j: int, m: int, peak: float, T: float) -> _Made:
+    begin, loss = T * rng.uniform(0.4, 0.6), rng.uniform(0.15, 0.5)
+    act = _on(j, lambda u, own, t, dt: u[j] * (1 - loss) if t > begin else u[j])
+    return {"begin": begin, "loss": loss}, act
+
+
+def _expo(rng: np.random.Generator, j: int, m: int, peak: float, T: float) -> _Made:
+    e = rng.uniform(0.2, 0.7)
+    return {"e": e}, _on(j, lambda u, own, t, dt: (1 - e) * u[j] + e * u[j] ** 3 / peak**2)
+
+
+def _quantised(rng: np.random.Generator, j: int, m: int, peak: float, T: float) -> _Made:
+    size = peak * rng.uniform(0.15, 0.5)
+    return {"step": size}, _on(j, lambda u, own, t, dt: size * np.rint(u[j] / size))
+
+
+def _crosstalk(rng: np.random.Generator, j: int, m: int, peak: float, T: float) -> _Made:
+    leak = float(rng.choice([-1, 1]) * rng.uniform(0.1, 0.4))
+    return {"leak": leak}, _on(j, lambda u, own, t, dt: u[j] + leak * u[(j + 1) % m] ** 2)
+
+
+def _gusts(rng: np.random.Generator, driven: str, rate: float, T: float) -> Withheld:
+    begins = np.sort(rng.uniform(0.1 * T, 0.9 * T, 4))
+    sizes = rate * rng.choice([-1, 1], 4) * rng.uniform(0.2, 0.8, 4)
+
+    def push(s: Any, a: Any, t: float, own: Mapping[str, Any]) -> Mapping[str, float]:
+        inside = (t > begins) & (t < begins + 0.5)
+        return {driven: float(sizes[inside].sum())}
+
+    return Withheld("gusts", driven, {"count": 4.0}, rates=(push,))
+
+
+def _hysteresis(rng: np.random.Generator, driven: str, rate: float) -> Withheld:
+    size = rate * rng.uniform(0.1, 0.4)
+
+    def drag(s: Any, a: Any, t: float, own: Mapping[str, Any]) -> Mapping[str, float]:
+        return {driven: -size * float(np.tanh(5 * own[driven] / rate) > 0)}
+
+    return Withheld("hysteresis", driven, {"size": size}, rates=(drag,))

@@ -2,26 +2,31 @@
 
 The oracle fits the true effects (values free, noise and parameters as in a diagnosis) and nothing
 else: a case counts as detectable where its evidence exceeds 3 nats, and its held-out gap is what a
-diagnosis is compared with.
+diagnosis is compared with. `study` makes, diagnoses and judges cases in memory, without files.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from grounded.challenge.cases import Case, Kind, make
 from grounded.diagnosis.data import prepare
+from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
+from grounded.diagnosis.held_out import held_out_errors
 from grounded.diagnosis.hypothesis import Hypothesis
 from grounded.diagnosis.prediction_error import horizon, normalised
-from grounded.diagnosis.search import Search
-from grounded.diagnosis.shrinkage import held_out
+from grounded.diagnosis.search import HypothesisSearch
 from grounded.effects import Library
 from grounded.frozen import Array
 from grounded.model import Model
+from grounded.task import Task
 from grounded.trial import Trial
+from grounded.utility import Reward
 
 DETECTABLE = 3.0  # nats
 
@@ -47,7 +52,7 @@ def oracle(
         {q.name: float(e["params"][q.name]) for q in effect.free}
         for e, effect in zip(label["effects"], effects, strict=True)
     ]
-    search = Search(data, Library().candidates(model, data.scales))
+    search = HypothesisSearch(data, Library().candidates(model, data.scales))
     search.nulls()
 
     def fitted(which: Sequence[int]) -> float:
@@ -76,11 +81,11 @@ def oracle(
         each[effect.name] = whole - below
     best = search.of_size(len(effects))[0]
     where = horizon(search.predictor, best, 1.0)
-    gap = normalised(held_out(search.predictor, best, best.track, where), where)
+    gap = normalised(held_out_errors(search.predictor, best, best.track, where), where)
     return Oracle(whole - search.score(search.best_null()), gap, each)
 
 
-def _plain(search: Search) -> list[Any]:
+def _plain(search: HypothesisSearch) -> list[Any]:
     """Fits without effects under white noise with exact parameters."""
     return [
         f
@@ -190,3 +195,54 @@ def summary(marks: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 def _part(marks: Sequence[Mapping[str, Any]], key: str) -> float | None:
     return float(np.mean([bool(m[key]) for m in marks])) if marks else None
+
+
+def task_of(case: Case) -> Task:
+    """The task that a case's owner has: his model, his latency, his limits."""
+    n, m = case.model.n, case.model.m
+    return Task(
+        model=case.model,
+        dt=case.dt,
+        target=case.target,
+        reward=Reward(np.ones(n), np.zeros(n), np.zeros(m), np.zeros(m)),
+        start=case.start,
+        past=np.zeros(m),
+        low=case.low,
+        high=case.high,
+        latency=case.latency,
+    )
+
+
+def study(
+    kind: Kind,
+    count: int,
+    seed: int,
+    *,
+    options: DiagnosisOptions | None = None,
+    only: str | None = None,
+    param_error: float | None = None,
+    noise: str | None = None,
+    progress: Callable[[dict[str, Any]], None] | None = None,
+) -> dict[str, Any]:
+    """Diagnoses `count` blind cases of a kind and returns the figures of `summary`, with CPU time.
+
+    Args:
+        kind: single, double, none or withheld.
+        count: cases.
+        seed: of everything.
+        options: of the diagnosis.
+        only: one system instead of all.
+        param_error: see `make`.
+        noise: see `make`.
+        progress: called with each case's marks.
+    """
+    marks = []
+    for case in make(kind, count, seed, only=only, param_error=param_error, noise=noise):
+        begin = time.process_time()
+        found = diagnose(task_of(case), case.trials, options).to_json()
+        spent = time.process_time() - begin
+        known = oracle(case.model, case.trials, case.latency, case.label)
+        marks.append({**judge(case.label, found, known), "cpu_s": spent})
+        if progress is not None:
+            progress(marks[-1])
+    return summary(marks)

@@ -80,9 +80,9 @@ def _swing(rng: np.random.Generator, t: Array, model: Model) -> tuple[Array, Arr
 
 
 def _fly(rng: np.random.Generator, t: Array, model: Model) -> tuple[Array, Array]:
-    from grounded.models.aircraft_trim import trim
+    from grounded.models.aircraft import level_trim
 
-    level = trim(model, np.array([10.0]), np.array([0.0]), float(t[1] - t[0]))
+    level = level_trim(model, np.array([10.0]), np.array([0.0]), float(t[1] - t[0]))
     u = np.tile(level.inputs[0], (len(t), 1))
     names = model.input_names
     u[:, names.index("throttle")] += 0.15 * steps(rng, t, -1, 1, 2.0)
@@ -98,20 +98,15 @@ def car() -> SystemUnderTest:
     """The RC car of section 5.2 (20 to 50 Hz, overhead camera)."""
     from grounded.models.car import model
 
+    process = {"delta": 0.01, "v": 0.03, "x": 0.004, "y": 0.004, "psi": 0.01, "psi_rate": 0.1}
+    measured = {"delta": 0.01, "v": 0.02, "x": 0.004, "y": 0.004, "psi": 0.01, "psi_rate": 0.1}
     return SystemUnderTest(
         name="car",
         model=model,
         low=np.array([-1.0, 0.0]),
         high=np.array([1.0, 1.0]),
-        process={"delta": 0.01, "v": 0.03, "x": 0.004, "y": 0.004, "psi": 0.01, "psi_rate": 0.1},
-        measurement={
-            "delta": 0.01,
-            "v": 0.02,
-            "x": 0.004,
-            "y": 0.004,
-            "psi": 0.01,
-            "psi_rate": 0.1,
-        },
+        process=process,
+        measurement=measured,
         tracking={"delta": 0.2, "v": 1.0, "x": 4.0, "y": 4.0, "psi": 1.0},
         effort=np.array([2.0, 2.0]),
         manoeuvre=_drive,

@@ -87,18 +87,12 @@ class _Run:
         latency = truth.latency or (0.0,) * model.m
         self.late = [divmod(seconds / self.fine, 1.0) for seconds in latency]
         self.queues = [[held[j]] * (int(whole) + 1) for j, (whole, _) in enumerate(self.late)]
-        self.gust = np.zeros(model.n)
-        self.past: list[Array] = []
-        self.last, self.tied = self.held, list[tuple[int, int]]()
+        self.gust, self.last, self.past = np.zeros(model.n), self.held, [self.x.copy()]
+        pairs = ((n, partner(model, n)) for n in self.names)
+        self.tied = [(self.names.index(n), self.names.index(k)) for n, k in pairs if k is not None]
 
     def trial(self, controller: Callable[[int, Array], Array], steps: int) -> Trial:
         model = self.truth.model
-        self.tied = [
-            (self.names.index(n), self.names.index(k))
-            for n in self.names
-            if (k := partner(model, n)) is not None
-        ]
-        self.past = [self.x.copy()]
         logged, inputs = [self.measure()], []
         for t in range(steps):
             u = np.asarray(controller(t, logged[-1]), float)
@@ -106,18 +100,13 @@ class _Run:
                 self.advance(u, t * self.dt + part * self.fine)
                 self.past.append(self.x.copy())
             self.disturb()
-            self.tie(u, (t + 1) * self.dt)
+            self.tie((t + 1) * self.dt)
             self.past[-1] = self.x.copy()
             logged.append(self.measure())
             inputs.append(u)
-        return Trial(
-            np.array(logged),
-            np.array(inputs),
-            self.dt,
-            model.state_names,
-            model.input_names,
-            start_inputs=self.held,
-        )
+        names = (model.state_names, model.input_names)
+        states = np.array(logged)
+        return Trial(states, np.array(inputs), self.dt, *names, start_inputs=self.held)
 
     def received(self, u: Array, t: float) -> Array:
         """What the actuators deliver over a fine step."""
@@ -167,7 +156,7 @@ class _Run:
         half = self.x + 0.5 * self.fine * self.rates(self.x, received, t)
         self.x = self.x + self.fine * self.rates(half, received, t + 0.5 * self.fine)
 
-    def tie(self, u: Array, t: float) -> None:
+    def tie(self, t: float) -> None:
         """A heading rate that the model only carries along is, in truth, the heading's rate."""
         if self.tied:
             rates = self.rates(self.x, self.last, t)
@@ -194,7 +183,7 @@ class _Run:
 
     def measure(self) -> Array:
         """The log of this moment."""
-        _model, noise = self.truth.model, self.truth.disturbance
+        noise = self.truth.disturbance
         y = self.x.copy()
         for effect, values in self.truth.effects:
             i = self.names.index(effect.site.target) if effect.site.target in self.names else -1

@@ -1,1 +1,14 @@
-"""The sim-to-real gap: where it lies, which effect makes it, how far it shrinks."""
+"""The sim-to-real gap: where it lies, which effect makes it, how far it shrinks.
+
+Read `diagnose` first; its docstring lists the stages. Below them lie, from the data upwards:
+
+    data                  trials as one record, cut into runs of equal length
+    hypothesis            effects with their values, and what they predict
+    filter, kernels       the Kalman filter along all runs (NumPy; compiled), and its smoother
+    delays, delayed_measurement     a sensor that shows an earlier state
+    noise                 the noise, estimated beside everything else
+    linearise             a hypothesis to first order: the columns that are filtered
+    refine, fitted        many hypotheses up their likelihood at once; where each ends
+    scan                  a first look at every candidate effect
+    hypotheses, search    what was fitted, what it is worth, what to try next
+"""

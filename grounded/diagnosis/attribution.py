@@ -13,11 +13,11 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from grounded.diagnosis.data import Data
-from grounded.diagnosis.fitted import Fit
+from grounded.diagnosis.fitted import Fitted
 from grounded.diagnosis.hypotheses import CLAIM
 from grounded.diagnosis.noise import Structure
 from grounded.diagnosis.refine import clean
-from grounded.diagnosis.search import LARGE, SHORTLIST, TO_THE_TOP, Search, tune
+from grounded.diagnosis.search import LARGE, SHORTLIST, TO_THE_TOP, HypothesisSearch, tune
 from grounded.effects import Effect
 
 HOPEFUL = 4  # larger sets that are fitted to the end
@@ -31,7 +31,7 @@ def attribute(
     *,
     max_effects: int = 3,
     tick: Callable[[str], None] | None = None,
-) -> tuple[Search, Fit]:
+) -> tuple[HypothesisSearch, Fitted]:
     """Searches for the effects that make the gap; returns the search and its best fit.
 
     Args:
@@ -41,12 +41,12 @@ def attribute(
         tick: called with what is being done, for a progress display.
     """
     with np.errstate(all="ignore"):  # a hypothesis that diverges scores minus infinity
-        search, best = _searched(Search(data, candidates, tick))
+        search, best = _searched(HypothesisSearch(data, candidates, tick))
         _grow(search, best, max_effects)
     return search, search.chosen(max_effects)
 
 
-def _searched(search: Search) -> tuple[Search, Fit]:
+def _searched(search: HypothesisSearch) -> tuple[HypothesisSearch, Fitted]:
     """The best single hypothesis; with outliers in the data, the best with their weights."""
     search.nulls()
     best = _explore(search)
@@ -56,7 +56,7 @@ def _searched(search: Search) -> tuple[Search, Fit]:
     return search, best
 
 
-def _explore(search: Search) -> Fit:
+def _explore(search: HypothesisSearch) -> Fitted:
     """The best hypothesis of one effect, or without when there is none to try."""
     null = search.best_null()
     plain = search.fits.get((Structure(), 0.0, ()), null)
@@ -85,20 +85,20 @@ def _explore(search: Search) -> Fit:
     return max([best, search.best_null()], key=search.score)
 
 
-def _kind(fit: Fit) -> tuple[object, ...]:
+def _kind(fit: Fitted) -> tuple[object, ...]:
     """What rivals have to be given too: the effects beside, the noise's structure, the prior."""
     h = fit.hypothesis
     return h.names, fit.noise.structure, h.spread
 
 
-def outliers(fit: Fit) -> bool:
+def outliers(fit: Fitted) -> bool:
     """Whether whitened innovations beyond 4 are far more frequent than a normal law has them."""
     count = float((np.abs(fit.white) > 4.0).sum())
     expected = 6.3e-5 * fit.white.size
     return count > 4 + 3 * expected
 
 
-def _starts(search: Search, size: int, best: Fit) -> list[Fit]:
+def _starts(search: HypothesisSearch, size: int, best: Fitted) -> list[Fitted]:
     """What a further effect is sought beside: the likeliest, and the same under plain noise.
 
     What the further effect does may so far have passed for coloured noise or for parameters.
@@ -116,7 +116,7 @@ def _starts(search: Search, size: int, best: Fit) -> list[Fit]:
     return found
 
 
-def _grow(search: Search, best: Fit, most: int) -> None:
+def _grow(search: HypothesisSearch, best: Fitted, most: int) -> None:
     """Second and further effects: add, then swap each for what goes better with the others."""
     size = len(best.hypothesis.effects)
     while 1 <= size < most:

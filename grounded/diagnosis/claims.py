@@ -1,21 +1,76 @@
-"""What is claimed, with values and intervals; what lost; what ties; what is nearly the same."""
+"""What is claimed, with values and intervals; what lost; what ties; what is nearly the same.
+
+Where calibrating the model's own parameters explains the gap, those that are off are named. Around
+the calibrated fit the log-posterior of the shifts is a parabola, H its curvature. With only a set S
+of the parameters free the best that is left is lower by
+
+    loss(S) = 1/2 b' (H_rr - H_rS H_SS^-1 H_Sr) b,        r: the others, b: their shifts
+
+Parameters are taken into S one by one, each time the one that lowers the loss most, until what the
+others would add is not worth a claim. So two parameters that only one combination of the data
+knows (a gain and a time constant) are not both blamed for it.
+"""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
-from grounded.diagnosis.calibration import blamed
-from grounded.diagnosis.fitted import Fit, calibrated
+import numpy as np
+
+from grounded.diagnosis.data import Data
+from grounded.diagnosis.fitted import Fitted, calibrated, standard_deviations
+from grounded.diagnosis.held_out import gaps_of, held_out_errors
 from grounded.diagnosis.hypotheses import TIE, parametric
 from grounded.diagnosis.hypothesis import param_scale
-from grounded.diagnosis.intervals import standard_deviations
 from grounded.diagnosis.limits import Limits
 from grounded.diagnosis.lookalike import lookalikes, of_parameters
 from grounded.diagnosis.prediction_error import normalised
 from grounded.diagnosis.report import Estimate, Likeness, Ranked
-from grounded.diagnosis.search import Search
-from grounded.diagnosis.shrinkage import gaps_of, held_out
+from grounded.diagnosis.search import HypothesisSearch
+from grounded.frozen import Array
+
+ENOUGH = 3.0  # nats that the parameters that are not named may still hold
+
+
+@dataclass(frozen=True)
+class Blame:
+    """A parameter that is off: its index in the model, what is lost without it [nats]."""
+
+    index: int
+    nats: float
+
+
+def loss(H: Array, b: Array, free: list[int]) -> float:
+    """What is lost when only `free` shifts may differ from zero [nats]."""
+    rest = [i for i in range(len(b)) if i not in free]
+    if not rest:
+        return 0.0
+    block, left = H[np.ix_(rest, rest)], b[rest]
+    if free:
+        across = H[np.ix_(rest, free)]
+        block = block - across @ np.linalg.pinv(H[np.ix_(free, free)], hermitian=True) @ across.T
+    return 0.5 * float(left @ block @ left)
+
+
+def blamed(data: Data, fit: Fitted) -> tuple[Blame, ...]:
+    """The parameters of a calibrated fit that have to differ, most important first."""
+    h = fit.hypothesis
+    if h.spread == 0 or h.shift is None:
+        return ()
+    k, which = len(h.theta), calibrated(data)
+    H = fit.gram.sum(axis=0)[k:, k:] + np.diag(fit.prior[k:])
+    b = h.shift[which] / param_scale(data.model)[which]
+    free: list[int] = []
+    now = loss(H, b, free)
+    while len(free) < len(b) and (now > ENOUGH or not free):
+        losses = {i: loss(H, b, [*free, i]) for i in range(len(b)) if i not in free}
+        i = min(losses, key=lambda j: losses[j])
+        free, now = [*free, i], losses[i]
+    found = [Blame(int(which[i]), loss(H, b, [j for j in free if j != i]) - now) for i in free]
+    return tuple(sorted(found, key=lambda blame: -blame.nats))
+
 
 RANKED = 12  # explanations that are listed
 SAME = 0.95  # share of a parameter's signal from which an effect is the same thing
@@ -24,7 +79,9 @@ SAME = 0.95  # share of a parameter's signal from which an effect is the same th
 class Claims:
     """What the best hypothesis blames: effects, or parameters where calibrating them is enough."""
 
-    def __init__(self, search: Search, best: Fit, known: Limits, *, left: bool) -> None:
+    def __init__(
+        self, search: HypothesisSearch, best: Fitted, known: Limits, *, left: bool
+    ) -> None:
         self.search, self.best, self.known = search, best, known
         self.predictor, self.data = search.predictor, search.data
         self.null = search.best_null()
@@ -42,7 +99,9 @@ class Claims:
         """The claimed effects first (by what would be lost without each), then what lost."""
         search, rows = self.search, []
         parts = self.parts()
-        after = normalised(held_out(self.predictor, self.best, self.best.track, where), where)
+        after = normalised(
+            held_out_errors(self.predictor, self.best, self.best.track, where), where
+        )
         for name in sorted(self.names, key=lambda n: -parts[n]):
             claimed = not self.known.no_cause
             rows.append(self._row(self.best, name, parts[name], after, before, claimed=claimed))
@@ -96,7 +155,7 @@ class Claims:
         return found
 
     def _row(
-        self, fit: Fit, name: str, evidence: float, gap: float, before: float, *, claimed: bool
+        self, fit: Fitted, name: str, evidence: float, gap: float, before: float, *, claimed: bool
     ) -> Ranked:
         index = fit.hypothesis.names.index(name)
         effect = fit.hypothesis.effects[index]
@@ -110,7 +169,7 @@ class Claims:
             claimed=claimed,
         )
 
-    def estimates(self, fit: Fit) -> list[dict[str, Estimate]]:
+    def estimates(self, fit: Fitted) -> list[dict[str, Estimate]]:
         """Values with intervals, effect by effect."""
         stds, halves = standard_deviations(fit, self.data.trial_of)
         found, at = [], 0

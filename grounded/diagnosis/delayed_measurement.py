@@ -1,6 +1,6 @@
-"""A late measurement in the filter: one state more, and its three passes stay as they are.
+"""A delayed measurement in the filter: one state more, and its three passes stay as they are.
 
-    r_i(s) = (1 - p) e_i(s) + p e_i(s - 1) + v(s)         of a late channel i, 0 <= p < 1
+    r_i(s) = (1 - p) e_i(s) + p e_i(s - 1) + v(s)         of a delayed channel i, 0 <= p < 1
 
 Slot i of the widened state is what is measured, z_i(s) = (1 - p) e_i(s) + p e_i(s - 1); slot n + j
 is e_i(s) itself, as a channel that is never measured. So H stays the identity of what is seen, and
@@ -10,7 +10,7 @@ is e_i(s) itself, as a channel that is never measured. So H stays the identity o
 
 where F takes e_i from slot n + j. Noise enters by G of n + D rows. Coloured noise follows, as ever.
 
-Shapes: L steps, B runs, n channels, D late ones, n' = n + D, N' = n' or 2 n'.
+Shapes: L steps, B runs, n channels, D delayed ones, n' = n + D, N' = n' or 2 n'.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import numpy as np
 from grounded.frozen import Array
 
 
-class System(NamedTuple):
+class FilterSystem(NamedTuple):
     """What `filter.gains` takes."""
 
     A: Array  # (L, B, N, N)
@@ -36,7 +36,7 @@ class System(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Late:
+class Delayed:
     """Late channels of every run: which (B, D) of int, and p (B, D)."""
 
     channel: Any
@@ -47,11 +47,7 @@ class Late:
         """D."""
         return int(self.channel.shape[1])
 
-    def tiled(self, times: int) -> Late:
-        """The same for every run of a batch that holds the runs several times."""
-        return Late(np.tile(self.channel, (times, 1)), np.tile(self.part, (times, 1)))
-
-    def system(self, of: System) -> System:
+    def system(self, of: FilterSystem) -> FilterSystem:
         """The widened system."""
         n, D = of.seen.shape[-1], self.count
         G = self._entry(of)
@@ -65,16 +61,16 @@ class Late:
         since = np.einsum("bdk,bk->bd", G[0, :, n:, :n] ** 2, power)
         R[0, :, n:] += self.part**2 * since
         start = of.start if of.start.shape[1] == 0 else np.pad(of.start, [(0, 0), (0, D)])
-        return System(self._transition(of, G), self.noises(of.Q, n), R, seen, start, G)
+        return FilterSystem(self._transition(of, G), self.noises(of.Q, n), R, seen, start, G)
 
-    def _entry(self, of: System) -> Array:
+    def _entry(self, of: FilterSystem) -> Array:
         """How noise enters, (L, B, n', n')."""
         L, B, n, D = *of.A.shape[:2], of.seen.shape[-1], self.count
         G = np.zeros((L, B, n + D, n + D))
         G[:, :, :n, :n] = np.eye(n) if of.G is None else of.G
         return self._led(G, n)
 
-    def _transition(self, of: System, G: Array) -> Array:
+    def _transition(self, of: FilterSystem, G: Array) -> Array:
         """A of the widened state, (L, B, N', N')."""
         (L, B, N, _), n, D = of.A.shape, of.seen.shape[-1], self.count
         wide, run = n + D, np.arange(B)
@@ -92,7 +88,7 @@ class Late:
         return A
 
     def _led(self, rows: Array, n: int) -> Array:
-        """Rows of e (L, B, n', C), those of late channels led to slot n + j and, by 1 - p, to i."""
+        """Rows of e (L, B, n', C), delayed channels led to slot n + j and, times 1 - p, to i."""
         found, run = rows.copy(), np.arange(rows.shape[1])
         found[:, :, n:] = np.take_along_axis(rows, self.channel[None, :, :, None], 2)
         for j in range(self.count):
@@ -128,15 +124,17 @@ class Late:
         return np.concatenate([values[..., :n], values[..., wide : wide + n]], axis=-1)
 
 
-def joined(parts: Sequence[tuple[System, Late | None]]) -> tuple[System, Late | None]:
-    """Systems with as many late channels each as one, their runs one after the other."""
+def joined(
+    parts: Sequence[tuple[FilterSystem, Delayed | None]],
+) -> tuple[FilterSystem, Delayed | None]:
+    """Systems with as many delayed channels each as one, their runs one after the other."""
     systems = [system for system, _ in parts]
     A, Q, R, seen = (np.concatenate([one[k] for one in systems], axis=1) for k in range(4))
     entries = [one.G for one in systems if one.G is not None]
     G = np.concatenate(entries, axis=1) if entries else None
-    whole = System(A, Q, R, seen, np.concatenate([one.start for one in systems]), G)
-    each = [late for _, late in parts if late is not None]
+    whole = FilterSystem(A, Q, R, seen, np.concatenate([one.start for one in systems]), G)
+    each = [delayed for _, delayed in parts if delayed is not None]
     if not each:
         return whole, None
-    channel, part = [late.channel for late in each], [late.part for late in each]
-    return whole, Late(np.concatenate(channel), np.concatenate(part))
+    channel, part = [delayed.channel for delayed in each], [delayed.part for delayed in each]
+    return whole, Delayed(np.concatenate(channel), np.concatenate(part))

@@ -4,9 +4,10 @@
     y_i(s + k) = (1 - p) x_i(s) + p x_i(s - 1)
 
 So under a hypothesis with a delay the log of its channel is moved by k steps, and the filter takes
-care of p (`late.py`). The first k samples of a trial show what was before it, which no model
-predicts. All hypotheses are judged by the same data, so they count too (`before`): as samples of a
-state that drifted into the trial at rest, or at the pace of its beginning, whichever is likelier.
+care of p (`delayed_measurement`). The first k samples of a trial show what was before it, which no
+model predicts. All hypotheses are judged by the same data, so they count too (`before`): as samples
+of a state that drifted into the trial at rest, or at the pace of its beginning, whichever is
+likelier.
 
 Noise (its weights) and adjoints belong to samples: outside the filter they stay in the log's order.
 """
@@ -20,10 +21,10 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis.data import Data
-from grounded.diagnosis.delayed_measurement import Late
+from grounded.diagnosis.delayed_measurement import Delayed
 from grounded.diagnosis.filter import UNKNOWN, Adjoint
 from grounded.diagnosis.hypothesis import Hypothesis
-from grounded.diagnosis.noise import Noise
+from grounded.diagnosis.noise import NoiseModel
 from grounded.effects import SensorDelayFamily
 from grounded.frozen import Array
 
@@ -32,17 +33,17 @@ UNLIKE = 1.0  # nats that a sample of what was before a trial costs at most more
 
 @dataclass(frozen=True, eq=False)
 class Delays:
-    """The late channels of a hypothesis, D of them: which, k and p of each."""
+    """The delayed channels of a hypothesis, D of them: which, k and p of each."""
 
     data: Data
     channel: tuple[int, ...]
     whole: tuple[int, ...]
     part: Array  # (D,)
 
-    def late(self) -> Late:
+    def in_filter(self) -> Delayed:
         """For the filter, every run the same."""
         B = len(self.data.valid)
-        return Late(np.tile(self.channel, (B, 1)), np.tile(self.part, (B, 1)))
+        return Delayed(np.tile(self.channel, (B, 1)), np.tile(self.part, (B, 1)))
 
     def moved(self, h: Hypothesis) -> Delays:
         """With the delays of another hypothesis but the samples of this one: p may leave 0 .. 1."""
@@ -87,14 +88,14 @@ class Delays:
                 values[..., i] = self._carried(values[..., i], (at, there), (own, run), 0.0)
         return replace(adjoint, **found)
 
-    def noise(self, noise: Noise) -> Noise:
+    def noise(self, noise: NoiseModel) -> NoiseModel:
         """The same noise with the weights of the moved samples."""
         if isinstance(noise.weight_v, float):
             return noise
         return replace(noise, weight_v=self.aligned(noise.weight_v, 1.0))
 
     def before(
-        self, noise: Noise, entry: Array | None, track: Array, white: Array, whiten: Array
+        self, noise: NoiseModel, entry: Array | None, track: Array, white: Array, whiten: Array
     ) -> float:
         """Log density of the samples that show what was before the trials; without log 2 pi [nats].
 
@@ -122,7 +123,7 @@ class Delays:
             total += max(least, *(self._drifted(noise, i, drift, p * pace) for p in (0.0, 1.0)))
         return total
 
-    def _drifted(self, noise: Noise, i: int, drift: Array, pace: Array) -> float:
+    def _drifted(self, noise: NoiseModel, i: int, drift: Array, pace: Array) -> float:
         """Log density of the first samples, the state going `pace` (B,) a step, spread by `drift`.
 
         A Kalman filter of one state; drift (k, B) are the variances of its steps.
@@ -190,6 +191,6 @@ def _named(h: Hypothesis, data: Data) -> list[tuple[int, float]]:
     """Channels and delays [s]."""
     return [
         (data.model.state_names.index(effect.site.target), float(values["d"]))
-        for effect, values in zip(h.effects, h.values, strict=True)
+        for effect, values in h.pairs
         if isinstance(effect.family, SensorDelayFamily)
     ]

@@ -1,14 +1,14 @@
 """START HERE: the sim-to-real gap, diagnosed. Trials and a crude model in, a verdict out.
 
-limits       what can't be known from these data
-attribution  which effects, by evidence                      (effects/, search, scan, refine, noise)
-claims       what is claimed, what ties, what is nearly the same   (calibration, lookalike)
-leftover     what no effect explains
-gap          where the gap lies: channels, times, regions
-split        what the error is made of: explained, unexplained, irreducible
-shrinkage    how far it shrinks on trials that were left out     (utility_prediction)
-verdict      all of it in sentences                              (words)
-excitation   what to run next, where two explanations tie
+limits            what can't be known from these data
+attribution       which effects, by evidence       (search, hypotheses, scan, refine, noise, fitted)
+held_out          no claim that held-out trials contradict; how far the gap shrinks on them
+claims            what is claimed, what ties, what is nearly the same    (lookalike)
+leftover          what no effect explains
+prediction_error  where the gap lies: channels, times, regions
+split             what the error is made of: explained, unexplained, irreducible
+verdict           all of it in sentences; `report` is the result as data
+excitation        what to run next, where two explanations tie
 """
 
 from __future__ import annotations
@@ -21,10 +21,16 @@ import numpy as np
 
 from grounded.diagnosis.attribution import attribute
 from grounded.diagnosis.claims import Claims
-from grounded.diagnosis.confirm import confirmed, noise_confirmed
 from grounded.diagnosis.data import prepare
 from grounded.diagnosis.delays import delays_of
-from grounded.diagnosis.fitted import Fit
+from grounded.diagnosis.fitted import Fitted
+from grounded.diagnosis.held_out import (
+    confirmed,
+    noise_confirmed,
+    shrinkage,
+    utility_prediction,
+    whole_runs,
+)
 from grounded.diagnosis.hypothesis import Hypothesis
 from grounded.diagnosis.leftover import Leftover, leftovers, whiteness
 from grounded.diagnosis.limits import Limits, knowable, limits
@@ -41,10 +47,8 @@ from grounded.diagnosis.report import (
     UtilityPrediction,
     Where,
 )
-from grounded.diagnosis.search import Search
-from grounded.diagnosis.shrinkage import shrinkage, whole_runs
+from grounded.diagnosis.search import HypothesisSearch
 from grounded.diagnosis.split import repeated, split
-from grounded.diagnosis.utility_prediction import utility_prediction
 from grounded.diagnosis.verdict import next_trial, verdict
 from grounded.effects import Library
 from grounded.model import Model
@@ -53,7 +57,7 @@ from grounded.trial import Trial
 
 
 @dataclass(frozen=True)
-class Options:
+class DiagnosisOptions:
     """How to diagnose.
 
     Args:
@@ -74,7 +78,7 @@ class Options:
 def diagnose(
     subject: Task | Model,
     trials: Sequence[Trial],
-    options: Options | None = None,
+    options: DiagnosisOptions | None = None,
     *,
     progress: Callable[[str], None] | None = None,
 ) -> Diagnosis:
@@ -89,7 +93,7 @@ def diagnose(
     Raises:
         GroundedError: for trials that don't fit the model, or with nothing in them.
     """
-    options, tick = options or Options(), progress or (lambda word: None)
+    options, tick = options or DiagnosisOptions(), progress or (lambda word: None)
     model = subject.model if isinstance(subject, Task) else subject
     latency = subject.latency if isinstance(subject, Task) else None
     past = subject.past if isinstance(subject, Task) else None
@@ -114,11 +118,11 @@ class _Writer:
 
     def __init__(
         self,
-        search: Search,
-        best: Fit,
+        search: HypothesisSearch,
+        best: Fitted,
         left: list[Leftover],
         known: Limits,
-        options: Options,
+        options: DiagnosisOptions,
         tick: Callable[[str], None],
         task: Task | None,
         trials: Sequence[Trial],

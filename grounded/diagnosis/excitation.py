@@ -20,10 +20,10 @@ import numpy as np
 
 from grounded.diagnosis.data import prepare, shifted
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor
-from grounded.diagnosis.noise import Noise, Structure
+from grounded.diagnosis.noise import NoiseModel, Structure
 from grounded.diagnosis.refine import refine
 from grounded.diagnosis.report import Diagnosis
-from grounded.effects import Effect, Library, memory_start, scales_of, wrap, wrapping_order
+from grounded.effects import Library, memory_start, scales_of, wrap, wrapping_order
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.policy import Policy, Runner
@@ -140,64 +140,42 @@ def _hypotheses(
     inputs = np.concatenate([trial.inputs for trial in trials])
     duration = max(trial.steps for trial in trials) * task.dt
     scales = scales_of(task.model, states, inputs, task.dt, duration)
-    built: dict[str, Effect] = {}
-    for name in {*diagnosis.effects, first, second}:
-        built[name] = library.effect(name, task.model, scales)
-    rest = [n for n in diagnosis.effects if n not in (first, second)]
-    found = []
-    for name in (first, second):
-        h = Hypothesis()
-        for n in [*rest, name]:
-            h = h.plus(built[n], diagnosis.values(n))
-        found.append(h)
-    return found[0], found[1]
+    h = Hypothesis()
+    for name in diagnosis.effects:
+        if name not in (first, second):
+            h = h.plus(library.effect(name, task.model, scales), diagnosis.values(name))
+    built = (library.effect(name, task.model, scales) for name in (first, second))
+    one, other = (h.plus(effect, diagnosis.values(effect.name)) for effect in built)
+    return one, other
 
 
-def _noise(model: Model, diagnosis: Diagnosis) -> Noise:
+def _noise(model: Model, diagnosis: Diagnosis) -> NoiseModel:
     def logs(levels: Mapping[str, float]) -> Array:
         return np.array([2 * np.log(levels[n] + 1e-12) for n in model.state_names])
 
     q, r = logs(diagnosis.noise.process), logs(diagnosis.noise.measurement)
-    return Noise(Structure(), q, r, q.copy(), np.full(model.n, -60.0))
+    return NoiseModel(Structure(), q, r, q.copy(), np.full(model.n, -60.0))
 
 
 def _run(task: Task, h: Hypothesis, policy: Policy) -> Trial | None:
     """A run of the policy in the model with a hypothesis, without noise; None if it diverges."""
     model = _wrapped(task, h)
     assert task.latency is not None
-    start = Trial(
-        task.start[None],
-        np.empty((0, task.model.m)),
-        task.dt,
-        task.model.state_names,
-        task.model.input_names,
-        start_inputs=task.past,
-    )
-    extra = memory_start(model, task.model, start)
-    z, runner = np.concatenate([task.start, extra]), Runner(policy)
-    states, inputs = [task.start], np.zeros((policy.horizon, model.m))
+    names = (task.model.state_names, task.model.input_names)
+    nothing = np.empty((0, task.model.m))
+    start = Trial(task.start[None], nothing, task.dt, *names, start_inputs=task.past)
+    z = np.concatenate([task.start, memory_start(model, task.model, start)])
+    states, inputs, runner = [task.start], np.zeros((policy.horizon, model.m)), Runner(policy)
+    late, past = task.latency / task.dt, task.past[:, None]
     for t in range(policy.horizon):
         inputs[t] = runner.action(t * policy.dt, states[-1])
-        received = np.array(
-            [
-                shifted(inputs[None, : t + 1, j], task.past[j : j + 1], task.latency[j] / task.dt)[
-                    0, -1
-                ]
-                for j in range(model.m)
-            ]
-        )
-        z = model.system.step(z[None], received[None], model.values, task.dt)[0]
+        sent = inputs[None, : t + 1]
+        received = [shifted(sent[..., j], past[j], late[j])[0, -1] for j in range(model.m)]
+        z = model.system.step(z[None], np.array([received]), model.values, task.dt)[0]
         if not np.isfinite(z).all():
             return None
         states.append(z[: task.model.n])
-    return Trial(
-        np.array(states),
-        inputs,
-        task.dt,
-        task.model.state_names,
-        task.model.input_names,
-        start_inputs=task.past,
-    )
+    return Trial(np.array(states), inputs, task.dt, *names, start_inputs=task.past)
 
 
 def _wrapped(task: Task, h: Hypothesis) -> Model:
@@ -217,7 +195,9 @@ def _safe(task: Task, run: Trial | None) -> bool:
     return bool(inside.all())
 
 
-def _evidence(task: Task, run: Trial, true: Hypothesis, rival: Hypothesis, noise: Noise) -> float:
+def _evidence(
+    task: Task, run: Trial, true: Hypothesis, rival: Hypothesis, noise: NoiseModel
+) -> float:
     """What the rival, its values free, fails to explain of a run [nats]."""
     data = prepare(task.model, [run], task.latency, task.past)
     predictor = Predictor(data)

@@ -17,8 +17,8 @@ N_t their covariances, d loglik / d R = (u u' - D) / 2 and d loglik / d Q = (r r
 Where a state is only carried along (a heading rate that is a function of steering and speed), what
 disturbs those disturbs it too: the noises enter through G_t (n, n), c + w -> G (c + w).
 
-A measurement that is late (`late.py`) shows the state of an earlier moment; one more state each
-remembers it. Callers see none of that: arrays go in and come out as without.
+A delayed measurement (`delayed_measurement`) shows the state of an earlier moment; one more state
+each remembers it. Callers see none of that: arrays go in and come out as without.
 
 Arrays are time-major: L steps, B runs, N states of the filter (n, or 2 n with coloured noise), C
 columns. A missing measurement is a False in `seen`.
@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis import kernels
-from grounded.diagnosis.delayed_measurement import Late, System
+from grounded.diagnosis.delayed_measurement import Delayed, FilterSystem
 from grounded.frozen import Array
 
 UNKNOWN = 1e6  # standard deviations: how little is known of a state that was not measured at t = 0
@@ -42,7 +42,7 @@ UNKNOWN = 1e6  # standard deviations: how little is known of a state that was no
 class Gains:
     """What does not depend on the data: A (L, B, N, N), K (L, B, N, n), whitener (L, B, n, n).
 
-    Where measurements are late, all of them are those of the widened state.
+    Where measurements are delayed, all of them are those of the widened state.
     """
 
     A: Array
@@ -51,7 +51,7 @@ class Gains:
     logdet: Array  # (L, B) log det S over what was seen
     seen: Array  # (L + 1, B, n) 1.0 or 0.0
     G: Array | None = None  # (L, B, n, n) how noise enters; None: as it is
-    late: Late | None = None  # which measurements are late
+    delayed: Delayed | None = None  # which measurements are delayed
 
 
 def transition(F: Array, phi: float | None, G: Array | None = None) -> Array:
@@ -77,7 +77,7 @@ def gains(
     seen: Array,
     start: Array,
     G: Array | None = None,
-    late: Late | None = None,
+    delayed: Delayed | None = None,
 ) -> Gains:
     """The covariance recursion.
 
@@ -88,20 +88,20 @@ def gains(
         seen: (L + 1, B, n), 1.0 where a measurement is there.
         start: (B, N - n) variance of the coloured noise at t = 0.
         G: (L, B, n, n) how the noise enters, None for the identity.
-        late: channels whose measurement is late.
+        delayed: channels whose measurement is delayed.
 
     Raises:
         numpy.linalg.LinAlgError: when a covariance is not finite.
     """
     L, B, N, _ = A.shape
     Q, R = np.broadcast_to(Q, (L, B, N)), np.broadcast_to(R, (L + 1, B, seen.shape[-1]))
-    given = System(A, Q, R, seen, start, G)
-    if late is None:
+    given = FilterSystem(A, Q, R, seen, start, G)
+    if delayed is None:
         return _gains(given)
-    return replace(_gains(late.system(given)), late=late)
+    return replace(_gains(delayed.system(given)), delayed=delayed)
 
 
-def _gains(given: System) -> Gains:
+def _gains(given: FilterSystem) -> Gains:
     A, Q, R, seen, start, G = given
     (L, B, N, _), n = A.shape, seen.shape[-1]
     first = np.concatenate([R[0] * np.where(seen[0] > 0, 1.0, UNKNOWN), start], axis=1)
@@ -143,12 +143,9 @@ def _compiled_gains(
     L, B, N, _ = A.shape
     n = seen.shape[-1]
     K, whiten = np.empty((L, B, N, n)), np.zeros((L, B, n, n))
-    A, seen = np.ascontiguousarray(A), np.ascontiguousarray(seen, float)
-    G = None if G is None else np.ascontiguousarray(G)
-    values: dict[str, Any] = {"A": A, "seen": seen}
-    values |= {"Q": np.ascontiguousarray(Q), "R": np.ascontiguousarray(R)}
-    values |= {"start": np.ascontiguousarray(first), "G": 0 if G is None else G}
-    kernels.run("gains", n, N, G is not None, {**values, "L": L, "B": B, "K": K, "W": whiten})
+    values: dict[str, Any] = {"A": A, "Q": Q, "R": R, "seen": seen, "start": first, "L": L, "B": B}
+    values |= {"G": 0 if G is None else G, "K": K, "W": whiten}
+    kernels.run_kernel("gains", n, N, G is not None, values)
     diagonal = np.einsum("tbii->tbi", whiten)
     if not np.isfinite(diagonal).all():
         raise np.linalg.LinAlgError("a covariance is not finite")
@@ -164,11 +161,11 @@ def innovations(g: Gains, d: Array, r: Array, *, track: bool = False) -> tuple[A
         r: what each column adds to a measurement (L + 1, B, n, C), or (L + 1, 1, 1, 1) of zeros.
         track: also return the filtered errors.
     """
-    if g.late is None:
+    if g.delayed is None:
         return _innovations(g, d, r, track=track)
-    white, filtered = _innovations(g, *g.late.columns(d, r), track=track)
+    white, filtered = _innovations(g, *g.delayed.columns(d, r), track=track)
     own = np.ascontiguousarray(white[:, :, : d.shape[2]])
-    return own, None if filtered is None else g.late.errors(filtered)
+    return own, None if filtered is None else g.delayed.errors(filtered)
 
 
 def _innovations(g: Gains, d: Array, r: Array, *, track: bool) -> tuple[Array, Array | None]:
@@ -200,14 +197,14 @@ def _compiled_innovations(
     g: Gains, d: Array, r: Array, *, track: bool
 ) -> tuple[Array, Array | None]:
     L, B, n, C = d.shape
-    lanes, wide = kernels.lanes(n), whole(C, n)
+    lanes, wide = kernels.columns_together(n), whole(C, n)
     d, r = _widened(d, (L, B, n, wide)), _widened(r, (L + 1, B, n, wide))
     out = np.empty((L, B, n, wide))
     filtered = np.empty((L + 1, B, n, wide)) if track else None
     values: dict[str, Any] = {"A": g.A, "K": g.K, "W": g.whiten, "d": d, "r": r, "seen": g.seen}
     values |= {"L": L, "B": B, "blocks": wide // lanes, "C": wide, "out": out}
     values |= {"track": 0 if filtered is None else filtered}
-    kernels.run("innovations", n, g.A.shape[-1], g.G is not None, values)
+    kernels.run_kernel("innovations", n, g.A.shape[-1], g.G is not None, values)
     return out[..., :C], None if filtered is None else filtered[..., :C]
 
 
@@ -215,13 +212,13 @@ def whole(count: int, n: int) -> int:
     """So many columns that they are filtered without being copied."""
     if not kernels.available(n):
         return count
-    return -(-count // kernels.lanes(n)) * kernels.lanes(n)
+    return -(-count // kernels.columns_together(n)) * kernels.columns_together(n)
 
 
 def _widened(columns: Array, shape: tuple[int, ...]) -> Array:
-    """Contiguous, with columns of zeros up to a shape."""
+    """With columns of zeros up to a shape."""
     if columns.shape == shape:
-        return np.ascontiguousarray(columns)
+        return columns
     whole = np.zeros(shape)
     whole[..., : columns.shape[-1]] = columns
     return whole
@@ -244,11 +241,11 @@ class Adjoint:
 
 def smoother(g: Gains, white: Array) -> Adjoint:
     """The backward pass for one column of whitened innovations, (L, B, n)."""
-    if g.late is None:
+    if g.delayed is None:
         return _smoother(g, white)
-    n, late = white.shape[-1], g.late
-    found = _smoother(g, np.pad(white, [(0, 0), (0, 0), (0, late.count)]))
-    r, N = late.disturbances(found.r, n), late.disturbances(found.N, n)
+    n, delayed = white.shape[-1], g.delayed
+    found = _smoother(g, np.pad(white, [(0, 0), (0, 0), (0, delayed.count)]))
+    r, N = delayed.disturbances(found.r, n), delayed.disturbances(found.N, n)
     return Adjoint(found.u[..., :n], found.D[..., :n], r, N)
 
 
@@ -258,15 +255,10 @@ def _smoother(g: Gains, white: Array) -> Adjoint:
     u, D = np.empty((L, B, n)), np.empty((L, B, n))
     r, Nd = np.empty((L, B, N)), np.empty((L, B, N))
     if kernels.available(n):
-        values: dict[str, Any] = {
-            "A": g.A,
-            "K": g.K,
-            "W": g.whiten,
-            "white": np.ascontiguousarray(white),
-        }
+        values: dict[str, Any] = {"A": g.A, "K": g.K, "W": g.whiten, "white": white}
         values |= {"seen": g.seen, "G": 0 if g.G is None else g.G, "L": L, "B": B}
         values |= {"u": u, "D": D, "r": r, "N": Nd}
-        kernels.run("smoother", n, N, g.G is not None, values)
+        kernels.run_kernel("smoother", n, N, g.G is not None, values)
         return Adjoint(u, D, r, Nd)
     q, Nq = np.zeros((B, N)), np.zeros((B, N, N))
     for t in range(L - 1, -1, -1):

@@ -1,20 +1,24 @@
-"""A hypothesis at its most likely values: what `refine` returns."""
+"""A hypothesis at its most likely values (`refine` returns it), and how sure these values are.
+
+The Fisher information believes the noise model; the jackknife asks the trials themselves, each left
+out once (Efron & Tibshirani 1993, ch. 11). The larger of the two is reported.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from grounded.diagnosis.data import Data
 from grounded.diagnosis.hypothesis import Hypothesis, param_scale
-from grounded.diagnosis.noise import Noise
+from grounded.diagnosis.noise import NoiseModel
 from grounded.frozen import Array
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class Fitted:
     """A hypothesis at its most likely values.
 
     Per run (B): `gram` (B, C, C), `score` (B, C), `rss` (B,), `logdet` (B,) of the whitened columns
@@ -22,7 +26,7 @@ class Fit:
     """
 
     hypothesis: Hypothesis
-    noise: Noise
+    noise: NoiseModel
     track: Array  # (L + 1, B, n)
     loglik: float  # of the data
     evidence: float  # log p(y | h): the shifts integrated out
@@ -53,9 +57,7 @@ class Fit:
         """Precision of each column, (C,): zero for effects."""
         h = self.hypothesis
         k = len(h.theta)
-        return np.concatenate(
-            [np.zeros(k), shift_precision(self.hypothesis, self.gram.shape[-1] - k)]
-        )
+        return np.concatenate([np.zeros(k), shift_precision(h, self.gram.shape[-1] - k)])
 
 
 def shift_precision(h: Hypothesis, count: int) -> Array:
@@ -66,3 +68,63 @@ def shift_precision(h: Hypothesis, count: int) -> Array:
 def calibrated(data: Data) -> Any:
     """Parameters that have a scale, as indices: those that a shift makes sense for."""
     return np.flatnonzero(param_scale(data.model) > 0)
+
+
+def moved(data: Data, h: Hypothesis, delta: Array) -> Hypothesis:
+    """A hypothesis with its values, and its shifts in units of their scale, moved by (C,)."""
+    k = len(h.theta)
+    other = h.with_theta(h.theta + delta[:k])
+    if len(delta) == k:
+        return other
+    which = calibrated(data)
+    shift = np.zeros(data.model.system.k) if h.shift is None else h.shift.copy()
+    shift[which] += delta[k:] * param_scale(data.model)[which]
+    return replace(other, shift=shift)
+
+
+def leave_one_out(fit: Fitted, trial_of: Array) -> tuple[Array, Array]:
+    """Changes of all values without each trial (S, C), and that trial's rss under them (S,).
+
+    One Newton step each: theta_{-i} = theta + (G - G_i)^-1 s_i.
+    """
+    trials = np.unique(trial_of)
+    C = fit.gram.shape[-1]
+    prior, total = np.diag(fit.prior), fit.gram.sum(axis=0)
+    shifts, rss = np.zeros((len(trials), C)), np.zeros(len(trials))
+    for i, trial in enumerate(trials):
+        own = trial_of == trial
+        G, s = fit.gram[own].sum(axis=0), fit.score[own].sum(axis=0)
+        if C and len(trials) > 1:
+            A = total - G + prior
+            scale = 1 / np.sqrt(np.maximum(np.diag(A), 1e-300))
+            scaled = A * np.outer(scale, scale)
+            shifts[i] = scale * np.linalg.lstsq(scaled, scale * s, rcond=1e-8)[0]
+        rss[i] = fit.rss[own].sum() + 2 * s @ shifts[i] + shifts[i] @ G @ shifts[i]
+    return shifts, rss
+
+
+def standard_deviations(fit: Fitted, trial_of: Array) -> tuple[Array, Array]:
+    """Of every free value: standard deviation, half-width of the 95 % interval, (C,) each."""
+    from scipy.special import stdtrit
+
+    if fit.gram.shape[-1] == 0:
+        return np.zeros(0), np.zeros(0)
+    fisher = _fisher(fit.gram.sum(axis=0) + np.diag(fit.prior))
+    shifts, _ = leave_one_out(fit, trial_of)
+    S = len(shifts)
+    if S < 3:
+        return fisher, 1.96 * fisher
+    spread = shifts - shifts.mean(axis=0)
+    jack = np.sqrt((S - 1) / S * (spread**2).sum(axis=0))
+    t = float(stdtrit(S - 1, 0.975))  # Student's quantile
+    return np.maximum(fisher, jack), np.maximum(1.96 * fisher, t * jack)
+
+
+def _fisher(information: Array) -> Array:
+    """Standard deviations from an information matrix (C, C), each unknown in units of its own.
+
+    A direction in which nothing is known makes all that take part in it as good as unknown.
+    """
+    scale = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+    size, axes = np.linalg.eigh(information * np.outer(scale, scale))
+    return np.asarray(scale * np.sqrt((axes**2 / np.maximum(size, 1e-12)).sum(axis=1)))

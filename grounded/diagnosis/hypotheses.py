@@ -1,8 +1,8 @@
-"""What an attribution has found so far: which hypotheses were fitted, their evidence, the best.
+"""Which hypotheses an attribution has fitted so far, their evidence, the best of them.
 
-evidence(h) = log p(y | h) - what its effects cost (`price.py`) - what the noise structure costs
+    evidence(h) = log p(y | h) - what naming its effects costs - what the noise structure costs
 
-What naming an effect costs: the price of its numbers, of looking for it, of where it might be.
+What naming an effect costs, the price of its numbers, of looking for it, of where it might be:
 
     price = k/2 ln N + ln(places looked at) + ln(targets of the family)
 
@@ -19,7 +19,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from grounded.diagnosis.data import Data
-from grounded.diagnosis.fitted import Fit
+from grounded.diagnosis.fitted import Fitted
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor
 from grounded.diagnosis.noise import Structure
 from grounded.effects import Effect, ParamFamily
@@ -28,7 +28,7 @@ CLAIM = 3.0  # nats from which an effect is claimed
 TIE = 3.0  # nats within which two explanations are not told apart
 
 
-class Found:
+class FittedHypotheses:
     """Fits by noise structure, freedom of the parameters, and effects: the best of each."""
 
     def __init__(self, data: Data, candidates: Sequence[Effect]) -> None:
@@ -36,7 +36,7 @@ class Found:
         self.candidates = tuple(candidates)
         self.N = max(data.steps, 2)
         self._prices: dict[tuple[object, ...], float] = {}
-        self.fits: dict[tuple[Structure, float, tuple[str, ...]], Fit] = {}
+        self.fits: dict[tuple[Structure, float, tuple[str, ...]], Fitted] = {}
         families = [e.family.name for e in candidates]
         self.crowd = {e.name: families.count(e.family.name) for e in candidates}
 
@@ -48,15 +48,15 @@ class Found:
             self._prices[key] = price(self.predictor, effect, values, targets)
         return self._prices[key]
 
-    def score(self, fit: Fit) -> float:
+    def score(self, fit: Fitted) -> float:
         """Evidence of a fit in nats, up to a constant of the data."""
         h = fit.hypothesis
-        paid = sum(self.price(e, dict(v)) for e, v in zip(h.effects, h.values, strict=True))
+        paid = sum(self.price(e, v) for e, v in h.pairs)
         extra = fit.noise.structure.numbers(self.data.model.n)
         calibration = 1.0 if h.spread > 0 else 0.0
         return fit.evidence - paid - 0.5 * extra * math.log(self.N) - calibration
 
-    def keep(self, fits: Sequence[Fit]) -> None:
+    def keep(self, fits: Sequence[Fitted]) -> None:
         """Remembers the best fit of every hypothesis under every structure."""
         for fit in fits:
             h = fit.hypothesis
@@ -64,11 +64,11 @@ class Found:
             if key not in self.fits or self.score(fit) > self.score(self.fits[key]):
                 self.fits[key] = fit
 
-    def best_null(self) -> Fit:
+    def best_null(self) -> Fitted:
         """The likeliest fit without effects."""
         return max((f for f in self.fits.values() if not f.hypothesis.effects), key=self.score)
 
-    def exact_null(self) -> Fit:
+    def exact_null(self) -> Fitted:
         """The likeliest fit without effects and with the parameters as they are."""
         bare = (f for (_, spread, names), f in self.fits.items() if not names and spread == 0)
         return max(bare, key=self.score)
@@ -79,9 +79,9 @@ class Found:
         spread = best.hypothesis.spread
         return spread > 0 and self.score(best) > self.score(self.exact_null()) + CLAIM
 
-    def of_size(self, count: int) -> list[Fit]:
+    def of_size(self, count: int) -> list[Fitted]:
         """All fits with that many effects, best first, one a set of effects."""
-        best: dict[tuple[str, ...], Fit] = {}
+        best: dict[tuple[str, ...], Fitted] = {}
         for (_, _, names), fit in self.fits.items():
             if len(names) == count and (
                 names not in best or self.score(fit) > self.score(best[names])
@@ -89,7 +89,7 @@ class Found:
                 best[names] = fit
         return sorted(best.values(), key=lambda f: -self.score(f))
 
-    def chosen(self, most: int) -> Fit:
+    def chosen(self, most: int) -> Fitted:
         """The hypothesis that would be claimed: every effect more has to pay for itself."""
         chosen = self.best_null()
         for size in range(1, most + 1):
@@ -103,7 +103,7 @@ class Found:
         return chosen
 
 
-def parametric(fit: Fit) -> bool:
+def parametric(fit: Fitted) -> bool:
     """Whether all that a fit blames is the model's own parameters."""
     effects = fit.hypothesis.effects
     return bool(effects) and all(isinstance(e.family, ParamFamily) for e in effects)

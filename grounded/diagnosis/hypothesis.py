@@ -52,10 +52,14 @@ class Hypothesis:
         return tuple(effect.name for effect in self.effects)
 
     @property
+    def pairs(self) -> list[tuple[Effect, Mapping[str, float]]]:
+        """Each effect with its values."""
+        return list(zip(self.effects, self.values, strict=True))
+
+    @property
     def theta(self) -> Array:
         """Free values of all effects in order, (k_effects,)."""
-        pairs = zip(self.effects, self.values, strict=True)
-        return np.array([v[q.name] for e, v in pairs for q in e.free], float)
+        return np.array([v[q.name] for e, v in self.pairs for q in e.free], float)
 
     def with_theta(self, theta: Array) -> Hypothesis:
         """The same effects with other free values, kept inside their bounds."""
@@ -82,12 +86,9 @@ class Hypothesis:
 
     def minus(self, name: str) -> Hypothesis:
         """One effect less."""
-        keep = [i for i, effect in enumerate(self.effects) if effect.name != name]
-        return replace(
-            self,
-            effects=tuple(self.effects[i] for i in keep),
-            values=tuple(self.values[i] for i in keep),
-        )
+        kept = [(effect, values) for effect, values in self.pairs if effect.name != name]
+        effects, values = tuple(e for e, _ in kept), tuple(v for _, v in kept)
+        return replace(self, effects=effects, values=values)
 
 
 def param_scale(model: Model) -> Array:
@@ -128,8 +129,7 @@ class Predictor:
     @staticmethod
     def acting(h: Hypothesis) -> list[tuple[Effect, Mapping[str, float]]]:
         """The effects on inputs with their values, in the order in which they act."""
-        order = acting_order([effect.family for effect in h.effects])
-        return [(h.effects[i], h.values[i]) for i in order]
+        return [h.pairs[i] for i in acting_order([effect.family for effect in h.effects])]
 
     def params(self, h: Hypothesis) -> Array:
         """The model's parameters under a hypothesis (k,)."""
@@ -137,21 +137,25 @@ class Predictor:
         if h.shift is not None:
             p = p + h.shift
         names = self.data.model.param_names
-        for effect, values in zip(h.effects, h.values, strict=True):
+        for effect, values in h.pairs:
             if isinstance(effect.family, ParamFamily):
                 p[names.index(effect.site.target)] += values["d"]
         return p
 
     def step(self, x: Array, u: Array, p: Array, dt: float | None = None) -> Array:
         """The model's own step at any leading shape."""
-        model = self.data.model
-        flat = model.system.step(
-            np.ascontiguousarray(x.reshape(-1, model.n)),
-            np.ascontiguousarray(u.reshape(-1, model.m)),
-            p,
-            dt or self.data.dt,
-        )
-        return flat.reshape(x.shape)
+        moved = self.data.model.system.step(*self.flat(x, u), p, dt or self.data.dt)
+        return moved.reshape(x.shape)
+
+    def slope(self, x: Array, u: Array, p: Array, dt: float | None = None) -> Array:
+        """Slope f_x of the model's own step at any leading shape, (..., n, n)."""
+        f_x, _ = self.data.model.system.linearise(*self.flat(x, u), p, dt or self.data.dt)
+        return f_x.reshape(*x.shape, x.shape[-1])
+
+    def flat(self, x: Array, u: Array) -> tuple[Array, Array]:
+        """States (..., n) and inputs (..., m) as rows."""
+        n, m = self.data.model.n, self.data.model.m
+        return np.ascontiguousarray(x.reshape(-1, n)), np.ascontiguousarray(u.reshape(-1, m))
 
     def next(self, h: Hypothesis, x: Array) -> Array:
         """f_h at the start of every step: x (L, B, n) -> (L, B, n)."""
@@ -195,20 +199,14 @@ class Predictor:
             touched |= (added != 0).any(axis=-1, keepdims=True)
         return np.where(touched, x, after), np.where(touched, mean, free)
 
-    def named(self, rate: Array) -> Named:
-        """Rates (..., n) by name."""
-        return Named("state", self.data.model.state_names, list(np.moveaxis(rate, -1, 0)))
+    def named(self, x: Array) -> Named:
+        """States, or their rates (..., n), by name."""
+        return Named("state", self.data.model.state_names, list(np.moveaxis(x, -1, 0)))
 
     def instant(self, x: Array, u: Array, p: Array) -> Array:
         """The model's own rates at x (..., n), by a very short step."""
-        model, short = self.data.model, 1e-3 * self.data.dt
-        flat = model.system.step(
-            np.ascontiguousarray(x.reshape(-1, model.n)),
-            np.ascontiguousarray(u.reshape(-1, model.m)),
-            p,
-            short,
-        )
-        return np.asarray((flat.reshape(x.shape) - x) / short)
+        short = 1e-3 * self.data.dt
+        return np.asarray((self.step(x, u, p, short) - x) / short)
 
     def tied(self) -> list[tuple[int, int]]:
         """(heading, heading rate) where the rate is only carried along."""
@@ -224,8 +222,7 @@ class Predictor:
 
         `own` are the model's own rates by name, for families that need them.
         """
-        names = self.data.model.state_names
-        s = Named("state", names, list(np.moveaxis(x, -1, 0)))
+        names, s = self.data.model.state_names, self.named(x)
         a = Named("input", self.data.model.input_names, list(np.moveaxis(u, -1, 0)))
         total = np.zeros_like(x)
         for effect, values in rates:
@@ -237,7 +234,7 @@ class Predictor:
     def offset(self, h: Hypothesis, track: Array) -> Array | float:
         """The log minus the state along a track (L + 1, B, n); 0.0 where sensors are right."""
         names, dt, old = self.data.model.state_names, self.data.dt, track
-        for effect, values in zip(h.effects, h.values, strict=True):
+        for effect, values in h.pairs:
             if isinstance(effect.family, SensorDelayFamily):
                 i, old = names.index(effect.site.target), old.copy()
                 old[..., i] += sensor_offset(effect, values, track[..., i], dt)
@@ -246,11 +243,7 @@ class Predictor:
 
     def standing(self, h: Hypothesis, shown: Array) -> Array | float:
         """What sensors add to what they are shown (..., n), however old it is; 0.0 if nothing."""
-        sensors = [
-            (e, v)
-            for e, v in zip(h.effects, h.values, strict=True)
-            if isinstance(e.family, SensorFamily)
-        ]
+        sensors = [(e, v) for e, v in h.pairs if isinstance(e.family, SensorFamily)]
         if not sensors:
             return 0.0
         names, total = self.data.model.state_names, np.zeros_like(shown)
@@ -262,14 +255,12 @@ class Predictor:
 
 def rates_of(h: Hypothesis) -> list[tuple[Any, Mapping[str, float]]]:
     """The rate effects of halves of a step, with their values."""
-    pairs = zip(h.effects, h.values, strict=True)
-    return [(e, v) for e, v in pairs if isinstance(e.family, RateFamily) and not e.family.parts]
+    return [(e, v) for e, v in h.pairs if isinstance(e.family, RateFamily) and not e.family.parts]
 
 
 def limits_of(h: Hypothesis) -> list[tuple[Any, Mapping[str, float]]]:
     """Those of parts of it: limits of rates."""
-    pairs = zip(h.effects, h.values, strict=True)
-    return [(e, v) for e, v in pairs if isinstance(e.family, RateFamily) and e.family.parts]
+    return [(e, v) for e, v in h.pairs if isinstance(e.family, RateFamily) and e.family.parts]
 
 
 def sensor_offset(effect: Effect, values: Mapping[str, float], track: Array, dt: float) -> Array:

@@ -17,10 +17,98 @@ from typing import Any
 
 import numpy as np
 
-from grounded.compile.emit.llvm_text import declarations, number, splat
+from grounded.compile.emit.llvm_batch import Words
+from grounded.compile.emit.llvm_text import Writer, declarations, number, splat
 from grounded.compile.run import jit
 from grounded.compile.run.compiled import call
-from grounded.diagnosis.kernel_pen import NAMES, Pen
+
+GAINS = ("A", "Q", "R", "seen", "start", "G", "L", "B", "K", "W", "state")
+INNOVATIONS = ("A", "K", "W", "d", "r", "seen", "L", "B", "blocks", "C", "out", "track", "state")
+SMOOTHER = ("A", "K", "W", "white", "seen", "G", "L", "B", "u", "D", "r", "N", "state")
+INTEGERS = ("L", "B", "C", "blocks")
+NAMES = {"gains": GAINS, "innovations": INNOVATIONS, "smoother": SMOOTHER}
+
+
+class Pen:
+    """A kernel being written: sizes, rooms, and the loops all three share."""
+
+    def __init__(self, name: str, n: int, N: int, width: int) -> None:
+        self.f = Writer(f"i64 @{name}(ptr %words)")
+        self.words = Words(self.f, NAMES[name])
+        self.n, self.N, self.width = n, N, width
+        self.wide, self.short = self.padded(N), self.padded(n)
+        self.inputs = {w: self.words.pointer(w) for w in NAMES[name] if w not in INTEGERS}
+        self.L, self.B = self.words.integer("L"), self.words.integer("B")
+
+    def padded(self, size: int) -> int:
+        """Whole vectors."""
+        return -(-size // self.width) * self.width
+
+    def room(self, rows: int, columns: int) -> str:
+        """Rows of whole vectors, zero."""
+        size = rows * columns
+        found = self.f.room(size)
+        with self.f.loop(size // self.width) as i:
+            at = self.f.integer("mul", i, self.width)
+            self.f.store(splat(0.0, self.width), found, at, self.width)
+        return found
+
+    def at(self, name: str, t: str, b: str, size: int) -> str:
+        """Where an array (time, run, size) has its part."""
+        f = self.f
+        place = f.integer("add", f.integer("mul", t, self.B), b)
+        return f.at(self.inputs[name], f.integer("mul", place, size))
+
+    def product(
+        self,
+        out: tuple[str, int, int],
+        left: tuple[str, int, int],
+        right: tuple[str, int],
+        inner: int,
+        *,
+        onto: str = "",
+    ) -> None:
+        """Writes out (address, rows, columns) = [onto +] left (address, row, column step) right.
+
+        `right` is (address, row step); `onto` has the shape of out or is empty.
+        """
+        f, w = self.f, self.width
+        address, rows, columns = out
+        with f.loop(rows) as i:
+            to = f.at(address, f.integer("mul", i, columns))
+            base = f.at(left[0], f.integer("mul", i, left[1]))
+            start = f.at(onto, f.integer("mul", i, columns)) if onto else ""
+            for c in range(0, columns, w):
+                total = f.load(start, c, w) if onto else splat(0.0, w)
+                for k in range(inner):
+                    a = f.load_all(base, k * left[2], w)
+                    total = f.fma(a, f.load(right[0], k * right[1] + c, w), total, w)
+                f.store(total, to, c, w)
+
+    def copied(self, source: str, step: int, to: str, to_step: int, size: tuple[int, int]) -> None:
+        """A matrix (rows, columns), its rows so many numbers apart here and there."""
+        f = self.f
+        with f.loop(size[0]) as i:
+            a, b = f.at(source, f.integer("mul", i, step)), f.at(to, f.integer("mul", i, to_step))
+            for c in range(size[1]):
+                f.store(f.load(a, c), b, c)
+
+    def turned(
+        self, source: str, size: tuple[int, int], step: int, to: str, wide: int, minus: bool = False
+    ) -> None:
+        """A matrix (rows, columns) with rows `step` apart, transposed into rows of `wide`."""
+        f = self.f
+        with f.loop(size[0]) as i:
+            a, b = f.at(source, f.integer("mul", i, step)), f.at(to, i)
+            for c in range(size[1]):
+                value = f.load(a, c)
+                f.store(f.neg(value) if minus else value, b, c * wide)
+
+    def end(self) -> str:
+        """The finished kernel."""
+        self.f.do("ret i64 0")
+        return self.f.text()
+
 
 LARGEST = 16  # states whose factorisation is written out
 
@@ -35,18 +123,19 @@ def _trouble() -> str:
     return jit.trouble()
 
 
-def lanes(n: int) -> int:
+def columns_together(n: int) -> int:
     """Columns that are computed together."""
     return 4 if n <= 4 else jit.lanes()
 
 
-def run(name: str, n: int, N: int, through: bool, values: Mapping[str, Any]) -> None:
-    """Calls a kernel; `through`: whether noise enters through a matrix G."""
-    wide = -(-N // lanes(n)) * lanes(n)
-    each = {"gains": N * wide, "innovations": N * lanes(n) * values.get("blocks", 1)}
+def run_kernel(name: str, n: int, N: int, through: bool, values: Mapping[str, Any]) -> None:
+    """Calls a kernel on arrays, made contiguous; `through`: noise enters through a matrix G."""
+    wide = -(-N // columns_together(n)) * columns_together(n)
+    each = {"gains": N * wide, "innovations": N * columns_together(n) * values.get("blocks", 1)}
     state = np.zeros(values["B"] * each.get(name, (N + 1) * wide))
-    values = {**values, "state": state}
-    call(_library(n, N, through, lanes(n))[name], NAMES[name], values)
+    arrays = {k: np.ascontiguousarray(v, float) for k, v in values.items() if np.ndim(v)}
+    values = {**values, **arrays, "state": state}
+    call(_library(n, N, through, columns_together(n))[name], NAMES[name], values)
 
 
 @cache
@@ -64,9 +153,7 @@ def _version() -> str:
     import hashlib
     from pathlib import Path
 
-    ours = [Path(__file__).with_name(name) for name in ("kernels.py", "kernel_pen.py")]
-    text = b"".join(path.read_bytes() for path in ours)
-    return hashlib.sha256(text).hexdigest()[:16] + jit.writers()
+    return hashlib.sha256(Path(__file__).read_bytes()).hexdigest()[:16] + jit.writers()
 
 
 def _gains(n: int, N: int, through: bool, width: int) -> str:
@@ -94,10 +181,10 @@ def _gains(n: int, N: int, through: bool, width: int) -> str:
             place = i * wide + i
             f.store(f.add(f.load(P, place), f.load(q, i)), P, place)
         _factorised(pen, P, R, seen, W, WT)
-        pen.unpadded(W, n, n, short, pen.at("W", t, b, n * n))
+        pen.copied(W, short, pen.at("W", t, b, n * n), n, (n, n))
         pen.product((half, N, short), (P, wide, 1), (WT, short), n)
         pen.product((K, N, short), (half, short, 1), (W, short), n)
-        pen.unpadded(K, N, n, short, pen.at("K", t, b, N * n))
+        pen.copied(K, short, pen.at("K", t, b, N * n), n, (N, n))
         pen.turned(half, (N, n), short, turned, wide, minus=True)
         pen.product((P, N, wide), (half, short, 1), (turned, wide), n, onto=P)
     return pen.end()
@@ -218,9 +305,9 @@ def _smoother(n: int, N: int, through: bool, width: int) -> str:
         raw = pen.at("K", t, b, N * n)
         rawW, white = pen.at("W", t, b, n * n), pen.at("white", t, b, n)
         seen = pen.at("seen", f.integer("add", t, 1), b, n)
-        pen.copied(pen.at("A", t, b, N * N), N, N, A, wide)
-        pen.copied(raw, N, n, K, short)
-        pen.copied(rawW, n, n, W, short)
+        pen.copied(pen.at("A", t, b, N * N), N, A, wide, (N, N))
+        pen.copied(raw, n, K, short, (N, n))
+        pen.copied(rawW, n, W, short, (n, n))
         pen.product((NK, N, short), (Nq, wide, 1), (K, short), N)
         pen.product((D, n, short), (W, 1, short), (W, short), n)
         pen.product((D, n, short), (K, 1, short), (NK, short), N, onto=D)
@@ -284,7 +371,7 @@ def _answer(pen: Pen, through: bool, t: str, b: str, rooms: tuple[str, str, str,
     if not through:
         return
     raw = pen.at("G", t, b, n * n)
-    pen.copied(raw, n, n, G, short)
+    pen.copied(raw, n, G, short, (n, n))
     pen.product((spare, 1, short), (q, wide, 1), (G, short), n)
     for i in range(n):
         f.store(f.load(spare, i), r_out, i)

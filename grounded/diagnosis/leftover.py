@@ -20,9 +20,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from grounded.diagnosis import filter as kalman
-from grounded.diagnosis.fitted import Fit
+from grounded.diagnosis.fitted import Fitted
 from grounded.diagnosis.hypothesis import Predictor
-from grounded.diagnosis.linearise import gains_of, jacobian
+from grounded.diagnosis.linearise import gains_of, step_jacobian
 from grounded.effects import places
 from grounded.effects.family import per
 from grounded.frozen import Array
@@ -45,7 +45,7 @@ class Leftover:
     improvement: Array  # (L, B) held-out gain of each step [nats]
 
 
-def leftovers(predictor: Predictor, fit: Fit) -> list[Leftover]:
+def leftovers(predictor: Predictor, fit: Fitted) -> list[Leftover]:
     """The channels in which a flexible model predicts held-out trials better, most first."""
     data = predictor.data
     if data.count < 2:
@@ -64,7 +64,7 @@ def leftovers(predictor: Predictor, fit: Fit) -> list[Leftover]:
     return sorted(found, key=lambda left: -left.gain)
 
 
-def flexible(predictor: Predictor, fit: Fit) -> Array:
+def flexible(predictor: Predictor, fit: Fitted) -> Array:
     """Features of every step, (L, B, K), each of unit size."""
     data, h = predictor.data, fit.hypothesis
     model = data.model
@@ -72,11 +72,7 @@ def flexible(predictor: Predictor, fit: Fit) -> Array:
     names = [n for n in places.dynamic(model) if n in model.state_names]
     states = [_scaled(x[..., model.state_names.index(n)]) for n in names][:6]
     inputs = [_scaled(u[..., j]) for j in range(model.m)]
-    lagged = [
-        _scaled(np.abs(_late(u[..., j], k)) * np.sign(_late(u[..., j], k)))
-        for j in range(model.m)
-        for k in LAGS
-    ]
+    lagged = [_scaled(_lagged(u[..., j], k)) for j in range(model.m) for k in LAGS]
     clock = data.time / max(float(data.time.max()), data.dt)
     columns: list[Array] = [np.ones_like(clock)]
     for value in inputs:
@@ -101,7 +97,7 @@ def _scaled(value: Array) -> Array:
     return np.asarray(np.clip((value - value.mean()) / max(spread, 1e-12), -3, 3))
 
 
-def _late(value: Array, steps: int) -> Array:
+def _lagged(value: Array, steps: int) -> Array:
     return np.concatenate([np.repeat(value[:1], steps, axis=0), value[:-steps]])[: len(value)]
 
 
@@ -118,7 +114,9 @@ def _bins(value: Array, count: int) -> list[Array]:
     return [column for column in inside if column.mean() > 0.01]
 
 
-def _channel(predictor: Predictor, fit: Fit, features: Array, i: int) -> tuple[float, Array, Array]:
+def _channel(
+    predictor: Predictor, fit: Fitted, features: Array, i: int
+) -> tuple[float, Array, Array]:
     """Held-out gain of correcting one channel's rate: total, by step (L, B); the weights."""
     data = predictor.data
     gains = filter_of(predictor, fit)
@@ -153,14 +151,16 @@ def _channel(predictor: Predictor, fit: Fit, features: Array, i: int) -> tuple[f
     return best
 
 
-def filter_of(predictor: Predictor, fit: Fit) -> kalman.Gains:
+def filter_of(predictor: Predictor, fit: Fitted) -> kalman.Gains:
     """The gains of a fit's filter."""
-    F = jacobian(predictor, fit.hypothesis, fit.track)
+    F = step_jacobian(predictor, fit.hypothesis, fit.track)
     return gains_of(predictor, fit.hypothesis, fit.noise, fit.track, F)
 
 
-def whiteness(fit: Fit, seen: Array) -> dict[str, float]:
+def whiteness(fit: Fitted, seen: Array) -> dict[str, float]:
     """Ljung-Box of each channel's whitened innovations over 10 lags: p-values by index."""
+    from scipy.special import chdtrc
+
     found = {}
     L, _, n = fit.white.shape
     lags = min(RHO_LAGS, L // 4)
@@ -172,15 +172,5 @@ def whiteness(fit: Fit, seen: Array) -> dict[str, float]:
             rho = float((e[k:] * e[:-k]).sum()) / max(power, 1e-300)
             q += rho**2 / max(count - k, 1.0)
         q *= count * (count + 2)
-        found[str(i)] = chi2_tail(q, lags)
+        found[str(i)] = float(chdtrc(lags, q)) if lags else 1.0
     return found
-
-
-def chi2_tail(q: float, dof: int) -> float:
-    """P(chi2_dof > q), by Wilson and Hilferty's cube root."""
-    from math import erfc, sqrt
-
-    if dof <= 0 or q <= 0:
-        return 1.0
-    z = ((q / dof) ** (1 / 3) - (1 - 2 / (9 * dof))) / sqrt(2 / (9 * dof))
-    return 0.5 * erfc(z / sqrt(2))

@@ -3,7 +3,29 @@
     e_{t+1} = F_t e_t + d_t,   r_t = y_t - x_t - offset_t
 
 d and r as columns: the residual first, then the derivative by each value and each shift. Where a
-sensor is late, r_t is that of the sample that shows the state at t (`delays.py`).
+sensor is delayed, r_t is that of the sample that shows the state at t (`delays`). An error passes
+through a step by the model's Jacobian and those of its effects,
+
+    F_h = (1 + dt/2 A_1) F (1 + dt/2 A_0),     A = d rate / d x at the start, at the end
+
+An added rate that depends on the state (a coupling, a friction) moves errors as the model does:
+left out, the noise of one state shows up unexplained in another. Effects in proportion to the
+model's own rates take their slope from F. A heading rate that is only carried along is the
+heading's rate, effects and all: its row follows from the heading's slope. A dry friction's slope at
+rest is as steep as its smoothing is narrow; it is bounded, so that no error turns its sign within
+half a step.
+
+A threshold (the throttle below which a motor stalls) has no derivative: a small change moves no
+sample across it. Where a parameter's derivative is zero at every sample, the finite difference over
+a few per cent of its size takes its place, so that a threshold that is off is found like any other
+parameter, and not blamed on an effect.
+
+A run starts with the state as it was measured. What was not measured (a speed that the log does not
+hold, a sensor that had dropped out) starts anywhere: a wide prior about the track, and with every
+pass the track's start moves to where the whole run puts it (`smoothed`),
+
+    E[e_0 | y] = - P_0 sum_t w_t nu_t,        nu, w: whitened innovations of the residual, and of a
+                                              unit of e_0 entering the first step (columns of F_0)
 """
 
 from __future__ import annotations
@@ -11,18 +33,19 @@ from __future__ import annotations
 import numpy as np
 
 from grounded.diagnosis import filter as kalman
-from grounded.diagnosis.delayed_measurement import Late, System
+from grounded.diagnosis.data import Data
+from grounded.diagnosis.delayed_measurement import Delayed, FilterSystem
 from grounded.diagnosis.delays import delays_of
-from grounded.diagnosis.fitted import Fit, calibrated
-from grounded.diagnosis.hypothesis import Hypothesis, Predictor, param_scale
-from grounded.diagnosis.initial_state import widened
-from grounded.diagnosis.jacobian import PART, heading_slope, passed, sensitivities, with_effects
-from grounded.diagnosis.noise import Noise
+from grounded.diagnosis.filter import UNKNOWN
+from grounded.diagnosis.fitted import Fitted, calibrated
+from grounded.diagnosis.hypothesis import Hypothesis, Predictor, limits_of, param_scale, rates_of
+from grounded.diagnosis.noise import NoiseModel
 from grounded.effects import ParamFamily
 from grounded.frozen import Array
+from grounded.model import Model
 
 
-def linearised(predictor: Predictor, h: Hypothesis, track: Array) -> tuple[Array, Array, Array]:
+def linearise(predictor: Predictor, h: Hypothesis, track: Array) -> tuple[Array, Array, Array]:
     """F (L, B, n, n); columns of d and r: the residual first, then each value, then each shift."""
     data = predictor.data
     model = data.model
@@ -62,7 +85,7 @@ def linearised(predictor: Predictor, h: Hypothesis, track: Array) -> tuple[Array
 def _sensitivities(predictor: Predictor, h: Hypothesis, x: Array, u: Array) -> tuple[Array, Array]:
     """F (L, B, n, n) and what each shift adds to a step, (L, B, n, k); k = 0 without shifts."""
     if h.spread == 0:
-        return jacobian(predictor, h, x), np.zeros((*x.shape, 0))
+        return step_jacobian(predictor, h, x), np.zeros((*x.shape, 0))
     which = calibrated(predictor.data)
     F, f_p = sensitivities_of(predictor, h, x, u)
     return F, f_p[..., which] * param_scale(predictor.data.model)[which]
@@ -72,21 +95,18 @@ def sensitivities_of(
     predictor: Predictor, h: Hypothesis, x: Array, u: Array
 ) -> tuple[Array, Array]:
     """Of a hypothesis' steps from x (L, B, n): F (L, B, n, n), slope in all parameters (..., k)."""
-    data, (L, B, n) = predictor.data, x.shape
-    flat = (np.ascontiguousarray(x.reshape(-1, n)), np.ascontiguousarray(u.reshape(L * B, -1)))
+    data, n = predictor.data, x.shape[-1]
+    flat = predictor.flat(x, u)
     f_x, f_p = sensitivities(data.model, *flat, predictor.params(h), data.dt)
-    F = with_effects(predictor, h, x, u, f_x.reshape(L, B, n, n))
-    return F, passed(predictor, h, x, u, f_p.reshape(L, B, n, -1))
+    F = with_effects(predictor, h, x, u, f_x.reshape(*x.shape, n))
+    return F, passed(predictor, h, x, u, f_p.reshape(*x.shape, -1))
 
 
-def jacobian(predictor: Predictor, h: Hypothesis, track: Array) -> Array:
+def step_jacobian(predictor: Predictor, h: Hypothesis, track: Array) -> Array:
     """F of every step along a track (L or more, B, n), (L, B, n, n)."""
     data, u = predictor.data, predictor.inputs(h)
-    model, (L, B) = data.model, data.time.shape
-    flat_x = np.ascontiguousarray(track[:L].reshape(-1, model.n))
-    flat_u = np.ascontiguousarray(u.reshape(-1, model.m))
-    f_x, _ = model.system.linearise(flat_x, flat_u, predictor.params(h), data.dt)
-    return with_effects(predictor, h, track[:L], u, f_x.reshape(L, B, model.n, model.n))
+    x = track[: len(data.time)]
+    return with_effects(predictor, h, x, u, predictor.slope(x, u, predictor.params(h)))
 
 
 def noise_entry(predictor: Predictor, h: Hypothesis, track: Array) -> Array | None:
@@ -103,40 +123,40 @@ def noise_entry(predictor: Predictor, h: Hypothesis, track: Array) -> Array | No
     return G
 
 
-def system_of(
-    predictor: Predictor, h: Hypothesis, noise: Noise, track: Array, F: Array
-) -> tuple[System, Late | None]:
+def filter_system(
+    predictor: Predictor, h: Hypothesis, noise: NoiseModel, track: Array, F: Array
+) -> tuple[FilterSystem, Delayed | None]:
     """What the filter of a hypothesis is made of; F (L, B, n, n)."""
     data = predictor.data
     (L, B, n, _), delays = F.shape, delays_of(h, data)
-    seen, late = data.seen, None
+    seen, delayed = data.seen, None
     if delays is not None:
-        noise, seen, late = delays.noise(noise), delays.samples()[1], delays.late()
+        noise, seen, delayed = delays.noise(noise), delays.samples()[1], delays.in_filter()
     G = noise_entry(predictor, h, track)
     A = kalman.transition(F, noise.structure.phi(data.dt), G)
     Q = np.broadcast_to(noise.process(data.dt), (L, B, A.shape[-1]))
     R = widened(data, np.broadcast_to(noise.measurement(L), (L + 1, B, n)), seen)
-    return System(A, Q, R, seen, noise.start(B), G), late
+    return FilterSystem(A, Q, R, seen, noise.start(B), G), delayed
 
 
 def gains_of(
-    predictor: Predictor, h: Hypothesis, noise: Noise, track: Array, F: Array
+    predictor: Predictor, h: Hypothesis, noise: NoiseModel, track: Array, F: Array
 ) -> kalman.Gains:
     """The gains of a hypothesis' filter; F (L, B, n, n)."""
-    system, late = system_of(predictor, h, noise, track, F)
-    return kalman.gains(*system, late)
+    system, delayed = filter_system(predictor, h, noise, track, F)
+    return kalman.gains(*system, delayed)
 
 
-def base_columns(predictor: Predictor, fit: Fit) -> tuple[Array, Array]:
+def base_columns(predictor: Predictor, fit: Fitted) -> tuple[Array, Array]:
     """What a fit's own values and shifts add to d and r: (L, B, n, C), (L + 1, B, n, C)."""
-    _, d, r = linearised(predictor, fit.hypothesis, fit.track)
+    _, d, r = linearise(predictor, fit.hypothesis, fit.track)
     return d[..., 1:], r[..., 1:]
 
 
 def step_sizes(h: Hypothesis) -> list[float]:
     """Half a step of the difference quotient of each free value."""
     sizes = []
-    for effect, values in zip(h.effects, h.values, strict=True):
+    for effect, values in h.pairs:
         for q in effect.free:
             if q.grid:
                 grid = np.sort(np.array(q.grid))
@@ -151,23 +171,183 @@ def step_sizes(h: Hypothesis) -> list[float]:
 def _tried(h: Hypothesis) -> list[tuple[float, ...]]:
     """The step of each free value; for a parameter that may be a threshold a larger one beside."""
     effects = [effect for effect in h.effects for _ in effect.free]
-    found: list[tuple[float, ...]] = []
-    for effect, size in zip(effects, step_sizes(h), strict=True):
+    found: list[tuple[float, ...]] = [(size,) for size in step_sizes(h)]
+    for j, effect in enumerate(effects):
         if isinstance(effect.family, ParamFamily):
             value = effect.site.model.params[effect.site.target].value
-            found.append((size, PART * abs(value)))
-        else:
-            found.append((size,))
+            found[j] = (*found[j], PART * abs(value))
     return found
 
 
 def _nudged(h: Hypothesis, theta: Array, j: int, size: float) -> tuple[Hypothesis, float]:
-    up = theta.copy()
-    up[j] += size
-    other = h.with_theta(up)
-    moved = float(other.theta[j] - theta[j])
-    if moved == 0:
-        up[j] = theta[j] - size
+    for step in (size, -size):
+        up = theta.copy()
+        up[j] += step
         other = h.with_theta(up)
-        moved = float(other.theta[j] - theta[j])
+        if moved := float(other.theta[j] - theta[j]):
+            break
     return other, moved
+
+
+SMALL = 1e-4  # of a state's spread: the difference that a slope is taken over
+STEEPEST = 1.0  # of a rate's own state, per half step
+
+
+def with_effects(predictor: Predictor, h: Hypothesis, x: Array, u: Array, F: Array) -> Array:
+    """The Jacobian of a hypothesis' step from x (L, B, n); F (L, B, n, n) of the model alone."""
+    one, data = np.eye(x.shape[-1]), predictor.data
+    F = passed(predictor, h, x, u, F, one)
+    if not rates_of(h):
+        return F
+    after, half, mean = predictor.advance(h, x, u, data.time), 0.5 * data.dt, (F - one) / data.dt
+    first = rate_slopes(predictor, h, x, u, data.time, mean)
+    direct = rate_slopes(predictor, h, after, u, data.time + data.dt, None)
+    later = F + half * direct @ F
+    if any(e.family.needs_own for e, _ in rates_of(h)):
+        # at the end the model's own rate is still the mean of the step: a function of its start
+        later += half * (rate_slopes(predictor, h, after, u, data.time + data.dt, mean) - direct)
+    found = later @ (one + half * first)
+    for heading, rate in predictor.tied():
+        row = heading_slope(predictor, h, after, u, data.time + data.dt, heading, rate)
+        row = (row[..., None, :] @ found)[..., 0, :]
+        row -= heading_slope(predictor, h, x, u, data.time, heading, rate)
+        row[..., rate] += 1.0
+        found[..., rate, :] = row
+    return np.asarray(found)
+
+
+def passed(
+    predictor: Predictor,
+    h: Hypothesis,
+    x: Array,
+    u: Array,
+    slopes: Array,
+    still: Array | float = 0.0,
+) -> Array:
+    """What limits of rates leave of the model's slopes (L, B, n, k) from x (L, B, n).
+
+    A state that moves as fast as it can no longer depends on the model: its slope is that of
+    standing `still` (n, k), for the part of the step that it does.
+    """
+    limits = limits_of(h)
+    if not limits:
+        return slopes
+    data, p = predictor.data, predictor.params(h)
+    parts = max(e.family.parts for e, _ in limits)
+    dt, held = data.dt / parts, np.zeros_like(x)
+    for k in range(parts):
+        t, own = data.time + k * dt, (predictor.step(x, u, p, dt) - x) / dt
+        tiny = 1e-6 * np.abs(own).max(axis=(0, 1)) + 1e-12
+        added, more = (
+            predictor.added_rate(limits, x, u, t, predictor.named(rate))
+            for rate in (own, own + tiny)
+        )
+        held += (more - added) / tiny / parts  # 0: free, -1: held back
+        x = x + dt * (own + added)
+    return np.asarray(slopes + held[..., None] * (slopes - still))
+
+
+def rate_slopes(
+    predictor: Predictor, h: Hypothesis, x: Array, u: Array, t: Array, of_own: Array | None
+) -> Array:
+    """Slope of the added rates (L, B, n, n) [1/s] at x (L, B, n).
+
+    of_own: slope of the model's own rates, (L, B, n, n) or broadcastable; None: they stay.
+    """
+    rates, data = rates_of(h), predictor.data
+    n, half, names = x.shape[-1], 0.5 * data.dt, data.model.state_names
+    if not rates:
+        return np.zeros((*x.shape, n))
+    needs = any(e.family.needs_own for e, _ in rates)
+    own = (predictor.step(x, u, predictor.params(h)) - x) / data.dt if needs else x
+    base = predictor.added_rate(rates, x, u, t, predictor.named(own))
+    found = np.empty((*x.shape, n))
+    for j, name in enumerate(names):
+        size = SMALL * data.scales.spread(name)
+        other = x.copy()
+        other[..., j] += size
+        moved = own if of_own is None else own + size * of_own[..., j]
+        rate = predictor.added_rate(rates, other, u, t, predictor.named(moved))
+        found[..., j] = (rate - base) / size
+    i = np.arange(n)
+    found[..., i, i] = np.maximum(found[..., i, i], -STEEPEST / half)
+    return found
+
+
+def heading_slope(
+    predictor: Predictor, h: Hypothesis, x: Array, u: Array, t: Array, heading: int, rate: int
+) -> Array:
+    """Slope of the heading's rate of this very moment, effects and all, (L, B, n) [1/s]."""
+    data, short = predictor.data, 1e-3 * predictor.data.dt
+    f_x = predictor.slope(x, u, predictor.params(h), short)
+    own = (f_x - np.eye(x.shape[-1])) / short
+    slope, name = own[..., heading, :].copy(), data.model.state_names[heading]
+    if any(name in e.site.targets or f"{name}<-" in e.name for e, _ in rates_of(h)):
+        slope += rate_slopes(predictor, h, x, u, t, own)[..., heading, :]
+    slope[..., [heading, rate]] = 0.0
+    return np.asarray(slope)
+
+
+PART = 0.05  # of a parameter's size, to each side
+
+
+def sensitivities(model: Model, x: Array, u: Array, p: Array, dt: float) -> tuple[Array, Array]:
+    """f_x (N, n, n) and f_p (N, n, k) of one step from x (N, n) with received inputs u (N, m)."""
+    f_x, _, f_p = model.system.sensitivities(x, u, p, dt)
+    flat = np.flatnonzero(~f_p.any(axis=(0, 1)) & (param_scale(model) > 0))
+    for i in flat:
+        size = PART * param_scale(model)[i]
+        ends = []
+        for sign in (-1, 1):
+            moved = p.copy()
+            moved[i] += sign * size
+            ends.append(model.system.step(x, u, moved, dt))
+        f_p[:, :, i] = model.difference(ends[1], ends[0]) / (2 * size)
+    return f_x, f_p
+
+
+WIDE = 10.0  # [SI unit] standard deviation of a state that is never measured
+
+
+def prior(data: Data) -> Array:
+    """Variances (n,) of states that were not measured when a run began."""
+    found = []
+    for i, name in enumerate(data.model.state_names):
+        known = bool(data.seen[..., i].any())
+        found.append(data.scales.spread(name) ** 2 if known else WIDE**2)
+    return np.array(found)
+
+
+def widened(data: Data, R: Array, seen: Array) -> Array:
+    """Measurement variances (L + 1, B, n) with the prior of what was not seen at the start.
+
+    In the filter's own convention: at t = 0 what is not seen has UNKNOWN times its R.
+    """
+    if seen[0].all():
+        return R
+    R = R.copy()
+    R[0] = np.where(seen[0] > 0, R[0], prior(data) / UNKNOWN)
+    return R
+
+
+def smoothed(data: Data, g: kalman.Gains, jacobian: Array, white: Array) -> Array | None:
+    """Where the run puts the start, (B, n) to be added to the track's; None: all was measured.
+
+    Args:
+        data: of one or several batches of runs.
+        g: gains of the runs (L, B, ...), as many times data's runs as there are hypotheses.
+        jacobian: F of the same runs (L, B, n, n).
+        white: whitened innovations of the residual (L, B, n).
+    """
+    if data.seen[0].all():
+        return None
+    L, B, n, _ = jacobian.shape
+    missing = np.tile(data.seen[0] == 0, (B // data.seen.shape[1], 1))
+    which = np.flatnonzero(missing.any(axis=0))
+    d = np.zeros((L, B, n, kalman.whole(len(which), n)))
+    d[0, :, :, : len(which)] = jacobian[0][:, :, which] * missing[:, None, which]
+    columns = kalman.innovations(g, d, np.zeros((L + 1, 1, 1, 1)))[0]
+    found = np.zeros((B, n))
+    against = np.einsum("lbnc,lbn->bc", columns[..., : len(which)], white)
+    found[:, which] = -prior(data)[which] * against
+    return found

@@ -20,12 +20,12 @@ import numpy as np
 
 from grounded.diagnosis import filter as kalman
 from grounded.diagnosis.delays import delays_of
-from grounded.diagnosis.fitted import Fit
+from grounded.diagnosis.fitted import Fitted
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor
 from grounded.diagnosis.leftover import filter_of
 from grounded.diagnosis.linearise import base_columns
 from grounded.diagnosis.report import Likeness
-from grounded.diagnosis.scan import scan
+from grounded.diagnosis.scan import scan_candidates
 from grounded.effects import Effect, ParamFamily
 
 NEARLY = 0.75  # share of an effect's signal from which a look-alike is named
@@ -33,7 +33,7 @@ MOST = 3  # that are named for one effect
 
 
 def lookalikes(
-    predictor: Predictor, fit: Fit, candidates: Sequence[Effect], nearly: float = NEARLY
+    predictor: Predictor, fit: Fitted, candidates: Sequence[Effect], nearly: float = NEARLY
 ) -> tuple[Likeness, ...]:
     """Look-alikes of each claimed effect that reproduce nearly all of its signal, most first."""
     found: list[Likeness] = []
@@ -47,7 +47,7 @@ def lookalikes(
 
 def of_parameters(
     predictor: Predictor,
-    null: Fit,
+    null: Fitted,
     off: Sequence[int],
     candidates: Sequence[Effect],
     nearly: float = NEARLY,
@@ -88,7 +88,7 @@ def related(one: Effect, other: Effect) -> bool:
 
 
 def _likely(
-    predictor: Predictor, fit: Fit, effect: Effect, own: Sequence[Effect], nearly: float
+    predictor: Predictor, fit: Fitted, effect: Effect, own: Sequence[Effect], nearly: float
 ) -> list[Likeness]:
     """The candidates that reproduce more than `nearly` of an effect's signal, most first."""
     shares = _shares(predictor, fit, effect, own) if own else []
@@ -97,7 +97,9 @@ def _likely(
     return near[:MOST]
 
 
-def _shares(predictor: Predictor, fit: Fit, effect: Effect, own: Sequence[Effect]) -> list[float]:
+def _shares(
+    predictor: Predictor, fit: Fitted, effect: Effect, own: Sequence[Effect]
+) -> list[float]:
     """Share of an effect's signal that the best values of each candidate reproduce."""
     h, data = fit.hypothesis, predictor.data
     if h.shift is not None:
@@ -124,5 +126,5 @@ def _shares(predictor: Predictor, fit: Fit, effect: Effect, own: Sequence[Effect
     flat = signal.reshape(-1)
     taken = W.T @ flat
     power = 0.5 * float(flat @ flat - taken @ other.covariance @ taken)
-    looks = scan(predictor, other, own)
+    looks = scan_candidates(predictor, other, own)
     return [float(np.clip(look.gain / max(power, 1e-12), 0.0, 1.0)) for look in looks]

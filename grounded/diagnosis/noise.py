@@ -11,16 +11,10 @@ which real noise differs from the textbook's, allowed before an effect is claime
                the same ones, so that outliers count for little and favour nobody.
 
 Variances climb the likelihood by scoring: with the smoother's adjoint r and its covariance N,
-d loglik / d log q = q sum(r^2 - N) / 2, all of them together by their average information
-(`information.py`), since what is a disturbance of one channel can pass for measurement noise of
-another.
-
-What the data know of the noise: the average information of all log variances together.
-
-Channels share their noise: an encoder's noise can pass for a disturbance of the speed behind it. So
-the variances step together, by the average of observed and expected information (Gilmour, Thompson
-& Cullis 1995, "Average information REML"). With P the inverse covariance of the data and V_i what
-noise i adds to it,
+d loglik / d log q = q sum(r^2 - N) / 2. Channels share their noise: an encoder's noise can pass for
+a disturbance of the speed behind it. So all variances step together, by the average of observed and
+expected information (Gilmour, Thompson & Cullis 1995, "Average information REML"). With P the
+inverse covariance of the data and V_i what noise i adds to it,
 
     AI_ij = 1/2 (V_i P y)' P (V_j P y)
 
@@ -65,7 +59,7 @@ class Structure:
 
 
 @dataclass(frozen=True, eq=False)
-class Noise:
+class NoiseModel:
     """Log variances (n,) of w, v and c; weights of heavy tails (L, B, n) or 1.0."""
 
     structure: Structure
@@ -98,7 +92,7 @@ class Noise:
             return np.zeros((runs, 0))
         return np.tile(np.exp(self.log_c), (runs, 1))
 
-    def allowing(self, structure: Structure, dt: float) -> Noise:
+    def allowing(self, structure: Structure, dt: float) -> NoiseModel:
         """The same noise, free to be coloured (or not): where its fit starts."""
         if structure.tau is None:
             return replace(self, structure=structure)
@@ -107,7 +101,7 @@ class Noise:
         log_c = np.maximum(self.log_q + share, self.floor)
         return replace(self, structure=structure, log_c=log_c)
 
-    def towards(self, other: Noise, part: float) -> Noise:
+    def towards(self, other: NoiseModel, part: float) -> NoiseModel:
         """Part of the way to another noise of the same structure."""
         if part == 1.0 or other is self:
             return other
@@ -118,7 +112,7 @@ class Noise:
         return replace(self, **logs)
 
 
-def first_guess(residual: Array, seen: Array, scale: Array) -> Noise:
+def noise_guess(residual: Array, seen: Array, scale: Array) -> NoiseModel:
     """Variances from one-step residuals of the raw measurements, (L, B, n).
 
     A residual's variance is about q + 2 r and its lag-one covariance -r; robust by medians.
@@ -143,12 +137,12 @@ def first_guess(residual: Array, seen: Array, scale: Array) -> Noise:
             log_q[i] = floor[i] + 2 * math.log(UNSEEN / 1e-6)
         if steps:
             floor[i] = max(floor[i], math.log(NOTHING * total))
-    return Noise(
+    return NoiseModel(
         Structure(), np.maximum(log_q, floor), np.maximum(log_r, floor), log_q.copy(), floor
     )
 
 
-def slopes(noise: Noise, adjoint: Adjoint, dt: float) -> Array:
+def likelihood_slopes(noise: NoiseModel, adjoint: Adjoint, dt: float) -> Array:
     """Slope d loglik / d log variance, (2 or 3, n): of w, v and, if any, the coloured part."""
     n = len(noise.log_q)
     q, r = np.exp(noise.log_q) / noise.weight_w, np.exp(noise.log_r) / noise.weight_v
@@ -160,7 +154,7 @@ def slopes(noise: Noise, adjoint: Adjoint, dt: float) -> Array:
     return np.stack([0.5 * (v * (s**2 - c)).sum(axis=(0, 1)) for v, s, c in parts])
 
 
-def climbed(noise: Noise, slope: Array, info: Array, count: int) -> Noise:
+def climbed(noise: NoiseModel, slope: Array, info: Array, count: int) -> NoiseModel:
     """One step up the likelihood, all variances together.
 
     Along each principal direction of the information by itself, bounded there: so the step goes up
@@ -185,7 +179,7 @@ def climbed(noise: Noise, slope: Array, info: Array, count: int) -> Noise:
     return replace(noise, log_q=moved[0], log_r=moved[1], log_c=log_c)
 
 
-def cleaned(noise: Noise, adjoint: Adjoint) -> Noise:
+def cleaned(noise: NoiseModel, adjoint: Adjoint) -> NoiseModel:
     """One round of outlier weights: scales from the weighted disturbances, then new weights."""
     n = len(noise.log_q)
     q_t, r_t = np.exp(noise.log_q) / noise.weight_w, np.exp(noise.log_r) / noise.weight_v
@@ -210,7 +204,7 @@ def _moment(variance: Array, score: Array, cover: Array) -> Array:
 
 
 def working(
-    noise: Noise, adjoint: kalman.Adjoint, G: Array | None, dt: float
+    noise: NoiseModel, adjoint: kalman.Adjoint, G: Array | None, dt: float
 ) -> tuple[Array, Array]:
     """What each noise, as the smoother sees it, adds to d (L, B, n, K) and r (L + 1, B, n, K).
 

@@ -19,10 +19,10 @@ import numpy as np
 from grounded.diagnosis import filter as kalman
 from grounded.diagnosis.data import Data
 from grounded.diagnosis.delays import delays_of
-from grounded.diagnosis.fitted import Fit
+from grounded.diagnosis.fitted import Fitted
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor
-from grounded.diagnosis.initial_state import widened
 from grounded.diagnosis.leftover import filter_of
+from grounded.diagnosis.linearise import widened
 from grounded.diagnosis.report import Region, TimeShare
 from grounded.frozen import Array
 
@@ -42,7 +42,7 @@ class Horizon:
     spread: Array
 
 
-def horizon(predictor: Predictor, fit: Fit, seconds: float) -> Horizon:
+def horizon(predictor: Predictor, fit: Fitted, seconds: float) -> Horizon:
     """Starting points spread over all runs, and the floor under their errors.
 
     Args:
@@ -64,27 +64,27 @@ def horizon(predictor: Predictor, fit: Fit, seconds: float) -> Horizon:
     return Horizon(steps, at, run, _spread(predictor, fit, at, run, steps))
 
 
-def _spread(predictor: Predictor, fit: Fit, at: Any, run: Any, steps: int) -> Array:
+def _spread(predictor: Predictor, fit: Fitted, at: Any, run: Any, steps: int) -> Array:
     """Standard deviation that noise alone gives the log `steps` after the moments (M,), (M, n)."""
     data, noise = predictor.data, fit.noise
     (L, B), n = data.time.shape, data.model.n
     g, delays = filter_of(predictor, fit), delays_of(fit.hypothesis, data)
     R = np.broadcast_to(noise.measurement(L), (L + 1, B, n))
     Q = noise.process(data.dt)
-    Q, wide, N = Q if g.late is None else g.late.noises(Q, n), g.seen.shape[-1], g.A.shape[-1]
+    Q, wide, N = Q if g.delayed is None else g.delayed.noises(Q, n), g.seen.shape[-1], g.A.shape[-1]
     Q = np.broadcast_to(Q, (L, B, N))
     P = np.zeros((len(at), N, N))
-    if g.late is None and bool(data.seen.all()):
+    if g.delayed is None and bool(data.seen.all()):
         P[:, :n, :n] = g.K[np.maximum(at - 1, 0), run][:, :n] * R[at, run][:, None, :]
     else:
         given = widened(data, R, g.seen[..., :n])
         P[:, :wide, :wide] = _covariances(g, Q, given)[np.maximum(at - 1, 0), run]
     k = np.arange(wide, wide + n if wide < N else wide)
     P[:, k, k] = noise.start(1)[0] if wide < N else 0.0
-    late = {} if delays is None else dict(zip(delays.channel, delays.whole, strict=True))
-    # what a late channel shows at the horizon is that much nearer; what lies before the moment has
-    # been filtered already, and this is more than its error
-    found = {i: P[:, i, i] for i, whole in late.items() if whole >= steps}
+    delayed = {} if delays is None else dict(zip(delays.channel, delays.whole, strict=True))
+    # what a delayed channel shows at the horizon is that much nearer; what lies before the moment
+    # has been filtered already, and this is more than its error
+    found = {i: P[:, i, i] for i, whole in delayed.items() if whole >= steps}
     for j in range(steps):
         A, q = g.A[at + j, run], Q[at + j, run]
         P = A @ P @ A.swapaxes(1, 2)
@@ -94,7 +94,7 @@ def _spread(predictor: Predictor, fit: Fit, at: Any, run: Any, steps: int) -> Ar
             Gt = g.G[at + j, run]
             entry[:, :wide, :wide] = (Gt * q[:, None, :wide]) @ Gt.swapaxes(1, 2)
         P = P + entry
-        found |= {i: P[:, i, i] for i, whole in late.items() if whole == steps - 1 - j}
+        found |= {i: P[:, i, i] for i, whole in delayed.items() if whole == steps - 1 - j}
     variance = np.einsum("bii->bi", P[:, :n, :n]).copy()
     for i, of_late in found.items():
         variance[:, i] = of_late
@@ -106,8 +106,10 @@ def _covariances(g: kalman.Gains, Q: Array, R: Array) -> Array:
     (L, B, N, _), wide = g.A.shape, g.seen.shape[-1]
     found, P = np.empty((L, B, wide, wide)), np.zeros((B, N, N))
     first = R[0] * np.where(g.seen[0, :, : R.shape[-1]] > 0, 1.0, kalman.UNKNOWN)
-    if g.late is not None:
-        first = np.concatenate([first, np.take_along_axis(first, g.late.channel, axis=1)], axis=1)
+    if g.delayed is not None:
+        first = np.concatenate(
+            [first, np.take_along_axis(first, g.delayed.channel, axis=1)], axis=1
+        )
     P[:, np.arange(wide), np.arange(wide)] = first
     for t in range(L):
         P = g.A[t] @ P @ g.A[t].swapaxes(1, 2)
@@ -128,7 +130,7 @@ def errors(predictor: Predictor, h: Hypothesis, track: Array, where: Horizon) ->
     x = track[where.at, where.run]
     u, t = predictor.inputs(h), data.time
     delays = delays_of(h, data)
-    oldest = 0 if delays is None else max(delays.whole) + 1  # what late sensors may still show
+    oldest = 0 if delays is None else max(delays.whole) + 1  # what delayed sensors may still show
     path = [track[np.maximum(where.at - j, 0), where.run] for j in range(oldest, -1, -1)]
     for j in range(where.steps):
         index = (where.at + j, where.run)
@@ -147,7 +149,7 @@ def normalised(error: Array, where: Horizon) -> float:
     return float(np.sqrt(np.nanmean((error / where.spread) ** 2)))
 
 
-def explained(predictor: Predictor, null: Hypothesis, best: Fit) -> Array:
+def explained(predictor: Predictor, null: Hypothesis, best: Fitted) -> Array:
     """What `best` gains over the bare model at every step and channel, (L, B, n) [nats].
 
     Both are filtered with the noise of `best`: the bare model's innovations would hide the gap in a
@@ -179,7 +181,7 @@ def by_time(gain: Array, data: Data, parts: int = 8) -> list[TimeShare]:
     return found
 
 
-def by_region(gain: Array, predictor: Predictor, fit: Fit, most: int = 3) -> list[Region]:
+def by_region(gain: Array, predictor: Predictor, fit: Fitted, most: int = 3) -> list[Region]:
     """Half-spaces of a state or an input that hold most of the gap in little of the time."""
     data = predictor.data
     model = data.model

@@ -10,15 +10,14 @@ of one fit and compared with its innovations:
 
 What the fit already estimates (its effects' values, the parameters' shifts) is projected out, so
 that a candidate is credited only with what they can't explain.
-
-The grid of scanned values: its points, which of them are tried, what lies below the first.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -26,9 +25,9 @@ import numpy as np
 from grounded.compile import Named
 from grounded.diagnosis import filter as kalman
 from grounded.diagnosis.delays import delays_of
-from grounded.diagnosis.fitted import Fit
+from grounded.diagnosis.fitted import Fitted
 from grounded.diagnosis.hypothesis import Predictor, sensor_offset
-from grounded.diagnosis.linearise import base_columns, sensitivities_of, system_of
+from grounded.diagnosis.linearise import base_columns, filter_system, sensitivities_of
 from grounded.effects import (
     Effect,
     InputFamily,
@@ -63,10 +62,14 @@ class _Column:
     r: Array  # (L + 1, B, n) or empty
 
 
-def scan(predictor: Predictor, fit: Fit, candidates: Sequence[Effect]) -> list[Look]:
+# by candidate and grid point: of each column its name and its products with residual, base, mates
+_Results = dict[tuple[int, int], list[tuple[str, float, Array, Array]]]
+
+
+def scan_candidates(predictor: Predictor, fit: Fitted, candidates: Sequence[Effect]) -> list[Look]:
     """Every candidate beside what `fit` already holds; same order as the candidates."""
     context = _Context(predictor, fit)
-    results: dict[tuple[int, int], list[tuple[str, float, Array, Array]]] = {}
+    results: _Results = {}
     pending: list[_Column] = []
     size = max(8, min(BLOCK, int(MOST_NUMBERS / fit.white.size)))
     for i, effect in enumerate(candidates):
@@ -84,7 +87,7 @@ def scan(predictor: Predictor, fit: Fit, candidates: Sequence[Effect]) -> list[L
 class _Context:
     """What all candidates share: the fit's track, Jacobian and gains."""
 
-    def __init__(self, predictor: Predictor, fit: Fit) -> None:
+    def __init__(self, predictor: Predictor, fit: Fitted) -> None:
         self.predictor, self.fit = predictor, fit
         data, h = predictor.data, fit.hypothesis
         self.x = fit.track[:-1]
@@ -93,8 +96,8 @@ class _Context:
         self.after = predictor.advance(h, self.x, self.u, data.time)
         self.ahead = np.concatenate([fit.track[:1], self.after])
         self.F, self.f_p = sensitivities_of(predictor, h, self.x, self.u)
-        system, late = system_of(predictor, h, fit.noise, fit.track, self.F)
-        self.G, self.gains = system.G, kalman.gains(*system, late)
+        system, delayed = filter_system(predictor, h, fit.noise, fit.track, self.F)
+        self.G, self.gains = system.G, kalman.gains(*system, delayed)
         self.delays = delays_of(h, data)
         self.white = fit.white
         self.base = fit.covariance if fit.gram.shape[-1] else np.zeros((0, 0))
@@ -112,19 +115,21 @@ class _Context:
             return [_Column(i, point, "d", self.f_p[..., k], _EMPTY)]
         return []
 
-    def _linear(self, effect: Effect) -> list[tuple[str, float]]:
-        """Linear quantities and a small amount of each."""
-        return [(q.name, 1e-3) for q in effect.free if not q.grid]
+    def _tried(
+        self, effect: Effect, grid: dict[str, float]
+    ) -> Iterator[tuple[str, float, dict[str, float]]]:
+        """A small amount of each linear quantity by name, or the whole change; all values then."""
+        linear = [q.name for q in effect.free if not q.grid]
+        values = {**effect.fixed, **dict.fromkeys(linear, 0.0), **grid}
+        for name in linear:
+            yield name, 1e-3, values | {name: 1e-3}
+        if not linear:
+            yield "", 1.0, values
 
     def _rate(self, i: int, point: int, effect: Effect, grid: dict[str, float]) -> list[_Column]:
         predictor, dt = self.predictor, self.predictor.data.dt
-        linear = self._linear(effect)
-        names = [q.name for q in effect.free if not q.grid]
         found = []
-        for name, amount in linear or [("", 1.0)]:
-            values = {**effect.fixed, **dict.fromkeys(names, 0.0), **grid}
-            if name:
-                values[name] = amount
+        for name, amount, values in self._tried(effect, grid):
             before = self._rates_at(effect, values, 0)
             later = self._rates_at(effect, values, 1)
             d = 0.5 * dt * ((self.F @ before[..., None])[..., 0] + later)
@@ -148,33 +153,26 @@ class _Context:
         t = data.time if when == 0 else data.time + data.dt
         own: Any = {}
         if effect.family.needs_own:  # type: ignore[attr-defined]
-            own = self._instant(when) if instant else self._mean()
+            own = self.instants[when] if instant else self.mean
         return self.predictor.added_rate([(effect, values)], x, self.u, t, own)
 
-    def _mean(self) -> Named:
-        """The model's own rates, mean over every step; computed once."""
-        if "mean" not in self.__dict__:
-            ahead = self.predictor.step(self.x, self.u, self.p)
-            self.mean = self.predictor.named((ahead - self.x) / self.predictor.data.dt)
-        return self.mean
+    @cached_property
+    def mean(self) -> Named:
+        """The model's own rates, mean over every step."""
+        ahead = self.predictor.step(self.x, self.u, self.p)
+        return self.predictor.named((ahead - self.x) / self.predictor.data.dt)
 
-    def _instant(self, when: int) -> Named:
-        """The same at the start or the end of every step."""
-        cache = self.__dict__.setdefault("instants", {})
-        if when not in cache:
-            x = self.x if when == 0 else self.after
-            cache[when] = self.predictor.named(self.predictor.instant(x, self.u, self.p))
-        found: Named = cache[when]
-        return found
+    @cached_property
+    def instants(self) -> tuple[Named, Named]:
+        """The same at the start and at the end of every step."""
+        start, end = (self.predictor.instant(x, self.u, self.p) for x in (self.x, self.after))
+        return self.predictor.named(start), self.predictor.named(end)
 
     def _step(self, i: int, point: int, effect: Effect, grid: dict[str, float]) -> list[_Column]:
         """The whole step again, with the candidate in it."""
         data, predictor = self.predictor.data, self.predictor
         found = []
-        for name, amount in self._linear(effect) or [("", 1.0)]:
-            values = {**effect.fixed, **grid}
-            if name:
-                values[name] = amount
+        for name, amount, values in self._tried(effect, grid):
             h = self.fit.hypothesis.plus(effect, values)
             acts = not isinstance(effect.family, RateFamily)
             received = data.runs(predictor.received(h)) if acts else self.u
@@ -187,21 +185,14 @@ class _Context:
         data = self.predictor.data
         k = data.model.state_names.index(effect.site.target)
         found = []
-        for name, amount in self._linear(effect) or [("", 1.0)]:
-            values = {**effect.fixed, **grid}
-            if name:
-                values[name] = amount
+        for name, amount, values in self._tried(effect, grid):
             r = np.zeros_like(self.fit.track)
             r[..., k] = -sensor_offset(effect, values, self.ahead[..., k], data.dt) / amount
             r = r if self.delays is None else self.delays.aligned(r)
             found.append(_Column(i, point, name, _EMPTY, r))
         return found
 
-    def filter(
-        self,
-        block: list[_Column],
-        results: dict[tuple[int, int], list[tuple[str, float, Array, Array]]],
-    ) -> None:
+    def filter(self, block: list[_Column], results: _Results) -> None:
         """Whitens a block of columns, keeps their products with residual, base, each other."""
         L, B, n = self.white.shape
         wide = kalman.whole(len(block), n)
@@ -214,37 +205,30 @@ class _Context:
         white, _ = kalman.innovations(self.gains, d, r)
         flat = white.reshape(-1, wide)
         against = flat.T @ self.white.reshape(-1)
-        base = self._base_white()
-        cross = flat.T @ base
+        cross = flat.T @ self.base_white
         own = flat.T @ flat
-        for j, column in enumerate(block):
-            mates = [
-                k
-                for k, other in enumerate(block)
-                if other.effect == column.effect and other.point == column.point
-            ]
+        places = [(column.effect, column.point) for column in block]
+        for j, (column, place) in enumerate(zip(block, places, strict=True)):
+            mates = [k for k, other in enumerate(places) if other == place]
             entry = (column.name, float(against[j]), cross[j], own[j, mates])
-            results.setdefault((column.effect, column.point), []).append(entry)
+            results.setdefault(place, []).append(entry)
 
-    def _base_white(self) -> Array:
+    @cached_property
+    def base_white(self) -> Array:
         """Whitened columns of what the fit estimates, (L B n, C)."""
-        if "base_white" not in self.__dict__:
-            d, r = base_columns(self.predictor, self.fit)
-            if d.shape[-1]:
-                white, _ = kalman.innovations(self.gains, d, r)
-            else:
-                white = np.zeros((*d.shape[:-1], 0))
-            self.base_white = white.reshape(self.white.size, d.shape[-1])
-            self.base_score = self.base_white.T @ self.white.reshape(-1)
-            self.base_score = self.base_score + self.fit.prior_pull(self.predictor.data)
-        return self.base_white
+        d, r = base_columns(self.predictor, self.fit)
+        white = np.zeros((*d.shape[:-1], 0))
+        if d.shape[-1]:
+            white, _ = kalman.innovations(self.gains, d, r)
+        return white.reshape(self.white.size, d.shape[-1])
 
-    def best(
-        self,
-        i: int,
-        effect: Effect,
-        results: dict[tuple[int, int], list[tuple[str, float, Array, Array]]],
-    ) -> Look:
+    @cached_property
+    def base_score(self) -> Array:
+        """Slope of the log-posterior by what the fit estimates, (C,); zero at its best."""
+        score = self.base_white.T @ self.white.reshape(-1)
+        return np.asarray(score + self.fit.prior_pull(self.predictor.data))
+
+    def best(self, i: int, effect: Effect, results: _Results) -> Look:
         """The grid point with the largest gain, its linear values solved."""
         looks = []
         for point, grid in enumerate(grid_points(effect)):
@@ -286,10 +270,8 @@ MOST_OTHERS = 2
 
 def grid_points(effect: Effect) -> list[dict[str, float]]:
     """All combinations of scanned values; one empty point for an effect that is all linear."""
-    scanned = [q for q in effect.free if q.grid]
-    grids = [q.grid for q in scanned]
-    names = [q.name for q in scanned]
-    return [dict(zip(names, point, strict=True)) for point in itertools.product(*grids)]
+    grids = {q.name: q.grid for q in effect.free if q.grid}
+    return [dict(zip(grids, point, strict=True)) for point in itertools.product(*grids.values())]
 
 
 def elsewhere(

@@ -1,4 +1,8 @@
-"""What one attribution tries: fits from where, under which noise, with what beside."""
+"""The search of one attribution: fits started from where, under which noise, with what beside.
+
+`HypothesisSearch` adds to the hypotheses that were fitted (`hypotheses`); `attribution` says in
+which order. `tune` sets constants of large effects, which are no parameters.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +12,12 @@ from dataclasses import replace
 import numpy as np
 
 from grounded.diagnosis.data import Data
-from grounded.diagnosis.fitted import Fit
-from grounded.diagnosis.hypotheses import Found, parametric
+from grounded.diagnosis.fitted import Fitted
+from grounded.diagnosis.hypotheses import FittedHypotheses, parametric
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor, param_scale
-from grounded.diagnosis.noise import Noise, Structure, first_guess
+from grounded.diagnosis.noise import NoiseModel, Structure, noise_guess
 from grounded.diagnosis.refine import refine
-from grounded.diagnosis.scan import Look, scan
+from grounded.diagnosis.scan import Look, scan_candidates
 from grounded.effects import Effect, ParamFamily
 from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import Array
@@ -31,7 +35,7 @@ TO_THE_TOP = 25  # iterations of fits that decide: most need fewer, and stop by 
 LARGE = 8  # states, above which one correlation time and half the shortlist have to do
 
 
-class Search(Found):
+class HypothesisSearch(FittedHypotheses):
     """The fits of one attribution (`Found`), and the ways to more of them."""
 
     def __init__(
@@ -49,7 +53,7 @@ class Search(Found):
         self.most = SHORTLIST // 2 if large else SHORTLIST
         self.beside = BESIDE // 2 if large else BESIDE
 
-    def refined(self, starts: Sequence[Fit | tuple], iterations: int = 6) -> list[Fit]:  # type: ignore[type-arg]
+    def refined(self, starts: Sequence[Fitted | tuple], iterations: int = 6) -> list[Fitted]:  # type: ignore[type-arg]
         """Refines, remembers, returns."""
         fits = refine(
             self.predictor, starts, iterations=iterations, tick=lambda: self.tick("refine")
@@ -57,14 +61,14 @@ class Search(Found):
         self.keep(fits)
         return fits
 
-    def finished(self, fits: Sequence[Fit], iterations: int) -> None:
+    def finished(self, fits: Sequence[Fitted], iterations: int) -> None:
         """Goes on with fits of any noise structure, those of one structure together."""
         for structure in dict.fromkeys(fit.noise.structure for fit in fits):
             self.refined([f for f in fits if f.noise.structure == structure], iterations)
 
     # -- without effects ------------------------------------------------------------------------
 
-    def nulls(self) -> Fit:
+    def nulls(self) -> Fitted:
         """The model alone under every noise structure, and with its parameters calibrated."""
         found = self.refined([self.fresh(Hypothesis())], iterations=20)
         if not found:
@@ -76,16 +80,16 @@ class Search(Found):
             self.calibrated(self.best_null())
         return self.best_null()
 
-    def fresh(self, h: Hypothesis) -> tuple[Hypothesis, Noise, Array]:
+    def fresh(self, h: Hypothesis) -> tuple[Hypothesis, NoiseModel, Array]:
         """Where a hypothesis starts by itself: about the log, with the noise it leaves there."""
         data, track = self.data, self.data.y.copy()
         predicted = self.predictor.next(h, track[:-1])
         residual = data.model.difference(predicted, track[1:])
         scale = np.array([data.scales.spread(n) for n in data.model.state_names])
         scale[list(data.hidden)] = 0.0  # nothing disturbs a memory
-        return h, first_guess(residual, data.seen, scale), track
+        return h, noise_guess(residual, data.seen, scale), track
 
-    def again(self, fits: Sequence[Fit]) -> list[Fit]:
+    def again(self, fits: Sequence[Fitted]) -> list[Fitted]:
         """Large effects from a start of their own: the noise without them is far away."""
         floor = self.score(self.best_null()) + LARGE_GAIN
         far = [f for f in fits if self.score(f) > floor]
@@ -98,7 +102,7 @@ class Search(Found):
             starts.append((start, replace(noise, weight_w=weight_w, weight_v=weight_v), track))
         return self.refined(starts, iterations=12)
 
-    def fair(self, best: Fit) -> None:
+    def fair(self, best: Fitted) -> None:
         """The model alone, starting from the noise and the shifts that the best hypothesis has.
 
         What is compared with must have climbed as high as it can, or a better noise passes for an
@@ -116,7 +120,7 @@ class Search(Found):
         (alone,) = self.refined(starts[:1], iterations=12)
         self.calibrated(alone)
 
-    def structures(self, fit: Fit) -> list[Fit]:
+    def structures(self, fit: Fitted) -> list[Fitted]:
         """A hypothesis with coloured noise of several correlation times (if it had none)."""
         if fit.noise.structure.tau is not None:
             return []
@@ -126,7 +130,7 @@ class Search(Found):
         ]
         return self.refined(starts, iterations=8 if fit.hypothesis.effects else TO_THE_TOP)
 
-    def calibrated(self, fit: Fit) -> list[Fit]:
+    def calibrated(self, fit: Fitted) -> list[Fitted]:
         """The same hypothesis with the model's parameters free to move a little, or more.
 
         Without effects, where they already moved by more than that: much.
@@ -144,7 +148,7 @@ class Search(Found):
             found += self.refined([(crude, found[-1].noise, found[-1].track)], iterations=10)
         return found
 
-    def _far(self, fit: Fit) -> bool:
+    def _far(self, fit: Fitted) -> bool:
         """Whether a parameter has moved beyond its prior."""
         h, unit = fit.hypothesis, param_scale(self.data.model)
         assert h.shift is not None
@@ -167,9 +171,9 @@ class Search(Found):
         for fit in self.refined(likely, 12):
             self.calibrated(fit)
 
-    def with_weights(self, clean_fit: Fit) -> Search:
+    def with_weights(self, clean_fit: Fitted) -> HypothesisSearch:
         """A new search on the same data with a clean fit's outlier weights in all noise."""
-        other = Search(self.data, self.candidates, self.tick)
+        other = HypothesisSearch(self.data, self.candidates, self.tick)
         weights = clean_fit.noise
         starts = []
         for fit in [*self.of_size(0), *self.of_size(1)[:SHORTLIST], clean_fit]:
@@ -189,7 +193,7 @@ class Search(Found):
 
     # -- one effect more --------------------------------------------------------------------------
 
-    def shortlist(self, fit: Fit, count: int) -> list[Look]:
+    def shortlist(self, fit: Fitted, count: int) -> list[Look]:
         """The candidates that would add most to a fit, after their price."""
         taken = set(fit.hypothesis.names)
         free = [
@@ -199,7 +203,7 @@ class Search(Found):
             and not (isinstance(e.family, ParamFamily) and fit.hypothesis.spread > 0)
         ]
         self.tick("scan")
-        looks = scan(self.predictor, fit, free)
+        looks = scan_candidates(self.predictor, fit, free)
         worth = [(look.gain - self.price(look.effect, look.values), look) for look in looks]
         worth = [(w, look) for w, look in worth if np.isfinite(w) and look.values]
         worth.sort(key=lambda pair: -pair[0])
@@ -207,9 +211,9 @@ class Search(Found):
         others = [look for _, look in worth if not isinstance(look.effect.family, ParamFamily)]
         return others[:count] + params[: count // 2]
 
-    def extended(self, fit: Fit, count: int = 0, iterations: int = 7) -> list[Fit]:
+    def extended(self, fit: Fitted, count: int = 0, iterations: int = 7) -> list[Fitted]:
         """The fit with each shortlisted effect added, refined."""
-        starts: list[Fit | tuple] = [fit]  # type: ignore[type-arg]
+        starts: list[Fitted | tuple] = [fit]  # type: ignore[type-arg]
         for look in self.shortlist(fit, count or self.most):
             h = fit.hypothesis
             starts += [
@@ -218,15 +222,15 @@ class Search(Found):
             ]
         return self.refined(starts, iterations)[1:]
 
-    def without(self, fit: Fit, name: str) -> Fit:
+    def without(self, fit: Fitted, name: str) -> Fitted:
         """The fit with one effect taken out, its noise and track kept: where rivals are sought."""
         start = (fit.hypothesis.minus(name), fit.noise, fit.track)
         alone = refine(self.predictor, [start], iterations=1, fixed_noise=True)
         return alone[0] if alone else self.best_null()
 
-    def under(self, structure: Structure, spread: float) -> Search | None:
+    def under(self, structure: Structure, spread: float) -> HypothesisSearch | None:
         """What was fitted under one noise and freedom of the parameters; None without a null."""
-        other = Search(self.data, self.candidates, self.tick)
+        other = HypothesisSearch(self.data, self.candidates, self.tick)
         exact = (structure, 0.0, ())
         kept = {k: f for k, f in self.fits.items() if k[:2] == (structure, spread) or k == exact}
         other.fits, other._prices = kept, self._prices
@@ -258,7 +262,7 @@ def undefined(predictor: Predictor) -> GroundedError:
     )
 
 
-def tune(search: Search, fits: list[Fit]) -> None:
+def tune(search: HypothesisSearch, fits: list[Fitted]) -> None:
     """Tries other constants of large effects (over which speed a dry friction builds up).
 
     A constant is no parameter: for a small effect any sensible one will do. Where an effect is
@@ -276,7 +280,7 @@ def tune(search: Search, fits: list[Fit]) -> None:
                     fit = _walked(search, fit, index, q.name)
 
 
-def _walked(search: Search, fit: Fit, index: int, name: str) -> Fit:
+def _walked(search: HypothesisSearch, fit: Fitted, index: int, name: str) -> Fitted:
     """The likeliest fit along one constant: uphill by factors, then to the top of a parabola."""
     factor = FIRST
     for _ in range(ROUNDS):
@@ -295,6 +299,8 @@ def _walked(search: Search, fit: Fit, index: int, name: str) -> Fit:
     return fit
 
 
-def _tried(search: Search, fit: Fit, index: int, name: str, values: tuple[float, ...]) -> list[Fit]:
+def _tried(
+    search: HypothesisSearch, fit: Fitted, index: int, name: str, values: tuple[float, ...]
+) -> list[Fitted]:
     starts = [(fit.hypothesis.tuned(index, name, v), fit.noise, fit.track) for v in values]
     return search.refined(starts, TO_THE_TOP)

@@ -19,11 +19,11 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis.data import Data
-from grounded.diagnosis.fitted import Fit
+from grounded.diagnosis.fitted import Fitted
+from grounded.diagnosis.held_out import held_out_errors
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor
 from grounded.diagnosis.prediction_error import Horizon, errors
 from grounded.diagnosis.report import ChannelParts, Parts, Split
-from grounded.diagnosis.shrinkage import held_out
 from grounded.frozen import Array
 
 MOST_MOMENTS = 40  # at which repeats are compared
@@ -43,7 +43,7 @@ def shares(before: Array, after: Array, floor: Array) -> Array:
 
 
 def split(
-    predictor: Predictor, fit: Fit, bare: Array, where: Horizon, repeats: Sequence[Sequence[int]]
+    predictor: Predictor, fit: Fitted, bare: Array, where: Horizon, repeats: Sequence[Sequence[int]]
 ) -> Split:
     """The parts of the error at one horizon.
 
@@ -56,7 +56,7 @@ def split(
     """
     data = predictor.data
     before = _mean_square(errors(predictor, Hypothesis(), bare, where))
-    after = _mean_square(held_out(predictor, fit, fit.track, where))
+    after = _mean_square(held_out_errors(predictor, fit, fit.track, where))
     noise = (where.spread**2).mean(axis=0)
     repeated = scatter(predictor, fit, where.steps, repeats)
     parts = before, after, noise if repeated is None else repeated
@@ -80,7 +80,7 @@ def _mean_square(error: Array) -> Array:
 
 
 def scatter(
-    predictor: Predictor, fit: Fit, steps: int, repeats: Sequence[Sequence[int]]
+    predictor: Predictor, fit: Fitted, steps: int, repeats: Sequence[Sequence[int]]
 ) -> Array | None:
     """Variance of prediction errors among repeats of one candidate, (n,); None without repeats."""
     data = predictor.data

@@ -1,4 +1,11 @@
-"""Unmodelled effects, one family a file; `Library` lists them, `wrap` adds one to a model."""
+"""Unmodelled effects: what a model may lack, one family of physics a file.
+
+Read `family` first (what an effect is), then any of the families: `actuator`, `friction`, `rate`,
+`geometry`, `sensor`. `places` says where in a model they can act. `registry` has the `Library` of
+all families: what of it applies to a model, and the way from a name to its effect. `wrap` adds an
+effect to a model, which is then a plain model again. A new family is a value in one of these files,
+or comes from a package of your own by the entry point group `grounded.effects`.
+"""
 
 from __future__ import annotations
 
@@ -14,11 +21,12 @@ from grounded.effects.family import (
     SensorDelayFamily,
     SensorFamily,
     Site,
+    acting_order,
     scales_of,
+    wrapping_order,
 )
-from grounded.effects.memory import memory_of, memory_start
 from grounded.effects.registry import Library
-from grounded.effects.wrap import acting_order, param_name, wrap, wrapping_order
+from grounded.effects.wrap import memory_of, memory_start, param_name, wrap
 
 __all__ = [
     "Effect",

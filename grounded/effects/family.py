@@ -14,6 +14,15 @@ c are the effect's quantities by name. A quantity without a scan grid is absent 
 equation is (to first order) linear in it; one with a grid is scanned first, then refined. A fixed
 quantity is a constant that the data's scale chose (the width of a smoothed sign); where the effect
 is large, the data may set it themselves.
+
+Several effects act in one order, for prediction, probes and adopted models alike:
+
+    command -> input effects as they were claimed -> transport delays -> model -> sensor effects
+
+A transport delay commutes with all that does not depend on time, so it may as well act last; there
+a fraction of a step blends two samples of what is delivered, not two commands that a nonlinear
+effect has yet to see. Of two effects the one that is wrapped LAST acts FIRST on a command, so
+wrapping goes from the model outwards: parameters, limits of rates, rates, sensors, inputs.
 """
 
 from __future__ import annotations
@@ -107,17 +116,20 @@ class Site:
         """Unit of a state or an input."""
         return self.model.states.get(name) or self.model.inputs.get(name) or "1"
 
-    def role(self, role: str) -> str | None:
-        """The state that plays a role, or None."""
-        found = self.model.roles.get(role)
-        return found if isinstance(found, str) else (found[0] if found else None)
-
 
 def per(unit: str, by: str = "s") -> str:
     """A unit divided by another, readable: m/s by s is m/s^2."""
     if unit == "1":
         return f"1/{by}"
     return f"{unit}^2" if unit.endswith(f"/{by}") else f"{unit}/{by}"
+
+
+def speed_limit(site: Site, unit: str) -> tuple[Quantity, ...]:
+    """A speed r that is not exceeded: scanned from half the fastest that a step could show."""
+    spread = site.scales.spread(site.target)
+    fastest = spread / site.scales.dt
+    grid = tuple(float(v) for v in np.geomspace(0.5 * fastest, 0.1 * spread, 12))
+    return (Quantity("r", unit, grid, 0.0, np.inf, start=2 * fastest, places=6),)
 
 
 @dataclass(frozen=True)
@@ -157,7 +169,7 @@ class MemoryFamily(Family):
     """advance(u, z, c, dt) -> (mean input over the step, next memory); z has `depth` entries.
 
     `depth(values, dt)`: how many memory states the effect needs, all starting at the input that
-    was held before t = 0. `transport`: a pure delay, which acts after all others (`order.py`).
+    was held before t = 0. `transport`: a pure delay, which acts after all others.
     """
 
     advance: Callable[[Any, tuple[Any, ...], Any, Any], tuple[Any, tuple[Any, ...]]] = (
@@ -227,10 +239,10 @@ class Effect:
 
     def tuned(self, name: str, value: float) -> Effect:
         """The same effect with another constant."""
-        found = [
+        new = (
             replace(q, start=value, tuned=True) if q.name == name else q for q in self.quantities
-        ]
-        return replace(self, quantities=tuple(found))
+        )
+        return replace(self, quantities=tuple(new))
 
     @property
     def places(self) -> float:
@@ -259,8 +271,7 @@ class Effect:
 def scales_of(model: Model, states: Array, inputs: Array, dt: float, duration: float) -> Scales:
     """Sizes of the signals in recorded data: states (N, n), inputs (N, m)."""
     low, high, quantiles = {}, {}, {}
-    named = [(model.state_names, states), (model.input_names, inputs)]
-    for names, values in named:
+    for names, values in ((model.state_names, states), (model.input_names, inputs)):
         for i, name in enumerate(names):
             column = values[np.isfinite(values[:, i]), i]
             if not len(column):
@@ -269,3 +280,24 @@ def scales_of(model: Model, states: Array, inputs: Array, dt: float, duration: f
             marks = np.quantile(np.abs(column), np.linspace(0, 1, 21))
             quantiles[name] = tuple(float(q) for q in marks)
     return Scales(low, high, quantiles, dt, duration)
+
+
+def acting_order(families: Sequence[Family]) -> list[int]:
+    """Indices of the effects on inputs, the one that acts first on a command first."""
+    own = [i for i, f in enumerate(families) if isinstance(f, InputFamily | MemoryFamily)]
+    return sorted(own, key=lambda i: getattr(families[i], "transport", False))
+
+
+def wrapping_order(families: Sequence[Family]) -> list[int]:
+    """Indices of all effects, the one that is wrapped first (the innermost) first."""
+    inputs = acting_order(families)
+    rest = [i for i in range(len(families)) if i not in inputs]
+    return [*sorted(rest, key=lambda i: _depth(families[i])), *reversed(inputs)]
+
+
+def _depth(family: Family) -> int:
+    if isinstance(family, ParamFamily):
+        return 0
+    if isinstance(family, RateFamily):
+        return 1 if family.parts else 2
+    return 3

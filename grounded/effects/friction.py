@@ -20,29 +20,15 @@ from grounded.effects import places
 from grounded.effects.family import Quantity, RateFamily, Site, Values, per
 
 
-def _viscous(site: Site) -> tuple[Quantity, ...]:
-    return (Quantity("k", "1/s"),)
-
-
-def _width(site: Site, part: float) -> float:
-    return part * site.scales.peak(site.target)
-
-
 def _coulomb(site: Site) -> tuple[Quantity, ...]:
-    unit = site.unit(site.target)
-    return (
-        Quantity("c", per(unit)),
-        Quantity("width", unit, fixed=True, start=_width(site, 0.01), tunable=True),
-    )
+    unit, width = site.unit(site.target), 0.01 * site.scales.peak(site.target)
+    constant = Quantity("width", unit, fixed=True, start=width, tunable=True)
+    return (Quantity("c", per(unit)), constant)
 
 
 def _quadratic(site: Site) -> tuple[Quantity, ...]:
     unit = site.unit(site.target)
-    return (Quantity("k", _inverse(unit)),)
-
-
-def _inverse(unit: str) -> str:
-    return {"m/s": "1/m", "rad/s": "1/rad"}.get(unit, f"1/({unit} s)")
+    return (Quantity("k", {"m/s": "1/m", "rad/s": "1/rad"}.get(unit, f"1/({unit} s)")),)
 
 
 def _stiction(site: Site) -> tuple[Quantity, ...]:
@@ -52,19 +38,6 @@ def _stiction(site: Site) -> tuple[Quantity, ...]:
         Quantity("c", per(unit), grid, 0.0, np.inf, places=6),
         Quantity("v_s", unit, fixed=True, start=0.05 * peak),
     )
-
-
-def _viscous_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
-    return {site.target: -c["k"] * s[site.target]}
-
-
-def _coulomb_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
-    return {site.target: -c["c"] * np.tanh(s[site.target] / c["width"])}
-
-
-def _quadratic_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
-    v = s[site.target]
-    return {site.target: -c["k"] * v * np.abs(v)}
 
 
 def _stiction_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
@@ -79,37 +52,41 @@ viscous_friction = RateFamily(
     name="viscous_friction",
     equation="v' = model - k v",
     sentence="{target} is damped by {k}",
-    targets=places.per_second,
-    quantities=_viscous,
+    targets=places.velocities,
+    quantities=lambda site: (Quantity("k", "1/s"),),
     lookalikes=("quadratic_drag", "coulomb_friction", "input_gain", "parameter"),
-    rate=_viscous_rate,
+    rate=lambda s, a, own, t, c, site: {site.target: -c["k"] * s[site.target]},
 )
 
 coulomb_friction = RateFamily(
     name="coulomb_friction",
     equation="v' = model - c sign(v)",
     sentence="{target} is opposed by a dry friction of {c}",
-    targets=places.per_second,
+    targets=places.velocities,
     quantities=_coulomb,
     lookalikes=("dead_zone", "viscous_friction", "offset", "stiction"),
-    rate=_coulomb_rate,
+    rate=lambda s, a, own, t, c, site: {
+        site.target: -c["c"] * np.tanh(s[site.target] / c["width"])
+    },
 )
 
 quadratic_drag = RateFamily(
     name="quadratic_drag",
     equation="v' = model - k v |v|",
     sentence="{target} is opposed by a drag of {k} times its square",
-    targets=places.per_second,
+    targets=places.velocities,
     quantities=_quadratic,
     lookalikes=("viscous_friction", "coulomb_friction", "saturation"),
-    rate=_quadratic_rate,
+    rate=lambda s, a, own, t, c, site: {
+        site.target: -c["k"] * s[site.target] * np.abs(s[site.target])
+    },
 )
 
 stiction = RateFamily(
     name="stiction",
     equation="v' = own - exp(-(v/v_s)^2) clip(own + 2 v, -c, c)",
     sentence="{target} sticks until it is driven harder than {c}",
-    targets=places.per_second,
+    targets=places.velocities,
     quantities=_stiction,
     lookalikes=("stall", "dead_zone", "coulomb_friction"),
     rate=_stiction_rate,

@@ -38,10 +38,6 @@ def _speed(site: Site) -> str:
     return name
 
 
-def _slip(site: Site) -> tuple[Quantity, ...]:
-    return (Quantity("k", "s^2/m"),)
-
-
 def _understeer(site: Site) -> tuple[Quantity, ...]:
     fastest = site.scales.peak(_speed(site))
     return (Quantity("k", "s^2/m^2", low=-0.5 / fastest**2, high=20 / fastest**2),)
@@ -68,17 +64,9 @@ def _patch(site: Site) -> tuple[Quantity, ...]:
 
 
 def _patch_targets(model: Model) -> list[str]:
-    if not places.position(model):
-        return []
-    still = {*places.position(model)}
-    return [n for n in places.dynamic(model) if n not in still] + (
-        [h] if (h := places.heading(model)) else []
-    )
-
-
-def _world_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
-    x, y = site.targets
-    return {x: c["a"] + 0.0 * s[x], y: c["b"] + 0.0 * s[y]}
+    where, heading = places.position(model), places.heading(model)
+    found = [n for n in places.dynamic(model) if n not in where]
+    return [*found, *([heading] if heading else [])] if where else []
 
 
 def _body_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
@@ -123,7 +111,9 @@ drift_world = RateFamily(
     targets=places.plane,
     quantities=_two_drifts,
     lookalikes=("offset", "drift_body", "sensor_bias"),
-    rate=_world_rate,
+    rate=lambda s, a, own, t, c, site: {
+        n: c[q] + 0.0 * s[n] for n, q in zip(site.targets, "ab", strict=True)
+    },
 )
 
 drift_body = RateFamily(
@@ -141,7 +131,7 @@ side_slip = RateFamily(
     equation="velocity to the left = -k v^2 psi'",
     sentence="it slides outwards in turns, by {k} of speed times lateral acceleration",
     targets=lambda model: places.plane(model) if _moving(model) else [],
-    quantities=_slip,
+    quantities=lambda site: (Quantity("k", "s^2/m"),),
     lookalikes=("drift_body", "understeer", "sensor_delay"),
     rate=_slip_rate,
     needs_own=True,

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from grounded.frozen import Array
 from grounded.model import Model
 
 POSITIONS = (("x", "y"), ("north", "east"), ("px", "py"), ("pos_x", "pos_y"))
@@ -45,23 +46,24 @@ def position(model: Model) -> tuple[str, ...]:
 
 def heading(model: Model) -> str | None:
     """The direction of travel of something that moves on the ground."""
-    named = role(model, "heading")
-    if named:
-        return named[0]
-    return next((h for h in HEADINGS if h in model.angles), None)
+    named = (*role(model, "heading"), *(h for h in HEADINGS if h in model.angles))
+    return next(iter(named), None)
 
 
 def speed(model: Model) -> str | None:
     """The speed along the heading."""
-    named = role(model, "speed")
-    if named:
-        return named[0]
-    return next((s for s in SPEEDS if s in model.state_names), None)
+    named = (*role(model, "speed"), *(s for s in SPEEDS if s in model.state_names))
+    return next(iter(named), None)
 
 
-def per_second(model: Model) -> list[str]:
+def velocities(model: Model) -> list[str]:
     """States whose unit is per second: velocities, linear or angular."""
     return [n for n, u in model.states.items() if u.endswith("/s") or u.endswith("/ s")]
+
+
+def but_position(model: Model) -> list[str]:
+    """Every state that is no position."""
+    return [n for n in model.state_names if n not in position(model)]
 
 
 def plane(model: Model) -> list[str]:
@@ -82,8 +84,14 @@ def dynamic(model: Model) -> list[str]:
 def pairs(model: Model) -> list[str]:
     """`v<-delta` for every dynamic target and every other dynamic state as a source."""
     names = dynamic(model)
-    targets = [n for n in model.state_names if n not in position(model)]
-    return [f"{t}<-{s}" for t in targets for s in names if s != t]
+    return [f"{t}<-{s}" for t in but_position(model) for s in names if s != t]
+
+
+def samples(model: Model, count: int = 3) -> tuple[Array, Array]:
+    """States (count, n) and inputs (count, m) at random, the same ones every time."""
+    rng = np.random.default_rng(0)
+    x = rng.uniform(0.2, 1.0, (count, model.n))
+    return x, rng.uniform(0.2, 1.0, (count, model.m))
 
 
 def following(model: Model) -> list[str]:
@@ -91,9 +99,7 @@ def following(model: Model) -> list[str]:
 
     Their rate depends on an input, on no state but themselves, and somewhere falls with them.
     """
-    rng, dt = np.random.default_rng(0), 1e-2
-    x, u = rng.uniform(0.2, 1.0, (8, model.n)), rng.uniform(0.2, 1.0, (8, model.m))
-    f_x, f_u = model.system.linearise(x, u, model.values, dt)
+    f_x, f_u = model.system.linearise(*samples(model, 8), model.values, 1e-2)
     found = []
     for i, name in enumerate(model.state_names):
         driven = np.abs(f_u[:, i]).max() > 1e-6

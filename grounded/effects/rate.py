@@ -1,18 +1,14 @@
-"""Rates that the model lacks: constant, proportional, coupled, growing, periodic.
+"""Rates that the model lacks: constant, proportional, coupled, growing, periodic; and limited ones.
 
-    s' = model + rate
+    s' = model + rate                  the least specific families: they fit what has no name
+    s' = clip(model, -r, r)            a servo that follows with a lag, but at a limited speed
 
-The least specific families: they fit what has no name of its own.
-
-How fast a state can move: a servo follows its command with a lag, but at a limited speed.
-
-    s' = clip(model, -r, r)
-
-Not `rate_limit`, which bounds the command before the lag: here the lag's own rate is bounded, so
-large moves go at r until the target is near. It applies to states that follow an input by
-themselves: their rate depends on themselves and on inputs alone and falls with the state. It acts
-on the mean rate of each quarter of a step: the limit ends within a step where the target is near,
-and a lag much shorter than a step is no trouble. A step that it does not touch is the model's own.
+`slew_limit` is not `rate_limit`, which bounds the command before the lag: here the lag's own rate
+is bounded, so large moves go at r until the target is near. It applies to states that follow an
+input by themselves: their rate depends on themselves and on inputs alone and falls with the state.
+It acts on the mean rate of each quarter of a step: the limit ends within a step where the target is
+near, and a lag much shorter than a step is no trouble. A step that it does not touch is the
+model's own.
 """
 
 from __future__ import annotations
@@ -22,19 +18,7 @@ from typing import Any
 import numpy as np
 
 from grounded.effects import places
-from grounded.effects.family import Quantity, RateFamily, Site, Values, per
-
-
-def _constant(site: Site) -> tuple[Quantity, ...]:
-    return (Quantity("c", per(site.unit(site.target))),)
-
-
-def _gain(site: Site) -> tuple[Quantity, ...]:
-    return (Quantity("g", "1", low=-1.5, high=5.0),)
-
-
-def _trend(site: Site) -> tuple[Quantity, ...]:
-    return (Quantity("k", per(per(site.unit(site.target)))),)
+from grounded.effects.family import Quantity, RateFamily, Site, Values, per, speed_limit
 
 
 def coupled(site: Site) -> tuple[str, str]:
@@ -63,18 +47,6 @@ def _periodic(site: Site) -> tuple[Quantity, ...]:
     )
 
 
-def _offset_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
-    return {site.target: c["c"] + 0.0 * s[site.target]}
-
-
-def _gain_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
-    return {site.target: c["g"] * own[site.target]}
-
-
-def _trend_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
-    return {site.target: c["k"] * t + 0.0 * s[site.target]}
-
-
 def _coupling_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
     target, source = coupled(site)
     return {target: c["k"] * s[source]}
@@ -86,24 +58,29 @@ def _periodic_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Valu
     return {site.target: wave + 0.0 * s[site.target]}
 
 
+def _slew_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
+    rate = own[site.target]
+    return {site.target: np.minimum(np.maximum(rate, -c["r"]), c["r"]) - rate}
+
+
 offset = RateFamily(
     name="offset",
     equation="s' = model + c",
     sentence="{target} drifts by {c}",
     targets=places.states,
-    quantities=_constant,
+    quantities=lambda site: (Quantity("c", per(site.unit(site.target))),),
     lookalikes=("input_bias", "trend", "drift_world", "sensor_bias", "parameter"),
-    rate=_offset_rate,
+    rate=lambda s, a, own, t, c, site: {site.target: c["c"] + 0.0 * s[site.target]},
 )
 
 rate_gain = RateFamily(
     name="rate_gain",
     equation="s' = (1 + g) model",
     sentence="{target} changes {g%faster|slower} than modelled",
-    targets=lambda model: [n for n in model.state_names if n not in places.position(model)],
-    quantities=_gain,
+    targets=places.but_position,
+    quantities=lambda site: (Quantity("g", "1", low=-1.5, high=5.0),),
     lookalikes=("input_gain", "understeer", "parameter", "sensor_scale"),
-    rate=_gain_rate,
+    rate=lambda s, a, own, t, c, site: {site.target: c["g"] * own[site.target]},
     needs_own=True,
 )
 
@@ -112,10 +89,10 @@ trend = RateFamily(
     equation="s' = model + k t",
     sentence="{target} drifts more and more, by {k}",
     targets=places.dynamic,
-    quantities=_trend,
+    quantities=lambda site: (Quantity("k", per(per(site.unit(site.target)))),),
     lookalikes=("input_fade", "offset", "periodic"),
     vague=0.5,
-    rate=_trend_rate,
+    rate=lambda s, a, own, t, c, site: {site.target: c["k"] * t + 0.0 * s[site.target]},
     timed=True,
 )
 
@@ -142,33 +119,16 @@ periodic = RateFamily(
     timed=True,
 )
 
-
-SLEW_PARTS = 4  # of a step
-
-
-def _slew(site: Site) -> tuple[Quantity, ...]:
-    spread = site.scales.spread(site.target)
-    fastest = spread / site.scales.dt
-    grid = tuple(float(v) for v in np.geomspace(0.5 * fastest, 0.1 * spread, 12))
-    unit = per(site.unit(site.target))
-    return (Quantity("r", unit, grid, 0.0, np.inf, start=2 * fastest, places=6),)
-
-
-def _slew_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
-    rate = own[site.target]
-    return {site.target: np.minimum(np.maximum(rate, -c["r"]), c["r"]) - rate}
-
-
 slew_limit = RateFamily(
     name="slew_limit",
     equation="s' = clip(model, -r, r)",
     sentence="{target} moves by at most {r}",
     targets=places.following,
-    quantities=_slew,
+    quantities=lambda site: speed_limit(site, per(site.unit(site.target))),
     lookalikes=("rate_limit", "first_order_lag", "saturation"),
     rate=_slew_rate,
     needs_own=True,
-    parts=SLEW_PARTS,
+    parts=4,
 )
 
 FAMILIES = (offset, rate_gain, trend, coupling, periodic, slew_limit)

@@ -3,9 +3,16 @@
 Third parties add families by the entry point group `grounded.effects` (read once, by the command
 line's options.py); here a library is a plain value.
 
-The model is right in form: one of its own parameters differs from its nominal value.
+To the families of the other modules it adds `parameter`, p = nominal + d: the model is right in
+form, and one of its own parameters differs from its nominal value.
 
-p = nominal + d
+Where two effects are the very same thing in a model, the name is offered that says most. A constant
+rate on a state may be just what a bias of an input does, or a parameter of the model; a gain of a
+rate just what a time constant or a wheelbase does. Such a rate has no name of its own (`aliases`):
+
+    offset:s, rate_gain:s   dropped where   d rate / d p  or  d rate / d u   is k times its own rate
+
+at every one of many states and inputs, and at other parameters too.
 """
 
 from __future__ import annotations
@@ -15,26 +22,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from grounded.effects import (
-    friction,
-    geometry,
-    input,
-    memory,
-    places,
-    rate,
-    sensor,
-)
-from grounded.effects.aliases import aliases
+from grounded.effects import actuator, friction, geometry, places, rate, sensor
 from grounded.effects.family import Effect, Family, ParamFamily, Quantity, RateFamily, Scales, Site
 from grounded.errors import GroundedError, nearest
-from grounded.model import Model
+from grounded.frozen import Array
+from grounded.model import Model, Param
+
+
+def _bounds(param: Param) -> tuple[float, float]:
+    low = -np.inf if param.low is None else param.low
+    return low, np.inf if param.high is None else param.high
 
 
 def _shift(site: Site) -> tuple[Quantity, ...]:
     param = site.model.params[site.target]
-    low = -np.inf if param.low is None else param.low - param.value
-    high = np.inf if param.high is None else param.high - param.value
-    return (Quantity("d", param.unit, low=low, high=high),)
+    low, high = _bounds(param)
+    return (Quantity("d", param.unit, low=low - param.value, high=high - param.value),)
 
 
 parameter = ParamFamily(
@@ -47,8 +50,7 @@ parameter = ParamFamily(
 )
 
 BUILT_IN: tuple[Family, ...] = (
-    *input.FAMILIES,
-    *memory.FAMILIES,
+    *actuator.FAMILIES,
     *rate.FAMILIES,
     *friction.FAMILIES,
     *geometry.FAMILIES,
@@ -79,12 +81,8 @@ class Library:
         Raises:
             GroundedError: for a name that is not in it.
         """
-        gone = set(names)
-        known = [family.name for family in self.families]
-        for name in gone:
-            if name not in known:
-                raise GroundedError(f"there is no effect family '{name}': {nearest(name, known)}")
-        return Library(tuple(family for family in self.families if family.name not in gone))
+        gone = [self.family(name) for name in set(names)]
+        return Library(tuple(family for family in self.families if family not in gone))
 
     def family(self, name: str) -> Family:
         """The family of that name.
@@ -116,7 +114,7 @@ class Library:
 
     def candidates(self, model: Model, scales: Scales | None = None) -> tuple[Effect, ...]:
         """Every effect that can apply to a model, in the library's order."""
-        found = []
+        found, offered = [], [family.name for family in self.families]
         idle, outright = derived_states(model), outright_states(model)
         integrals, same = integrated_states(model), aliases(model, idle | outright)
         for family in self.families:
@@ -128,15 +126,10 @@ class Library:
                     continue
                 if driven[2] and integrals.get(driven[0]) == driven[2]:
                     continue  # it would be rate_gain under another name
-                if _offered(self, same.get(f"{family.name}:{target}", "")):
+                if same.get(f"{family.name}:{target}", "").partition(":")[0] in offered:
                     continue
                 found.append(_build(family, target, model, scales or Scales()))
         return tuple(found)
-
-
-def _offered(library: Library, name: str) -> bool:
-    """Whether the family of an effect is in the library."""
-    return name.partition(":")[0] in [family.name for family in library.families]
 
 
 def _build(family: Family, target: str, model: Model, scales: Scales) -> Effect:
@@ -152,10 +145,7 @@ def derived_states(model: Model) -> set[str]:
     named = places.role(model, "heading_rate")
     if not named:
         return set()
-    rng = np.random.default_rng(0)
-    x = rng.uniform(0.2, 1.0, (3, model.n))
-    u = rng.uniform(0.2, 1.0, (3, model.m))
-    f_x, _ = model.system.linearise(x, u, model.values, 0.01)
+    f_x, _ = model.system.linearise(*places.samples(model), model.values, 0.01)
     i = model.state_names.index(named[0])
     others = np.delete(f_x[:, :, i], i, axis=1)
     return {named[0]} if float(np.abs(others).max()) < 1e-12 else set()
@@ -163,8 +153,7 @@ def derived_states(model: Model) -> set[str]:
 
 def integrated_states(model: Model) -> dict[str, str]:
     """States whose rate is another state, times a constant: an angle and its angular velocity."""
-    rng, dt = np.random.default_rng(0), 1e-6
-    x, u = rng.uniform(0.2, 1.0, (3, model.n)), rng.uniform(0.2, 1.0, (3, model.m))
+    (x, u), dt = places.samples(model), 1e-6
     f_x, f_u = model.system.linearise(x, u, model.values, dt)
     rates = (f_x - np.eye(model.n)) / dt
     moved = (model.system.step(x, u, model.values, dt) - x) / dt
@@ -183,9 +172,7 @@ def integrated_states(model: Model) -> dict[str, str]:
 
 def outright_states(model: Model) -> set[str]:
     """States that the model sets outright, whatever they were: they have no rate of their own."""
-    rng = np.random.default_rng(0)
-    x, u = rng.uniform(0.2, 1.0, (3, model.n)), rng.uniform(0.2, 1.0, (3, model.m))
-    f_x, _ = model.system.linearise(x, u, model.values, 0.01)
+    f_x, _ = model.system.linearise(*places.samples(model), model.values, 0.01)
     own = np.abs(f_x[:, np.arange(model.n), np.arange(model.n)]).max(axis=0)
     return {name for name, size in zip(model.state_names, own, strict=True) if size < 1e-9}
 
@@ -196,3 +183,68 @@ def partner(model: Model, target: str) -> str | None:
         return None
     idle = derived_states(model)
     return next(iter(idle), None)
+
+
+SAMPLES = 40
+SAME = 1e-7  # of the squared length: what may differ
+SHORT = 1e-5  # [s], a step that shows the rates
+BESIDE = 1.3  # times the parameters: where the slopes must agree too
+
+
+def aliases(model: Model, idle: Iterable[str] = ()) -> dict[str, str]:
+    """Names of rate effects that are the same as another effect: {dropped: kept}.
+
+    Args:
+        model: whose rates.
+        idle: states that are carried along or set outright; they are not compared.
+    """
+    rng, n = np.random.default_rng(0), model.n
+    x, u = rng.uniform(-1, 1, (SAMPLES, n)), rng.uniform(-1, 1, (SAMPLES, model.m))
+    kept = [i for i, name in enumerate(model.state_names) if name not in set(idle)]
+    found: dict[str, str] = {}
+    beside = np.where(model.values == 0, 0.1, BESIDE * model.values)
+    here, there = (_Rates(model, x, u, p, kept) for p in (model.values, beside))
+    for name, own in here.named.items():
+        for other, slope in here.slopes.items():
+            same = _along(slope, own) and _along(there.slopes[other], there.named[name])
+            if same and name not in found and _free(model, other):
+                found[name] = other
+    return found
+
+
+class _Rates:
+    """Rates (SAMPLES, n) that named rate effects add, slopes of the model's rates by name."""
+
+    def __init__(self, model: Model, x: Array, u: Array, p: Array, kept: list[int]) -> None:
+        own = (model.system.step(x, u, p, SHORT) - x) / SHORT
+        _, f_u, f_p = model.system.sensitivities(x, u, p, SHORT)
+        self.named: dict[str, Array] = {}
+        for i in kept:
+            one = np.zeros_like(own)
+            one[:, i] = 1.0
+            name = model.state_names[i]
+            self.named |= {
+                f"offset:{name}": one[:, kept],
+                f"rate_gain:{name}": (one * own)[:, kept],
+            }
+        inputs = {f"input_bias:{n}": f_u[:, kept, j] for j, n in enumerate(model.input_names)}
+        params = {f"parameter:{n}": f_p[:, kept, k] for k, n in enumerate(model.param_names)}
+        self.slopes = inputs | params
+
+
+def _along(slope: Array, own: Array) -> bool:
+    """Whether one is a multiple of the other, neither zero."""
+    a, b = slope.reshape(-1), own.reshape(-1)
+    lengths = float(a @ a) * float(b @ b)
+    return bool(lengths > 0 and np.isfinite(lengths) and (a @ b) ** 2 > (1 - SAME) * lengths)
+
+
+def _free(model: Model, name: str) -> bool:
+    """Whether a parameter may halve and double, so that it can stand for the effect."""
+    family, _, target = name.partition(":")
+    if family != "parameter":
+        return True
+    param = model.params[target]
+    low, high = _bounds(param)
+    ends = (0.5 * param.value, 2 * param.value) if param.value else (-0.05, 0.05)
+    return bool(low <= min(ends) and high >= max(ends))

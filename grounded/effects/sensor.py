@@ -8,27 +8,10 @@ changes nothing.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from grounded.effects import places
-from grounded.effects.family import (
-    Quantity,
-    RateFamily,
-    SensorDelayFamily,
-    SensorFamily,
-    Site,
-    Values,
-)
-
-
-def _scale(site: Site) -> tuple[Quantity, ...]:
-    return (Quantity("k", "1", low=-0.8, high=4.0),)
-
-
-def _bias(site: Site) -> tuple[Quantity, ...]:
-    return (Quantity("b", site.unit(site.target)),)
+from grounded.effects.family import Quantity, RateFamily, SensorDelayFamily, SensorFamily, Site
 
 
 def _delay(site: Site) -> tuple[Quantity, ...]:
@@ -38,18 +21,14 @@ def _delay(site: Site) -> tuple[Quantity, ...]:
     return (Quantity("d", "s", grid, 0.0, longest, places=4),)
 
 
-def _odometry_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
-    return {name: c["k"] * own[name] for name in site.targets}
-
-
 odometry_scale = RateFamily(
     name="odometry_scale",
     equation="x' = (1 + k) model, y' = (1 + k) model",
     sentence="distances are {k%longer|shorter} than modelled",
     targets=lambda model: ["+".join(p)] if (p := places.position(model)) else [],
-    quantities=_scale,
+    quantities=lambda site: (Quantity("k", "1", low=-0.8, high=4.0),),
     lookalikes=("sensor_scale", "rate_gain", "drift_body"),
-    rate=_odometry_rate,
+    rate=lambda s, a, own, t, c, site: {name: c["k"] * own[name] for name in site.targets},
     needs_own=True,
 )
 
@@ -57,8 +36,8 @@ sensor_bias = SensorFamily(
     name="sensor_bias",
     equation="y = s + b",
     sentence="the log of {target} is off by {b}",
-    targets=lambda model: [n for n in model.state_names if n not in places.position(model)],
-    quantities=_bias,
+    targets=places.but_position,
+    quantities=lambda site: (Quantity("b", site.unit(site.target)),),
     lookalikes=("offset", "input_bias", "drift_body"),
     measure=lambda value, c: value + c["b"],
     recover=lambda value, c: value - c["b"],
@@ -68,10 +47,8 @@ sensor_scale = SensorFamily(
     name="sensor_scale",
     equation="y = (1 + k) s",
     sentence="the log of {target} is {k%too large|too small}",
-    targets=lambda model: [
-        n for n in model.state_names if n not in model.angles and n not in places.position(model)
-    ],
-    quantities=_scale,
+    targets=lambda model: [n for n in places.but_position(model) if n not in model.angles],
+    quantities=lambda site: (Quantity("k", "1", low=-0.8, high=4.0),),
     lookalikes=("odometry_scale", "rate_gain", "input_gain", "parameter"),
     measure=lambda value, c: (1 + c["k"]) * value,
     recover=lambda value, c: value / (1 + c["k"]),

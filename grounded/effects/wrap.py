@@ -14,16 +14,8 @@ the rate of a model that has another of them in it. A limit acts inside the adde
 
 It is a `step` model in plain NumPy, so that it is traced and compiled where the original was.
 Memory (a lag's output, a queue, a clock) becomes further states, all of them functions of the
-commands and the measured states: `memory_of` (recall.py) recovers them along a recorded trial.
-
-In which order several effects act: one rule for prediction, for probes, for adopted models.
-
-    command -> input effects as they were claimed -> transport delays -> model -> sensor effects
-
-A transport delay commutes with all that does not depend on time, so it may as well act last; there
-a fraction of a step blends two samples of what is delivered, not two commands that a nonlinear
-effect has yet to see. Of two effects the one that is wrapped LAST acts FIRST on a command, so
-wrapping goes from the model outwards: parameters, limits of rates, rates, sensors, inputs.
+commands and the measured states: `memory_of` recovers them along a recorded trial. In which order
+several effects are wrapped: `wrapping_order`.
 """
 
 from __future__ import annotations
@@ -36,7 +28,6 @@ import numpy as np
 from grounded.compile.names import Named
 from grounded.effects.family import (
     Effect,
-    Family,
     InputFamily,
     MemoryFamily,
     ParamFamily,
@@ -47,7 +38,9 @@ from grounded.effects.family import (
 )
 from grounded.effects.registry import partner
 from grounded.errors import GroundedError
+from grounded.frozen import Array
 from grounded.model import Model, Param
+from grounded.trial import Trial
 
 Step = Callable[[Any, Any, Any, Any], dict[str, Any]]
 
@@ -325,26 +318,34 @@ def _sensor_delay_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, 
     return step, dict.fromkeys(memory, model.states[target])
 
 
-def acting_order(families: Sequence[Family]) -> list[int]:
-    """Indices of the effects on inputs, the one that acts first on a command first."""
-    own = [i for i, f in enumerate(families) if isinstance(f, InputFamily | MemoryFamily)]
-    return sorted(own, key=lambda i: _transports(families[i]))
+def memory_of(wrapped: Model, base: Model, trial: Trial) -> Array:
+    """The memory states along a recorded trial, (T + 1, wrapped.n - base.n).
+
+    They start at what held before t = 0 (the held input, the first logged value, a clock at zero)
+    and follow the commands and the logged states.
+    """
+    extra = wrapped.state_names[base.n :]
+    now = memory_start(wrapped, base, trial)
+    found = [now]
+    for t in range(trial.steps):
+        x = np.concatenate([trial.states[t], now])[None]
+        after = wrapped.system.step(x, trial.inputs[t][None], wrapped.values, trial.dt)
+        now = after[0, base.n :]
+        found.append(now)
+    return np.array(found).reshape(trial.steps + 1, len(extra))
 
 
-def wrapping_order(families: Sequence[Family]) -> list[int]:
-    """Indices of all effects, the one that is wrapped first (the innermost) first."""
-    inputs = acting_order(families)
-    rest = [i for i in range(len(families)) if i not in inputs]
-    return [*sorted(rest, key=lambda i: _depth(families[i])), *reversed(inputs)]
-
-
-def _transports(family: Family) -> bool:
-    return isinstance(family, MemoryFamily) and family.transport
-
-
-def _depth(family: Family) -> int:
-    if isinstance(family, ParamFamily):
-        return 0
-    if isinstance(family, RateFamily):
-        return 1 if family.parts else 2
-    return 3
+def memory_start(wrapped: Model, base: Model, trial: Trial) -> Array:
+    """The memory states at t = 0, (wrapped.n - base.n,)."""
+    held = np.zeros(base.m) if trial.start_inputs is None else trial.start_inputs
+    start = []
+    for name in wrapped.state_names[base.n :]:
+        inputs = [i for i, n in enumerate(base.input_names) if name.startswith(f"{n}_")]
+        states = [i for i, n in enumerate(base.state_names) if name.startswith(f"{n}_true")]
+        if name.endswith("_clock"):
+            start.append(0.0)
+        elif states:
+            start.append(float(trial.states[0, states[-1]]))
+        else:
+            start.append(float(held[inputs[-1]]) if inputs else 0.0)
+    return np.array(start)

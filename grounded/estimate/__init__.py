@@ -8,17 +8,22 @@
 
 Everything works for any model (also a black-box simulator), any measurement function, lost samples,
 sensors and controllers of different rates, transport delays of any fraction of a step.
+
+Read `trials` first (the front door), then `measurement` and `record` (what goes in), `filter` (the
+equations) with `steps` (the model in it), `recursion` (NumPy, forwards and back) and `kernel` (the
+same as machine code), `likelihood` (the noise). `tracker` stands by itself.
 """
 
 from __future__ import annotations
 
-from grounded.estimate.consistency import Consistency, consistency
 from grounded.estimate.likelihood import NoiseEstimate
-from grounded.estimate.measurement import Measurement, Noise, of_function, of_states
+from grounded.estimate.measurement import Measurement, NoiseStd, of_function, of_states
 from grounded.estimate.record import Record, cut, merged, record_of
 from grounded.estimate.tracker import Tracker
 from grounded.estimate.trials import (
+    Consistency,
     Estimated,
+    consistency,
     filter_trials,
     noise_of,
     smooth_trials,
@@ -28,8 +33,8 @@ __all__ = [
     "Consistency",
     "Estimated",
     "Measurement",
-    "Noise",
     "NoiseEstimate",
+    "NoiseStd",
     "Record",
     "Tracker",
     "consistency",

@@ -21,7 +21,7 @@ along a whole track in one call, a compiled linear filter runs about that track,
 states are the next track. Sweep s is exact for the first s steps, and in practice everywhere after
 two or three, because a track of a neighbouring fit is at hand.
 
-Notation as above; arrays are time first, (T + 1, B, ...): see `grounded.estimate.batch`.
+Notation as above; arrays are time first, (T + 1, B, ...): see `grounded.estimate.record`.
 Source: Särkkä, Bayesian Filtering and Smoothing (2013), ch. 5; Ljung, System Identification, ch. 7.
 """
 
@@ -31,11 +31,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from grounded.estimate import lanes
-from grounded.estimate.batch import Batch
-from grounded.estimate.filtered import Filtered
-from grounded.estimate.measurement import Measurement, Noise
-from grounded.estimate.recursion import recursion
+from grounded.estimate import kernel
+from grounded.estimate.measurement import Measurement, NoiseStd
+from grounded.estimate.record import RecordBatch
+from grounded.estimate.recursion import Filtered, recursion
 from grounded.estimate.steps import ModelSteps
 from grounded.frozen import Array
 
@@ -45,10 +44,10 @@ STILL = 1e-3  # [nats] or the likelihood; at a kink a track may flip for ever,
 ENOUGH = 0.05  # [nats] and then this is enough after SWEEPS
 
 
-def run(
-    batch: Batch,
+def filter_batch(
+    batch: RecordBatch,
     measurement: Measurement,
-    noise: Noise,
+    noise: NoiseStd,
     steps: ModelSteps,
     about: Filtered | None = None,
 ) -> Filtered:
@@ -62,7 +61,7 @@ def run(
         about: a pass with nearly the same model and noise, where sweeps begin.
     """
     (T, B), n = batch.dt.shape, batch.start.shape[1]
-    if lanes.usable(T, n, measurement.ny):
+    if kernel.usable(T, n, measurement.ny):
         if about is not None and about.x.shape == (T + 1, B, n):
             start = about.x[:-1], about.std[:-1], about.x_prior
         elif measurement.states == tuple(range(n)) and batch.seen[1:].all():
@@ -80,9 +79,9 @@ def run(
 
 
 def _sweeps(
-    batch: Batch,
+    batch: RecordBatch,
     measurement: Measurement,
-    noise: Noise,
+    noise: NoiseStd,
     steps: ModelSteps,
     track: Array,
     std: Array,
@@ -99,15 +98,15 @@ def _sweeps(
             H, e0 = _seen(batch, measurement, xbar)
             if not all(np.isfinite(array).all() for array in (f, A, H, e0)):
                 return None
-            lin = lanes.linearised(batch, A, f, more, track, H, e0, xbar)
-            done = lanes.forward(lin, noise)
+            lin = kernel.in_lanes(batch, A, f, more, track, H, e0, xbar)
+            done = kernel.forward(lin, noise)
             if not np.isfinite(done.loglik):
                 return None
-            x = lanes.unpack(done.out["x"], B, n)
-            x_prior = lanes.unpack(done.out["x_prior"], B, n)
-            P = lanes.unpack(done.out["P_prior"], B, n, n)
+            x = kernel.unpack(done.out["x"], B, n)
+            x_prior = kernel.unpack(done.out["x_prior"], B, n)
+            P = kernel.unpack(done.out["P_prior"], B, n, n)
             wide = np.sqrt(np.abs(np.diagonal(P, axis1=-2, axis2=-1))) + 1e-12
-            after = lanes.unpack(lanes.posterior_std(done), B, n)
+            after = kernel.unpack(kernel.posterior_std(done), B, n)
             moved = max(
                 float(np.max(np.abs(x[:-1] - track) / wide[:-1])),
                 float(np.max(np.abs(x_prior - xbar) / wide)),
@@ -126,7 +125,7 @@ def _sweeps(
     return None
 
 
-def _seen(batch: Batch, measurement: Measurement, x: Array) -> tuple[Array, Array]:
+def _seen(batch: RecordBatch, measurement: Measurement, x: Array) -> tuple[Array, Array]:
     """H (T + 1, B, ny, n) and y - h(x) (T + 1, B, ny) along a track, zero where not seen."""
     flat = x.reshape(-1, x.shape[-1])
     e = measurement.innovation(batch.y, measurement.function(flat).reshape(batch.y.shape))

@@ -17,15 +17,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from grounded.compile import System
-from grounded.estimate import lanes
-from grounded.estimate.batch import Batch, batch_of
-from grounded.estimate.filter import run
-from grounded.estimate.filtered import Filtered
-from grounded.estimate.measurement import Measurement, Noise
-from grounded.estimate.record import Record
-from grounded.estimate.recursion import recursion
-from grounded.estimate.smoother import smooth
-from grounded.estimate.steps import ModelSteps, fixed_steps
+from grounded.estimate import kernel
+from grounded.estimate.filter import filter_batch
+from grounded.estimate.measurement import Measurement, NoiseStd
+from grounded.estimate.record import Record, RecordBatch
+from grounded.estimate.recursion import Filtered, fixed_steps, recursion, smooth
+from grounded.estimate.steps import ModelSteps
 from grounded.frozen import Array
 
 FLOOR = 1e-4  # of the visible scatter: below it a std is zero
@@ -39,7 +36,7 @@ ROWS = 8_000  # more samples than this teach the noise little
 class NoiseEstimate:
     """The noise, its log-likelihood, what is seen of it, and how the search ended."""
 
-    noise: Noise
+    noise: NoiseStd
     loglik: float
     process_seen: tuple[bool, ...]  # (n,) False: at the floor, or nothing says anything about it
     measurement_seen: tuple[bool, ...]  # (ny,)
@@ -49,9 +46,9 @@ class NoiseEstimate:
 def maximum_likelihood(
     system: System,
     p: Array,
-    batch: Batch,
+    batch: RecordBatch,
     measurement: Measurement,
-    start: Noise,
+    start: NoiseStd,
     *,
     rounds: int = ROUNDS,
     wide: bool = False,
@@ -76,7 +73,7 @@ def maximum_likelihood(
             status = best.status
             break
         trial, seen = _climb(batch, measurement, noise, best, start)
-        after = run(batch, measurement, trial, steps, best)
+        after = filter_batch(batch, measurement, trial, steps, best)
         gain = after.loglik - best.loglik
         if gain > 0:
             noise, best = trial, after
@@ -91,13 +88,13 @@ def maximum_likelihood(
 
 
 def _expectation(
-    batch: Batch, measurement: Measurement, noise: Noise, steps: ModelSteps, rounds: int
-) -> tuple[Noise, Filtered]:
+    batch: RecordBatch, measurement: Measurement, noise: NoiseStd, steps: ModelSteps, rounds: int
+) -> tuple[NoiseStd, Filtered]:
     """Expectation-maximisation: each variance becomes what the smoother expects of it.
 
     Slow near the end, but sure-footed far from it, where it also mends the track.
     """
-    best = run(batch, measurement, noise, steps)
+    best = filter_batch(batch, measurement, noise, steps)
     steps_seen = max(int(batch.valid.sum()), 1)
     samples = np.maximum(batch.seen.sum(axis=(0, 1)), 1)
     for _ in range(rounds):
@@ -110,22 +107,22 @@ def _expectation(
         share = np.concatenate([np.full(n, steps_seen), samples])
         factor = np.clip(1 + 2 * slope / share, 1e-2, 1e2)
         std = np.sqrt(variance * factor)
-        trial = Noise(std[:n], std[n:], noise.dt)
-        after = run(batch, measurement, trial, steps, best)
+        trial = NoiseStd(std[:n], std[n:], noise.dt)
+        after = filter_batch(batch, measurement, trial, steps, best)
         if not after.loglik > best.loglik:
             break
         noise, best = trial, after
     return noise, best
 
 
-def first_noise(batch: Batch, measurement: Measurement, dt: float) -> Noise:
+def first_noise(batch: RecordBatch, measurement: Measurement) -> NoiseStd:
     """A rough noise, from how smooth the measurements are: robust, and only a place to begin.
 
     Second differences of a smooth signal are measurement noise (times sqrt 6), fourth differences
     (times sqrt 70) also of one that turns; a tenth of the first differences is what the model may
     miss in a step.
     """
-    n = batch.start.shape[1]
+    n, dt = batch.start.shape[1], round(float(np.median(batch.dt[batch.valid])), 9)
     r, q = np.empty(measurement.ny), np.full(n, 0.05 * np.sqrt(dt))
     for c, i in enumerate(measurement.states):
         y = np.where(batch.seen[..., c], batch.y[..., c], np.nan)
@@ -136,7 +133,7 @@ def first_noise(batch: Batch, measurement: Measurement, dt: float) -> Noise:
         r[c] = max(min(_spread(np.diff(y, n=k, axis=0)) / v**0.5 for k, v in orders), least)
         if i >= 0 and np.isfinite(one).any():
             q[i] = max(0.1 * _spread(one), least)
-    return Noise(q, r, dt)
+    return NoiseStd(q, r, dt)
 
 
 def enough(records: Sequence[Record], rng: np.random.Generator | None = None) -> list[Record]:
@@ -154,8 +151,12 @@ def enough(records: Sequence[Record], rng: np.random.Generator | None = None) ->
 
 
 def _climb(
-    batch: Batch, measurement: Measurement, noise: Noise, about: Filtered, start: Noise
-) -> tuple[Noise, Array]:
+    batch: RecordBatch,
+    measurement: Measurement,
+    noise: NoiseStd,
+    about: Filtered,
+    start: NoiseStd,
+) -> tuple[NoiseStd, Array]:
     """The best noise for a fixed linearisation, and which variances the data see."""
     from scipy.optimize import minimize
 
@@ -163,11 +164,11 @@ def _climb(
 
     def cost(theta: Array) -> tuple[float, Array]:
         std = np.exp(0.5 * theta)
-        there = Noise(std[:n], std[n:], dt)
+        there = NoiseStd(std[:n], std[n:], dt)
         if about.done is not None:
-            done = lanes.forward(about.done.linearised, there)
+            done = kernel.forward(about.done.linearised, there)
             loglik = done.loglik
-            slope = lanes.variance_slopes(done, there) if np.isfinite(loglik) else None
+            slope = kernel.variance_slopes(done, there) if np.isfinite(loglik) else None
         else:
             filtered = recursion(batch, measurement, there, fixed_steps(about))
             loglik = filtered.loglik
@@ -183,13 +184,13 @@ def _climb(
     options = {"maxiter": 60, "ftol": 1e-9, "gtol": 1e-6}
     found = minimize(cost, theta, jac=True, method="L-BFGS-B", bounds=bounds, options=options).x
     std = np.exp(0.5 * found)
-    return Noise(std[:n], std[n:], dt), found > low + 2.0
+    return NoiseStd(std[:n], std[n:], dt), found > low + 2.0
 
 
-def _slope(filtered: Filtered, batch: Batch, noise: Noise) -> Array:
+def _slope(filtered: Filtered, batch: RecordBatch, noise: NoiseStd) -> Array:
     """Slope of the log-likelihood by the log variances, (n + ny,)."""
     if filtered.done is not None:
-        return lanes.variance_slopes(filtered.done, noise)
+        return kernel.variance_slopes(filtered.done, noise)
     back = smooth(filtered, batch)
     by_q = np.sum(back.process_slope * batch.dt[..., None] / noise.dt, axis=(0, 1))
     by_r = np.sum(back.measurement_slope, axis=(0, 1))
@@ -205,17 +206,3 @@ def _spread(values: Array) -> float:
         return 0.0
     mad = 1.4826 * float(np.median(np.abs(finite - np.median(finite))))
     return mad if mad > 0 else float(np.std(finite))
-
-
-def noise_of_records(
-    system: System,
-    p: Array,
-    records: Sequence[Record],
-    measurement: Measurement,
-    latency: Array,
-    rng: np.random.Generator | None = None,
-) -> NoiseEstimate:
-    """Noise of records from scratch; see `grounded.estimate.noise_of` for the arguments."""
-    batch = batch_of(enough(records, rng), measurement, system.n, latency)
-    dt = round(float(np.median(batch.dt[batch.valid])), 9)
-    return maximum_likelihood(system, p, batch, measurement, first_noise(batch, measurement, dt))

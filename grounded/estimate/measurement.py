@@ -1,13 +1,10 @@
-"""Measurement: what the sensors see of a state, y = h(x) + v.
-
-The default measures states as they are. A camera that sees two markers, a gyroscope, an encoder
-are a function h of states (N, n) -> (N, ny), with its Jacobian or without (then it is differenced).
-
-Noise: how far a state strays in a step, and how far a measurement strays from the state.
+"""Measurement: what the sensors see of a state, and how far noise makes both stray.
 
     x_{t+1} = f(x_t, u_t) + w_t,  w ~ N(0, diag(process^2)),     y = h(x) + v,  v ~ N(0, diag(r^2))
 
-Both are the data's to say: see `grounded.estimate.likelihood`.
+The default measures states as they are. A camera that sees two markers, a gyroscope, an encoder
+are a function h of states (N, n) -> (N, ny), with its Jacobian or without (then it is differenced).
+The noise is the data's to say: see `grounded.estimate.likelihood`.
 """
 
 from __future__ import annotations
@@ -120,7 +117,7 @@ def _differenced(function: Callable[[Array], Array]) -> Callable[[Array], Array]
 
 
 @dataclass(frozen=True, eq=False)
-class Noise:
+class NoiseStd:
     """Standard deviations, in the units of the states and of the channels.
 
     Args:

@@ -22,8 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from grounded.compile import System
-from grounded.estimate.batch import Batch
-from grounded.estimate.filtered import Filtered
+from grounded.estimate.record import RecordBatch
 from grounded.frozen import Array
 
 # t, x (B, n) and its standard deviation (B, n) -> f (B, n), A (B, n, n), added variance (B, n)
@@ -47,7 +46,7 @@ class ModelSteps:
 
     system: System
     p: Array
-    batch: Batch
+    batch: RecordBatch
     wide: bool = False
 
     def at(self, t: int, x: Array, std: Array) -> tuple[Array, Array, Array]:
@@ -107,14 +106,3 @@ class ModelSteps:
                 self.system.step(down, u, self.p, h),
                 reach[:, i],
             )
-
-
-def fixed_steps(filtered: Filtered) -> Advance:
-    """The linearisation of an earlier pass, f_t + A_t (x - x_t)."""
-
-    def advance(t: int, x: Array, std: Array) -> tuple[Array, Array, Array]:
-        A = filtered.A[t]
-        moved = (A @ (x - filtered.x[t])[..., None])[..., 0]
-        return filtered.f[t] + moved, A, filtered.more[t]
-
-    return advance

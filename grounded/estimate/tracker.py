@@ -15,7 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from grounded.errors import GroundedError
-from grounded.estimate.measurement import Measurement, Noise, of_states
+from grounded.estimate.measurement import Measurement, NoiseStd, of_states
 from grounded.estimate.record import Record
 from grounded.frozen import Array
 from grounded.model import Model
@@ -48,7 +48,7 @@ class Tracker:
     def __init__(
         self,
         model: Model,
-        noise: Noise,
+        noise: NoiseStd,
         start: Array,
         start_std: Array,
         *,

@@ -1,4 +1,14 @@
-"""The front door for stored trials: a model and trials in, states with their certainty out."""
+"""The front door for stored trials: a model and trials in, states with their certainty out.
+
+`consistency` says whether what the filter claims is true:
+
+    NIS   e_t' S_t^-1 e_t / ny         mean 1 if the innovations are as large as claimed
+    NEES  (x - xhat)' P^-1 (x - xhat) / n    mean 1 if the states are as uncertain as claimed
+    whiteness   correlation of neighbouring whitened innovations, 0 if nothing predictable is left
+
+Each mean is compared with the 95 % band that independent draws would give (chi squared; Bar-Shalom,
+Li & Kirubarajan 2001, ch. 5). States within a trial are correlated, so NEES is judged by trials.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +18,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from grounded.errors import GroundedError
-from grounded.estimate.batch import Batch, batch_of
-from grounded.estimate.filter import run
-from grounded.estimate.filtered import Filtered
-from grounded.estimate.likelihood import NoiseEstimate, noise_of_records
-from grounded.estimate.measurement import Measurement, Noise, of_states
-from grounded.estimate.record import Record, records_of
-from grounded.estimate.smoother import smooth
+from grounded.estimate.filter import filter_batch
+from grounded.estimate.likelihood import NoiseEstimate, enough, first_noise, maximum_likelihood
+from grounded.estimate.measurement import Measurement, NoiseStd, of_states
+from grounded.estimate.record import Record, RecordBatch, batch_of, records_of
+from grounded.estimate.recursion import Filtered, smooth
 from grounded.estimate.steps import ModelSteps
 from grounded.frozen import Array
 from grounded.model import Model
@@ -46,7 +54,7 @@ class Estimated:
 def filter_trials(
     model: Model,
     trials: Sequence[Trial | Record],
-    noise: Noise,
+    noise: NoiseStd,
     *,
     latency: Array | None = None,
     measurement: Measurement | None = None,
@@ -70,7 +78,7 @@ def filter_trials(
 def smooth_trials(
     model: Model,
     trials: Sequence[Trial | Record],
-    noise: Noise,
+    noise: NoiseStd,
     *,
     latency: Array | None = None,
     measurement: Measurement | None = None,
@@ -105,16 +113,18 @@ def noise_of(
     if max(r.steps for r in records) < 2:
         raise GroundedError("noise can't be estimated: no trial has more than two samples")
     delay = np.zeros(model.m) if latency is None else np.asarray(latency, float)
-    return noise_of_records(model.system, model.values, records, measurement, delay, rng)
+    batch = batch_of(enough(records, rng), measurement, model.n, delay)
+    start = first_noise(batch, measurement)
+    return maximum_likelihood(model.system, model.values, batch, measurement, start)
 
 
 def _passed(
     model: Model,
     trials: Sequence[Trial | Record],
-    noise: Noise,
+    noise: NoiseStd,
     latency: Array | None,
     measurement: Measurement | None,
-) -> tuple[list[Record], Batch, Filtered, Measurement]:
+) -> tuple[list[Record], RecordBatch, Filtered, Measurement]:
     measurement = of_states(model) if measurement is None else measurement
     if len(noise.process) != model.n or len(noise.measurement) != measurement.ny:
         raise GroundedError(
@@ -125,11 +135,11 @@ def _passed(
     delay = np.zeros(model.m) if latency is None else np.asarray(latency, float)
     batch = batch_of(records, measurement, model.n, delay)
     steps = ModelSteps(model.system, model.values, batch)
-    return records, batch, run(batch, measurement, noise, steps), measurement
+    return records, batch, filter_batch(batch, measurement, noise, steps), measurement
 
 
 def _estimates(
-    records: list[Record], batch: Batch, filtered: Filtered, x: Array, P: Array
+    records: list[Record], batch: RecordBatch, filtered: Filtered, x: Array, P: Array
 ) -> list[Estimated]:
     found = []
     for b, record in enumerate(records):
@@ -151,3 +161,91 @@ def _estimates(
             Estimated(record.times, x[rows, b], P[rows, b], e, np.asarray(S), loglik, status)
         )
     return found
+
+
+@dataclass(frozen=True, eq=False)
+class Consistency:
+    """Means with the bands in which 95 % of consistent filters lie; NaN where not known."""
+
+    nis: float
+    nis_band: tuple[float, float]
+    lag_one: float
+    lag_one_band: tuple[float, float]
+    nees: float
+    nees_band: tuple[float, float]
+
+    @property
+    def consistent(self) -> bool:
+        """All that is known lies in its band."""
+        bands = (self.nis_band, self.lag_one_band, self.nees_band)
+        pairs = zip((self.nis, self.lag_one, self.nees), bands, strict=True)
+        return all(low <= value <= high for value, (low, high) in pairs if np.isfinite(value))
+
+
+def consistency(
+    estimated: Sequence[Estimated],
+    truth: Sequence[Array] | None = None,
+    states: Sequence[int] | None = None,
+) -> Consistency:
+    """Judges filtered trials.
+
+    Args:
+        estimated: from `filter_trials` (NEES also from `smooth_trials`).
+        truth: the true states of each trial, (T + 1, n), where a simulation knows them.
+        states: index of the states that NEES judges; None: all.
+    """
+    squares, count, products, pairs = 0.0, 0, 0.0, 0
+    for trial in estimated:
+        eps = _whitened(trial)
+        seen = np.isfinite(eps)
+        squares, count = squares + float(np.nansum(eps**2)), count + int(seen.sum())
+        both = seen[1:] & seen[:-1]
+        products += float(np.sum((eps[1:] * eps[:-1])[both]))
+        pairs += int(both.sum())
+    nees, nees_band = np.nan, (np.nan, np.nan)
+    if truth is not None:
+        nees, nees_band = _nees(estimated, truth, states)
+    width = 1.96 / np.sqrt(max(pairs, 1))
+    return Consistency(
+        nis=squares / max(count, 1),
+        nis_band=_band(count),
+        lag_one=products / pairs if pairs else np.nan,
+        lag_one_band=(-width, width),
+        nees=nees,
+        nees_band=nees_band,
+    )
+
+
+def _whitened(trial: Estimated) -> Array:
+    C = np.linalg.inv(np.linalg.cholesky(trial.innovation_covariance))
+    seen = np.isfinite(trial.innovations)
+    eps = (C @ np.where(seen, trial.innovations, 0.0)[..., None])[..., 0]
+    return np.where(seen, eps, np.nan)
+
+
+def _band(count: int) -> tuple[float, float]:
+    if count == 0:
+        return (np.nan, np.nan)
+    from scipy.stats import chi2
+
+    low, high = chi2.ppf([0.025, 0.975], count) / count
+    return (float(low), float(high))
+
+
+def _nees(
+    estimated: Sequence[Estimated], truth: Sequence[Array], states: Sequence[int] | None
+) -> tuple[float, tuple[float, float]]:
+    means = []
+    for trial, x in zip(estimated, truth, strict=True):
+        pick = np.arange(x.shape[1]) if states is None else np.array(states)
+        error = (trial.states - x)[1:, pick]
+        P = trial.covariance[1:][:, pick][:, :, pick]
+        weighted = np.linalg.solve(P, error[..., None])[..., 0]
+        means.append(float(np.mean(np.sum(error * weighted, axis=1))) / len(pick))
+    if len(means) < 2:
+        return float(np.mean(means)), (-np.inf, np.inf)
+    from scipy.stats import t
+
+    quantile = float(t.ppf(0.975, len(means) - 1))
+    width = quantile * float(np.std(means, ddof=1)) / np.sqrt(len(means))
+    return float(np.mean(means)), (1 - width, 1 + width)

@@ -1,25 +1,148 @@
-"""Baselines: how many real trials each method needs, and where it ends.
+"""Baselines: how many real trials each of seven methods needs, and where it ends.
 
-Three manoeuvres of the car, three kinds of error (`bench`), a number of seeds. Of each policy that
-a method keeps, the TRUE utility counts: in a quiet world that of its trial, with noise the mean of
-fresh runs, because a winner's own trials flatter it. Zero is the model's own policy (the eighth
-method: model-based alone), one the optimum that knows the real car.
+    paper        this algorithm as the paper has it: the bias alone, DDP to convergence
+    grounded     this algorithm as the tool recommends it: matched inputs, damped steps
+    refit+bias   the same, the model's parameters refitted to all trials before the bias is added
+    gradient     this algorithm with policy gradient
+    refit        parameters fitted to all trials, the policy solved again, no bias
+    ilc          norm-optimal iterative learning control (`ilc`)
+    differences  model-free: finite differences of the real utility (footnote 5), with BFGS
+
+A method sees the task with the crude model and a function that runs a policy on the real system;
+`differences` is told the true gradient, and charged the trials that differencing would have cost.
+
+They meet on three manoeuvres of the car, three kinds of error (`bench`), a number of seeds. Of each
+policy that a method keeps, the TRUE utility counts: in a quiet world that of its trial, with noise
+the mean of fresh runs, because a winner's own trials flatter it. Zero is the model's own policy
+(the eighth method: model-based alone), one the optimum that knows the real car.
 """
 
 from __future__ import annotations
 
-from collections.abc import MutableMapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Unpack
 
 import numpy as np
 
-from grounded.experiments.bench import KINDS, bench, optimum, standing_still, true_utility
+from grounded.experiments.bench import (
+    KINDS,
+    Bench,
+    Kept,
+    bench,
+    optimum,
+    searched,
+    standing_still,
+    true_utility,
+)
 from grounded.experiments.car_tasks import NAMES
-from grounded.experiments.jobs import Engine, Job, Progress, Table, run_jobs
-from grounded.experiments.methods import METHODS, run_method
+from grounded.experiments.ilc import gradient_of, lifted, update
+from grounded.experiments.jobs import Running, StudyTable, run_study
+from grounded.frozen import Array
+from grounded.model import Model
 from grounded.search.improve import first_policy
 from grounded.search.standing import Options
+from grounded.task import Task
+from grounded.trial import Trial, mean_trial
+
+
+def fitted_model(task: Task, trials: Sequence[Trial]) -> Model:
+    """The model with all its parameters fitted to whole trials."""
+    from grounded.fit import fit
+
+    whole = [trial for trial in trials if trial.finite_steps >= 3]
+    return fit(task, whole, hold_out=0.0).model if whole else task.model
+
+
+def refit_alone(case: Bench, options: Options, rounds: int = 6) -> list[Kept]:
+    """Fit to all trials so far, solve, run, again; the policy of the latest model is kept."""
+    task, trials, kept = case.task, list[Trial](), list[Kept]()
+    for _ in range(rounds):
+        policy, _ = first_policy(task)
+        repeats = [case.real(policy, len(trials) + i) for i in range(options.repeats)]
+        trials += repeats
+        utility = float(np.mean([case.task.utility(trial) for trial in repeats]))
+        kept.append(Kept(len(trials), policy, utility))
+        task = case.task.with_model(fitted_model(case.task, trials))
+    return kept
+
+
+def learning_control(case: Bench, options: Options, rounds: int = 12) -> list[Kept]:
+    """Norm-optimal ILC: every update is taken; after a failed run the step is not repeated."""
+    policy, _ = first_policy(case.task)
+    model = lifted(case.task, policy)
+    kept: list[Kept] = []
+    done = 0
+    for _ in range(rounds):
+        repeats = [case.real(policy, done + i) for i in range(options.repeats)]
+        done += options.repeats
+        utility = float(np.mean([case.task.utility(trial) for trial in repeats]))
+        kept.append(Kept(done, policy, utility))
+        if not np.isfinite(utility):
+            break
+        policy = update(case.task, model, policy, mean_trial(repeats, case.task.model.angle_mask))
+    return kept
+
+
+def differences(case: Bench, options: Options, budget: int = 5000) -> list[Kept]:
+    """BFGS on the real utility by the feed-forward; a gradient costs H m trials.
+
+    The gradient is the true system's own derivative, so no noise spoils it and no step size has to
+    be chosen: a bound from below on what differencing needs.
+    """
+    from scipy.optimize import minimize
+
+    policy, _ = first_policy(case.task)
+    size = policy.feedforward.size
+    kept = [Kept(1, policy, gradient_of(case.truth, policy)[0])]
+    count = {"evaluations": 0, "gradients": 0}
+
+    def cost(v: Array) -> tuple[float, Array]:
+        count["evaluations"] += 1
+        moved = replace(policy, feedforward=v.reshape(policy.feedforward.shape))
+        utility, gradient = gradient_of(case.truth, moved)
+        return (-utility, -gradient.ravel()) if np.isfinite(utility) else (1e12, 0 * v)
+
+    def note(v: Array) -> None:
+        count["gradients"] += 1
+        moved = replace(policy, feedforward=v.reshape(policy.feedforward.shape))
+        spent = 1 + count["evaluations"] + count["gradients"] * size
+        kept.append(Kept(spent, moved, gradient_of(case.truth, moved)[0]))
+        if spent > budget:
+            raise StopIteration
+
+    bounds = np.column_stack(
+        [np.tile(b, case.task.horizon) for b in (case.task.low, case.task.high)]
+    )
+    minimize(
+        cost,
+        np.clip(policy.feedforward.ravel(), *bounds.T),
+        jac=True,
+        method="L-BFGS-B",
+        bounds=bounds,
+        callback=note,
+        options={"maxiter": 200},
+    )
+    return [k for k in kept if k.trials <= budget]
+
+
+def run_method(name: str, case: Bench, options: Options) -> list[Kept]:
+    """The policies that a method keeps, in the order of real trials."""
+    ours: dict[str, dict[str, Any]] = {
+        "paper": {"step": "full", "match_inputs": False},
+        "grounded": {},
+        "refit+bias": {"refit": True},
+        "gradient": {"method": "policy-gradient"},
+    }
+    if name in ours:
+        refit = fitted_model if name == "refit+bias" else None
+        return searched(case, replace(options, **ours[name]), refit=refit)[0]
+    others = {"refit": refit_alone, "ilc": learning_control, "differences": differences}
+    return others[name](case, options)
+
+
+METHODS = ("paper", "grounded", "refit+bias", "gradient", "refit", "ilc", "differences")
+
 
 SHARES = (0.5, 0.9, 0.97, 0.99)
 BUDGET = 40  # trials of every method but finite differences
@@ -49,12 +172,12 @@ class BaselinesResult:
         """Lines by name."""
         return {"shares": list(SHARES), "lines": [vars(line) for line in self.lines]}
 
-    def tables(self) -> list[Table]:
+    def tables(self) -> list[StudyTable]:
         """Median trials to 50/90/97/99 % and the median and worst share reached, by method."""
         cases = dict.fromkeys((line.manoeuvre, line.kind) for line in self.lines)
         return [self._table(manoeuvre, kind) for manoeuvre, kind in cases]
 
-    def _table(self, manoeuvre: str, kind: str) -> Table:
+    def _table(self, manoeuvre: str, kind: str) -> StudyTable:
         rows = []
         chosen = [li for li in self.lines if (li.manoeuvre, li.kind) == (manoeuvre, kind)]
         for method in dict.fromkeys(line.method for line in chosen):
@@ -64,7 +187,7 @@ class BaselinesResult:
             rows.append((method, counts, f"{np.median(finals):.1%}", f"{min(finals):.1%}"))
         title = f"{manoeuvre}, {kind} error: median of {len(chosen) // max(len(rows), 1)} seeds"
         head = ("method", "trials to 50/90/97/99 %", "gap closed", "worst")
-        return Table(title, head, tuple(rows))
+        return StudyTable(title, head, tuple(rows))
 
 
 def median_trials(trials: Sequence[int | None]) -> str:
@@ -79,26 +202,21 @@ def run(
     manoeuvres: Sequence[str] = NAMES,
     kinds: Sequence[str] = KINDS,
     methods: Sequence[str] = METHODS,
-    engine: Engine | None = None,
-    finished: MutableMapping[str, dict[str, Any]] | None = None,
-    progress: Progress | None = None,
+    **how: Unpack[Running],
 ) -> BaselinesResult:
     """Every method on every case; a job is one of them."""
-    jobs = [
-        Job(one, {"method": method, "manoeuvre": manoeuvre, "kind": kind, "seed": seed})
+    cases = (
+        {"method": method, "manoeuvre": manoeuvre, "kind": kind, "seed": seed}
         for manoeuvre in manoeuvres
         for kind in kinds
         for method in methods
         for seed in seeds
         if not (method == "differences" and kind == "noise")  # it was given the true gradient
-    ]
-    found = run_jobs(jobs, engine, finished=finished, progress=progress)
-    return BaselinesResult(
-        tuple(Line(**(result | {"trials": tuple(result["trials"])})) for result in found)
     )
+    return BaselinesResult(run_study(Line, baselines_job, cases, **how))
 
 
-def one(method: str, manoeuvre: str, kind: str, seed: int) -> dict[str, Any]:
+def baselines_job(method: str, manoeuvre: str, kind: str, seed: int) -> dict[str, Any]:
     """A job: one method, one case."""
     case = bench(manoeuvre, kind, seed)
     noisy = kind == "noise"
@@ -121,12 +239,4 @@ def one(method: str, manoeuvre: str, kind: str, seed: int) -> dict[str, Any]:
         for i, level in enumerate(SHARES):
             if reached[i] is None and share >= level:
                 reached[i] = used
-    return {
-        "method": method,
-        "manoeuvre": manoeuvre,
-        "kind": kind,
-        "seed": seed,
-        "trials": reached,
-        "final": share,
-        "used": used,
-    }
+    return vars(Line(method, manoeuvre, kind, seed, tuple(reached), share, used))

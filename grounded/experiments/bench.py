@@ -6,14 +6,13 @@
     noise        structural, and every run scatters as the real car does
 
 The optimum is what the search reaches when it plans with the TRUE model and latency: no method sees
-it. It is a local optimum, like the paper's; `share` of the gap may therefore exceed one.
-
-A plant with more or less of its own noise, and a policy's TRUE utility under it.
+it. It is a local optimum, like the paper's; `share` of the gap may therefore exceed one. What a
+policy is worth is its TRUE utility, the mean of fresh runs (`true_utility`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,16 +22,18 @@ from grounded.experiments.car_tasks import car_task
 from grounded.experiments.real_car import CALIBRATION, SCATTER, real_car
 from grounded.experiments.real_car import LATENCY as TRUE
 from grounded.frozen import Array
+from grounded.model import Model
 from grounded.models.car import model as car
 from grounded.plant import Noise, Plant
 from grounded.policy import Policy, z_difference
-from grounded.search.improve import learn
+from grounded.search.improve import learn, propose
 from grounded.search.standing import Candidate, Options
 from grounded.task import Task
 from grounded.trial import Trial
 
 KINDS = ("parametric", "structural", "noise")
 SPREAD = 0.2
+Refit = Callable[[Task, Sequence[Trial]], Model]
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +87,52 @@ def optimum(case: Bench) -> tuple[Policy, float]:
     standing, _, _ = learn(case.truth, run, options)
     assert standing.incumbent is not None
     return standing.incumbent.candidate.policy, standing.incumbent.utility
+
+
+@dataclass(frozen=True, eq=False)
+class Kept:
+    """A policy that a method would return after so many trials, and the utility it measured."""
+
+    trials: int
+    policy: Policy
+    utility: float
+
+
+def searched(
+    case: Bench, options: Options, *, refit: Refit | None = None, again: bool = False
+) -> tuple[list[Kept], float, int]:
+    """This algorithm on the bench, through the function that proposes candidates.
+
+    Args:
+        case: what is learned.
+        options: of the search.
+        refit: how the model is fitted to the trials so far; None: it is not.
+        again: run the incumbent once more beside every new candidate.
+
+    Returns:
+        The policies kept in turn, the utility that the last one claims, and how many trials ran.
+    """
+    candidates: list[Candidate] = []
+    trials: list[Trial] = []
+    kept: list[Kept] = []
+
+    def run(candidate: Candidate) -> None:
+        trial = case.real(candidate.policy, len(trials))
+        trials.append(replace(trial, candidate=candidate.id))
+
+    while True:
+        proposal = propose(case.task, candidates, trials, options, refit=refit)
+        best = proposal.standing.incumbent
+        if best is not None and (not kept or kept[-1].policy is not best.candidate.policy):
+            kept.append(Kept(len(trials), best.candidate.policy, best.utility))
+        if proposal.candidate is None:
+            assert best is not None
+            return kept, best.utility, len(trials)
+        if proposal.is_new:
+            candidates.append(proposal.candidate)
+            if again and best is not None:
+                run(best.candidate)
+        run(proposal.candidate)
 
 
 def scaled(plant: Plant, level: float) -> Plant:

@@ -12,15 +12,15 @@ knows the real car. One quiet repetition, without scatter, shows the method by i
 
 from __future__ import annotations
 
-from collections.abc import MutableMapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
 from grounded.experiments.bench import Bench, optimum, true_utility
 from grounded.experiments.car_tasks import NAMES, car_task
-from grounded.experiments.jobs import Engine, Job, Progress, Table, improvement, mean_se, run_jobs
+from grounded.experiments.jobs import Running, StudyTable, improvement, mean_text, run_study
 from grounded.experiments.real_car import LATENCY, real_car, real_plant
 from grounded.models.car import model as car
 from grounded.search.improve import learn
@@ -73,7 +73,7 @@ class CarResult:
         figures = {name: some[0].paths for name in NAMES if (some := self.of(name, True))}
         return {"runs": runs, "figures": figures, "paper": PAPER}
 
-    def tables(self) -> list[Table]:
+    def tables(self) -> list[StudyTable]:
         """Improvement and trials beside the paper's, quiet and with scatter."""
         rows = []
         for name in dict.fromkeys(run.manoeuvre for run in self.runs):
@@ -89,15 +89,14 @@ class CarResult:
             "trials an iteration",
             "paper",
         )
-        return [Table(f"RC car, up to {ITERATIONS} iterations", head, tuple(rows))]
+        return [StudyTable(f"RC car, up to {ITERATIONS} iterations", head, tuple(rows))]
 
 
 def _cells(runs: list[CarRun]) -> tuple[str, str, str]:
     if not runs:
         return "", "", ""
-    mean, se = mean_se([run.improvement for run in runs])
     best = np.mean([improvement(run.true[0], run.optimum) for run in runs])
-    shown = f"{mean:.1%}" if len(runs) < 2 else f"{mean:.1%} (±{se:.1%})"
+    shown = mean_text([run.improvement for run in runs])
     if not runs[0].noisy:
         return shown, f"{best:.1%}", f"{runs[0].trials}"
     each = np.mean([run.trials / max(len(run.utilities), 1) for run in runs])
@@ -108,24 +107,16 @@ def run(
     seeds: Sequence[int] = range(4),
     *,
     manoeuvres: Sequence[str] = NAMES,
-    engine: Engine | None = None,
-    finished: MutableMapping[str, dict[str, Any]] | None = None,
-    progress: Progress | None = None,
+    **how: Unpack[Running],
 ) -> CarResult:
     """Every manoeuvre once without scatter and once for each seed with it."""
-    jobs = [
-        Job(one, {"manoeuvre": manoeuvre, "seed": seed, "noisy": noisy})
+    cases = (
+        {"manoeuvre": manoeuvre, "seed": seed, "noisy": noisy}
         for manoeuvre in manoeuvres
         for noisy, some in ((False, [0]), (True, seeds))
         for seed in some
-    ]
-    found = run_jobs(jobs, engine, finished=finished, progress=progress)
-    return CarResult(tuple(_read(result) for result in found))
-
-
-def _read(result: dict[str, Any]) -> CarRun:
-    listed = {key: tuple(result[key]) for key in ("utilities", "true", "alphas")}
-    return CarRun(**(result | listed))
+    )
+    return CarResult(run_study(CarRun, car_job, cases, **how))
 
 
 def real_case(manoeuvre: str, seed: int, noisy: bool) -> Bench:
@@ -136,7 +127,7 @@ def real_case(manoeuvre: str, seed: int, noisy: bool) -> Bench:
     return Bench(task, truth, real_plant(noisy), seed)
 
 
-def one(manoeuvre: str, seed: int, noisy: bool) -> dict[str, Any]:
+def car_job(manoeuvre: str, seed: int, noisy: bool) -> dict[str, Any]:
     """A job: one repetition of one manoeuvre."""
     case = real_case(manoeuvre, seed, noisy)
     options = Options(max_trials=BUDGET)
@@ -159,14 +150,7 @@ def one(manoeuvre: str, seed: int, noisy: bool) -> dict[str, Any]:
     paths = {"target": case.task.target[:, columns].tolist()}
     for i, tried in enumerate(kept):
         paths[f"iteration {i}"] = tried.trials[0].states[:, columns].tolist()
-    return {
-        "manoeuvre": manoeuvre,
-        "seed": seed,
-        "noisy": noisy,
-        "utilities": standing.utilities,
-        "true": true[:2],
-        "optimum": true[2],
-        "trials": len(trials),
-        "alphas": [candidate.alpha for candidate in candidates],
-        "paths": paths,
-    }
+    utilities, alphas = tuple(standing.utilities), tuple(c.alpha for c in candidates)
+    first, last, top = true
+    run = (manoeuvre, seed, noisy, utilities, (first, last), top, len(trials), alphas, paths)
+    return vars(CarRun(*run))

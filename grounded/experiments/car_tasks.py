@@ -49,7 +49,8 @@ def target(name: str, wheelbase: float = 0.15) -> Array:
     ends = np.cumsum([length for length, _, _ in profile])
     s_grid = np.linspace(0.0, ends[-1], 4001)
     segment = np.minimum(np.searchsorted(ends, s_grid, side="right"), len(profile) - 1)
-    kappa = _smooth(np.array([profile[i][1] for i in segment]), s_grid[1], width=0.25)
+    width = round(0.25 / s_grid[1]) // 2 * 2  # steps in 0.25 m, an even number
+    kappa = hann_smoothed(np.array([profile[i][1] for i in segment]), width)
     limit = np.array([profile[i][2] for i in segment])
     speed_limit = _reachable(limit, s_grid[1])
     h = DT / FINE
@@ -68,11 +69,10 @@ def target(name: str, wheelbase: float = 0.15) -> Array:
     return np.array(rows)
 
 
-def _smooth(values: Array, step: float, width: float) -> Array:
-    """A Hann window over `width` metres of path."""
-    count = max(round(width / step) | 1, 3)
-    window = np.hanning(count + 2)[1:-1]
-    padded = np.pad(values, count // 2, mode="edge")
+def hann_smoothed(signal: Array, width: int) -> Array:
+    """Weighted mean over `width` + 1 samples; the ends are continued by their last value."""
+    window = np.hanning(width + 3)[1:-1]
+    padded = np.pad(signal, width // 2, mode="edge")
     return np.convolve(padded, window / window.sum(), mode="valid")
 
 

@@ -19,9 +19,10 @@ import math
 
 import numpy as np
 
+from grounded.experiments.car_tasks import hann_smoothed
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded.models.aircraft_trim import trim
+from grounded.models.aircraft import level_trim
 from grounded.task import Task
 from grounded.utility import Reward
 
@@ -56,13 +57,6 @@ def figure8_profile() -> tuple[Array, Array]:
     return speed, (right * 1.0 - left * 1.0) / RADIUS
 
 
-def hann_smoothed(signal: Array, width: int) -> Array:
-    """Weighted mean over `width` + 1 samples; the ends are continued by their last value."""
-    window = np.hanning(width + 3)[1:-1]
-    padded = np.pad(signal, width // 2, mode="edge")
-    return np.convolve(padded, window / window.sum(), mode="valid")
-
-
 def figure8_target() -> tuple[Array, Array, Array]:
     """North, east, altitude [m] (H + 1, 3), speed [m/s] and turn rate [rad/s] (H + 1,)."""
     speed, curvature = (hann_smoothed(s, round(SMOOTHING / DT)) for s in figure8_profile())
@@ -91,7 +85,7 @@ def flight_task(model: Model, started_by: Model | None = None) -> Task:
     target[:, columns] = path
     weights = np.zeros(model.n)
     weights[columns] = POSITION
-    start = trim(model if started_by is None else started_by, speed[:1], np.zeros(1), DT)
+    start = level_trim(model if started_by is None else started_by, speed[:1], np.zeros(1), DT)
     low, high = np.array([LIMITS[name] for name in model.input_names]).T
     ones = np.ones(model.m)
     return Task(

@@ -1,30 +1,134 @@
 """The car's parameters from half an hour of manual driving (footnote 17).
 
-As the paper did it: the wheelbase is measured with a tape; the steering angle is measured on the
-bench for various inputs (linear regression: a1, b1); 30 minutes of driving are filmed at 30 Hz;
-linear regression over stretches of steady speed gives a2, a3, b2, and step responses give
-tau_delta, tau_v, a4 and the latency. From these first values `grounded.fit` climbs the likelihood
-of all the data, parameters, stall threshold and latency together.
+As the paper did it: the wheelbase is measured with a tape, steering angles on the bench for various
+inputs; 30 minutes of driving are filmed at 30 Hz. The film gives first values (`first_values`):
 
-Every seed is another car (each parameter +-20 %), another driver and other noise. The check: the
-stated 95 % intervals hold the true values.
+    a1, b1          a line through the steering angles measured on the bench
+    a2, a3, b2      linear regression over stretches of steady speed
+    stall           the largest throttle at which the car stood
+    tau_delta, latency, tau_v, a4   from how heading rate and speed follow the inputs
+
+From these `grounded.fit` climbs the likelihood of all the data, parameters, stall threshold and
+latency together. Every seed is another car (each parameter +-20 %), another driver and other noise.
+The check: the stated 95 % intervals hold the true values.
 """
 
 from __future__ import annotations
 
-from collections.abc import MutableMapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
-from grounded.experiments.driving import drive, markers
-from grounded.experiments.first_values import first_values
-from grounded.experiments.jobs import Engine, Job, Progress, Table, run_jobs
+from grounded.estimate import Record
+from grounded.experiments.driving import RATE, drive, markers
+from grounded.experiments.jobs import Job, Running, StudyTable, run_jobs
 from grounded.fit import fit
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.models.car import model as car
+
+
+def first_values(
+    films: Sequence[Record], length: float, angles: tuple[Array, Array]
+) -> dict[str, float]:
+    """Where the climb begins, as in footnote 17: regressions and step responses.
+
+    Args:
+        films: the camera's records.
+        length: wheelbase [m].
+        angles: inputs and steering angles from the bench.
+    """
+    a1, b1 = np.polyfit(*angles, 1)
+    runs = [(film.commands, *_seen(film, length)) for film in films]
+    steady = np.vstack([_steady(u, v) for u, v, _ in runs])
+    moving = steady[(steady[:, 2] > 0.15) & (steady[:, 1] > 0.25)]
+    ones = np.ones(len(moving))
+    design = np.column_stack([moving[:, 1], np.abs(moving[:, 0]), ones])
+    a2, a3, b2 = np.linalg.lstsq(design, moving[:, 2], rcond=None)[0]
+    standing = steady[(steady[:, 2] < 0.05) & (np.abs(steady[:, 0]) < 0.3), 1]
+    stall = float(np.quantile(standing, 0.98)) if len(standing) else 0.1
+    latency, tau_delta = _steering_response(runs, float(a1), float(b1), length)
+    tau_v, a4 = _speed_response(runs, (float(a2), float(a3), float(b2)), latency)
+    values = {"a1": a1, "b1": b1, "a2": a2, "a3": a3, "b2": b2, "a4": a4, "stall": stall}
+    values |= {"tau_delta": tau_delta, "tau_v": tau_v, "latency": latency}
+    inside = {}
+    for name, value in values.items():
+        p = car.params.get(name)
+        low, high = (0.0, 0.3) if p is None else (p.low, p.high)
+        inside[name] = float(np.clip(value, low, high))
+    return inside
+
+
+def _seen(film: Record, length: float) -> tuple[Array, Array]:
+    """Front-wheel speed [m/s] and heading rate [rad/s] at each frame, (steps,), from a film."""
+    front, rear = film.measured[:, :2], film.measured[:, 2:]
+    heading = np.unwrap(np.arctan2(*(front - rear).T[::-1]))
+    width = 4  # frames on either side
+    dt = 2 * width / RATE
+    velocity = np.zeros_like(front)
+    velocity[width:-width] = (front[2 * width :] - front[: -2 * width]) / dt
+    rate = np.zeros(len(front))
+    rate[width:-width] = (heading[2 * width :] - heading[: -2 * width]) / dt
+    return np.hypot(*velocity.T)[:-1], rate[:-1]
+
+
+def _steady(u: Array, v: Array) -> Array:
+    """Rows [steering, throttle, speed] of the last half second of each stretch of held inputs."""
+    rows, hold = [], 0
+    for t in range(1, len(u)):
+        hold = hold + 1 if np.abs(u[t] - u[t - 1]).max() < 0.1 else 0
+        if hold > 60 and hold % 15 == 0:
+            window = slice(t - 15, t)
+            rows.append([*u[window].mean(axis=0), v[window].mean()])
+    return np.array(rows).reshape(-1, 3)
+
+
+def _lagged(x: Array, tau: float) -> Array:
+    """First-order response to x, sampled at RATE, from zero."""
+    from scipy.signal import lfilter
+
+    decay = np.exp(-1 / (RATE * tau))
+    return np.asarray(lfilter([0.0, 1 - decay], [1.0, -decay], x, axis=0))
+
+
+def _steering_response(
+    runs: Sequence[tuple[Array, Array, Array]], a1: float, b1: float, length: float
+) -> tuple[float, float]:
+    """Latency and tau_delta [s] for which the heading rate follows v sin(delta) / L best."""
+    best = (np.inf, 0.1, 0.1)
+    for frames in range(0, 8):
+        for tau in (0.03, 0.05, 0.07, 0.1, 0.14, 0.2, 0.3):
+            error = 0.0
+            for u, v, rate in runs[:8]:
+                late = np.concatenate([np.zeros(frames), u[: len(u) - frames, 0]])
+                delta = _lagged(a1 * late + b1, tau)
+                error += float(np.sum((rate - v * np.sin(delta) / length) ** 2))
+            best = min(best, (error, frames / RATE, tau))
+    return best[1], best[2]
+
+
+def _speed_response(
+    runs: Sequence[tuple[Array, Array, Array]], steady: tuple[float, float, float], latency: float
+) -> tuple[float, float]:
+    """tau_v [s] and a4 [m/s^2] from how fast the speed rises and falls after the throttle moves."""
+    a2, a3, b2 = steady
+    gaps, rises, falls = [], [], []
+    frames = round(latency * RATE)
+    for u, v, _ in runs:
+        late = np.vstack([np.zeros((frames, 2)), u[: len(u) - frames]])
+        target = np.maximum(a2 * late[:, 1] + a3 * np.abs(late[:, 0]) + b2, 0.0)
+        slope = np.gradient(v) * RATE
+        gap = target - v
+        up, down = gap > 0.3, (gap < -0.4) & (v > 0.3)
+        gaps.append(gap[up])
+        rises.append(slope[up])
+        falls.append(slope[down])
+    gap, rise, fall = (np.concatenate(parts) for parts in (gaps, rises, falls))
+    tau = float(gap @ gap / max(float(gap @ rise), 1e-6)) if len(gap) else 0.4
+    return tau, float(np.median(fall)) if len(fall) else -1.0
+
 
 BENCH = 0.005  # [rad] noise of a steering angle measured on the bench
 FITTED = ("a1", "b1", "a2", "b2", "a3", "a4", "tau_delta", "tau_v", "stall")
@@ -56,7 +160,7 @@ class FitCarResult:
             "coverage_all": float(np.mean(every)),
         }
 
-    def tables(self) -> list[Table]:
+    def tables(self) -> list[StudyTable]:
         """Per parameter: error of the first value, of the fit, the stated std, the coverage."""
         rows = []
         for name, share in self.coverage.items():
@@ -68,38 +172,34 @@ class FitCarResult:
             rows.append((f"{name} [{each[0]['unit']}]", *row))
         head = ("parameter", "first value's error", "fit's error", "stated std", "inside 95 %")
         title = f"Parameters from {self.minutes:g} minutes of driving, {len(self.runs)} cars"
-        return [Table(title, head, tuple(rows))]
+        return [StudyTable(title, head, tuple(rows))]
 
 
 def fit_car(
     seeds: Sequence[int],
     *,
     minutes: float = 30.0,
-    engine: Engine | None = None,
-    finished: MutableMapping[str, dict[str, Any]] | None = None,
-    progress: Progress | None = None,
+    **how: Unpack[Running],
 ) -> FitCarResult:
     """The study, one job a seed.
 
     Args:
         seeds: of the cars, drivers and noise.
         minutes: of driving.
-        engine: where the jobs run.
-        finished: results of earlier jobs.
-        progress: called with jobs done and jobs in all.
+        how: where the jobs run, see `run_jobs`.
     """
-    jobs = [Job(one_car, {"seed": int(seed), "minutes": minutes}) for seed in seeds]
-    found = run_jobs(jobs, engine, finished=finished, progress=progress)
+    jobs = [Job(fit_car_job, {"seed": int(seed), "minutes": minutes}) for seed in seeds]
+    found = run_jobs(jobs, **how)
     return FitCarResult(tuple(found), minutes)
 
 
-def one_car(seed: int, minutes: float) -> dict[str, Any]:
+def fit_car_job(seed: int, minutes: float) -> dict[str, Any]:
     """One car: driven, filmed, estimated."""
     rng = np.random.default_rng(seed)
     truth, latency = true_car(rng)
     records = drive(truth, latency, minutes, rng)
     length = truth.params["L"].value
-    first = first_values(records, length, bench(truth, rng))
+    first = first_values(records, length, bench_angles(truth, rng))
     begin = np.full(2, first.pop("latency"))
     start = car.with_values({**first, "L": length})
     found = fit(
@@ -117,11 +217,7 @@ def one_car(seed: int, minutes: float) -> dict[str, Any]:
         params[name] = {
             "true": true,
             "first": estimate.start,
-            "value": estimate.value,
-            "std": estimate.std,
-            "low": estimate.low,
-            "high": estimate.high,
-            "unit": estimate.unit,
+            **{key: getattr(estimate, key) for key in ("value", "std", "low", "high", "unit")},
             "inside": bool(estimate.low <= true <= estimate.high),
         }
     return {"seed": seed, "params": params, "status": found.sentence, "samples": found.samples}
@@ -134,7 +230,7 @@ def true_car(rng: np.random.Generator) -> tuple[Model, float]:
     return car.with_values(values), float(rng.uniform(0.08, 0.12))
 
 
-def bench(truth: Model, rng: np.random.Generator) -> tuple[Array, Array]:
+def bench_angles(truth: Model, rng: np.random.Generator) -> tuple[Array, Array]:
     """Steering angles [rad] measured by hand for inputs from -1 to 1, car standing."""
     u = np.linspace(-1, 1, 9)
     p = truth.params

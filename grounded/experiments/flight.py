@@ -12,27 +12,17 @@ the true parameters, which the search never sees.
 
 from __future__ import annotations
 
-import math
-from collections.abc import MutableMapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
 from grounded.errors import GroundedError
 from grounded.experiments.figure8 import RADIUS, figure8_target, flight_task, perturbed
-from grounded.experiments.jobs import (
-    Engine,
-    Job,
-    Progress,
-    Table,
-    improvement,
-    jsonable,
-    mean_se,
-    run_jobs,
-)
+from grounded.experiments.jobs import Running, StudyTable, improvement, mean_se, run_study
 from grounded.frozen import Array
 from grounded.models.aircraft import model as aircraft
+from grounded.result import plain
 from grounded.rollout import simulate
 from grounded.search.improve import first_policy, learn, propose
 from grounded.search.standing import Candidate, Options
@@ -110,22 +100,14 @@ class FlightResult:
     def to_json(self) -> dict[str, Any]:
         """See CONTRACT.md."""
         runs = [
-            {
-                "seed": run.seed,
-                "discarded": run.discarded,
-                "utilities": list(run.utilities),
-                "trials": run.trials,
-                "alphas": list(run.alphas),
-                "optimum": self.optimum,
-            }
+            {k: v for k, v in vars(run).items() if k != "paths"} | {"optimum": self.optimum}
             for run in self.runs
         ]
         shown = self.representative
         figure = {"seed": shown.seed, "desired": self.desired, **shown.paths}
-        whole = {"runs": runs, **self.summary(), "figure": figure, "paper": PAPER}
-        return dict(jsonable(whole))
+        return dict(plain({"runs": runs, **self.summary(), "figure": figure, "paper": PAPER}))
 
-    def tables(self) -> list[Table]:
+    def tables(self) -> list[StudyTable]:
         """Table 1 beside the paper's."""
         found = self.summary()
         gain = found["improvement"]
@@ -148,27 +130,23 @@ class FlightResult:
             ("discarded", f"{found['discarded']} of {len(self.runs)}", "about 20 %"),
         )
         title = f"Table 1: flight simulator, {len(self.flown)} runs, mean (± one standard error)"
-        return [Table(title, ("", "here", "paper"), rows)]
+        return [StudyTable(title, ("", "here", "paper"), rows)]
 
 
 def run(
     count: int = 10,
     *,
     first_seed: int = 0,
-    engine: Engine | None = None,
-    finished: MutableMapping[str, dict[str, Any]] | None = None,
-    progress: Progress | None = None,
     step: str = "damped",
+    **how: Unpack[Running],
 ) -> FlightResult:
     """Table 1 with `count` runs that were not discarded: seeds first_seed, first_seed + 1 ...
 
     Args:
         count: runs that count.
         first_seed: of the approximate models.
-        engine: where the jobs run.
-        finished: results kept from before, by job.
-        progress: called with jobs done and in all.
         step: "damped" or "full", as in [search].
+        how: where the jobs run, see `run_jobs`.
 
     Raises:
         GroundedError: if more than four of five models are discarded.
@@ -179,25 +157,20 @@ def run(
         if len(found) >= 5 * count:
             raise GroundedError(f"{len(found)} models and fewer than {count} flyable ones")
         missing = count - sum(not r.discarded for r in found)
-        jobs = [Job(one, {"seed": s, "step": step}) for s in range(seed, seed + missing)]
+        cases = ({"seed": s, "step": step} for s in range(seed, seed + missing))
+        found += run_study(FlightRun, flight_job, cases, **how)
         seed += missing
-        found += [_read(r) for r in run_jobs(jobs, engine, finished=finished, progress=progress)]
     path, _, _ = figure8_target()
-    return FlightResult(tuple(found), optimum(), path[::FIGURE_STEP].tolist())
+    return FlightResult(tuple(found), flight_optimum(), path[::FIGURE_STEP].tolist())
 
 
-def _read(result: dict[str, Any]) -> FlightRun:
-    result = result | {key: tuple(result[key]) for key in ("utilities", "alphas")}
-    return FlightRun(**result)
-
-
-def optimum() -> float:
+def flight_optimum() -> float:
     """Utility of DDP on the true parameters."""
     _, result = first_policy(flight_task(aircraft))
     return -result.cost
 
 
-def one(seed: int, step: str) -> dict[str, Any]:
+def flight_job(seed: int, step: str) -> dict[str, Any]:
     """A job: one approximate model, five iterations."""
     truth = flight_task(aircraft)
     crude = perturbed(aircraft, np.random.default_rng(seed))
@@ -205,30 +178,19 @@ def one(seed: int, step: str) -> dict[str, Any]:
     options = Options(step="full" if step == "full" else "damped")
     first = propose(task, [], [], options).candidate
     if first is None or unstable(truth, flown := real_flight(truth, first)):
-        utility = [] if first is None else [_finite(truth.utility(flown))]
-        return {
-            "seed": seed,
-            "discarded": True,
-            "utilities": utility,
-            "trials": 1,
-            "alphas": [1.0],
-            "paths": {} if first is None else _paths(model=flown),
-        }
+        if first is None:
+            return vars(FlightRun(seed, True, (), 1, (1.0,), {}))
+        claimed = plain([truth.utility(flown)])  # JSON has no infinity
+        return vars(FlightRun(seed, True, claimed, 1, (1.0,), _paths(model=flown)))
 
     def fly(candidate: Candidate) -> Trial:
         return real_flight(truth, candidate)
 
     standing, candidates, trials = learn(task, fly, options, max_iterations=ITERATIONS)
     assert standing.incumbent is not None
-    best = standing.incumbent.trials[0]
-    return {
-        "seed": seed,
-        "discarded": False,
-        "utilities": standing.utilities,
-        "trials": len(trials),
-        "alphas": [candidate.alpha for candidate in candidates],
-        "paths": _paths(model=trials[0], learned=best),
-    }
+    paths = _paths(model=trials[0], learned=standing.incumbent.trials[0])
+    utilities, alphas = tuple(standing.utilities), tuple(c.alpha for c in candidates)
+    return vars(FlightRun(seed, False, utilities, len(trials), alphas, paths))
 
 
 def real_flight(truth: Task, candidate: Candidate) -> Trial:
@@ -252,10 +214,6 @@ def unstable(truth: Task, flight: Trial) -> bool:
         return True
     error: Array = flight.states[:, :3] - truth.target[:, :3]
     return bool(np.linalg.norm(error, axis=1).max() > RADIUS)
-
-
-def _finite(utility: float) -> float | None:
-    return utility if math.isfinite(utility) else None  # JSON has no infinity
 
 
 def _paths(**flights: Trial) -> dict[str, list[list[float]]]:

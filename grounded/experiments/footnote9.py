@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from grounded.experiments.jobs import Table
+from grounded.experiments.jobs import StudyTable
 from grounded.model import Model, Param
 from grounded.search.improve import learn
 from grounded.search.standing import Candidate, Options
@@ -56,7 +56,7 @@ class Footnote9Result:
         """Rows by name."""
         return {"rows": [vars(row) for row in self.rows], "paper": {"iterations": 1}}
 
-    def tables(self) -> list[Table]:
+    def tables(self) -> list[StudyTable]:
         """Shares of the optimum by b."""
         head = (
             "b",
@@ -77,7 +77,7 @@ class Footnote9Result:
             )
             for row in self.rows
         )
-        return [Table("Footnote 9: utility as a share of the optimum", head, rows)]
+        return [StudyTable("Footnote 9: utility as a share of the optimum", head, rows)]
 
 
 def run(offsets: Sequence[float] = OFFSETS, *, iterations: int = 20) -> Footnote9Result:

@@ -10,24 +10,24 @@ through Dask's own joblib backend (extra `grounded[cluster]`); there is no sched
                 holds a hash of our sources, so that results of two versions are never mixed.
     lost worker its job is run again (by Dask itself, or here after a process died), not the study.
 
-Numbers that studies report: means with standard errors, improvements, slopes, tables.
-
-Improvement of a utility (never positive) from U_0 to U: (U - U_0) / |U_0|, so 0.76 means that 76 %
-of the cost is gone. The paper does not say whether its 76 % is a mean of ratios or a ratio of
-means; both are given.
+At the end stand the numbers that studies report: means with standard errors, improvements, slopes,
+tables. The improvement of a utility (never positive) from U_0 to U is (U - U_0) / |U_0|, so 0.76
+means that 76 % of the cost is gone. The paper does not say whether its 76 % is a mean of ratios or
+a ratio of means; both are given.
 """
 
 from __future__ import annotations
 
 import hashlib
+import importlib
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterable, Iterator, MutableMapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict, TypeVar, Unpack
 
 import numpy as np
 
@@ -36,6 +36,7 @@ from grounded.errors import GroundedError
 Progress = Callable[[int, int], None]  # jobs done, jobs in all
 CONNECT_S = 10.0  # for a cluster's scheduler to answer
 ROUNDS = 5  # times that jobs of lost workers are handed out again
+R = TypeVar("R")
 
 
 @cache
@@ -87,6 +88,14 @@ class Engine:
             )
 
 
+class Running(TypedDict, total=False):
+    """How a study runs its jobs: the keyword arguments of `run_jobs`."""
+
+    engine: Engine | None
+    finished: MutableMapping[str, dict[str, Any]] | None
+    progress: Progress | None
+
+
 def run_jobs(
     jobs: Sequence[Job],
     engine: Engine | None = None,
@@ -127,6 +136,25 @@ def run_jobs(
         f"{len(waiting)} of {total} jobs lost their worker {ROUNDS} times (out of memory?); the "
         f"finished ones are kept, run the study again with fewer --jobs: {lost}"
     )
+
+
+def run_study(
+    kind: type[R],
+    function: Callable[..., dict[str, Any]],
+    cases: Iterable[dict[str, Any]],
+    **how: Unpack[Running],
+) -> tuple[R, ...]:
+    """Runs one job a case and reads each result as a `kind`, JSON's lists as tuples.
+
+    Args:
+        kind: a dataclass that has the result's names as fields.
+        function: of the jobs.
+        cases: its arguments.
+        how: where the jobs run, see `run_jobs`.
+    """
+    found = run_jobs([Job(function, case) for case in cases], **how)
+    tuples = ({k: tuple(v) if isinstance(v, list) else v for k, v in r.items()} for r in found)
+    return tuple(kind(**result) for result in tuples)
 
 
 def _round(
@@ -172,11 +200,14 @@ def _results(jobs: Sequence[Job], engine: Engine) -> Iterator[tuple[str, dict[st
         yield from parallel(joblib.delayed(_call)(job) for job in jobs)
 
 
-def _backend(engine: Engine, joblib: Any) -> AbstractContextManager[Any]:
+@contextmanager
+def _backend(engine: Engine, joblib: Any) -> Iterator[None]:
+    """Sets where joblib runs; a connection to a Dask cluster is closed at the end, it stays."""
     if engine.name == "local":
         # One BLAS thread a worker: results don't depend on how many workers share the machine.
-        config = joblib.parallel_config(backend="loky", inner_max_num_threads=1)
-        return config if config is not None else nullcontext()
+        with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
+            yield
+        return
     distributed = _import("distributed", 'pip install "grounded[cluster]"')
     try:
         client = distributed.Client(engine.address, timeout=CONNECT_S)
@@ -184,28 +215,15 @@ def _backend(engine: Engine, joblib: Any) -> AbstractContextManager[Any]:
         raise GroundedError(
             f"no Dask scheduler answers at {engine.address}: is it running? ({error})"
         ) from error
-    return _Cluster(client, joblib)
-
-
-class _Cluster(AbstractContextManager[None]):
-    """A connection to a running Dask cluster, closed at the end; the cluster stays."""
-
-    def __init__(self, client: Any, joblib: Any) -> None:
-        self.client, self.joblib = client, joblib
-
-    def __enter__(self) -> None:
-        self.config = self.joblib.parallel_config(backend="dask", client=self.client)
-        self.config.__enter__()
-
-    def __exit__(self, *error: object) -> None:
-        self.config.__exit__(*error)
-        self.client.close()
+    try:
+        with joblib.parallel_config(backend="dask", client=client):
+            yield
+    finally:
+        client.close()
 
 
 def _lost() -> tuple[type[BaseException], ...]:
     """The errors that say a worker died, not that a job failed; asked for after an error only."""
-    import importlib
-
     kinds: list[type[BaseException]] = []
     for module, name in (
         ("joblib.externals.loky.process_executor", "TerminatedWorkerError"),
@@ -219,8 +237,6 @@ def _lost() -> tuple[type[BaseException], ...]:
 
 
 def _import(name: str, remedy: str) -> Any:
-    import importlib
-
     try:
         return importlib.import_module(name)
     except ImportError as error:
@@ -228,7 +244,7 @@ def _import(name: str, remedy: str) -> Any:
 
 
 @dataclass(frozen=True)
-class Table:
+class StudyTable:
     """A title, column heads and rows of text, for the terminal and for docs/experiments.md."""
 
     title: str
@@ -241,6 +257,12 @@ def improvement(before: float, after: float) -> float:
     return (after - before) / abs(before)
 
 
+def mean_text(values: Sequence[float], digits: str = ".1%", of_error: str = ".1%") -> str:
+    """`76.1% (±0.4%)`; the mean alone where there is one value."""
+    mean, se = mean_se(values)
+    return f"{mean:{digits}}" if len(values) < 2 else f"{mean:{digits}} (±{se:{of_error}})"
+
+
 def mean_se(values: Sequence[float]) -> tuple[float, float]:
     """Mean and one standard error of it (nan for fewer than two values)."""
     data = np.asarray(values, dtype=float)
@@ -249,16 +271,7 @@ def mean_se(values: Sequence[float]) -> tuple[float, float]:
     return float(data.mean()), float(data.std(ddof=1) / math.sqrt(len(data)))
 
 
-def jsonable(value: Any) -> Any:
-    """The same with null for numbers that JSON does not have (nan, infinities)."""
-    if isinstance(value, Mapping):
-        return {key: jsonable(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [jsonable(inner) for inner in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def slope(x: Sequence[float], y: Sequence[float]) -> tuple[float, float]:
+def loglog_slope(x: Sequence[float], y: Sequence[float]) -> tuple[float, float]:
     """Least-squares slope of log y over log x, and its standard error."""
     u, v = np.log(np.asarray(x, dtype=float)), np.log(np.asarray(y, dtype=float))
     centred = u - u.mean()

@@ -8,15 +8,15 @@ sequence from starts that scatter, with its disturbances; the spread of the end-
 
 from __future__ import annotations
 
-from collections.abc import MutableMapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Unpack
 
 import numpy as np
 
 from grounded.experiments.bench import scaled
 from grounded.experiments.car_tasks import DT, car_task
-from grounded.experiments.jobs import Engine, Job, Progress, Table, run_jobs
+from grounded.experiments.jobs import Running, StudyTable, run_study
 from grounded.experiments.real_car import real_plant
 from grounded.frozen import Array
 from grounded.models.car import model as car
@@ -40,7 +40,7 @@ def sequences() -> dict[str, Array]:
 
 
 @dataclass(frozen=True)
-class Spread:
+class EndPointSpread:
     """End-points of repeated runs of one sequence [m]."""
 
     sequence: str
@@ -53,7 +53,7 @@ class Spread:
 class NondeterminismResult:
     """One spread for each sequence and level of scatter."""
 
-    spreads: tuple[Spread, ...]
+    spreads: tuple[EndPointSpread, ...]
     runs: int
 
     def to_json(self) -> dict[str, Any]:
@@ -61,7 +61,7 @@ class NondeterminismResult:
         paper = {"largest": [0.03, 0.5], "seconds": SECONDS}
         return {"runs": self.runs, "spreads": [vars(s) for s in self.spreads], "paper": paper}
 
-    def tables(self) -> list[Table]:
+    def tables(self) -> list[StudyTable]:
         """The largest distance between two end-points, by sequence and scatter."""
         names = list(dict.fromkeys(s.sequence for s in self.spreads))
         levels = sorted({s.level for s in self.spreads})
@@ -73,7 +73,7 @@ class NondeterminismResult:
         rows.append(("paper", *("a few to 50" if level == 1 else "" for level in levels)))
         head = ("sequence", *(f"scatter x{level:g}" for level in levels))
         title = f"Largest distance between the end-points of {self.runs} runs of {SECONDS:g} s [cm]"
-        return [Table(title, head, tuple(rows))]
+        return [StudyTable(title, head, tuple(rows))]
 
 
 def run(
@@ -81,26 +81,24 @@ def run(
     *,
     levels: Sequence[float] = LEVELS,
     seed: int = 0,
-    engine: Engine | None = None,
-    finished: MutableMapping[str, dict[str, Any]] | None = None,
-    progress: Progress | None = None,
+    **how: Unpack[Running],
 ) -> NondeterminismResult:
     """Repeats every sequence `runs` times at each level of scatter."""
-    jobs = [
-        Job(one, {"sequence": name, "level": level, "runs": runs, "seed": seed})
+    cases = (
+        {"sequence": name, "level": level, "runs": runs, "seed": seed}
         for name in sequences()
         for level in levels
-    ]
-    found = run_jobs(jobs, engine, finished=finished, progress=progress)
-    return NondeterminismResult(tuple(Spread(**result) for result in found), runs)
+    )
+    spreads = run_study(EndPointSpread, nondeterminism_job, cases, **how)
+    return NondeterminismResult(spreads, runs)
 
 
-def one(sequence: str, level: float, runs: int, seed: int) -> dict[str, Any]:
+def nondeterminism_job(sequence: str, level: float, runs: int, seed: int) -> dict[str, Any]:
     """A job: the end-points of one sequence."""
     inputs = sequences()[sequence]
     task = car_task("turn", car)
     policy = task.policy(np.zeros((task.horizon, 2)), None, None)
-    policy = type(policy)(**{**vars(policy), "feedforward": inputs})
+    policy = replace(policy, feedforward=inputs)
     plant = scaled(real_plant(noisy=True), level)
     ends = []
     for i in range(runs):

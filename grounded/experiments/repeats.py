@@ -16,20 +16,17 @@ lucky winner loses its luck; "losses checked" does so only after a loss that may
 
 from __future__ import annotations
 
-from collections.abc import Callable, MutableMapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
-from grounded.experiments.bench import bench, optimum, scaled, true_utility
-from grounded.experiments.jobs import Engine, Job, Progress, Table, mean_se, run_jobs
+from grounded.experiments.bench import bench, optimum, scaled, searched, true_utility
+from grounded.experiments.jobs import Running, StudyTable, mean_se, run_study
 from grounded.frozen import Array
 from grounded.policy import Policy
-from grounded.search.improve import propose
-from grounded.search.standing import Candidate, Options
-from grounded.task import Task
-from grounded.trial import Trial
+from grounded.search.standing import Options
 
 LEVELS = (0.5, 1.0, 2.0, 3.0)
 MANOEUVRES = ("turn", "figure8")
@@ -39,7 +36,7 @@ FRESH = 30  # runs that judge a policy
 
 
 @dataclass(frozen=True)
-class Rule:
+class LineSearchRule:
     """How trials decide."""
 
     name: str
@@ -50,13 +47,13 @@ class Rule:
 
 
 RULES = (
-    Rule("single trials, alpha to 1/64", 1, 6),
-    Rule("single trials, alpha to 1/8", 1, 3),
-    Rule("single trials, incumbent again", 1, 3, again=True),
-    Rule("losses checked, alpha to 1/64", 1, 6, checked=True),
-    Rule("losses checked, alpha to 1/8", 1, 3, checked=True),
-    Rule("2 trials, alpha to 1/8", 2, 3),
-    Rule("3 trials, alpha to 1/8", 3, 3),
+    LineSearchRule("single trials, alpha to 1/64", 1, 6),
+    LineSearchRule("single trials, alpha to 1/8", 1, 3),
+    LineSearchRule("single trials, incumbent again", 1, 3, again=True),
+    LineSearchRule("losses checked, alpha to 1/64", 1, 6, checked=True),
+    LineSearchRule("losses checked, alpha to 1/8", 1, 3, checked=True),
+    LineSearchRule("2 trials, alpha to 1/8", 2, 3),
+    LineSearchRule("3 trials, alpha to 1/8", 3, 3),
 )
 
 
@@ -115,7 +112,7 @@ class NoiseResult:
         )
         return np.array([values[-1] for values in own])
 
-    def _summary(self) -> Table:
+    def _summary(self) -> StudyTable:
         rows, recommended = [], self.recommended
         for rule in self._rules:
             closed, early, trials = (
@@ -133,19 +130,19 @@ class NoiseResult:
                 )
             )
         head = ("rule (*: recommended)", "gap closed", "worst", f"after {EARLY}", "trials")
-        return Table("all cases: means", head, tuple(rows))
+        return StudyTable("all cases: means", head, tuple(rows))
 
     def _of(self, rule: str, manoeuvre: str, level: float) -> list[Outcome]:
         wanted = (rule, manoeuvre, level)
         return [o for o in self.outcomes if (o.rule, o.manoeuvre, o.level) == wanted]
 
-    def tables(self) -> list[Table]:
+    def tables(self) -> list[StudyTable]:
         """By manoeuvre and level: false acceptances, share closed, flattery; then all cases."""
         cases = dict.fromkeys((o.manoeuvre, o.level) for o in self.outcomes)
         each = [self._table(manoeuvre, level) for manoeuvre, level in cases]
         return [*each, self._summary()]
 
-    def _table(self, manoeuvre: str, level: float) -> Table:
+    def _table(self, manoeuvre: str, level: float) -> StudyTable:
         rows = []
         for rule in self._rules:
             own = self._of(rule, manoeuvre, level)
@@ -166,7 +163,7 @@ class NoiseResult:
             )
         after = f"after {EARLY}"
         head = ("rule", "false acceptances", "gap closed", "worst", after, "flattered by", "trials")
-        return Table(f"{manoeuvre}, scatter x{level:g}", head, tuple(rows))
+        return StudyTable(f"{manoeuvre}, scatter x{level:g}", head, tuple(rows))
 
 
 def run(
@@ -174,26 +171,23 @@ def run(
     *,
     manoeuvres: Sequence[str] = MANOEUVRES,
     levels: Sequence[float] = LEVELS,
-    rules: Sequence[Rule] = RULES,
-    engine: Engine | None = None,
-    finished: MutableMapping[str, dict[str, Any]] | None = None,
-    progress: Progress | None = None,
+    rules: Sequence[LineSearchRule] = RULES,
+    **how: Unpack[Running],
 ) -> NoiseResult:
     """Every rule on every case; a job is one of them."""
-    jobs = [
-        Job(one, {"rule": vars(rule), "manoeuvre": manoeuvre, "level": level, "seed": seed})
+    cases = (
+        {"rule": vars(rule), "manoeuvre": manoeuvre, "level": level, "seed": seed}
         for manoeuvre in manoeuvres
         for level in levels
         for rule in rules
         for seed in seeds
-    ]
-    found = run_jobs(jobs, engine, finished=finished, progress=progress)
-    return NoiseResult(tuple(Outcome(**result) for result in found))
+    )
+    return NoiseResult(run_study(Outcome, repeats_job, cases, **how))
 
 
-def one(rule: dict[str, Any], manoeuvre: str, level: float, seed: int) -> dict[str, Any]:
+def repeats_job(rule: dict[str, Any], manoeuvre: str, level: float, seed: int) -> dict[str, Any]:
     """A job: one rule, one case."""
-    how = Rule(**rule)
+    how = LineSearchRule(**rule)
     case = bench(manoeuvre, "noise", seed)
     best, _ = optimum(case)
     case = replace(case, plant=scaled(case.plant, level))
@@ -201,9 +195,15 @@ def one(rule: dict[str, Any], manoeuvre: str, level: float, seed: int) -> dict[s
     def truly(policy: Policy) -> float:
         return true_utility(case.task, case.plant, policy, FRESH, seed)
 
-    accepted, claimed, trials = _search(how, case.real, case.task)
-    utilities = [truly(policy) for _, policy in accepted]
-    early = [u for (ran, _), u in zip(accepted, utilities, strict=True) if ran <= EARLY][-1]
+    options = Options(
+        max_trials=BUDGET,
+        repeats=how.repeats,
+        max_halvings=how.max_halvings,
+        rerun_incumbent=how.checked,
+    )
+    accepted, claimed, trials = searched(case, options, again=how.again)
+    utilities = [truly(kept.policy) for kept in accepted]
+    early = [u for kept, u in zip(accepted, utilities, strict=True) if kept.trials <= EARLY][-1]
     gap = truly(best) - utilities[0]
     return {
         "rule": how.name,
@@ -217,33 +217,3 @@ def one(rule: dict[str, Any], manoeuvre: str, level: float, seed: int) -> dict[s
         "flattered": (claimed - utilities[-1]) / gap,
         "trials": trials,
     }
-
-
-def _search(
-    rule: Rule, real: Callable[[Policy, int], Trial], task: Task
-) -> tuple[list[tuple[int, Policy]], float, int]:
-    """The policies kept in turn and after how many trials, what the last one claims, trials run."""
-    options = Options(
-        max_trials=BUDGET,
-        repeats=rule.repeats,
-        max_halvings=rule.max_halvings,
-        rerun_incumbent=rule.checked,
-    )
-    candidates: list[Candidate] = []
-    trials: list[Trial] = []
-    accepted: list[tuple[int, Policy]] = []
-    while True:
-        proposal = propose(task, candidates, trials, options)
-        best = proposal.standing.incumbent
-        if best is not None and (not accepted or accepted[-1][1] is not best.candidate.policy):
-            accepted.append((len(trials), best.candidate.policy))
-        if proposal.candidate is None or len(trials) >= BUDGET:
-            assert best is not None
-            return accepted, best.utility, len(trials)
-        if proposal.is_new:
-            candidates.append(proposal.candidate)
-            if rule.again and best is not None:
-                again = real(best.candidate.policy, len(trials))
-                trials.append(replace(again, candidate=best.candidate.id))
-        trial = real(proposal.candidate.policy, len(trials))
-        trials.append(replace(trial, candidate=proposal.candidate.id))

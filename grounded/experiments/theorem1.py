@@ -20,25 +20,17 @@ K^2 epsilon^2 / (2 M).)
 from __future__ import annotations
 
 import math
-from collections.abc import MutableMapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
 from grounded.compile import Problem
-from grounded.experiments.jobs import (
-    Engine,
-    Job,
-    Progress,
-    Table,
-    jsonable,
-    mean_se,
-    run_jobs,
-    slope,
-)
+from grounded.experiments.jobs import Running, StudyTable, loglog_slope, mean_se, run_study
 from grounded.frozen import Array
 from grounded.model import Model, Param
+from grounded.result import plain
 from grounded.solve.bias import ground
 from grounded.solve.policy_gradient import gradient
 from grounded.task import Task
@@ -83,8 +75,8 @@ class Theorem1Result:
         for seed in dict.fromkeys(row.seed for row in self.rows):
             own = [row for row in self.rows if row.seed == seed]
             x = [row.epsilon for row in own]
-            found["gradient_error"].append(slope(x, [row.error for row in own])[0])
-            found["squared_gradient"].append(slope(x, [row.squared for row in own])[0])
+            found["gradient_error"].append(loglog_slope(x, [row.error for row in own])[0])
+            found["squared_gradient"].append(loglog_slope(x, [row.squared for row in own])[0])
         return {name: mean_se(values) for name, values in found.items()}
 
     def to_json(self) -> dict[str, Any]:
@@ -94,9 +86,9 @@ class Theorem1Result:
         paper = {"gradient_error": 1, "squared_gradient": 2}
         found: dict[str, Any] = {"rows": [vars(r) for r in self.rows], "slopes": slopes}
         found |= {"largest_ratio_to_bound": worst, "paper": paper}
-        return dict(jsonable(found))
+        return dict(plain(found))
 
-    def tables(self) -> list[Table]:
+    def tables(self) -> list[StudyTable]:
         """Medians by epsilon, and the slopes beside the theorem's."""
         rows = []
         for epsilon in dict.fromkeys(row.epsilon for row in self.rows):
@@ -126,8 +118,8 @@ class Theorem1Result:
         seeds = len(self.rows) // max(len(rows), 1)
         title = f"Theorem 1: medians of {seeds} seeds" if seeds > 1 else "Theorem 1: one seed"
         return [
-            Table(title, head, tuple(rows)),
-            Table("Slopes (± one standard error)", ("", "here", "theorem"), slopes),
+            StudyTable(title, head, tuple(rows)),
+            StudyTable("Slopes (± one standard error)", ("", "here", "theorem"), slopes),
         ]
 
 
@@ -139,14 +131,11 @@ def run(
     seeds: Sequence[int] = range(8),
     *,
     epsilons: Sequence[float] = EPSILONS,
-    engine: Engine | None = None,
-    finished: MutableMapping[str, dict[str, Any]] | None = None,
-    progress: Progress | None = None,
+    **how: Unpack[Running],
 ) -> Theorem1Result:
     """A search for each epsilon and seed; the seed draws the shape of the model's error."""
-    jobs = [Job(one, {"epsilon": float(e), "seed": seed}) for e in epsilons for seed in seeds]
-    found = run_jobs(jobs, engine, finished=finished, progress=progress)
-    return Theorem1Result(tuple(Theorem1Row(**result) for result in found))
+    cases = ({"epsilon": float(e), "seed": seed} for e in epsilons for seed in seeds)
+    return Theorem1Result(run_study(Theorem1Row, theorem1_job, cases, **how))
 
 
 def _dynamics(s: Any, a: Any, p: Any) -> dict[str, Any]:
@@ -185,7 +174,7 @@ def theorem1_task(epsilon: float, seed: int) -> Task:
     )
 
 
-def one(epsilon: float, seed: int) -> dict[str, Any]:
+def theorem1_job(epsilon: float, seed: int) -> dict[str, Any]:
     """A job: one search to its end."""
     task = theorem1_task(epsilon, seed)
     truth = task.with_model(task.model.with_values({"eps": 0.0}))
@@ -202,14 +191,7 @@ def one(epsilon: float, seed: int) -> dict[str, Any]:
         better = _line_search(real, u, -guess, float(swarm.cost[0]))
         if better is None or iterations >= ITERATIONS:
             squared = float((own**2).sum())
-            return {
-                "epsilon": epsilon,
-                "seed": seed,
-                "error": first,
-                "squared": squared,
-                "K": K,
-                "iterations": iterations,
-            }
+            return vars(Theorem1Row(epsilon, seed, first, squared, K, iterations))
         u, iterations = better, iterations + 1
 
 

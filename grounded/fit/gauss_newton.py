@@ -1,35 +1,132 @@
 """Levenberg and Marquardt's climb of the likelihood for a given noise, within bounds.
 
-    delta = -(W'W + lambda diag(W'W))^-1 W' eps,       theta <- clip(theta + delta)
+What is fitted, parameters of the model and delays of its inputs, is one vector theta (`Unknowns`).
+The least-squares problem are the whitened innovations of the filter and their slopes,
+
+    eps(theta): the filter's, with f(.; theta);      W = d eps / d theta  (`estimate.sensitivity`)
+    delta = -(W'W + lambda diag(W'W))^-1 W' eps,     theta <- clip(theta + delta)
+
+The sum of squares of eps is what is left unexplained, measured in the noise; the log-likelihood
+adds the log-determinants; W'W is the information that the data hold about theta. Because every step
+of a trial starts from what the filter knows, noise of the measurements does not bias the fit, as it
+does in one-step least squares (errors in variables).
 
 A step counts if the log-likelihood rises; else lambda grows. Unknowns at a bound that would leave
 it are held; directions of which the data say nothing are not moved.
-
-The least-squares problem behind a fit: whitened innovations eps(theta) and their slopes.
-
-    eps(theta): the filter's, with f(.; theta);      W = d eps / d theta  (`estimate.sensitivity`)
-
-Their sum of squares is what is left unexplained, measured in the noise; the log-likelihood adds the
-log-determinants. Gauss and Newton's step is -(W'W)^-1 W' eps, and W'W is the information that the
-data hold about theta. Because every step of a trial starts from what the filter knows, noise of the
-measurements does not bias the fit, as it does in one-step least squares (errors in variables).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from grounded.compile import System
-from grounded.estimate import Measurement, Noise, Record
-from grounded.estimate.batch import Batch, batch_of
-from grounded.estimate.filter import run, sensitivity
-from grounded.estimate.filtered import Filtered
+from grounded.errors import GroundedError, nearest
+from grounded.estimate import Measurement, NoiseStd, Record
+from grounded.estimate.filter import filter_batch, sensitivity
+from grounded.estimate.record import RecordBatch, batch_of
+from grounded.estimate.recursion import Filtered
 from grounded.estimate.steps import ModelSteps
-from grounded.fit.unknowns import Unknowns
 from grounded.frozen import Array
+from grounded.model import Model
+
+Latency = Literal["known", "common", "each"]
+LONGEST = 0.5  # [s] no latency is sought beyond
+
+
+@dataclass(frozen=True, eq=False)
+class Unknowns:
+    """theta = [parameters, latencies]: names, bounds, scales, and the way back to the model.
+
+    The scale is a natural size of a change: the width of the bounds where both are given.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    start: Array  # (k,)
+    low: Array  # (k,) may be -inf
+    high: Array  # (k,) may be inf
+    scale: Array  # (k,)
+    columns: tuple[int, ...]  # of the model's parameters that are fitted
+    delayed: tuple[tuple[int, ...], ...]  # inputs that each fitted latency delays
+    values: Array  # all parameters of the model
+    latency: Array  # (m,) [s] of all inputs
+
+    @property
+    def k(self) -> int:
+        """Number of unknowns."""
+        return len(self.names)
+
+    def unpack(self, theta: Array) -> tuple[Array, Array]:
+        """All parameter values and all latencies [s] at theta."""
+        p, latency = self.values.copy(), self.latency.copy()
+        p[list(self.columns)] = theta[: len(self.columns)]
+        for value, inputs in zip(theta[len(self.columns) :], self.delayed, strict=True):
+            latency[list(inputs)] = value
+        return p, latency
+
+    def clipped(self, theta: Array) -> Array:
+        """Theta within the bounds."""
+        return np.asarray(np.clip(theta, self.low, self.high))
+
+
+def unknowns_of(
+    model: Model, names: Sequence[str] | None, latency: Array, fit_latency: Latency
+) -> Unknowns:
+    """Checks the names and gathers bounds.
+
+    Args:
+        model: gives values and bounds.
+        names: parameters to fit; None: all.
+        latency: of each input [s], known or where to begin, (m,).
+        fit_latency: "known" (not fitted), "common" (one for all inputs), or "each".
+
+    Raises:
+        GroundedError: for a name that is not a parameter, or nothing to fit.
+    """
+    names = model.param_names if names is None else tuple(names)
+    for name in names:
+        if name not in model.params:
+            raise GroundedError(
+                f"'{name}' is not a parameter of model '{model.name}': "
+                + nearest(name, model.params)
+            )
+    if fit_latency not in ("known", "common", "each"):
+        raise GroundedError(f"fit_latency must be known, common or each, got '{fit_latency}'")
+    params = [model.params[name] for name in names]
+    choices: dict[str, list[tuple[int, ...]]] = {
+        "known": [],
+        "common": [tuple(range(model.m))],
+        "each": [(j,) for j in range(model.m)],
+    }
+    delayed = choices[fit_latency]
+    labels = ["latency"] if fit_latency == "common" else []
+    if fit_latency == "each":
+        labels = [f"latency:{name}" for name in model.input_names]
+    if not names and not labels:
+        raise GroundedError(f"model '{model.name}' has no parameter to fit")
+    low = [-np.inf if p.low is None else p.low for p in params] + [0.0] * len(delayed)
+    high = [np.inf if p.high is None else p.high for p in params] + [LONGEST] * len(delayed)
+    start = [p.value for p in params] + [float(latency[inputs[0]]) for inputs in delayed]
+    width = np.array(high) - np.array(low)
+    size = np.maximum(np.abs(start), 1e-3)
+    return Unknowns(
+        names=(*names, *labels),
+        units=(*(p.unit for p in params), *("s" for _ in delayed)),
+        start=np.array(start, float),
+        low=np.array(low, float),
+        high=np.array(high, float),
+        scale=np.where(np.isfinite(width), width, size),
+        columns=tuple(model.param_names.index(name) for name in names),
+        delayed=tuple(delayed),
+        values=np.array(model.values),
+        latency=np.array(latency, float),
+    )
+
 
 ENOUGH = 0.002  # [nats] a step that promises less, a sixteenth of a std, is the last
 NOTHING = 1e-9  # of the largest eigenvalue (scaled): below it the data say nothing
@@ -46,8 +143,8 @@ class Climb:
 
 
 def climb(
-    data: Data,
-    noise: Noise,
+    data: FitData,
+    noise: NoiseStd,
     start: Point,
     free: NDArray[np.bool_],
     max_steps: int = 20,
@@ -71,15 +168,15 @@ def climb(
 
 
 def _step(
-    data: Data,
-    noise: Noise,
+    data: FitData,
+    noise: NoiseStd,
     at: Point,
     slopes: Linear,
     free: NDArray[np.bool_],
     damping: float,
 ) -> tuple[Point, Linear, float, str]:
     for _ in range(12):
-        delta, promise = direction(data, at.theta, slopes, free, damping)
+        delta, promise = marquardt_step(data, at.theta, slopes, free, damping)
         if promise < ENOUGH:
             return at, slopes, damping, "converged"
         there = point(data, noise, data.unknowns.clipped(at.theta + delta), at)
@@ -94,8 +191,8 @@ def _step(
     return at, slopes, damping, "no step rises further"
 
 
-def direction(
-    data: Data, theta: Array, slopes: Linear, free: NDArray[np.bool_], damping: float
+def marquardt_step(
+    data: FitData, theta: Array, slopes: Linear, free: NDArray[np.bool_], damping: float
 ) -> tuple[Array, float]:
     """The damped step (k,) and the gain in nats that the linear problem promises of it."""
     unknowns = data.unknowns
@@ -116,7 +213,7 @@ def direction(
 
 
 @dataclass(frozen=True, eq=False)
-class Data:
+class FitData:
     """Records with what measures them: all that a likelihood needs beside theta and the noise."""
 
     system: System
@@ -124,7 +221,7 @@ class Data:
     measurement: Measurement
     unknowns: Unknowns
 
-    def batch(self, theta: Array) -> Batch:
+    def batch(self, theta: Array) -> RecordBatch:
         """The records side by side, inputs delayed as theta says."""
         latency = self.unknowns.unpack(theta)[1]
         return batch_of(self.records, self.measurement, self.system.n, latency)
@@ -135,7 +232,7 @@ class Point:
     """The likelihood at one theta."""
 
     theta: Array
-    batch: Batch
+    batch: RecordBatch
     filtered: Filtered
 
     @property
@@ -153,16 +250,16 @@ class Linear:
     block: NDArray[np.int64]  # (rows,) the piece of time that a row belongs to
 
 
-def point(data: Data, noise: Noise, theta: Array, near: Point | None = None) -> Point:
+def point(data: FitData, noise: NoiseStd, theta: Array, near: Point | None = None) -> Point:
     """One pass of the filter at theta; `near`: a point not far from it, which saves time."""
     batch = data.batch(theta)
     p = data.unknowns.unpack(theta)[0]
     steps = ModelSteps(data.system, p, batch, wide=True)
     about = None if near is None else near.filtered
-    return Point(theta, batch, run(batch, data.measurement, noise, steps, about))
+    return Point(theta, batch, filter_batch(batch, data.measurement, noise, steps, about))
 
 
-def linear(data: Data, at: Point, blocks: int = 60) -> Linear:
+def linear(data: FitData, at: Point, blocks: int = 60) -> Linear:
     """Slopes at a point whose filter got through.
 
     Args:
@@ -176,7 +273,7 @@ def linear(data: Data, at: Point, blocks: int = 60) -> Linear:
     return Linear(W[seen], at.filtered.eps[seen], _blocks(at.batch, blocks)[seen])
 
 
-def _change_of_the_next_state(data: Data, at: Point) -> Array:
+def _change_of_the_next_state(data: FitData, at: Point) -> Array:
     """f_theta along the filtered track, (T, B, n, k)."""
     unknowns, batch, (T, B, n) = data.unknowns, at.batch, at.filtered.f.shape
     p = unknowns.unpack(at.theta)[0]
@@ -195,7 +292,7 @@ def _change_of_the_next_state(data: Data, at: Point) -> Array:
     return out
 
 
-def _blocks(batch: Batch, blocks: int) -> NDArray[np.int64]:
+def _blocks(batch: RecordBatch, blocks: int) -> NDArray[np.int64]:
     """A block number for each sample, (T + 1, B, ny): contiguous in time, within one record."""
     T1, B, ny = batch.seen.shape
     each = max(1, round(blocks / B))

@@ -1,11 +1,7 @@
 """fit: the parameters of any model from trials, by maximum likelihood of the innovations.
 
-search      parameters, delays, thresholds and noise in turn
-held_out    the last quarter of the time judges the model before and after, one step and a
-second ahead, then joins the rest for the final values
-result      values, intervals, the sentence
-
-The last quarter of the time judges a fit: prediction errors of the model before and after.
+The last quarter of the time judges a fit: the model before and after predicts it, one step and a
+second ahead. Then it joins the rest for the final values.
 """
 
 from __future__ import annotations
@@ -15,12 +11,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from grounded.errors import GroundedError
-from grounded.estimate import Measurement, Record, of_states
+from grounded.estimate import Measurement, NoiseStd, Record, of_states
 from grounded.estimate.record import part, records_of
+from grounded.fit.gauss_newton import Latency, Unknowns, unknowns_of
 from grounded.fit.prediction import PredictionError, prediction_error
 from grounded.fit.result import Fit, report
-from grounded.fit.search import Found, data_of, first_search, search
-from grounded.fit.unknowns import Latency, Unknowns, unknowns_of
+from grounded.fit.search import SearchEnd, data_of, first_search, search_parameters
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.task import Task
@@ -65,20 +61,17 @@ def fit(
     if max(r.steps for r in records) < 3:
         raise GroundedError("a fit needs a trial of at least 3 steps")
     rng = np.random.default_rng(0) if rng is None else rng
-    train, test = held_out(records, hold_out, horizon_s, measurement)
+    train, test = split_in_time(records, hold_out, horizon_s, measurement)
     first = first_search(data_of(model, train, measurement, unknowns), rng)
-    before = after = None
+    before, after, last = None, None, first
     if test and np.isfinite(first.climb.at.loglik):
         before, after = judged(model, test, measurement, unknowns, first, horizon_s)
-        last = search(
-            data_of(model, records, measurement, unknowns), first.climb.at.theta, first.noise, rng
-        )
-    else:
-        last = first
+        whole = data_of(model, records, measurement, unknowns)
+        last = search_parameters(whole, first.climb.at.theta, first.noise, rng)
     return report(model, unknowns, last, before, after)
 
 
-def held_out(
+def split_in_time(
     records: Sequence[Record], share: float, horizon_s: float, measurement: Measurement
 ) -> tuple[list[Record], list[Record]]:
     """The first and the last part of every record.
@@ -108,18 +101,16 @@ def judged(
     test: Sequence[Record],
     measurement: Measurement,
     unknowns: Unknowns,
-    found: Found,
+    found: SearchEnd,
     horizon_s: float,
 ) -> tuple[PredictionError, PredictionError]:
     """Held-out prediction errors of the model before and after, each with its own noise."""
-    pairs = ((unknowns.start, found.start_noise), (found.climb.at.theta, found.noise))
-    judged = []
-    for theta, noise in pairs:
+
+    def error(theta: Array, noise: NoiseStd) -> PredictionError:
         p, latency = unknowns.unpack(theta)
         there = model.with_values(dict(zip(model.param_names, p.tolist(), strict=True)))
-        judged.append(
-            prediction_error(
-                there, test, horizon_s, latency=latency, measurement=measurement, noise=noise
-            )
+        return prediction_error(
+            there, test, horizon_s, latency=latency, measurement=measurement, noise=noise
         )
-    return judged[0], judged[1]
+
+    return error(unknowns.start, found.start_noise), error(found.climb.at.theta, found.noise)

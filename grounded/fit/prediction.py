@@ -13,11 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from grounded.estimate import Measurement, Noise, Record, noise_of, of_states
-from grounded.estimate.batch import Batch, batch_of
-from grounded.estimate.filter import run
-from grounded.estimate.record import records_of
-from grounded.estimate.smoother import smooth
+from grounded.estimate import Measurement, NoiseStd, Record, noise_of, of_states
+from grounded.estimate.filter import filter_batch
+from grounded.estimate.record import RecordBatch, batch_of, records_of
+from grounded.estimate.recursion import smooth
 from grounded.estimate.steps import ModelSteps
 from grounded.frozen import Array
 from grounded.model import Model
@@ -44,7 +43,7 @@ def prediction_error(
     *,
     latency: Array | None = None,
     measurement: Measurement | None = None,
-    noise: Noise | None = None,
+    noise: NoiseStd | None = None,
 ) -> PredictionError:
     """One-step and `horizon_s` open-loop prediction error of a model on trials.
 
@@ -66,7 +65,9 @@ def prediction_error(
         options = {"latency": delay, "measurement": measurement}
         noise = noise_of(model, records, **options).noise  # type: ignore[arg-type]
     batch = batch_of(records, measurement, model.n, delay)
-    filtered = run(batch, measurement, noise, ModelSteps(model.system, model.values, batch))
+    filtered = filter_batch(
+        batch, measurement, noise, ModelSteps(model.system, model.values, batch)
+    )
     x = smooth(filtered, batch).x if np.isfinite(filtered.loglik) else filtered.x
     steps = max(1, round(horizon_s / noise.dt))
     one, ahead, windows = _windows(model, batch, measurement, x, steps)
@@ -74,7 +75,7 @@ def prediction_error(
 
 
 def _windows(
-    model: Model, batch: Batch, measurement: Measurement, x: Array, steps: int
+    model: Model, batch: RecordBatch, measurement: Measurement, x: Array, steps: int
 ) -> tuple[Array, Array, int]:
     """Rms after one step and after `steps`, from as many starts as there are."""
     first, trial = np.nonzero(batch.valid)
@@ -91,7 +92,7 @@ def _windows(
 
 def _error(
     model: Model,
-    batch: Batch,
+    batch: RecordBatch,
     measurement: Measurement,
     x: Array,
     first: NDArray[np.int64],

@@ -1,6 +1,6 @@
 """What a fit found, each value with its interval, and the sentence that says how it ended.
 
-How sure a fit is of each unknown.
+How sure a fit is of each unknown is judged twice:
 
     information I = W'W,            covariance I^-1                 (noise as modelled)
     sandwich    I^-1 (sum_b g_b g_b') I^-1,   g_b = W_b' eps_b      (blocks b of time)
@@ -20,18 +20,16 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from grounded.estimate import Noise
-from grounded.fit.gauss_newton import Linear
+from grounded.estimate import NoiseStd
+from grounded.fit.gauss_newton import Linear, Unknowns
 from grounded.fit.prediction import PredictionError
-from grounded.fit.scan import likelihood_interval, quiet
-from grounded.fit.search import Found
-from grounded.fit.unknowns import Unknowns
+from grounded.fit.search import SearchEnd, likelihood_interval, quiet
 from grounded.frozen import Array
 from grounded.model import Model
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
+class FittedValue:
     """One fitted quantity with its 95 % interval; `std` is infinite where not identified."""
 
     value: float
@@ -50,10 +48,10 @@ class Fit:
     `params` holds the model's parameters and, if fitted, `latency` or `latency:<input>` [s].
     """
 
-    params: Mapping[str, Estimate]
+    params: Mapping[str, FittedValue]
     model: Model  # with the fitted values
     latency: Array  # (m,) [s]
-    noise: Noise
+    noise: NoiseStd
     loglik: float
     status: str  # converged, still rising, or why it stopped
     sentence: str
@@ -69,7 +67,7 @@ class Fit:
 def report(
     model: Model,
     unknowns: Unknowns,
-    last: Found,
+    last: SearchEnd,
     before: PredictionError | None,
     after: PredictionError | None,
 ) -> Fit:
@@ -100,17 +98,17 @@ def report(
     )
 
 
-def _estimates(unknowns: Unknowns, found: Found) -> tuple[dict[str, Estimate], Spread]:
+def _estimates(unknowns: Unknowns, found: SearchEnd) -> tuple[dict[str, FittedValue], Uncertainty]:
     at, scanned, worth = found.climb.at, np.zeros(unknowns.k, dtype=bool), 1.0
     if not np.isfinite(at.loglik):
         k = unknowns.k
-        wide = Spread(np.full(k, np.inf), np.zeros((k, k)), ())
+        wide = Uncertainty(np.full(k, np.inf), np.zeros((k, k)), ())
     else:
         scanned = quiet(found.data, found.climb.slopes) | found.thresholds
         smooth, scanned = ~scanned, scanned & np.isfinite(unknowns.scale)
-        wide = spread(found.climb.slopes, smooth)
+        wide = uncertainty(found.climb.slopes, smooth)
         worth = inflation(found.climb.slopes, smooth)
-    params: dict[str, Estimate] = {}
+    params: dict[str, FittedValue] = {}
     for i, name in enumerate(unknowns.names):
         value, std = float(at.theta[i]), float(wide.std[i])
         low, high = value - 1.96 * std, value + 1.96 * std
@@ -122,12 +120,12 @@ def _estimates(unknowns: Unknowns, found: Found) -> tuple[dict[str, Estimate], S
         known = bool(np.isfinite(std) and std < range_ / np.sqrt(12))
         low, high = max(low, float(unknowns.low[i])), min(high, float(unknowns.high[i]))
         start = float(unknowns.start[i])
-        params[name] = Estimate(value, std, low, high, unknowns.units[i], known, start)
+        params[name] = FittedValue(value, std, low, high, unknowns.units[i], known, start)
     return params, wide
 
 
 def _sentence(
-    unknowns: Unknowns, params: Mapping[str, Estimate], wide: Spread, found: Found
+    unknowns: Unknowns, params: Mapping[str, FittedValue], wide: Uncertainty, found: SearchEnd
 ) -> str:
     if not np.isfinite(found.climb.at.loglik):
         return f"nothing was fitted: {found.status}; check units, signs and start values"
@@ -152,7 +150,7 @@ LOADING = 0.05  # a share of a null direction above which an unknown takes part 
 
 
 @dataclass(frozen=True, eq=False)
-class Spread:
+class Uncertainty:
     """Standard deviations (k,), infinite where not identified, and which go together in that."""
 
     std: Array
@@ -160,7 +158,7 @@ class Spread:
     together: tuple[tuple[int, ...], ...]  # unknowns that only a combination of is identified
 
 
-def spread(slopes: Linear, free: NDArray[np.bool_]) -> Spread:
+def uncertainty(slopes: Linear, free: NDArray[np.bool_]) -> Uncertainty:
     """Standard deviations at the end of a climb.
 
     Args:
@@ -172,7 +170,7 @@ def spread(slopes: Linear, free: NDArray[np.bool_]) -> Spread:
     use = np.flatnonzero(free & (np.diag(N) > 0))
     std, covariance = np.full(k, np.inf), np.zeros((k, k))
     if len(use) == 0:
-        return Spread(std, covariance, ())
+        return Uncertainty(std, covariance, ())
     scale = 1 / np.sqrt(np.diag(N)[use])
     values, vectors = np.linalg.eigh(N[np.ix_(use, use)] * np.outer(scale, scale))
     null = values < NULL * values[-1]
@@ -188,7 +186,7 @@ def spread(slopes: Linear, free: NDArray[np.bool_]) -> Spread:
     for i in lost:
         std[i] = np.inf
         covariance[i, :] = covariance[:, i] = 0.0
-    return Spread(std, covariance, tuple(together))
+    return Uncertainty(std, covariance, tuple(together))
 
 
 def inflation(slopes: Linear, free: NDArray[np.bool_]) -> float:

@@ -32,7 +32,7 @@ class Planner:
         plan, base = self.plan.model, self.task.model
         if plan.n == base.n:
             return trial
-        from grounded.effects.memory import memory_of
+        from grounded.effects import memory_of
 
         if trial.start_inputs is None:
             trial = dataclasses.replace(trial, start_inputs=self.task.past)
@@ -69,7 +69,7 @@ def planner_for(task: Task, model: Model, latency: np.ndarray) -> Planner:
     )
     memory = np.zeros(0)
     if extra:  # effects take a while to import, and most models have none
-        from grounded.effects.memory import memory_start
+        from grounded.effects import memory_start
 
         memory = memory_start(model, task.model, held)
     nothing, reward = np.zeros(extra), task.reward

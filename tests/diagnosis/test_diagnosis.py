@@ -9,12 +9,12 @@ import pytest
 
 from grounded import GroundedError, Model, Param, Trial
 from grounded.challenge import judge, make, oracle, sealed, summary
-from grounded.diagnosis import confirm
 from grounded.diagnosis import filter as kalman
+from grounded.diagnosis import held_out
 from grounded.diagnosis.attribution import attribute
-from grounded.diagnosis.calibration import loss
+from grounded.diagnosis.claims import loss
 from grounded.diagnosis.data import prepare, shifted
-from grounded.diagnosis.diagnose import Options, diagnose
+from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.excitation import probe
 from grounded.diagnosis.leftover import chi2_tail
 from grounded.diagnosis.prediction_error import _stump
@@ -274,7 +274,7 @@ def test_a_threshold_that_is_zero_but_for_rounding_reads_zero(scale):
 def test_without_the_family_a_look_alike_is_marked_by_what_it_leaves():
     model, trials = cart(dead=0.25, trials=6)
     library = Library().without(["dead_zone", "stall", "backlash", "stiction", "coulomb_friction"])
-    found = diagnose(model, trials, Options(library=library))
+    found = diagnose(model, trials, DiagnosisOptions(library=library))
     assert found.kind == "unknown" or found.leftover or found.gap.after < 1.3
 
 
@@ -398,7 +398,7 @@ def test_a_hypothesis_whose_held_out_predictions_run_away_gives_way(monkeypatch)
     model, trials = cart(friction=0.4)
     data = prepare(model, trials, np.zeros(1))
     search, best = attribute(data, Library().candidates(model, data.scales))
-    assert best.hypothesis.effects and confirm.confirmed(search, best, 1.0) is best
+    assert best.hypothesis.effects and held_out.confirmed(search, best, 1.0) is best
 
     class Gap:
         gap_before = 2.0
@@ -406,9 +406,9 @@ def test_a_hypothesis_whose_held_out_predictions_run_away_gives_way(monkeypatch)
         def __init__(self, after):
             self.gap_after = after
 
-    monkeypatch.setattr(confirm, "shrinkage", lambda *a: Gap(1e6))
-    assert not confirm.confirmed(search, best, 1.0).hypothesis.effects
-    monkeypatch.setattr(confirm, "shrinkage", lambda p, f, t, w: Gap(1e6 if f is best else 1.0))
-    other = confirm.confirmed(search, best, 1.0)
+    monkeypatch.setattr(held_out, "shrinkage", lambda *a: Gap(1e6))
+    assert not held_out.confirmed(search, best, 1.0).hypothesis.effects
+    monkeypatch.setattr(held_out, "shrinkage", lambda p, f, t, w: Gap(1e6 if f is best else 1.0))
+    other = held_out.confirmed(search, best, 1.0)
     assert other is not best and other.hypothesis.effects
     assert search.score(other) > search.score(search.best_null())

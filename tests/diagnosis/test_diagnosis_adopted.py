@@ -11,9 +11,9 @@ from test_diagnosis import DT, cart
 from cli import grounded
 from grounded import Trial
 from grounded.diagnosis.data import prepare
-from grounded.diagnosis.diagnose import Options, diagnose
+from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.limits import limits
-from grounded.diagnosis.search import Search
+from grounded.diagnosis.search import HypothesisSearch
 from grounded.effects import Library, memory_of, wrap
 from grounded.errors import NextCommand
 from grounded_trials.store.trial_file import write_trial
@@ -63,7 +63,7 @@ def test_what_is_left_beside_an_adopted_lag_is_named():
     model, runs = lagging(0.4)
     better, lifted, memory = adopted(model, runs)
     assert len(memory) == 1
-    options = Options(hidden=memory, but={"first_order_lag:u"})
+    options = DiagnosisOptions(hidden=memory, but={"first_order_lag:u"})
     found = diagnose(better, lifted, options)
     assert found.effects == ("coulomb_friction:v",)
     assert found.ranking[0].params["c"].value == pytest.approx(0.4, rel=0.05)
@@ -75,7 +75,7 @@ def test_what_is_left_beside_an_adopted_lag_is_named():
 def test_nothing_is_left_beside_what_is_all():
     model, runs = lagging(0.0)
     better, lifted, memory = adopted(model, runs)
-    found = diagnose(better, lifted, Options(hidden=memory, but={"first_order_lag:u"}))
+    found = diagnose(better, lifted, DiagnosisOptions(hidden=memory, but={"first_order_lag:u"}))
     assert found.kind == "none" and not found.leftover and found.gap.after < 1.2
 
 
@@ -87,7 +87,7 @@ def test_a_memory_is_known_at_the_start_and_disturbed_by_nothing():
     assert data.seen.shape[1] == 4  # two runs of each trial
     assert data.seen[0, :, i].sum() == 2 and data.seen[1:, :, i].sum() == 0
     assert not [s for s in limits(data).sentences if memory[0] in s]
-    noise = Search(data, ()).nulls().noise
+    noise = HypothesisSearch(data, ()).nulls().noise
     assert np.exp(noise.log_q[i]) < 1e-20
 
 

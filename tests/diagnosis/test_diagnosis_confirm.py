@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from grounded import Model, Param, Trial
-from grounded.diagnosis import confirm
+from grounded.diagnosis import held_out
 from grounded.diagnosis.attribution import attribute
 from grounded.diagnosis.data import prepare
 from grounded.diagnosis.noise import Structure
@@ -57,7 +57,7 @@ def test_what_predicts_down_to_the_noise_keeps_its_noise():
     data = prepare(model, trials, np.zeros(1))
     search, best = attribute(data, Library().candidates(model, data.scales))
     assert best.hypothesis.effects
-    kept, same = confirm.noise_confirmed(search, best, 3, 1.0)
+    kept, same = held_out.noise_confirmed(search, best, 3, 1.0)
     assert kept is search and same is best
 
 
@@ -73,22 +73,22 @@ def test_another_noise_is_confirmed_where_the_likeliest_predicts_badly(wavy, mon
         keys = [(f.noise.structure, f.hypothesis.spread) for f in fits]
         return [1.1 if key == wanted else 3.0 for key in keys]
 
-    monkeypatch.setattr(confirm, "gaps_of", gaps)
-    found, chosen = confirm.noise_confirmed(search, best, 3, 1.0)
+    monkeypatch.setattr(held_out, "gaps_of", gaps)
+    found, chosen = held_out.noise_confirmed(search, best, 3, 1.0)
     assert (chosen.noise.structure, chosen.hypothesis.spread) == wanted
     assert chosen.hypothesis.effects
     assert {(s, w) for s, w, names in found.fits if names} == {wanted}
-    assert found.score(chosen) > found.score(found.best_null()) + confirm.CLAIM
+    assert found.score(chosen) > found.score(found.best_null()) + held_out.CLAIM
 
-    monkeypatch.setattr(confirm, "gaps_of", lambda p, fits, w: [1.4 for _ in fits])
-    assert confirm.noise_confirmed(search, best, 3, 1.0) == (search, best)  # not much better
+    monkeypatch.setattr(held_out, "gaps_of", lambda p, fits, w: [1.4 for _ in fits])
+    assert held_out.noise_confirmed(search, best, 3, 1.0) == (search, best)  # not much better
 
 
 def test_one_trial_alone_confirms_nothing():
     model, trials = axis(WAVE, trials=1)
     data = prepare(model, trials, np.zeros(1))
     search, best = attribute(data, Library().candidates(model, data.scales))
-    assert confirm.noise_confirmed(search, best, 3, 1.0) == (search, best)
+    assert held_out.noise_confirmed(search, best, 3, 1.0) == (search, best)
 
 
 def test_in_a_misfit_an_effect_that_predicts_no_better_is_dropped(wavy, monkeypatch):
@@ -100,10 +100,10 @@ def test_in_a_misfit_an_effect_that_predicts_no_better_is_dropped(wavy, monkeypa
         def gaps(predictor, fits, where):
             return [without if f.hypothesis.names else bare for f in fits]
 
-        monkeypatch.setattr(confirm, "gaps_of", gaps)
+        monkeypatch.setattr(held_out, "gaps_of", gaps)
         gap = type("Gap", (), {"gap_before": bare, "gap_after": worst})
-        monkeypatch.setattr(confirm, "shrinkage", lambda *a: gap)
-        return confirm.confirmed(search, best, 1.0)
+        monkeypatch.setattr(held_out, "shrinkage", lambda *a: gap)
+        return held_out.confirmed(search, best, 1.0)
 
     assert judged(1.2, 1.2) is best  # predicts down to the noise: the evidence decides
     assert judged(5.0, 9.0) is best  # each of them is worth naming

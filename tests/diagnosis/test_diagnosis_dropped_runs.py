@@ -11,9 +11,9 @@ from test_diagnosis_split import task_of
 from grounded import Trial
 from grounded.diagnosis import data as diagnosis_data
 from grounded.diagnosis.data import prepare
+from grounded.diagnosis.held_out import utility_prediction
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor
 from grounded.diagnosis.split import scatter
-from grounded.diagnosis.utility_prediction import utility_prediction
 
 STEPS = 450  # three runs of 150 steps
 

@@ -9,9 +9,8 @@ from grounded.challenge.cases import make
 from grounded.diagnosis.data import prepare
 from grounded.diagnosis.hypotheses import price
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor
-from grounded.diagnosis.jacobian import sensitivities
-from grounded.diagnosis.linearise import jacobian
-from grounded.diagnosis.search import Search
+from grounded.diagnosis.linearise import sensitivities, step_jacobian
+from grounded.diagnosis.search import HypothesisSearch
 from grounded.effects import Library
 
 
@@ -42,7 +41,7 @@ def test_the_jacobian_is_that_of_the_hypothesis(cars, name, values):
     predictor, h = Predictor(data), Hypothesis().plus(effect(data, name), values)
     track = data.y.copy()
     track[..., data.model.state_names.index("v")] += 0.5  # away from the kink at rest
-    F = jacobian(predictor, h, track)
+    F = step_jacobian(predictor, h, track)
     x, u, size = track[:-1], predictor.inputs(h), 1e-6
     for j in range(data.model.n):
         ends = []
@@ -61,7 +60,7 @@ def test_without_the_effects_slope_it_would_be_another(cars):
     predictor = Predictor(data)
     h = Hypothesis().plus(effect(data, "coupling:psi<-v"), {"k": 0.36})
     names = data.model.state_names
-    with_it, alone = (jacobian(predictor, one, data.y) for one in (h, Hypothesis()))
+    with_it, alone = (step_jacobian(predictor, one, data.y) for one in (h, Hypothesis()))
     change = (with_it - alone)[..., names.index("psi"), names.index("v")]
     assert change.max() == pytest.approx(0.36 * data.dt, rel=0.01)
     assert change.min() > 0.7 * 0.36 * data.dt  # less where v itself decays within a step
@@ -85,7 +84,7 @@ def test_a_stall_that_is_off_is_calibrated_not_blamed_on_another_effect():
     case = next(iter(make("none", 1, 20, only="car", noise="white")))  # its throttle passes there
     crude = case.model.with_values({"stall": 1.15 * case.model.params["stall"].value})
     data = prepare(crude, case.trials, case.latency)
-    search = Search(data, Library().candidates(crude, data.scales))
+    search = HypothesisSearch(data, Library().candidates(crude, data.scales))
     with np.errstate(all="ignore"):
         search.nulls()
     fit = search.best_null()

@@ -5,14 +5,14 @@ import pytest
 
 from grounded.diagnosis import kernels
 from grounded.diagnosis.data import prepare
-from grounded.diagnosis.delayed_measurement import Late
+from grounded.diagnosis.delayed_measurement import Delayed
 from grounded.diagnosis.delays import delays_of
 from grounded.diagnosis.filter import UNKNOWN, Adjoint, gains, innovations, smoother, transition
+from grounded.diagnosis.held_out import held_out_errors
 from grounded.diagnosis.hypothesis import Hypothesis
-from grounded.diagnosis.noise import Noise, Structure
+from grounded.diagnosis.noise import NoiseModel, Structure
 from grounded.diagnosis.prediction_error import horizon, normalised
-from grounded.diagnosis.search import Search
-from grounded.diagnosis.shrinkage import held_out
+from grounded.diagnosis.search import HypothesisSearch
 from grounded.effects import Library
 from grounded.models.pendulum import model as pendulum
 from grounded.trial import Trial
@@ -33,7 +33,7 @@ class Problem:
 
     def __init__(self, channel, part, phi, through, missing, steps=L):
         rng = np.random.default_rng(n)
-        self.L, self.phi, self.late = steps, phi, Late(np.array(channel), np.array(part))
+        self.L, self.phi, self.late = steps, phi, Delayed(np.array(channel), np.array(part))
         self.F = 0.9 * np.eye(n) + 0.1 * rng.standard_normal((steps, B, n, n))
         self.G = None
         if through:
@@ -174,7 +174,7 @@ def test_a_moved_log_crosses_the_runs_of_a_trial_but_not_its_end(whole):
     assert (delays.aligned(data.y)[..., 1] == y[..., 1])[seen[..., 1] > 0].all()
     weight = np.random.default_rng(0).uniform(0.5, 2.0, data.seen[1:].shape)
     log = np.zeros(2)
-    moved = delays.noise(Noise(Structure(), log, log, log, log, weight, weight)).weight_v
+    moved = delays.noise(NoiseModel(Structure(), log, log, log, log, weight, weight)).weight_v
     back = delays.restored(Adjoint(moved, moved, moved, moved))
     same = back.u[..., 1] == weight[..., 1]
     lost = data.seen[1:, :, 1].sum() - seen[1:, :, 1].sum()
@@ -189,7 +189,7 @@ def test_samples_of_what_was_before_a_trial_count_like_those_of_a_state_that_dri
     effect = Library().effect("sensor_delay:omega", pendulum, data.scales)
     delays = delays_of(Hypothesis().plus(effect, {"d": (whole + 0.25) * data.dt}), data)
     log, L, B = np.log([0.5, 1.0]), len(data.time), len(data.valid)
-    noise = Noise(Structure(), log, log - 1, log, log)
+    noise = NoiseModel(Structure(), log, log - 1, log, log)
     white, whiten = np.zeros((L, B, 2)), np.tile(1e-9 * np.eye(2), (L, B, 1, 1))
     still = np.zeros((L + 1, B, 2))
     found = delays.before(noise, None, still, white, whiten)
@@ -220,7 +220,7 @@ def test_a_delay_is_found_where_the_state_is_disturbed_and_predictions_reach_the
         log += [0.002, 0.01] * rng.standard_normal(log.shape)
         trials.append(Trial(log, u, dt, pendulum.state_names, pendulum.input_names))
     data = prepare(pendulum, trials)
-    search, found = Search(data, ()), {}
+    search, found = HypothesisSearch(data, ()), {}
     (null,) = search.refined([search.fresh(Hypothesis())], 20)
     for name, values in (("sensor_delay", {"d": 0.03}), ("viscous_friction", {"k": 0.1})):
         effect = Library().effect(f"{name}:omega", pendulum, data.scales)
@@ -231,6 +231,6 @@ def test_a_delay_is_found_where_the_state_is_disturbed_and_predictions_reach_the
     assert fit.loglik > max(null.loglik, found["viscous_friction"].loglik) + 300
     assert np.exp(0.5 * fit.noise.log_q[1]) == pytest.approx(0.03, rel=0.1)
     where = horizon(search.predictor, fit, 0.5)
-    error = held_out(search.predictor, fit, fit.track, where)
+    error = held_out_errors(search.predictor, fit, fit.track, where)
     of_late = float(np.sqrt((error[:, 1] ** 2 / where.spread[:, 1] ** 2).mean()))
     assert 0.85 < of_late < 1.15 and 0.85 < normalised(error, where) < 1.15

@@ -10,7 +10,7 @@ from grounded import GroundedError, Model, Param, Trial
 from grounded.diagnosis.data import prepare
 from grounded.diagnosis.diagnose import diagnose
 from grounded.diagnosis.limits import knowable, still_states
-from grounded.diagnosis.search import Search
+from grounded.diagnosis.search import HypothesisSearch
 from grounded.effects import Library
 from grounded.models.pendulum import model as pendulum
 
@@ -61,4 +61,4 @@ def test_a_model_that_is_no_number_at_a_measured_state_says_where():
 )
 def test_coloured_noise_is_offered_however_slow_the_system_is(dt, expected):
     trials = [replace(trial, dt=dt) for trial in swings(2, 40)]
-    assert Search(prepare(pendulum, trials), ()).taus == pytest.approx(expected)
+    assert HypothesisSearch(prepare(pendulum, trials), ()).taus == pytest.approx(expected)

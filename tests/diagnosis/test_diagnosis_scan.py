@@ -8,7 +8,7 @@ import pytest
 from grounded import Model, Param
 from grounded.diagnosis.data import prepare
 from grounded.diagnosis.scan import elsewhere, faint
-from grounded.diagnosis.search import Search
+from grounded.diagnosis.search import HypothesisSearch
 from grounded.effects import Library
 from grounded.models.car import model as car
 from grounded.models.pendulum import model as pendulum
@@ -37,7 +37,7 @@ def test_a_delay_of_a_hundredth_of_a_step_is_a_matter_of_time_stamps():
     t = np.arange(60) * 0.05
     trial = Trial(np.zeros((61, 2)), np.sin(t)[:, None], 0.05, ("theta", "omega"), ("torque",))
     data = prepare(pendulum, [trial, trial])
-    search = Search(data, Library().candidates(pendulum, data.scales))
+    search = HypothesisSearch(data, Library().candidates(pendulum, data.scales))
     effect = Library().effect("delay:torque", pendulum, data.scales)
     assert search.price(effect, {"d": 0.0005}) == math.inf
     assert search.price(effect, {"d": 0.02}) < 20

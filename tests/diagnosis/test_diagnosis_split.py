@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_diagnosis import DT, cart
 
-from grounded.diagnosis.diagnose import Options, diagnose
+from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.split import repeated, shares
 from grounded.effects import Library
 from grounded.task import Task
@@ -62,7 +62,9 @@ def test_without_an_effect_the_error_is_noise():
 
 def test_what_no_effect_explains_stays_unexplained_and_is_not_white():
     model, trials = cart(asymmetric=0.8, trials=6)
-    poor = Options(library=Library((Library().family("trend"),)))  # nothing that could explain it
+    poor = DiagnosisOptions(
+        library=Library((Library().family("trend"),))
+    )  # nothing that could explain it
     found = diagnose(task_of(model), trials, poor)
     assert found.leftover and found.where.whiteness["v"] < 0.01
     assert found.where.split["horizon"].channels[1].explained < 1

@@ -7,8 +7,8 @@ from grounded import Trial
 from grounded.diagnosis import filter as kalman
 from grounded.diagnosis.data import prepare
 from grounded.diagnosis.diagnose import diagnose
-from grounded.diagnosis.initial_state import prior, smoothed, widened
-from grounded.diagnosis.search import Search
+from grounded.diagnosis.linearise import prior, smoothed, widened
+from grounded.diagnosis.search import HypothesisSearch
 from grounded.models.pendulum import model as pendulum
 
 DT = 0.02
@@ -58,7 +58,7 @@ def test_a_speed_that_is_never_measured_is_no_effect(seed):
 def test_a_state_that_is_measured_now_and_then_leaves_its_noise_to_be_found(state, every):
     trials = list(seen_every(swings(6, 200, 3), state, every))
     data = prepare(pendulum, trials)
-    noise = Search(data, ()).nulls().noise
+    noise = HypothesisSearch(data, ()).nulls().noise
     assert np.exp(noise.log_q[1] / 2) == pytest.approx(DISTURBED[1], rel=0.3)
     assert np.exp(noise.floor[state] / 2) < 0.1 * DISTURBED[state]
     found = diagnose(pendulum, trials)

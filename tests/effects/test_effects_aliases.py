@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from grounded.effects import Library
-from grounded.effects.aliases import aliases
+from grounded.effects.registry import aliases
 from grounded.model import Model, Param
 from grounded.models.aircraft import model as aircraft
 from grounded.models.car import model as car

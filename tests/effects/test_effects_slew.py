@@ -6,7 +6,7 @@ import pytest
 from grounded import Model, Param, Trial
 from grounded.diagnosis.data import prepare
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor
-from grounded.diagnosis.linearise import linearised
+from grounded.diagnosis.linearise import linearise
 from grounded.effects import Library, wrap
 from grounded.models.aircraft import model as aircraft
 from grounded.models.car import model as car
@@ -73,7 +73,7 @@ def test_the_filter_knows_that_a_limited_state_keeps_its_error():
     trial = Trial(np.zeros((31, 1)), u, DT, ("angle",), ("command",), start_inputs=np.zeros(1))
     predictor = Predictor(prepare(model, [trial, trial]))
     h = Hypothesis(spread=0.1).plus(limit(model), {"r": 1.5})
-    F, d, _ = linearised(predictor, h, predictor.data.y.copy())
+    F, d, _ = linearise(predictor, h, predictor.data.y.copy())
     free, held = F[:15, 0, 0, 0], F[15:, 0, 0, 0]
     np.testing.assert_allclose(free, 0.375)  # RK4 of exp(-1)
     np.testing.assert_allclose(held, 1.0)

@@ -5,7 +5,7 @@ import pytest
 
 from grounded.errors import GroundedError
 from grounded.estimate import (
-    Noise,
+    NoiseStd,
     Tracker,
     consistency,
     cut,
@@ -17,11 +17,10 @@ from grounded.estimate import (
     record_of,
     smooth_trials,
 )
-from grounded.estimate.batch import batch_of
-from grounded.estimate.filter import run, sensitivity
+from grounded.estimate.filter import filter_batch, sensitivity
 from grounded.estimate.likelihood import _slope
-from grounded.estimate.recursion import recursion
-from grounded.estimate.smoother import smooth
+from grounded.estimate.record import batch_of
+from grounded.estimate.recursion import recursion, smooth
 from grounded.estimate.steps import ModelSteps, fixed_steps
 from grounded.estimate.tracker import nearest_step
 from grounded.model import Model, Param
@@ -43,7 +42,7 @@ SPRING = Model(
     params={"k": Param(4.0, "1/s^2", 0.1, 20.0), "d": Param(0.5, "1/s", 0.0, 5.0)},
     derivative=_spring,
 )
-SPRING_NOISE = Noise(np.array([0.002, 0.02]), np.array([0.01, 0.05]), DT)
+SPRING_NOISE = NoiseStd(np.array([0.002, 0.02]), np.array([0.01, 0.05]), DT)
 
 
 def simulated(model, rng, noise, *, B=4, T=100, latency=0.0, low=-1.0, high=1.0):
@@ -106,7 +105,7 @@ def test_a_linear_model_is_filtered_and_smoothed_exactly():
 def test_sensitivities_of_the_innovations_match_differences():
     _, trials = simulated(car, np.random.default_rng(1), CAR_NOISE, B=2, T=40)
     batch, measurement = batched(car, trials)
-    base = run(batch, measurement, CAR_NOISE, ModelSteps(car.system, car.values, batch))
+    base = filter_batch(batch, measurement, CAR_NOISE, ModelSteps(car.system, car.values, batch))
     F = np.stack(
         [car.system.sensitivities(base.x[t], batch.u[t], car.values, DT)[2] for t in range(40)]
     )
@@ -129,7 +128,7 @@ def test_sensitivities_of_the_innovations_match_differences():
         assert np.allclose(W[..., i], moved, atol=2e-3 * np.abs(moved).max())
 
 
-CAR_NOISE = Noise(
+CAR_NOISE = NoiseStd(
     np.array([0.003, 0.01, 0.001, 0.001, 0.002, 0.02]),
     np.array([0.01, 0.03, 0.003, 0.003, 0.01, 0.05]),
     DT,
@@ -145,11 +144,13 @@ def test_slopes_by_the_variances_match_differences():
     lost[5:8, 0], lost[3] = np.nan, np.nan
     gappy = Trial(lost, trials[1].inputs, DT, SPRING.state_names, SPRING.input_names)
     batch, measurement = batched(SPRING, [trials[0], gappy, short])
-    base = run(batch, measurement, SPRING_NOISE, ModelSteps(SPRING.system, SPRING.values, batch))
+    base = filter_batch(
+        batch, measurement, SPRING_NOISE, ModelSteps(SPRING.system, SPRING.values, batch)
+    )
 
     def at(theta):
         std = np.exp(theta / 2)
-        noise = Noise(std[:2], std[2:], DT)
+        noise = NoiseStd(std[:2], std[2:], DT)
         return noise, recursion(batch, measurement, noise, fixed_steps(base))
 
     theta = 2 * np.log(np.concatenate([SPRING_NOISE.process, SPRING_NOISE.measurement]))
@@ -174,8 +175,10 @@ def test_the_compiled_pass_is_the_recursion(width):
     batch, measurement = batched(car, trials, np.array([0.1, 0.07]))
     steps = ModelSteps(car.system, car.values, batch)
     plain = recursion(batch, measurement, CAR_NOISE, steps.at)
-    near = Noise(1.2 * CAR_NOISE.process, 0.9 * CAR_NOISE.measurement, DT)
-    fast = run(batch, measurement, CAR_NOISE, steps, recursion(batch, measurement, near, steps.at))
+    near = NoiseStd(1.2 * CAR_NOISE.process, 0.9 * CAR_NOISE.measurement, DT)
+    fast = filter_batch(
+        batch, measurement, CAR_NOISE, steps, recursion(batch, measurement, near, steps.at)
+    )
     assert fast.done is not None
     assert fast.loglik == pytest.approx(plain.loglik, abs=1e-3)
     for name in ("x", "x_prior", "P_prior", "e", "A", "f", "P", "K", "C", "eps"):
@@ -226,7 +229,7 @@ def test_the_noise_is_recovered_and_the_filter_is_consistent():
 
 def test_a_filter_with_the_wrong_noise_is_called_inconsistent():
     truth, trials = simulated(SPRING, np.random.default_rng(12), SPRING_NOISE)
-    wrong = Noise(SPRING_NOISE.process / 3, SPRING_NOISE.measurement, DT)
+    wrong = NoiseStd(SPRING_NOISE.process / 3, SPRING_NOISE.measurement, DT)
     assert not consistency(filter_trials(SPRING, trials, wrong), truth).consistent
     assert consistency(filter_trials(SPRING, trials, SPRING_NOISE), truth).consistent
 
@@ -251,7 +254,7 @@ def test_camera_at_30_hz_and_control_at_20_hz_from_two_markers():
     rng = np.random.default_rng(7)
     L, sigma = 0.15, 0.003
     steps = 600  # of 1/60 s
-    noise = Noise(np.array([1e-3, 5e-3, 2e-4, 2e-4, 5e-4, 1e-3]), np.full(4, sigma), 1 / 60)
+    noise = NoiseStd(np.array([1e-3, 5e-3, 2e-4, 2e-4, 5e-4, 1e-3]), np.full(4, sigma), 1 / 60)
 
     def markers(x):
         front = x[:, 2:4] + L * np.stack([np.cos(x[:, 4]), np.sin(x[:, 4])], axis=1)
@@ -333,10 +336,10 @@ def test_pieces_of_a_record_keep_their_latency_and_cover_it():
 def test_misuse_says_what_to_do():
     _, trials = simulated(SPRING, np.random.default_rng(11), SPRING_NOISE, B=1)
     with pytest.raises(GroundedError, match="2 states and 2 channels"):
-        filter_trials(SPRING, trials, Noise(np.ones(3), np.ones(2), DT))
+        filter_trials(SPRING, trials, NoiseStd(np.ones(3), np.ones(2), DT))
     with pytest.raises(GroundedError, match="ingest at least one"):
         filter_trials(SPRING, [], SPRING_NOISE)
     with pytest.raises(GroundedError, match="no input 'steering'"):
         filter_trials(car, trials, CAR_NOISE)
     with pytest.raises(GroundedError, match="finite standard"):
-        Noise(np.array([np.nan]), np.ones(1), DT)
+        NoiseStd(np.array([np.nan]), np.ones(1), DT)

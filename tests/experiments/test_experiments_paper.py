@@ -65,7 +65,7 @@ def test_flights_can_be_continued(flown):
 
 def test_an_unstable_first_controller_is_discarded(monkeypatch):
     monkeypatch.setattr(flight, "RADIUS", 1.0)
-    result = flight.one(0, "damped")
+    result = flight.flight_job(0, "damped")
     assert result["discarded"] and result["trials"] == 1
     assert result["utilities"][0] < -5000
 

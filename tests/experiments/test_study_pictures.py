@@ -12,7 +12,7 @@ from grounded.experiments.estimated import EstimatedResult, EstimatedRun
 from grounded.experiments.fit_car import FitCarResult
 from grounded.experiments.flight import FlightResult, FlightRun
 from grounded.experiments.footnote9 import Footnote9Result, Footnote9Row
-from grounded.experiments.nondeterminism import NondeterminismResult, Spread
+from grounded.experiments.nondeterminism import EndPointSpread, NondeterminismResult
 from grounded.experiments.repeats import NoiseResult, Outcome
 from grounded.experiments.theorem1 import Theorem1Result, Theorem1Row
 from grounded_cli.experiment import STUDIES
@@ -63,7 +63,9 @@ def results():
         for e in (0.01, 0.1)
         for s in (0, 1)
     ]
-    spreads = tuple(Spread("circle", level, 0.1 * level, 0.2 * level) for level in (0.0, 1.0, 3.0))
+    spreads = tuple(
+        EndPointSpread("circle", level, 0.1 * level, 0.2 * level) for level in (0.0, 1.0, 3.0)
+    )
     ways = [filmed("circle", way) for way in ("camera", "true")]
     return {
         "flight": FlightResult((flown(0, 1.0), flown(1, 2.0)), -1826.0, LOOP.tolist()),

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from grounded.errors import GroundedError
-from grounded.estimate import Noise, of_states, record_of
+from grounded.estimate import NoiseStd, of_states, record_of
 from grounded.fit import fit, prediction_error
-from grounded.fit.gauss_newton import Data, linear, point
-from grounded.fit.unknowns import unknowns_of
+from grounded.fit.gauss_newton import FitData, linear, point, unknowns_of
 from grounded.model import Model, Param
 from grounded.models.pendulum import model as pendulum
 from grounded.trial import Trial
@@ -30,7 +29,7 @@ SPRING = Model(
     params={"k": Param(4.0, "1/s^2", 0.1, 20.0), "d": Param(0.5, "1/s", 0.0, 5.0)},
     derivative=_spring,
 )
-NOISE = Noise(np.array([0.002, 0.02]), np.array([0.01, 0.05]), DT)
+NOISE = NoiseStd(np.array([0.002, 0.02]), np.array([0.01, 0.05]), DT)
 
 
 def simulated(model, rng, noise, *, B=4, T=150, latency=0.0, low=-1.0, high=1.0):
@@ -86,7 +85,7 @@ def test_intervals_cover_the_truth_as_often_as_they_say():
 
 
 def test_noise_of_the_measurements_does_not_bias_the_fit():
-    noisy = Noise(np.array([1e-4, 1e-3]), np.array([0.03, 0.2]), DT)
+    noisy = NoiseStd(np.array([1e-4, 1e-3]), np.array([0.03, 0.2]), DT)
     trials = simulated(SPRING, np.random.default_rng(1), noise=noisy, B=8)
     found = fit(SPRING, trials, hold_out=0.0)
     assert abs(found.params["d"].value - 0.5) < 3 * found.params["d"].std < 0.1
@@ -126,7 +125,7 @@ STALLING = Model(
 
 
 def test_a_threshold_is_found_by_scanning():
-    noise = Noise(np.array([0.005]), np.array([0.02]), DT)
+    noise = NoiseStd(np.array([0.005]), np.array([0.02]), DT)
     trials = simulated(STALLING, np.random.default_rng(3), noise, B=8, low=0.0)
     found = fit(STALLING.with_values({"stall": 0.1, "gain": 1.5}), trials, hold_out=0.0)
     stall = found.params["stall"]
@@ -138,7 +137,7 @@ def test_a_threshold_is_found_by_scanning():
 
 def test_correlated_disturbances_widen_intervals_of_thresholds_too():
     """A wind that the model knows nothing of: nats of white noise would be far too sure."""
-    calm = Noise(np.array([0.005]), np.array([0.02]), DT)
+    calm = NoiseStd(np.array([0.005]), np.array([0.02]), DT)
     widths = {}
     for wind in (0.0, 0.15):
         covered, each = 0, []
@@ -160,7 +159,7 @@ def test_correlated_disturbances_widen_intervals_of_thresholds_too():
 
 
 def test_what_the_data_cannot_tell_is_named():
-    noise = Noise(np.array([1e-3, 1e-2]), np.array([5e-3, 2e-2]), DT)
+    noise = NoiseStd(np.array([1e-3, 1e-2]), np.array([5e-3, 2e-2]), DT)
     trials = simulated(pendulum, np.random.default_rng(4), noise, B=4, T=100)
     found = fit(pendulum, trials, hold_out=0.0)  # torque/(m l^2), b/(m l^2), g/l: three, not four
     assert "only a combination of" in found.sentence
@@ -194,7 +193,7 @@ def test_slopes_of_the_problem_are_what_differences_say():
     measurement = of_states(SPRING)
     unknowns = unknowns_of(SPRING, None, np.array([0.06]), "each")
     records = tuple(record_of(SPRING, t) for t in trials)
-    data = Data(SPRING.system, records, measurement, unknowns)
+    data = FitData(SPRING.system, records, measurement, unknowns)
     at = point(data, NOISE, unknowns.start)
     W = linear(data, at).W
     for i, h in enumerate((1e-4, 1e-4, 1e-5)):
@@ -218,14 +217,14 @@ def test_a_black_box_step_is_fitted_all_the_same():
     box = Model(
         states={"y": "1"}, inputs={"u": "1"}, params={"tau": Param(0.3, "s", 0.05, 2.0)}, step=step
     )
-    noise = Noise(np.array([0.01]), np.array([0.02]), DT)
+    noise = NoiseStd(np.array([0.01]), np.array([0.02]), DT)
     trials = simulated(box, np.random.default_rng(7), noise, B=2, T=80)
     found = fit(box.with_values({"tau": 0.6}), trials, hold_out=0.0)
     assert abs(found.params["tau"].value - 0.3) < 3 * found.params["tau"].std < 0.15
 
 
 def test_prediction_error_falls_to_the_noise_for_the_true_model():
-    quiet = Noise(np.array([1e-5, 1e-5]), np.array([0.01, 0.05]), DT)
+    quiet = NoiseStd(np.array([1e-5, 1e-5]), np.array([0.01, 0.05]), DT)
     trials = simulated(SPRING, np.random.default_rng(8), quiet)
     error = prediction_error(SPRING, trials, 1.0)
     assert np.allclose(error.ahead, quiet.measurement, rtol=0.15)

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from grounded.experiments.driving import drive
-from grounded.experiments.first_values import first_values
-from grounded.experiments.fit_car import bench, fit_car, true_car
+from grounded.experiments.fit_car import bench_angles, first_values, fit_car, true_car
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +38,7 @@ def test_first_values_are_within_reach():
     rng = np.random.default_rng(5)
     truth, latency = true_car(rng)
     films = drive(truth, latency, 4.0, rng)
-    first = first_values(films, truth.params["L"].value, bench(truth, rng))
+    first = first_values(films, truth.params["L"].value, bench_angles(truth, rng))
     for name, share in (
         ("a1", 0.05),
         ("a2", 0.15),

@@ -7,8 +7,7 @@ import pytest
 
 from grounded.errors import GroundedError
 from grounded.experiments.figure8 import DT, figure8_target, flight_task, perturbed
-from grounded.models.aircraft import PARAMS, dynamics, lift_coefficient, model
-from grounded.models.aircraft_trim import trim
+from grounded.models.aircraft import PARAMS, dynamics, level_trim, lift_coefficient, model
 from grounded.models.pendulum import model as pendulum
 
 VALUES = SimpleNamespace(**{name: param.value for name, param in PARAMS.items()})
@@ -33,7 +32,7 @@ def column(path, name):
 
 @pytest.fixture(scope="module")
 def straight():
-    flight = trim(model, np.array([11.0]), np.array([0.0]))
+    flight = level_trim(model, np.array([11.0]), np.array([0.0]))
     return flight.states[0], flight.inputs[0]
 
 
@@ -61,7 +60,7 @@ def test_trim_is_held_for_ten_seconds(straight):
 def test_a_coordinated_turn_banks_by_its_turn_rate():
     # a level coordinated turn: tan(phi) = omega V / g, point mass; the wing body's lift tilts a bit
     for omega in (-0.2, 0.2):
-        flight = trim(model, 9.0, omega)
+        flight = level_trim(model, 9.0, omega)
         path = fly(flight.states[0], flight.inputs[0], 2.0)
         turned = column(path, "psi")[-1] - column(path, "psi")[0]
         assert turned == pytest.approx(2.0 * omega, abs=1e-6)
@@ -141,9 +140,9 @@ def test_lift_falls_beyond_the_stall():
 
 def test_no_trim_is_said_so():
     with pytest.raises(GroundedError, match="no level flight"):
-        trim(model.with_values({"rho": 0.0}), 9.0, 0.0)
+        level_trim(model.with_values({"rho": 0.0}), 9.0, 0.0)
     with pytest.raises(GroundedError, match="states of an aircraft"):
-        trim(pendulum, 3.0, 0.0)
+        level_trim(pendulum, 3.0, 0.0)
 
 
 def test_the_figure8_closes_in_sixty_seconds():

@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from grounded.effects.family import Effect, Family, Scales, Site
+from grounded.effects.family import Effect, Family, Scales, Site, wrapping_order
 from grounded.effects.registry import Library
-from grounded.effects.wrap import wrap, wrapping_order
+from grounded.effects.wrap import wrap
 from grounded.errors import GroundedError
 from grounded.model import Model
 from grounded.search.planner import Planner, planner_for

@@ -50,7 +50,7 @@ def diagnose_in(
     Raises:
         GroundedError: for an unknown trial, or where there is none to learn from.
     """
-    from grounded.diagnosis.diagnose import Options, diagnose
+    from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
     from grounded.effects import Library
 
     effects = [dict(effect) for effect in workspace.config.model.effects]
@@ -59,7 +59,9 @@ def diagnose_in(
     library = library or Library()
     planner, used = workspace.planner, _chosen(workspace, trials)
     memory = planner.plan.model.state_names[planner.task.model.n :]
-    options = Options(library=library, max_effects=max_effects, hidden=tuple(memory), but=adopted)
+    options = DiagnosisOptions(
+        library=library, max_effects=max_effects, hidden=tuple(memory), but=adopted
+    )
     lifted = [planner.lift(trial) for trial in used]
     made = Made(
         trials=tuple(trial.id for trial in used),

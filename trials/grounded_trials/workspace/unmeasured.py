@@ -92,7 +92,7 @@ def _smoothed(
     workspace: Folder, found: Gridded, measured: list[str], table: EstimateTable
 ) -> Array:
     """All states (T + 1, n): the smoother's, with the measured ones as they were measured."""
-    from grounded.estimate import Noise, Record, noise_of, of_states, smooth_trials
+    from grounded.estimate import NoiseStd, Record, noise_of, of_states, smooth_trials
 
     model, task = workspace.base_model, workspace.task
     dt = task.dt
@@ -111,7 +111,7 @@ def _smoothed(
     for name, std in table.process.items():
         process[model.state_names.index(name)] = std
     known = np.array([table.measured[name] for name in measured])
-    noise = Noise(process=process, measurement=known, dt=noise.dt)
+    noise = NoiseStd(process=process, measurement=known, dt=noise.dt)
     smooth = smooth_trials(model, [record], noise, **options)[0]  # type: ignore[arg-type]
     if not np.isfinite(smooth.states).all():
         raise GroundedError(

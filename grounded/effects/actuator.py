@@ -1,0 +1,211 @@
+"""What an actuator makes of its commands: at once (bias, dead zone ...), or with a memory (delay).
+
+    u_eff     = effect(u, t)             static maps of one input; t is the time in the trial
+    u_eff, z+ = advance(u, z, dt)        maps with a memory z
+
+The command u is held over a step of dt (a zero-order hold), so the u_eff of a map with memory is
+the MEAN of what the actuator delivers over the step, and fractions of a step matter:
+
+    delay      d = dt (i + f):        u_eff = (1 - f) u[t-i] + f u[t-i-1]
+    lag        z' = (u - z) / tau:    z+ = u + (z - u) e,  e = exp(-dt / tau)
+                                      u_eff = u + (z - u) (1 - e) tau / dt
+    rate limit |z'| <= r:             z+ = z + clip(u - z, -r dt, r dt), ramp then hold
+    backlash   width b:               z+ = clip(z, u - b/2, u + b/2)
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from grounded.effects import places
+from grounded.effects.family import InputFamily, MemoryFamily, Quantity, Site, speed_limit
+from grounded.model import Model
+
+LONGEST_DELAY = 0.5  # [s] that a scan considers, where steps are not longer than usual
+LONGEST_LAG = 2.0  # [s] the same
+
+
+def _threshold(site: Site) -> tuple[Quantity, ...]:
+    """A threshold below which something differs: scanned, the small ones closely."""
+    peak = site.scales.peak(site.target)
+    grid = tuple(float(v) for v in np.linspace(0.15, 0.87, 20) ** 2 * peak)
+    return (Quantity("c", site.unit(site.target), grid, 0.0, peak, places=8),)
+
+
+def _limit(site: Site) -> tuple[Quantity, ...]:
+    """A limit above which the input is cut: scanned from the peak downwards."""
+    peak = site.scales.peak(site.target)
+    grid = tuple(float(v) for v in np.linspace(0.95, 0.3, 12) * peak)
+    return (Quantity("c", site.unit(site.target), grid, 0.0, 1.5 * peak, start=2 * peak, places=6),)
+
+
+input_bias = InputFamily(
+    name="input_bias",
+    equation="u_eff = u + b",
+    sentence="{target} has an offset of {b}",
+    targets=places.inputs,
+    quantities=lambda site: (Quantity("b", site.unit(site.target)),),
+    lookalikes=("offset", "input_fade", "dead_zone"),
+    vague=0.7,  # ln 2: it may have either sign
+    effect=lambda u, t, c: u + c["b"],
+)
+
+input_gain = InputFamily(
+    name="input_gain",
+    equation="u_eff = (1 + g) u",
+    sentence="{target} acts {g%stronger|weaker} than modelled",
+    targets=places.inputs,
+    quantities=lambda site: (Quantity("g", "1", low=-1.5, high=5.0),),
+    lookalikes=("viscous_friction", "rate_gain", "parameter", "input_fade"),
+    effect=lambda u, t, c: (1 + c["g"]) * u,
+)
+
+dead_zone = InputFamily(
+    name="dead_zone",
+    equation="u_eff = sign(u) max(|u| - c, 0)",
+    sentence="{target} has a dead zone of {c}, which every command loses",
+    targets=places.inputs,
+    quantities=_threshold,
+    lookalikes=("stall", "stiction", "coulomb_friction", "backlash", "input_bias"),
+    effect=lambda u, t, c: np.maximum(u - c["c"], 0.0) - np.maximum(-u - c["c"], 0.0),
+)
+
+stall = InputFamily(
+    name="stall",
+    equation="u_eff = u where |u| > c, 0 elsewhere",
+    sentence="{target} does nothing below {c}",
+    targets=places.inputs,
+    quantities=_threshold,
+    lookalikes=("dead_zone", "stiction"),
+    effect=lambda u, t, c: np.where(np.abs(u) > c["c"], u, 0.0),
+)
+
+saturation = InputFamily(
+    name="saturation",
+    equation="u_eff = clip(u, -c, c)",
+    sentence="{target} saturates at {c}",
+    targets=places.inputs,
+    quantities=_limit,
+    lookalikes=("rate_limit", "slew_limit", "input_gain", "quadratic_drag"),
+    effect=lambda u, t, c: np.minimum(np.maximum(u, -c["c"]), c["c"]),
+)
+
+input_fade = InputFamily(
+    name="input_fade",
+    equation="u_eff = (1 - k t) u",
+    sentence="{target} gets {k%weaker every second (a battery that sags)|stronger every second}",
+    targets=places.inputs,
+    quantities=lambda site: (Quantity("k", "1/s", high=1.0 / max(site.scales.duration, 1e-3)),),
+    lookalikes=("input_gain", "trend", "input_bias"),
+    effect=lambda u, t, c: (1 - c["k"] * t) * u,
+    timed=True,
+)
+
+
+def _delay(site: Site) -> tuple[Quantity, ...]:
+    dt = site.scales.dt
+    longest = min(max(LONGEST_DELAY, 4 * dt), site.scales.duration / 4)
+    count = int(min(max(round(2 * longest / dt), 6), 14))
+    grid = tuple(float(v) for v in longest * (np.arange(1, count + 1) / count) ** 1.5)
+    return (Quantity("d", "s", grid, 0.0, longest, places=6),)
+
+
+def _lag(site: Site) -> tuple[Quantity, ...]:
+    dt = site.scales.dt
+    top = min(max(LONGEST_LAG, 40 * dt), site.scales.duration / 4)
+    last = max(top, dt)
+    first = min(max(0.3 * dt, 0.005), 0.5 * last)
+    grid = tuple(float(v) for v in np.geomspace(first, last, 10))
+    return (Quantity("tau", "s", grid, 0.0, max(2 * top, last), places=6),)
+
+
+def _backlash(site: Site) -> tuple[Quantity, ...]:
+    spread = site.scales.spread(site.target)
+    grid = tuple(float(v) for v in np.linspace(0.02, 0.6, 10) * spread)
+    return (Quantity("b", site.unit(site.target), grid, 0.0, spread, places=6),)
+
+
+def _one_or_all(model: Model) -> list[str]:
+    """Each input, and all at once: a delay in the radio or the camera shifts every command."""
+    names = model.input_names
+    return [*names, "+".join(names)] if len(names) > 1 else list(names)
+
+
+def _advance_delay(u: Any, z: tuple[Any, ...], c: Any, dt: Any) -> tuple[Any, tuple[Any, ...]]:
+    steps = c["d"] / dt
+    queue = (u, *z)
+    received: Any = 0.0
+    for i, past in enumerate(queue):
+        received = received + np.maximum(1 - np.abs(steps - i), 0.0) * past
+    return received, queue[:-1]
+
+
+def _advance_lag(u: Any, z: tuple[Any, ...], c: Any, dt: Any) -> tuple[Any, tuple[Any, ...]]:
+    tau = np.maximum(c["tau"], 1e-6)
+    e = np.exp(-dt / tau)
+    behind = z[0] - u
+    return u + behind * (1 - e) * tau / dt, (u + behind * e,)
+
+
+def _advance_rate(u: Any, z: tuple[Any, ...], c: Any, dt: Any) -> tuple[Any, tuple[Any, ...]]:
+    most = np.maximum(c["r"] * dt, 1e-12)
+    missing = u - z[0]
+    moved = np.minimum(np.maximum(missing, -most), most)
+    reached = np.minimum(np.abs(missing) / most, 1.0)  # the part of the step spent on the ramp
+    return z[0] + moved * (1 - 0.5 * reached), (z[0] + moved,)
+
+
+def _advance_backlash(u: Any, z: tuple[Any, ...], c: Any, dt: Any) -> tuple[Any, tuple[Any, ...]]:
+    half = 0.5 * c["b"]
+    held = np.minimum(np.maximum(z[0], u - half), u + half)
+    return held, (held,)
+
+
+delay = MemoryFamily(
+    name="delay",
+    equation="u_eff(t) = u(t - d)",
+    sentence="{target} arrive{s} {d} later than modelled",
+    targets=_one_or_all,
+    quantities=_delay,
+    lookalikes=("first_order_lag", "rate_limit", "sensor_delay"),
+    advance=_advance_delay,
+    depth=lambda values, dt: max(1, int(np.ceil(values["d"] / dt - 1e-9)) + 1),
+    transport=True,
+)
+
+first_order_lag = MemoryFamily(
+    name="first_order_lag",
+    equation="tau u_eff' = u - u_eff",
+    sentence="{target} lags with a time constant of {tau}",
+    targets=places.inputs,
+    quantities=_lag,
+    lookalikes=("delay", "rate_limit", "slew_limit", "parameter"),
+    advance=_advance_lag,
+)
+
+rate_limit = MemoryFamily(
+    name="rate_limit",
+    equation="|u_eff'| <= r",
+    sentence="{target} can't move faster than {r}",
+    targets=places.inputs,
+    quantities=lambda site: speed_limit(site, f"{site.unit(site.target)}/s"),
+    lookalikes=("slew_limit", "first_order_lag", "delay", "saturation"),
+    advance=_advance_rate,
+)
+
+backlash = MemoryFamily(
+    name="backlash",
+    equation="u_eff+ = clip(u_eff, u - b/2, u + b/2)",
+    sentence="{target} has a play of {b}",
+    targets=places.inputs,
+    quantities=_backlash,
+    lookalikes=("dead_zone", "delay", "first_order_lag"),
+    advance=_advance_backlash,
+)
+
+FAMILIES = (
+    *(input_bias, input_gain, dead_zone, stall, saturation, input_fade),
+    *(delay, first_order_lag, rate_limit, backlash),
+)
