@@ -121,7 +121,7 @@ def _row(tried: Tried, last: bool) -> tuple[str, ...]:
 
 def certainty(standing: Standing) -> str:
     """Whether the last improvement exceeds the noise of the utility, as a sentence."""
-    from grounded.search.certainty import last_improvement
+    from grounded.search.standing import last_improvement
 
     return last_improvement(standing.history)
 
