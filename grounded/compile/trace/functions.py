@@ -87,29 +87,11 @@ def _op(name: str) -> Callable[..., Any]:
 
 
 TRACED: dict[str, Callable[..., Any]] = {
-    **{name: _op(name) for name in ("sqrt", "cbrt", "exp", "expm1", "log", "log1p", "sin", "cos")},
-    **{
-        name: _op(name)
-        for name in ("tan", "sinh", "cosh", "tanh", "floor", "rint", "trunc", "sign")
-    },
-    "add": _op("add"),
-    "subtract": _op("sub"),
-    "multiply": _op("mul"),
-    "divide": _op("div"),
+    **{name: _op(op) for op, names in PLAIN.items() for name in (op, names)},
     "true_divide": _op("div"),
-    "negative": _op("neg"),
     "positive": lambda x: x,
-    "power": _op("pow"),
     "float_power": _op("pow"),
-    "arcsin": _op("asin"),
-    "arccos": _op("acos"),
-    "arctan": _op("atan"),
-    "arctan2": _op("atan2"),
-    "asin": _op("asin"),
-    "acos": _op("acos"),
-    "atan": _op("atan"),
-    "atan2": _op("atan2"),
-    "pow": _op("pow"),
+    "sign": _op("sign"),
     "arcsinh": lambda x: apply("log", x + apply("sqrt", x * x + 1.0)),
     "arccosh": lambda x: apply("log", x + apply("sqrt", x * x - 1.0)),
     "arctanh": lambda x: 0.5 * (apply("log1p", x) - apply("log1p", -x)),
