@@ -41,9 +41,10 @@ def cpu(function, repeats=20):
 
 
 def our_solve(case, iterations, tolerance=0.0):
-    from grounded.solve.ddp import Options, solve
+    from grounded.compile import DescentOptions
+    from grounded.solve.ddp import solve
 
-    options = Options(max_iterations=iterations, tolerance=tolerance)
+    options = DescentOptions(max_iterations=iterations, tolerance=tolerance)
     return solve(case.problem, case.u, options=options)
 
 
@@ -54,13 +55,14 @@ def our_row(case):
     """
     from peer_data import CLOSE
 
-    from grounded.solve.ddp import Options, solve
+    from grounded.compile import DescentOptions
+    from grounded.solve.ddp import solve
 
     best = our_solve(case, 50, 1e-10).cost
     iterations = next(i for i in range(1, 50) if our_solve(case, i).cost <= best * (1 + CLOSE))
     ms = 1e3 * cpu(lambda: our_solve(case, iterations), 50)
     found = our_solve(case, iterations)
-    start, settings = (case.problem, case.u), Options(max_iterations=0)
+    start, settings = (case.problem, case.u), DescentOptions(max_iterations=0)
     first = 1e3 * cpu(lambda: solve(*start, options=settings), 50)  # a rollout and a sweep
     return best, {
         "peer": "grounded",
@@ -144,9 +146,10 @@ def stretched(problem, H):
 def horizon_part(options):
     from cases import cases
 
-    from grounded.solve.ddp import Options, solve
+    from grounded.compile import DescentOptions
+    from grounded.solve.ddp import solve
 
-    case, settings = cases(["aircraft"])[0], Options(max_iterations=3, tolerance=0.0)
+    case, settings = cases(["aircraft"])[0], DescentOptions(max_iterations=3, tolerance=0.0)
     print("\nCPU of 3 iterations against the horizon (aircraft, straight flight)")
     for H in (200, 500, 1000, 2000, 5000, 10_000, 20_000):
         start = stretched(case.problem, H)
@@ -199,7 +202,8 @@ def size_part(options):
 def swarm_part(options):
     from cases import cases
 
-    from grounded.solve.ddp import Options, solve
+    from grounded.compile import DescentOptions
+    from grounded.solve.ddp import solve
 
     case, rng = cases(["car"])[0], np.random.default_rng(0)
     p = case.problem.p
@@ -208,7 +212,7 @@ def swarm_part(options):
     def all_of_them():
         for values in models:
             problem = dataclasses.replace(case.problem, p=values)
-            solve(problem, case.u, options=Options(tolerance=1e-6))
+            solve(problem, case.u, options=DescentOptions(tolerance=1e-6))
 
     print(f"\n1000 perturbed cars solved in one process: {cpu(all_of_them, 3):.3f} s of CPU")
 
@@ -217,9 +221,9 @@ def memory_part(options):
     code = (
         "import resource, sys; sys.path[:0] = sys.argv[1:]\n"
         "import numpy as np\nfrom cases import cases\nfrom run import stretched\n"
-        "from grounded.solve.ddp import Options, solve\n"
+        "from grounded.compile import DescentOptions\nfrom grounded.solve.ddp import solve\n"
         "case = cases(['aircraft'])[0]\n"
-        "solve(*stretched(case.problem, 20_000), options=Options(max_iterations=10))\n"
+        "solve(*stretched(case.problem, 20_000), options=DescentOptions(max_iterations=10))\n"
         "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)"
     )
     command = [sys.executable, "-c", code, str(HERE), str(HERE.parent)]

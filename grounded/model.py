@@ -157,7 +157,6 @@ class Model:
             inputs=self.input_names,
             params=self.param_names,
             integrator=self.integrator,
-            angles=tuple(bool(a) for a in self.angle_mask),
         )
 
     def difference(self, a: Array, b: Array) -> Array:

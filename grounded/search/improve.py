@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 
-from grounded.compile import Problem
+from grounded.compile import DescentOptions, Problem
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.policy import Policy
@@ -45,7 +45,7 @@ from grounded.solve.bias import Grounding, ground
 from grounded.task import Task
 from grounded.trial import Trial, mean_trial
 
-PLANNING = ddp.Options(max_iterations=30, tolerance=1e-6)  # a direction needs no more digits
+PLANNING = DescentOptions(max_iterations=30, tolerance=1e-6)  # a direction needs no more digits
 CAUTION = 100.0  # factor on the input penalties each time the first policy crashed (FACTS.md 2)
 
 
@@ -97,7 +97,7 @@ def model_fingerprint(task: Task) -> str:
     return digest.hexdigest()[:16]
 
 
-def first_policy(task: Task, caution: int = 0) -> tuple[Policy, ddp.Result]:
+def first_policy(task: Task, caution: int = 0) -> tuple[Policy, ddp.Solution]:
     """Steps 1 and 2: the (locally) optimal policy of the crude model.
 
     Args:
@@ -135,7 +135,7 @@ def direction(
     problem = grounding.on(task.problem())
     if options.step == "damped":
         problem = damped(problem, grounding.inputs, damping)
-    gains = ddp.damped_step(problem, grounding.z, grounding.inputs, np.zeros(task.model.m)).gains
+    gains = ddp.sweep(problem, grounding.z, grounding.inputs).gains
     result = ddp.solve(problem, grounding.inputs, gains.K, grounding.z[:-1], PLANNING)
     return task.policy(result.u, result.K, result.z[:-1])
 

@@ -39,7 +39,7 @@ class SearchOptions:
     method: Literal["ddp", "policy-gradient"] = "ddp"
     step: Literal["damped", "full"] = "damped"
     refit: bool = False
-    match_inputs: bool = True  # False: the paper's bias alone, see `matching`
+    match_inputs: bool = True  # False: the paper's bias alone, see `bias`
     max_halvings: int = 6
     repeats: int = 1
     rerun_incumbent: bool = True  # see `_in_doubt`

@@ -13,7 +13,7 @@ from grounded.search.ask_tell import learn
 from grounded.search.improve import first_policy
 from grounded.search.standing import SearchOptions
 from grounded.solve.bias import ground
-from grounded.solve.levenberg_marquardt import Batch, solve
+from grounded.solve.levenberg_marquardt import LeastSquares, solve
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +85,7 @@ def test_levenberg_marquardt_solves_each_row_and_keeps_bounds():
         return J
 
     bounds = np.array([1.0, 1.0])
-    batch = Batch(residual, jacobian, -bounds, bounds, solved=1e-20)
+    batch = LeastSquares(residual, jacobian, -bounds, bounds, solved=1e-20)
     found = solve(batch, np.full((3, 2), 0.3), np.arange(3), 60)
     np.testing.assert_allclose(found.w[[0, 2]], goals[[0, 2]], atol=1e-6)
     assert found.w[1, 0] == 1.0 and found.error[1] > 1.0

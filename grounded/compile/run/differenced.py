@@ -11,15 +11,15 @@ are good to about 1e-10 of the function's scale; all 2 (n + m) shifted points go
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from grounded.compile.names import Named, check_names, raised_at, where, wrong_value
-from grounded.compile.problem import Array, Integrator, Kind
+from grounded.compile.names import check_names, raised_at, wrong_value
 from grounded.compile.run.interpreted import Interpreted
 from grounded.errors import GroundedError
+from grounded.frozen import Array
 
 RELATIVE_STEP = float(np.cbrt(np.finfo(float).eps))
 CHUNK = 4096  # samples in one call, so that long horizons don't fill the memory
@@ -30,24 +30,8 @@ class DifferencedSystem(Interpreted):
 
     how = "differenced"
 
-    def __init__(
-        self,
-        function: Callable[..., Mapping[str, Any]],
-        *,
-        kind: Kind,
-        states: Sequence[str],
-        inputs: Sequence[str],
-        params: Sequence[str],
-        integrator: Integrator = "rk4",
-        note: str = "",
-        returns: Sequence[str] = (),
-    ) -> None:
-        super().__init__(kind, integrator, (len(states), len(inputs), len(params)), note)
-        self.function, self.source = function, where(function)
-        self.states, self.inputs, self.params = tuple(states), tuple(inputs), tuple(params)
-        self.outputs = tuple(returns) or self.states  # names of what the function returns
-        self._batches = True  # until the function fails on arrays
-        self._calls = 0
+    _batches = True  # until the function fails on arrays
+    _calls = 0
 
     def evaluate(self, x: Array, u: Array, p: Array, dt: float, smoothing: float) -> Array:
         """The function at N samples."""
@@ -58,7 +42,7 @@ class DifferencedSystem(Interpreted):
                 return result
             self._batches = False
         return np.array([self._single(a, b, p, dt) for a, b in zip(x, u, strict=True)]).reshape(
-            len(x), len(self.outputs)
+            len(x), len(self.signature.outputs)
         )
 
     def check(self, x: Array, u: Array, p: Array, dt: float) -> None:
@@ -108,8 +92,8 @@ class DifferencedSystem(Interpreted):
         self._calls += 1
         try:
             values = self._call([*x.T], [*u.T], p, dt)
-            result = np.empty((len(x), len(self.outputs)))
-            for i, name in enumerate(self.outputs):
+            result = np.empty((len(x), len(self.signature.outputs)))
+            for i, name in enumerate(self.signature.outputs):
                 result[:, i] = np.broadcast_to(np.asarray(values[name], float), len(x))
         except Exception:  # whatever it is, the call on one sample tells the user
             return None
@@ -124,31 +108,25 @@ class DifferencedSystem(Interpreted):
     def _single(self, x: Array, u: Array, p: Array, dt: float) -> Array:
         """The function on one sample; NaN where it leaves the finite numbers."""
         if not (np.isfinite(x).all() and np.isfinite(u).all()):
-            return np.full(len(self.outputs), np.nan)
+            return np.full(len(self.signature.outputs), np.nan)
         try:
             values = self._call(x.tolist(), u.tolist(), p, dt)
         except ArithmeticError:
-            return np.full(len(self.outputs), np.nan)
+            return np.full(len(self.signature.outputs), np.nan)
         except ValueError as error:
             if "math domain error" in str(error) or "nonnegative input" in str(error):
-                return np.full(len(self.outputs), np.nan)
+                return np.full(len(self.signature.outputs), np.nan)
             raise self._failure(error) from error
         except GroundedError:
             raise
         except Exception as error:
             raise self._failure(error) from error
-        return np.array([self._number(name, values[name]) for name in self.outputs])
+        return np.array([self._number(name, values[name]) for name in self.signature.outputs])
 
     def _call(self, x: Sequence[Any], u: Sequence[Any], p: Array, dt: float) -> Mapping[str, Any]:
-        s = Named("state", self.states, x)
-        a = Named("input", self.inputs, u)
-        parameters = Named("parameter", self.params, np.asarray(p, float).tolist())
         with np.errstate(all="ignore"):
-            if self.kind == "step":
-                values = self.function(s, a, parameters, dt)
-            else:
-                values = self.function(s, a, parameters)
-        check_names(values, self.outputs, self.function)
+            values = self.signature.call(x, u, np.asarray(p, float).tolist(), dt)
+        check_names(values, self.signature.outputs, self.signature.function)
         return values
 
     def _number(self, name: str, value: Any) -> float:
@@ -158,9 +136,8 @@ class DifferencedSystem(Interpreted):
                 return float(array.reshape(()))
         except Exception:  # ragged lists and stranger things are described below
             array = np.asarray(None)
-        raise wrong_value(name, value, self.function)
+        raise wrong_value(name, value, self.signature.function)
 
     def _failure(self, error: Exception) -> GroundedError:
-        return GroundedError(
-            f"{raised_at(error, self.function)}: the model raised {type(error).__name__}: {error}"
-        )
+        line = raised_at(error, self.signature.function)
+        return GroundedError(f"{line}: the model raised {type(error).__name__}: {error}")

@@ -1,62 +1,42 @@
 """What the two NumPy paths share: integration, rollouts and the sweep, without a compiler.
 
 A subclass evaluates the user's function on N samples at once and gives its derivatives; how it
-does so (`python.py` calls the function, `traced.py` runs its graph) is all that differs.
+does so (`differenced.py` calls the function, `traced.py` runs its graph) is all that differs.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 
 import numpy as np
 
-from grounded.compile.problem import (
-    Array,
-    Backward,
-    Descent,
-    Integrator,
-    Kind,
-    Options,
-    Problem,
-    Swarm,
-    queue_of,
-)
-from grounded.compile.run.sweep import sweep, trajectory_cost, wrapped
+from grounded.compile.names import where
+from grounded.compile.problem import Backward, Integrator, Problem, Swarm, System
+from grounded.compile.run.sweep import linearised, sweep, trajectory_cost, wrapped
+from grounded.compile.trace.tracing import Signature
+from grounded.frozen import Array
 
 
-class Interpreted(ABC):
-    """A System whose kernels are NumPy."""
+class Interpreted(System):
+    """A System whose kernels are NumPy.
 
-    how: str
-    note: str
-    source: str
-    states: tuple[str, ...]
+    Args:
+        signature: the user's function and its names.
+        integrator: for a derivative.
+        note: why it is not compiled.
+    """
 
     def __init__(
-        self, kind: Kind, integrator: Integrator, sizes: tuple[int, int, int], note: str = ""
+        self, signature: Signature, integrator: Integrator = "rk4", note: str = ""
     ) -> None:
-        self.kind, self.integrator, self.note = kind, integrator, note
-        self.n, self.m, self.k = sizes
+        self.signature, self.integrator, self.note = signature, integrator, note
+        self.kind, self.states = signature.kind, signature.states
+        self.source = where(signature.function)
+        self.n, self.m, self.k = self.sizes = signature.sizes
 
     @abstractmethod
     def evaluate(self, x: Array, u: Array, p: Array, dt: float, smoothing: float) -> Array:
         """The user's function: x (N, n), u (N, m), p (k,) -> ds/dt or next state (N, n)."""
-
-    @abstractmethod
-    def linearise(
-        self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
-    ) -> tuple[Array, Array]:
-        """f_x (N, n, n), f_u (N, n, m)."""
-
-    @abstractmethod
-    def sensitivities(
-        self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
-    ) -> tuple[Array, Array, Array]:
-        """f_x (N, n, n), f_u (N, n, m), f_p (N, n, k)."""
-
-    @abstractmethod
-    def check(self, x: Array, u: Array, p: Array, dt: float) -> None:
-        """Compares with the user's own function."""
 
     def step(self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0) -> Array:
         """See `System.step`."""
@@ -82,8 +62,8 @@ class Interpreted(ABC):
     ) -> Swarm:
         """See `System.rollout`."""
         alphas = np.ones(1) if alphas is None else np.asarray(alphas, float)
-        queue, n, runs = queue_of(problem), self.n, len(alphas)
-        z = np.empty((runs, problem.horizon + 1, queue.nz))
+        queue, n, runs = problem.queue, self.n, len(alphas)
+        z = np.empty((runs, problem.horizon + 1, problem.nz))
         u = np.empty((runs, problem.horizon, self.m))
         z[:, 0] = problem.z_start()
         with np.errstate(all="ignore"):
@@ -92,9 +72,7 @@ class Interpreted(ABC):
                 if K is not None and zbar is not None:
                     u[:, t] += wrapped(z[:, t] - zbar[t], problem.angles) @ K[t].T
                 u[:, t] = np.clip(u[:, t], problem.low, problem.high)
-                sent = queue.effective(z[:, t], u[:, t])
-                if problem.input_shift is not None:
-                    sent = sent - problem.input_shift[t]
+                sent = problem.received(z[:, t], u[:, t], t)
                 x = self.step(z[:, t, :n], sent, problem.p, problem.dt, problem.smoothing)
                 z[:, t + 1, :n] = x + problem.bias[t]
                 z[:, t + 1, n:] = queue.after(z[:, t, n:], u[:, t])
@@ -109,20 +87,5 @@ class Interpreted(ABC):
         into: Backward | None = None,
     ) -> Backward:
         """See `System.backward`."""
-        sent = queue_of(problem).effective(z[:-1], u)
-        sent = sent if problem.input_shift is None else sent - problem.input_shift
-        x = np.ascontiguousarray(z[:-1, : self.n])
         with np.errstate(all="ignore"):
-            f_x, f_u = self.linearise(x, sent, problem.p, problem.dt, problem.smoothing)
-            return sweep(problem, z, u, f_x, f_u, damping)
-
-    def descend(
-        self,
-        problem: Problem,
-        ubar: Array,
-        K: Array | None,
-        zbar: Array | None,
-        options: Options,
-    ) -> Descent | None:
-        """See `System.descend`."""
-        return None
+            return sweep(problem, u, linearised(self, problem, z, u), damping)

@@ -1,6 +1,13 @@
-"""One Riccati sweep in NumPy: the interpreted twin of the compiled kernel (theory: `riccati.py`).
+"""One Riccati sweep in NumPy: the interpreted twin of the compiled kernel (theory: `ddp.py`).
 
-With A = [[f_x, f_u past], [0, S]], B = [[f_u now], [E]] (see `queue.py`) and V the value's Hessian,
+The problem about a trajectory is linear dynamics of z and a quadratic cost (`Quadratic`): with
+q the past inputs (`Queue`),
+
+    A = [[f_x, f_u past], [0, S]],    B = [[f_u now], [E]],
+    l_t(z, u) = W_t |x - target_t|^2 + R |u - u_target_t|^2 + S |u - u_{t-1}|^2,
+
+without halves, so that l_x = 2 W e and l_xx = 2 W; errors of angles wrap. With V the value's
+Hessian, backwards in time,
 
     Q_z = l_z + A'V_z    Q_zz = l_zz + A'V A    Q_uz = l_uz + B'V A
     Q_u = l_u + B'V_z    Q_uu = l_uu + B'V B
@@ -8,15 +15,10 @@ With A = [[f_x, f_u past], [0, S]], B = [[f_u now], [E]] (see `queue.py`) and V 
     V_z  = Q_z  + K'(Q_uu k + Q_u) + Q_uz'k
     V_zz = Q_zz + K'Q_uu K + K'Q_uz + Q_uz'K.
 
-min 1/2 k'Hk + g'k subject to low <= k <= high, by projected Newton (Tassa et al. 2014).
-
-The free set are the inputs that no bound holds back. On it a Newton step is exact, so a handful of
-iterations end with the exact solution: the clamped set is then the right one.
-
-The quadratic cost J of `problem.py` and its derivatives, which need no model.
-
-l_t(z, u) = W_t |x - target_t|^2 + R |u - u_target_t|^2 + S |u - u_{t-1}|^2 (no halves), so that
-l_x = 2 W e and l_xx = 2 W. Errors of angles wrap.
+Inside the limits: min 1/2 k'Hk + g'k subject to low <= k <= high, by projected Newton (`box_qp`;
+Tassa et al. 2014). The free set are the inputs that no bound holds back. On it a Newton step is
+exact, so a handful of iterations end with the exact solution: the clamped set is then the right
+one.
 """
 
 from __future__ import annotations
@@ -31,12 +33,12 @@ from grounded.compile.problem import (
     MAX_ITERATIONS,
     ROUNDING,
     STOP,
-    Array,
     Backward,
     Problem,
     Queue,
-    queue_of,
+    System,
 )
+from grounded.frozen import Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,10 +54,14 @@ class Quadratic:
     l_uz: Array  # (m, nz), the same at every step
 
 
-def quadratic(problem: Problem, z: Array, u: Array, f_x: Array, f_u: Array) -> Quadratic:
-    """The quadratic model about z (H+1, nz), u (H, m) with the given Jacobians of f."""
-    queue, H, n = queue_of(problem), problem.horizon, problem.system.n
-    A, B = _augmented(queue, f_x, f_u)
+def linearised(system: System, problem: Problem, z: Array, u: Array) -> Quadratic:
+    """The problem about z (H+1, nz), u (H, m), with the system's derivatives."""
+    queue, H, n = problem.queue, problem.horizon, system.n
+    x = np.ascontiguousarray(z[:-1, :n])
+    received = problem.received(z[:-1], u)
+    A, B = _augmented(
+        queue, *system.linearise(x, received, problem.p, problem.dt, problem.smoothing)
+    )
     R, S = problem.input_weight, problem.change_weight
     change = input_change(problem, u)
     l_z = np.zeros((H + 1, queue.nz))
@@ -80,10 +86,9 @@ def _augmented(queue: Queue, f_x: Array, f_u: Array) -> tuple[Array, Array]:
     return A, B
 
 
-def sweep(problem: Problem, z: Array, u: Array, f_x: Array, f_u: Array, damping: Array) -> Backward:
-    """Gains along z (H+1, nz), u (H, m); f_x (H, n, n), f_u (H, n, m), damping (m,)."""
-    q = quadratic(problem, z, u, f_x, f_u)
-    H, m, nz = problem.horizon, u.shape[1], z.shape[1]
+def sweep(problem: Problem, u: Array, q: Quadratic, damping: Array) -> Backward:
+    """Gains along u (H, m), with the problem about it; damping (m,)."""
+    H, m, nz = q.B.shape[0], q.B.shape[2], q.B.shape[1]
     k, K, d1, d2 = np.zeros((H, m)), np.zeros((H, m, nz)), 0.0, 0.0
     V_z, V = q.l_z[H], np.diag(q.l_zz[H])
     for t in range(H - 1, -1, -1):

@@ -12,8 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from grounded.compile.names import where
-from grounded.compile.problem import STAGES, Array, Integrator
+from grounded.compile.problem import STAGES, Integrator
 from grounded.compile.run.differenced import DifferencedSystem
 from grounded.compile.run.interpreted import Interpreted
 from grounded.compile.trace.graph import Program
@@ -26,6 +25,7 @@ from grounded.compile.trace.tracing import (
     values_and_jacobian,
 )
 from grounded.errors import GroundedError
+from grounded.frozen import Array
 
 CHUNK = 1024  # samples at once
 AGREE = 1e-9  # a trace and its original, relative to the size of the state's values
@@ -39,19 +39,9 @@ class TracedSystem(Interpreted):
     def __init__(
         self, signature: Signature, first: Trace, integrator: Integrator, note: str
     ) -> None:
-        sizes = (len(signature.states), len(signature.inputs), len(signature.params))
-        super().__init__(signature.kind, integrator, sizes, note)
-        self.signature, self.source = signature, where(signature.function)
-        self.states = signature.states
-        self.original = DifferencedSystem(
-            signature.function,
-            kind=signature.kind,
-            states=signature.states,
-            inputs=signature.inputs,
-            params=signature.params,
-            integrator=integrator,
-        )
-        self._variants = [Variant(first, sizes)] if not first.guards else []
+        super().__init__(signature, integrator, note)
+        self.original = DifferencedSystem(signature, integrator)
+        self._variants = [Variant(first, self.sizes)] if not first.guards else []
 
     def variant(self, p: Array, dt: float) -> Variant:
         """The trace that holds for these parameters.
@@ -65,7 +55,7 @@ class TracedSystem(Interpreted):
         found = trace(self.signature, np.asarray(p, float), dt)
         if isinstance(found, str):
             raise GroundedError(f"{found}; with these parameters only; use np.where")
-        self._variants.append(Variant(found, (self.n, self.m, self.k)))
+        self._variants.append(Variant(found, self.sizes))
         return self._variants[-1]
 
     def evaluate(self, x: Array, u: Array, p: Array, dt: float, smoothing: float) -> Array:
@@ -101,7 +91,7 @@ class TracedSystem(Interpreted):
         if differ.any():
             t, i = np.argwhere(differ)[0]
             raise GroundedError(
-                f"{where(self.signature.function)}: the traced model differs from the function: "
+                f"{self.source}: the traced model differs from the function: "
                 f"at sample {t}, state '{self.signature.states[i]}', the trace gives "
                 f"{mine[t, i]!r} and the function {theirs[t, i]!r}. Does it use random numbers, "
                 "keep a memory, or look at the type of its arguments?"

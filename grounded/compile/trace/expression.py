@@ -17,7 +17,7 @@ from grounded.compile.trace.graph import Graph
 
 Operator = Callable[[Any, Any], Any]
 
-FUNCTIONS: dict[str, Callable[..., Any]] = {}  # NumPy's names; filled by `functions.py`
+FUNCTIONS: dict[str, Callable[..., Any]] = {}  # NumPy's names; filled by `functions`
 
 
 class NotTraceable(Exception):

@@ -98,8 +98,8 @@ def equal(eps: float, left: Any, r: Any) -> Any:
 
 # Operations that are a NumPy function and no more, by their names there.
 PLAIN = {
-    **{name: name for name in ("sqrt", "cbrt", "exp", "expm1", "log", "log1p", "sin", "cos", "tan")},
-    **{name: name for name in ("sinh", "cosh", "tanh", "floor", "rint", "trunc")},
+    **{name: name for name in ("sqrt", "cbrt", "exp", "expm1", "log", "log1p", "sin", "cos")},
+    **{name: name for name in ("tan", "sinh", "cosh", "tanh", "floor", "rint", "trunc")},
     **{"add": "add", "sub": "subtract", "mul": "multiply", "div": "divide", "neg": "negative"},
     **{"pow": "power", "asin": "arcsin", "acos": "arccos", "atan": "arctan", "atan2": "arctan2"},
 }
