@@ -32,12 +32,9 @@ PEERS = ("crocoddyl", "casadi", "jax")
 
 def cpu(function, repeats=20):
     """Least CPU seconds of a few calls."""
-    times = []
-    for _ in range(repeats):
-        start = time.process_time()
-        function()
-        times.append(time.process_time() - start)
-    return min(times)
+    from peer_data import fastest
+
+    return fastest(function, repeats)
 
 
 def our_solve(case, iterations, tolerance=0.0):
@@ -80,7 +77,10 @@ def peer_rows(case, best, python, folder, fatrop):
     calls = [[peer] for peer in PEERS] + ([["casadi", "fatrop"]] if fatrop else [])
     for peer, *extra in calls:
         command = [python, f"peer_{peer}.py", str(path), repr(best), *extra]
-        done = subprocess.run(command, cwd=HERE, capture_output=True, text=True, check=False)
+        environment = os.environ | {"PYTHONPATH": str(HERE.parent)}
+        done = subprocess.run(
+            command, cwd=HERE, env=environment, capture_output=True, text=True, check=False
+        )
         if done.returncode == 0:
             yield json.loads(done.stdout.strip().splitlines()[-1])
         else:
