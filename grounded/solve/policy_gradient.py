@@ -31,7 +31,7 @@ from grounded.compile import Problem
 from grounded.compile.run.sweep import Quadratic
 from grounded.compile.run.sweep import linearised as quadratic_model
 from grounded.errors import GroundedError
-from grounded.frozen import Array
+from grounded.frozen import Array, wrapped
 from grounded.rollout import simulate
 
 if TYPE_CHECKING:
@@ -67,9 +67,7 @@ def gradient(problem: Problem, z: Array, u: Array, policy: Policy | None = None)
             f"a gain must have shape {(*u.shape, z.shape[1])}, got {policy.gain.shape}"
         )
     g, _ = adjoint(local, policy.gain, free)
-    n = problem.system.n
-    dz = z[:-1] - policy.reference
-    dz[:, :n] -= 2 * np.pi * np.rint(dz[:, :n] / (2 * np.pi)) * problem.angles
+    dz = wrapped(z[:-1] - policy.reference, problem.angles)
     return Gradient(g * free, (g * free)[:, :, None] * dz[:, None, :])
 
 

@@ -48,32 +48,25 @@ class DifferencedSystem(Interpreted):
     def check(self, x: Array, u: Array, p: Array, dt: float) -> None:
         """Nothing to compare: this is the user's own function."""
 
-    def linearise(
-        self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
-    ) -> tuple[Array, Array]:
-        """f_x and f_u by central differences of `step`."""
+    def jacobian(
+        self, x: Array, u: Array, p: Array, dt: float, smoothing: float, width: int
+    ) -> Array:
+        """See `Interpreted.jacobian`; by central differences."""
         shifted = self.n + self.m
         both = np.concatenate([x, u], axis=1)
-        J = np.empty((len(x), self.n, shifted))
+        J = np.empty((len(x), self.n, width))
         size = max(1, CHUNK // (2 * shifted))
         for at in range(0, len(x), size):
-            J[at : at + size] = self._jacobian(both[at : at + size], p, dt)
-        return np.ascontiguousarray(J[:, :, : self.n]), np.ascontiguousarray(J[:, :, self.n :])
-
-    def sensitivities(
-        self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
-    ) -> tuple[Array, Array, Array]:
-        """As `linearise`, and f_p."""
-        f_x, f_u = self.linearise(x, u, p, dt)
-        f_p = np.empty((len(x), self.n, self.k))
-        for i, value in enumerate(p):
+            J[at : at + size, :, :shifted] = self._by_state_and_input(both[at : at + size], p, dt)
+        for i in range(width - shifted):
             up, down = np.array(p, float), np.array(p, float)
-            up[i] += RELATIVE_STEP * max(1.0, abs(value))
-            down[i] -= RELATIVE_STEP * max(1.0, abs(value))
-            f_p[:, :, i] = (self.step(x, u, up, dt) - self.step(x, u, down, dt)) / (up[i] - down[i])
-        return f_x, f_u, f_p
+            up[i] += RELATIVE_STEP * max(1.0, abs(p[i]))
+            down[i] -= RELATIVE_STEP * max(1.0, abs(p[i]))
+            change = self.step(x, u, up, dt) - self.step(x, u, down, dt)
+            J[:, :, shifted + i] = change / (up[i] - down[i])
+        return J
 
-    def _jacobian(self, both: Array, p: Array, dt: float) -> Array:
+    def _by_state_and_input(self, both: Array, p: Array, dt: float) -> Array:
         """(N, n + m) points -> (N, n, n + m), in one call of the step."""
         N, d = both.shape
         h = RELATIVE_STEP * np.maximum(1.0, np.abs(both))

@@ -12,9 +12,9 @@ import numpy as np
 
 from grounded.compile.names import where
 from grounded.compile.problem import Backward, Integrator, Problem, Swarm, System
-from grounded.compile.run.sweep import linearised, sweep, trajectory_cost, wrapped
+from grounded.compile.run.sweep import linearised, sweep, trajectory_cost
 from grounded.compile.trace.tracing import Signature
-from grounded.frozen import Array
+from grounded.frozen import Array, wrapped
 
 
 class Interpreted(System):
@@ -37,6 +37,28 @@ class Interpreted(System):
     @abstractmethod
     def evaluate(self, x: Array, u: Array, p: Array, dt: float, smoothing: float) -> Array:
         """The user's function: x (N, n), u (N, m), p (k,) -> ds/dt or next state (N, n)."""
+
+    @abstractmethod
+    def jacobian(
+        self, x: Array, u: Array, p: Array, dt: float, smoothing: float, width: int
+    ) -> Array:
+        """Derivatives of `step` by the first `width` of x, u and p, (N, n, width)."""
+
+    def linearise(
+        self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
+    ) -> tuple[Array, Array]:
+        """See `System.linearise`."""
+        J = self.jacobian(x, u, p, dt, smoothing, self.n + self.m)
+        f_x, f_u = np.split(J, [self.n], axis=2)
+        return np.ascontiguousarray(f_x), np.ascontiguousarray(f_u)
+
+    def sensitivities(
+        self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
+    ) -> tuple[Array, Array, Array]:
+        """See `System.sensitivities`."""
+        J = self.jacobian(x, u, p, dt, smoothing, sum(self.sizes))
+        f_x, f_u, f_p = np.split(J, [self.n, self.n + self.m], axis=2)
+        return np.ascontiguousarray(f_x), np.ascontiguousarray(f_u), np.ascontiguousarray(f_p)
 
     def step(self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0) -> Array:
         """See `System.step`."""

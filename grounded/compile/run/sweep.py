@@ -38,7 +38,7 @@ from grounded.compile.problem import (
     Queue,
     System,
 )
-from grounded.frozen import Array
+from grounded.frozen import Array, wrapped
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,13 +182,6 @@ def _projected_search(
             return np.asarray(trial)
         beta *= 0.5
     return k
-
-
-def wrapped(d: Array, angles: NDArray[np.bool_]) -> Array:
-    """`d` (..., >= n) with the angles among its first n entries wrapped to [-pi, pi], in place."""
-    for i in np.flatnonzero(angles):
-        d[..., i] -= 2 * np.pi * np.rint(d[..., i] / (2 * np.pi))
-    return d
 
 
 def tracking_error(problem: Problem, z: Array) -> Array:

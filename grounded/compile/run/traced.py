@@ -63,22 +63,6 @@ class TracedSystem(Interpreted):
         values = self.variant(p, dt).values(leaves_of(x, u, p, dt), smoothing)
         return np.stack([np.broadcast_to(v, len(x)) for v in values], axis=1)
 
-    def linearise(
-        self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
-    ) -> tuple[Array, Array]:
-        """f_x and f_u, exact."""
-        J = self._derivatives(x, u, p, dt, smoothing, False)
-        return np.ascontiguousarray(J[:, :, : self.n]), np.ascontiguousarray(J[:, :, self.n :])
-
-    def sensitivities(
-        self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
-    ) -> tuple[Array, Array, Array]:
-        """f_x, f_u and f_p, exact."""
-        J = self._derivatives(x, u, p, dt, smoothing, True)
-        ends = (self.n, self.n + self.m)
-        f_x, f_u, f_p = np.split(J, ends, axis=2)
-        return np.ascontiguousarray(f_x), np.ascontiguousarray(f_u), np.ascontiguousarray(f_p)
-
     def check(self, x: Array, u: Array, p: Array, dt: float) -> None:
         """See `System.check`."""
         x, u = np.asarray(x, float), np.asarray(u, float)
@@ -97,13 +81,12 @@ class TracedSystem(Interpreted):
                 "keep a memory, or look at the type of its arguments?"
             )
 
-    def _derivatives(
-        self, x: Array, u: Array, p: Array, dt: float, smoothing: float, full: bool
+    def jacobian(
+        self, x: Array, u: Array, p: Array, dt: float, smoothing: float, width: int
     ) -> Array:
-        width = self.n + self.m + (self.k if full else 0)
-        J = np.empty((len(x), self.n, width))
-        variant = self.variant(p, dt)
-        program = variant.full if full else variant.small
+        """See `Interpreted.jacobian`; exact."""
+        J, variant = np.empty((len(x), self.n, width)), self.variant(p, dt)
+        program = variant.small if width == self.n + self.m else variant.full
         for at in range(0, len(x), CHUNK):
             some = slice(at, at + CHUNK)
             with np.errstate(all="ignore"):

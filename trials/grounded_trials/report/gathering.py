@@ -20,7 +20,7 @@ from grounded.search.planner import Planner
 from grounded.search.standing import Candidate, Standing, standing, utility_noise
 from grounded.solve.bias import residuals
 from grounded.task import Task
-from grounded.trial import Trial, bridge
+from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.report.findings import Findings, Log, Lost, Run
 from grounded_trials.store.trial_file import read_trial
 from grounded_trials.workspace.adopting import Better, better_model
@@ -80,7 +80,7 @@ def _trials(workspace: Workspace) -> tuple[list[Trial], dict[str, bytes], list[L
         except GroundedError as error:
             lost.append(Lost(stored.path.name, str(error)))
             continue
-        trials.append(bridge(replace(trial, id=stored.id)).trial)
+        trials.append(interpolate_gaps(replace(trial, id=stored.id)).trial)
         if policy is not None:
             policies.setdefault(trial.candidate, policy)
     for number in sorted(set(range(1, max(numbers, default=0))) - set(numbers)):

@@ -20,7 +20,7 @@ from grounded.errors import GroundedError, nearest
 from grounded.model import Model
 from grounded.search.standing import Candidate
 from grounded.task import Task
-from grounded.trial import Trial, bridge
+from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.store.candidate_file import candidate_bytes, read_candidate
 from grounded_trials.store.store import Store, Stored, write_atomically
 from grounded_trials.store.trial_file import read_trial
@@ -191,7 +191,7 @@ class Workspace:
         for stored in self.store.list():
             trial, meta, _ = read_trial(self.store.read(stored), stored.path.name)
             logged = replace(trial, id=stored.id)
-            yield StoredTrial(stored, bridge(logged).trial, meta, logged)
+            yield StoredTrial(stored, interpolate_gaps(logged).trial, meta, logged)
 
     def estimated_states(self) -> tuple[str, ...]:
         """States that some stored trial did not measure: the smoother's, no evidence."""

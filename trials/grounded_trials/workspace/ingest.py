@@ -100,9 +100,9 @@ def _verdict(trial: Trial, tried: Tried | None, repeats: int) -> str:
 
 
 def _bridged(trial: Trial) -> Trial:
-    from grounded.trial import bridge
+    from grounded.trial import interpolate_gaps
 
-    return bridge(trial).trial
+    return interpolate_gaps(trial).trial
 
 
 def _tried(workspace: Workspace, trial: Trial) -> Tried | None:
