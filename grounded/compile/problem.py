@@ -276,12 +276,7 @@ class System(ABC):
 
     @abstractmethod
     def backward(
-        self,
-        problem: Problem,
-        z: Array,
-        u: Array,
-        damping: Array,
-        into: Backward | None = None,
+        self, problem: Problem, z: Array, u: Array, damping: Array, into: Backward | None = None
     ) -> Backward:
         """Linearise along z (H+1, nz), u (H, m) and sweep back, Q_uu + diag(damping), damping (m,).
 

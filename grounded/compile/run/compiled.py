@@ -218,12 +218,7 @@ class CompiledSystem(TracedSystem):
         return Swarm(z, u, cost)
 
     def backward(
-        self,
-        problem: Problem,
-        z: Array,
-        u: Array,
-        damping: Array,
-        into: Backward | None = None,
+        self, problem: Problem, z: Array, u: Array, damping: Array, into: Backward | None = None
     ) -> Backward:
         """See `System.backward`."""
         if self.m > MAX_INPUTS:

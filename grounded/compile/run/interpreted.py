@@ -101,12 +101,7 @@ class Interpreted(System):
         return Swarm(z, u, trajectory_cost(problem, z, u))
 
     def backward(
-        self,
-        problem: Problem,
-        z: Array,
-        u: Array,
-        damping: Array,
-        into: Backward | None = None,
+        self, problem: Problem, z: Array, u: Array, damping: Array, into: Backward | None = None
     ) -> Backward:
         """See `System.backward`."""
         with np.errstate(all="ignore"):

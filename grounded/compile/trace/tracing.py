@@ -87,7 +87,7 @@ def trace(signature: Signature, p: Array | None, dt: float, limit: int = MAX_NOD
     graph, guards = Graph(limit), []
 
     def oracle(i: int) -> bool:
-        if any(graph.nodes[j].leaf and graph.nodes[j].leaf[0] in "xu" for j in graph.live([i])):  # type: ignore[index]
+        if graph.varies(i):
             raise NotTraceable("an `if` (or and, or, while) on a state or an input; use np.where")
         outcome = True if p is None else bool(Program(graph, [i])(_uniform(p, dt), 0.0)[0])
         guards.append((i, outcome))
