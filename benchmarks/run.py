@@ -78,9 +78,7 @@ def peer_rows(case, best, python, folder, fatrop):
     for peer, *extra in calls:
         command = [python, f"peer_{peer}.py", str(path), repr(best), *extra]
         environment = os.environ | {"PYTHONPATH": str(HERE.parent)}
-        done = subprocess.run(
-            command, cwd=HERE, env=environment, capture_output=True, text=True, check=False
-        )
+        done = subprocess.run(command, cwd=HERE, env=environment, capture_output=True, text=True)
         if done.returncode == 0:
             yield json.loads(done.stdout.strip().splitlines()[-1])
         else:
@@ -110,10 +108,8 @@ def show(row, ours):
     text += f"  {row['iterations']} iterations, cost {row['cost']:.6g}"
     text += f", ratio {row['ms'] / ours['ms']:.1f}"
     if "backward_ms" in row:
-        ratio = row["backward_ms"] / ours["iteration_ms"]
-        text += (
-            f"; its backward pass alone {row['backward_ms']:.3f} ms, {ratio:.1f} of our iterations"
-        )
+        alone, ratio = row["backward_ms"], row["backward_ms"] / ours["iteration_ms"]
+        text += f"; its backward pass alone {alone:.3f} ms, {ratio:.1f} of our iterations"
     if "iteration_ms" in row:
         text += f"; an iteration {row['iteration_ms']:.3f} ms"
     if "build_s" in row:
@@ -194,9 +190,8 @@ def size_part(options):
         result = solve(problem, u)
         first = time.process_time() - start
         ms = 1e3 * cpu(lambda p=problem, u=u: solve(p, u), 5)
-        print(
-            f"  n = {n:3d}  {ms:8.3f} ms  {len(result.trace)} iterations; first call {first:.2f} s"
-        )
+        turns = f"{len(result.trace)} iterations"
+        print(f"  n = {n:3d}  {ms:8.3f} ms  {turns}; first call {first:.2f} s")
 
 
 def swarm_part(options):
@@ -281,23 +276,15 @@ def process_part(options):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--peers", help="a Python that has the peers")
-    parser.add_argument(
-        "--fatrop", action="store_true", help="CasADi with fatrop too (slow to build)"
-    )
+    parser.add_argument("--fatrop", action="store_true", help="CasADi's fatrop too (slow to build)")
     parser.add_argument("parts", nargs="*", help=f"of {', '.join(PARTS)}")
     options = parser.parse_args()
-    sys.path[:0] = [
-        str(HERE),
-        str(HERE.parent),
-        str(HERE.parent / "cli"),
-        str(HERE.parent / "trials"),
-    ]
-    versions = f"Python {platform.python_version()}, NumPy {np.__version__}"
+    sys.path[:0] = [str(HERE.parent / folder) for folder in ("", "cli", "trials")]
     import llvmlite
 
-    print(
-        f"{versions}, llvmlite {llvmlite.__version__}, {platform.processor() or platform.machine()}"
-    )
+    versions = f"NumPy {np.__version__}, llvmlite {llvmlite.__version__}"
+    machine = platform.processor() or platform.machine()
+    print(f"Python {platform.python_version()}, {versions}, {machine}")
     for part in options.parts or PARTS:
         globals()[f"{part}_part"](options)
 

@@ -23,7 +23,7 @@ from grounded.compile.problem import (
     history_depths,
 )
 from grounded.compile.run.differenced import DifferencedSystem
-from grounded.compile.run.threads import parallel
+from grounded.compile.run.jit import parallel
 from grounded.compile.run.traced import TracedSystem
 from grounded.compile.trace.graph import TooLong
 from grounded.compile.trace.tracing import Signature, trace

@@ -14,7 +14,7 @@ import numpy as np
 
 from grounded.compile import Problem
 from grounded.compile.run.differenced import RELATIVE_STEP, DifferencedSystem
-from grounded.compile.run.sweep import trajectory_cost
+from grounded.compile.run.interpreted import trajectory_cost
 from grounded.compile.trace.tracing import (
     Signature,
     Variant,

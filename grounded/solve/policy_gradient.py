@@ -28,8 +28,8 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from grounded.compile import Problem
-from grounded.compile.run.sweep import Quadratic
-from grounded.compile.run.sweep import linearised as quadratic_model
+from grounded.compile.run.interpreted import Quadratic
+from grounded.compile.run.interpreted import linearised as quadratic_model
 from grounded.errors import GroundedError
 from grounded.frozen import Array, wrapped
 from grounded.rollout import simulate

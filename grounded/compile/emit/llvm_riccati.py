@@ -1,4 +1,4 @@
-"""Kernel: linearise along a trajectory and sweep back, the compiled twin of `sweep.py`.
+"""Kernel: linearise along a trajectory and sweep back, the compiled twin of `interpreted.sweep`.
 
 Rows of the value's Hessian V are vectors. With the Jacobian [A B] sparse and the past inputs a
 shift, the two products of Q = [A B]' V [A B] are the same routine twice,
