@@ -13,18 +13,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from models import CAR_INPUTS, CAR_PARAMS, CAR_STATES, car
+from models import MODELS
 
-from grounded import Model, Param
 from grounded.compile import Problem
 from grounded.experiments.car_tasks import car_task
 from grounded.experiments.figure8 import flight_task
-from grounded.models.aircraft import model as aircraft_model
 from grounded.search.first_policy import first_guess
 
 
 @dataclass(frozen=True, eq=False)
-class Case:
+class BenchmarkCase:
     """A problem and the trajectory that every solver starts from."""
 
     name: str
@@ -43,34 +41,15 @@ class Case:
         return path
 
 
-def smooth_car() -> Model:
-    """The car without indicator terms."""
-
-    def rate(s, a, p):
-        x = [s[name] for name in CAR_STATES]
-        values = car(x, [a.steering, a.throttle], [p[name] for name in CAR_PARAMS], np)
-        return dict(zip(CAR_STATES, values, strict=True))
-
-    return Model(
-        name="smooth car",
-        states=dict.fromkeys(CAR_STATES, "1"),
-        inputs=dict.fromkeys(CAR_INPUTS, "1"),
-        params={name: Param(value) for name, value in CAR_PARAMS.items()},
-        angles=("psi",),
-        roles={"position": ("x", "y"), "heading": "psi", "speed": "v"},
-        derivative=rate,
-    )
-
-
-def cases(names=("car", "aircraft")) -> list[Case]:
+def cases(names=("car", "aircraft")) -> list[BenchmarkCase]:
     """Both problems with their starts."""
     found = []
     for name in names:
         if name == "car":
-            task = car_task("circle", smooth_car())
+            task = car_task("circle", MODELS[name])
             task = dataclasses.replace(task, latency=np.zeros(2))
         else:
-            task = flight_task(aircraft_model)
+            task = flight_task(MODELS[name])
         free = np.full(task.model.m, np.inf)
         problem = dataclasses.replace(task.problem(), low=-free, high=free)
         target = np.nan_to_num(problem.target)
@@ -80,5 +59,5 @@ def cases(names=("car", "aircraft")) -> list[Case]:
         else:
             guess = first_guess(task)
             run = problem.system.rollout(problem, guess.inputs, guess.gain, guess.z[:-1])
-        found.append(Case(name, problem, run.u[0], run.z[0]))
+        found.append(BenchmarkCase(name, problem, run.u[0], run.z[0]))
     return found

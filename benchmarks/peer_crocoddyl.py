@@ -10,14 +10,14 @@ import numpy as np
 from models import rk4
 from peer_data import fastest, load, reached, report
 
-case = load()
+case = load(np)
 n, m = case.n, case.m
 STEP = 6e-6
 
 
 def step(x, u):
     """Batched: columns are samples."""
-    return np.array(rk4(case.rate, list(x), list(u), case.p, case.dt, np))
+    return np.array(rk4(case.rate, list(x), list(u), case.p, case.dt))
 
 
 class Node(crocoddyl.ActionModelAbstract):
@@ -69,17 +69,13 @@ def solve(iterations):
 
 
 iterations = 1
-while True:
-    solver = solve(iterations)
-    if reached(case, solver.cost) or iterations >= 30:
-        break
+while not reached(case, (solver := solve(iterations)).cost) and iterations < 30:
     iterations += 1
-repeats = 1 if case.name == "aircraft" else 3
 report(
     peer="Crocoddyl, NumPy model",
     version=crocoddyl.__version__,
     case=case.name,
-    ms=1e3 * fastest(lambda: solve(iterations), repeats),
+    ms=1e3 * fastest(lambda: solve(iterations), case.repeats),
     iterations=iterations,
     cost=solver.cost,
     backward_ms=1e3 * fastest(solver.backwardPass, 10),

@@ -6,20 +6,17 @@ import time
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from models import rk4
 from peer_data import fastest, load, reached, report
 
 jax.config.update("jax_enable_x64", True)
-case = load()
+case = load(jnp)
 n, m = case.n, case.m
 R, S = jnp.array(case.R), jnp.array(case.S)
 
 
 def step(z, u):
-    x = jnp.stack(
-        rk4(case.rate, [z[i] for i in range(n)], [u[j] for j in range(m)], case.p, case.dt, jnp)
-    )
+    x = jnp.stack(rk4(case.rate, list(z[:n]), list(u), case.p, case.dt))
     return jnp.concatenate([x, u])
 
 
@@ -91,4 +88,3 @@ report(
     cost=cost,
     build_s=built,
 )
-np.asarray(0)

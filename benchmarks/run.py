@@ -32,18 +32,16 @@ PEERS = ("crocoddyl", "casadi", "jax")
 
 def cpu(function, repeats=20):
     """Least CPU seconds of a few calls."""
-    times = []
-    for _ in range(repeats):
-        start = time.process_time()
-        function()
-        times.append(time.process_time() - start)
-    return min(times)
+    from peer_data import fastest
+
+    return fastest(function, repeats)
 
 
 def our_solve(case, iterations, tolerance=0.0):
-    from grounded.solve.ddp import Options, solve
+    from grounded.compile import DescentOptions
+    from grounded.solve.ddp import solve
 
-    options = Options(max_iterations=iterations, tolerance=tolerance)
+    options = DescentOptions(max_iterations=iterations, tolerance=tolerance)
     return solve(case.problem, case.u, options=options)
 
 
@@ -54,13 +52,14 @@ def our_row(case):
     """
     from peer_data import CLOSE
 
-    from grounded.solve.ddp import Options, solve
+    from grounded.compile import DescentOptions
+    from grounded.solve.ddp import solve
 
     best = our_solve(case, 50, 1e-10).cost
     iterations = next(i for i in range(1, 50) if our_solve(case, i).cost <= best * (1 + CLOSE))
     ms = 1e3 * cpu(lambda: our_solve(case, iterations), 50)
     found = our_solve(case, iterations)
-    start, settings = (case.problem, case.u), Options(max_iterations=0)
+    start, settings = (case.problem, case.u), DescentOptions(max_iterations=0)
     first = 1e3 * cpu(lambda: solve(*start, options=settings), 50)  # a rollout and a sweep
     return best, {
         "peer": "grounded",
@@ -78,7 +77,8 @@ def peer_rows(case, best, python, folder, fatrop):
     calls = [[peer] for peer in PEERS] + ([["casadi", "fatrop"]] if fatrop else [])
     for peer, *extra in calls:
         command = [python, f"peer_{peer}.py", str(path), repr(best), *extra]
-        done = subprocess.run(command, cwd=HERE, capture_output=True, text=True, check=False)
+        environment = os.environ | {"PYTHONPATH": str(HERE.parent)}
+        done = subprocess.run(command, cwd=HERE, env=environment, capture_output=True, text=True)
         if done.returncode == 0:
             yield json.loads(done.stdout.strip().splitlines()[-1])
         else:
@@ -108,10 +108,8 @@ def show(row, ours):
     text += f"  {row['iterations']} iterations, cost {row['cost']:.6g}"
     text += f", ratio {row['ms'] / ours['ms']:.1f}"
     if "backward_ms" in row:
-        ratio = row["backward_ms"] / ours["iteration_ms"]
-        text += (
-            f"; its backward pass alone {row['backward_ms']:.3f} ms, {ratio:.1f} of our iterations"
-        )
+        alone, ratio = row["backward_ms"], row["backward_ms"] / ours["iteration_ms"]
+        text += f"; its backward pass alone {alone:.3f} ms, {ratio:.1f} of our iterations"
     if "iteration_ms" in row:
         text += f"; an iteration {row['iteration_ms']:.3f} ms"
     if "build_s" in row:
@@ -144,9 +142,10 @@ def stretched(problem, H):
 def horizon_part(options):
     from cases import cases
 
-    from grounded.solve.ddp import Options, solve
+    from grounded.compile import DescentOptions
+    from grounded.solve.ddp import solve
 
-    case, settings = cases(["aircraft"])[0], Options(max_iterations=3, tolerance=0.0)
+    case, settings = cases(["aircraft"])[0], DescentOptions(max_iterations=3, tolerance=0.0)
     print("\nCPU of 3 iterations against the horizon (aircraft, straight flight)")
     for H in (200, 500, 1000, 2000, 5000, 10_000, 20_000):
         start = stretched(case.problem, H)
@@ -191,15 +190,15 @@ def size_part(options):
         result = solve(problem, u)
         first = time.process_time() - start
         ms = 1e3 * cpu(lambda p=problem, u=u: solve(p, u), 5)
-        print(
-            f"  n = {n:3d}  {ms:8.3f} ms  {len(result.trace)} iterations; first call {first:.2f} s"
-        )
+        turns = f"{len(result.trace)} iterations"
+        print(f"  n = {n:3d}  {ms:8.3f} ms  {turns}; first call {first:.2f} s")
 
 
 def swarm_part(options):
     from cases import cases
 
-    from grounded.solve.ddp import Options, solve
+    from grounded.compile import DescentOptions
+    from grounded.solve.ddp import solve
 
     case, rng = cases(["car"])[0], np.random.default_rng(0)
     p = case.problem.p
@@ -208,7 +207,7 @@ def swarm_part(options):
     def all_of_them():
         for values in models:
             problem = dataclasses.replace(case.problem, p=values)
-            solve(problem, case.u, options=Options(tolerance=1e-6))
+            solve(problem, case.u, options=DescentOptions(tolerance=1e-6))
 
     print(f"\n1000 perturbed cars solved in one process: {cpu(all_of_them, 3):.3f} s of CPU")
 
@@ -217,9 +216,9 @@ def memory_part(options):
     code = (
         "import resource, sys; sys.path[:0] = sys.argv[1:]\n"
         "import numpy as np\nfrom cases import cases\nfrom run import stretched\n"
-        "from grounded.solve.ddp import Options, solve\n"
+        "from grounded.compile import DescentOptions\nfrom grounded.solve.ddp import solve\n"
         "case = cases(['aircraft'])[0]\n"
-        "solve(*stretched(case.problem, 20_000), options=Options(max_iterations=10))\n"
+        "solve(*stretched(case.problem, 20_000), options=DescentOptions(max_iterations=10))\n"
         "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)"
     )
     command = [sys.executable, "-c", code, str(HERE), str(HERE.parent)]
@@ -277,23 +276,15 @@ def process_part(options):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--peers", help="a Python that has the peers")
-    parser.add_argument(
-        "--fatrop", action="store_true", help="CasADi with fatrop too (slow to build)"
-    )
+    parser.add_argument("--fatrop", action="store_true", help="CasADi's fatrop too (slow to build)")
     parser.add_argument("parts", nargs="*", help=f"of {', '.join(PARTS)}")
     options = parser.parse_args()
-    sys.path[:0] = [
-        str(HERE),
-        str(HERE.parent),
-        str(HERE.parent / "cli"),
-        str(HERE.parent / "trials"),
-    ]
-    versions = f"Python {platform.python_version()}, NumPy {np.__version__}"
+    sys.path[:0] = [str(HERE.parent / folder) for folder in ("", "cli", "trials")]
     import llvmlite
 
-    print(
-        f"{versions}, llvmlite {llvmlite.__version__}, {platform.processor() or platform.machine()}"
-    )
+    versions = f"NumPy {np.__version__}, llvmlite {llvmlite.__version__}"
+    machine = platform.processor() or platform.machine()
+    print(f"Python {platform.python_version()}, {versions}, {machine}")
     for part in options.parts or PARTS:
         globals()[f"{part}_part"](options)
 

@@ -1,4 +1,4 @@
-"""Arrays that can't be changed after they entered a frozen dataclass."""
+"""Arrays: read-only ones for frozen dataclasses, and differences of angles."""
 
 from __future__ import annotations
 
@@ -17,3 +17,15 @@ def readonly(values: ArrayLike, dtype: Any = np.float64) -> Any:
         array = np.array(array, dtype=dtype, order="C")
         array.flags.writeable = False
     return array
+
+
+def wrapped(d: Array, angles: ArrayLike) -> Array:
+    """`d` (..., >= n) with the angles among its first n entries wrapped to [-pi, pi], in place.
+
+    Args:
+        d: differences.
+        angles: (n,) of bool.
+    """
+    for i in np.flatnonzero(angles):
+        d[..., i] -= 2 * np.pi * np.rint(d[..., i] / (2 * np.pi))
+    return d

@@ -22,7 +22,7 @@ import numpy as np
 
 from grounded.compile import System, system_of
 from grounded.errors import GroundedError, nearest
-from grounded.frozen import Array, readonly
+from grounded.frozen import Array, readonly, wrapped
 
 Function = Callable[..., Mapping[str, Any]]
 
@@ -157,15 +157,11 @@ class Model:
             inputs=self.input_names,
             params=self.param_names,
             integrator=self.integrator,
-            angles=tuple(bool(a) for a in self.angle_mask),
         )
 
     def difference(self, a: Array, b: Array) -> Array:
         """The difference a - b of arrays (..., n) of states; angles wrapped to [-pi, pi]."""
-        d: Array = np.asarray(a, float) - np.asarray(b, float)
-        mask = self.angle_mask
-        d[..., mask] -= 2 * np.pi * np.rint(d[..., mask] / (2 * np.pi))
-        return d
+        return wrapped(np.asarray(a, float) - np.asarray(b, float), self.angle_mask)
 
     def with_values(self, values: Mapping[str, float]) -> Model:
         """A copy with other parameter values; bounds are widened where a value lies outside.

@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
-from grounded.frozen import Array, readonly
+from grounded.frozen import Array, readonly, wrapped
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,11 +144,7 @@ class Policy:
 
 def z_difference(a: Array, b: Array, angles: tuple[bool, ...]) -> Array:
     """The difference a - b of augmented states (..., nz), angles wrapped."""
-    d: Array = np.asarray(a, float) - np.asarray(b, float)
-    for i, angle in enumerate(angles):
-        if angle:
-            d[..., i] -= 2 * np.pi * np.rint(d[..., i] / (2 * np.pi))
-    return d
+    return wrapped(np.asarray(a, float) - np.asarray(b, float), angles)
 
 
 FORMAT = "grounded-policy-1"

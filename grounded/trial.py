@@ -1,10 +1,9 @@
 """Trial: one real run on the control grid. A simulated run is a Rollout, never a Trial.
 
-Lost samples: short gaps in a trial are bridged, long ones end it.
-
-A camera that misses the car for half a second loses states, not the trial: the bias over the gap is
-interpolated by interpolating the states (FACTS.md 2: 2 % lost samples are harmless). Inputs are
-never invented: a trial ends before its first unknown input.
+Samples get lost: a camera that misses the car for half a second loses states, not the trial. Short
+gaps are interpolated (`interpolate_gaps`), and with them the bias (FACTS.md 2: 2 % lost samples are
+harmless); long ones end the trial. Inputs are never invented: a trial ends before its first unknown
+input.
 """
 
 from __future__ import annotations
@@ -16,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from grounded.errors import GroundedError
-from grounded.frozen import Array, readonly
+from grounded.frozen import Array, readonly, wrapped
 
+MAX_GAP_S = 1.0  # a longer gap ends a trial
 HUGE = 1e100  # from here on a number is as good as infinite: squares and products must be numbers
 
 
@@ -100,7 +100,7 @@ def mean_trial(trials: Sequence[Trial], angles: NDArray[np.bool_] | None = None)
     first = trials[0]
     off = np.array([t.states - first.states for t in trials])
     if angles is not None:
-        off[..., angles] -= 2 * np.pi * np.rint(off[..., angles] / (2 * np.pi))
+        wrapped(off, angles)
     held = [t.start_inputs for t in trials if t.start_inputs is not None]
     return Trial(
         states=first.states + off.mean(axis=0),
@@ -113,11 +113,8 @@ def mean_trial(trials: Sequence[Trial], angles: NDArray[np.bool_] | None = None)
     )
 
 
-MAX_GAP_S = 1.0
-
-
 @dataclass(frozen=True, eq=False)
-class Bridged:
+class Interpolated:
     """A trial without gaps: samples that were interpolated, and the state of the longest gap."""
 
     trial: Trial
@@ -127,14 +124,14 @@ class Bridged:
     at_s: float
 
 
-def bridge(trial: Trial) -> Bridged:
+def interpolate_gaps(trial: Trial) -> Interpolated:
     """Interpolates gaps of at most MAX_GAP_S between known samples; the first state must be known.
 
     A longer gap, or one that reaches the end, stays: the trial then counts as ended there.
     """
     bad = ~np.isfinite(trial.states)
     if not bad.any() or bad[0].any():
-        return Bridged(trial, 0, 0.0, "", 0.0)
+        return Interpolated(trial, 0, 0.0, "", 0.0)
     states = np.array(trial.states)
     filled, longest, where, at = 0, 0, "", 0.0
     for i, name in enumerate(trial.state_names):
@@ -146,7 +143,7 @@ def bridge(trial: Trial) -> Bridged:
             filled += last - first
             if last - first > longest:
                 longest, where, at = last - first, name, first * trial.dt
-    return Bridged(replace(trial, states=states), filled, longest * trial.dt, where, at)
+    return Interpolated(replace(trial, states=states), filled, longest * trial.dt, where, at)
 
 
 def _gaps(bad: np.ndarray) -> list[tuple[int, int]]:

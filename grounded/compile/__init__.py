@@ -13,9 +13,9 @@ from grounded.compile.names import Named, where
 from grounded.compile.problem import (
     Backward,
     Descent,
+    DescentOptions,
     Integrator,
     Kind,
-    Options,
     Problem,
     Status,
     Swarm,
@@ -23,7 +23,7 @@ from grounded.compile.problem import (
     history_depths,
 )
 from grounded.compile.run.differenced import DifferencedSystem
-from grounded.compile.run.threads import parallel
+from grounded.compile.run.jit import parallel
 from grounded.compile.run.traced import TracedSystem
 from grounded.compile.trace.graph import TooLong
 from grounded.compile.trace.tracing import Signature, trace
@@ -31,8 +31,8 @@ from grounded.compile.trace.tracing import Signature, trace
 __all__ = [
     "Backward",
     "Descent",
+    "DescentOptions",
     "Named",
-    "Options",
     "Problem",
     "Status",
     "Swarm",
@@ -52,7 +52,6 @@ def system_of(
     inputs: Sequence[str],
     params: Sequence[str],
     integrator: Integrator = "rk4",
-    angles: Sequence[bool] = (),
 ) -> System:
     """The System of a user's function.
 
@@ -63,7 +62,6 @@ def system_of(
         inputs: see `states`.
         params: see `states`.
         integrator: "rk4" or "euler", for a derivative.
-        angles: (n,) which states wrap.
 
     Raises:
         GroundedError: if the function can't be a model of these names, naming its file and line.
@@ -71,21 +69,10 @@ def system_of(
     from grounded.compile.run import jit
     from grounded.compile.run.compiled import MAX_PLACES, CompiledSystem
 
-    def differenced(why: str) -> System:
-        return DifferencedSystem(
-            function,
-            kind=kind,
-            states=states,
-            inputs=inputs,
-            params=params,
-            integrator=integrator,
-            note=f"not compiled, {why}",
-        )
-
     signature = Signature(function, kind, tuple(states), tuple(inputs), tuple(params))
     found = trace(signature, None, 1.0)
     if isinstance(found, str):
-        return differenced(found)
+        return DifferencedSystem(signature, integrator, f"not compiled, {found}")
     trouble = jit.trouble()
     if trouble:
         return TracedSystem(signature, found, integrator, f"not compiled: {trouble}")
@@ -93,7 +80,8 @@ def system_of(
         system = CompiledSystem(signature, found, integrator)
         operations = system.operations
     except TooLong as error:
-        return differenced(f"{where(function)}: its derivatives take {error}")
+        note = f"not compiled, {where(function)}: its derivatives take {error}"
+        return DifferencedSystem(signature, integrator, note)
     if operations > MAX_COMPILED or system.n * (system.n + system.m) > MAX_PLACES:
         size = f"{system.n} states and {operations:,} operations"
         note = f"not compiled, {where(function)}: {size} would take too long"

@@ -1,50 +1,53 @@
-"""A finite-horizon tracking problem in plain arrays: all that a kernel knows of a task.
+"""A finite-horizon tracking problem in plain arrays, and what can be done with it (`System`).
 
-The state a kernel works on is augmented with the inputs already sent,
+The state a kernel works on is augmented with the inputs already sent, newest first, input by input,
 
-    z_t = [x_t, u_0[t-1] .. u_0[t-D_0], u_1[t-1] .. u_1[t-D_1], ...],
+    z_t = [x_t, q_t] = [x_t, u_0[t-1] .. u_0[t-D_0], u_1[t-1] .. u_1[t-D_1], ...],
 
 because two things need them: the cost of input CHANGES (u_t - u_{t-1}) and the transport DELAY of
 an input. D_j = max(1, ceil(delay_j)); with delay_j = d + phi (0 <= phi < 1, in steps) the actuator
 receives, under a zero-order hold, the mean over the step (1 - phi) u_j[t-d] + phi u_j[t-d-1].
 
+    u_eff_t = now * u_t + past q_t,        q_{t+1} = [u_t, q_t without the oldest]  (`Queue`)
     x_{t+1} = f(x_t, u_eff_t - input_shift_t) + bias_t
     J = sum_t  W_t |x_t - target_t|^2 + R |u_t - u_target_t|^2 + S |u_t - u_{t-1}|^2
         + W_H |x_H - target_H|^2,                         low <= u_t <= high
 
 J is a COST: minus the paper's utility. Errors of states marked as angles wrap to [-pi, pi].
 
-The inputs already sent: where they sit in z, and what of them reaches the actuator.
-
-z_t = [x_t, q_t] with q_t the past inputs, newest first, input by input. A delay of d + phi steps
-(0 <= phi < 1) under a zero-order hold means
-
-    u_eff_t = now * u_t + past q_t          (weights 1 - phi and phi on two neighbours)
-    q_{t+1} = [u_t, q_t without the oldest]  for each input.
-
-What the loop of `ddp.solve` and its compiled twin (`llvm_descent.py`) have in common.
-
-What every path from a user's function to numbers offers: compiled, traced, or differenced.
-
-`ddp`, `fit`, `estimate` and the diagnosis talk to this interface alone, so that a black-box
-simulator and a model compiled to machine code are the same thing to them. All arrays are float64
-and C-contiguous; a state that leaves the finite numbers is returned as it is (NaN, inf), never
-raised: the caller turns it into a status.
+A `System` is the model: compiled, traced or differenced (`run`), the same to all that is above, so
+that a black-box simulator serves as well as machine code. All arrays are float64 and C-contiguous.
+A state that leaves the finite numbers is returned as it is (NaN, inf), never raised: the caller
+turns it into a status.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from grounded.frozen import Array
+
+# Box-limited quadratic programmes: `interpreted.box_qp` and its twin `llvm_box`.
 MAX_ITERATIONS = 50
 STOP = 1e-11  # on the free gradient, relative to |g|
 ARMIJO = 0.1
 ROUNDING = 1e-13  # of the value: a smaller rise is none
+
+# The loop of `ddp.descended` and its compiled twin `llvm_descent`.
+FLOOR = 1e-6  # first regularisation after a failed factorisation
+SEARCH_FLOOR = 1e-3  # regularisation after a failed search
+GROWTH = 10.0
+CEILING = 1e10
+LARGE_MU = 1.0
+LEAST = 1e-14  # a predicted change that is none
+Status = Literal["converged", "no improvement", "max iterations", "not finite"]
+STATUSES: tuple[Status, ...] = ("converged", "no improvement", "max iterations", "not finite")
 
 STAGES: dict[str, tuple[tuple[float, float], ...]] = {  # (c, b): where and with what weight
     "rk4": ((0.0, 1 / 6), (0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6)),
@@ -53,8 +56,6 @@ STAGES: dict[str, tuple[tuple[float, float], ...]] = {  # (c, b): where and with
 
 Kind = Literal["derivative", "step"]
 Integrator = Literal["rk4", "euler"]
-
-Array = NDArray[np.float64]
 
 
 def history_depths(delay: Array) -> tuple[int, ...]:
@@ -81,7 +82,7 @@ class Problem:
     low: Array  # (m,) hard limits, may be -inf
     high: Array  # (m,) may be +inf
     angles: NDArray[np.bool_]  # (n,)
-    input_shift: Array | None = None  # (H, m) off what the actuators receive, see `matching`
+    input_shift: Array | None = None  # (H, m) off what the actuators receive, see `bias`
     smoothing: float = 0.0  # width of the smoothed indicator terms; 0: exact
 
     @property
@@ -108,6 +109,16 @@ class Problem:
     def nz(self) -> int:
         """Size of the augmented state z."""
         return self.system.n + sum(self.depths)
+
+    @cached_property
+    def queue(self) -> Queue:
+        """Where the past inputs sit in z, and what of them reaches the actuator."""
+        return _queue(self.system.n, self.delay, self.depths)
+
+    def received(self, z: Array, u: Array, t: int | slice = slice(None)) -> Array:
+        """What the model is given at steps t: z (..., nz), u (..., m) -> (..., m)."""
+        sent = self.queue.effective(z, u)
+        return sent if self.input_shift is None else sent - self.input_shift[t]
 
     def z_start(self) -> Array:
         """z_0: the start state and the input held before it, (nz,)."""
@@ -149,38 +160,23 @@ class Queue:
         return self.after(np.eye(D), np.zeros((D, m))).T, self.after(np.zeros((m, D)), np.eye(m)).T
 
 
-def queue_of(problem: Problem) -> Queue:
-    """The queue of a problem: depths and weights from its delays."""
-    n, depths = problem.system.n, problem.depths
+def _queue(n: int, delay: Array, depths: tuple[int, ...]) -> Queue:
     starts = np.concatenate([[0], np.cumsum(depths)]).astype(int)
     now, past = np.zeros(len(depths)), np.zeros((len(depths), int(starts[-1])))
-    for j, delay in enumerate(problem.delay):
-        whole = int(np.floor(delay + 1e-9))
-        part = max(0.0, float(delay) - whole)
+    for j, steps in enumerate(delay):
+        whole = int(np.floor(steps + 1e-9))
+        part = max(0.0, float(steps) - whole)
         part = 0.0 if part < 1e-9 else part
-        for steps, weight in ((whole, 1.0 - part), (whole + 1, part)):
-            if weight == 0.0:
-                continue
-            if steps == 0:
+        for age, weight in ((whole, 1.0 - part), (whole + 1, part)):
+            if weight and age:
+                past[j, starts[j] + age - 1] = weight
+            elif weight:
                 now[j] = weight
-            else:
-                past[j, starts[j] + steps - 1] = weight
     return Queue(n, depths, tuple(int(n + s) for s in starts[:-1]), now, past)
 
 
-Status = Literal["converged", "no improvement", "max iterations", "not finite"]
-STATUSES: tuple[Status, ...] = ("converged", "no improvement", "max iterations", "not finite")
-
-FLOOR = 1e-6  # first regularisation after a failed factorisation
-SEARCH_FLOOR = 1e-3  # regularisation after a failed search
-GROWTH = 10.0
-CEILING = 1e10
-LARGE_MU = 1.0
-LEAST = 1e-14  # a predicted change that is none
-
-
 @dataclass(frozen=True)
-class Options:
+class DescentOptions:
     """Settings of `ddp.solve`."""
 
     max_iterations: int = 100
@@ -227,7 +223,7 @@ class Backward:
     failed_at: int
 
 
-class System(Protocol):
+class System(ABC):
     """Discrete dynamics x_{t+1} = f(x_t, u_t; p) over a step dt, and the kernels built on them."""
 
     n: int
@@ -238,30 +234,31 @@ class System(Protocol):
     source: str  # file:line of the user's function
     states: tuple[str, ...]  # names, for messages
 
+    @abstractmethod
     def step(self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0) -> Array:
         """From x (N, n), u (N, m) to the next x (N, n)."""
-        ...
 
+    @abstractmethod
     def check(self, x: Array, u: Array, p: Array, dt: float) -> None:
         """Compares a trace with the user's own function at points x (N, n), u (N, m).
 
         Raises:
             GroundedError: where they differ, with both values.
         """
-        ...
 
+    @abstractmethod
     def linearise(
         self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
     ) -> tuple[Array, Array]:
         """f_x (N, n, n) and f_u (N, n, m)."""
-        ...
 
+    @abstractmethod
     def sensitivities(
         self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
     ) -> tuple[Array, Array, Array]:
         """f_x (N, n, n), f_u (N, n, m) and f_p (N, n, k)."""
-        ...
 
+    @abstractmethod
     def rollout(
         self,
         problem: Problem,
@@ -276,15 +273,10 @@ class System(Protocol):
         ubar (H, m), K (H, m, nz), zbar (H, nz) or (H+1, nz), k (H, m), alphas (A,) or one of 1.
         Differences of angles wrap.
         """
-        ...
 
+    @abstractmethod
     def backward(
-        self,
-        problem: Problem,
-        z: Array,
-        u: Array,
-        damping: Array,
-        into: Backward | None = None,
+        self, problem: Problem, z: Array, u: Array, damping: Array, into: Backward | None = None
     ) -> Backward:
         """Linearise along z (H+1, nz), u (H, m) and sweep back, Q_uu + diag(damping), damping (m,).
 
@@ -292,7 +284,6 @@ class System(Protocol):
         rows of K of a clamped input are zero. `into` is an earlier result that nobody needs any
         more: its arrays may be used again.
         """
-        ...
 
     def descend(
         self,
@@ -300,10 +291,10 @@ class System(Protocol):
         ubar: Array,
         K: Array | None,
         zbar: Array | None,
-        options: Options,
+        options: DescentOptions,
     ) -> Descent | None:
         """The loop of `ddp.solve` in one piece; None where it is left to `ddp`.
 
         From the rollout of ubar (H, m) or of ubar + K (z - zbar).
         """
-        ...
+        return None

@@ -23,8 +23,8 @@ from grounded.experiments.car_tasks import NAMES, car_task
 from grounded.experiments.jobs import Running, StudyTable, improvement, mean_text, run_study
 from grounded.experiments.real_car import LATENCY, real_car, real_plant
 from grounded.models.car import model as car
-from grounded.search.improve import learn
-from grounded.search.standing import Candidate, Options
+from grounded.search.ask_tell import learn
+from grounded.search.standing import Candidate, SearchOptions
 from grounded.trial import Trial
 
 PAPER = {"turn": 0.97, "circle": 0.88, "figure8": 0.63}
@@ -130,15 +130,15 @@ def real_case(manoeuvre: str, seed: int, noisy: bool) -> Bench:
 def car_job(manoeuvre: str, seed: int, noisy: bool) -> dict[str, Any]:
     """A job: one repetition of one manoeuvre."""
     case = real_case(manoeuvre, seed, noisy)
-    options = Options(max_trials=BUDGET)
+    options = SearchOptions(max_trials=BUDGET)
     trials: list[Trial] = []
 
     def real(candidate: Candidate) -> Trial:
         trials.append(case.real(candidate.policy, len(trials)))
         return trials[-1]
 
-    standing, candidates, _ = learn(case.task, real, options, max_iterations=ITERATIONS)
-    assert standing.incumbent is not None
+    found = learn(case.task, real, options, max_iterations=ITERATIONS)
+    standing = found.standing
     kept = [tried for tried in standing.history if tried.accepted]
     best, _ = optimum(case)
     fresh = FRESH if noisy else 1
@@ -150,7 +150,7 @@ def car_job(manoeuvre: str, seed: int, noisy: bool) -> dict[str, Any]:
     paths = {"target": case.task.target[:, columns].tolist()}
     for i, tried in enumerate(kept):
         paths[f"iteration {i}"] = tried.trials[0].states[:, columns].tolist()
-    utilities, alphas = tuple(standing.utilities), tuple(c.alpha for c in candidates)
+    utilities, alphas = tuple(standing.utilities), tuple(c.alpha for c in found.candidates)
     first, last, top = true
     run = (manoeuvre, seed, noisy, utilities, (first, last), top, len(trials), alphas, paths)
     return vars(CarRun(*run))

@@ -36,8 +36,8 @@ from grounded.frozen import Array
 from grounded.model import Model
 from grounded.plant import Plant
 from grounded.policy import Policy, Runner
-from grounded.search.improve import learn
-from grounded.search.standing import Candidate, Options
+from grounded.search.ask_tell import learn
+from grounded.search.standing import Candidate, SearchOptions
 from grounded.task import Task
 from grounded.trial import Trial
 
@@ -319,7 +319,7 @@ def estimated_job(manoeuvre: str, seed: int, states: str) -> dict[str, Any]:
     case = real_case(manoeuvre, seed, True)
     see = markers(SPACING)
     filmed = Filmed(case.task, case.plant, see, CAMERA, assumed_noise(case, see, seed))
-    options = Options(max_trials=BUDGET)
+    options = SearchOptions(max_trials=BUDGET)
     flights: list[Flown] = []
 
     def real(candidate: Candidate) -> Trial:
@@ -327,7 +327,7 @@ def estimated_job(manoeuvre: str, seed: int, states: str) -> dict[str, Any]:
         flights.append(filmed.run(candidate.policy, rng, estimated=states == "camera"))
         return flights[-1].trial
 
-    standing, _, _ = learn(case.task, real, options, max_iterations=ITERATIONS)
+    standing = learn(case.task, real, options, max_iterations=ITERATIONS).standing
     assert standing.incumbent is not None
     first = next(tried for tried in standing.history if tried.accepted)
     policies = (first.candidate.policy, standing.incumbent.candidate.policy, optimum(case)[0])

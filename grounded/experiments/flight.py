@@ -24,8 +24,9 @@ from grounded.frozen import Array
 from grounded.models.aircraft import model as aircraft
 from grounded.result import plain
 from grounded.rollout import simulate
-from grounded.search.improve import first_policy, learn, propose
-from grounded.search.standing import Candidate, Options
+from grounded.search.ask_tell import learn
+from grounded.search.improve import first_policy, propose
+from grounded.search.standing import Candidate, SearchOptions
 from grounded.task import Task
 from grounded.trial import Trial
 
@@ -175,7 +176,7 @@ def flight_job(seed: int, step: str) -> dict[str, Any]:
     truth = flight_task(aircraft)
     crude = perturbed(aircraft, np.random.default_rng(seed))
     task = flight_task(crude, started_by=aircraft)
-    options = Options(step="full" if step == "full" else "damped")
+    options = SearchOptions(step="full" if step == "full" else "damped")
     first = propose(task, [], [], options).candidate
     if first is None or unstable(truth, flown := real_flight(truth, first)):
         if first is None:
@@ -186,11 +187,12 @@ def flight_job(seed: int, step: str) -> dict[str, Any]:
     def fly(candidate: Candidate) -> Trial:
         return real_flight(truth, candidate)
 
-    standing, candidates, trials = learn(task, fly, options, max_iterations=ITERATIONS)
-    assert standing.incumbent is not None
-    paths = _paths(model=trials[0], learned=standing.incumbent.trials[0])
-    utilities, alphas = tuple(standing.utilities), tuple(c.alpha for c in candidates)
-    return vars(FlightRun(seed, False, utilities, len(trials), alphas, paths))
+    found = learn(task, fly, options, max_iterations=ITERATIONS)
+    assert found.best is not None
+    paths = _paths(model=found.trials[0], learned=found.best.trials[0])
+    alphas = tuple(c.alpha for c in found.candidates)
+    utilities = tuple(found.standing.utilities)
+    return vars(FlightRun(seed, False, utilities, len(found.trials), alphas, paths))
 
 
 def real_flight(truth: Task, candidate: Candidate) -> Trial:

@@ -26,7 +26,7 @@ from grounded.experiments.bench import bench, optimum, scaled, searched, true_ut
 from grounded.experiments.jobs import Running, StudyTable, mean_se, run_study
 from grounded.frozen import Array
 from grounded.policy import Policy
-from grounded.search.standing import Options
+from grounded.search.standing import SearchOptions
 
 LEVELS = (0.5, 1.0, 2.0, 3.0)
 MANOEUVRES = ("turn", "figure8")
@@ -195,7 +195,7 @@ def repeats_job(rule: dict[str, Any], manoeuvre: str, level: float, seed: int) -
     def truly(policy: Policy) -> float:
         return true_utility(case.task, case.plant, policy, FRESH, seed)
 
-    options = Options(
+    options = SearchOptions(
         max_trials=BUDGET,
         repeats=how.repeats,
         max_halvings=how.max_halvings,

@@ -1,29 +1,26 @@
 """Step 4: the ORIGINAL model plus a time-dependent bias, so that it replays a trial exactly.
 
-    f_t^(i+1)(s, a) = f_t(s, a) + s_{t+1}^(i) - f_t(s_t^(i), a_t^(i))
+    f_t^(i+1)(s, a) = f_t(s, a - rho_t) + bias_t
+    bias_t          = s_{t+1}^(i) - f_t(s_t^(i), a_t^(i) - rho_t)
 
 The bias is measured on one trial (or on the mean of repeated ones) and added to the model that was
-never changed by an earlier trial: errors do not pile up. With an input shift rho (`matching.py`)
-the model is asked about s, a - rho_t and still replays the trial; rho = 0 is the paper's. In the
-biased model the trial's own policy gives the trial's own states, so derivatives are taken along the
-true states (section 4.1).
+never changed by an earlier trial: errors do not pile up. In the biased model the trial's own policy
+gives the trial's own states, so derivatives are taken along the true states (section 4.1). Without
+the input shift, rho = 0, this is the paper's step 4.
 
-Matched inputs: what the MODEL would have needed to move as the real system did.
-
-A crude model has regimes: a motor drives or brakes, a wheel grips, a stick is in its dead zone.
-Along a real trial (s_t, a_t) a miscalibrated model is easily in another regime than the robot was:
+Why a shift: a crude model has regimes. A motor drives or brakes, a wheel grips, a stick is in its
+dead zone. Along a real trial a miscalibrated model is easily in another regime than the robot was:
 the car held its speed, the model at the same throttle brakes. Its derivatives are then those of the
 wrong branch, and DDP is told that the throttle does nothing. So the part of the disagreement that
-inputs can explain is booked on the inputs, and only the rest is added as a bias:
+inputs can explain is booked on the inputs, and only the rest is added as a bias: w_t is the input
+that the MODEL would have needed to move as the real system did,
 
-    f_t^(i+1)(s, a) = f_t(s, a - rho_t) + bias_t,       rho_t = a_t - w_t,
+    rho_t = a_t - w_t,
     w_t = argmin_w  |(f_t(s_t, w) - s_{t+1}) / (dt scale)|^2 + (PULL (w - a_t) / span)^2
 
-The model still replays the trial exactly, and its derivatives are still taken along the trial's own
-STATES (section 4.1 of the paper); rho = 0 is the paper's step 4. scale is the spread of each
-state's rate along the trial, span that of each input. rho is smoothed over WINDOW steps, since
-noise in the states would shake it. Measured on the car (docs/experiments.md): one trial does what
-took five.
+with scale the spread of each state's rate along the trial, span that of each input. rho is smoothed
+over WINDOW steps, since noise in the states would shake it. Measured on the car
+(docs/experiments.md): one trial does what took five.
 """
 
 from __future__ import annotations
@@ -37,9 +34,15 @@ from grounded.compile import Problem
 from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.rollout import augmented
-from grounded.solve.levenberg_marquardt import Batch, Rows, solve
+from grounded.solve.levenberg_marquardt import LeastSquares, Rows, solve
 from grounded.task import Task
 from grounded.trial import Trial
+
+PULL = 0.2  # price of leaving the recorded input: a whole span costs as much as 0.2 spreads of rate
+WINDOW = 5  # steps of the Hann window
+ITERATIONS = 15
+ELSEWHERE = (-0.15, 0.15)  # further starts, in spans, where a stalled motor has no slope
+DEAD = 0.1  # of an input's usual effect
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +52,7 @@ class Grounding:
     bias: Array
     z: Array
     inputs: Array
-    shift: Array | None = None  # rho of `matching`, None for none
+    shift: Array | None = None  # rho, see `input_shift`; None for none
 
     def on(self, problem: Problem) -> Problem:
         """The problem with a model that replays the trial."""
@@ -87,7 +90,7 @@ def ground(
         task: gives the original model, with its latency.
         trial: a whole trial, finite for H steps; what follows is not used.
         exact: measure the bias of the exact model, not of the smoothed planning model.
-        match_inputs: book on the inputs what inputs can explain (`matching.py`).
+        match_inputs: book on the inputs what inputs can explain (`input_shift`).
         shift: rho (H, m), where it is known already.
 
     Raises:
@@ -127,15 +130,8 @@ def residuals(task: Task, trial: Trial) -> Array:
     return task.model.difference(trial.states[1:], predicted)
 
 
-PULL = 0.2  # price of leaving the recorded input: a whole span costs as much as 0.2 spreads of rate
-WINDOW = 5  # steps of the Hann window
-ITERATIONS = 15
-ELSEWHERE = (-0.15, 0.15)  # further starts, in spans, where a stalled motor has no slope
-DEAD = 0.1  # of an input's usual effect
-
-
 def input_shift(problem: Problem, x: Array, received: Array) -> Array:
-    """Rho (T, m) along a trial.
+    """The shift rho (T, m) of the inputs along a trial.
 
     Args:
         problem: the original model, exact or smoothed.
@@ -170,7 +166,7 @@ def _span(problem: Problem, received: Array) -> Array:
     return np.where(np.isfinite(limits), limits, used)
 
 
-def _moves(problem: Problem, x: Array, received: Array) -> Batch:
+def _moves(problem: Problem, x: Array, received: Array) -> LeastSquares:
     """The equations of every step in w, the input that the model is given."""
     settings = (problem.p, problem.dt, problem.smoothing)
     rate = np.diff(x, axis=0) / problem.dt
@@ -187,4 +183,4 @@ def _moves(problem: Problem, x: Array, received: Array) -> Batch:
         pulls = np.tile(np.diag(pull), (len(rows), 1, 1))
         return np.concatenate([f_u / problem.dt / scale[:, None], pulls], axis=1)
 
-    return Batch(residual, jacobian, problem.low, problem.high, solved=0.0)
+    return LeastSquares(residual, jacobian, problem.low, problem.high, solved=0.0)

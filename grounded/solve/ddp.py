@@ -1,35 +1,28 @@
 """DDP: the method A of the paper, "find a locally optimal policy of a simulator".
 
-Each iteration sweeps back for gains (`riccati.py`) and rolls the nonlinear model out with them,
-
-    u_t = clip( ubar_t + alpha k_t + K_t (z_t - zbar_t) ),   alpha = 1, 1/2, 1/4, ...
-
-until the cost falls by at least a tenth of the predicted alpha d1 + alpha^2 d2.
-A failed sweep or search raises the regularisation mu of Q_uu (in units of the inputs' own weights),
-a success lowers it. `solve` runs to convergence. `damped_step` is ONE step with a damping of the
-caller's choice; it gives the gains with which the search starts along a trial. What keeps the
-search close to the trial is a price on leaving its inputs, part of the problem itself
-(`improve.damped`).
-
-Settings as measured on a car (H = 200) and a 6-DOF aircraft (H = 3000): 4 and 5 iterations.
-
-Riccati: the best small change of every input, and the feedback that goes with it.
-
 About a trajectory (zbar, ubar) the problem is replaced by its quadratic model (Gauss-Newton: the
 curvature of the dynamics is left out), and the value of being at z_t is swept back in time,
 
     V_t(dz) = min over du of  1/2 [dz du]' Q_t [dz du] + [Q_z Q_u] [dz du],
 
-whose minimiser is du = k_t + K_t dz. Three things are this project's own:
+whose minimiser is du = k_t + K_t dz. The nonlinear model is then rolled out with these gains,
+
+    u_t = clip( ubar_t + alpha k_t + K_t (z_t - zbar_t) ),   alpha = 1, 1/2, 1/4, ...
+
+until the cost falls by at least a tenth of the predicted alpha d1 + alpha^2 d2. A failed sweep or
+search raises the regularisation mu of Q_uu (in units of the inputs' own weights), a success lowers
+it. Three things are this project's own:
 
 - the state is z = [x, inputs already sent], so input changes and transport delays are exact;
 - limits of the inputs are part of each step's quadratic programme (Tassa, Mansard, Todorov,
   "Control-limited differential dynamic programming", ICRA 2014): clamped inputs get no feedback;
-- diag(damping) is added to Q_uu when the step is chosen, and left out of V (Tassa, Erez, Todorov,
+- the damping of Q_uu is added when the step is chosen, and left out of V (Tassa, Erez, Todorov,
   IROS 2012, eq. 11), so that d1 and d2 predict the true quadratic change.
 
-The sweep itself belongs to a system (`compile/sweep.py`, or a compiled kernel): here it is made to
-succeed, by raising the damping until every Q_uu is positive definite.
+`solve` runs to convergence: 4 iterations on a car (H = 200), 5 on a 6-DOF aircraft (H = 3000). What
+keeps the search close to a trial is a price on leaving its inputs, part of the problem itself
+(`improve.damped`). The sweep itself belongs to a system (`interpreted.py`, or a compiled kernel);
+`sweep` here makes it succeed, by raising mu until every Q_uu is positive definite.
 """
 
 from __future__ import annotations
@@ -38,14 +31,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from grounded.compile import Backward, Descent, Options, Problem, Status
+from grounded.compile import Backward, Descent, DescentOptions, Problem, Status
 from grounded.compile.problem import CEILING, FLOOR, GROWTH, LARGE_MU, LEAST, SEARCH_FLOOR
 from grounded.errors import GroundedError
 from grounded.frozen import Array
-
-__all__ = [
-    "Iteration", "Options", "Result", "damped_step", "descended", "natural_damping", "solve",
-]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -59,7 +48,7 @@ class Iteration:
 
 
 @dataclass(frozen=True, eq=False)
-class Result:
+class Solution:
     """Where the search ended and why.
 
     k and K belong to a sweep about the solution itself: u_t + K_t (z_t - z[t]) is the policy.
@@ -85,8 +74,8 @@ def solve(
     ubar: Array,
     K: Array | None = None,
     zbar: Array | None = None,
-    options: Options | None = None,
-) -> Result:
+    options: DescentOptions | None = None,
+) -> Solution:
     """DDP from the rollout of ubar (H, m), or of the policy ubar + K (z - zbar).
 
     Args:
@@ -99,31 +88,10 @@ def solve(
     Raises:
         GroundedError: for arrays that do not fit the problem.
     """
-    options = options or Options()
+    options = options or DescentOptions()
     _check(problem, ubar, K, zbar)
     found = problem.system.descend(problem, ubar, K, zbar, options)
-    return _result(problem, found or descended(problem, ubar, K, zbar, options))
-
-
-def damped_step(problem: Problem, z: Array, u: Array, damping: Array) -> Sweep:
-    """One step about a given trajectory, a real trial's: k, K with Q_uu + diag(damping).
-
-    Args:
-        problem: with the bias that makes the model replay the trial.
-        z: (H+1, nz) the trial's states and past inputs.
-        u: (H, m) its inputs.
-        damping: (m,) non-negative, such as `natural_damping`.
-
-    Raises:
-        GroundedError: for arrays that do not fit the problem.
-    """
-    _check(problem, u, None, z)
-    return sweep(problem, z, u, damping)
-
-
-def natural_damping(problem: Problem, factor: float = 1.0) -> Array:
-    """Damping in the problem's own units (m,): factor times the inputs' curvature 2 (R + S)."""
-    return factor * problem.input_scale
+    return _solution(problem, found or descended(problem, ubar, K, zbar, options))
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +103,7 @@ class _State:
 
 
 def descended(
-    problem: Problem, ubar: Array, K: Array | None, zbar: Array | None, options: Options
+    problem: Problem, ubar: Array, K: Array | None, zbar: Array | None, options: DescentOptions
 ) -> Descent:
     """The loop of `solve`; a compiled system has the same in one kernel (`System.descend`)."""
     first = problem.system.rollout(problem, ubar, K, zbar)
@@ -167,7 +135,7 @@ def descended(
 
 
 def _search(
-    problem: Problem, state: _State, found: Sweep, options: Options
+    problem: Problem, state: _State, found: Sweep, options: DescentOptions
 ) -> tuple[_State, float]:
     """The first alpha that keeps its promise; 0 and a higher regularisation if none does."""
     gains, alphas = found.gains, np.float64(0.5) ** np.arange(options.halvings + 1)
@@ -181,7 +149,7 @@ def _search(
     return replace(state, mu=max(SEARCH_FLOOR, GROWTH * found.mu)), 0.0
 
 
-def _result(problem: Problem, found: Descent) -> Result:
+def _solution(problem: Problem, found: Descent) -> Solution:
     trace = tuple(Iteration(*line) for line in found.lines.tolist())
     sentences: dict[Status, str] = {
         "converged": f"converged after {len(trace)} iterations",
@@ -197,7 +165,7 @@ def _result(problem: Problem, found: Descent) -> Result:
             else f"the sweep failed at step {found.failed_at}"
         )
     sentence = sentences[found.status]
-    return Result(found.status, sentence, found.z, found.u, k, K, found.cost, trace)
+    return Solution(found.status, sentence, found.z, found.u, k, K, found.cost, trace)
 
 
 def _first_bad(problem: Problem, z: Array) -> str:

@@ -23,7 +23,7 @@ SETTLED, STUCK = 1e-6, 1e4  # relative gain of a step, damping
 
 
 @dataclass(frozen=True, eq=False)
-class Batch:
+class LeastSquares:
     """residual(w, rows) -> (len(rows), k) and its jacobian -> (len(rows), k, q), for some rows."""
 
     residual: Callable[[Array, Rows], Array]
@@ -34,25 +34,25 @@ class Batch:
 
 
 @dataclass(frozen=True, eq=False)
-class Solution:
+class Minimum:
     """Unknowns w (N, q) and the squared errors (N,)."""
 
     w: Array
     error: Array
 
-    def better_of(self, other: Solution, rows: Rows) -> Solution:
+    def better_of(self, other: Minimum, rows: Rows) -> Minimum:
         """Row by row the smaller error; `other` holds only the given rows."""
         chosen = other.error < self.error[rows]
         w, error = self.w.copy(), self.error.copy()
         w[rows[chosen]], error[rows[chosen]] = other.w[chosen], other.error[chosen]
-        return Solution(w, error)
+        return Minimum(w, error)
 
 
-def solve(batch: Batch, w: Array, rows: Rows, iterations: int) -> Solution:
+def solve(batch: LeastSquares, w: Array, rows: Rows, iterations: int) -> Minimum:
     """Solves the given rows from w (len(rows), q)."""
     w = np.clip(w, batch.low, batch.high)
     r = batch.residual(w, rows)
-    now = Solution(w, _error(r))
+    now = Minimum(w, _error(r))
     damping, settled = np.full(len(rows), 1e-3), np.zeros(len(rows), dtype=bool)
     for _ in range(iterations):
         open_ = np.flatnonzero((now.error > batch.solved) & ~settled & (damping < STUCK))
@@ -65,7 +65,7 @@ def solve(batch: Batch, w: Array, rows: Rows, iterations: int) -> Solution:
         better = error < before
         r[open_[better]] = r_moved[better]
         settled[open_] = better & (error > (1 - SETTLED) * before) & np.isfinite(before)
-        now = now.better_of(Solution(moved, error), open_)
+        now = now.better_of(Minimum(moved, error), open_)
         damping[open_] = np.clip(damping[open_] * np.where(better, 0.2, 5.0), 1e-9, 1e6)
     return now
 

@@ -13,7 +13,7 @@ utility. theta is one of
 
     open loop    the inputs ubar (H, m) themselves
     feedback     ubar (H, m) and the gains K (H, m, nz) of u = ubar + K (z - zbar)
-    a class      a few named parameters of the user's function `policy(s, theta, t)`
+    a class      a few named parameters of a function of the user's (`policy_class.py`)
 
 A gradient has a direction and no length. `ascent` measures inputs by the curvature 2 (R + S) of
 their own cost, and takes the length that gains most in the biased model.
@@ -21,17 +21,17 @@ their own cost, and takes the length that gains most in the biased model.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from grounded.compile import Problem
-from grounded.compile.problem import queue_of
-from grounded.compile.run.parametric import ParametricPolicy
-from grounded.compile.run.sweep import Quadratic, quadratic
+from grounded.compile.run.interpreted import Quadratic
+from grounded.compile.run.interpreted import linearised as quadratic_model
 from grounded.errors import GroundedError
-from grounded.frozen import Array
+from grounded.frozen import Array, wrapped
 from grounded.rollout import simulate
 
 if TYPE_CHECKING:
@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from grounded.solve.bias import Grounding
     from grounded.task import Task
 
+Theta = TypeVar("Theta")
 LENGTHS = 2.0 ** np.arange(3, -25, -1)  # of a step, in units of the scaled gradient
 
 
@@ -57,7 +58,7 @@ def gradient(problem: Problem, z: Array, u: Array, policy: Policy | None = None)
         GroundedError: for arrays that do not fit, or a policy about another z.
     """
     local = linearised(problem, z, u)
-    free = _free(problem, u)
+    free = free_inputs(problem, u)
     if policy is None or policy.gain is None or policy.reference is None:
         g, _ = adjoint(local, np.zeros((*u.shape, z.shape[1])), free)
         return Gradient(g * free)
@@ -66,9 +67,7 @@ def gradient(problem: Problem, z: Array, u: Array, policy: Policy | None = None)
             f"a gain must have shape {(*u.shape, z.shape[1])}, got {policy.gain.shape}"
         )
     g, _ = adjoint(local, policy.gain, free)
-    n = problem.system.n
-    dz = z[:-1] - policy.reference
-    dz[:, :n] -= 2 * np.pi * np.rint(dz[:, :n] / (2 * np.pi)) * problem.angles
+    dz = wrapped(z[:-1] - policy.reference, problem.angles)
     return Gradient(g * free, (g * free)[:, :, None] * dz[:, None, :])
 
 
@@ -80,11 +79,7 @@ def linearised(problem: Problem, z: Array, u: Array) -> Quadratic:
             f"a trajectory must have shapes {(H + 1, nz)} and {(H, problem.system.m)}, "
             f"got {z.shape} and {u.shape}"
         )
-    sent = queue_of(problem).effective(z[:-1], u)
-    sent = sent if problem.input_shift is None else sent - problem.input_shift
-    x = np.ascontiguousarray(z[:-1, : problem.system.n])
-    f_x, f_u = problem.system.linearise(x, sent, problem.p, problem.dt, problem.smoothing)
-    return quadratic(problem, z, u, f_x, f_u)
+    return quadratic_model(problem.system, problem, z, u)
 
 
 def adjoint(local: Quadratic, answer: Array, free: Array) -> tuple[Array, Array]:
@@ -105,7 +100,7 @@ def adjoint(local: Quadratic, answer: Array, free: Array) -> tuple[Array, Array]
     return g, slope
 
 
-def _free(problem: Problem, u: Array) -> Array:
+def free_inputs(problem: Problem, u: Array) -> Array:
     """1 where an input is strictly inside its limits."""
     return ((u > problem.low) & (u < problem.high)).astype(float)
 
@@ -133,14 +128,26 @@ def ascent(task: Task, policy: Policy, grounding: Grounding) -> Policy:
         forward = policy.feedforward + length * d
         return replace(policy, feedforward=np.clip(forward, *_room(policy, forward)), gain=gain)
 
-    here = simulate(problem, policy).utility
-    best, best_utility = policy, here
-    for length in LENGTHS:
-        candidate = moved(float(length))
-        utility = simulate(problem, candidate).utility
-        if utility > best_utility:
-            best, best_utility = candidate, utility
-        elif best is not policy:
+    return best_length(policy, moved, lambda theta: -simulate(problem, theta).utility)
+
+
+def best_length(
+    start: Theta, moved: Callable[[float], Theta], cost: Callable[[Theta], float]
+) -> Theta:
+    """The policy of least cost among the start and what steps of LENGTHS make of it.
+
+    Args:
+        start: theta.
+        moved: theta after a step of some length.
+        cost: of a theta, in the model.
+    """
+    best, lowest = start, cost(start)
+    for length in LENGTHS.tolist():
+        candidate = moved(length)
+        found = cost(candidate)
+        if found < lowest:
+            best, lowest = candidate, found
+        elif best is not start:
             break  # shorter ones gain less and less
     return best
 
@@ -163,77 +170,3 @@ def _room(policy: Policy, forward: Array) -> tuple[Array, Array]:
     if policy.gain is None:
         return policy.low, policy.high
     return np.full_like(forward, -np.inf), np.full_like(forward, np.inf)
-
-
-# A policy class with a few named parameters.
-
-
-@dataclass(frozen=True, eq=False)
-class Run:
-    """A run of a policy class in a model: z (H+1, nz), u (H, m), its cost."""
-
-    z: Array
-    u: Array
-    cost: float
-
-
-def run_class(problem: Problem, policy: ParametricPolicy, theta: Array) -> Run:
-    """Rolls pi(x, theta, t) out in the problem's model; inputs clipped to the limits."""
-    from grounded.compile.run.sweep import trajectory_cost
-
-    queue, n = queue_of(problem), problem.system.n
-    z, u = np.empty((problem.horizon + 1, problem.nz)), np.empty((problem.horizon, policy.m))
-    z[0] = problem.z_start()
-    theta = np.asarray(theta, float)
-    with np.errstate(all="ignore"):
-        for t in range(problem.horizon):
-            asked = policy.inputs(z[t : t + 1, :n], np.array([t * problem.dt]), theta)[0]
-            u[t] = np.clip(asked, problem.low, problem.high)
-            sent = queue.effective(z[t], u[t])
-            if problem.input_shift is not None:
-                sent = sent - problem.input_shift[t]
-            x = problem.system.step(
-                z[t : t + 1, :n], sent[None], problem.p, problem.dt, problem.smoothing
-            )
-            z[t + 1, :n], z[t + 1, n:] = x[0] + problem.bias[t], queue.after(z[t, n:], u[t])
-    return Run(z, u, float(trajectory_cost(problem, z, u)))
-
-
-def class_gradient(
-    problem: Problem, policy: ParametricPolicy, theta: Array, z: Array, u: Array
-) -> Array:
-    """dJ/dtheta (k,) along z (H+1, nz), u (H, m), which the policy has produced with theta."""
-    n, H = problem.system.n, problem.horizon
-    t = np.arange(H, dtype=np.float64) * problem.dt
-    x = np.ascontiguousarray(z[:-1, :n])
-    with np.errstate(all="ignore"):
-        pi_x, pi_theta = policy.derivatives(x, t, np.asarray(theta, float))
-    answer = np.zeros((H, policy.m, problem.nz))
-    answer[:, :, :n] = pi_x
-    free = _free(problem, u)
-    g, _ = adjoint(linearised(problem, z, u), answer, free)
-    return np.asarray(np.einsum("tj,tjk->k", g * free, pi_theta))
-
-
-def class_ascent(
-    problem: Problem, policy: ParametricPolicy, theta: Array, z: Array, u: Array
-) -> Array:
-    """Theta (k,) moved up the utility's gradient by the length that gains most in the model.
-
-    Parameters are measured by their own size (1 for those near zero).
-    """
-    theta = np.asarray(theta, float)
-    unit = np.maximum(np.abs(theta), 0.1)
-    slope = class_gradient(problem, policy, theta, z, u) * unit
-    size = float(np.linalg.norm(slope))
-    best, lowest = theta, run_class(problem, policy, theta).cost
-    if not (np.isfinite(size) and size > 0):
-        return best
-    for length in LENGTHS:
-        candidate = theta - length * unit * slope / size
-        cost = run_class(problem, policy, candidate).cost
-        if cost < lowest:
-            best, lowest = candidate, cost
-        elif best is not theta:
-            break
-    return best

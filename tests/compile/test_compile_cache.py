@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from grounded.compile.run import cache
+from grounded.compile.run import jit
 from problems import system
 from shared_data import SUPPORT
 
@@ -46,7 +46,7 @@ def test_compiles_once(home, monkeypatch):
         lambda data: data[: len(data) // 2],
         lambda data: data[:-1] + bytes([data[-1] ^ 1]),
         lambda data: b"something else entirely",
-        lambda data: cache.MAGIC + bytes(32) + data[50:],
+        lambda data: jit.MAGIC + bytes(32) + data[50:],
     ],
 )
 def test_damaged_entries_are_replaced(home, damage):
@@ -59,19 +59,19 @@ def test_damaged_entries_are_replaced(home, damage):
 
 
 def test_a_file_under_another_name_is_foreign(home):
-    cache.write("a" * 64, b"code")
+    jit.store("a" * 64, b"code")
     (home / f"{'b' * 64}.kernel").write_bytes((home / f"{'a' * 64}.kernel").read_bytes())
-    assert cache.read("a" * 64) == b"code"
-    assert cache.read("b" * 64) is None and cache.read("c" * 64) is None
+    assert jit.stored("a" * 64) == b"code"
+    assert jit.stored("b" * 64) is None and jit.stored("c" * 64) is None
 
 
 def test_size_is_bounded_and_the_oldest_go(home, monkeypatch):
-    monkeypatch.setattr(cache, "MAX_BYTES", 1000)
+    monkeypatch.setattr(jit, "MAX_BYTES", 1000)
     for i in range(5):
-        cache.write(str(i) * 64, bytes(300))
+        jit.store(str(i) * 64, bytes(300))
         os.utime(home / f"{str(i) * 64}.kernel", (i, i))
-    cache.read("3" * 64)  # used last
-    cache.write("9" * 64, bytes(300))
+    jit.stored("3" * 64)  # used last
+    jit.store("9" * 64, bytes(300))
     left = [path.name[0] for path in kernels(home)]
     assert "3" in left and "0" not in left and len(left) <= 3
     assert not list(home.glob("*.part"))
@@ -79,7 +79,7 @@ def test_size_is_bounded_and_the_oldest_go(home, monkeypatch):
 
 def test_no_cache_and_unwritable_cache_still_work(monkeypatch, tmp_path):
     monkeypatch.setenv("GROUNDED_CACHE", "")
-    assert cache.folder() is None
+    assert jit.folder() is None
     first = run()
     blocked = tmp_path / "file"
     blocked.write_text("not a folder")
@@ -91,9 +91,9 @@ def test_folder_follows_the_users_settings(monkeypatch):
     monkeypatch.delenv("GROUNDED_CACHE", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", "/some/where")
     if sys.platform == "linux":
-        assert cache.folder() == Path("/some/where/grounded")
+        assert jit.folder() == Path("/some/where/grounded")
         monkeypatch.setenv("XDG_CACHE_HOME", "relative")  # to be ignored, says the XDG rule
-        assert cache.folder() == Path.home() / ".cache" / "grounded"
+        assert jit.folder() == Path.home() / ".cache" / "grounded"
 
 
 def test_processes_share_the_folder(home):

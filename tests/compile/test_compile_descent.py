@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from grounded.compile import Problem, system_of
+from grounded.compile import DescentOptions, Problem, system_of
 from grounded.compile.run.arguments import MOST, _shelf, empty
-from grounded.solve.ddp import Options, descended
+from grounded.solve.ddp import descended
 from problems import problem
 
 
@@ -32,7 +32,7 @@ def test_the_compiled_loop_takes_the_decisions_of_the_loop_in_numpy(halvings):
     for task, u0, most in tasks:
         H, m = task.horizon, task.system.m
         u = u0 * np.cos(np.arange(H * m) * 0.1).reshape(H, m)
-        options = Options(max_iterations=most, halvings=halvings, accept=0.3)
+        options = DescentOptions(max_iterations=most, halvings=halvings, accept=0.3)
         fast = task.system.descend(task, u, None, None, options)
         slow = descended(task, u, None, None, options)
         assert (fast.status, fast.cost, fast.failed_at) == (slow.status, slow.cost, slow.failed_at)

@@ -8,14 +8,13 @@ import pytest
 
 from grounded.compile import Named
 from grounded.compile.run.differenced import DifferencedSystem
+from grounded.compile.trace.tracing import Signature
 from grounded.errors import GroundedError
 from problems import SPECS, system
 
 
 def make(function, states=("x", "v"), inputs=("f",), params=("m",), kind="derivative", **more):
-    return DifferencedSystem(
-        function, kind=kind, states=states, inputs=inputs, params=params, **more
-    )
+    return DifferencedSystem(Signature(function, kind, states, inputs, params), **more)
 
 
 X, U, P = np.array([[1.0, 2.0], [-1.0, 0.5]]), np.array([[0.3], [0.1]]), np.array([2.0])
@@ -115,7 +114,7 @@ def test_rk4_is_fourth_order_and_euler_first():
 
 
 def test_derivatives_of_a_linear_model_are_exact():
-    f, p = system("double_integrator", DifferencedSystem)
+    f, p = system("double_integrator", make)
     x, u = np.random.default_rng(0).normal(size=(5, 2)), np.zeros((5, 1))
     f_x, f_u, f_p = f.sensitivities(x, u, p, 0.05)
     mass, drag = SPECS["double_integrator"]["params"].values()

@@ -9,6 +9,7 @@ import pytest
 
 from grounded.compile import system_of
 from grounded.compile.run.differenced import DifferencedSystem
+from grounded.compile.trace.tracing import Signature
 from grounded.errors import GroundedError
 
 G = 9.81
@@ -100,9 +101,7 @@ def test_everyday_idioms_are_traced_and_mean_the_same(function):
     assert (system.how, system.note) == ("compiled", "")
     x, u, p = points()
     system.check(x, u, p, 0.1)
-    plain = DifferencedSystem(
-        function, kind="derivative", states=("x", "v"), inputs=("u",), params=("c",)
-    )
+    plain = DifferencedSystem(Signature(function, "derivative", ("x", "v"), ("u",), ("c",)))
     mine, theirs = system.step(x, u, p, 0.1), plain.step(x, u, p, 0.1)
     assert np.allclose(mine, theirs, rtol=1e-12, atol=1e-12, equal_nan=True)
 

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from grounded.compile import DescentOptions
 from grounded.errors import GroundedError
-from grounded.solve.ddp import Options, damped_step, natural_damping, solve
+from grounded.solve.ddp import solve, sweep
 from problems import linear_least_squares, problem
 
 
@@ -18,7 +19,7 @@ def test_linear_problem_with_limits_reaches_the_bounded_optimum(delay):
         problem("double_integrator", 25, delay=np.array([delay]))
     )  # same seed, no limits
     exact = lsq_linear(M, r, (low[0], high[0]), tol=1e-14)
-    found = solve(task, np.zeros((25, 1)), options=Options(tolerance=1e-13))
+    found = solve(task, np.zeros((25, 1)), options=DescentOptions(tolerance=1e-13))
     assert found.status == "converged"
     assert found.cost == pytest.approx(2 * exact.cost, rel=1e-9)
     assert np.allclose(found.u.ravel(), exact.x, atol=1e-4)
@@ -60,13 +61,13 @@ def test_solution_is_stationary():
         assert task.system.rollout(task, found.u + d).cost[0] >= found.cost
 
 
-def test_damped_step_descends_and_shrinks_with_damping():
+def test_a_damped_sweep_descends_and_shrinks_with_damping():
     task = problem("car", 30)
     u = np.tile([0.1, 0.5], (30, 1))
     run = task.system.rollout(task, u)
     size = np.inf
     for factor in (0.1, 1.0, 10.0):
-        gains = damped_step(task, run.z[0], u, natural_damping(task, factor)).gains
+        gains = sweep(task, run.z[0], u, factor * task.input_scale).gains
         assert gains.d1 < 0 <= gains.d2
         assert np.abs(gains.k).sum() < size
         size = np.abs(gains.k).sum()

@@ -9,10 +9,11 @@ from grounded.experiments.bench import bench, optimum
 from grounded.experiments.car_tasks import car_task
 from grounded.experiments.real_car import real_plant
 from grounded.models.car import model as car
-from grounded.search.improve import first_policy, learn
-from grounded.search.standing import Options
+from grounded.search.ask_tell import learn
+from grounded.search.improve import first_policy
+from grounded.search.standing import SearchOptions
 from grounded.solve.bias import ground
-from grounded.solve.levenberg_marquardt import Batch, solve
+from grounded.solve.levenberg_marquardt import LeastSquares, solve
 
 
 @pytest.fixture(scope="module")
@@ -60,10 +61,10 @@ def test_one_trial_closes_most_of_the_gap_of_a_miscalibrated_car():
         best = optimum(case)[1]
         for matched in shares:
             number = iter(range(100))
-            options = Options(max_trials=2, match_inputs=matched)
-            _, _, trials = learn(
+            options = SearchOptions(max_trials=2, match_inputs=matched)
+            trials = learn(
                 case.task, lambda c, n=number, case=case: case.real(c.policy, next(n)), options
-            )
+            ).trials
             first, second = (case.task.utility(t) for t in trials)
             shares[matched].append((max(second, first) - first) / (best - first))
     assert min(shares[True]) > 0.98
@@ -84,7 +85,7 @@ def test_levenberg_marquardt_solves_each_row_and_keeps_bounds():
         return J
 
     bounds = np.array([1.0, 1.0])
-    batch = Batch(residual, jacobian, -bounds, bounds, solved=1e-20)
+    batch = LeastSquares(residual, jacobian, -bounds, bounds, solved=1e-20)
     found = solve(batch, np.full((3, 2), 0.3), np.arange(3), 60)
     np.testing.assert_allclose(found.w[[0, 2]], goals[[0, 2]], atol=1e-6)
     assert found.w[1, 0] == 1.0 and found.error[1] > 1.0

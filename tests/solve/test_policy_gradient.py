@@ -4,19 +4,21 @@ import numpy as np
 import pytest
 
 from facts import holding
-from grounded.compile.run.parametric import ParametricPolicy
 from grounded.errors import GroundedError
 from grounded.model import Model, Param
 from grounded.policy import Policy
 from grounded.rollout import simulate
 from grounded.solve.bias import ground
 from grounded.solve.ddp import solve
-from grounded.solve.policy_gradient import (
-    ascent,
+from grounded.solve.policy_class import (
+    ParametricPolicy,
     class_ascent,
     class_gradient,
-    gradient,
     run_class,
+)
+from grounded.solve.policy_gradient import (
+    ascent,
+    gradient,
 )
 from grounded.task import Task
 from grounded.trial import Trial
@@ -111,12 +113,12 @@ def test_policy_class(function):
     policy = ParametricPolicy(function, SPECS["car"]["states"], SPECS["car"]["inputs"], NAMES)
     assert bool(policy.note) == (function is steer_untraceable)
     run = run_class(task, policy, THETA)
-    assert run.cost == pytest.approx(float(task.system.rollout(task, run.u).cost[0]))
-    found = class_gradient(task, policy, THETA, run.z, run.u)
-    near = differences(lambda theta: run_class(task, policy, theta).cost, THETA)
+    assert -run.utility == pytest.approx(float(task.system.rollout(task, run.inputs).cost[0]))
+    found = class_gradient(task, policy, THETA, run.z, run.inputs)
+    near = differences(lambda theta: -run_class(task, policy, theta).utility, THETA)
     assert np.allclose(found, near, rtol=1e-5, atol=1e-6 * np.abs(near).max())
-    better = class_ascent(task, policy, THETA, run.z, run.u)
-    assert run_class(task, policy, better).cost < run.cost
+    better = class_ascent(task, policy, THETA, run.z, run.inputs)
+    assert run_class(task, policy, better).utility > run.utility
 
 
 def test_policy_class_with_wrong_names():

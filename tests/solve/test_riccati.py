@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from grounded.compile.run.sweep import box_qp, trajectory_cost
+from grounded.compile.run.interpreted import box_qp, trajectory_cost
 from grounded.solve.ddp import sweep
 from problems import linear_least_squares, problem
 

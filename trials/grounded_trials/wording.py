@@ -97,16 +97,5 @@ def folded(command: str, lead: str = "next: ") -> str:
 
 
 def verdict(tried: Tried, last: bool = True) -> str:
-    """What became of a candidate: first, better, no better; or why that is not decided.
-
-    Args:
-        tried: the candidate with its trials.
-        last: whether it is the latest one; an earlier one without a trial will get none.
-    """
-    if tried.in_doubt:
-        return "in doubt"
-    if tried.accepted is None:
-        return "waiting" if last or tried.trials else "no trial"
-    if not tried.accepted:
-        return "no better"
-    return "better" if tried.candidate.base else "first"
+    """See `Tried.verdict`."""
+    return tried.verdict(last)

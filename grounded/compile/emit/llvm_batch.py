@@ -6,7 +6,7 @@ is computed as the values of its places and scattered into matrices that are zer
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from grounded.compile.emit.llvm_step import Dynamics, StepWriter
 from grounded.compile.emit.llvm_text import Writer
@@ -26,6 +26,10 @@ class Words:
     def pointer(self, name: str) -> str:
         """An array."""
         return self.f.emit(f"load ptr, ptr {self._address(name)}, align 8")
+
+    def row(self, name: str, t: str, size: int) -> str:
+        """The address of row t of an array of rows."""
+        return self.f.at(self.pointer(name), self.f.integer("mul", t, size))
 
     def integer(self, name: str) -> str:
         """An i64."""
@@ -67,30 +71,40 @@ def gather_rows(
                 f.store(f.load(source, j), to, j * width)
 
 
+def _each_sample(
+    f: Writer,
+    arrays: Sequence[tuple[str, int, str]],
+    words: Words,
+    width: int,
+    compute: Callable[[], object],
+    scatter: Callable[[str, str], None],
+) -> None:
+    """Samples in blocks of W: `compute` on gathered rows, `scatter(row, lane)` for each."""
+    count = words.integer("N")
+    with f.loop(f.integer("sdiv", f.integer("add", count, width - 1), width)) as block:
+        first = f.integer("mul", block, width)
+        gather_rows(f, arrays, first, count, width)
+        compute()
+        left = f.integer("sub", count, first)
+        full = f.emit(f"icmp sgt i64 {left}, {width}")
+        with f.loop(f.emit(f"select i1 {full}, i64 {width}, i64 {left}")) as lane:
+            scatter(f.integer("add", first, lane), lane)
+
+
 def step_kernel(d: Dynamics, width: int) -> str:
     """`void @step(words)`: out (N, n)."""
     f = Writer("void @step(ptr %words)")
     words = Words(f, BATCH)
-    x, u, out, count = (
-        words.pointer("x"),
-        words.pointer("u"),
-        words.pointer("out"),
-        words.integer("N"),
-    )
-    table = start_table(f, words, d)
-    writer = StepWriter(f, d, width, table)
-    blocks = f.integer("sdiv", f.integer("add", count, width - 1), width)
-    with f.loop(blocks) as block:
-        first = f.integer("mul", block, width)
-        gather_rows(f, [(x, d.n, writer.x), (u, d.m, writer.u)], first, count, width)
-        writer.step()
-        left = f.integer("sub", count, first)
-        full = f.emit(f"icmp sgt i64 {left}, {width}")
-        with f.loop(f.emit(f"select i1 {full}, i64 {width}, i64 {left}")) as lane:
-            to = f.at(out, f.integer("mul", f.integer("add", first, lane), d.n))
-            source = f.at(writer.next, lane)
-            for i in range(d.n):
-                f.store(f.load(source, i * width), to, i)
+    x, u, out = (words.pointer(name) for name in ("x", "u", "out"))
+    writer = StepWriter(f, d, width, start_table(f, words, d))
+
+    def scatter(row: str, lane: str) -> None:
+        to, source = f.at(out, f.integer("mul", row, d.n)), f.at(writer.next, lane)
+        for i in range(d.n):
+            f.store(f.load(source, i * width), to, i)
+
+    arrays = [(x, d.n, writer.x), (u, d.m, writer.u)]
+    _each_sample(f, arrays, words, width, writer.step, scatter)
     f.do("ret void")
     return f.text()
 
@@ -99,19 +113,16 @@ def linearise_kernel(d: Dynamics, width: int, k: int) -> str:
     """`void @linearise(words)`: f_x (N, n, n), f_u (N, n, m) and, for k > 0, f_p (N, n, k)."""
     f = Writer("void @linearise(ptr %words)")
     words = Words(f, BATCH)
-    x, u, count = words.pointer("x"), words.pointer("u"), words.integer("N")
-    table = start_table(f, words, d)
+    x, u, table = words.pointer("x"), words.pointer("u"), start_table(f, words, d)
     xu, following = f.room((d.n + d.m) * width), f.room(d.n * width)
     values = f.room(len(d.places) * width)
-    blocks = f.integer("sdiv", f.integer("add", count, width - 1), width)
-    with f.loop(blocks) as block:
-        first, inputs = f.integer("mul", block, width), f.at(xu, d.n * width)
-        gather_rows(f, [(x, d.n, xu), (u, d.m, inputs)], first, count, width)
-        f.do(f"call i64 @jacobian(ptr {xu}, ptr {table}, ptr {following}, ptr {values})")
-        left = f.integer("sub", count, first)
-        full = f.emit(f"icmp sgt i64 {left}, {width}")
-        with f.loop(f.emit(f"select i1 {full}, i64 {width}, i64 {left}")) as lane:
-            _scatter(f, words, d, k, f.integer("add", first, lane), f.at(values, lane), width)
+    arrays = [(x, d.n, xu), (u, d.m, f.at(xu, d.n * width))]
+    jacobian = f"call i64 @jacobian(ptr {xu}, ptr {table}, ptr {following}, ptr {values})"
+
+    def scatter(row: str, lane: str) -> None:
+        _scatter(f, words, d, k, row, f.at(values, lane), width)
+
+    _each_sample(f, arrays, words, width, lambda: f.do(jacobian), scatter)
     f.do("ret void")
     return f.text()
 

@@ -1,8 +1,8 @@
 """Functions of m inputs: a factor of the free ones, and the box-limited quadratic programme.
 
-The compiled twin of `box_qp.py`; the same steps in the same order. Everything is written out for m
-inputs, in small arrays: H [m][m] = L D L', 1/D in `inv`, and `free`, 1 for an input that no bound
-holds back, else 0.
+The compiled twin of `interpreted.box_qp`; the same steps in the same order. Everything is written
+out for m inputs, in small arrays: H [m][m] = L D L', 1/D in `inv`, and `free`, 1 for an input that
+no bound holds back, else 0.
 """
 
 from __future__ import annotations
@@ -26,26 +26,18 @@ def _factor(m: int) -> str:
     """
     f = Writer("internal i1 @factor(ptr %H, ptr %free, ptr %L, ptr %inv)")
     free = [f.load("%free", i) for i in range(m)]
-    L, LD = dict[tuple[int, int], str](), dict[tuple[int, int], str]()
-    for j in range(m):
-        inverse = ""
-        for i in range(j, m):
-            value = f.mul(f.mul(f.load("%H", i * m + j), free[i]), free[j])
-            if i == j:
-                value = f.add(value, f.sub(ONE, free[i]))
-            for s in range(j):
-                value = f.sub(value, f.mul(LD[i, s], L[j, s]))
-            if i == j:
-                good = f.compare("ogt", value, ZERO)
-                finite = f.compare("olt", value, number(float("inf")))
-                both = f.emit(f"and i1 {good}, {finite}")
-                f.return_if(f.emit(f"xor i1 {both}, true"), "i1 false")
-                inverse = f.div(ONE, value)
-                f.store(inverse, "%inv", j)
-            else:
-                LD[i, j], L[i, j] = value, f.mul(value, inverse)
-                f.store(L[i, j], "%L", i * m + j)
-    f.do("ret i1 true")
+    H = [
+        [f.mul(f.mul(f.load("%H", i * m + j), free[i]), free[j]) for j in range(m)]
+        for i in range(m)
+    ]
+    for i in range(m):
+        H[i][i] = f.add(H[i][i], f.sub(ONE, free[i]))
+    L, inverse, good = factored(f, H)
+    for (i, j), value in L.items():
+        f.store(value, "%L", i * m + j)
+    for i, value in enumerate(inverse):
+        f.store(value, "%inv", i)
+    f.do(f"ret i1 {good}")
     return f.text()
 
 

@@ -24,15 +24,15 @@ class Uniforms:
     def __init__(self, graph: Graph, outputs: Sequence[int]) -> None:
         self.graph = graph
         live = graph.live(outputs)
-        varying = _reached(graph, live, "xu")
+        varying = {i for i in live if graph.varies(i)}
         read = [i for i in _frontier(graph, live, varying, outputs) if graph.nodes[i].op != "const"]
         self.slot = {i: FIRST + place for place, i in enumerate(read)}
 
     def held(self, outputs: Sequence[int]) -> list[int]:
         """Nodes of the inputs alone that outputs use: the same in every stage of a step."""
         live = self.graph.live(outputs)
-        moving, varying = (_reached(self.graph, live, letters) for letters in ("x", "xu"))
-        return [i for i in _frontier(self.graph, live, moving, outputs) if i in varying]
+        moving = {i for i in live if self.graph.varies(i, "x")}
+        return [i for i in _frontier(self.graph, live, moving, outputs) if self.graph.varies(i)]
 
     @property
     def size(self) -> int:
@@ -56,16 +56,6 @@ class Uniforms:
             f.store(body.value(i), "%table", slot)
         f.do("ret void")
         return f.text()
-
-
-def _reached(graph: Graph, live: Sequence[int], letters: str) -> set[int]:
-    """Nodes that depend on leaves of these letters."""
-    found: set[int] = set()
-    for i in live:
-        node = graph.nodes[i]
-        if (node.leaf and node.leaf[0] in letters) or any(a in found for a in node.args):
-            found.add(i)
-    return found
 
 
 def _frontier(

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 
-from grounded.compile.emit.llvm_text import Writer, number, splat, vector
+from grounded.compile.emit.llvm_text import Writer, splat, vector
 
 SIN = (
     -1.66666666666666324348e-01,
@@ -69,6 +69,7 @@ class Lanes:
 
     def __init__(self, f: Writer, width: int) -> None:
         self.f, self.width = f, width
+        self.whole = "i64" if width == 1 else f"<{width} x i64>"  # W integers
         self._angles: dict[str, tuple[str, str]] = {}
 
     def const(self, value: float) -> str:
@@ -80,37 +81,30 @@ class Lanes:
         f, w = self.f, self.width
         terms = [self.const(c) for c in coefficients]
         while len(terms) > 1:
-            pairs = [
+            terms = [
                 f.fma(x, terms[i + 1], terms[i], w) if i + 1 < len(terms) else terms[i]
                 for i in range(0, len(terms), 2)
             ]
-            terms = pairs
             if len(terms) > 1:
                 x = f.mul(x, x, w)
         return terms[0]
 
     def _bits(self, value: str) -> str:
-        kind = "i64" if self.width == 1 else f"<{self.width} x i64>"
-        return self.f.emit(f"bitcast {vector(self.width)} {value} to {kind}")
+        return self.f.emit(f"bitcast {vector(self.width)} {value} to {self.whole}")
 
     def _from_bits(self, value: str) -> str:
-        kind = "i64" if self.width == 1 else f"<{self.width} x i64>"
-        return self.f.emit(f"bitcast {kind} {value} to {vector(self.width)}")
+        return self.f.emit(f"bitcast {self.whole} {value} to {vector(self.width)}")
 
     def _bitwise(self, op: str, a: str, value: int) -> str:
-        if self.width == 1:
-            return self.f.emit(f"{op} i64 {a}, {value}")
         inside = ", ".join(f"i64 {value}" for _ in range(self.width))
-        return self.f.emit(f"{op} <{self.width} x i64> {a}, <{inside}>")
+        return self.f.emit(f"{op} {self.whole} {a}, {value if self.width == 1 else f'<{inside}>'}")
 
     def _exclusive(self, a: str, b: str) -> str:
-        kind = "i64" if self.width == 1 else f"<{self.width} x i64>"
-        return self.f.emit(f"xor {kind} {a}, {b}")
+        return self.f.emit(f"xor {self.whole} {a}, {b}")
 
     def _is_set(self, bit: str) -> str:
-        if self.width == 1:
-            return self.f.emit(f"icmp ne i64 {bit}, 0")
-        return self.f.emit(f"icmp ne <{self.width} x i64> {bit}, zeroinitializer")
+        zero = "0" if self.width == 1 else "zeroinitializer"
+        return self.f.emit(f"icmp ne {self.whole} {bit}, {zero}")
 
     def _rounding(self, x: str, scale: float) -> str:
         """MAGIC + the integer nearest to scale x; taking MAGIC off leaves the integer."""
@@ -164,8 +158,7 @@ class Lanes:
         start = f.add(r, self.const(1.0), w)
         mantissa = f.fma(f.mul(r, r, w), self.polynomial(r, EXP), start, w)
         exponent = self._bitwise("shl", self._bits(shifted), 52)
-        kind = "i64" if w == 1 else f"<{w} x i64>"
-        return self._from_bits(f.emit(f"add {kind} {self._bits(mantissa)}, {exponent}"))
+        return self._from_bits(f.emit(f"add {self.whole} {self._bits(mantissa)}, {exponent}"))
 
     def tanh(self, x: str) -> str:
         """(1 - e) / (1 + e) with e = exp(-2 |x|), and x's sign."""
@@ -247,6 +240,3 @@ class Lanes:
             one = f.emit(f"call double @{name}({inside})")
             result = f.emit(f"insertelement {vector(w)} {result}, double {one}, i64 {i}")
         return result
-
-
-__all__ = ["Lanes", "number"]

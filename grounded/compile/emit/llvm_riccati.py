@@ -1,4 +1,4 @@
-"""Kernel: linearise along a trajectory and sweep back, the compiled twin of `sweep.py`.
+"""Kernel: linearise along a trajectory and sweep back, the compiled twin of `interpreted.sweep`.
 
 Rows of the value's Hessian V are vectors. With the Jacobian [A B] sparse and the past inputs a
 shift, the two products of Q = [A B]' V [A B] are the same routine twice,
@@ -28,8 +28,7 @@ from grounded.compile.emit.llvm_step import Dynamics
 from grounded.compile.emit.llvm_text import Writer, number, splat
 
 SWEEP = (
-    *("z_run", "u_run", "shift", "p", "dt", "eps", "target", "weight", "input_target"),
-    *("R", "S"),
+    *("z_run", "u_run", "shift", "p", "dt", "eps", "target", "weight", "input_target", "R", "S"),
     *("low", "high", "now", "past", "damping", "H", "k", "K", "expected", "jacobian"),
 )
 
@@ -72,9 +71,6 @@ class _Sweep:
         self.k, self.free, self.low, self.high = (f.room(m) for _ in range(4))
         self.K, self.F, self.sums = f.room(m * self.P), f.room(m * self.P), f.room(2)
 
-    def _row(self, name: str, t: str, size: int) -> str:
-        return self.f.at(self.words.pointer(name), self.f.integer("mul", t, size))
-
     def end(self) -> None:
         """V and v of the last state; zeros in the padding."""
         f = self.f
@@ -89,8 +85,8 @@ class _Sweep:
     def _tracking(self, t: str) -> list[tuple[str, str]]:
         """(2 W e, 2 W) of each state at step t."""
         f, n = self.f, self.layout.n
-        z, target = self._row("z_run", t, self.layout.nz), self._row("target", t, n)
-        weight, out = self._row("weight", t, n), []
+        z, target = self.words.row("z_run", t, self.layout.nz), self.words.row("target", t, n)
+        weight, out = self.words.row("weight", t, n), []
         for i in range(n):
             e = f.sub(f.load(z, i), f.load(target, i))
             e = wrap(f, e, 1) if self.layout.angles[i] else e
@@ -128,8 +124,8 @@ class _Sweep:
                         row = placed(f, value, place - at, row, size)
                 f.store(G[j], self.G, j * C + at, size)
                 f.store(row, self.U, j * C + at, size)
-        before, u = self._row("z_run", t, layout.nz), self._row("u_run", t, layout.m)
-        target = self._row("input_target", t, layout.m)
+        before, u = self.words.row("z_run", t, layout.nz), self.words.row("u_run", t, layout.m)
+        target = self.words.row("input_target", t, layout.m)
         for j, (S, R) in enumerate(doubled):
             value = f.load(u, j)
             slope = f.fma(R, f.sub(value, f.load(target, j)), slopes[layout.nz + j])
@@ -148,16 +144,14 @@ class _Sweep:
                 if own and at <= c < at + size:
                     row = placed(f, own[1], c - at, row, size)
                 f.store(row, self.V, c * P + at, size)
-            slope = []
-            for c in range(at, min(at + size, len(cost))):
-                own = cost[c]
-                slope.append(f.add(slopes[c], own[0]) if own else slopes[c])
+            here = zip(slopes[at : at + size], cost[at : at + size], strict=False)
+            slope = [f.add(value, own[0]) if own else value for value, own in here]
             f.store(row_of(f, slope, size), self.v, at, size)
 
     def _state_cost(self, t: str) -> list[tuple[str, str] | None]:
         """(l_z, l_zz) for each entry of z, None where it has no cost."""
         f, layout = self.f, self.layout
-        before, u = self._row("z_run", t, layout.nz), self._row("u_run", t, layout.m)
+        before, u = self.words.row("z_run", t, layout.nz), self.words.row("u_run", t, layout.m)
         cost: list[tuple[str, str] | None] = [*self._tracking(t)]
         for j, depth in enumerate(layout.depths):
             S = f.load(self.words.pointer("S"), j)
@@ -190,7 +184,7 @@ class _Sweep:
         self, t: str, H: list[list[str]], usual: tuple[Lower, list[str], list[str]]
     ) -> tuple[Lower, list[str], list[str]]:
         """L, -1/D and k; of the box-limited programme where the unlimited k breaks a limit."""
-        f, m, u = self.f, self.layout.m, self._row("u_run", t, self.layout.m)
+        f, m, u = self.f, self.layout.m, self.words.row("u_run", t, self.layout.m)
         L, inverse, k = usual
         low, high = (
             [f.sub(f.load(self.words.pointer(name), i), f.load(u, i)) for i in range(m)]
@@ -240,7 +234,7 @@ class _Sweep:
             Q_uz = [f.load(self.U, j * self.C + at, size) for j in range(m)]
             for j, row in enumerate(solved(f, Q_uz, L, inverse, size)):
                 f.store(row, self.K, j * P + at, size)
-        to_K, to_k = self._row("K", t, m * nz), self._row("k", t, m)
+        to_K, to_k = self.words.row("K", t, m * nz), self.words.row("k", t, m)
         for j in range(m):
             f.store(k[j], self.k, j)
             f.store(k[j], to_k, j)

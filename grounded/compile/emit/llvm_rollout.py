@@ -15,12 +15,25 @@ from dataclasses import dataclass
 
 from grounded.compile.emit.llvm_batch import Words, start_table
 from grounded.compile.emit.llvm_step import Dynamics, StepWriter
-from grounded.compile.emit.llvm_text import Writer, number, splat
+from grounded.compile.emit.llvm_text import Writer, splat
 
 ROLLOUT = (
     *("start", "ubar", "K", "zbar", "k", "alphas", "p", "dt", "eps", "bias", "target", "weight"),
-    "shift",
-    *("input_target", "R", "S", "low", "high", "now", "past", "H", "runs", "z", "u", "cost"),
+    *(
+        "shift",
+        "input_target",
+        "R",
+        "S",
+        "low",
+        "high",
+        "now",
+        "past",
+        "H",
+        "runs",
+        "z",
+        "u",
+        "cost",
+    ),
 )
 LANES = 4
 
@@ -97,10 +110,6 @@ class _Rollout:
             f.store(f.load_all(start, i, LANES), self.z, i * LANES, LANES)
         f.store(splat(0.0, LANES), self.cost, 0, LANES)
 
-    def _row(self, name: str, t: str, size: int) -> str:
-        """Address of row t of an array of rows."""
-        return self.f.at(self.words.pointer(name), self.f.integer("mul", t, size))
-
     def _all(self, at: str, size: int) -> list[str]:
         return [self.f.load(at, i * LANES, LANES) for i in range(size)]
 
@@ -113,7 +122,7 @@ class _Rollout:
 
     def _tracking(self, t: str) -> None:
         f, n = self.f, self.layout.n
-        target, weight = self._row("target", t, n), self._row("weight", t, n)
+        target, weight = self.words.row("target", t, n), self.words.row("weight", t, n)
         terms = []
         for i in range(n):
             e = f.sub(f.load(self.z, i * LANES, LANES), f.load_all(target, i, LANES), LANES)
@@ -125,11 +134,11 @@ class _Rollout:
         """The inputs of step t and the cost of being there."""
         f, layout = self.f, self.layout
         self._tracking(t)
-        ubar = self._row("ubar", t, layout.m)
+        ubar = self.words.row("ubar", t, layout.m)
         for j in range(layout.m):
             f.store(f.load_all(ubar, j, LANES), self.u, j * LANES, LANES)
         with f.when(f.emit(f"icmp ne ptr {self.words.pointer('k')}, null")):
-            k = self._row("k", t, layout.m)
+            k = self.words.row("k", t, layout.m)
             for j in range(layout.m):
                 u = f.load(self.u, j * LANES, LANES)
                 u = f.fma(self.alpha, f.load_all(k, j, LANES), u, LANES)
@@ -140,7 +149,7 @@ class _Rollout:
 
     def _feedback(self, t: str) -> None:
         f, layout = self.f, self.layout
-        zbar, K = self._row("zbar", t, layout.nz), self._row("K", t, layout.m * layout.nz)
+        zbar, K = self.words.row("zbar", t, layout.nz), self.words.row("K", t, layout.m * layout.nz)
         dz = []
         for i in range(layout.nz):
             e = f.sub(f.load(self.z, i * LANES, LANES), f.load_all(zbar, i, LANES), LANES)
@@ -155,7 +164,7 @@ class _Rollout:
 
     def _clip(self, t: str) -> None:
         f, layout, terms = self.f, self.layout, []
-        target = self._row("input_target", t, layout.m)
+        target = self.words.row("input_target", t, layout.m)
         for j in range(layout.m):
             u = f.load(self.u, j * LANES, LANES)
             low, high, R, S = (
@@ -173,10 +182,8 @@ class _Rollout:
         """Stores z_t and u_t of the runs that were asked for."""
         f, layout, H = self.f, self.layout, self.words.integer("H")
         z, u = self.words.pointer("z"), self.words.pointer("u")
-        with (
-            f.when(f.emit(f"icmp ne ptr {z}, null")),
-            f.loop(self.words.integer("runs")) as run,
-        ):
+        wanted = f.emit(f"icmp ne ptr {z}, null")
+        with f.when(wanted), f.loop(self.words.integer("runs")) as run:
             row = f.integer("add", f.integer("mul", run, f.integer("add", H, 1)), t)
             to = f.at(z, f.integer("mul", row, layout.nz))
             lane = f.at(self.z, run)
@@ -192,18 +199,14 @@ class _Rollout:
         """From z_t to z_{t+1}."""
         f, layout, step = self.f, self.layout, self.step
         z, u = self._all(self.z, layout.nz), self._all(self.u, layout.m)
-        shift = self._row("shift", t, layout.m)
+        shift = self.words.row("shift", t, layout.m)
         for j, value in enumerate(received(f, self.words, layout, z, u, LANES)):
             f.store(f.sub(value, f.load_all(shift, j, LANES), LANES), step.u, j * LANES, LANES)
         for j, depth in enumerate(layout.depths):
             for i in range(depth):
-                f.store(
-                    z[layout.slot(j, i - 1)] if i else u[j],
-                    self.z,
-                    layout.slot(j, i) * LANES,
-                    LANES,
-                )
-        bias = self._row("bias", t, layout.n)
+                later = z[layout.slot(j, i - 1)] if i else u[j]
+                f.store(later, self.z, layout.slot(j, i) * LANES, LANES)
+        bias = self.words.row("bias", t, layout.n)
         for i, value in enumerate(step.step()):
             x = f.add(value, f.load_all(bias, i, LANES), LANES)
             f.store(x, self.z, i * LANES, LANES)
@@ -215,6 +218,3 @@ class _Rollout:
         self.save(H, last=True)
         with f.loop(self.words.integer("runs")) as run:
             f.store(f.load(self.cost, run), self.words.pointer("cost"), run)
-
-
-__all__ = ["LANES", "ROLLOUT", "Layout", "number", "received", "rollout_kernel", "wrap"]

@@ -1,12 +1,12 @@
-"""Tables of 64-bit words, a kernel's only argument: addresses, integers, doubles.
+"""What a kernel is called with: a table of 64-bit words, and memory for its results.
 
-What a problem gives every kernel is packed once and kept beside the problem; a call adds its own.
+The words are addresses, integers, doubles. What a problem gives every kernel is packed once and
+kept beside the problem (`packed`); a call adds its own (`table`).
 
-Memory for results, used again: the first touch of a page costs as much as ten control steps.
-
-A solve of thousands of steps fills a megabyte. Taken from the system and given back each time, its
-pages would be mapped and zeroed each time, which takes longer than the computation. So a block goes
-to a shelf when the last array made of it is gone, and the next result of that size takes it down.
+Results are arrays on memory that is used again (`empty`): a solve of thousands of steps fills a
+megabyte, and pages taken from the system each time would be mapped and zeroed each time, which
+takes longer than the computation. So a block goes to a shelf when the last array made of it is
+gone, and the next result of that size takes it down.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from typing import Any
 import numpy as np
 
 from grounded.compile.emit.llvm_rollout import Layout
-from grounded.compile.problem import Array, Problem, queue_of
+from grounded.compile.problem import Problem
+from grounded.frozen import Array
 
 Table = ctypes.Array[ctypes.c_int64]
 
@@ -45,13 +46,12 @@ def packed(problem: Problem) -> Packed:
 
 
 def _pack(problem: Problem) -> Packed:
-    queue, shift = queue_of(problem), problem.input_shift
-    m = len(problem.depths)
+    queue, shift = problem.queue, problem.input_shift
     arrays = {
         "start": problem.z_start(),
         "p": problem.p,
         "bias": problem.bias,
-        "shift": np.zeros((problem.horizon, m)) if shift is None else shift,
+        "shift": np.zeros_like(problem.input_target) if shift is None else shift,
         "target": problem.target,
         "weight": problem.state_weight,
         "input_target": problem.input_target,

@@ -34,11 +34,10 @@ from grounded.compile.emit.llvm_step import Dynamics, dynamics_of, jacobian_func
 from grounded.compile.emit.llvm_text import declarations
 from grounded.compile.problem import (
     STATUSES,
-    Array,
     Backward,
     Descent,
+    DescentOptions,
     Integrator,
-    Options,
     Problem,
     Swarm,
 )
@@ -55,6 +54,7 @@ from grounded.compile.run.arguments import (
 )
 from grounded.compile.run.traced import TracedSystem
 from grounded.compile.trace.tracing import Signature, Trace, Variant
+from grounded.frozen import Array
 
 __all__ = ["BATCH", "CompiledSystem", "Kernels", "call"]
 
@@ -218,12 +218,7 @@ class CompiledSystem(TracedSystem):
         return Swarm(z, u, cost)
 
     def backward(
-        self,
-        problem: Problem,
-        z: Array,
-        u: Array,
-        damping: Array,
-        into: Backward | None = None,
+        self, problem: Problem, z: Array, u: Array, damping: Array, into: Backward | None = None
     ) -> Backward:
         """See `System.backward`."""
         if self.m > MAX_INPUTS:
@@ -251,7 +246,7 @@ class CompiledSystem(TracedSystem):
         ubar: Array,
         K: Array | None,
         zbar: Array | None,
-        options: Options,
+        options: DescentOptions,
     ) -> Descent | None:
         """See `System.descend`."""
         if self.m > MAX_INPUTS:

@@ -11,15 +11,15 @@ are good to about 1e-10 of the function's scale; all 2 (n + m) shifted points go
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from grounded.compile.names import Named, check_names, raised_at, where, wrong_value
-from grounded.compile.problem import Array, Integrator, Kind
+from grounded.compile.names import check_names, raised_at, wrong_value
 from grounded.compile.run.interpreted import Interpreted
 from grounded.errors import GroundedError
+from grounded.frozen import Array
 
 RELATIVE_STEP = float(np.cbrt(np.finfo(float).eps))
 CHUNK = 4096  # samples in one call, so that long horizons don't fill the memory
@@ -30,24 +30,8 @@ class DifferencedSystem(Interpreted):
 
     how = "differenced"
 
-    def __init__(
-        self,
-        function: Callable[..., Mapping[str, Any]],
-        *,
-        kind: Kind,
-        states: Sequence[str],
-        inputs: Sequence[str],
-        params: Sequence[str],
-        integrator: Integrator = "rk4",
-        note: str = "",
-        returns: Sequence[str] = (),
-    ) -> None:
-        super().__init__(kind, integrator, (len(states), len(inputs), len(params)), note)
-        self.function, self.source = function, where(function)
-        self.states, self.inputs, self.params = tuple(states), tuple(inputs), tuple(params)
-        self.outputs = tuple(returns) or self.states  # names of what the function returns
-        self._batches = True  # until the function fails on arrays
-        self._calls = 0
+    _batches = True  # until the function fails on arrays
+    _calls = 0
 
     def evaluate(self, x: Array, u: Array, p: Array, dt: float, smoothing: float) -> Array:
         """The function at N samples."""
@@ -58,38 +42,31 @@ class DifferencedSystem(Interpreted):
                 return result
             self._batches = False
         return np.array([self._single(a, b, p, dt) for a, b in zip(x, u, strict=True)]).reshape(
-            len(x), len(self.outputs)
+            len(x), len(self.signature.outputs)
         )
 
     def check(self, x: Array, u: Array, p: Array, dt: float) -> None:
         """Nothing to compare: this is the user's own function."""
 
-    def linearise(
-        self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
-    ) -> tuple[Array, Array]:
-        """f_x and f_u by central differences of `step`."""
+    def jacobian(
+        self, x: Array, u: Array, p: Array, dt: float, smoothing: float, width: int
+    ) -> Array:
+        """See `Interpreted.jacobian`; by central differences."""
         shifted = self.n + self.m
         both = np.concatenate([x, u], axis=1)
-        J = np.empty((len(x), self.n, shifted))
+        J = np.empty((len(x), self.n, width))
         size = max(1, CHUNK // (2 * shifted))
         for at in range(0, len(x), size):
-            J[at : at + size] = self._jacobian(both[at : at + size], p, dt)
-        return np.ascontiguousarray(J[:, :, : self.n]), np.ascontiguousarray(J[:, :, self.n :])
-
-    def sensitivities(
-        self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
-    ) -> tuple[Array, Array, Array]:
-        """As `linearise`, and f_p."""
-        f_x, f_u = self.linearise(x, u, p, dt)
-        f_p = np.empty((len(x), self.n, self.k))
-        for i, value in enumerate(p):
+            J[at : at + size, :, :shifted] = self._by_state_and_input(both[at : at + size], p, dt)
+        for i in range(width - shifted):
             up, down = np.array(p, float), np.array(p, float)
-            up[i] += RELATIVE_STEP * max(1.0, abs(value))
-            down[i] -= RELATIVE_STEP * max(1.0, abs(value))
-            f_p[:, :, i] = (self.step(x, u, up, dt) - self.step(x, u, down, dt)) / (up[i] - down[i])
-        return f_x, f_u, f_p
+            up[i] += RELATIVE_STEP * max(1.0, abs(p[i]))
+            down[i] -= RELATIVE_STEP * max(1.0, abs(p[i]))
+            change = self.step(x, u, up, dt) - self.step(x, u, down, dt)
+            J[:, :, shifted + i] = change / (up[i] - down[i])
+        return J
 
-    def _jacobian(self, both: Array, p: Array, dt: float) -> Array:
+    def _by_state_and_input(self, both: Array, p: Array, dt: float) -> Array:
         """(N, n + m) points -> (N, n, n + m), in one call of the step."""
         N, d = both.shape
         h = RELATIVE_STEP * np.maximum(1.0, np.abs(both))
@@ -108,8 +85,8 @@ class DifferencedSystem(Interpreted):
         self._calls += 1
         try:
             values = self._call([*x.T], [*u.T], p, dt)
-            result = np.empty((len(x), len(self.outputs)))
-            for i, name in enumerate(self.outputs):
+            result = np.empty((len(x), len(self.signature.outputs)))
+            for i, name in enumerate(self.signature.outputs):
                 result[:, i] = np.broadcast_to(np.asarray(values[name], float), len(x))
         except Exception:  # whatever it is, the call on one sample tells the user
             return None
@@ -124,31 +101,25 @@ class DifferencedSystem(Interpreted):
     def _single(self, x: Array, u: Array, p: Array, dt: float) -> Array:
         """The function on one sample; NaN where it leaves the finite numbers."""
         if not (np.isfinite(x).all() and np.isfinite(u).all()):
-            return np.full(len(self.outputs), np.nan)
+            return np.full(len(self.signature.outputs), np.nan)
         try:
             values = self._call(x.tolist(), u.tolist(), p, dt)
         except ArithmeticError:
-            return np.full(len(self.outputs), np.nan)
+            return np.full(len(self.signature.outputs), np.nan)
         except ValueError as error:
             if "math domain error" in str(error) or "nonnegative input" in str(error):
-                return np.full(len(self.outputs), np.nan)
+                return np.full(len(self.signature.outputs), np.nan)
             raise self._failure(error) from error
         except GroundedError:
             raise
         except Exception as error:
             raise self._failure(error) from error
-        return np.array([self._number(name, values[name]) for name in self.outputs])
+        return np.array([self._number(name, values[name]) for name in self.signature.outputs])
 
     def _call(self, x: Sequence[Any], u: Sequence[Any], p: Array, dt: float) -> Mapping[str, Any]:
-        s = Named("state", self.states, x)
-        a = Named("input", self.inputs, u)
-        parameters = Named("parameter", self.params, np.asarray(p, float).tolist())
         with np.errstate(all="ignore"):
-            if self.kind == "step":
-                values = self.function(s, a, parameters, dt)
-            else:
-                values = self.function(s, a, parameters)
-        check_names(values, self.outputs, self.function)
+            values = self.signature.call(x, u, np.asarray(p, float).tolist(), dt)
+        check_names(values, self.signature.outputs, self.signature.function)
         return values
 
     def _number(self, name: str, value: Any) -> float:
@@ -158,9 +129,8 @@ class DifferencedSystem(Interpreted):
                 return float(array.reshape(()))
         except Exception:  # ragged lists and stranger things are described below
             array = np.asarray(None)
-        raise wrong_value(name, value, self.function)
+        raise wrong_value(name, value, self.signature.function)
 
     def _failure(self, error: Exception) -> GroundedError:
-        return GroundedError(
-            f"{raised_at(error, self.function)}: the model raised {type(error).__name__}: {error}"
-        )
+        line = raised_at(error, self.signature.function)
+        return GroundedError(f"{line}: the model raised {type(error).__name__}: {error}")

@@ -1,62 +1,97 @@
-"""What the two NumPy paths share: integration, rollouts and the sweep, without a compiler.
+"""What the two NumPy engines share: integration, rollouts, the cost and the Riccati sweep.
 
-A subclass evaluates the user's function on N samples at once and gives its derivatives; how it
-does so (`python.py` calls the function, `traced.py` runs its graph) is all that differs.
+A subclass of `Interpreted` evaluates the user's function on N samples at once and differentiates
+it; how it does so (`differenced.py` calls the function, `traced.py` runs its graph) is all that
+differs. The rest are the twins of the compiled kernels, in the same order of steps.
+
+The sweep (theory: `ddp.py`). The problem about a trajectory is linear dynamics of z and a quadratic
+cost (`Quadratic`): with q the past inputs (`Queue`),
+
+    A = [[f_x, f_u past], [0, S]],    B = [[f_u now], [E]],
+    l_t(z, u) = W_t |x - target_t|^2 + R |u - u_target_t|^2 + S |u - u_{t-1}|^2,
+
+without halves, so that l_x = 2 W e and l_xx = 2 W; errors of angles wrap. With V the value's
+Hessian, backwards in time,
+
+    Q_z = l_z + A'V_z    Q_zz = l_zz + A'V A    Q_uz = l_uz + B'V A
+    Q_u = l_u + B'V_z    Q_uu = l_uu + B'V B
+    k, K: minimise the step's quadratic with Q_uu + diag(damping) inside the input limits
+    V_z  = Q_z  + K'(Q_uu k + Q_u) + Q_uz'k
+    V_zz = Q_zz + K'Q_uu K + K'Q_uz + Q_uz'K.
+
+Inside the limits: min 1/2 k'Hk + g'k subject to low <= k <= high, by projected Newton (`box_qp`;
+Tassa et al. 2014). The free set are the inputs that no bound holds back. On it a Newton step is
+exact, so a handful of iterations end with the exact solution: the clamped set is then the right
+one.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
+from grounded.compile.names import where
 from grounded.compile.problem import (
-    Array,
+    ARMIJO,
+    MAX_ITERATIONS,
+    ROUNDING,
+    STOP,
     Backward,
-    Descent,
     Integrator,
-    Kind,
-    Options,
     Problem,
+    Queue,
     Swarm,
-    queue_of,
+    System,
 )
-from grounded.compile.run.sweep import sweep, trajectory_cost, wrapped
+from grounded.compile.trace.tracing import Signature
+from grounded.frozen import Array, wrapped
 
 
-class Interpreted(ABC):
-    """A System whose kernels are NumPy."""
+class Interpreted(System):
+    """A System whose kernels are NumPy.
 
-    how: str
-    note: str
-    source: str
-    states: tuple[str, ...]
+    Args:
+        signature: the user's function and its names.
+        integrator: for a derivative.
+        note: why it is not compiled.
+    """
 
     def __init__(
-        self, kind: Kind, integrator: Integrator, sizes: tuple[int, int, int], note: str = ""
+        self, signature: Signature, integrator: Integrator = "rk4", note: str = ""
     ) -> None:
-        self.kind, self.integrator, self.note = kind, integrator, note
-        self.n, self.m, self.k = sizes
+        self.signature, self.integrator, self.note = signature, integrator, note
+        self.kind, self.states = signature.kind, signature.states
+        self.source = where(signature.function)
+        self.n, self.m, self.k = self.sizes = signature.sizes
 
     @abstractmethod
     def evaluate(self, x: Array, u: Array, p: Array, dt: float, smoothing: float) -> Array:
         """The user's function: x (N, n), u (N, m), p (k,) -> ds/dt or next state (N, n)."""
 
     @abstractmethod
+    def jacobian(
+        self, x: Array, u: Array, p: Array, dt: float, smoothing: float, width: int
+    ) -> Array:
+        """Derivatives of `step` by the first `width` of x, u and p, (N, n, width)."""
+
     def linearise(
         self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
     ) -> tuple[Array, Array]:
-        """f_x (N, n, n), f_u (N, n, m)."""
+        """See `System.linearise`."""
+        J = self.jacobian(x, u, p, dt, smoothing, self.n + self.m)
+        f_x, f_u = np.split(J, [self.n], axis=2)
+        return np.ascontiguousarray(f_x), np.ascontiguousarray(f_u)
 
-    @abstractmethod
     def sensitivities(
         self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
     ) -> tuple[Array, Array, Array]:
-        """f_x (N, n, n), f_u (N, n, m), f_p (N, n, k)."""
-
-    @abstractmethod
-    def check(self, x: Array, u: Array, p: Array, dt: float) -> None:
-        """Compares with the user's own function."""
+        """See `System.sensitivities`."""
+        J = self.jacobian(x, u, p, dt, smoothing, sum(self.sizes))
+        f_x, f_u, f_p = np.split(J, [self.n, self.n + self.m], axis=2)
+        return np.ascontiguousarray(f_x), np.ascontiguousarray(f_u), np.ascontiguousarray(f_p)
 
     def step(self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0) -> Array:
         """See `System.step`."""
@@ -82,8 +117,8 @@ class Interpreted(ABC):
     ) -> Swarm:
         """See `System.rollout`."""
         alphas = np.ones(1) if alphas is None else np.asarray(alphas, float)
-        queue, n, runs = queue_of(problem), self.n, len(alphas)
-        z = np.empty((runs, problem.horizon + 1, queue.nz))
+        queue, n, runs = problem.queue, self.n, len(alphas)
+        z = np.empty((runs, problem.horizon + 1, problem.nz))
         u = np.empty((runs, problem.horizon, self.m))
         z[:, 0] = problem.z_start()
         with np.errstate(all="ignore"):
@@ -92,37 +127,179 @@ class Interpreted(ABC):
                 if K is not None and zbar is not None:
                     u[:, t] += wrapped(z[:, t] - zbar[t], problem.angles) @ K[t].T
                 u[:, t] = np.clip(u[:, t], problem.low, problem.high)
-                sent = queue.effective(z[:, t], u[:, t])
-                if problem.input_shift is not None:
-                    sent = sent - problem.input_shift[t]
+                sent = problem.received(z[:, t], u[:, t], t)
                 x = self.step(z[:, t, :n], sent, problem.p, problem.dt, problem.smoothing)
                 z[:, t + 1, :n] = x + problem.bias[t]
                 z[:, t + 1, n:] = queue.after(z[:, t, n:], u[:, t])
         return Swarm(z, u, trajectory_cost(problem, z, u))
 
     def backward(
-        self,
-        problem: Problem,
-        z: Array,
-        u: Array,
-        damping: Array,
-        into: Backward | None = None,
+        self, problem: Problem, z: Array, u: Array, damping: Array, into: Backward | None = None
     ) -> Backward:
         """See `System.backward`."""
-        sent = queue_of(problem).effective(z[:-1], u)
-        sent = sent if problem.input_shift is None else sent - problem.input_shift
-        x = np.ascontiguousarray(z[:-1, : self.n])
         with np.errstate(all="ignore"):
-            f_x, f_u = self.linearise(x, sent, problem.p, problem.dt, problem.smoothing)
-            return sweep(problem, z, u, f_x, f_u, damping)
+            return sweep(problem, u, linearised(self, problem, z, u), damping)
 
-    def descend(
-        self,
-        problem: Problem,
-        ubar: Array,
-        K: Array | None,
-        zbar: Array | None,
-        options: Options,
-    ) -> Descent | None:
-        """See `System.descend`."""
-        return None
+
+@dataclass(frozen=True, eq=False)
+class Quadratic:
+    """The problem about a trajectory: linear dynamics of z, quadratic cost."""
+
+    A: Array  # (H, nz, nz)
+    B: Array  # (H, nz, m)
+    l_z: Array  # (H+1, nz)
+    l_u: Array  # (H, m)
+    l_zz: Array  # (H+1, nz), a diagonal
+    l_uu: Array  # (m,), a diagonal
+    l_uz: Array  # (m, nz), the same at every step
+
+
+def linearised(system: System, problem: Problem, z: Array, u: Array) -> Quadratic:
+    """The problem about z (H+1, nz), u (H, m), with the system's derivatives."""
+    queue, H, n = problem.queue, problem.horizon, system.n
+    x = np.ascontiguousarray(z[:-1, :n])
+    received = problem.received(z[:-1], u)
+    A, B = _augmented(
+        queue, *system.linearise(x, received, problem.p, problem.dt, problem.smoothing)
+    )
+    R, S = problem.input_weight, problem.change_weight
+    change = input_change(problem, u)
+    l_z = np.zeros((H + 1, queue.nz))
+    l_zz = np.zeros((H + 1, queue.nz))
+    l_z[:, :n] = 2 * problem.state_weight * tracking_error(problem, z)
+    l_zz[:, :n] = 2 * problem.state_weight
+    l_uz = np.zeros((len(R), queue.nz))
+    newest = list(queue.first)
+    l_z[:-1, newest] = -2 * S * change
+    l_zz[:-1, newest] = 2 * S
+    l_uz[np.arange(len(R)), newest] = -2 * S
+    l_u = 2 * R * (u - problem.input_target) + 2 * S * change
+    return Quadratic(A, B, l_z, l_u, l_zz, 2 * (R + S), l_uz)
+
+
+def _augmented(queue: Queue, f_x: Array, f_u: Array) -> tuple[Array, Array]:
+    H, n, nz, m = len(f_x), queue.n, queue.nz, f_u.shape[2]
+    S, E = queue.shift()
+    A, B = np.zeros((H, nz, nz)), np.zeros((H, nz, m))
+    A[:, :n, :n], A[:, :n, n:], A[:, n:, n:] = f_x, f_u @ queue.past, S
+    B[:, :n], B[:, n:] = f_u * queue.now, E
+    return A, B
+
+
+def sweep(problem: Problem, u: Array, q: Quadratic, damping: Array) -> Backward:
+    """Gains along u (H, m), with the problem about it; damping (m,)."""
+    H, m, nz = q.B.shape[0], q.B.shape[2], q.B.shape[1]
+    k, K, d1, d2 = np.zeros((H, m)), np.zeros((H, m, nz)), 0.0, 0.0
+    V_z, V = q.l_z[H], np.diag(q.l_zz[H])
+    for t in range(H - 1, -1, -1):
+        A, B = q.A[t], q.B[t]
+        VA, VB = V @ A, V @ B
+        Q_z, Q_u = q.l_z[t] + A.T @ V_z, q.l_u[t] + B.T @ V_z
+        Q_zz = np.diag(q.l_zz[t]) + A.T @ VA
+        Q_uu = np.diag(q.l_uu) + B.T @ VB
+        Q_uz = q.l_uz + B.T @ VA
+        if not (_positive_definite(Q_uu + np.diag(damping)) and np.isfinite(Q_u).all()):
+            return Backward(k, K, d1, d2, t)
+        k[t], K[t] = _gains(
+            Q_uu + np.diag(damping), Q_u, Q_uz, problem.low - u[t], problem.high - u[t]
+        )
+        d1 += float(k[t] @ Q_u)
+        d2 += 0.5 * float(k[t] @ Q_uu @ k[t])
+        V_z = Q_z + K[t].T @ (Q_uu @ k[t] + Q_u) + Q_uz.T @ k[t]
+        V = Q_zz + K[t].T @ (Q_uu @ K[t] + Q_uz) + Q_uz.T @ K[t]
+        V = 0.5 * (V + V.T)
+    return Backward(k, K, d1, d2, -1 if np.isfinite(K[0]).all() else 0)
+
+
+def _positive_definite(Q: Array) -> bool:
+    if not np.isfinite(Q).all():
+        return False
+    try:
+        np.linalg.cholesky(Q)
+    except np.linalg.LinAlgError:
+        return False
+    return True
+
+
+def _gains(Q_uu: Array, Q_u: Array, Q_uz: Array, low: Array, high: Array) -> tuple[Array, Array]:
+    """Returns k (m,) inside [low, high] and K (m, nz), whose rows of clamped inputs are zero."""
+    both = -solve(Q_uu, np.column_stack([Q_u, Q_uz]))
+    k = both[:, 0]
+    if np.all((low <= k) & (k <= high)):
+        return k, both[:, 1:]
+    k, free = box_qp(Q_uu, Q_u, low, high)
+    K = -solve(masked(Q_uu, free), np.where(free[:, None], Q_uz, 0.0))
+    return k, K
+
+
+def solve(H: Array, b: Array) -> Array:
+    """H^-1 b in float64."""
+    return np.asarray(np.linalg.solve(H, b), np.float64)
+
+
+def masked(H: Array, free: NDArray[np.bool_]) -> Array:
+    """H with rows and columns of clamped inputs replaced by the identity's."""
+    return np.asarray(np.where(free[:, None] & free, H, 0.0) + np.diag(np.where(free, 0.0, 1.0)))
+
+
+def free_set(k: Array, gradient: Array, low: Array, high: Array) -> NDArray[np.bool_]:
+    """Inputs that no bound holds back."""
+    held = ((k <= low) & (gradient > 0)) | ((k >= high) & (gradient < 0)) | (low >= high)
+    return np.asarray(~held)
+
+
+def box_qp(H: Array, g: Array, low: Array, high: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """The minimiser k (m,) and its free set (m,), for a positive definite H (m, m).
+
+    Low <= 0 <= high is not needed; low <= high is.
+    """
+    k = np.clip(-solve(H, g), low, high)
+    floor = STOP * (1e-300 + float(np.abs(g).max()))
+    free = np.ones(len(g), bool)
+    for _ in range(MAX_ITERATIONS):
+        gradient = g + H @ k
+        free = free_set(k, gradient, low, high)
+        if not np.any(np.abs(gradient[free]) > floor):
+            break
+        newton = -solve(masked(H, free), np.where(free, gradient, 0.0))
+        k_next = _projected_search(H, g, k, newton, low, high)
+        if np.array_equal(k_next, k):
+            break
+        k = k_next
+    return k, free
+
+
+def _projected_search(
+    H: Array, g: Array, k: Array, newton: Array, low: Array, high: Array
+) -> Array:
+    """Moves k along the projected path clip(k + beta newton), halving beta until J falls enough."""
+    value, gradient, beta = g @ k + 0.5 * k @ H @ k, g + H @ k, 1.0
+    slack = ROUNDING * abs(value)
+    for _ in range(40):
+        trial = np.clip(k + beta * newton, low, high)
+        change = g @ trial + 0.5 * trial @ H @ trial - value
+        if change <= ARMIJO * gradient @ (trial - k) + slack:
+            return np.asarray(trial)
+        beta *= 0.5
+    return k
+
+
+def tracking_error(problem: Problem, z: Array) -> Array:
+    """x_t - target_t, angles wrapped: z (..., H+1, nz) -> (..., H+1, n)."""
+    return wrapped(z[..., : problem.system.n] - problem.target, problem.angles)
+
+
+def input_change(problem: Problem, u: Array) -> Array:
+    """u_t - u_{t-1} with u_{-1} = past: u (..., H, m) -> (..., H, m)."""
+    before = np.broadcast_to(problem.past, (*u.shape[:-2], 1, u.shape[-1]))
+    return np.diff(u, axis=-2, prepend=before)
+
+
+def trajectory_cost(problem: Problem, z: Array, u: Array) -> Array:
+    """J of each run: z (..., H+1, nz), u (..., H, m) -> (...,)."""
+    with np.errstate(all="ignore"):
+        e = tracking_error(problem, z)
+        J = np.einsum("...ti,ti->...", e * e, problem.state_weight)
+        a, change = u - problem.input_target, input_change(problem, u)
+        J = J + (a * a).sum(axis=-2) @ problem.input_weight
+        return np.asarray(J + (change * change).sum(axis=-2) @ problem.change_weight)

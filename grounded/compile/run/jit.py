@@ -1,23 +1,36 @@
-"""LLVM IR text to functions, by llvmlite, through the disk cache.
+"""LLVM IR text to functions, by llvmlite, through a cache on disk; and many calls at once.
 
-Loading a cached object takes about a millisecond; compiling takes a tenth of a second. Kernels are
-called through ctypes, which releases the GIL while they run.
+Compiling takes a tenth of a second, loading a cached object a millisecond. Kernels are called
+through ctypes, which releases the GIL while they run: threads are enough for many models or trials
+(`parallel`).
+
+The cache is the user's: one file a kernel, of a header, the SHA-256 of the code, and the code. A
+file that is short, damaged or of another format is not used and is replaced. A file is written
+under a temporary name and renamed, so that any number of processes may share the folder; beyond
+MAX_BYTES the files that were used longest ago go. Without a cache (a read-only home) kernels are
+compiled again. GROUNDED_CACHE names another folder; empty, it switches the cache off.
 """
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import hashlib
+import os
+import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
-
-from grounded.compile.run import cache as disk
+from typing import Any, TypeVar
 
 OLDEST = (0, 45)  # of llvmlite: pointers without a type
 OPTIMISATION = 1  # of LLVM's code generator; the text is optimised as it is written
+MAGIC = b"grounded kernel 1\n"
+MAX_BYTES = 64 * 2**20  # of all files
+STACK = 16 * 2**20  # bytes for each thread: kernels keep their matrices there
+Item = TypeVar("Item")
+Outcome = TypeVar("Outcome")
 _LOCK = threading.Lock()
 
 
@@ -101,13 +114,124 @@ def library(key: str, write: Callable[[], str], names: Sequence[str]) -> Library
 
     with _LOCK:  # LLVM's global context is not thread safe
         digest = hashlib.sha256(f"{key} {_host()[2]}".encode()).hexdigest()
-        machine, code = _machine(), disk.read(digest)
+        machine, code = _machine(), stored(digest)
         if code is None:
             module = llvm.parse_assembly(write())
             module.triple = llvm.get_process_triple()
             code = machine.emit_object(module)
-            disk.write(digest, code)
+            store(digest, code)
         engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
         engine.add_object_file(llvm.ObjectFileRef.from_data(code))
         engine.finalize_object()
         return Library(engine, names)
+
+
+def folder() -> Path | None:
+    """Where kernels are kept; None when the cache is off."""
+    chosen = os.environ.get("GROUNDED_CACHE")
+    if chosen is not None:
+        return Path(chosen) if chosen else None
+    if sys.platform == "win32":
+        base = Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
+    elif sys.platform == "darwin":
+        base = Path.home() / "Library" / "Caches"
+    else:
+        xdg = os.environ.get("XDG_CACHE_HOME", "")
+        base = Path(xdg) if xdg.startswith("/") else Path.home() / ".cache"
+    return base / "grounded"
+
+
+def stored(digest: str) -> bytes | None:
+    """The code stored under a digest, or None when there is none that can be trusted."""
+    try:
+        home = folder()
+        if home is None:
+            return None
+        path = home / f"{digest}.kernel"
+        data = path.read_bytes()
+        code = data[len(MAGIC) + 32 :]
+        if data != MAGIC + _check(digest, code) + code:
+            return None
+        with contextlib.suppress(OSError):
+            os.utime(path)  # used now
+        return code
+    except (OSError, RuntimeError):
+        return None
+
+
+def store(digest: str, code: bytes) -> None:
+    """Stores code, atomically; silently does nothing where it can't."""
+    import tempfile  # only a cold process needs it
+
+    try:
+        home = folder()
+        if home is None:
+            return
+        home.mkdir(parents=True, exist_ok=True, mode=0o700)
+        handle, temporary = tempfile.mkstemp(dir=home, suffix=".part")
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(MAGIC + _check(digest, code) + code)
+            Path(temporary).replace(home / f"{digest}.kernel")
+        except BaseException:
+            with contextlib.suppress(OSError):
+                Path(temporary).unlink()
+            raise
+        _prune(home)
+    except (OSError, RuntimeError):
+        return
+
+
+def _check(digest: str, code: bytes) -> bytes:
+    """Binds the code to its name: a file under another's name is foreign."""
+    return hashlib.sha256(digest.encode() + code).digest()
+
+
+def _prune(home: Path) -> None:
+    """Removes the files that were used longest ago until MAX_BYTES are left."""
+    entries = []
+    for path in home.glob("*.kernel"):
+        with contextlib.suppress(OSError):
+            status = path.stat()
+            entries.append((status.st_mtime, status.st_size, path))
+    total = sum(size for _, size, _ in entries)
+    for _, size, path in sorted(entries):
+        if total <= MAX_BYTES:
+            break
+        with contextlib.suppress(OSError):
+            path.unlink()
+            total -= size
+
+
+def parallel(
+    function: Callable[[Item], Outcome], items: Iterable[Item], workers: int | None = None
+) -> list[Outcome]:
+    """[function(item) for item in items], in that order, by threads.
+
+    Args:
+        function: must not change anything shared.
+        items: what it is called with.
+        workers: threads; None: as many as the process may use processors.
+
+    Raises:
+        Exception: the first that `function` raises, in the order of the items.
+    """
+    work = list(items)
+    count = min(len(work), workers or _processors())
+    if count <= 1:
+        return [function(item) for item in work]
+    from concurrent.futures import ThreadPoolExecutor
+
+    before = threading.stack_size(STACK)
+    try:
+        with ThreadPoolExecutor(count) as pool:
+            return list(pool.map(function, work))
+    finally:
+        threading.stack_size(before)
+
+
+def _processors() -> int:
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # macOS, Windows
+        return os.cpu_count() or 1

@@ -12,8 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from grounded.compile.names import where
-from grounded.compile.problem import STAGES, Array, Integrator
+from grounded.compile.problem import STAGES, Integrator
 from grounded.compile.run.differenced import DifferencedSystem
 from grounded.compile.run.interpreted import Interpreted
 from grounded.compile.trace.graph import Program
@@ -26,6 +25,7 @@ from grounded.compile.trace.tracing import (
     values_and_jacobian,
 )
 from grounded.errors import GroundedError
+from grounded.frozen import Array
 
 CHUNK = 1024  # samples at once
 AGREE = 1e-9  # a trace and its original, relative to the size of the state's values
@@ -39,19 +39,9 @@ class TracedSystem(Interpreted):
     def __init__(
         self, signature: Signature, first: Trace, integrator: Integrator, note: str
     ) -> None:
-        sizes = (len(signature.states), len(signature.inputs), len(signature.params))
-        super().__init__(signature.kind, integrator, sizes, note)
-        self.signature, self.source = signature, where(signature.function)
-        self.states = signature.states
-        self.original = DifferencedSystem(
-            signature.function,
-            kind=signature.kind,
-            states=signature.states,
-            inputs=signature.inputs,
-            params=signature.params,
-            integrator=integrator,
-        )
-        self._variants = [Variant(first, sizes)] if not first.guards else []
+        super().__init__(signature, integrator, note)
+        self.original = DifferencedSystem(signature, integrator)
+        self._variants = [Variant(first, self.sizes)] if not first.guards else []
 
     def variant(self, p: Array, dt: float) -> Variant:
         """The trace that holds for these parameters.
@@ -65,29 +55,13 @@ class TracedSystem(Interpreted):
         found = trace(self.signature, np.asarray(p, float), dt)
         if isinstance(found, str):
             raise GroundedError(f"{found}; with these parameters only; use np.where")
-        self._variants.append(Variant(found, (self.n, self.m, self.k)))
+        self._variants.append(Variant(found, self.sizes))
         return self._variants[-1]
 
     def evaluate(self, x: Array, u: Array, p: Array, dt: float, smoothing: float) -> Array:
         """The graph at N samples."""
         values = self.variant(p, dt).values(leaves_of(x, u, p, dt), smoothing)
         return np.stack([np.broadcast_to(v, len(x)) for v in values], axis=1)
-
-    def linearise(
-        self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
-    ) -> tuple[Array, Array]:
-        """f_x and f_u, exact."""
-        J = self._derivatives(x, u, p, dt, smoothing, False)
-        return np.ascontiguousarray(J[:, :, : self.n]), np.ascontiguousarray(J[:, :, self.n :])
-
-    def sensitivities(
-        self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
-    ) -> tuple[Array, Array, Array]:
-        """f_x, f_u and f_p, exact."""
-        J = self._derivatives(x, u, p, dt, smoothing, True)
-        ends = (self.n, self.n + self.m)
-        f_x, f_u, f_p = np.split(J, ends, axis=2)
-        return np.ascontiguousarray(f_x), np.ascontiguousarray(f_u), np.ascontiguousarray(f_p)
 
     def check(self, x: Array, u: Array, p: Array, dt: float) -> None:
         """See `System.check`."""
@@ -101,19 +75,18 @@ class TracedSystem(Interpreted):
         if differ.any():
             t, i = np.argwhere(differ)[0]
             raise GroundedError(
-                f"{where(self.signature.function)}: the traced model differs from the function: "
+                f"{self.source}: the traced model differs from the function: "
                 f"at sample {t}, state '{self.signature.states[i]}', the trace gives "
                 f"{mine[t, i]!r} and the function {theirs[t, i]!r}. Does it use random numbers, "
                 "keep a memory, or look at the type of its arguments?"
             )
 
-    def _derivatives(
-        self, x: Array, u: Array, p: Array, dt: float, smoothing: float, full: bool
+    def jacobian(
+        self, x: Array, u: Array, p: Array, dt: float, smoothing: float, width: int
     ) -> Array:
-        width = self.n + self.m + (self.k if full else 0)
-        J = np.empty((len(x), self.n, width))
-        variant = self.variant(p, dt)
-        program = variant.full if full else variant.small
+        """See `Interpreted.jacobian`; exact."""
+        J, variant = np.empty((len(x), self.n, width)), self.variant(p, dt)
+        program = variant.small if width == self.n + self.m else variant.full
         for at in range(0, len(x), CHUNK):
             some = slice(at, at + CHUNK)
             with np.errstate(all="ignore"):

@@ -15,11 +15,18 @@ import numpy as np
 
 from grounded.compile.trace.graph import Graph
 
-FUNCTIONS: dict[str, Callable[..., Any]] = {}  # NumPy's names; filled by `functions.py`
+Operator = Callable[[Any, Any], Any]
+
+FUNCTIONS: dict[str, Callable[..., Any]] = {}  # NumPy's names; filled by `functions`
 
 
 class NotTraceable(Exception):
     """What the user's function does can't be put into a graph; the text says what."""
+
+
+def _both_ways(function: Operator) -> tuple[Operator, Operator]:
+    """An operator, and the one that Python asks when the expression stands on its right."""
+    return function, lambda self, other: function(other, self)
 
 
 class Expression:
@@ -54,47 +61,13 @@ class Expression:
 
     # Arithmetic.
 
-    def __add__(self, other: Any) -> Any:
-        return apply("add", self, other)
-
-    def __radd__(self, other: Any) -> Any:
-        return apply("add", other, self)
-
-    def __sub__(self, other: Any) -> Any:
-        return apply("sub", self, other)
-
-    def __rsub__(self, other: Any) -> Any:
-        return apply("sub", other, self)
-
-    def __mul__(self, other: Any) -> Any:
-        return apply("mul", self, other)
-
-    def __rmul__(self, other: Any) -> Any:
-        return apply("mul", other, self)
-
-    def __truediv__(self, other: Any) -> Any:
-        return apply("div", self, other)
-
-    def __rtruediv__(self, other: Any) -> Any:
-        return apply("div", other, self)
-
-    def __pow__(self, other: Any) -> Any:
-        return apply("pow", self, other)
-
-    def __rpow__(self, other: Any) -> Any:
-        return apply("pow", other, self)
-
-    def __mod__(self, other: Any) -> Any:
-        return remainder(self, other)
-
-    def __rmod__(self, other: Any) -> Any:
-        return remainder(other, self)
-
-    def __floordiv__(self, other: Any) -> Any:
-        return apply("floor", apply("div", self, other))
-
-    def __rfloordiv__(self, other: Any) -> Any:
-        return apply("floor", apply("div", other, self))
+    __add__, __radd__ = _both_ways(lambda a, b: apply("add", a, b))
+    __sub__, __rsub__ = _both_ways(lambda a, b: apply("sub", a, b))
+    __mul__, __rmul__ = _both_ways(lambda a, b: apply("mul", a, b))
+    __truediv__, __rtruediv__ = _both_ways(lambda a, b: apply("div", a, b))
+    __pow__, __rpow__ = _both_ways(lambda a, b: apply("pow", a, b))
+    __mod__, __rmod__ = _both_ways(lambda a, b: remainder(a, b))
+    __floordiv__, __rfloordiv__ = _both_ways(lambda a, b: apply("floor", apply("div", a, b)))
 
     def __neg__(self) -> Any:
         return apply("neg", self)
@@ -107,33 +80,16 @@ class Expression:
 
     # Conditions: weights in [0, 1].
 
-    def __gt__(self, other: Any) -> Any:
-        return apply("above", self, other)
-
-    def __ge__(self, other: Any) -> Any:
-        return at_least(self, other)
-
-    def __lt__(self, other: Any) -> Any:
-        return apply("above", other, self)
-
-    def __le__(self, other: Any) -> Any:
-        return at_least(other, self)
+    __gt__, __lt__ = _both_ways(lambda a, b: apply("above", a, b))
+    __ge__, __le__ = _both_ways(lambda a, b: at_least(a, b))
+    __and__, __rand__ = _both_ways(lambda a, b: logical_and(a, b))
+    __or__, __ror__ = _both_ways(lambda a, b: logical_or(a, b))
 
     def __eq__(self, other: object) -> Any:
         return apply("equal", self, other)
 
     def __ne__(self, other: object) -> Any:
         return logical_not(apply("equal", self, other))
-
-    def __and__(self, other: Any) -> Any:
-        return logical_and(self, other)
-
-    __rand__ = __and__
-
-    def __or__(self, other: Any) -> Any:
-        return logical_or(self, other)
-
-    __ror__ = __or__
 
     def __invert__(self) -> Any:
         return logical_not(self)

@@ -43,7 +43,7 @@ class Graph:
         self.limit = limit
         self.conditions: set[int] = set()  # nodes that are weights in [0, 1]
         self.oracle: Callable[[int], bool] | None = None  # answers an `if` while tracing
-        self.varying: set[int] = set()  # nodes that depend on a state or an input
+        self.letters: list[frozenset[str]] = []  # of the leaves that each node depends on
         self._known: dict[Node | tuple[str, str], int] = {}
 
     def const(self, value: float) -> int:
@@ -70,11 +70,15 @@ class Graph:
             return known
         if len(self.nodes) >= self.limit:
             raise TooLong(f"more than {self.limit:,} operations")
-        if (node.leaf and node.leaf[0] in "xu") or any(a in self.varying for a in node.args):
-            self.varying.add(len(self.nodes))
+        own = frozenset(node.leaf[0] if node.leaf else ())
+        self.letters.append(own.union(*(self.letters[a] for a in node.args)))
         self.nodes.append(node)
         self._known[key] = len(self.nodes) - 1
         return len(self.nodes) - 1
+
+    def varies(self, i: int, letters: str = "xu") -> bool:
+        """Whether a node depends on a state or an input."""
+        return not self.letters[i].isdisjoint(letters)
 
     def constant(self, i: int) -> float | None:
         """The value of a constant node, None for any other."""
@@ -175,7 +179,7 @@ def _div(g: Graph, args: tuple[int, ...], v: list[float | None]) -> int | None:
         return args[0]
     if v[0] == 0.0 and v[1] is None:
         return g.const(0.0)
-    if args[0] in g.varying and args[1] not in g.varying:  # one division a call, not one a sample
+    if g.varies(args[0]) and not g.varies(args[1]):  # one division a call, not one a sample
         return g.node("mul", args[0], g.node("div", g.const(1.0), args[1]))
     return None
 

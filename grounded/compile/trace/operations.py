@@ -96,40 +96,21 @@ def equal(eps: float, left: Any, r: Any) -> Any:
     return np.equal(left, r).astype(float)
 
 
+# Operations that are a NumPy function and no more, by their names there.
+PLAIN = {
+    **{name: name for name in ("sqrt", "cbrt", "exp", "expm1", "log", "log1p", "sin", "cos")},
+    **{name: name for name in ("tan", "sinh", "cosh", "tanh", "floor", "rint", "trunc")},
+    **{"add": "add", "sub": "subtract", "mul": "multiply", "div": "divide", "neg": "negative"},
+    **{"pow": "power", "asin": "arcsin", "acos": "arccos", "atan": "arctan", "atan2": "arctan2"},
+}
+
+
 def _plain(function: Callable[..., Any]) -> Callable[..., Any]:
     return lambda eps, *args: function(*args)
 
 
 NUMPY: dict[str, Callable[..., Any]] = {
-    name: _plain(function)
-    for name, function in {
-        "add": np.add,
-        "sub": np.subtract,
-        "mul": np.multiply,
-        "div": np.divide,
-        "neg": np.negative,
-        "pow": np.power,
-        "sqrt": np.sqrt,
-        "cbrt": np.cbrt,
-        "exp": np.exp,
-        "expm1": np.expm1,
-        "log": np.log,
-        "log1p": np.log1p,
-        "sin": np.sin,
-        "cos": np.cos,
-        "tan": np.tan,
-        "asin": np.arcsin,
-        "acos": np.arccos,
-        "atan": np.arctan,
-        "atan2": np.arctan2,
-        "sinh": np.sinh,
-        "cosh": np.cosh,
-        "tanh": np.tanh,
-        "floor": np.floor,
-        "rint": np.rint,
-        "trunc": np.trunc,
-    }.items()
-} | {
+    **{op: _plain(getattr(np, name)) for op, name in PLAIN.items()},
     "above": above,
     "equal": equal,
     "blend": blend,

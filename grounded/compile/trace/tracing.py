@@ -9,19 +9,20 @@ the slower path that is taken instead.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from grounded.compile.names import Named, check_names, raised_at, wrong_value
-from grounded.compile.problem import Array, Kind
+from grounded.compile.problem import Kind
 from grounded.compile.trace.derivative import jacobian
 from grounded.compile.trace.expression import Expression, NotTraceable, node_of
+from grounded.compile.trace.functions import rebound
 from grounded.compile.trace.graph import MAX_NODES, Graph, Program, TooLong
-from grounded.compile.trace.rebinding import rebound
 from grounded.errors import GroundedError
+from grounded.frozen import Array
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,20 @@ class Signature:
     def outputs(self) -> tuple[str, ...]:
         """Names of the returned values, in array order."""
         return self.returns or self.states
+
+    @property
+    def sizes(self) -> tuple[int, int, int]:
+        """Numbers n, m, k of states, inputs and parameters."""
+        return len(self.states), len(self.inputs), len(self.params)
+
+    def call(
+        self, x: Sequence[Any], u: Sequence[Any], p: Sequence[Any], dt: Any
+    ) -> Mapping[str, Any]:
+        """What the function, or a copy of it, returns for n, m and k values and dt."""
+        s, a = Named("state", self.states, x), Named("input", self.inputs, u)
+        parameters = Named("parameter", self.params, p)
+        more = (dt,) if self.kind == "step" else ()
+        return self.function(s, a, parameters, *more)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +87,7 @@ def trace(signature: Signature, p: Array | None, dt: float, limit: int = MAX_NOD
     graph, guards = Graph(limit), []
 
     def oracle(i: int) -> bool:
-        if any(graph.nodes[j].leaf and graph.nodes[j].leaf[0] in "xu" for j in graph.live([i])):  # type: ignore[index]
+        if graph.varies(i):
             raise NotTraceable("an `if` (or and, or, while) on a state or an input; use np.where")
         outcome = True if p is None else bool(Program(graph, [i])(_uniform(p, dt), 0.0)[0])
         guards.append((i, outcome))
@@ -104,15 +119,9 @@ def _call(signature: Signature, graph: Graph) -> Mapping[str, Any]:
     def leaves(letter: str, count: int) -> list[Expression]:
         return [Expression(graph, graph.leaf(letter, i)) for i in range(count)]
 
-    s = Named("state", signature.states, leaves("x", len(signature.states)))
-    a = Named("input", signature.inputs, leaves("u", len(signature.inputs)))
-    p = Named("parameter", signature.params, leaves("p", len(signature.params)))
-    function = rebound(signature.function)
-    if signature.kind == "step":
-        values = function(s, a, p, Expression(graph, graph.leaf("d")))
-    else:
-        values = function(s, a, p)
-    return values  # type: ignore[no-any-return]
+    x, u, p = (leaves(letter, size) for letter, size in zip("xup", signature.sizes, strict=True))
+    dt = Expression(graph, graph.leaf("d")) if signature.kind == "step" else None
+    return replace(signature, function=rebound(signature.function)).call(x, u, p, dt)
 
 
 def _output(graph: Graph, name: str, value: Any, signature: Signature) -> int:

@@ -20,7 +20,7 @@ from grounded.errors import GroundedError, nearest
 from grounded.model import Model
 from grounded.search.standing import Candidate
 from grounded.task import Task
-from grounded.trial import Trial, bridge
+from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.store.candidate_file import candidate_bytes, read_candidate
 from grounded_trials.store.store import Store, Stored, write_atomically
 from grounded_trials.store.trial_file import read_trial
@@ -244,7 +244,7 @@ class Folder:
                 lost.append(Lost(stored.path.name, str(error)))
                 continue
             logged = replace(trial, id=stored.id)
-            yield StoredTrial(stored, bridge(logged).trial, meta, logged, policy)
+            yield StoredTrial(stored, interpolate_gaps(logged).trial, meta, logged, policy)
         numbers = {stored.number for stored in entries}
         for number in sorted(set(range(1, max(numbers, default=0))) - numbers):
             if lost is not None:

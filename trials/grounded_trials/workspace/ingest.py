@@ -17,7 +17,7 @@ from typing import Any
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result
 from grounded.search.standing import Tried
-from grounded.trial import Trial, bridge
+from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.formats.mcap_walk import read_records
 from grounded_trials.logs.log_files import kind_of, log_files, open_log
 from grounded_trials.logs.log_table import log_mapping, read_log
@@ -111,7 +111,7 @@ def ingest_log(
         sha256=added.sha256,
         known=added.known,
         candidate=trial.candidate,
-        utility=workspace.task.utility(bridge(trial).trial) if trial.candidate else None,
+        utility=workspace.task.utility(interpolate_gaps(trial).trial) if trial.candidate else None,
         accepted=tried.accepted if tried else None,
         warnings=warnings,
         signals=read.signals,

@@ -83,7 +83,7 @@ class Status(Result):
     @property
     def certainty(self) -> str:
         """Whether the last improvement exceeds the noise of the utility, as a sentence."""
-        from grounded.search.certainty import last_improvement
+        from grounded.search.standing import last_improvement
 
         return last_improvement(self.standing.history)
 

@@ -7,7 +7,7 @@ import numpy as np
 from grounded.frozen import Array
 from grounded.policy import Policy, z_difference
 from grounded.task import Task
-from grounded.trial import HUGE, Trial, bridge
+from grounded.trial import HUGE, Trial, interpolate_gaps
 from grounded_trials.workspace.folder import Folder
 
 FAR = 0.1  # of a state's range in the trial: a start this far from s_0 is worth a warning
@@ -16,7 +16,7 @@ FAR = 0.1  # of a state's range in the trial: a start this far from s_0 is worth
 def warnings_about(workspace: Folder, trial: Trial) -> tuple[str, ...]:
     """Gaps, an early end, a start far from s_0, inputs outside the limits or logged late."""
     task = workspace.task
-    filled = bridge(trial)
+    filled = interpolate_gaps(trial)
     found = []
     if filled.samples:
         found.append(
