@@ -10,7 +10,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, fields
 from functools import cache
-from html import escape
 from types import UnionType
 from typing import Any, Self, Union, get_args, get_origin, get_type_hints
 
@@ -21,15 +20,27 @@ MALFORMED = (ValueError, TypeError, AttributeError, KeyError, OverflowError, Rec
 
 
 class Result:
-    """Base of frozen results: `to_json` gives the document that the command's --json prints."""
+    """Base of frozen results, dataclasses with `repr=False`: what a notebook shows of them."""
+
+    def summary(self) -> str:
+        """What it is, in a few words: its name, its utility."""
+        return ""
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.summary()}".rstrip() + ">"
 
     def to_json(self) -> dict[str, Any]:
-        """Plain dicts, lists, strings and finite numbers; None where there is no number."""
+        """What the command's --json prints: finite numbers, None where there is none."""
         raise NotImplementedError
 
     def _repr_html_(self) -> str:
         """The document as a table, for Jupyter."""
-        return f"<b>{escape(type(self).__name__)}</b>{_table(self.to_json())}"
+        return f"<b>{type(self).__name__}</b>{_table(self.to_json())}"
+
+
+def document(**values: Any) -> dict[str, Any]:
+    """A document of these keys, `plain`."""
+    return {key: plain(value) for key, value in values.items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,6 +141,8 @@ def plain(value: Any) -> Any:
 
 
 def _table(value: Any) -> str:
+    from html import escape
+
     if isinstance(value, dict):
         rows = "".join(
             f"<tr><th style='text-align:left'>{escape(key)}</th><td>{_table(item)}</td></tr>"

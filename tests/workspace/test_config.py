@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from grounded.errors import GroundedError
-from grounded.search.standing import Options
+from grounded.search.standing import SearchOptions
 from grounded_trials.logs.log_table import log_mapping
 from grounded_trials.toml_table import Table
 from grounded_trials.workspace.config import ModelTable, SystemTable, TaskTable, read_config
@@ -24,13 +24,15 @@ from workspaces import CONFIG, make
 REFERENCE = Path(__file__).resolve().parents[2] / "docs" / "configuration.md"
 
 
-@pytest.mark.parametrize("table", [ModelTable, TaskTable, Options, SystemTable, EstimateTable])
+@pytest.mark.parametrize(
+    "table", [ModelTable, TaskTable, SearchOptions, SystemTable, EstimateTable]
+)
 def test_the_reference_lists_every_key_with_its_default(table):
     rows = re.findall(r"^\| `(\w+)` \| (.*?) \|", REFERENCE.read_text(), re.M)
     listed = dict(rows)
     for key in fields(table):
         assert key.name in listed, f"docs/configuration.md does not say what {key.name} is"
-        if table is Options:
+        if table is SearchOptions:
             default = key.default
             shown = listed[key.name].strip("`")
             assert shown == (

@@ -29,9 +29,9 @@ class Report(Result):
     findings: Findings
     paths: tuple[Path, ...]
 
-    def __repr__(self) -> str:
-        files = "".join(f", {path}" for path in self.paths)
-        return f"<Report of {len(self.findings.runs)} trials{files}>"
+    def summary(self) -> str:
+        """How much it shows, and its files."""
+        return ", ".join([f"{len(self.findings.runs)} trials", *map(str, self.paths)])
 
     def to_json(self) -> dict[str, Any]:
         """The document of `report --json`, with the figures of the text by state and input."""

@@ -25,7 +25,7 @@ Effect = dict[str, Any]  # {"name": "dead_zone:throttle", "c": 0.146}
 AGAIN, PROPOSE = NextCommand("diagnose"), NextCommand("propose")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Adopted(Result):
     """What the model has now."""
 
@@ -33,6 +33,10 @@ class Adopted(Result):
     params: Mapping[str, float]  # of the model, written with them
     claimed: bool  # the diagnosis claims the new ones; else one was taken by itself
     then: NextCommand = PROPOSE
+
+    def summary(self) -> str:
+        """The effects that the model has now."""
+        return ", ".join(str(effect["name"]) for effect in self.effects)
 
     def to_json(self) -> dict[str, Any]:
         """The document of `adopt --json`."""

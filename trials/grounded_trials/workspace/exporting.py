@@ -28,13 +28,17 @@ from grounded_trials.workspace.proposing import candidate_named
 LAW = "u_t = clip(feedforward_t + gain_t (z - reference_t), low, high); z = [state, past inputs]"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Exported(Result):
     """A candidate's file for other languages."""
 
     candidate: str
     file: Path
     format: str
+
+    def summary(self) -> str:
+        """The candidate and its file."""
+        return f"{self.candidate}: {self.file}"
 
     def to_json(self) -> dict[str, Any]:
         """The document of `export --json`."""

@@ -26,9 +26,9 @@ class Fitted(Result):
     applied: bool
     then: NextCommand
 
-    def __repr__(self) -> str:
-        values = ", ".join(f"{name} = {e.value:.4g}" for name, e in self.fit.params.items())
-        return f"<Fitted {values}>"
+    def summary(self) -> str:
+        """The values."""
+        return ", ".join(f"{name} = {e.value:.4g}" for name, e in self.fit.params.items())
 
     def to_json(self) -> dict[str, Any]:
         """The document of `fit --json`: values, intervals, held-out prediction errors."""

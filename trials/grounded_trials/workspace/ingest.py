@@ -24,7 +24,6 @@ from grounded_trials.logs.log_table import log_mapping, read_log
 from grounded_trials.logs.signal_report import SignalReport
 from grounded_trials.store.own_files import CANDIDATE, FILE_LIMIT, TRIAL, read_file
 from grounded_trials.store.trial_file import read_trial, trial_bytes
-from grounded_trials.wording import verdict
 from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.proposing import standing_in
@@ -51,9 +50,9 @@ class Ingested(Result):
         after_run = "diagnose" if self.verdict == "probe" else "propose"
         return NextCommand(after_run if self.candidate else "fit")
 
-    def __repr__(self) -> str:
-        ran = f"{self.candidate}, {self.verdict}" if self.candidate else "data"
-        return f"<Ingested {self.trial}: {ran}>"
+    def summary(self) -> str:
+        """The trial, what it ran and what became of that."""
+        return f"{self.trial}: {f'{self.candidate}, {self.verdict}' if self.candidate else 'data'}"
 
     def to_json(self) -> dict[str, Any]:
         """Its entry in `ingest --json`; a failed run's utility is null and `failed` true."""
@@ -123,7 +122,7 @@ def _verdict(trial: Trial, tried: Tried | None, repeats: int) -> str:
     if tried is None:
         return "probe" if trial.candidate else ""
     ran = [one.id for one in tried.trials[:repeats]]
-    return "run again" if tried.accepted and trial.id not in ran else verdict(tried)
+    return "run again" if tried.accepted and trial.id not in ran else tried.verdict()
 
 
 def _tried(workspace: Folder, trial: Trial) -> Tried | None:

@@ -19,8 +19,8 @@ import numpy as np
 from grounded.errors import GroundedError, NextCommand, nearest
 from grounded.plant import Noise, Plant
 from grounded.result import Result
-from grounded.search.improve import learn
-from grounded.search.standing import Candidate, Options
+from grounded.search.ask_tell import learn
+from grounded.search.standing import Candidate, SearchOptions
 from grounded.trial import Trial
 from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace.folder import Folder
@@ -42,8 +42,9 @@ class Ran(Result):
         """Take the trial in."""
         return NextCommand("ingest", (str(self.trial_file),))
 
-    def __repr__(self) -> str:
-        return f"<Ran {self.candidate}: {self.trial_file}>"
+    def summary(self) -> str:
+        """What was run, and where its trial is."""
+        return f"{self.candidate}: {self.trial_file}"
 
     def to_json(self) -> dict[str, Any]:
         """The document of `run --json`."""
@@ -197,5 +198,5 @@ def optimum(workspace: Folder) -> float | None:
     def run(candidate: Candidate) -> Trial:
         return plant.run(candidate.policy, start, np.random.default_rng(0))
 
-    standing, _, _ = learn(truth, run, Options(max_trials=TRIALS, tolerance=1e-4))
-    return standing.incumbent.utility if standing.incumbent else None
+    best = learn(truth, run, SearchOptions(max_trials=TRIALS, tolerance=1e-4)).best
+    return best.utility if best else None

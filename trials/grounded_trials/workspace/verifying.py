@@ -11,12 +11,16 @@ from grounded_trials.store.candidate_file import read_candidate
 from grounded_trials.workspace.folder import Folder, Lost
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Verified(Result):
     """How many files were checked, and those that are not what they were."""
 
     checked: int
     damaged: tuple[Lost, ...]
+
+    def summary(self) -> str:
+        """How many are good, how many not."""
+        return f"{self.checked} files, {len(self.damaged)} damaged"
 
     def to_json(self) -> dict[str, Any]:
         """The document of `verify --json`."""
