@@ -72,31 +72,6 @@ def _measures(task: Task, run: Run | None) -> dict[str, Any] | None:
     }
 
 
-def report_in(
-    workspace: Folder, *, html: bool = False, png: bool = False, rrd: bool = False
-) -> Report:
-    """Reads all that a report shows and writes what was asked for.
-
-    Args:
-        workspace: a damaged or missing file of it is left out, and named in the findings.
-        html: the page, reports/report.html.
-        png: its figures, reports/*.png.
-        rrd: the recording for the Rerun viewer, reports/recording.rrd.
-
-    Raises:
-        GroundedError: if the task can't be built, or a file not be written.
-    """
-    findings = gather(workspace)
-    paths = []
-    if html:
-        paths.append(save_page(workspace, findings))
-    if png:
-        paths += save_pictures(workspace, findings)
-    if rrd:
-        paths.append(save_recording(workspace, findings))
-    return Report(findings, tuple(paths))
-
-
 def save_recording(workspace: Folder, findings: Findings | None = None) -> Path:
     """reports/recording.rrd for the Rerun viewer."""
     from grounded_trials.report.recording.recording import write_recording

@@ -48,13 +48,7 @@ class Exported(Result):
 def export_candidate(
     workspace: Folder, identity: str, form: str | None = None, path: Path | None = None
 ) -> Exported:
-    """Writes a candidate.
-
-    Args:
-        workspace: whose candidate it is.
-        identity: c0003, or `best`.
-        form: csv, json or npz; None: as `path` is named, else json.
-        path: the file; None: IDENTITY.FORM in the current folder.
+    """Writes a candidate, `best` or by its id; without `form` as `path` is named, else as json.
 
     Raises:
         GroundedError: for an unknown candidate or format, or a place that can't be written.
