@@ -10,7 +10,7 @@ from test_next_step import diagnosed
 
 from cli import grounded
 from grounded.errors import GroundedError, NextCommand
-from grounded.result import Result
+from grounded.result import Result, plain
 from grounded_trials import Workspace
 from reported import cart, copied
 from workspaces import make
@@ -81,16 +81,9 @@ def test_the_document_is_the_command_s(cart, tmp_path, monkeypatch, verb, option
     calls = {"report": lambda: w.report(html=True), "export": lambda: w.export("best", "best.csv")}
     found = calls.get(verb, lambda: getattr(w, verb)(*options))()
     assert isinstance(found, Result)
-    assert np_free(found.to_json()) == printed.json
+    assert plain(found.to_json()) == printed.json
     assert repr(found).startswith(f"<{type(found).__name__} ") and len(repr(found)) < 200
     assert "<table>" in found._repr_html_()
-
-
-def np_free(document):
-    """As JSON has it."""
-    from grounded.result import plain
-
-    return plain(document)
 
 
 def test_what_was_changed_on_the_disk_is_seen_by_the_next_call(cart, tmp_path):
