@@ -9,7 +9,6 @@ import click
 
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
 from grounded_cli.terminal import field, number, progress, show, show_json, sparkline, table
-from grounded_trials.wording import verdict
 
 if TYPE_CHECKING:
     from grounded.search.standing import Standing, Tried
@@ -37,6 +36,7 @@ def command(json_: bool) -> None:
 
 def summary(status: Status) -> str:
     """The history as a table, with a line of bars and how sure the last improvement is."""
+    from grounded.search.standing import last_improvement
     from grounded_trials.report.report_text import spaced
 
     standing, lines = status.standing, []
@@ -51,8 +51,8 @@ def summary(status: Status) -> str:
         best = standing.incumbent
         text = f"{best.candidate.id}, utility {number(best.utility)}{_gained(standing)}"
         lines.append(field("best", text))
-    if status.certainty:
-        lines.append(field("certainty", status.certainty))
+    if certainty := last_improvement(standing.history):
+        lines.append(field("certainty", certainty))
     lines.append(field("phase", f"{standing.phase}: {standing.sentence}"))
     return "\n".join(lines)
 
@@ -81,5 +81,5 @@ def _row(tried: Tried, last: bool) -> tuple[str, ...]:
         number(tried.utility),
         "-" if error != error else f"{error:.2g}",
         str(len(tried.trials)),
-        verdict(tried, last),
+        tried.verdict(last),
     )

@@ -11,7 +11,7 @@ import pytest
 
 from cli import grounded, process
 from grounded_cli import completion
-from grounded_cli.main import COMMANDS
+from grounded_cli.main import COMMANDS, cli
 from reported import cart
 
 __all__ = ["cart"]
@@ -31,13 +31,18 @@ def test_commands_and_their_options():
     assert {"--html", "--png", "--rrd"} <= set(_asked("grounded report --"))
 
 
+@pytest.mark.parametrize("words", ["grounded -C {} export ", "grounded export -C {} "])
+def test_names_of_the_workspace_that_is_named(cart, words):
+    assert {"best", "c0001"} <= set(_asked(words.format(cart)))
+
+
 def _context(folder) -> click.Context:
-    return click.Context(click.Command("export"), info_name="export", obj=None)
+    """As the shell's TAB key makes it, with -C before the command."""
+    return cli.make_context("grounded", ["-C", str(folder), "export"], resilient_parsing=True)
 
 
 def test_candidates_trials_and_effects(cart, tmp_path):
     ctx = _context(cart)
-    ctx.params["folder"] = str(cart)
     param = click.Argument(["x"])
 
     def names(items):
@@ -48,7 +53,7 @@ def test_candidates_trials_and_effects(cart, tmp_path):
     assert names(completion.trials(ctx, param, "t000"))[0] == "t0001"
     assert names(completion.effects(ctx, param, "visc")) == ["viscous_friction:v"]
     assert "car-turn" in names(completion.examples(ctx, param, "car"))
-    ctx.params["folder"] = str(tmp_path)
+    ctx = _context(tmp_path)
     assert names(completion.trials(ctx, param, "")) == []
     assert names(completion.effects(ctx, param, "")) == []
     (tmp_path / "reports").mkdir()

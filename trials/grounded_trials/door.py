@@ -14,10 +14,13 @@ frozen result whose `to_json()` is the document that the command prints with --j
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
-from grounded_trials.workspace.folder import Folder
+from grounded.errors import GroundedError, NextCommand
+from grounded.result import Result
+from grounded_trials.workspace.folder import Folder, Lost
 
 if TYPE_CHECKING:
     from grounded.diagnosis.report import Diagnosis
@@ -31,7 +34,22 @@ if TYPE_CHECKING:
     from grounded_trials.workspace.inspecting import Inspected
     from grounded_trials.workspace.proposing import Proposed, Status
     from grounded_trials.workspace.running import Ran
-    from grounded_trials.workspace.verifying import Verified
+
+
+@dataclass(frozen=True, repr=False)
+class Verified(Result):
+    """How many files were checked, and those that are not what they were."""
+
+    checked: int
+    damaged: tuple[Lost, ...]
+
+    def summary(self) -> str:
+        """How many are good, how many not."""
+        return f"{self.checked} files, {len(self.damaged)} damaged"
+
+    def to_json(self) -> dict[str, Any]:
+        """The document of `verify --json`."""
+        return {"checked": self.checked, "damaged": [vars(one) for one in self.damaged]}
 
 
 class Workspace(Folder):
@@ -85,9 +103,20 @@ class Workspace(Folder):
         Args:
             candidate: c0003, or `best`; None: the outstanding one.
         """
-        from grounded_trials.workspace.running import run_in
+        from grounded_trials.workspace.proposing import candidate_named, standing_in
+        from grounded_trials.workspace.running import run_candidate
 
-        return run_in(self._afresh(), candidate)
+        here = self._afresh()
+        if candidate is None:
+            waiting = standing_in(here).outstanding
+            if waiting is None:
+                raise GroundedError(
+                    "no candidate is waiting to be run: `propose` makes the next one, or says that "
+                    "the search has ended; name a candidate to run it again",
+                    NextCommand("propose"),
+                )
+            candidate = waiting.id
+        return run_candidate(here, candidate_named(here, candidate))
 
     def ingest(
         self, path: str | Path, *, candidate: str | None = None, data: bool = False
@@ -121,9 +150,27 @@ class Workspace(Folder):
             progress: told what is being done.
             each: given every candidate with its trial, once that is stored.
         """
-        from grounded_trials.workspace.learning import learn_in
+        from grounded_trials.workspace.ingest import ingest_log
+        from grounded_trials.workspace.proposing import propose_in, standing_in, status_of
+        from grounded_trials.workspace.running import run_candidate
 
-        return learn_in(self._afresh(), trials, progress=progress, each=each)
+        here, tell, done = self._afresh(), progress or (lambda stage: None), 0
+        while trials is None or done < trials:
+            tell("planning")
+            proposed = propose_in(here)
+            made = proposed.candidate
+            if made is None:
+                return status_of(here, proposed.standing, proposed.proposal.notes)
+            tell(f"running {made.id}")
+            path = run_candidate(here, made.id).trial_file
+            found = ingest_log(here, path, made.id)
+            path.unlink()  # its bytes are in the store now
+            done += 1
+            if each is not None:
+                each(made, found)
+        status = status_of(here, standing_in(here))
+        goes_on = status.standing.phase == "propose"
+        return replace(status, then=NextCommand("learn")) if goes_on else status
 
     def status(self) -> Status:
         """Where the search stands; nothing is written."""
@@ -141,9 +188,15 @@ class Workspace(Folder):
             latency: fit one transport delay of all inputs too.
             apply: write the values to grounded.toml.
         """
-        from grounded_trials.workspace.fitting import fit_in
+        from grounded_trials.workspace.fitting import Fitted, apply_fit, fit_trials
 
-        return fit_in(self._afresh(), params, latency=latency, apply=apply)
+        found = fit_trials(self._afresh(), params, latency=latency)
+        if apply:
+            apply_fit(self, found)
+            self.forget()
+            return Fitted(found, applied=True)
+        chosen = ("--params", ",".join(params)) if params else ()
+        return Fitted(found, False, (*chosen, *["--latency"] * latency, "--apply"))
 
     def diagnose(
         self,
@@ -184,7 +237,9 @@ class Workspace(Folder):
         """
         from grounded_trials.workspace.adopting import adopt_effects
 
-        return adopt_effects(self._afresh(), effects, parameters=parameters)
+        done = adopt_effects(self._afresh(), effects, parameters=parameters)
+        self.forget()
+        return done
 
     def report(self, *, html: bool = False, png: bool = False, rrd: bool = False) -> Report:
         """Utilities, trajectories, bias and gap of all stored trials.
@@ -196,9 +251,17 @@ class Workspace(Folder):
             png: write its figures, reports/*.png.
             rrd: write reports/recording.rrd for the Rerun viewer.
         """
-        from grounded_trials.report.reporting import report_in
+        from grounded_trials.report import reporting
+        from grounded_trials.report.gathering import gather
 
-        return report_in(self._afresh(), html=html, png=png, rrd=rrd)
+        findings, paths = gather(self._afresh()), []
+        if html:
+            paths.append(reporting.save_page(self, findings))
+        if png:
+            paths += reporting.save_pictures(self, findings)
+        if rrd:
+            paths.append(reporting.save_recording(self, findings))
+        return reporting.Report(findings, tuple(paths))
 
     def export(
         self, candidate: str = "best", path: str | Path | None = None, *, form: str | None = None
@@ -216,9 +279,16 @@ class Workspace(Folder):
 
     def verify(self) -> Verified:
         """Checks every stored trial against its hash, every candidate against its checksums."""
-        from grounded_trials.workspace.verifying import verify_in
+        from grounded_trials.store.candidate_file import read_candidate
 
-        return verify_in(self)
+        damaged = [Lost(str(one.path), one.reason) for one in self.store.verify()]
+        candidates = sorted((self.folder / "candidates").glob("*.mcap"))
+        for path in candidates:
+            try:
+                read_candidate(path)
+            except GroundedError as error:
+                damaged.append(Lost(str(path), str(error)))
+        return Verified(len(self.store.list()) + len(candidates), tuple(damaged))
 
     def inspect(self, log: str | Path) -> Inspected:
         """Shows what a log holds, and guesses a [log] table for this workspace's model."""

@@ -29,9 +29,9 @@ class Report(Result):
     findings: Findings
     paths: tuple[Path, ...]
 
-    def __repr__(self) -> str:
-        files = "".join(f", {path}" for path in self.paths)
-        return f"<Report of {len(self.findings.runs)} trials{files}>"
+    def summary(self) -> str:
+        """How much it shows, and its files."""
+        return ", ".join([f"{len(self.findings.runs)} trials", *map(str, self.paths)])
 
     def to_json(self) -> dict[str, Any]:
         """The document of `report --json`, with the figures of the text by state and input."""
@@ -70,31 +70,6 @@ def _measures(task: Task, run: Run | None) -> dict[str, Any] | None:
         name: dict(zip(task.model.state_names, map(float, values), strict=True))
         for name, values in measures.items()
     }
-
-
-def report_in(
-    workspace: Folder, *, html: bool = False, png: bool = False, rrd: bool = False
-) -> Report:
-    """Reads all that a report shows and writes what was asked for.
-
-    Args:
-        workspace: a damaged or missing file of it is left out, and named in the findings.
-        html: the page, reports/report.html.
-        png: its figures, reports/*.png.
-        rrd: the recording for the Rerun viewer, reports/recording.rrd.
-
-    Raises:
-        GroundedError: if the task can't be built, or a file not be written.
-    """
-    findings = gather(workspace)
-    paths = []
-    if html:
-        paths.append(save_page(workspace, findings))
-    if png:
-        paths += save_pictures(workspace, findings)
-    if rrd:
-        paths.append(save_recording(workspace, findings))
-    return Report(findings, tuple(paths))
 
 
 def save_recording(workspace: Folder, findings: Findings | None = None) -> Path:

@@ -2,7 +2,6 @@
 
 Read `folder.py` first (how a folder becomes a task, trials and candidates). `config.py`,
 `task_file.py` and `model_file.py` read what the user wrote; `proposing.py` (status too),
-`running.py`, `ingest.py`, `learning.py`, `fitting.py`, `diagnosing.py`, `adopting.py`,
-`exporting.py`, `inspecting.py` and `verifying.py` are a verb each; `grounded_trials.door` makes
-them the methods of one class.
+`running.py`, `ingest.py`, `fitting.py`, `diagnosing.py`, `adopting.py`, `exporting.py` and
+`inspecting.py` are a verb each; `grounded_trials.door` makes them the methods of one class.
 """

@@ -15,7 +15,7 @@ from typing import Any
 
 from grounded.diagnosis.report import Diagnosis
 from grounded.errors import GroundedError, NextCommand, nearest
-from grounded.result import Document
+from grounded.result import Result
 from grounded.search.planner import Planner
 from grounded_trials.workspace.config import set_in_model
 from grounded_trials.workspace.diagnosing import read_diagnosis
@@ -25,18 +25,23 @@ Effect = dict[str, Any]  # {"name": "dead_zone:throttle", "c": 0.146}
 AGAIN, PROPOSE = NextCommand("diagnose"), NextCommand("propose")
 
 
-@dataclass(frozen=True, eq=False)
-class Adopted(Document):
+@dataclass(frozen=True, repr=False)
+class Adopted(Result):
     """What the model has now."""
 
     effects: tuple[Mapping[str, Any], ...]  # all that are adopted
     params: Mapping[str, float]  # of the model, written with them
     claimed: bool  # the diagnosis claims the new ones; else one was taken by itself
+    then: NextCommand = PROPOSE
 
-    @property
-    def then(self) -> NextCommand:
-        """The search goes on with the better model."""
-        return PROPOSE
+    def summary(self) -> str:
+        """The effects that the model has now."""
+        return ", ".join(str(effect["name"]) for effect in self.effects)
+
+    def to_json(self) -> dict[str, Any]:
+        """The document of `adopt --json`."""
+        effects = [dict(effect) for effect in self.effects]
+        return {"effects": effects, "params": dict(self.params), "claimed": self.claimed}
 
 
 def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool = True) -> Adopted:

@@ -28,13 +28,17 @@ from grounded_trials.workspace.proposing import candidate_named
 LAW = "u_t = clip(feedforward_t + gain_t (z - reference_t), low, high); z = [state, past inputs]"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Exported(Result):
     """A candidate's file for other languages."""
 
     candidate: str
     file: Path
     format: str
+
+    def summary(self) -> str:
+        """The candidate and its file."""
+        return f"{self.candidate}: {self.file}"
 
     def to_json(self) -> dict[str, Any]:
         """The document of `export --json`."""
@@ -44,13 +48,7 @@ class Exported(Result):
 def export_candidate(
     workspace: Folder, identity: str, form: str | None = None, path: Path | None = None
 ) -> Exported:
-    """Writes a candidate.
-
-    Args:
-        workspace: whose candidate it is.
-        identity: c0003, or `best`.
-        form: csv, json or npz; None: as `path` is named, else json.
-        path: the file; None: IDENTITY.FORM in the current folder.
+    """Writes a candidate, `best` or by its id; without `form` as `path` is named, else as json.
 
     Raises:
         GroundedError: for an unknown candidate or format, or a place that can't be written.

@@ -24,11 +24,16 @@ class Fitted(Result):
 
     fit: Fit
     applied: bool
-    then: NextCommand
+    asked: tuple[str, ...] = ()  # the options of the command that fits the same again
 
-    def __repr__(self) -> str:
-        values = ", ".join(f"{name} = {e.value:.4g}" for name, e in self.fit.params.items())
-        return f"<Fitted {values}>"
+    @property
+    def then(self) -> NextCommand:
+        """Write the values to grounded.toml, or go on with those that were written."""
+        return NextCommand("propose" if self.applied else "fit", self.asked)
+
+    def summary(self) -> str:
+        """The values."""
+        return ", ".join(f"{name} = {e.value:.4g}" for name, e in self.fit.params.items())
 
     def to_json(self) -> dict[str, Any]:
         """The document of `fit --json`: values, intervals, held-out prediction errors."""
@@ -49,33 +54,6 @@ class Fitted(Result):
                     "ahead": dict(zip(error.names, error.ahead.tolist(), strict=True)),
                 }
         return document
-
-
-def fit_in(
-    workspace: Folder,
-    params: Sequence[str] | None = None,
-    *,
-    latency: bool = False,
-    apply: bool = False,
-) -> Fitted:
-    """Fits the model's parameters to all trials.
-
-    Args:
-        workspace: whose trials are used.
-        params: only these; None: all of them.
-        latency: fit one transport delay of all inputs too.
-        apply: write the values to grounded.toml.
-
-    Raises:
-        GroundedError: for an unknown parameter, or where there is no trial to learn from.
-    """
-    found = fit_trials(workspace, params, latency=latency)
-    if apply:
-        apply_fit(workspace, found)
-        return Fitted(found, True, NextCommand("propose"))
-    chosen = ("--params", ",".join(params)) if params else ()
-    again = (*chosen, *["--latency"] * latency, "--apply")
-    return Fitted(found, False, NextCommand("fit", again))
 
 
 def usable_trials(workspace: Folder) -> list[Trial]:

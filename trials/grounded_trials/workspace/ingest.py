@@ -23,8 +23,8 @@ from grounded_trials.logs.log_files import kind_of, log_files, open_log
 from grounded_trials.logs.log_table import log_mapping, read_log
 from grounded_trials.logs.signal_report import SignalReport
 from grounded_trials.store.own_files import CANDIDATE, FILE_LIMIT, TRIAL, read_file
+from grounded_trials.store.store import hash_file
 from grounded_trials.store.trial_file import read_trial, trial_bytes
-from grounded_trials.wording import verdict
 from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.proposing import standing_in
@@ -51,9 +51,9 @@ class Ingested(Result):
         after_run = "diagnose" if self.verdict == "probe" else "propose"
         return NextCommand(after_run if self.candidate else "fit")
 
-    def __repr__(self) -> str:
-        ran = f"{self.candidate}, {self.verdict}" if self.candidate else "data"
-        return f"<Ingested {self.trial}: {ran}>"
+    def summary(self) -> str:
+        """The trial, what it ran and what became of that."""
+        return f"{self.trial}: {f'{self.candidate}, {self.verdict}' if self.candidate else 'data'}"
 
     def to_json(self) -> dict[str, Any]:
         """Its entry in `ingest --json`; a failed run's utility is null and `failed` true."""
@@ -123,7 +123,7 @@ def _verdict(trial: Trial, tried: Tried | None, repeats: int) -> str:
     if tried is None:
         return "probe" if trial.candidate else ""
     ran = [one.id for one in tried.trials[:repeats]]
-    return "run again" if tried.accepted and trial.id not in ran else verdict(tried)
+    return "run again" if tried.accepted and trial.id not in ran else tried.verdict()
 
 
 def _tried(workspace: Folder, trial: Trial) -> Tried | None:
@@ -161,25 +161,19 @@ def _own(workspace: Folder, path: Path, candidate: str | None, data: bool) -> _R
         }
         about |= {"kind": "data", "ran": trial.candidate}
         trial = replace(trial, candidate="")
-        return _Read(trial, _encode(workspace, trial, about, None))
+        return _Read(trial, _encode(workspace, trial, about))
     if candidate is not None and trial.candidate not in ("", candidate):
         raise GroundedError(f"{path} says that it ran {trial.candidate}, not {candidate}")
-    if not trial.candidate:
-        return _claimed(workspace, path, trial, candidate)
-    _check_candidate(workspace, path, trial.candidate, meta.get("task", ""), policy)
-    return _Read(trial, content)
-
-
-def _claimed(workspace: Folder, path: Path, trial: Trial, candidate: str | None) -> _Read:
-    """A trial of ours that doesn't say what it ran."""
-    chosen = candidate or _outstanding(workspace, path)
-    trial = replace(trial, candidate=chosen)
-    _check_candidate(workspace, path, chosen, "", None)
-    return _Read(trial, _encode(workspace, trial, _about(workspace, chosen), chosen))
+    if trial.candidate:
+        _check_candidate(workspace, path, trial.candidate, meta.get("task", ""), policy)
+        return _Read(trial, content)
+    trial = replace(trial, candidate=candidate or _outstanding(workspace, path))
+    _check_candidate(workspace, path, trial.candidate)
+    return _Read(trial, _encode(workspace, trial, _about(workspace, trial.candidate)))
 
 
 def _check_candidate(
-    workspace: Folder, path: Path, candidate: str, task: str, policy: bytes | None
+    workspace: Folder, path: Path, candidate: str, task: str = "", policy: bytes | None = None
 ) -> None:
     """The candidate must be one of this workspace and task, the policy the one in its file."""
     if candidate not in workspace.candidate_ids():
@@ -256,8 +250,8 @@ def _foreign(workspace: Folder, path: Path, candidate: str | None, data: bool) -
     if estimated:
         about["estimated"] = ",".join(estimated)
     if chosen:
-        _check_candidate(workspace, path, chosen, "", None)
-    encoded = _encode(workspace, trial, about, chosen, found.start_ns)
+        _check_candidate(workspace, path, chosen)
+    encoded = _encode(workspace, trial, about, found.start_ns)
     return _Read(trial, encoded, found.warnings, found.reports)
 
 
@@ -272,10 +266,7 @@ def _check_is_log(path: Path, files: Sequence[Path]) -> None:
 
 def _hashed(files: Sequence[Path]) -> str:
     """SHA-256 over a log's files, or over their hashes when there are several."""
-    hashes = []
-    for file in files:
-        with file.open("rb") as stream:
-            hashes.append(hashlib.file_digest(stream, "sha256").hexdigest())
+    hashes = [hash_file(file) for file in files]
     joined = "".join(hashes).encode()
     return hashes[0] if len(hashes) == 1 else hashlib.sha256(joined).hexdigest()
 
@@ -300,17 +291,11 @@ def _about(workspace: Folder, candidate: str) -> dict[str, str]:
     }
 
 
-def _encode(
-    workspace: Folder,
-    trial: Trial,
-    about: dict[str, str],
-    candidate: str | None,
-    start_ns: int = 0,
-) -> bytes:
+def _encode(workspace: Folder, trial: Trial, about: dict[str, str], start_ns: int = 0) -> bytes:
     return trial_bytes(
         trial,
         about,
-        workspace.candidate_bytes(candidate) if candidate else None,
+        workspace.candidate_bytes(trial.candidate) if trial.candidate else None,
         state_units=dict(workspace.base_model.states),
         input_units=dict(workspace.base_model.inputs),
         start_ns=start_ns,

@@ -46,8 +46,9 @@ class Inspected(Result):
         ready = self.format == TRIAL or self.log_table
         return NextCommand("ingest" if ready else "inspect", (self.log,))
 
-    def __repr__(self) -> str:
-        return f"<Inspected {self.log}: {self.report.messages} messages>"
+    def summary(self) -> str:
+        """The log and its size."""
+        return f"{self.log}: {self.report.messages} messages"
 
     def to_json(self) -> dict[str, Any]:
         """The document of `inspect --json`."""

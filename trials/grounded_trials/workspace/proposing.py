@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result
-from grounded_trials.wording import figure, verdict
 from grounded_trials.workspace.folder import Contents, Folder
 
 if TYPE_CHECKING:
@@ -39,36 +38,13 @@ class Proposed(Result):
         """Where the search stands."""
         return self.proposal.standing
 
-    def __repr__(self) -> str:
-        if self.candidate is None:
-            return f"<Proposed nothing: {self.standing.sentence}>"
-        predicted = figure(self.candidate.predicted_utility)
-        return f"<Proposed {self.candidate.id}, predicted utility {predicted}>"
+    def summary(self) -> str:
+        """The candidate, or the end of the search."""
+        return self.proposal.summary()
 
     def to_json(self) -> dict[str, Any]:
         """The document of `propose --json`; candidate is null when the search has ended."""
-        standing, candidate = self.standing, self.candidate
-        document: dict[str, Any] = {
-            "candidate": None,
-            "file": None,
-            "iteration": standing.iteration,
-            "alpha": None,
-            "predicted_utility": None,
-            "phase": "await-trial" if candidate is not None else standing.phase,
-            "sentence": standing.sentence,
-            "notes": list(self.proposal.notes),
-        }
-        if candidate is not None:
-            document |= {
-                "candidate": candidate.id,
-                "file": str(self.file),
-                "iteration": candidate.iteration,
-                "alpha": candidate.alpha,
-                "predicted_utility": candidate.predicted_utility,
-                "best_utility": standing.incumbent.utility if standing.incumbent else None,
-                "new": self.proposal.is_new,
-            }
-        return document
+        return self.proposal.to_json() | {"file": str(self.file) if self.file else None}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -80,48 +56,13 @@ class Status(Result):
     outdated: str = ""  # why the last diagnosis is not the last word
     notes: tuple[str, ...] = ()  # of the search, where it has ended
 
-    @property
-    def certainty(self) -> str:
-        """Whether the last improvement exceeds the noise of the utility, as a sentence."""
-        from grounded.search.standing import last_improvement
-
-        return last_improvement(self.standing.history)
-
-    def __repr__(self) -> str:
-        best = self.standing.incumbent
-        so_far = f"best {best.candidate.id} {figure(best.utility)}, " if best else ""
-        return f"<Status {self.standing.phase}, {so_far}{self.standing.trials} trials>"
+    def summary(self) -> str:
+        """The phase and the best candidate."""
+        return self.standing.summary()
 
     def to_json(self) -> dict[str, Any]:
         """The document of `status --json`, the whole history in it."""
-        standing = self.standing
-        best, waiting = standing.incumbent, standing.outstanding
-        return {
-            "phase": standing.phase,
-            "iteration": standing.iteration,
-            "best": {"candidate": best.candidate.id, "utility": best.utility} if best else None,
-            "utilities": standing.utilities,
-            "trials": standing.trials,
-            "outstanding": waiting.id if waiting else None,
-            "missing": standing.missing,
-            "sentence": standing.sentence,
-            "certainty": self.certainty,
-            "history": [
-                {
-                    "candidate": t.candidate.id,
-                    "iteration": t.candidate.iteration,
-                    "alpha": t.candidate.alpha,
-                    "base": t.candidate.base or None,
-                    "predicted_utility": t.candidate.predicted_utility,
-                    "utility": t.utility,
-                    "standard_error": t.standard_error,
-                    "trials": [trial.id for trial in t.trials],
-                    "accepted": t.accepted,
-                    "verdict": verdict(t, t is standing.history[-1]),
-                }
-                for t in standing.history
-            ],
-        }
+        return self.standing.to_json()
 
 
 def propose_in(workspace: Folder) -> Proposed:

@@ -25,7 +25,6 @@ from grounded.trial import Trial
 from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.model_file import load_module, model_in
-from grounded_trials.workspace.proposing import candidate_named, standing_in
 
 TRIALS = 30  # of the search for the optimum
 
@@ -42,35 +41,17 @@ class Ran(Result):
         """Take the trial in."""
         return NextCommand("ingest", (str(self.trial_file),))
 
-    def __repr__(self) -> str:
-        return f"<Ran {self.candidate}: {self.trial_file}>"
+    def summary(self) -> str:
+        """What was run, and where its trial is."""
+        return f"{self.candidate}: {self.trial_file}"
 
     def to_json(self) -> dict[str, Any]:
         """The document of `run --json`."""
         return {"trial_file": str(self.trial_file), "candidate": self.candidate}
 
 
-def run_in(workspace: Folder, candidate: str | None = None) -> Ran:
-    """Runs the outstanding candidate, or the named one; `best` is the best one so far.
-
-    Raises:
-        GroundedError: if none is waiting or there is none of that name, and as `run_candidate`.
-    """
-    if candidate is None:
-        waiting = standing_in(workspace).outstanding
-        if waiting is None:
-            raise GroundedError(
-                "no candidate is waiting to be run: `propose` makes the next one, or says that the "
-                "search has ended; name a candidate to run it again",
-                NextCommand("propose"),
-            )
-        candidate = waiting.id
-    candidate = candidate_named(workspace, candidate)
-    return Ran(candidate, run_candidate(workspace, candidate))
-
-
-def run_candidate(workspace: Folder, identity: str) -> Path:
-    """Runs a candidate once and returns the new trial file, runs/cNNNN-K.mcap.
+def run_candidate(workspace: Folder, identity: str) -> Ran:
+    """Runs a candidate once; its trial file is runs/cNNNN-K.mcap.
 
     Raises:
         GroundedError: if no system is configured, it failed, or it wrote no trial.
@@ -89,7 +70,7 @@ def run_candidate(workspace: Folder, identity: str) -> Path:
             'give [system] command = "python drive.py {candidate} {trial}"',
             NextCommand("ingest", ("TRIAL.mcap",)),
         )
-    return path
+    return Ran(identity, path)
 
 
 def simulated_plant(workspace: Folder) -> Plant:
