@@ -1,8 +1,8 @@
 """Functions of m inputs: a factor of the free ones, and the box-limited quadratic programme.
 
-The compiled twin of `interpreted.box_qp`; the same steps in the same order. Everything is written out for m
-inputs, in small arrays: H [m][m] = L D L', 1/D in `inv`, and `free`, 1 for an input that no bound
-holds back, else 0.
+The compiled twin of `interpreted.box_qp`; the same steps in the same order. Everything is written
+out for m inputs, in small arrays: H [m][m] = L D L', 1/D in `inv`, and `free`, 1 for an input that
+no bound holds back, else 0.
 """
 
 from __future__ import annotations
