@@ -9,12 +9,11 @@ from __future__ import annotations
 import struct
 import sys
 import tempfile
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
+from peer_data import fastest
 
 from grounded_trials.logs.signals import SignalSpec, read_signals
 
@@ -58,13 +57,6 @@ def write(path: Path, count: int, *, chunked: bool) -> None:
         writer.finish()
 
 
-def cpu(run: Callable[[], None]) -> float:
-    """CPU seconds of one run."""
-    start = time.process_time()
-    run()
-    return time.process_time() - start
-
-
 def one_by_one(path: Path) -> None:
     """The decoder of the mcap project."""
     from mcap_ros2.decoder import DecoderFactory
@@ -92,14 +84,14 @@ def main() -> None:
             path = Path(folder, "log.mcap")
             write(path, count, chunked=chunked)
             specs = {name: SignalSpec(text) for name, text in PATHS.items()}
-            took = cpu(lambda path=path, specs=specs: read_signals(path, specs))  # type: ignore[misc]
+            took = fastest(lambda path=path, specs=specs: read_signals(path, specs), 1)  # type: ignore[misc]
             size = path.stat().st_size / 1e6
             how = "zstd chunks" if chunked else "no chunks"
             print(f"{count} messages, {how}, {size:.0f} MB: 4 signals in {took:.2f} s")
         write(path, count // 20, chunked=True)
         for name, run in (("mcap-ros2-support", one_by_one), ("rosbags", with_rosbags)):
             try:
-                took = 20 * cpu(lambda run=run, path=path: run(path))  # type: ignore[misc]
+                took = 20 * fastest(lambda run=run, path=path: run(path), 1)  # type: ignore[misc]
             except ImportError:
                 continue
             print(f"{name}, one by one: {took:.1f} s (scaled)")

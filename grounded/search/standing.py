@@ -220,9 +220,6 @@ def standing(
     """
     history, incumbent, iteration = _judge(task, candidates, trials, options, model)
     total = sum(len(t.trials) for t in history)
-    last = history[-1] if history else None
-    doubt = next((t for t in history if t.in_doubt), None)
-
     now = Standing(
         phase="propose",
         iteration=iteration,
@@ -235,25 +232,8 @@ def standing(
         trials=total,
         sentence="the model's own policy comes first",
     )
-    if doubt is not None and incumbent is not None:
-        own = incumbent.candidate.id
-        return replace(
-            now,
-            phase="await-trial",
-            outstanding=incumbent.candidate,
-            missing=1,
-            sentence=f"{doubt.candidate.id} lost to {own} by less than luck may do: {own} is "
-            "waiting for another trial",
-        )
-    if last is not None and last.accepted is None and last.candidate.model == model:
-        missing = options.repeats - len(last.trials)
-        return replace(
-            now,
-            phase="await-trial",
-            outstanding=last.candidate,
-            missing=missing,
-            sentence=f"{last.candidate.id} is waiting for {missing} trial{'s' * (missing > 1)}",
-        )
+    if (awaited := _awaited(now, options, model)) is not None:
+        return awaited
     if total + options.repeats > options.max_trials:
         used = "all" if total >= options.max_trials else f"{total} of"
         needs = f"; a candidate needs {options.repeats}" * (total < options.max_trials)
@@ -277,6 +257,24 @@ def standing(
         )
         return replace(now, phase="converged", sentence=sentence)
     return replace(now, step=step, sentence=f"improve on {own} with alpha = {step.alpha:g}")
+
+
+def _awaited(now: Standing, options: SearchOptions, model: str) -> Standing | None:
+    """The same, waiting for a trial; None where every candidate has its trials."""
+    last = now.history[-1] if now.history else None
+    doubt = next((t for t in now.history if t.in_doubt), None)
+    if doubt is not None and now.incumbent is not None:
+        made, missing = now.incumbent.candidate, 1
+        sentence = (
+            f"{doubt.candidate.id} lost to {made.id} by less than luck may do: {made.id} is "
+            "waiting for another trial"
+        )
+    elif last is not None and last.accepted is None and last.candidate.model == model:
+        made, missing = last.candidate, options.repeats - len(last.trials)
+        sentence = f"{made.id} is waiting for {missing} trial{'s' * (missing > 1)}"
+    else:
+        return None
+    return replace(now, phase="await-trial", outstanding=made, missing=missing, sentence=sentence)
 
 
 def _next_step(

@@ -15,13 +15,7 @@ import numpy as np
 from grounded.compile import Problem
 from grounded.compile.run.differenced import RELATIVE_STEP, DifferencedSystem
 from grounded.compile.run.interpreted import trajectory_cost
-from grounded.compile.trace.tracing import (
-    Signature,
-    Variant,
-    leaves_of,
-    trace,
-    values_and_jacobian,
-)
+from grounded.compile.trace.tracing import Signature, Variant, trace
 from grounded.frozen import Array
 from grounded.rollout import Rollout
 from grounded.solve.policy_gradient import adjoint, best_length, free_inputs, linearised
@@ -69,16 +63,14 @@ class ParametricPolicy:
         """U (N, m) at x (N, n), times t (N,) [s], theta (k,)."""
         if self._variant is None:
             return self._plain.evaluate(x, t[:, None], theta, NO_STEP, 0.0)
-        values = self._variant.values(leaves_of(x, t[:, None], theta, NO_STEP), 0.0)
-        return np.stack([np.broadcast_to(v, len(x)) for v in values], axis=1)
+        return self._variant.values(x, t[:, None], theta, NO_STEP, 0.0)
 
     def derivatives(self, x: Array, t: Array, theta: Array) -> tuple[Array, Array]:
         """pi_x (N, m, n) and pi_theta (N, m, k)."""
         if self._variant is None:
             return self._differenced(x, t, theta)
-        leaves = leaves_of(x, t[:, None], theta, NO_STEP)
         width = self.n + 1 + self.k
-        _, J = values_and_jacobian(self._variant.full, leaves, 0.0, len(x), width)
+        _, J = self._variant.linearised(x, t[:, None], theta, NO_STEP, 0.0, width)
         return J[:, :, : self.n], J[:, :, self.n + 1 :]
 
     def _differenced(self, x: Array, t: Array, theta: Array) -> tuple[Array, Array]:

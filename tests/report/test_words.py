@@ -1,6 +1,4 @@
-"""Numbers, units and verdicts as people read them."""
-
-from types import SimpleNamespace
+"""Numbers and units as people read them."""
 
 import pytest
 
@@ -10,7 +8,6 @@ from grounded_trials.wording import (
     per_second,
     percent,
     shown,
-    verdict,
     with_unit,
 )
 
@@ -42,24 +39,3 @@ def test_the_unit_one_is_not_printed():
 )
 def test_a_share_keeps_its_tenths_where_they_matter(share, text):
     assert percent(share) == text
-
-
-@pytest.mark.parametrize(
-    ("accepted", "base", "doubt", "trials", "last", "word"),
-    [
-        (True, "", False, 1, True, "first"),
-        (True, "c0001", False, 1, False, "better"),
-        (False, "c0001", False, 1, False, "no better"),
-        (False, "", False, 1, False, "no better"),
-        (None, "c0001", True, 1, True, "in doubt"),
-        (None, "c0001", False, 0, True, "waiting"),
-        (None, "c0001", False, 1, False, "waiting"),
-        (None, "c0001", False, 0, False, "no trial"),
-    ],
-)
-def test_a_verdict_is_one_of_a_few_words(accepted, base, doubt, trials, last, word):
-    candidate = SimpleNamespace(base=base)
-    tried = SimpleNamespace(
-        accepted=accepted, candidate=candidate, in_doubt=doubt, trials=(None,) * trials
-    )
-    assert verdict(tried, last) == word

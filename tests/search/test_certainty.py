@@ -1,4 +1,4 @@
-"""How sure an improvement is, in a sentence."""
+"""How sure an improvement is, in a sentence; what became of a candidate, in a word."""
 
 import numpy as np
 import pytest

@@ -111,15 +111,10 @@ class Kernels:
 
     def _batch_text(self) -> str:
         d, width = self.dynamics, jit.lanes()
-        kernels = (
-            jacobian_function(d, width) + linearise_kernel(d, width, 0) + step_kernel(d, width)
-        )
-        return _start_of_module(d, width) + kernels
+        return _linearise_text(d, width, 0) + step_kernel(d, width)
 
     def _full_text(self) -> str:
-        d, width = self._dynamics(sum(self.sizes)), jit.lanes()
-        kernels = jacobian_function(d, width) + linearise_kernel(d, width, self.sizes[2])
-        return _start_of_module(d, width) + kernels
+        return _linearise_text(self._dynamics(sum(self.sizes)), jit.lanes(), self.sizes[2])
 
     def _search_text(self, layout: Layout) -> str:
         d, width = self.dynamics, jit.lanes()
@@ -132,6 +127,11 @@ class Kernels:
 
 def _start_of_module(d: Dynamics, width: int) -> str:
     return declarations({width, LANES}) + stage_tables(d) + d.uniforms.function()
+
+
+def _linearise_text(d: Dynamics, width: int, k: int) -> str:
+    kernels = jacobian_function(d, width) + linearise_kernel(d, width, k)
+    return _start_of_module(d, width) + kernels
 
 
 class CompiledSystem(TracedSystem):

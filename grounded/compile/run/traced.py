@@ -15,15 +15,7 @@ import numpy as np
 from grounded.compile.problem import STAGES, Integrator
 from grounded.compile.run.differenced import DifferencedSystem
 from grounded.compile.run.interpreted import Interpreted
-from grounded.compile.trace.graph import Program
-from grounded.compile.trace.tracing import (
-    Signature,
-    Trace,
-    Variant,
-    leaves_of,
-    trace,
-    values_and_jacobian,
-)
+from grounded.compile.trace.tracing import Signature, Trace, Variant, trace
 from grounded.errors import GroundedError
 from grounded.frozen import Array
 
@@ -60,8 +52,7 @@ class TracedSystem(Interpreted):
 
     def evaluate(self, x: Array, u: Array, p: Array, dt: float, smoothing: float) -> Array:
         """The graph at N samples."""
-        values = self.variant(p, dt).values(leaves_of(x, u, p, dt), smoothing)
-        return np.stack([np.broadcast_to(v, len(x)) for v in values], axis=1)
+        return self.variant(p, dt).values(x, u, p, dt, smoothing)
 
     def check(self, x: Array, u: Array, p: Array, dt: float) -> None:
         """See `System.check`."""
@@ -85,34 +76,26 @@ class TracedSystem(Interpreted):
         self, x: Array, u: Array, p: Array, dt: float, smoothing: float, width: int
     ) -> Array:
         """See `Interpreted.jacobian`; exact."""
-        J, variant = np.empty((len(x), self.n, width)), self.variant(p, dt)
-        program = variant.small if width == self.n + self.m else variant.full
+        J = np.empty((len(x), self.n, width))
         for at in range(0, len(x), CHUNK):
             some = slice(at, at + CHUNK)
             with np.errstate(all="ignore"):
-                J[some] = self._chain(program, x[some], u[some], p, dt, smoothing, width)
+                J[some] = self._chain(x[some], u[some], p, dt, smoothing, width)
         return J
 
     def _chain(
-        self,
-        program: tuple[Program, list[tuple[int, int]]],
-        x: Array,
-        u: Array,
-        p: Array,
-        dt: float,
-        smoothing: float,
-        width: int,
+        self, x: Array, u: Array, p: Array, dt: float, smoothing: float, width: int
     ) -> Array:
+        variant = self.variant(p, dt)
         if self.kind == "step":
-            return values_and_jacobian(program, leaves_of(x, u, p, dt), smoothing, len(x), width)[1]
+            return variant.linearised(x, u, p, dt, smoothing, width)[1]
         identity = np.eye(self.n, width)
         k, K = np.zeros_like(x), np.zeros((len(x), self.n, width))
         total = np.zeros_like(K)
         for c, b in STAGES[self.integrator]:
-            leaves = leaves_of(x + c * dt * k, u, p, dt)
-            k, K_own = values_and_jacobian(program, leaves, smoothing, len(x), width)
+            k, own = variant.linearised(x + c * dt * k, u, p, dt, smoothing, width)
             T = identity + c * dt * K
-            K = K_own[:, :, : self.n] @ T
-            K[:, :, self.n :] += K_own[:, :, self.n :]
+            K = own[:, :, : self.n] @ T
+            K[:, :, self.n :] += own[:, :, self.n :]
             total = total + b * K
         return np.asarray(identity + dt * total)

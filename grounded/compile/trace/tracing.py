@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -137,21 +136,12 @@ def _uniform(p: Array, dt: float) -> dict[tuple[str, int], Any]:
     return {("d", 0): dt} | {("p", i): value for i, value in enumerate(p)}
 
 
-def leaves_of(
-    x: Array, u: Array, p: Sequence[float] | Array, dt: float
-) -> dict[tuple[str, int], Any]:
-    """Leaf values of N samples: x (N, n), u (N, m), p (k,)."""
-    values: dict[tuple[str, int], Any] = _uniform(p, dt)  # type: ignore[arg-type]
-    values |= {("x", i): x[:, i] for i in range(x.shape[1])}
-    return values | {("u", j): u[:, j] for j in range(u.shape[1])}
-
-
 class Variant:
-    """One trace; its derivatives and the programs made of them, when they are asked for."""
+    """One trace as a function of arrays; its derivatives are made when they are asked for."""
 
     def __init__(self, found: Trace, sizes: tuple[int, int, int]) -> None:
         self.trace, self.sizes = found, sizes
-        self.values = Program(found.graph, found.outputs)
+        self._programs: dict[int, tuple[Program, list[tuple[int, int]]]] = {}
 
     def entries(self, width: int) -> list[tuple[int, int, int]]:
         """(row, column, node) of the non-zero derivatives by the first `width` of x, u, p."""
@@ -164,39 +154,29 @@ class Variant:
         rows = jacobian(graph, self.trace.outputs, variables)
         return sorted((r, column[v], i) for r, row in enumerate(rows) for v, i in row.items())
 
-    @cached_property
-    def small(self) -> tuple[Program, list[tuple[int, int]]]:
-        """Values and derivatives by state and input."""
-        return self._program(self.sizes[0] + self.sizes[1])
-
-    @cached_property
-    def full(self) -> tuple[Program, list[tuple[int, int]]]:
-        """Values and derivatives by state, input and parameter."""
-        return self._program(sum(self.sizes))
-
     def operations(self) -> int:
         """Nodes of the values and of their derivatives by state and input."""
         entries = self.entries(self.sizes[0] + self.sizes[1])
         return len(self.trace.graph.live([*self.trace.outputs, *(i for _, _, i in entries)]))
 
-    def _program(self, width: int) -> tuple[Program, list[tuple[int, int]]]:
-        entries = self.entries(width)
-        outputs = [*self.trace.outputs, *(i for _, _, i in entries)]
-        return Program(self.trace.graph, outputs), [(r, c) for r, c, _ in entries]
+    def values(self, x: Array, u: Array, p: Array, dt: float, smoothing: float) -> Array:
+        """The r outputs at N samples x (N, n), u (N, m): (N, r)."""
+        return self.linearised(x, u, p, dt, smoothing, 0)[0]
 
-
-def values_and_jacobian(
-    program: tuple[Program, list[tuple[int, int]]],
-    leaves: Mapping[tuple[str, int], Any],
-    smoothing: float,
-    N: int,
-    width: int,
-) -> tuple[Array, Array]:
-    """The r outputs (N, r) and their Jacobian (N, r, width) at N samples."""
-    run, places = program
-    found = run(leaves, smoothing)
-    values = found[: len(found) - len(places)]
-    J = np.zeros((N, len(values), width))
-    for (r, c), value in zip(places, found[len(values) :], strict=True):
-        J[:, r, c] = value
-    return np.stack([np.broadcast_to(v, N) for v in values], axis=1), J
+    def linearised(
+        self, x: Array, u: Array, p: Array, dt: float, smoothing: float, width: int
+    ) -> tuple[Array, Array]:
+        """The outputs (N, r), and their Jacobian by the first `width` of x, u, p (N, r, width)."""
+        if width not in self._programs:
+            entries = self.entries(width) if width else []
+            outputs = [*self.trace.outputs, *(i for _, _, i in entries)]
+            program = Program(self.trace.graph, outputs)
+            self._programs[width] = program, [(r, c) for r, c, _ in entries]
+        run, places = self._programs[width]
+        leaves = _uniform(p, dt) | {("x", i): column for i, column in enumerate(x.T)}
+        found = run(leaves | {("u", j): column for j, column in enumerate(u.T)}, smoothing)
+        values = found[: len(found) - len(places)]
+        J = np.zeros((len(x), len(values), width))
+        for (r, c), value in zip(places, found[len(values) :], strict=True):
+            J[:, r, c] = value
+        return np.stack([np.broadcast_to(v, len(x)) for v in values], axis=1), J
