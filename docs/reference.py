@@ -43,7 +43,7 @@ def modules(room: str) -> list[str]:
 def purpose(room: str) -> str:
     """What the docstring of a room says; its lines `name   what it is` become a list."""
     text = inspect.getdoc(import_module(room)) or ""
-    listed = re.sub(r"^ *(\S+(?:, \S+)*) {2,}(.+)$", r"- `\1`: \2", text, flags=re.M)
+    listed = re.sub(r"^([\w./]+(?:, [\w./]+)*) {2,}(.+)$", r"- `\1`: \2", text, flags=re.M)
     return re.sub(r"^(?!- )(.+)\n(?=- )", r"\1\n\n", listed, flags=re.M)
 
 
