@@ -16,7 +16,7 @@ from grounded.diagnosis.claims import loss
 from grounded.diagnosis.data import prepare, shifted
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.excitation import probe
-from grounded.diagnosis.leftover import chi2_tail
+from grounded.diagnosis.leftover import whiteness
 from grounded.diagnosis.prediction_error import _stump
 from grounded.diagnosis.report import Estimate, Remainder
 from grounded.diagnosis.verdict import meaning, sentence, verdict
@@ -142,8 +142,11 @@ def test_a_delay_of_any_fraction():
     np.testing.assert_allclose(shifted(u, np.zeros(1), 1.25)[0], [0, 0.75, 1.75, 2.75, 3.75])
 
 
-def test_chi_square_tail():
-    assert chi2_tail(18.31, 10) == pytest.approx(0.05, abs=0.002)
+def test_whiteness_is_the_chance_that_white_noise_is_as_correlated():
+    white = np.random.default_rng(0).standard_normal((200, 5, 2))
+    white[1:, :, 1] += 0.3 * white[:-1, :, 1]
+    found = whiteness(SimpleNamespace(white=white), np.ones((201, 5, 2)))
+    assert 0.01 < found["0"] <= 1 and found["1"] < 1e-6
 
 
 @pytest.mark.parametrize(
