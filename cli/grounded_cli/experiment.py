@@ -59,7 +59,7 @@ def command(
         show("\n".join(f"{key:15} {text}" for key, (_, _, _, text) in STUDIES.items()))
         return
     from grounded.experiments.jobs import Engine
-    from grounded_trials.store.study_store import StudyStore
+    from grounded_trials.store.store import StudyStore
 
     where = Engine(jobs=jobs, name=engine, address=address)
     module, function, kind, _ = STUDIES[name]
