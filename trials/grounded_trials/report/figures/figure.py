@@ -1,8 +1,9 @@
-"""Figures: what is drawn, before it is known how: a page and a picture show the same ones.
+"""Figures as plain values: what is drawn, before it is known how.
 
-A figure is a title, a caption and panels; a panel has axes and what lies in them. `figures_draw`
-turns a panel into shapes at places, `figures_svg` and `figures_png` turn shapes into files. Colours
-are roles ("best", "desired"), so that a page can follow the reader's light or dark.
+A figure is a title, a caption and panels; a panel has axes and what lies in them. `draw.py` turns
+a panel into shapes at places, `svg.py` and `png.py` turn shapes into files, so that a page and a
+picture show the same. Colours are roles ("best", "desired"): a page follows the reader's light or
+dark.
 """
 
 from __future__ import annotations
@@ -27,6 +28,11 @@ COLOURS = {
     "step3": ("#9a9a9a", "#8d8d8d"),
 }
 DASHES = {"desired": (6.0, 3.0), "predicted": (2.0, 2.0), "limit": (8.0, 2.0, 2.0, 2.0)}
+
+
+def rgb(colour: str) -> tuple[int, int, int]:
+    """Red, green and blue of "#rrggbb"."""
+    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
 
 
 @dataclass(frozen=True, eq=False)

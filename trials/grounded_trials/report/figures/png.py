@@ -15,7 +15,7 @@ import numpy as np
 
 from grounded.frozen import Array
 from grounded_trials.report.figures.draw import Box, Drawing, Spot, Stroke, Words, draw
-from grounded_trials.report.figures.figure import COLOURS, DASHES, Figure, Key
+from grounded_trials.report.figures.figure import COLOURS, DASHES, Figure, Key, rgb
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -202,8 +202,7 @@ def _legend(pen: Any, keys: tuple[Key, ...], places: list[tuple[float, int]]) ->
 
 
 def _rgb(role: str) -> tuple[int, int, int]:
-    colour = COLOURS[role][0]
-    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
+    return rgb(COLOURS[role][0])
 
 
 def _mixed(role: str, opacity: float) -> tuple[int, int, int]:

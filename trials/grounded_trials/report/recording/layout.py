@@ -54,7 +54,7 @@ def _overview(findings: Findings, scene: Scene) -> Any:
     ]
     plots = [_plot(origin, name, legend=False) for origin, name in named]
     left = rrb.Vertical(
-        _space(findings, scene, "/", ["/paths/**"], _axes(scene)),
+        _space(findings, scene, ["/paths/**"], _axes(scene)),
         rrb.Horizontal(
             rrb.BarChartView(
                 origin="/utilities",
@@ -86,22 +86,21 @@ def _interesting(findings: Findings) -> list[str]:
 def _trials(findings: Findings, scene: Scene) -> list[Any]:
     import rerun.blueprint as rrb
 
-    tabs = []
+    shown = []
     for run in findings.runs[-TRIALS:]:
-        at = f"/trials/{run.trial.id}"
-        contents = ["/paths/desired", f"{at}/path", f"{at}/predicted", f"{at}/body"]
         names = dict(NAMES)
         if run.explained is not None:
             names["explained"] = "bias that is left after the diagnosis"
-        plots = [_plot(f"{at}/{key}", name) for key, name in names.items()]
-        space = _space(findings, scene, "/", contents, f"{run.label}, utility {run.utility:.4g}")
-        tabs.append(rrb.Horizontal(space, rrb.Vertical(*plots), name=run.trial.id))
+        about = f"{run.label}, utility {run.utility:.4g}"
+        shown.append((f"/trials/{run.trial.id}", about, names, ["path", "predicted", "body"]))
     for log in findings.logs[-TRIALS:]:
-        at = f"/data/{log.trial.id}"
-        plots = [_plot(f"{at}/{key}", name) for key, name in NAMES.items()]
-        contents = ["/paths/desired", f"{at}/path", f"{at}/body"]
-        space = _space(findings, scene, "/", contents, f"{log.trial.id}, data")
-        tabs.append(rrb.Horizontal(space, rrb.Vertical(*plots), name=log.trial.id))
+        shown.append((f"/data/{log.trial.id}", f"{log.trial.id}, data", NAMES, ["path", "body"]))
+    tabs = []
+    for at, about, names, drawn in shown:
+        contents = ["/paths/desired", *(f"{at}/{part}" for part in drawn)]
+        plots = [_plot(f"{at}/{key}", name) for key, name in names.items()]
+        space = _space(findings, scene, contents, about)
+        tabs.append(rrb.Horizontal(space, rrb.Vertical(*plots), name=at.split("/")[-1]))
     return tabs
 
 
@@ -112,7 +111,7 @@ def _plot(origin: str, name: str, legend: bool = True) -> Any:
     return rrb.TimeSeriesView(origin=origin, name=name, plot_legend=key)
 
 
-def _space(findings: Findings, scene: Scene, origin: str, contents: list[str], name: str) -> Any:
+def _space(findings: Findings, scene: Scene, contents: list[str], name: str) -> Any:
     """A view of space: from above for a plane (so that y points up), from the side for a volume."""
     import rerun.blueprint as rrb
 
@@ -128,17 +127,16 @@ def _space(findings: Findings, scene: Scene, origin: str, contents: list[str], n
     spacing = 10.0 ** math.floor(math.log10(max(extent, 1e-3) / 2))
     grid = rrb.LineGrid3D(visible=True, spacing=spacing, color=(90, 90, 90, 60))
     return rrb.Spatial3DView(
-        origin=origin, contents=contents, name=name, eye_controls=eye, line_grid=grid
+        origin="/", contents=contents, name=name, eye_controls=eye, line_grid=grid
     )
 
 
 def _bounds(findings: Findings, scene: Scene) -> tuple[Array, float]:
     """The middle and the size of all that is drawn, without runs that went astray."""
-    shown = [findings.task.target] if findings.task.target is not None else []
+    shown = [findings.task.target]
     shown += [run.trial.states for run in (findings.best, findings.first) if run is not None]
     shown += [log.trial.states for log in findings.logs] if not findings.runs else []
-    points = np.vstack([scene.points(s) for s in shown])
-    points = points[np.isfinite(points).all(axis=1)]
+    points = np.vstack([scene.finite(s) for s in shown])
     if not len(points):
         return np.zeros(3), 1.0
     low, high = points.min(axis=0), points.max(axis=0)
