@@ -75,7 +75,7 @@ def command(
             given["progress"] = progress
         result = study(**given)
     if png:
-        from grounded_trials.report.studies.trends import draw_study
+        from grounded_trials.report.studies.pictures import draw_study
 
         draw_study(name, result, Path(png))
     if json_:

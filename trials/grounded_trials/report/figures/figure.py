@@ -27,6 +27,8 @@ COLOURS = {
     "step2": ("#e69f00", "#f0e442"),
     "step3": ("#9a9a9a", "#8d8d8d"),
 }
+STEPS = ("step1", "step2", "step3")  # roles of iterations, in order
+WIDTHS = {"best": 2.5, "desired": 1.0}  # of paths; 1.5 for the other roles
 DASHES = {"desired": (6.0, 3.0), "predicted": (2.0, 2.0), "limit": (8.0, 2.0, 2.0, 2.0)}
 
 
