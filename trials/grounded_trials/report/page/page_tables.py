@@ -23,7 +23,7 @@ from grounded_trials.report.findings import (
 )
 from grounded_trials.report.forecast import SECONDS, forecast_error
 from grounded_trials.wording import figure, shown, verdict, with_unit
-from grounded_trials.workspace.diagnosis_file import Diagnosis, Value
+from grounded_trials.workspace.diagnosis_file import Diagnosis, Ranked, Value
 from grounded_trials.workspace.next_step import Since
 
 WIDEST = 1e6  # an interval so many times its value, or so wide, says nothing
@@ -86,8 +86,8 @@ def effect_table(diagnosis: Diagnosis, since: Since) -> str:
             r.effect + " (adopted since)" * (r.effect in since.adopted),
             figure(r.evidence, 3),
             figure(r.gap_after, 3),
-            _whole_percent(r.shrinkage),
-            "; ".join(map(_value, r.params)) or "-",
+            f"{100 * r.shrinkage:.0f} %" if math.isfinite(r.shrinkage) else "-",
+            _params(r),
         )
         for r in diagnosis.ranking
     ]
@@ -96,8 +96,8 @@ def effect_table(diagnosis: Diagnosis, since: Since) -> str:
     return table("effects", header, rows, strong)
 
 
-def _whole_percent(share: float) -> str:
-    return f"{100 * share:.0f} %" if math.isfinite(share) else "-"
+def _params(ranked: Ranked) -> str:
+    return "; ".join(map(_value, ranked.params)) or "-"
 
 
 def _value(v: Value) -> str:
@@ -121,7 +121,7 @@ def leftover_table(diagnosis: Diagnosis) -> str:
             left.channel,
             with_unit(figure(left.size, 3), left.unit),
             left.when or "-",
-            _whole_percent(left.share),
+            f"{100 * left.share:.0f} %" if math.isfinite(left.share) else "-",
             figure(left.evidence, 3),
         )
         for left in diagnosis.leftover
