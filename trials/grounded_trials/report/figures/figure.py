@@ -1,7 +1,7 @@
 """Figures as plain values: what is drawn, before it is known how.
 
 A figure is a title, a caption and panels; a panel has axes and what lies in them. `draw.py` turns
-a panel into shapes at places, `svg.py` and `png.py` turn shapes into files, so that a page and a
+a panel into shapes at places and into SVG, `png.py` makes PNG files of them: a page and a
 picture show the same. Colours are roles ("best", "desired"): a page follows the reader's light or
 dark.
 """
@@ -72,14 +72,12 @@ class Rule:
 
 @dataclass(frozen=True)
 class Band:
-    """A horizontal band, or a vertical one, across the panel."""
+    """A faint horizontal band across the panel."""
 
     low: float
     high: float
     role: str
     note: str
-    vertical: bool = False
-    opacity: float = 0.15
 
 
 @dataclass(frozen=True, eq=False)

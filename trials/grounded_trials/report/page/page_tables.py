@@ -9,9 +9,8 @@ import math
 from collections.abc import Collection, Sequence
 from html import escape
 
-from grounded_trials.report.figures.draw import draw
+from grounded_trials.report.figures.draw import draw, svg
 from grounded_trials.report.figures.figure import COLOURS, DASHES, Figure, Key
-from grounded_trials.report.figures.svg import svg
 from grounded_trials.report.findings import (
     Findings,
     by_state,
