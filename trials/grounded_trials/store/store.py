@@ -212,12 +212,9 @@ def write_atomically(path: Path, data: bytes) -> None:
     """
     temporary = path.with_name(f".{path.name}-{os.getpid()}.tmp")
     try:
-        try:
-            _copy(data, temporary, mode=0o644)
-            temporary.replace(path)
-            sync_folder(path.parent)
-        finally:
-            _remove(temporary)
+        _copy(data, temporary, mode=0o644)
+        temporary.replace(path)
+        sync_folder(path.parent)
     except FileNotFoundError:
         raise GroundedError(
             f"{path} can't be written: the folder {path.parent} does not exist; make it, or name "
@@ -225,6 +222,8 @@ def write_atomically(path: Path, data: bytes) -> None:
         ) from None
     except OSError as error:
         raise GroundedError(f"{path} can't be written: {error.strerror}") from None
+    finally:
+        _remove(temporary)
 
 
 def _remove(path: Path) -> None:

@@ -45,8 +45,11 @@ def blueprint(findings: Findings, scene: Scene) -> Any:
 def _overview(findings: Findings, scene: Scene) -> Any:
     import rerun.blueprint as rrb
 
-    model = findings.task.model
-    chosen = _interesting(findings)
+    model, reward = findings.task.model, findings.task.reward
+    weighed = reward.state + reward.terminal != 0
+    chosen = sorted(model.states, key=lambda n: not weighed[model.state_names.index(n)])[:FIRST]
+    axes = [labelled(name, unit) for name, unit in zip(scene.names, scene.units, strict=True)]
+    title = "Paths: " + " over ".join(reversed(axes)) if len(axes) == 2 else "Paths"
     named = [(f"/state/{n}", f"{n} [{model.states[n]}]") for n in chosen]
     named += [(f"/input/{n}", labelled(n, u)) for n, u in list(model.inputs.items())[:2]]
     named += [
@@ -54,7 +57,7 @@ def _overview(findings: Findings, scene: Scene) -> Any:
     ]
     plots = [_plot(origin, name, legend=False) for origin, name in named]
     left = rrb.Vertical(
-        _space(findings, scene, ["/paths/**"], _axes(scene)),
+        _space(findings, scene, ["/paths/**"], title),
         rrb.Horizontal(
             rrb.BarChartView(
                 origin="/utilities",
@@ -65,22 +68,8 @@ def _overview(findings: Findings, scene: Scene) -> Any:
         ),
         row_shares=[3, 2],
     )
-    return rrb.Horizontal(
-        left, rrb.Grid(*plots, grid_columns=2), name="Overview", column_shares=[1, 1]
-    )
-
-
-def _axes(scene: Scene) -> str:
-    axes = [labelled(name, unit) for name, unit in zip(scene.names, scene.units, strict=True)]
-    return "Paths: " + " over ".join(reversed(axes)) if len(axes) == 2 else "Paths"
-
-
-def _interesting(findings: Findings) -> list[str]:
-    """The states with a weight in the reward, then the others."""
-    task = findings.task
-    weight = task.reward.state + task.reward.terminal
-    order = sorted(range(task.model.n), key=lambda i: (weight[i] == 0, i))
-    return [task.model.state_names[i] for i in order[:FIRST]]
+    right = rrb.Grid(*plots, grid_columns=2)
+    return rrb.Horizontal(left, right, name="Overview", column_shares=[1, 1])
 
 
 def _trials(findings: Findings, scene: Scene) -> list[Any]:
