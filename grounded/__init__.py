@@ -1,16 +1,81 @@
-"""grounded: learn a manoeuvre on a real system from a crude model and a handful of trials.
+"""Teach a real system a manoeuvre in a few trials from a crude model; say what the model lacks.
 
-Abbeel, Quigley & Ng, "Using Inaccurate Models in Reinforcement Learning", ICML 2006.
-Start reading in `grounded.search.improve`.
+    import grounded as gr
+
+    search = gr.Search(gr.Task(model=gr.Model(...), ...))
+    while (candidate := search.ask()) is not None:
+        search.tell(run(candidate))                # a gr.Trial of the real system
+    found = gr.diagnose(search.task, search.trials)
+
+The algorithm is that of Abbeel, Quigley & Ng, "Using Inaccurate Models in Reinforcement Learning",
+ICML 2006; start reading in `grounded.search.improve`. What this page names is imported when it is
+first used.
 """
 
 from __future__ import annotations
 
-from grounded.errors import GroundedError
-from grounded.model import Model, Param
-from grounded.policy import Policy
-from grounded.trial import Trial
+import sys
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from grounded.diagnosis.diagnose import diagnose
+    from grounded.diagnosis.report import Diagnosis
+    from grounded.errors import GroundedError, NextCommand
+    from grounded.fit import fit
+    from grounded.model import Model, Param
+    from grounded.policy import Policy
+    from grounded.search.ask_tell import Search, learn
+    from grounded.search.improve import propose
+    from grounded.search.standing import SearchOptions
+    from grounded.task import Task
+    from grounded.trial import Trial
+    from grounded.utility import Reward
 
 __version__ = "0.2.0"
 
-__all__ = ["GroundedError", "Model", "Param", "Policy", "Trial", "__version__"]
+__all__ = [
+    "Diagnosis", "GroundedError", "Model", "NextCommand", "Param", "Policy", "Reward", "Search",
+    "SearchOptions", "Task", "Trial", "__version__", "diagnose", "fit", "learn", "propose",
+]  # fmt: skip
+
+_HOMES = {
+    "grounded.diagnosis.diagnose": ("diagnose",),
+    "grounded.diagnosis.report": ("Diagnosis",),
+    "grounded.errors": ("GroundedError", "NextCommand"),
+    "grounded.fit": ("fit",),
+    "grounded.model": ("Model", "Param"),
+    "grounded.policy": ("Policy",),
+    "grounded.search.ask_tell": ("Search", "learn"),
+    "grounded.search.improve": ("propose",),
+    "grounded.search.standing": ("SearchOptions",),
+    "grounded.task": ("Task",),
+    "grounded.trial": ("Trial",),
+    "grounded.utility": ("Reward",),
+}
+
+if not TYPE_CHECKING:  # or any misspelt name would pass for an attribute
+
+    def __getattr__(name: str) -> Any:
+        from importlib import import_module
+
+        for home, names in _HOMES.items():
+            if name in names:
+                globals()[name] = value = getattr(import_module(home), name)
+                return value
+        raise AttributeError(f"module 'grounded' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+class _Door(ModuleType):
+    """`grounded.fit` is the function, also after the room of that name was imported."""
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if not (name == "fit" and isinstance(value, ModuleType)):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Door

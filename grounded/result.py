@@ -1,31 +1,132 @@
-"""What every result offers: one JSON document, and a table of it for a notebook."""
+"""What every result offers: one JSON document, and a table of it for a notebook.
+
+`Result` is the base of all of them. A `Document` is a result whose fields are the keys of its
+document, so that it can be read back from it.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from html import escape
-from typing import Any
+from dataclasses import MISSING, dataclass, fields
+from functools import cache
+from types import UnionType
+from typing import Any, Self, Union, get_args, get_origin, get_type_hints
+
+from grounded.errors import GroundedError
+
+# what reading a document of another shape may raise
+MALFORMED = (ValueError, TypeError, AttributeError, KeyError, OverflowError, RecursionError)
 
 
 class Result:
-    """Base of frozen results: `to_json` gives the document that the command's --json prints."""
+    """Base of frozen results, dataclasses with `repr=False`: what a notebook shows of them."""
+
+    def summary(self) -> str:
+        """What it is, in a few words: its name, its utility."""
+        return ""
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.summary()}".rstrip() + ">"
 
     def to_json(self) -> dict[str, Any]:
-        """Plain dicts, lists, strings and finite numbers; None where there is no number."""
+        """What the command's --json prints: finite numbers, None where there is none."""
         raise NotImplementedError
 
     def _repr_html_(self) -> str:
         """The document as a table, for Jupyter."""
-        return f"<b>{escape(type(self).__name__)}</b>{_table(self.to_json())}"
+        return f"<b>{type(self).__name__}</b>{_table(self.to_json())}"
+
+
+def document(**values: Any) -> dict[str, Any]:
+    """A document of these keys, `plain`."""
+    return {key: plain(value) for key, value in values.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class Document(Result):
+    """Base of frozen dataclasses that are written to JSON field by field, and read back.
+
+    A field's metadata may name another `key` than its own name, or leave the key out (`brief`)
+    where the value is None, NaN or "". Two are equal where their documents are: a number that is
+    not finite is null in both.
+    """
+
+    def to_json(self) -> dict[str, Any]:
+        """The fields by their keys, plain."""
+        found = {}
+        for one in fields(self):
+            value = getattr(self, one.name)
+            if not (one.metadata.get("brief") and (value in (None, "") or value != value)):
+                found[one.metadata.get("key", one.name)] = plain(value)
+        return found
+
+    @classmethod
+    def from_json(cls, document: Any) -> Self:
+        """Reads what `to_json` wrote: null is NaN, or empty; a missing key is the field's default.
+
+        Args:
+            document: parsed JSON, of this version, of an older one, or of a stranger.
+
+        Raises:
+            GroundedError: if it has another shape.
+        """
+        try:
+            return _read(cls, document)  # type: ignore[no-any-return]
+        except MALFORMED as error:
+            raise GroundedError(f"not the document of a {cls.__name__}: {error}") from None
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, type(self)) and self.to_json() == other.to_json()
+
+
+@cache
+def _types(kind: type) -> dict[str, Any]:
+    return get_type_hints(kind)
+
+
+def _read(kind: Any, value: Any) -> Any:
+    """A value of JSON as a field's type has it; null is its empty value."""
+    origin, of = get_origin(kind), get_args(kind)
+    if origin in (Union, UnionType):  # X | None
+        optional = isinstance(of[0], type) and issubclass(of[0], Document)
+        return None if optional and not value else _read(of[0], value)
+    if kind is Any:
+        return value
+    if kind is float:
+        return math.nan if value is None else float(value)
+    if origin is tuple and of[-1] is Ellipsis:
+        return tuple(_read(of[0], item) for item in value or ())
+    if origin is tuple:
+        items = [None] * len(of) if value is None else value
+        return tuple(_read(one, item) for one, item in zip(of, items, strict=True))
+    if origin is Mapping:
+        return {str(key): _read(of[1], item) for key, item in (value or {}).items()}
+    if issubclass(kind, Document):
+        return kind(**_given(kind, {} if value is None else dict(value)))
+    return kind() if value is None else kind(value)  # str, int, bool
+
+
+def _given(kind: Any, document: dict[str, Any]) -> dict[str, Any]:
+    """The fields that a document holds, by name."""
+    found = {}
+    for one in fields(kind):
+        key = one.metadata.get("key", one.name)
+        if key in document:
+            found[one.name] = _read(_types(kind)[one.name], document[key])
+        elif one.default is MISSING and one.default_factory is MISSING:
+            raise ValueError(f"it has no '{key}'")
+    return found
 
 
 def plain(value: Any) -> Any:
-    """A value as JSON can hold it: arrays as lists, NaN and infinity as None.
+    """A value as JSON can hold it: arrays as lists, results as dicts, NaN and infinity as None.
 
     Args:
         value: nested mappings, sequences, arrays, numbers, strings; anything else by its `str`.
     """
+    if isinstance(value, Result):
+        return value.to_json()
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -40,6 +141,8 @@ def plain(value: Any) -> Any:
 
 
 def _table(value: Any) -> str:
+    from html import escape
+
     if isinstance(value, dict):
         rows = "".join(
             f"<tr><th style='text-align:left'>{escape(key)}</th><td>{_table(item)}</td></tr>"

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from grounded_trials.workspace.folder import Workspace
+from grounded_trials.workspace.folder import Folder
 from shared_data import DATA
 
 
@@ -33,11 +33,11 @@ def shared() -> Path:
 
 
 @pytest.fixture
-def workspace_of(tmp_path: Path) -> Callable[..., Workspace]:
+def workspace_of(tmp_path: Path) -> Callable[..., Folder]:
     """Makes a workspace from an example: the cart of `workspaces` unless another is named."""
     from workspaces import make
 
-    def made(example: str = "cart", folder: str = "w", **changes: str) -> Workspace:
+    def made(example: str = "cart", folder: str = "w", **changes: str) -> Folder:
         return make(tmp_path / folder, example, **changes)
 
     return made

@@ -5,7 +5,7 @@ from __future__ import annotations
 import click
 
 from grounded_cli import completion as complete
-from grounded_cli.options import as_json, in_workspace, open_workspace
+from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
 from grounded_cli.terminal import field, number, remark, show, show_json
 from grounded_trials.wording import with_unit
 
@@ -22,7 +22,7 @@ UNCLAIMED = (
 @click.option("--effect-only", is_flag=True, help="Leave the model's own parameters alone.")
 @in_workspace
 @as_json
-def command(effects: tuple[str, ...], effect_only: bool, folder: str | None, json_: bool) -> None:
+def command(effects: tuple[str, ...], effect_only: bool, json_: bool) -> None:
     """Add effects of the last diagnosis (`family:target`) to [model] in grounded.toml.
 
     Effects that were claimed together were estimated together: adopt them together. Parameters of
@@ -33,13 +33,10 @@ def command(effects: tuple[str, ...], effect_only: bool, folder: str | None, jso
     effects out of [model] effects and the parameters that were printed out of [model] params in
     grounded.toml, or give them their old values.
     """
-    workspace = open_workspace(folder)
-    from grounded_trials.workspace.adopting import adopt_effects
-
-    done = adopt_effects(workspace, effects, parameters=not effect_only)
+    workspace = open_workspace()
+    done = workspace.adopt(*effects, parameters=not effect_only)
     if json_:
-        found = [dict(one) for one in done.effects]
-        show_json({"effects": found, "params": dict(done.params), "claimed": done.claimed})
+        show_json(done.to_json())
         return
     for name in dict.fromkeys(effects):
         show(f"{name} is part of the model now ({workspace.config.file})")
@@ -51,4 +48,4 @@ def command(effects: tuple[str, ...], effect_only: bool, folder: str | None, jso
     for name, value in done.params.items():
         text = with_unit(f"{number(before[name].value)} -> {number(value)}", before[name].unit)
         show(field(name, text, "  "))
-    show("\nnext: grounded propose")
+    show(f"\n{next_line(done.then)}")

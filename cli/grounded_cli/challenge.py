@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from grounded_cli.options import as_json
+from grounded.errors import GroundedError, NextCommand
+from grounded_cli.options import as_json, next_line, parallel
 from grounded_cli.terminal import bar, names_in, number, show, show_json, table
 from grounded_trials.wording import count
+
+if TYPE_CHECKING:
+    from grounded.experiments.jobs import Engine
 
 
 @click.group("challenge")
@@ -19,28 +22,6 @@ def command() -> None:
 
     Run `grounded challenge run DIR` where the labels are not on the disk.
     """
-
-
-def parallel(function: Any) -> Any:
-    """The options of a command that is a list of independent jobs."""
-    for option in (
-        click.option("--address", metavar="URL", help="Scheduler of a Dask cluster."),
-        click.option(
-            "--engine",
-            type=click.Choice(["local", "dask"]),
-            default="local",
-            help="Where jobs run: here (default) or on a Dask cluster that sees this disk.",
-        ),
-        click.option(
-            "--jobs",
-            type=click.IntRange(1),
-            metavar="N",
-            default=1,
-            help="Processes on this machine.",
-        ),
-    ):
-        function = option(function)
-    return function
 
 
 @command.command("make", short_help="Write cases, and their labels, sealed, elsewhere.")
@@ -78,7 +59,7 @@ def make_cases(
         return
     made = count(len(names), "case")
     show(f"{made} in {folder}, the labels in {sealed} (keep them away from it)")
-    show(f"\nnext: grounded challenge run {shlex.quote(folder)}")
+    show(f"\n{next_line(NextCommand('challenge', ('run', folder)))}")
 
 
 @command.command("run", short_help="Diagnose the cases that were not yet.")
@@ -91,21 +72,17 @@ def run_cases(
     folder: str,
     without: tuple[str, ...],
     again: bool,
-    jobs: int,
-    engine: str,
-    address: str | None,
+    engine: Engine,
     json_: bool,
 ) -> None:
     """Diagnose the cases of DIR that were not yet; a run that was cut off goes on."""
-    from grounded.experiments.jobs import Engine
     from grounded_trials.workspace.challenge import diagnose_cases, undiagnosed
 
-    where = Engine(jobs=jobs, name=engine, address=address)
     families = [name for text in without for name in names_in(text)]
     waiting = undiagnosed(Path(folder), again=again)
     with bar("diagnoses") as progress:
         times = diagnose_cases(
-            Path(folder), without=families, again=again, engine=where, progress=progress
+            Path(folder), without=families, again=again, engine=engine, progress=progress
         )
     if json_:
         show_json({"cases": list(times), "cpu_s": times})
@@ -116,7 +93,7 @@ def run_cases(
         show(f"{len(waiting)} {are} diagnosed now; {mean:.1f} s of CPU a case")
     else:
         show("nothing to do: every case is diagnosed already (--again does them once more)")
-    show(f"\nnext: {_score_command(folder)}")
+    show(f"\n{_scored(folder)}")
 
 
 @command.command("score", short_help="Open the labels, mark the diagnoses.")
@@ -124,18 +101,14 @@ def run_cases(
 @click.option("--labels", metavar="DIR", help="Where the labels are (default: DIR-labels).")
 @parallel
 @as_json
-def score(
-    folder: str, labels: str | None, jobs: int, engine: str, address: str | None, json_: bool
-) -> None:
+def score(folder: str, labels: str | None, engine: Engine, json_: bool) -> None:
     """Open the labels and mark the diagnoses of DIR, beside an oracle that knows the effects."""
     from grounded.challenge import summary
-    from grounded.experiments.jobs import Engine
     from grounded_trials.workspace.challenge import score_cases
 
     sealed = _labels(folder, labels)
-    where = Engine(jobs=jobs, name=engine, address=address)
     with bar("cases") as progress:
-        marks = score_cases(Path(folder), sealed, engine=where, progress=progress)
+        marks = score_cases(Path(folder), sealed, engine=engine, progress=progress)
     found = summary(marks)
     if json_:
         show_json({"summary": found, "cases": marks})
@@ -154,23 +127,21 @@ def _labels(folder: str, labels: str | None) -> Path:
     Raises:
         GroundedError: if they were not named, and are not where they are by default.
     """
-    from grounded.errors import GroundedError
-
     usual = Path(f"{folder}-labels")
     if labels is None and Path(folder).is_dir() and not usual.is_dir():
         raise GroundedError(
             f"{usual} does not exist: the labels of {folder} are kept elsewhere; name the folder "
-            "that `grounded challenge make` wrote them to with --labels DIR"
+            "that `make` wrote them to with --labels DIR"
         )
     return Path(labels) if labels is not None else usual
 
 
-def _score_command(folder: str) -> str:
+def _scored(folder: str) -> str:
     """How the cases are scored; it says what is to be filled in where the labels are elsewhere."""
-    command = f"grounded challenge score {shlex.quote(folder)}"
     if Path(f"{folder}-labels").is_dir():
-        return command
-    return f"{command} --labels DIR\nDIR is the folder with the labels, where `make` wrote them"
+        return next_line(NextCommand("challenge", ("score", folder)))
+    line = next_line(NextCommand("challenge", ("score", folder, "--labels", "DIR")))
+    return f"{line}\nDIR is the folder with the labels, where `make` wrote them"
 
 
 def _words(value: Any) -> str:

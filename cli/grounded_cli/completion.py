@@ -12,6 +12,7 @@ from pathlib import Path
 import click
 from click.shell_completion import CompletionItem, get_completion_class
 
+from grounded_cli.options import given
 from grounded_cli.terminal import show
 
 SHELLS = ("bash", "zsh", "fish")
@@ -51,7 +52,7 @@ def trials(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[
 def effects(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
     """The effects that the last diagnosis weighed, best first."""
     from grounded.errors import GroundedError
-    from grounded_trials.workspace.diagnosis_file import read_diagnosis
+    from grounded_trials.workspace.diagnosing import read_diagnosis
 
     try:
         found = read_diagnosis(_folder(ctx) / "reports")
@@ -86,8 +87,4 @@ def _items(names: Iterable[str], incomplete: str) -> list[CompletionItem]:
 
 def _folder(ctx: click.Context) -> Path:
     """The workspace that -C names, at the command or before it."""
-    for context in (ctx, ctx.find_root()):
-        folder = context.params.get("folder")
-        if isinstance(folder, str):
-            return Path(folder)
-    return Path()
+    return Path(given(ctx) or ".")

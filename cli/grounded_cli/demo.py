@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
-from grounded_cli.learn import learn_in
-from grounded_cli.options import as_json
+from grounded.errors import GroundedError, NextCommand
+from grounded_cli.learn import narrated
+from grounded_cli.options import as_json, next_line
 from grounded_cli.status import summary
 from grounded_cli.terminal import field, number, progress, say, show, show_json
 from grounded_trials.wording import count
-
-if TYPE_CHECKING:
-    from grounded_trials.workspace.folder import Workspace
 
 
 @click.command("demo")
@@ -28,37 +25,39 @@ def command(name: str, folder: str | None, json_: bool) -> None:
     `grounded init --list` lists the examples. The optimum is found afterwards with the TRUE model,
     which the search never sees.
     """
-    from grounded.errors import GroundedError
+    from grounded_trials import Workspace
     from grounded_trials.report.reporting import save_optimum
-    from grounded_trials.workspace.examples import example, write_example
-    from grounded_trials.workspace.folder import Workspace
+    from grounded_trials.workspace.examples import example
+    from grounded_trials.workspace.running import optimum
 
     example(name)
     target = Path(folder or f"demo-{name}")
     if target.exists() and any(target.iterdir()):
         raise GroundedError(f"{target} is not empty: name another folder with --dir, or remove it")
-    write_example(target, name)
-    workspace = Workspace(target)
+    workspace = Workspace.create(target, example=name)
     say(f"workspace {target}: {name}, a crude model and a simulated real system\n")
-    standing = learn_in(workspace)
-    optimum = _optimum(workspace)
-    save_optimum(workspace, optimum)
-    verdict = _diagnosis(workspace)
-    paths = _report(workspace)
+    status = narrated(workspace)
+    with progress("finding the optimum with the true model"):
+        best = optimum(workspace)
+    save_optimum(workspace, best)
+    with progress("diagnosing the gap"):
+        diagnosed = workspace.diagnose()
+    with progress("writing the report"):
+        report = workspace.report(html=True, rrd=True)
     document = {
         "workspace": str(target),
-        "utilities": standing.utilities,
-        "trials": standing.trials,
-        "phase": standing.phase,
-        "optimum": optimum,
-        "verdict": verdict,
-        "paths": paths,
+        "utilities": status.standing.utilities,
+        "trials": status.standing.trials,
+        "phase": status.standing.phase,
+        "optimum": best,
+        "verdict": diagnosed.verdict.to_json(),
+        "paths": report.to_json()["paths"],
     }
     if json_:
         show_json(document)
         return
     say("")
-    show(summary(standing))
+    show(summary(status))
     _tell(document)
 
 
@@ -75,25 +74,4 @@ def _tell(document: dict[str, Any]) -> None:
     show(field("gap", document["verdict"]["sentence"]))
     for kind, path in document["paths"].items():
         show(field(kind, path))
-    show(f"\nnext: grounded -C {shlex.quote(document['workspace'])} view")
-
-
-def _optimum(workspace: Workspace) -> float | None:
-    from grounded_trials.workspace.running import optimum
-
-    with progress("finding the optimum with the true model"):
-        return optimum(workspace)
-
-
-def _diagnosis(workspace: Workspace) -> dict[str, Any] | None:
-    from grounded_trials.workspace.diagnosing import diagnose_in
-
-    with progress("diagnosing the gap"):
-        return dict(diagnose_in(workspace).document["verdict"])
-
-
-def _report(workspace: Workspace) -> dict[str, str]:
-    from grounded_cli.report import write_all
-
-    with progress("writing the report"):
-        return write_all(workspace)
+    show(f"\n{next_line(NextCommand('view'), document['workspace'])}")

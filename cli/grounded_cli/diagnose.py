@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
+from grounded.errors import NextCommand
 from grounded_cli import completion as complete
-from grounded_cli.options import as_json, in_workspace, library_of, open_workspace
+from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
 from grounded_cli.terminal import field, names_in, number, show, show_json, stages, table
-from grounded_trials.wording import folded, with_unit
+from grounded_trials.wording import with_unit
 
 if TYPE_CHECKING:
-    from grounded_trials.workspace.diagnosing import Diagnosed
-    from grounded_trials.workspace.folder import Workspace
+    from grounded.diagnosis.report import Diagnosis, Ranked, Where
+    from grounded_trials import Workspace
 
 
 @click.command("diagnose")
@@ -34,67 +35,56 @@ if TYPE_CHECKING:
 @click.option("--without", multiple=True, metavar="F1,F2,...", help="Families not to blame.")
 @in_workspace
 @as_json
-def command(
-    trials: str | None, max_effects: int, without: tuple[str, ...], folder: str | None, json_: bool
-) -> None:
+def command(trials: str | None, max_effects: int, without: tuple[str, ...], json_: bool) -> None:
     """Explain the sim-to-real gap from the stored trials; keeps reports/diagnosis.json.
 
     The verdict is one effect, several, none (the model explains the data down to the noise) or
     unknown (a gap that no known effect explains). Where two effects tie, a probe candidate that
     would tell them apart is written.
     """
-    workspace = open_workspace(folder)
+    workspace = open_workspace()
     from grounded.errors import GroundedError
-    from grounded_trials.workspace.diagnosing import diagnose_in
 
     chosen = names_in(trials)
     if trials is not None and not chosen:
         raise GroundedError(
             "--trials names no trial: expected some, like t0001,t0002; leave it out to take all"
         )
-    library = library_of(tuple(name for text in without for name in names_in(text)))
+    families = [name for text in without for name in names_in(text)]
     with stages() as tell:
-        found = diagnose_in(
-            workspace, trials=chosen, max_effects=max_effects, library=library, progress=tell
-        )
+        found = workspace.diagnose(chosen, max_effects=max_effects, without=families, progress=tell)
     if json_:
-        show_json(found.document)
+        show_json(found.to_json())
     else:
         params = workspace.base_model.params
-        _tell(found.document, {name: param.value for name, param in params.items()})
-        show(f"\n{_follow(workspace, found)}")
+        _tell(found, {name: param.value for name, param in params.items()})
+        show(f"\n{next_line(_follow(workspace, found))}")
 
 
-def _follow(workspace: Workspace, found: Diagnosed) -> str:
-    """The command that follows: adopt what was claimed, run another trial, or see the whole."""
-    from grounded_trials.workspace.diagnosis_file import diagnosis_of
+def _follow(workspace: Workspace, found: Diagnosis) -> NextCommand:
+    """What follows: adopt what was claimed, run another trial, or see the whole."""
     from grounded_trials.workspace.next_step import after_diagnosis, another_trial
     from grounded_trials.workspace.proposing import standing_in
 
-    diagnosis = diagnosis_of(found.document)
-    if diagnosis.no_cause:
-        return folded(another_trial(workspace, standing_in(workspace, ahead=True)))
-    command = after_diagnosis(workspace, diagnosis)
-    if not command and found.probe:
-        command = f"grounded run {found.probe}"
-    return folded(command or "grounded report --html")
+    if found.no_cause:
+        return another_trial(workspace, standing_in(workspace, ahead=True))
+    probe = NextCommand("run", (found.probe,)) if found.probe else None
+    return after_diagnosis(workspace, found) or probe or NextCommand("report", ("--html",))
 
 
-def _tell(document: dict[str, Any], before: dict[str, float]) -> None:
+def _tell(found: Diagnosis, before: dict[str, float]) -> None:
     from grounded_trials.report.diagnosis_words import error_lines
-    from grounded_trials.workspace.diagnosis_file import diagnosis_of
 
-    verdict, diagnosis = document["verdict"], diagnosis_of(document)
-    show(_verdict(verdict["kind"], verdict["sentence"]))
-    for text in document.get("unknowable", []):
-        if text not in verdict["sentence"]:
+    show(_verdict(found.kind, found.sentence))
+    for text in found.unknowable:
+        if text not in found.sentence:
             show(field("unknown", text))
-    for title, text in error_lines(diagnosis, before):
+    for title, text in error_lines(found, before):
         show(field(title, text))
-    _places(document["where"])
-    if not diagnosis.no_cause:
-        _effects(document)
-    show("\n" + field("next trial", document["next_trial"]))
+    _places(found.where)
+    if not found.no_cause:
+        _effects(found)
+    show("\n" + field("next trial", found.next_trial))
 
 
 def _verdict(kind: str, text: str) -> str:
@@ -106,44 +96,42 @@ def _verdict(kind: str, text: str) -> str:
     return "\n".join([*lines, *(field("", sentence) for sentence in others)])
 
 
-def _places(where: dict[str, Any]) -> None:
+def _places(where: Where) -> None:
     channels = [
-        (c["name"], f"{100 * c['share']:.0f} %", with_unit(number(c["rms"], 3), c["unit"]))
-        for c in where["channels"]
-        if c["share"] >= 0.005
+        (c.name, f"{100 * c.share:.0f} %", with_unit(number(c.rms, 3), c.unit))
+        for c in where.channels
+        if c.share >= 0.005
     ]
     if channels:
         show("\n" + table(channels, ("where", "share of the gap", "rms")))
-    for region in where["regions"][:3]:
-        share, time = 100 * region["share"], 100 * region["occupancy"]
-        show(field("", f"{region['when']}: {share:.0f} % of the gap in {time:.0f} % of the time"))
+    for region in where.regions[:3]:
+        share, time = 100 * region.share, 100 * region.occupancy
+        show(field("", f"{region.when}: {share:.0f} % of the gap in {time:.0f} % of the time"))
 
 
-def _effects(document: dict[str, Any]) -> None:
-    ranking = document["ranking"][:8]
+def _effects(found: Diagnosis) -> None:
+    ranking = found.ranking[:8]
     if ranking:
-        rows = [_ranked(entry) for entry in ranking]
+        rows = [
+            (("* " if r.claimed else "  ") + r.effect, f"{r.evidence:.1f}", number(r.gap_after, 3))
+            for r in ranking
+        ]
         show("\n" + table(rows, ("effect (*: claimed)", "evidence [nats]", "gap after")))
         show("  evidence of a claimed effect: what is lost without it; of others: what each")
         show("  gains by itself; +-: standard deviation")
-    for entry in ranking:
-        if entry.get("claimed"):
-            show(field(f"  {entry['effect']}:", _values(entry)))
-    for group in document["indistinguishable"]:
+    for row in ranking:
+        if row.claimed:
+            show(field(f"  {row.effect}:", _values(row)))
+    for group in found.indistinguishable:
         show(field("tied", f"the data can't tell apart: {', '.join(group)}"))
 
 
-def _ranked(entry: dict[str, Any]) -> tuple[str, str, str]:
-    mark = "* " if entry.get("claimed") else "  "
-    return mark + entry["effect"], f"{entry['evidence']:.1f}", number(entry["gap_after"], 3)
-
-
-def _values(entry: dict[str, Any]) -> str:
+def _values(row: Ranked) -> str:
     return ", ".join(
-        with_unit(f"{name} = {number(p['value'], 3)}{_spread(p['std'])}", p["unit"])
-        for name, p in entry["params"].items()
+        with_unit(f"{name} = {number(e.value, 3)}{_spread(e.std)}", e.unit)
+        for name, e in row.params.items()
     )
 
 
-def _spread(std: float | None) -> str:
+def _spread(std: float) -> str:
     return f" +- {number(std, 2)}" if std and math.isfinite(std) else ""

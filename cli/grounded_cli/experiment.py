@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import importlib
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from grounded_cli.options import as_json
+from grounded_cli.options import as_json, parallel
 from grounded_cli.terminal import bar, show, show_json, table
+
+if TYPE_CHECKING:
+    from grounded.experiments.jobs import Engine
 
 # name -> (module, function, what --seeds is: "seeds", "count" of runs, or none, one line)
 STUDIES = {
@@ -28,25 +31,14 @@ STUDIES = {
 @click.command("experiment")
 @click.argument("name", type=click.Choice(list(STUDIES)), metavar="[NAME]", required=False)
 @click.option("--seeds", metavar="N|A-B|A,B,...", help="How many seeds, or which.")
-@click.option(
-    "--jobs", type=click.IntRange(1), metavar="N", default=1, help="Processes on this machine."
-)
-@click.option(
-    "--engine",
-    type=click.Choice(["local", "dask"]),
-    default="local",
-    help="Where jobs run: here (default) or on a Dask cluster.",
-)
-@click.option("--address", metavar="URL", help="Scheduler of a Dask cluster, tcp://host:8786.")
+@parallel
 @click.option("--keep", metavar="DIR", help="Finished jobs (default: .grounded-studies/NAME).")
 @click.option("--png", metavar="FILE", help="Draw the study's picture.")
 @as_json
 def command(
     name: str | None,
     seeds: str | None,
-    jobs: int,
-    engine: str,
-    address: str | None,
+    engine: Engine,
     keep: str | None,
     png: str | None,
     json_: bool,
@@ -58,16 +50,14 @@ def command(
     if name is None:
         show("\n".join(f"{key:15} {text}" for key, (_, _, _, text) in STUDIES.items()))
         return
-    from grounded.experiments.jobs import Engine
     from grounded_trials.store.store import StudyStore
 
-    where = Engine(jobs=jobs, name=engine, address=address)
     module, function, kind, _ = STUDIES[name]
     study = getattr(importlib.import_module(f"grounded.experiments.{module}"), function)
     given: dict[str, Any] = _seeds(seeds, kind, name)
     if kind:
         given |= {
-            "engine": where,
+            "engine": engine,
             "finished": StudyStore(Path(keep or f".grounded-studies/{name}")),
         }
     with bar(name) as progress:

@@ -10,8 +10,7 @@ from grounded_cli import completion as complete
 from grounded_cli.options import as_json, in_workspace, open_workspace
 from grounded_cli.terminal import show, show_json
 
-FORMATS = ("csv", "npz", "json")
-# how a program begins with each
+# the formats, and how a program begins with each
 USES = {
     "csv": "a row a control step; the control law is in its head",
     "npz": "on the robot: grounded.policy.load (docs/robot.md)",
@@ -24,35 +23,23 @@ USES = {
 @click.option(
     "--format",
     "form",
-    type=click.Choice(FORMATS),
+    type=click.Choice(list(USES)),
     help="Default: as FILE is named, else json. npz is what `grounded.policy.load` reads.",
 )
 @click.option("-o", "--output", metavar="FILE", help="Default: ID.FORMAT in the current folder.")
 @in_workspace
 @as_json
-def command(
-    candidate: str, form: str | None, output: str | None, folder: str | None, json_: bool
-) -> None:
+def command(candidate: str, form: str | None, output: str | None, json_: bool) -> None:
     """Write a candidate as csv, npz or json, with units and the time base in the file.
 
     `best` names the best candidate so far.
     """
-    form = _format(form, output)
-    workspace = open_workspace(folder)
-    from grounded_trials.workspace.exporting import export_candidate
-
-    path = Path(output or f"{candidate}.{form}")
-    chosen = export_candidate(workspace, candidate, form, path)
-    if json_:
-        show_json({"file": str(path), "candidate": chosen, "format": form})
-    else:
-        show(f"{chosen} is written to {path}")
-        show(f"  {USES[form]}")
-
-
-def _format(form: str | None, output: str | None) -> str:
-    """What --format says, or else the name of the file; they must not contradict each other."""
     named = Path(output or "").suffix.lstrip(".").lower()
-    if form is not None and named in FORMATS and named != form:
+    if form is not None and named in USES and named != form:
         raise click.UsageError(f"-o {output} is named as {named}, --format says {form}")
-    return form or (named if named in FORMATS else "json")
+    done = open_workspace().export(candidate, output, form=form)
+    if json_:
+        show_json(done.to_json())
+    else:
+        show(f"{done.candidate} is written to {done.file}")
+        show(f"  {USES[done.format]}")

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
-from grounded_cli.options import as_json, in_workspace, open_workspace
+from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
 from grounded_cli.terminal import names_in, number, progress, remark, show, show_json, table
 from grounded_trials.wording import count, shown
 
@@ -21,16 +21,13 @@ if TYPE_CHECKING:
 @click.option("--apply", "apply_", is_flag=True, help="Write the values to grounded.toml.")
 @in_workspace
 @as_json
-def command(
-    params: str | None, latency: bool, apply_: bool, folder: str | None, json_: bool
-) -> None:
+def command(params: str | None, latency: bool, apply_: bool, json_: bool) -> None:
     """Estimate parameters by maximum likelihood of the trials, noise included.
 
     Prediction errors are measured on a quarter of the time that the fit has not seen.
     """
-    workspace = open_workspace(folder)
+    workspace = open_workspace()
     from grounded.errors import GroundedError
-    from grounded_trials.workspace.fitting import apply_fit, fit_trials
 
     names = names_in(params) or None
     if params is not None and names is None:
@@ -38,52 +35,20 @@ def command(
             "--params names no parameter: expected some, like a1,L; leave it out to fit all"
         )
     with progress("fitting"):
-        found = fit_trials(workspace, names, latency=latency)
-    if apply_:
-        apply_fit(workspace, found)
+        done = workspace.fit(names, latency=latency, apply=apply_)
     if json_:
-        show_json(as_document(found, apply_))
+        show_json(done.to_json())
         return
+    found = done.fit
     show(_parameters(found))
     if found.before is not None and found.after is not None:
         show(f"\n{_errors(found, workspace.base_model)}")
     remark("fit", f"{found.sentence}; {count(found.samples, 'sample')}")
     if apply_:
-        show("\nwritten to grounded.toml [model] params\nnext: grounded propose")
+        show("\nwritten to grounded.toml [model] params")
     else:
-        again = f" --params {params}" * bool(params) + " --latency" * latency
         show("\n--apply writes the values to grounded.toml")
-        show(f"next: grounded fit{again} --apply")
-
-
-def as_document(found: Fit, applied: bool) -> dict[str, Any]:
-    """The fields of CONTRACT.md, with intervals and held-out prediction errors."""
-    document: dict[str, Any] = {
-        "params": {
-            name: {
-                "value": e.value,
-                "std": e.std,
-                "low": e.low,
-                "high": e.high,
-                "unit": e.unit,
-                "identified": e.identified,
-                "start": e.start,
-            }
-            for name, e in found.params.items()
-        },
-        "status": found.status,
-        "sentence": found.sentence,
-        "samples": found.samples,
-        "applied": applied,
-    }
-    for name, error in (("before", found.before), ("after", found.after)):
-        if error is not None:
-            document[f"prediction_error_{name}"] = {
-                "horizon_s": error.horizon_s,
-                "one_step": dict(zip(error.names, error.one_step.tolist(), strict=True)),
-                "ahead": dict(zip(error.names, error.ahead.tolist(), strict=True)),
-            }
-    return document
+    show(next_line(done.then))
 
 
 def _parameters(found: Fit) -> str:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
 from grounded_cli import completion as complete
-from grounded_cli.options import as_json, in_workspace, open_workspace
+from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
 from grounded_cli.terminal import field, number, progress, remark, show, show_json, table
 
 if TYPE_CHECKING:
@@ -34,48 +33,24 @@ VERDICTS = {
 @click.option("--data", is_flag=True, help="The log ran no candidate: for fit and diagnose only.")
 @in_workspace
 @as_json
-def command(
-    files: tuple[str, ...], candidate: str | None, data: bool, folder: str | None, json_: bool
-) -> None:
+def command(files: tuple[str, ...], candidate: str | None, data: bool, json_: bool) -> None:
     """Check, resample and store trials: MCAP files or bag folders.
 
     A file that was stored before is a success that says which trial it is. Trials that grounded
     wrote are taken as they are; other logs are mapped by the [log] table (`grounded inspect LOG`
     prints one).
     """
-    workspace = open_workspace(folder)
-    from grounded_trials.workspace.ingest import ingest_log
-    from grounded_trials.workspace.proposing import candidate_named
-
-    done: list[Ingested] = []
+    workspace = open_workspace()
+    done = []
     for name in files:
         with progress(f"reading {name}"):
-            ran = candidate and candidate_named(workspace, candidate)
-            found = ingest_log(workspace, Path(name), ran, data=data)
-        done.append(found)
+            done.append(workspace.ingest(name, candidate=candidate, data=data))
         if not json_:
-            _tell(name, found)
+            _tell(name, done[-1])
     if json_:
-        show_json({"trials": [as_document(one) for one in done]})
+        show_json({"trials": [one.to_json() for one in done]})
     else:
-        follow = "diagnose" if done[-1].verdict == "probe" else "propose"
-        show(f"\nnext: grounded {follow if done[-1].candidate else 'fit'}")
-
-
-def as_document(one: Ingested) -> dict[str, Any]:
-    """The fields of CONTRACT.md; a failed run's utility is null and `failed` true."""
-    return {
-        "trial": one.trial,
-        "sha256": one.sha256,
-        "known": one.known,
-        "candidate": one.candidate or None,
-        "utility": one.utility,
-        "failed": one.utility == float("-inf"),
-        "accepted": one.accepted,
-        "verdict": one.verdict or None,
-        "warnings": list(one.warnings),
-        "signals": [vars(signal) for signal in one.signals],
-    }
+        show(f"\n{next_line(done[-1].then)}")
 
 
 def _tell(name: str, one: Ingested) -> None:

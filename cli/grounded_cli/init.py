@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-from pathlib import Path
 
 import click
 
@@ -28,9 +27,9 @@ def command(folder: str | None, name: str | None, list_: bool, json_: bool) -> N
 
     real.py stands in for your robot; replace [system] in grounded.toml when you have one.
     """
-    from grounded_trials.workspace.examples import EXAMPLES, write_example
-
     if list_:
+        from grounded_trials.workspace.examples import EXAMPLES
+
         if json_:
             show_json({"examples": {key: value.text for key, value in EXAMPLES.items()}})
         else:
@@ -41,7 +40,9 @@ def command(folder: str | None, name: str | None, list_: bool, json_: bool) -> N
             "give a folder and an example: grounded init DIR --example car-turn; "
             "`grounded init --list` names them"
         )
-    write_example(Path(folder), name)
+    from grounded_trials import Workspace
+
+    Workspace.create(folder, example=name)
     if json_:
         show_json({"workspace": folder, "example": name})
         return

@@ -2,39 +2,40 @@
 
 from __future__ import annotations
 
-import shlex
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
-from grounded_cli.options import as_json, in_workspace, open_workspace
+from grounded_cli.options import as_json, given, in_workspace, next_line, typed
 from grounded_cli.terminal import number, progress, remark, show, show_json, table
 from grounded_trials.wording import count
 
 if TYPE_CHECKING:
-    from grounded_trials.logs.inspect_report import LogReport, TopicReport
+    from grounded_trials.logs.inspect_report import TopicReport
+    from grounded_trials.workspace.inspecting import Inspected
 
 
 @click.command("inspect")
 @click.argument("log", metavar="LOG")
 @in_workspace
 @as_json
-def command(log: str, folder: str | None, json_: bool) -> None:
+def command(log: str, json_: bool) -> None:
     """Show topics, types, rates and fields of a log, and a ready-made [log] table.
 
     The table is guessed for the states and inputs of the workspace; `unsure` marks what to look at.
     It is left out for files of grounded's own, for damaged ones, and outside a workspace.
     """
-    from grounded_trials.logs.inspect_log import inspect_log
+    from grounded_trials.workspace.folder import Folder
+    from grounded_trials.workspace.inspecting import inspect_in
 
     with progress(f"reading {log}"):
-        report = inspect_log(log)
-    mapping = "" if report.meta.get("format") or report.damage else _mapping(report, folder)
+        found = inspect_in(Folder(given() or "."), log)
+    if found.why_none:
+        remark("note", f"no [log] table is guessed{found.why_none}")
     if json_:
-        show_json(_document(report, mapping))
+        show_json(found.to_json())
         return
-    what = _what(report)
+    report, what = found.report, _what(found)
     show(
         f"{', '.join(str(f) for f in report.files)}: {what}{chr(10) + '  ' if what else ''}"
         f"{count(report.messages, 'message')} in {report.duration_s:.2f} s, "
@@ -44,9 +45,11 @@ def command(log: str, folder: str | None, json_: bool) -> None:
         _tell(topic)
     for one in report.remarks:
         remark("note", one)
-    if mapping:
-        show(f"\n# for grounded.toml; look at what is marked unsure\n{mapping}")
-    show(f"{'' if mapping else chr(10)}{_next(report, log, bool(mapping))}")
+    if found.log_table:
+        show(f"\n# for grounded.toml; look at what is marked unsure\n{found.log_table}")
+    else:
+        show()
+    show(_next(found))
 
 
 def _tell(topic: TopicReport) -> None:
@@ -66,64 +69,27 @@ def _tell(topic: TopicReport) -> None:
         show(table(rows, ("  field", "low", "high")))
 
 
-def _what(report: LogReport) -> str:
+def _what(found: Inspected) -> str:
     """What a file is, where it says so itself."""
     from grounded_trials.store.own_files import CANDIDATE, TRIAL
 
-    damaged = "DAMAGED" * bool(report.damage)
-    comma = ", " * bool(damaged)
-    form, ran = report.meta.get("format", ""), report.meta.get("candidate", "")
-    if form == TRIAL:
-        return f"{damaged}{comma}a trial{f' of {ran}' * bool(ran)} that grounded wrote"
-    if form == CANDIDATE:
-        return f"{damaged}{comma}a candidate: the policy to run, not a trial"
-    return damaged
-
-
-def _next(report: LogReport, log: str, mapped: bool) -> str:
-    """What to do with the file."""
-    from grounded_trials.store.own_files import CANDIDATE, TRIAL
-
-    quoted = shlex.quote(log)
-    if report.damage:
-        return f"next: grounded recover {quoted if len(report.files) == 1 else 'FILE'}"
-    form = report.meta.get("format", "")
-    if form == TRIAL and Path(log).resolve().parent.name == "trials":
-        return "it is stored already, and needs no [log] table\nnext: grounded report"
-    if form == TRIAL:
-        return f"it needs no [log] table\nnext: grounded ingest {quoted}"
-    if form == CANDIDATE:
-        return f"next: grounded run {Path(log).stem}"
-    if mapped:
-        return f"# next: put this table into grounded.toml, then: grounded ingest {quoted}"
-    return f"next: grounded -C WORKSPACE inspect {quoted}"
-
-
-def _mapping(report: LogReport, folder: str | None) -> str:
-    from grounded.errors import GroundedError
-    from grounded_trials.logs.inspect_guess import guess_mapping, is_simulated, mapping_toml
-
-    try:
-        model = open_workspace(folder).base_model
-    except GroundedError as error:
-        why = f": {error}"
-        if "does not exist: this is not a workspace" in why:
-            why = " outside a workspace (-C DIR names one)"
-        remark("note", f"no [log] table is guessed{why}")
-        return ""
-    states, inputs = guess_mapping(report, model.state_names, model.input_names)
-    return mapping_toml(states, inputs, simulated=is_simulated(report))
-
-
-def _document(report: LogReport, mapping: str) -> dict[str, Any]:
-    return {
-        "files": [str(f) for f in report.files],
-        "format": report.meta.get("format") or None,
-        "library": report.library,
-        "duration_s": report.duration_s,
-        "messages": report.messages,
-        "topics": [vars(t) | {"fields": [vars(f) for f in t.fields]} for t in report.topics],
-        "remarks": list(report.remarks),
-        "damage": report.damage,
-        "log_table": mapping,
+    damaged = ["DAMAGED"] * bool(found.report.damage)
+    ran = found.report.meta.get("candidate", "")
+    kinds = {
+        TRIAL: f"a trial{f' of {ran}' * bool(ran)} that grounded wrote",
+        CANDIDATE: "a candidate: the policy to run, not a trial",
     }
+    return ", ".join(damaged + [text for form, text in kinds.items() if form == found.format])
+
+
+def _next(found: Inspected) -> str:
+    """What to do with the file."""
+    from grounded_trials.store.own_files import TRIAL
+
+    if found.log_table:
+        return f"# next: put this table into grounded.toml, then: {typed(found.then)}"
+    line = next_line(found.then, "WORKSPACE" if found.then.verb == "inspect" else None)
+    if found.format != TRIAL or found.report.damage:
+        return line
+    stored = "is stored already, and " * found.stored
+    return f"it {stored}needs no [log] table\n{line}"

@@ -19,6 +19,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small; thread
 
 import click
 
+from grounded_cli.options import in_workspace
+
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
 
@@ -73,7 +75,7 @@ class LazyGroup(click.Group):
         ctx.fail(f"no command '{name}': {nearest(name, COMMANDS)}")
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Runs a command; the commands that its error advises name the workspace as -C did."""
+        """Runs a command; a GroundedError is printed, with the command that mends it."""
         try:
             return super().invoke(ctx)
         except Exception as error:
@@ -81,9 +83,13 @@ class LazyGroup(click.Group):
 
             if not isinstance(error, GroundedError):
                 raise
-            from grounded_cli.address import addressed
+            from grounded_cli.options import next_line
+            from grounded_cli.terminal import style
 
-            raise GroundedError(addressed(str(error), fit=False)) from None
+            click.echo(f"{style('error:', fg='red', bold=True)} {error}", err=True)
+            if error.then is not None:
+                click.echo(next_line(error.then), err=True)
+            ctx.exit(1)
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
         """Names for the TAB key without importing any command."""
@@ -99,18 +105,14 @@ class LazyGroup(click.Group):
 
 
 @click.command(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
-@click.option("-C", "folder", default=None, metavar="DIR", help="The workspace (default: here).")
+@in_workspace
 @click.version_option(package_name="grounded")
-@click.pass_context
-def cli(ctx: click.Context, folder: str | None) -> None:
+def cli() -> None:
     """Teach a real system a manoeuvre in a few trials, from a crude model.
 
     Start with `grounded demo car-figure8` in an empty folder, or make a workspace of your own with
     `grounded init DIR --example car-turn`.
     """
-    from grounded_cli.address import remember
-
-    remember(ctx, folder)
 
 
 def main() -> NoReturn:
@@ -133,15 +135,6 @@ def main() -> NoReturn:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 0
-    except Exception as error:
-        from grounded.errors import GroundedError
-
-        if not isinstance(error, GroundedError):
-            raise
-        from grounded_cli.terminal import style
-
-        click.echo(f"{style('error:', fg='red', bold=True)} {error}", err=True)
-        code = 1
     sys.exit(code if isinstance(code, int) else 0)
 
 

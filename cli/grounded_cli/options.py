@@ -1,36 +1,49 @@
-"""Options that commands share, and the workspace they name."""
+"""Options that commands share, the workspace that they name, and the command to type next."""
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from grounded_cli.address import given, remember
+from grounded_trials.wording import folded, rendered
 
 if TYPE_CHECKING:
-    from grounded.effects import Library
-    from grounded_trials.workspace.folder import Workspace
+    from grounded.errors import NextCommand
+    from grounded_trials import Workspace
 
 F = TypeVar("F", bound=Callable[..., Any])
+# the commands that are about no workspace: they are printed without -C
+ELSEWHERE = frozenset({"init", "recover", "demo", "experiment", "challenge", "completion"})
+_KEY = "grounded_cli.folder"
 
 
 def in_workspace(function: F) -> F:
-    """Adds -C DIR; the folder is passed as `folder`, falling back on the group's."""
+    """Adds -C DIR, at the group or at a command; `given` says what it named."""
     return click.option(
         "-C",
-        "folder",
-        default=None,
         metavar="DIR",
+        expose_value=False,
         callback=_remembered,
         help="The workspace (default: here).",
     )(function)
 
 
-def _remembered(ctx: click.Context, option: click.Parameter, folder: str | None) -> str | None:
-    remember(ctx, folder)
-    return folder
+def _remembered(ctx: click.Context, option: click.Parameter, folder: str | None) -> None:
+    if folder is not None:
+        ctx.meta[_KEY] = folder
+
+
+def given(ctx: click.Context | None = None) -> str | None:
+    """The folder as -C named it, None where it was not given.
+
+    Args:
+        ctx: the command's; None: the one that runs.
+    """
+    ctx = ctx or click.get_current_context(silent=True)
+    return None if ctx is None else ctx.meta.get(_KEY)
 
 
 def as_json(function: F) -> F:
@@ -38,44 +51,58 @@ def as_json(function: F) -> F:
     return click.option("--json", "json_", is_flag=True, help="Print one JSON document.")(function)
 
 
-def open_workspace(folder: str | None) -> Workspace:
+def parallel(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Adds the options of a command that is a list of independent jobs; passed as `engine`."""
+
+    @functools.wraps(function)
+    def call(*args: Any, jobs: int, engine: str, address: str | None, **others: Any) -> Any:
+        from grounded.experiments.jobs import Engine
+
+        return function(*args, engine=Engine(jobs=jobs, name=engine, address=address), **others)
+
+    for option in (
+        click.option("--address", metavar="URL", help="Scheduler of a Dask cluster."),
+        click.option(
+            "--engine",
+            type=click.Choice(["local", "dask"]),
+            default="local",
+            help="Where jobs run: here (default) or on a Dask cluster that sees this disk.",
+        ),
+        click.option(
+            "--jobs",
+            type=click.IntRange(1),
+            metavar="N",
+            default=1,
+            help="Processes on this machine.",
+        ),
+    ):
+        call = option(call)
+    return call
+
+
+def open_workspace() -> Workspace:
     """The workspace that -C names, at the command or before it.
 
     Raises:
         GroundedError: if its grounded.toml is missing or wrong.
     """
-    from grounded_trials.workspace.folder import Workspace
+    from grounded_trials import Workspace
 
-    workspace = Workspace(folder or given() or ".")
-    _ = workspace.config
-    return workspace
+    return Workspace(given() or ".")
 
 
-def library_of(without: tuple[str, ...] = ()) -> Library:
-    """The effects that may be blamed: built in, and those of other packages.
+def typed(then: NextCommand, folder: str | None = None) -> str:
+    """A command as it works from where the user is.
 
-    A package adds families by the entry point group `grounded.effects`: a family, or a sequence of
-    families.
-
-    Raises:
-        GroundedError: for an entry point that can't be loaded or holds something else.
+    Args:
+        then: the command.
+        folder: a workspace to name; None: the one that -C named.
     """
-    from importlib.metadata import entry_points
+    if folder is None and then.verb not in ELSEWHERE:
+        folder = given()
+    return rendered(then, folder)
 
-    from grounded.effects import Family, Library
-    from grounded.errors import GroundedError
 
-    found: list[Family] = []
-    for point in entry_points(group="grounded.effects"):
-        try:
-            loaded = point.load()
-        except Exception as error:
-            raise GroundedError(
-                f"the effects of package '{point.value}' can't be loaded: {error}; mend or "
-                "uninstall it"
-            ) from None
-        families = [loaded] if isinstance(loaded, Family) else list(loaded)
-        if not all(isinstance(family, Family) for family in families):
-            raise GroundedError(f"'{point.value}' must be an effect family or a sequence of them")
-        found += families
-    return Library().with_families(found).without(without)
+def next_line(then: NextCommand, folder: str | None = None) -> str:
+    """The last line of an output: the command to type next, see `typed`."""
+    return folded(typed(then, folder))

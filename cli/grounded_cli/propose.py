@@ -7,74 +7,44 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from grounded_cli.options import as_json, in_workspace, open_workspace
-from grounded_cli.status import next_line
+from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
 from grounded_cli.terminal import field, number, progress, remark, show, show_json
 from grounded_trials.wording import count, with_unit
 
 if TYPE_CHECKING:
     from grounded.search.standing import Candidate, Standing
     from grounded.task import Task
-    from grounded_trials.workspace.folder import Workspace
+    from grounded_trials import Workspace
     from grounded_trials.workspace.proposing import Proposed
 
 
 @click.command("propose")
 @in_workspace
 @as_json
-def command(folder: str | None, json_: bool) -> None:
+def command(json_: bool) -> None:
     """Say what to run next and write its candidate file.
 
     The outstanding candidate is named again while its trial is missing. Nothing is proposed once
     the search has ended.
     """
-    workspace = open_workspace(folder)
-    from grounded_trials.workspace.proposing import propose_in
-
+    workspace = open_workspace()
     with progress("planning"):
-        proposed = propose_in(workspace)
+        proposed = workspace.propose()
     if json_:
-        show_json(as_document(workspace, proposed))
+        show_json(proposed.to_json())
     else:
         _tell(workspace, proposed)
 
 
-def as_document(workspace: Workspace, proposed: Proposed) -> dict[str, Any]:
-    """The fields of CONTRACT.md; candidate is null when the search has ended."""
-    standing, candidate = proposed.proposal.standing, proposed.proposal.candidate
-    phase = "await-trial" if candidate is not None else standing.phase
-    document: dict[str, Any] = {
-        "candidate": None,
-        "file": None,
-        "iteration": standing.iteration,
-        "alpha": None,
-        "predicted_utility": None,
-        "phase": phase,
-        "sentence": standing.sentence,
-        "notes": list(proposed.proposal.notes),
-    }
-    if candidate is not None:
-        document |= {
-            "candidate": candidate.id,
-            "file": str(proposed.file),
-            "iteration": candidate.iteration,
-            "alpha": candidate.alpha,
-            "predicted_utility": candidate.predicted_utility,
-            "best_utility": standing.incumbent.utility if standing.incumbent else None,
-            "new": proposed.proposal.is_new,
-        }
-    return document
-
-
 def _tell(workspace: Workspace, proposed: Proposed) -> None:
-    standing, candidate = proposed.proposal.standing, proposed.proposal.candidate
+    standing, candidate = proposed.standing, proposed.candidate
     for note in proposed.proposal.notes:
         remark("note", note)
     if note := workspace.planner.plan.model.system.note:
         remark("note", f"the model is not compiled: {note}")
     if candidate is None:
         show(field("end", f"nothing to run: {standing.sentence}"))
-        show(f"\n{next_line(workspace, standing)}")
+        show(f"\n{next_line(proposed.then)}")
         return
     ran = any(t.candidate.id == candidate.id and t.trials for t in standing.history)
     waiting = "" if proposed.proposal.is_new else " (proposed before, its trial is missing)"
@@ -90,8 +60,7 @@ def _tell(workspace: Workspace, proposed: Proposed) -> None:
     show(field("trust", _trust(standing, adopted), "  "))
     for name, text in _extent(candidate, workspace.task):
         show(field(name, text, "  "))
-    can_run = workspace.config.system.command or workspace.config.system.model
-    show(f"\nnext: grounded {'run' if can_run else 'ingest TRIAL.mcap'}")
+    show(f"\n{next_line(proposed.then)}")
 
 
 def _what(candidate: Candidate, task: Task) -> str:

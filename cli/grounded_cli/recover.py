@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from grounded_cli.options import as_json
+from grounded_cli.options import as_json, next_line
 from grounded_cli.terminal import field, progress, say, show, show_json
 from grounded_trials.wording import count
 
@@ -92,23 +91,25 @@ def _steps(found: Recovery) -> str:
 
 def _next(found: Recovery) -> str:
     """What to do with the file."""
+    from grounded.errors import NextCommand
     from grounded_trials.store.own_files import CANDIDATE
 
-    target = shlex.quote(str(found.target))
+    target = str(found.target)
     if found.format == CANDIDATE:
         return (
             f"a candidate is not for repair: remove {found.source}\n"
-            "next: grounded propose   writes the one that is waiting again"
+            f"{next_line(NextCommand('propose'))}   writes the one that is waiting again"
         )
     if not _is_trial(found):
-        return f"next: grounded inspect {target}"
+        return next_line(NextCommand("inspect", (target,)))
     if found.hole:
-        again = f"\nnext: grounded run {found.candidate}" * bool(found.candidate)
-        return f"a trial with a hole can't be used: it has to be run again{again}"
+        why = "a trial with a hole can't be used: it has to be run again"
+        again = NextCommand("run", (found.candidate,))
+        return f"{why}\n{next_line(again)}" if found.candidate else why
     short = found.planned is None or found.steps < found.planned
     if found.complete or not (found.candidate and short):
-        return f"next: grounded ingest {target}"
+        return next_line(NextCommand("ingest", (target,)))
     return (
-        f"next: grounded ingest --data {target}   for fit and diagnose only;\n"
+        f"{next_line(NextCommand('ingest', ('--data', target)))}   for fit and diagnose only;\n"
         "without --data it counts as a run that failed, as one that ended early does"
     )

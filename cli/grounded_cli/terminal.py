@@ -15,26 +15,9 @@ from typing import Any
 import click
 
 from grounded.result import plain
-from grounded_cli.address import addressed
-from grounded_trials.wording import WIDTH, wrapped
-from grounded_trials.wording import figure as number
+from grounded_trials.wording import WIDTH, figure, wrapped
 
-__all__ = [
-    "bar",
-    "field",
-    "harmless",
-    "names_in",
-    "number",
-    "progress",
-    "remark",
-    "say",
-    "show",
-    "show_json",
-    "sparkline",
-    "stages",
-    "style",
-    "table",
-]
+number = figure
 
 
 def style(text: str, **how: Any) -> str:
@@ -45,12 +28,12 @@ def style(text: str, **how: Any) -> str:
 
 def say(text: str) -> None:
     """Narration, on stderr."""
-    click.echo(harmless(addressed(text)), err=True)
+    click.echo(harmless(text), err=True)
 
 
 def show(text: str = "") -> None:
     """Data, on stdout."""
-    click.echo(harmless(addressed(text)))
+    click.echo(harmless(text))
 
 
 def harmless(text: str) -> str:
@@ -71,12 +54,12 @@ def show_json(document: dict[str, Any]) -> None:
 def field(label: str, text: str, indent: str = "") -> str:
     """A label and its text, wrapped to 80 columns under itself; a number keeps its %."""
     head = f"{indent}{label:<10} "
-    return "\n".join(wrapped(addressed(text), head, " " * len(head)) or [head.rstrip()])
+    return "\n".join(wrapped(text, head, " " * len(head)) or [head.rstrip()])
 
 
 def remark(kind: str, text: str) -> None:
     """Narration with a word ahead, `note: ...`, wrapped to 80 columns."""
-    say("\n".join(wrapped(addressed(text), f"{kind}: ", "  ")))
+    say("\n".join(wrapped(text, f"{kind}: ", "  ")))
 
 
 def names_in(text: str | None) -> list[str]:
@@ -85,50 +68,39 @@ def names_in(text: str | None) -> list[str]:
 
 
 @contextmanager
-def progress(text: str) -> Iterator[None]:
-    """Says what is going on while something takes more than a moment; only on a terminal."""
-    live = sys.stderr.isatty()
-    if live:
-        click.echo(f"{text} ...", err=True, nl=False)
-    try:
-        yield
-    finally:
-        if live:
-            click.echo("\r\033[K", err=True, nl=False)
-
-
-@contextmanager
 def stages() -> Iterator[Callable[[str], None]]:
-    """A function that shows which stage a long command is in; only on a terminal."""
+    """A function that shows which stage a long command is in, "" for none; only on a terminal."""
     live = sys.stderr.isatty()
 
     def tell(stage: str) -> None:
         if live:
-            click.echo(f"\r\033[K{stage} ...", err=True, nl=False)
+            click.echo(f"\r\033[K{stage and stage + ' ...'}", err=True, nl=False)
 
     try:
         yield tell
     finally:
-        if live:
-            click.echo("\r\033[K", err=True, nl=False)
+        tell("")
+
+
+@contextmanager
+def progress(text: str) -> Iterator[None]:
+    """Says what is going on while something takes more than a moment; only on a terminal."""
+    with stages() as tell:
+        tell(text)
+        yield
 
 
 @contextmanager
 def bar(text: str) -> Iterator[Callable[[int, int], None]]:
     """A progress bar on stderr for things that can be counted; only on a terminal."""
-    live, width = sys.stderr.isatty(), 30
+    width = 30
+    with stages() as tell:
 
-    def tell(done: int, total: int) -> None:
-        if live and total:
-            full = done * width // total
-            line = f"{text} [{'#' * full}{'.' * (width - full)}] {done}/{total}"
-            click.echo(f"\r\033[K{line}", err=True, nl=False)
+        def count(done: int, total: int) -> None:
+            full = done * width // max(total, 1)
+            tell(f"{text} [{'#' * full}{'.' * (width - full)}] {done}/{total}")
 
-    try:
-        yield tell
-    finally:
-        if live:
-            click.echo("\r\033[K", err=True, nl=False)
+        yield count
 
 
 def table(rows: Sequence[Sequence[str]], header: Sequence[str]) -> str:

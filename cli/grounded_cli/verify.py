@@ -11,18 +11,16 @@ from grounded_cli.terminal import progress, remark, show, show_json
 @click.command("verify")
 @in_workspace
 @as_json
-def command(folder: str | None, json_: bool) -> None:
+def command(json_: bool) -> None:
     """Check every stored trial against the hash in its name, and every candidate's checksum."""
-    workspace = open_workspace(folder)
-    from grounded_trials.workspace.exporting import damaged_files
-
+    workspace = open_workspace()
     with progress("checking"):
-        checked, damaged = damaged_files(workspace)
+        found = workspace.verify()
     if json_:
-        show_json({"checked": checked, "damaged": [{"file": f, "reason": r} for f, r in damaged]})
+        show_json(found.to_json())
     else:
-        for _, reason in damaged:
-            remark("damaged", reason)
-        show(f"{checked} files checked, {len(damaged)} damaged")
-    if damaged:
+        for one in found.damaged:
+            remark("damaged", one.reason)
+        show(f"{found.checked} files checked, {len(found.damaged)} damaged")
+    if found.damaged:
         click.get_current_context().exit(1)

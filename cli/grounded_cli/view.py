@@ -16,13 +16,13 @@ from grounded_cli.terminal import progress, say
 
 @click.command("view")
 @in_workspace
-def command(folder: str | None) -> None:
+def command() -> None:
     """Open the recording in the Rerun viewer: paths, states, inputs, bias, trial by trial.
 
     The file reports/recording.rrd is written first. Without a screen, copy it to a computer that
     has one (`pip install rerun-sdk`) and open it there: rerun recording.rrd
     """
-    workspace = open_workspace(folder)
+    workspace = open_workspace()
     from grounded_trials.report.reporting import save_recording
 
     with progress("writing the recording"):

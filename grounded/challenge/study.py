@@ -57,7 +57,7 @@ def study(
     marks = []
     for case in make(kind, count, seed, only=only, param_error=param_error, noise=noise):
         begin = time.process_time()
-        found = diagnose(task_of(case), case.trials, options).to_dict()
+        found = diagnose(task_of(case), case.trials, options).to_json()
         spent = time.process_time() - begin
         known = oracle(case.model, case.trials, case.latency, case.label)
         marks.append({**judge(case.label, found, known), "cpu_s": spent})

@@ -11,12 +11,9 @@ from grounded.diagnosis.hypotheses import TIE, parametric
 from grounded.diagnosis.hypothesis import param_scale
 from grounded.diagnosis.intervals import standard_deviations
 from grounded.diagnosis.limits import Limits
-from grounded.diagnosis.lookalike import Likeness, lookalikes, of_parameters
+from grounded.diagnosis.lookalike import lookalikes, of_parameters
 from grounded.diagnosis.prediction_error import normalised
-from grounded.diagnosis.report import (
-    Estimate,
-    Ranked,
-)
+from grounded.diagnosis.report import Estimate, Likeness, Ranked
 from grounded.diagnosis.search import Search
 from grounded.diagnosis.shrinkage import gaps_of, held_out
 
@@ -66,7 +63,9 @@ class Claims:
         for blame in self.blamed:
             name = model.param_names[blame.index]
             nominal, e = float(model.values[blame.index]), known[name]
-            d = Estimate(e.value - nominal, e.std, e.low - nominal, e.high - nominal, e.unit)
+            assert e.interval is not None
+            low, high = (end - nominal for end in e.interval)
+            d = Estimate(e.value - nominal, e.std, (low, high), e.unit)
             rows.append(
                 Ranked(
                     effect=f"parameter:{name}",
@@ -119,7 +118,7 @@ class Claims:
             some = {}
             for q in effect.free:
                 v, s, w = float(values[q.name]), float(stds[at]), float(halves[at])
-                some[q.name] = Estimate(v, s, v - w, v + w, q.unit)
+                some[q.name] = Estimate(v, s, (v - w, v + w), q.unit)
                 at += 1
             found.append(some)
         return found
@@ -168,6 +167,6 @@ class Claims:
         for at, index in enumerate(calibrated(self.data)):
             value = float(model.values[index] + h.shift[index])
             std, half = (float(a[k + at] * scale[index]) for a in (stds, halves))
-            name = model.param_names[index]
-            found[name] = Estimate(value, std, value - half, value + half, model.params[name].unit)
+            name, interval = model.param_names[index], (value - half, value + half)
+            found[name] = Estimate(value, std, interval, model.params[name].unit)
         return found

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from grounded.effects import Scales, scales_of
-from grounded.errors import GroundedError
+from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.trial import Trial
@@ -132,8 +132,9 @@ def prepare(
     used = [(trial, T) for trial, T in used if T >= 2]
     if not used:
         raise GroundedError(
-            "no trial holds two finite steps: nothing to diagnose; run `grounded verify` or ingest "
-            "a trial that ran"
+            "no trial holds two finite steps: nothing to diagnose; verify the stored files, or "
+            "ingest a trial that ran",
+            then=NextCommand("verify"),
         )
     dt, m = used[0][0].dt, model.m
     lengths = np.array([T for _, T in used])

@@ -29,7 +29,18 @@ from grounded.diagnosis.hypothesis import Hypothesis
 from grounded.diagnosis.leftover import Leftover, leftovers, whiteness
 from grounded.diagnosis.limits import Limits, knowable, limits
 from grounded.diagnosis.prediction_error import Horizon, by_region, by_time, explained, horizon
-from grounded.diagnosis.report import Diagnosis, Remainder
+from grounded.diagnosis.report import (
+    Change,
+    ChannelShare,
+    Diagnosis,
+    Gap,
+    NoiseLevels,
+    Remainder,
+    RunChange,
+    Split,
+    UtilityPrediction,
+    Where,
+)
 from grounded.diagnosis.search import Search
 from grounded.diagnosis.shrinkage import shrinkage, whole_runs
 from grounded.diagnosis.split import repeated, split
@@ -135,38 +146,36 @@ class _Writer:
         groups = self.claims.groups()
         alike = self.claims.nearly(groups)
         remainder = tuple(self.remainder(left) for left in self.left)
-        kind, sentence = verdict(
-            self.claims, shrunk.gap_before, shrunk.gap_after, ranking, groups, alike, remainder
-        )
-        named = tuple(row.effect for row in ranking if row.claimed)
         return Diagnosis(
-            kind=kind,
-            effects=named,
-            sentence=sentence,
-            channels=tuple(self.channels(gain, shrunk.before, where.spread)),
-            times=tuple(by_time(gain.sum(axis=-1), data)),
-            regions=tuple(by_region(gain.sum(axis=-1), predictor, self.best)),
+            verdict=verdict(
+                self.claims, shrunk.gap_before, shrunk.gap_after, ranking, groups, alike, remainder
+            ),
+            where=Where(
+                channels=self.channels(gain, shrunk.before, where.spread),
+                times=tuple(by_time(gain.sum(axis=-1), data)),
+                regions=tuple(by_region(gain.sum(axis=-1), predictor, self.best)),
+                split=self.split(bare, where),
+                whiteness=self.whiteness(),
+            ),
             ranking=ranking,
             indistinguishable=groups,
-            gap={
-                "horizon_s": where.steps * data.dt,
-                "unit": "noise-normalised rms",
-                "before": shrunk.gap_before,
-                "after": shrunk.gap_after,
-                "floor": 1.0,
-                "held_out": data.count > 1,
-                "channels": self.by_channel(shrunk.before, shrunk.after, where.spread),
-            },
+            lookalikes=alike,
+            gap=Gap(
+                horizon_s=where.steps * data.dt,
+                unit="noise-normalised rms",
+                before=shrunk.gap_before,
+                after=shrunk.gap_after,
+                floor=1.0,
+                held_out=data.count > 1,
+                channels=self.by_channel(shrunk.before, shrunk.after, where.spread),
+            ),
+            utility_prediction=self.utility_prediction(bare),
+            whole_run=self.whole_run(bare),
             leftover=remainder,
             next_trial=next_trial(self.claims, self.left, groups),
             unknowable=self.known.sentences,
             noise=self.noise(),
-            whole_run=self.whole_run(bare),
             parameters=self.claims.parameters(),
-            lookalikes=alike,
-            split=self.split(bare, where),
-            whiteness=self.whiteness(),
-            utility_prediction=self.utility_prediction(bare),
             trials=data.count,
             steps=data.steps,
             candidates=len(self.search.candidates),
@@ -180,57 +189,51 @@ class _Writer:
             left.channel, left.size, left.unit, left.gain, regions[0] if regions else None
         )
 
-    def channels(self, gain: Any, error: Any, spread: Any) -> list[dict[str, Any]]:
+    def channels(self, gain: Any, error: Any, spread: Any) -> tuple[ChannelShare, ...]:
         """Each state's part of the gap."""
         data = self.data
         excess = np.maximum(gain.sum(axis=(0, 1)), 0.0)
         share = excess / max(float(excess.sum()), 1e-12)
         rms = _rms(error)
         rows = [
-            {
-                "name": name,
-                "share": float(share[i]),
-                "rms": float(rms[i]),
-                "unit": data.model.states[name],
-                "noise": float(np.sqrt((spread[:, i] ** 2).mean())),
-            }
+            ChannelShare(
+                name,
+                share=float(share[i]),
+                rms=float(rms[i]),
+                unit=data.model.states[name],
+                noise=float(np.sqrt((spread[:, i] ** 2).mean())),
+            )
             for i, name in self.shown
         ]
-        return sorted(rows, key=lambda row: -float(row["share"]))
+        return tuple(sorted(rows, key=lambda row: -row.share))
 
-    def by_channel(self, before: Any, after: Any, spread: Any) -> dict[str, Any]:
+    def by_channel(self, before: Any, after: Any, spread: Any) -> dict[str, Change]:
         """The gap of each state, noise-normalised."""
         found = {}
         for i, name in self.shown:
-            b, a = (float(_rms(e[:, i] / spread[:, i])) for e in (before, after))
-            found[name] = {"before": b, "after": a}
+            found[name] = Change(*(float(_rms(e[:, i] / spread[:, i])) for e in (before, after)))
         return found
 
-    def noise(self) -> dict[str, Any]:
+    def noise(self) -> NoiseLevels:
         """The noise as it was estimated."""
         noise = self.best.noise
+        tau = noise.structure.tau
         q, r = np.exp(0.5 * noise.log_q), np.exp(0.5 * noise.log_r)
-        return {
-            "process": {name: float(q[i]) for i, name in self.shown},
-            "measurement": {name: float(r[i]) for i, name in self.shown},
-            "correlation_s": noise.structure.tau,
-            "outliers": not isinstance(noise.weight_v, float),
-        }
+        return NoiseLevels(
+            process={name: float(q[i]) for i, name in self.shown},
+            measurement={name: float(r[i]) for i, name in self.shown},
+            correlation_s=np.nan if tau is None else tau,
+            outliers=not isinstance(noise.weight_v, float),
+        )
 
-    def whole_run(self, bare: Any) -> dict[str, Any]:
+    def whole_run(self, bare: Any) -> dict[str, RunChange]:
         """Errors of predictions from the first state to the end of each run."""
         before = whole_runs(self.predictor, Hypothesis(), bare)
         after = whole_runs(self.predictor, self.best.hypothesis, self.best.track)
-        return {
-            name: {
-                "before": float(before[i]),
-                "after": float(after[i]),
-                "unit": self.data.model.states[name],
-            }
-            for i, name in self.shown
-        }
+        units = self.data.model.states
+        return {n: RunChange(float(before[i]), float(after[i]), units[n]) for i, n in self.shown}
 
-    def split(self, bare: Any, where: Horizon) -> dict[str, Any]:
+    def split(self, bare: Any, where: Horizon) -> dict[str, Split]:
         """Explained, unexplained, irreducible: one step, the horizon, a whole run."""
         repeats = repeated([trial.candidate for trial in self.trials])
         horizons = {
@@ -239,7 +242,7 @@ class _Writer:
             "whole_run": horizon(self.predictor, self.best, np.inf),
         }
         return {
-            name: split(self.predictor, self.best, bare, one, repeats).to_dict(self.data)
+            name: split(self.predictor, self.best, bare, one, repeats).shared_out(self.data)
             for name, one in horizons.items()
         }
 
@@ -250,13 +253,13 @@ class _Writer:
         found = whiteness(self.best, seen)
         return {name: found[str(i)] for i, name in self.shown}
 
-    def utility_prediction(self, bare: Any) -> dict[str, Any] | None:
+    def utility_prediction(self, bare: Any) -> UtilityPrediction | None:
         """Rms errors of predicted utilities, held out; None for a bare model."""
         if self.task is None:
             return None
         self.tick("utility")
         found = utility_prediction(self.predictor, self.best, bare, self.task, self.trials)
-        return found.to_dict()
+        return found.summary()
 
 
 def _rms(error: Any) -> Any:

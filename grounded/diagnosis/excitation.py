@@ -12,7 +12,7 @@ The probe stays inside the inputs' limits, and both hypotheses' runs inside the 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -154,10 +154,10 @@ def _hypotheses(
 
 
 def _noise(model: Model, diagnosis: Diagnosis) -> Noise:
-    def logs(kind: str) -> Array:
-        return np.array([2 * np.log(diagnosis.noise[kind][n] + 1e-12) for n in model.state_names])
+    def logs(levels: Mapping[str, float]) -> Array:
+        return np.array([2 * np.log(levels[n] + 1e-12) for n in model.state_names])
 
-    q, r = logs("process"), logs("measurement")
+    q, r = logs(diagnosis.noise.process), logs(diagnosis.noise.measurement)
     return Noise(Structure(), q, r, q.copy(), np.full(model.n, -60.0))
 
 

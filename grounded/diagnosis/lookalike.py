@@ -13,9 +13,8 @@ the evidence says besides.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -25,24 +24,12 @@ from grounded.diagnosis.fitted import Fit
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor
 from grounded.diagnosis.leftover import filter_of
 from grounded.diagnosis.linearise import base_columns
+from grounded.diagnosis.report import Likeness
 from grounded.diagnosis.scan import scan
 from grounded.effects import Effect, ParamFamily
 
 NEARLY = 0.75  # share of an effect's signal from which a look-alike is named
 MOST = 3  # that are named for one effect
-
-
-@dataclass(frozen=True)
-class Likeness:
-    """A candidate that reproduces a share of a claimed effect's signal."""
-
-    effect: str
-    like: str
-    share: float
-
-    def to_dict(self) -> Mapping[str, Any]:
-        """For JSON."""
-        return {"effect": self.effect, "like": self.like, "share": self.share}
 
 
 def lookalikes(

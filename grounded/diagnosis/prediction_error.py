@@ -23,6 +23,7 @@ from grounded.diagnosis.fitted import Fit
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor
 from grounded.diagnosis.initial_state import widened
 from grounded.diagnosis.leftover import filter_of
+from grounded.diagnosis.report import Region, TimeShare
 from grounded.frozen import Array
 
 MOST_STARTS = 400
@@ -165,7 +166,7 @@ def explained(predictor: Predictor, null: Hypothesis, best: Fit) -> Array:
     return np.asarray(0.5 * (white[..., 0] ** 2 - best.white**2))
 
 
-def by_time(gain: Array, data: Data, parts: int = 8) -> list[dict[str, float]]:
+def by_time(gain: Array, data: Data, parts: int = 8) -> list[TimeShare]:
     """Shares of the gap over equal parts of the trial's duration."""
     whole = max(float(np.maximum(gain.sum(), 1e-12)), 1e-12)
     end = float(data.time.max()) + data.dt
@@ -174,13 +175,11 @@ def by_time(gain: Array, data: Data, parts: int = 8) -> list[dict[str, float]]:
     for a, b in itertools.pairwise(edges):
         inside = (data.time >= a) & (data.time < b)
         share = float(gain[inside].sum()) / whole
-        found.append({"from": float(a), "to": float(b), "share": max(share, 0.0)})
+        found.append(TimeShare(float(a), float(b), max(share, 0.0)))
     return found
 
 
-def by_region(
-    gain: Array, predictor: Predictor, fit: Fit, most: int = 3
-) -> list[dict[str, float | str]]:
+def by_region(gain: Array, predictor: Predictor, fit: Fit, most: int = 3) -> list[Region]:
     """Half-spaces of a state or an input that hold most of the gap in little of the time."""
     data = predictor.data
     model = data.model
@@ -197,15 +196,13 @@ def by_region(
         best = _stump(name, signal, gain, valid, whole)
         if best is not None:
             found.append(best)
-    found.sort(key=lambda r: -(float(r["share"]) - float(r["occupancy"])))
+    found.sort(key=lambda region: -(region.share - region.occupancy))
     return found[:most]
 
 
-def _stump(
-    name: str, signal: Array, gain: Array, valid: Any, whole: float
-) -> dict[str, float | str] | None:
+def _stump(name: str, signal: Array, gain: Array, valid: Any, whole: float) -> Region | None:
     """The best threshold of one signal, of its value or its size."""
-    best: dict[str, float | str] | None = None
+    best: Region | None = None
     margin = 0.1
     nothing = 1e-3 * float(signal[valid].std())  # a level that is zero but for rounding
     forms: list[tuple[str, Callable[[Array], Array]]] = [(name, lambda v: v)]
@@ -222,9 +219,5 @@ def _stump(
                     continue
                 margin = share - occupancy
                 shown = 0.0 if abs(level) < nothing else level
-                best = {
-                    "when": f"{label} {sign} {shown:.3g}",
-                    "share": min(share, 1.0),
-                    "occupancy": occupancy,
-                }
+                best = Region(f"{label} {sign} {shown:.3g}", min(share, 1.0), occupancy)
     return best

@@ -1,154 +1,299 @@
-"""What a diagnosis says: frozen values, one dict for JSON, sentences an engineer understands."""
+"""What a diagnosis says: one tree of frozen values, and the JSON document that it is kept as.
+
+Command, page, pictures, recording and notebook all take a `Diagnosis`; `to_json` gives the document
+of `diagnose --json` (CONTRACT.md) and `from_json` reads it back, an older one too.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from grounded.diagnosis.lookalike import Likeness
+from grounded.result import Document
+
+BRIEF: dict[str, Any] = {"brief": True}  # a field whose key is left out where there is nothing
 
 Kind = Literal["effect", "several", "none", "unknown"]
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """A value, its standard deviation, its 95 % interval, its unit."""
+@dataclass(frozen=True, eq=False)
+class Verdict(Document):
+    """The answer: its kind, the effects that it claims, and why, in sentences."""
+
+    kind: str  # one of `Kind`
+    effects: tuple[str, ...] = ()
+    sentence: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class ChannelShare(Document):
+    """A state's part of the gap, the rms of its prediction error and of its noise alone."""
+
+    name: str
+    share: float  # 0 to 1
+    rms: float
+    unit: str = ""
+    noise: float = math.nan
+
+
+@dataclass(frozen=True, eq=False)
+class TimeShare(Document):
+    """A time's part of the gap, from `start` to `end` [s] of a trial."""
+
+    start: float = field(metadata={"key": "from"})
+    end: float = field(metadata={"key": "to"})
+    share: float
+
+
+@dataclass(frozen=True, eq=False)
+class Region(Document):
+    """A region's part of the gap (`v > 0.5`), and of the time."""
+
+    when: str
+    share: float = math.nan
+    occupancy: float = math.nan
+
+
+@dataclass(frozen=True, eq=False)
+class Parts(Document):
+    """A mean squared error in three parts that sum to 1."""
+
+    explained: float = math.nan
+    unexplained: float = math.nan
+    irreducible: float = math.nan
+
+
+@dataclass(frozen=True, eq=False)
+class ChannelParts(Document):
+    """The same of one state, and the rms error of the bare model."""
+
+    name: str
+    unit: str = ""
+    rms: float = math.nan
+    explained: float = math.nan
+    unexplained: float = math.nan
+    irreducible: float = math.nan
+
+
+@dataclass(frozen=True, eq=False)
+class Split(Document):
+    """What the error a while ahead is made of: of all states in units of their noise, and of each.
+
+    The irreducible part comes from "repeats" of a candidate, or else from the estimated "noise".
+    """
+
+    horizon_s: float
+    whole: Parts = field(metadata={"key": "all"})
+    channels: tuple[ChannelParts, ...] = ()
+    irreducible_from: str = "noise"
+
+
+@dataclass(frozen=True, eq=False)
+class Where(Document):
+    """Where the gap lies, and what is left of it: the largest shares first.
+
+    split: by horizon (one_step, horizon, whole_run).
+    whiteness: by state, the chance that white noise leaves what is left of it (a p-value).
+    """
+
+    channels: tuple[ChannelShare, ...] = ()
+    times: tuple[TimeShare, ...] = ()
+    regions: tuple[Region, ...] = ()
+    split: Mapping[str, Split] = field(default_factory=dict)
+    whiteness: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate(Document):
+    """A value, its standard deviation, its 95 % interval (None in older documents), its unit."""
 
     value: float
-    std: float
-    low: float
-    high: float
-    unit: str
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return {
-            "value": self.value,
-            "std": self.std,
-            "interval": [self.low, self.high],
-            "unit": self.unit,
-        }
+    std: float = math.nan
+    interval: tuple[float, float] | None = field(metadata=BRIEF, default=None)
+    unit: str = ""
 
 
-@dataclass(frozen=True)
-class Ranked:
+@dataclass(frozen=True, eq=False)
+class Ranked(Document):
     """One explanation: its values, evidence [nats] over the model alone, the gap that it leaves."""
 
     effect: str
-    params: Mapping[str, Estimate]
-    fixed: Mapping[str, float]
-    evidence: float
-    gap_after: float | None = None
-    shrinkage: float | None = None
+    params: Mapping[str, Estimate] = field(default_factory=dict)
+    fixed: Mapping[str, float] = field(default_factory=dict)  # quantities that are no parameters
+    evidence: float = math.nan
+    gap_after: float = math.nan
+    shrinkage: float = math.nan  # the share of the gap that it closes
     claimed: bool = False
 
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return {
-            "effect": self.effect,
-            "params": {name: e.to_dict() for name, e in self.params.items()},
-            "fixed": dict(self.fixed),
-            "evidence": self.evidence,
-            "gap_after": self.gap_after,
-            "shrinkage": self.shrinkage,
-            "claimed": self.claimed,
-        }
+    @property
+    def values(self) -> dict[str, float]:
+        """All its quantities, as `grounded.effects.wrap` wants them."""
+        return {name: e.value for name, e in self.params.items()} | dict(self.fixed)
 
 
-@dataclass(frozen=True)
-class Remainder:
-    """A leftover that no known effect explains."""
+@dataclass(frozen=True, eq=False)
+class Likeness(Document):
+    """A candidate that reproduces a share of a claimed effect's signal."""
+
+    effect: str
+    like: str
+    share: float = math.nan
+
+
+@dataclass(frozen=True, eq=False)
+class Change(Document):
+    """An error without effects and with them."""
+
+    before: float = math.nan
+    after: float = math.nan
+
+
+@dataclass(frozen=True, eq=False)
+class RunChange(Change):
+    """The rms error of predictions from the first state to the end of each run."""
+
+    unit: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Gap(Document):
+    """The prediction error over a horizon, without the effects and with them, and the noise's."""
+
+    horizon_s: float = math.nan
+    unit: str = ""
+    before: float = math.nan
+    after: float = math.nan
+    floor: float = math.nan
+    held_out: bool = False
+    channels: Mapping[str, Change] = field(default_factory=dict)
+
+    @property
+    def measured(self) -> bool:
+        """Whether the document has a gap at all."""
+        return self != Gap()
+
+
+@dataclass(frozen=True, eq=False)
+class UtilityPrediction(Document):
+    """Rms error of predicted utilities of whole trials, without the effects and with them."""
+
+    trials: int = 0
+    unit: str = field(metadata=BRIEF, default="")
+    before: float = math.nan  # NaN: the predicted run diverged
+    after: float = math.nan
+    spread: float = field(metadata=BRIEF, default=math.nan)  # standard deviation of the real ones
+    mean: float = field(metadata=BRIEF, default=math.nan)
+
+
+@dataclass(frozen=True, eq=False)
+class Remainder(Document):
+    """A leftover that no known effect explains: a state's missing rate, rms."""
 
     channel: str
-    size: float
-    unit: str
-    gain: float
-    region: Mapping[str, Any] | None
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        region = None if self.region is None else dict(self.region)
-        return {
-            "channel": self.channel,
-            "size": self.size,
-            "unit": self.unit,
-            "evidence": self.gain,
-            "region": region,
-        }
+    size: float = math.nan
+    unit: str = ""
+    evidence: float = math.nan  # [nats]
+    region: Region | None = None  # that holds most of it
 
     def sentence(self) -> str:
         """One clause."""
-        where = "" if self.region is None else f", mostly where {self.region['when']}"
+        where = "" if self.region is None else f", mostly where {self.region.when}"
         return f"{self.channel} is off by {number(self.size)} {self.unit} rms{where}"
 
 
 @dataclass(frozen=True, eq=False)
-class Diagnosis:
-    """All that `grounded diagnose --json` shows (CONTRACT.md)."""
+class NoiseLevels(Document):
+    """The noise as it was estimated: a standard deviation for each state."""
 
-    kind: Kind
-    effects: tuple[str, ...]
-    sentence: str
-    channels: tuple[Mapping[str, Any], ...]
-    times: tuple[Mapping[str, Any], ...]
-    regions: tuple[Mapping[str, Any], ...]
-    ranking: tuple[Ranked, ...]
-    indistinguishable: tuple[tuple[str, ...], ...]
-    gap: Mapping[str, Any]
-    leftover: tuple[Remainder, ...]
-    next_trial: str
-    unknowable: tuple[str, ...] = ()
-    noise: Mapping[str, Any] = field(default_factory=dict)
-    whole_run: Mapping[str, Any] = field(default_factory=dict)
-    parameters: Mapping[str, Estimate] = field(
-        default_factory=dict
-    )  # calibrated beside the effects
-    split: Mapping[str, Any] = field(default_factory=dict)  # of the error, by horizon
-    whiteness: Mapping[str, float] = field(default_factory=dict)  # p-value of what is left
-    utility_prediction: Mapping[str, Any] | None = None  # where the subject was a task
+    process: Mapping[str, float] = field(default_factory=dict)
+    measurement: Mapping[str, float] = field(default_factory=dict)
+    correlation_s: float = math.nan  # of process noise; NaN where it is white
+    outliers: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Made(Document):
+    """What a diagnosis was made from: stored trials, and the model of that day."""
+
+    trials: tuple[str, ...] = ()
+    adopted: tuple[Mapping[str, Any], ...] = ()  # {"name": "dead_zone:throttle", "c": 0.146}
+    params: Mapping[str, float] | None = field(metadata=BRIEF, default=None)  # of [model]
+    nominal: Mapping[str, float] = field(default_factory=dict)  # the values of all parameters
+
+    def __post_init__(self) -> None:
+        if not all("name" in effect for effect in self.adopted):
+            raise ValueError("an adopted effect has no 'name'")
+
+    @property
+    def effects(self) -> dict[str, dict[str, Any]]:
+        """The adopted effects by name."""
+        return {str(effect["name"]): dict(effect) for effect in self.adopted}
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Diagnosis(Document):
+    """All that a diagnosis found, as `diagnose --json` has it (CONTRACT.md)."""
+
+    verdict: Verdict
+    where: Where = field(default_factory=Where)
+    ranking: tuple[Ranked, ...] = ()  # what is claimed first, then what lost
+    indistinguishable: tuple[tuple[str, ...], ...] = ()
     lookalikes: tuple[Likeness, ...] = ()  # that hardly differ from a claimed effect
+    gap: Gap = field(default_factory=Gap)
+    utility_prediction: UtilityPrediction | None = None  # where the subject was a task
+    whole_run: Mapping[str, RunChange] = field(default_factory=dict)
+    leftover: tuple[Remainder, ...] = ()
+    next_trial: str = ""
+    unknowable: tuple[str, ...] = ()  # what the trials are too few or too quiet for
+    noise: NoiseLevels = field(default_factory=NoiseLevels)
+    parameters: Mapping[str, Estimate] = field(default_factory=dict)  # calibrated beside effects
     trials: int = 0
     steps: int = 0
     candidates: int = 0
+    made: Made | None = field(metadata=BRIEF | {"key": "diagnosed"}, default=None)  # in a workspace
+    probe: str = field(metadata=BRIEF, default="")  # the candidate that tells what ties apart
+
+    def __repr__(self) -> str:
+        named = ", ".join(self.effects) or "no effect"
+        gap = f"{number(self.gap.before)} -> {number(self.gap.after)}"
+        return f"Diagnosis({self.kind}: {named}; gap {gap}; {self.trials} trials)"
+
+    @property
+    def kind(self) -> str:
+        """Of the verdict: one effect, several, none or unknown."""
+        return self.verdict.kind
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Those that the verdict claims."""
+        return self.verdict.effects
+
+    @property
+    def sentence(self) -> str:
+        """The verdict in words."""
+        return self.verdict.sentence
+
+    @property
+    def no_cause(self) -> bool:
+        """Whether too little is known to name any cause: its figures mean nothing then."""
+        return self.kind == "unknown" and any(text in self.sentence for text in self.unknowable)
+
+    def ranked(self, effect: str) -> Ranked | None:
+        """The row of an effect, None where it was not weighed."""
+        return next((row for row in self.ranking if row.effect == effect), None)
 
     def values(self, effect: str) -> dict[str, float]:
-        """An effect's quantities, constants included, as `grounded.effects.wrap` wants them."""
-        for ranked in self.ranking:
-            if ranked.effect == effect:
-                return {**ranked.fixed, **{n: e.value for n, e in ranked.params.items()}}
-        return {}
+        """An effect's quantities, fixed ones included; none where it was not weighed."""
+        row = self.ranked(effect)
+        return {} if row is None else row.values
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain lists, dicts and numbers, ready for JSON."""
-        return {
-            "verdict": {
-                "kind": self.kind,
-                "effects": list(self.effects),
-                "sentence": self.sentence,
-            },
-            "where": {
-                "channels": [dict(c) for c in self.channels],
-                "times": [dict(t) for t in self.times],
-                "regions": [dict(r) for r in self.regions],
-                "split": dict(self.split),
-                "whiteness": dict(self.whiteness),
-            },
-            "ranking": [r.to_dict() for r in self.ranking],
-            "indistinguishable": [list(group) for group in self.indistinguishable],
-            "lookalikes": [dict(one.to_dict()) for one in self.lookalikes],
-            "gap": dict(self.gap),
-            "utility_prediction": self.utility_prediction and dict(self.utility_prediction),
-            "whole_run": dict(self.whole_run),
-            "leftover": [left.to_dict() for left in self.leftover],
-            "next_trial": self.next_trial,
-            "unknowable": list(self.unknowable),
-            "noise": dict(self.noise),
-            "parameters": {name: e.to_dict() for name, e in self.parameters.items()},
-            "trials": self.trials,
-            "steps": self.steps,
-            "candidates": self.candidates,
-        }
+    def open(self, adopted: Iterable[Mapping[str, Any]]) -> tuple[str, ...]:
+        """The claimed effects that the model with these adopted ones lacks as it did then."""
+        now = {str(effect["name"]): dict(effect) for effect in adopted}
+        then = self.made.effects if self.made is not None else {}
+        return tuple(name for name in self.effects if now.get(name) == then.get(name))
 
 
 def number(value: float) -> str:

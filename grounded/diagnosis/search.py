@@ -15,7 +15,7 @@ from grounded.diagnosis.noise import Noise, Structure, first_guess
 from grounded.diagnosis.refine import refine
 from grounded.diagnosis.scan import Look, scan
 from grounded.effects import Effect, ParamFamily
-from grounded.errors import GroundedError
+from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import Array
 
 SPREADS = (0.03, 0.1)  # prior relative errors of the model's parameters when they are calibrated
@@ -68,7 +68,7 @@ class Search(Found):
         """The model alone under every noise structure, and with its parameters calibrated."""
         found = self.refined([self.fresh(Hypothesis())], iterations=20)
         if not found:
-            raise GroundedError(undefined(self.predictor))
+            raise undefined(self.predictor)
         (plain,) = found
         self.structures(plain)
         self.calibrated(plain)
@@ -233,16 +233,17 @@ class Search(Found):
         return other if exact in kept else None
 
 
-def undefined(predictor: Predictor) -> str:
-    """Where a model is no number along the log, in words."""
+def undefined(predictor: Predictor) -> GroundedError:
+    """Says where a model gives no finite number along the log."""
     data, h = predictor.data, Hypothesis()
     with np.errstate(all="ignore"):
         after = predictor.next(h, data.y[:-1])
     bad = np.argwhere(~np.isfinite(after).all(axis=-1) & (data.valid.T > 0))
     if not len(bad):
-        return (
-            "the model's own predictions of these trials diverge: try it with `grounded fit`, or "
-            "check the units of its parameters"
+        return GroundedError(
+            "the model's own predictions of these trials diverge: fit its parameters, or check "
+            "their units",
+            then=NextCommand("fit"),
         )
     t, b = bad[0]
     trial = data.ids[data.trial_of[b]] or f"number {data.trial_of[b] + 1}"
@@ -250,7 +251,7 @@ def undefined(predictor: Predictor) -> str:
         f"{name} = {value:.4g}"
         for name, value in zip(data.model.state_names, data.y[t, b], strict=True)
     )
-    return (
+    return GroundedError(
         f"the model '{data.model.name}' is no number at a state that was measured: trial {trial}, "
         f"t = {data.time[t, b]:.3g} s, {values}; noise can carry a log beyond where a square root "
         "or a logarithm holds: bound its argument in the model (np.maximum(x, 0))"

@@ -23,6 +23,7 @@ from grounded.diagnosis.data import Data
 from grounded.diagnosis.fitted import Fit
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor
 from grounded.diagnosis.prediction_error import Horizon, errors
+from grounded.diagnosis.report import ChannelParts, Parts, Split
 from grounded.diagnosis.shrinkage import held_out
 from grounded.frozen import Array
 
@@ -30,7 +31,7 @@ MOST_MOMENTS = 40  # at which repeats are compared
 
 
 @dataclass(frozen=True, eq=False)
-class Split:
+class SquaredErrors:
     """Mean squared errors of each state (n,) at one horizon; `noise` is the filter's estimate."""
 
     horizon: float  # [s]
@@ -53,35 +54,27 @@ class Split:
         floor = np.minimum(floor, after)
         return np.stack([before - after, after - floor, floor]) / np.maximum(before, 1e-300)
 
-    def to_dict(self, data: Data) -> dict[str, Any]:
-        """For JSON; in all, each channel counts in units of its noise."""
+    def shared_out(self, data: Data) -> Split:
+        """The shares of each state and in all, where each counts in units of its noise."""
         model, each = data.model, self.shares()
-        whole = self.shares(1 / np.maximum(self.noise, 1e-300))
-        return {
-            "horizon_s": self.horizon,
-            "all": _named(whole),
-            "channels": [
-                {
-                    "name": name,
-                    "unit": model.states[name],
-                    "rms": float(np.sqrt(np.nan_to_num(self.before[i]))),
-                    **_named(each[:, i]),
-                }
-                for i, name in enumerate(model.state_names)
-                if i not in data.hidden
-            ],
-            "irreducible_from": "noise" if self.repeats is None else "repeats",
-        }
-
-
-def _named(shares: Array) -> dict[str, float]:
-    keys = ("explained", "unexplained", "irreducible")
-    return {key: float(share) for key, share in zip(keys, shares, strict=True)}
+        channels = [
+            ChannelParts(
+                name,
+                model.states[name],
+                float(np.sqrt(np.nan_to_num(self.before[i]))),
+                *map(float, each[:, i]),
+            )
+            for i, name in enumerate(model.state_names)
+            if i not in data.hidden
+        ]
+        whole = Parts(*map(float, self.shares(1 / np.maximum(self.noise, 1e-300))))
+        source = "noise" if self.repeats is None else "repeats"
+        return Split(self.horizon, whole, tuple(channels), source)
 
 
 def split(
     predictor: Predictor, fit: Fit, bare: Array, where: Horizon, repeats: Sequence[Sequence[int]]
-) -> Split:
+) -> SquaredErrors:
     """The parts of the error at one horizon.
 
     Args:
@@ -93,7 +86,7 @@ def split(
     """
     before = errors(predictor, Hypothesis(), bare, where)
     after = held_out(predictor, fit, fit.track, where)
-    return Split(
+    return SquaredErrors(
         where.steps * predictor.data.dt,
         _mean_square(before),
         _mean_square(after),

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from grounded.diagnosis.fitted import Fit
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor
 from grounded.diagnosis.intervals import leave_one_out
+from grounded.diagnosis.report import UtilityPrediction
 from grounded.diagnosis.shrinkage import moved
 from grounded.frozen import Array
 from grounded.task import Task
@@ -25,35 +25,28 @@ FAR = 1e6  # a state beyond it has diverged
 
 
 @dataclass(frozen=True, eq=False)
-class UtilityPrediction:
+class Utilities:
     """Real utilities of whole trials (S,), predicted ones before and after."""
 
     real: Array
     before: Array
     after: Array
 
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON; null where a prediction diverged or no trial was whole."""
+    def summary(self) -> UtilityPrediction:
+        """Rms errors; NaN where a prediction diverged or no trial was whole."""
         if not len(self.real):
-            return {"trials": 0, "before": None, "after": None}
-        return {
-            "trials": len(self.real),
-            "unit": "utility, rms",
-            "before": _rms(self.before - self.real),
-            "after": _rms(self.after - self.real),
-            "spread": float(self.real.std()),
-            "mean": float(self.real.mean()),
-        }
-
-
-def _rms(error: Array) -> float | None:
-    value = float(np.sqrt((error**2).mean()))
-    return value if np.isfinite(value) else None
+            return UtilityPrediction()
+        before, after = (
+            float(np.sqrt(((predicted - self.real) ** 2).mean()))
+            for predicted in (self.before, self.after)
+        )
+        spread, mean = float(self.real.std()), float(self.real.mean())
+        return UtilityPrediction(len(self.real), "utility, rms", before, after, spread, mean)
 
 
 def utility_prediction(
     predictor: Predictor, fit: Fit, bare: Array, task: Task, trials: Sequence[Trial]
-) -> UtilityPrediction:
+) -> Utilities:
     """Real and predicted utilities of the trials that ran to the horizon.
 
     Args:
@@ -80,7 +73,7 @@ def utility_prediction(
         parts = [task.utility(_again(predictor, g, trial, start, i)) for g, start in pairs]
         rows.append([real, *parts])
     found = np.array(rows).reshape(-1, 3)
-    return UtilityPrediction(found[:, 0], found[:, 1], found[:, 2])
+    return Utilities(found[:, 0], found[:, 1], found[:, 2])
 
 
 def _again(predictor: Predictor, h: Hypothesis, trial: Trial, start: Array, i: int) -> Trial:

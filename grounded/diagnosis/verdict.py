@@ -1,7 +1,4 @@
-"""The verdict: its kind, its sentence, and what to run next.
-
-What a diagnosis says in words: an effect, the verdict, what to do in the next trial.
-"""
+"""What a diagnosis says in words: the verdict, each effect in it, what to run next."""
 
 from __future__ import annotations
 
@@ -11,12 +8,13 @@ from dataclasses import replace
 
 from grounded.diagnosis.claims import Claims
 from grounded.diagnosis.leftover import Leftover
-from grounded.diagnosis.lookalike import Likeness
 from grounded.diagnosis.report import (
     Estimate,
     Kind,
+    Likeness,
     Ranked,
     Remainder,
+    Verdict,
     number,
     quantity,
 )
@@ -34,7 +32,7 @@ def verdict(
     groups: tuple[tuple[str, ...], ...],
     alike: tuple[Likeness, ...],
     remainder: tuple[Remainder, ...],
-) -> tuple[Kind, str]:
+) -> Verdict:
     """One effect, several, none or unknown, and why, in sentences.
 
     Args:
@@ -49,36 +47,30 @@ def verdict(
     left = "; ".join(r.sentence() for r in remainder[:NAMED])
     left += f"; and {len(remainder) - NAMED} more" if len(remainder) > NAMED else ""
     if claims.known.no_cause:
-        return "unknown", f"No cause is named: {claims.known.sentences[0]}."
-    if claims.blamed:
-        return _calibration(claims, before, after, ranking, groups, alike)
-    if not claims.names and not remainder:
-        return "none", (
-            f"The model explains the data down to the noise (predictions "
-            f"{number(before)} times what noise alone makes)."
-        )
-    if not claims.names:
-        return "unknown", f"A gap remains that no known effect explains: {left}."
-    effects = {e.name: e for e in claims.best.hypothesis.effects}
+        return Verdict("unknown", (), f"No cause is named: {claims.known.sentences[0]}.")
     claimed = [row for row in ranking if row.claimed]
-    words = [sentence(meaning(effects[row.effect], row.params) for row in claimed)]
-    words.append(improvement(before, after))
+    if claims.blamed:
+        words = [_calibration(claims, ranking), improvement(before, after)]
+        words.append("Fit them all at once.")
+    elif claims.names:
+        effects = {e.name: e for e in claims.best.hypothesis.effects}
+        words = [sentence(meaning(effects[row.effect], row.params) for row in claimed)]
+        words.append(improvement(before, after))
+    elif remainder:
+        return Verdict("unknown", (), f"A gap remains that no known effect explains: {left}.")
+    else:
+        level = f"predictions {number(before)} times what noise alone makes"
+        return Verdict("none", (), f"The model explains the data down to the noise ({level}).")
     words += [f"The data can't tell {tied(group)}." for group in groups]
     if alike:
         words.append(nearly(alike))
-    if remainder:
+    if claims.names and remainder:
         words.append(f"Something is left that no known effect explains: {left}.")
-    return ("effect" if len(claims.names) == 1 else "several"), " ".join(words)
+    kind: Kind = "effect" if len(claimed) == 1 else "several"
+    return Verdict(kind, tuple(row.effect for row in claimed), " ".join(words))
 
 
-def _calibration(
-    claims: Claims,
-    before: float,
-    after: float,
-    ranking: Sequence[Ranked],
-    groups: tuple[tuple[str, ...], ...],
-    alike: tuple[Likeness, ...],
-) -> tuple[Kind, str]:
+def _calibration(claims: Claims, ranking: Sequence[Ranked]) -> str:
     """The model's form is right, its numbers are not."""
     model, listed = claims.data.model, []
     for row in ranking[: len(claims.blamed)]:
@@ -87,11 +79,7 @@ def _calibration(
         new = quantity(replace(d, value=nominal + d.value))
         part = f" ({d.value / abs(nominal):+.1%})" if nominal else ""
         listed.append(f"{name} should be {new}{part}")
-    text = sentence(["the model's form explains the data, its numbers don't", *listed])
-    words = [text, improvement(before, after), "`grounded fit` fits them all."]
-    words += [f"The data can't tell {tied(group)}." for group in groups]
-    words += [nearly(alike)] if alike else []
-    return ("effect" if len(listed) == 1 else "several"), " ".join(words)
+    return sentence(["the model's form explains the data, its numbers don't", *listed])
 
 
 def next_trial(

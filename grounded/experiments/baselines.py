@@ -19,7 +19,7 @@ from grounded.experiments.car_tasks import NAMES
 from grounded.experiments.jobs import Engine, Job, Progress, Table, run_jobs
 from grounded.experiments.methods import METHODS, run_method
 from grounded.search.improve import first_policy
-from grounded.search.standing import Options
+from grounded.search.standing import SearchOptions
 
 SHARES = (0.5, 0.9, 0.97, 0.99)
 BUDGET = 40  # trials of every method but finite differences
@@ -102,7 +102,7 @@ def one(method: str, manoeuvre: str, kind: str, seed: int) -> dict[str, Any]:
     """A job: one method, one case."""
     case = bench(manoeuvre, kind, seed)
     noisy = kind == "noise"
-    options = Options(max_trials=BUDGET)
+    options = SearchOptions(max_trials=BUDGET)
     best_policy, best = optimum(case)
     if noisy:
         best = true_utility(case.task, case.plant, best_policy, FRESH, seed)

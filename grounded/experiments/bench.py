@@ -26,8 +26,8 @@ from grounded.frozen import Array
 from grounded.models.car import model as car
 from grounded.plant import Noise, Plant
 from grounded.policy import Policy, z_difference
-from grounded.search.improve import learn
-from grounded.search.standing import Candidate, Options
+from grounded.search.ask_tell import learn
+from grounded.search.standing import Candidate, SearchOptions
 from grounded.task import Task
 from grounded.trial import Trial
 
@@ -82,10 +82,10 @@ def optimum(case: Bench) -> tuple[Policy, float]:
     def run(candidate: Candidate) -> Trial:
         return quiet.real(candidate.policy, 0)
 
-    options = Options(step="full", max_trials=30, max_halvings=6)
-    standing, _, _ = learn(case.truth, run, options)
-    assert standing.incumbent is not None
-    return standing.incumbent.candidate.policy, standing.incumbent.utility
+    options = SearchOptions(step="full", max_trials=30, max_halvings=6)
+    best = learn(case.truth, run, options).best
+    assert best is not None
+    return best.candidate.policy, best.utility
 
 
 def scaled(plant: Plant, level: float) -> Plant:

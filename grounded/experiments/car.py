@@ -23,8 +23,8 @@ from grounded.experiments.car_tasks import NAMES, car_task
 from grounded.experiments.jobs import Engine, Job, Progress, Table, improvement, mean_se, run_jobs
 from grounded.experiments.real_car import LATENCY, real_car, real_plant
 from grounded.models.car import model as car
-from grounded.search.improve import learn
-from grounded.search.standing import Candidate, Options
+from grounded.search.ask_tell import learn
+from grounded.search.standing import Candidate, SearchOptions
 from grounded.trial import Trial
 
 PAPER = {"turn": 0.97, "circle": 0.88, "figure8": 0.63}
@@ -139,15 +139,15 @@ def real_case(manoeuvre: str, seed: int, noisy: bool) -> Bench:
 def one(manoeuvre: str, seed: int, noisy: bool) -> dict[str, Any]:
     """A job: one repetition of one manoeuvre."""
     case = real_case(manoeuvre, seed, noisy)
-    options = Options(max_trials=BUDGET)
+    options = SearchOptions(max_trials=BUDGET)
     trials: list[Trial] = []
 
     def real(candidate: Candidate) -> Trial:
         trials.append(case.real(candidate.policy, len(trials)))
         return trials[-1]
 
-    standing, candidates, _ = learn(case.task, real, options, max_iterations=ITERATIONS)
-    assert standing.incumbent is not None
+    found = learn(case.task, real, options, max_iterations=ITERATIONS)
+    standing = found.standing
     kept = [tried for tried in standing.history if tried.accepted]
     best, _ = optimum(case)
     fresh = FRESH if noisy else 1
@@ -167,6 +167,6 @@ def one(manoeuvre: str, seed: int, noisy: bool) -> dict[str, Any]:
         "true": true[:2],
         "optimum": true[2],
         "trials": len(trials),
-        "alphas": [candidate.alpha for candidate in candidates],
+        "alphas": [candidate.alpha for candidate in found.candidates],
         "paths": paths,
     }

@@ -29,8 +29,8 @@ from grounded.experiments.filmed import Filmed, Flown
 from grounded.experiments.jobs import Engine, Job, Progress, Table, improvement, mean_se, run_jobs
 from grounded.frozen import Array
 from grounded.policy import Policy
-from grounded.search.improve import learn
-from grounded.search.standing import Candidate, Options
+from grounded.search.ask_tell import learn
+from grounded.search.standing import Candidate, SearchOptions
 from grounded.trial import Trial
 
 CAMERA = 0.003  # [m] noise of a marker's position
@@ -176,7 +176,7 @@ def one(manoeuvre: str, seed: int, states: str) -> dict[str, Any]:
     case = real_case(manoeuvre, seed, True)
     see = markers(SPACING)
     filmed = Filmed(case.task, case.plant, see, CAMERA, assumed_noise(case, see, seed))
-    options = Options(max_trials=BUDGET)
+    options = SearchOptions(max_trials=BUDGET)
     flights: list[Flown] = []
 
     def real(candidate: Candidate) -> Trial:
@@ -184,7 +184,7 @@ def one(manoeuvre: str, seed: int, states: str) -> dict[str, Any]:
         flights.append(filmed.run(candidate.policy, rng, estimated=states == "camera"))
         return flights[-1].trial
 
-    standing, _, _ = learn(case.task, real, options, max_iterations=ITERATIONS)
+    standing = learn(case.task, real, options, max_iterations=ITERATIONS).standing
     assert standing.incumbent is not None
     first = next(tried for tried in standing.history if tried.accepted)
     policies = (first.candidate.policy, standing.incumbent.candidate.policy, optimum(case)[0])

@@ -34,8 +34,9 @@ from grounded.experiments.jobs import (
 from grounded.frozen import Array
 from grounded.models.aircraft import model as aircraft
 from grounded.rollout import simulate
-from grounded.search.improve import first_policy, learn, propose
-from grounded.search.standing import Candidate, Options
+from grounded.search.ask_tell import learn
+from grounded.search.improve import first_policy, propose
+from grounded.search.standing import Candidate, SearchOptions
 from grounded.task import Task
 from grounded.trial import Trial
 
@@ -202,7 +203,7 @@ def one(seed: int, step: str) -> dict[str, Any]:
     truth = flight_task(aircraft)
     crude = perturbed(aircraft, np.random.default_rng(seed))
     task = flight_task(crude, started_by=aircraft)
-    options = Options(step="full" if step == "full" else "damped")
+    options = SearchOptions(step="full" if step == "full" else "damped")
     first = propose(task, [], [], options).candidate
     if first is None or unstable(truth, flown := real_flight(truth, first)):
         utility = [] if first is None else [_finite(truth.utility(flown))]
@@ -218,16 +219,15 @@ def one(seed: int, step: str) -> dict[str, Any]:
     def fly(candidate: Candidate) -> Trial:
         return real_flight(truth, candidate)
 
-    standing, candidates, trials = learn(task, fly, options, max_iterations=ITERATIONS)
-    assert standing.incumbent is not None
-    best = standing.incumbent.trials[0]
+    found = learn(task, fly, options, max_iterations=ITERATIONS)
+    assert found.best is not None
     return {
         "seed": seed,
         "discarded": False,
-        "utilities": standing.utilities,
-        "trials": len(trials),
-        "alphas": [candidate.alpha for candidate in candidates],
-        "paths": _paths(model=trials[0], learned=best),
+        "utilities": found.standing.utilities,
+        "trials": len(found.trials),
+        "alphas": [candidate.alpha for candidate in found.candidates],
+        "paths": _paths(model=found.trials[0], learned=found.best.trials[0]),
     }
 
 

@@ -24,8 +24,8 @@ import numpy as np
 
 from grounded.experiments.jobs import Table
 from grounded.model import Model, Param
-from grounded.search.improve import learn
-from grounded.search.standing import Candidate, Options
+from grounded.search.ask_tell import learn
+from grounded.search.standing import Candidate, SearchOptions
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded.utility import Reward
@@ -128,8 +128,8 @@ def _solved(b: float) -> tuple[float, int]:
         a = candidate.policy.feedforward
         return Trial(np.vstack([np.zeros((1, 1)), a]), a, 1.0, ("s",), ("a",))
 
-    standing, _, trials = learn(task, real, Options(step="full"), max_iterations=1)
-    return math.exp(standing.utilities[-1]), len(trials)
+    found = learn(task, real, SearchOptions(step="full"), max_iterations=1)
+    return math.exp(found.standing.utilities[-1]), len(found.trials)
 
 
 def _gradient(b: float, iterations: int) -> tuple[float, int]:

@@ -25,7 +25,7 @@ from grounded.frozen import Array
 from grounded.model import Model
 from grounded.policy import Policy
 from grounded.search.improve import first_policy, propose
-from grounded.search.standing import Candidate, Options
+from grounded.search.standing import Candidate, SearchOptions
 from grounded.task import Task
 from grounded.trial import Trial, mean_trial
 
@@ -41,7 +41,7 @@ class Kept:
     utility: float
 
 
-def search(case: Bench, options: Options, refit: Refit | None = None) -> list[Kept]:
+def search(case: Bench, options: SearchOptions, refit: Refit | None = None) -> list[Kept]:
     """This algorithm, through the function behind `grounded propose`."""
     candidates: list[Candidate] = []
     trials: list[Trial] = []
@@ -67,7 +67,7 @@ def fitted(task: Task, trials: Sequence[Trial]) -> Model:
     return fit(task, whole, hold_out=0.0).model if whole else task.model
 
 
-def refit_alone(case: Bench, options: Options, rounds: int = 6) -> list[Kept]:
+def refit_alone(case: Bench, options: SearchOptions, rounds: int = 6) -> list[Kept]:
     """Fit to all trials so far, solve, run, again; the policy of the latest model is kept."""
     task, trials, kept = case.task, list[Trial](), list[Kept]()
     for _ in range(rounds):
@@ -80,7 +80,7 @@ def refit_alone(case: Bench, options: Options, rounds: int = 6) -> list[Kept]:
     return kept
 
 
-def learning_control(case: Bench, options: Options, rounds: int = 12) -> list[Kept]:
+def learning_control(case: Bench, options: SearchOptions, rounds: int = 12) -> list[Kept]:
     """Norm-optimal ILC: every update is taken; after a failed run the step is not repeated."""
     policy, _ = first_policy(case.task)
     model = lifted(case.task, policy)
@@ -97,7 +97,7 @@ def learning_control(case: Bench, options: Options, rounds: int = 12) -> list[Ke
     return kept
 
 
-def differences(case: Bench, options: Options, budget: int = 5000) -> list[Kept]:
+def differences(case: Bench, options: SearchOptions, budget: int = 5000) -> list[Kept]:
     """BFGS on the real utility by the feed-forward; a gradient costs H m trials.
 
     The gradient is the true system's own derivative, so no noise spoils it and no step size has to
@@ -139,7 +139,7 @@ def differences(case: Bench, options: Options, budget: int = 5000) -> list[Kept]
     return [k for k in kept if k.trials <= budget]
 
 
-def run_method(name: str, case: Bench, options: Options) -> list[Kept]:
+def run_method(name: str, case: Bench, options: SearchOptions) -> list[Kept]:
     """The policies that a method keeps, in the order of real trials."""
     if name == "grounded":
         return search(case, options)

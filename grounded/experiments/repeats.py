@@ -27,7 +27,7 @@ from grounded.experiments.jobs import Engine, Job, Progress, Table, mean_se, run
 from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.search.improve import propose
-from grounded.search.standing import Candidate, Options
+from grounded.search.standing import Candidate, SearchOptions
 from grounded.task import Task
 from grounded.trial import Trial
 
@@ -223,7 +223,7 @@ def _search(
     rule: Rule, real: Callable[[Policy, int], Trial], task: Task
 ) -> tuple[list[tuple[int, Policy]], float, int]:
     """The policies kept in turn and after how many trials, what the last one claims, trials run."""
-    options = Options(
+    options = SearchOptions(
         max_trials=BUDGET,
         repeats=rule.repeats,
         max_halvings=rule.max_halvings,

@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,7 @@ from grounded.fit.search import Found
 from grounded.fit.unknowns import Unknowns
 from grounded.frozen import Array
 from grounded.model import Model
+from grounded.result import Result, document
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,8 +45,8 @@ class Estimate:
     start: float
 
 
-@dataclass(frozen=True, eq=False)
-class Fit:
+@dataclass(frozen=True, eq=False, repr=False)
+class Fit(Result):
     """What a fit found.
 
     `params` holds the model's parameters and, if fitted, `latency` or `latency:<input>` [s].
@@ -64,6 +66,29 @@ class Fit:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "params", MappingProxyType(dict(self.params)))
+
+    def summary(self) -> str:
+        """The values with their standard deviations."""
+        found = ", ".join(f"{name} {e.value:.4g} +- {e.std:.2g}" for name, e in self.params.items())
+        return f"{self.status}: {found}"
+
+    def to_json(self) -> dict[str, Any]:
+        """The document of `grounded fit --json`; "applied" is for whoever writes the values."""
+        found = document(
+            params={name: vars(e) for name, e in self.params.items()},
+            status=self.status,
+            sentence=self.sentence,
+            samples=self.samples,
+            applied=False,
+        )
+        for name, error in (("before", self.before), ("after", self.after)):
+            if error is not None:
+                found[f"prediction_error_{name}"] = document(
+                    horizon_s=error.horizon_s,
+                    one_step=dict(zip(error.names, error.one_step, strict=True)),
+                    ahead=dict(zip(error.names, error.ahead, strict=True)),
+                )
+        return found
 
 
 def report(

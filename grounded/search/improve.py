@@ -13,19 +13,19 @@ true states.
 | 3    | run it, record the trial                       | people, robots: `grounded run`, `ingest`|
 | 4    | add a bias to the ORIGINAL model               | `bias.ground`                           |
 | 5    | direction d from algorithm A in that model     | `direction` (`ddp`, `policy_gradient`)  |
-| 6    | theta + alpha d, line search on the real system| `Policy.toward`, `line_search`          |
-| 7    | none improves: return the current policy       | `search.standing`                       |
+| 6    | theta + alpha d, line search on the real system| `Policy.toward`, `step_size`            |
+| 7    | none improves: return the current policy       | `standing`                              |
 
 `propose` is a pure function: the same candidates and trials give the same next candidate, bit for
-bit. `learn` is the loop for a real system that is a function call.
+bit. `ask_tell` is the loop around it.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -33,11 +33,12 @@ from grounded.compile import Problem
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.policy import Policy
+from grounded.result import Result, document
 from grounded.rollout import simulate
 from grounded.search.first_policy import first_guess
 from grounded.search.planner import Planner
 from grounded.search.safety import objections, spread
-from grounded.search.standing import Candidate, Options, Standing, Tried, standing
+from grounded.search.standing import Candidate, SearchOptions, Standing, Tried, standing
 from grounded.search.step_size import Step
 from grounded.solve import ddp
 from grounded.solve.bias import Grounding, ground
@@ -48,14 +49,34 @@ PLANNING = ddp.Options(max_iterations=30, tolerance=1e-6)  # a direction needs n
 CAUTION = 100.0  # factor on the input penalties each time the first policy crashed (FACTS.md 2)
 
 
-@dataclass(frozen=True, eq=False)
-class Proposal:
+@dataclass(frozen=True, eq=False, repr=False)
+class Proposal(Result):
     """What to run next, or why nothing is: `candidate` is None when the search has ended."""
 
     standing: Standing
     candidate: Candidate | None
     is_new: bool
     notes: tuple[str, ...] = ()
+
+    def summary(self) -> str:
+        """The candidate, or the end of the search."""
+        return self.candidate.summary() if self.candidate else self.standing.summary()
+
+    def to_json(self) -> dict[str, Any]:
+        """The document of `grounded propose --json`; `file` is for whoever writes the candidate."""
+        now, made = self.standing, self.candidate
+        known = document(
+            candidate=made and made.id,
+            file=None,
+            iteration=made.iteration if made else now.iteration,
+            alpha=made and made.alpha,
+            predicted_utility=made and made.predicted_utility,
+            phase="await-trial" if made else now.phase,
+            sentence=now.sentence,
+            notes=self.notes,
+        )
+        best = now.incumbent and now.incumbent.utility
+        return known | document(best_utility=best, new=self.is_new) if made else known
 
 
 def model_fingerprint(task: Task) -> str:
@@ -96,7 +117,7 @@ def first_policy(task: Task, caution: int = 0) -> tuple[Policy, ddp.Result]:
 
 
 def direction(
-    task: Task, policy: Policy, grounding: Grounding, options: Options, damping: float = 1.0
+    task: Task, policy: Policy, grounding: Grounding, options: SearchOptions, damping: float = 1.0
 ) -> Policy:
     """Step 5: theta' such that d = theta' - theta improves the policy in the biased model.
 
@@ -105,10 +126,12 @@ def direction(
         policy: theta, the policy that ran the trial.
         grounding: the trial as the biased model replays it (step 4).
         options: which algorithm A.
-        damping: lambda of `trust`, the share of mu that leaving the trial's inputs costs.
+        damping: lambda of `step_size`, the share of mu that leaving the trial's inputs costs.
     """
     if options.method == "policy-gradient":
-        return _gradient_direction(task, policy, grounding)
+        from grounded.solve.policy_gradient import ascent
+
+        return ascent(task, policy, grounding)
     problem = grounding.on(task.problem())
     if options.step == "damped":
         problem = damped(problem, grounding.inputs, damping)
@@ -133,17 +156,11 @@ def damped(problem: Problem, inputs: Array, factor: float = 1.0) -> Problem:
     return replace(problem, input_weight=weight, input_target=mixed / safe)
 
 
-def _gradient_direction(task: Task, policy: Policy, grounding: Grounding) -> Policy:
-    from grounded.solve.policy_gradient import ascent
-
-    return ascent(task, policy, grounding)
-
-
 def propose(
     task: Task,
     candidates: Sequence[Candidate],
     trials: Sequence[Trial],
-    options: Options,
+    options: SearchOptions,
     *,
     identity: str = "",
     planner: Planner | None = None,
@@ -158,7 +175,8 @@ def propose(
         options: the [search] table.
         identity: the name of a new candidate; by default the next after those of this task.
         planner: plans with adopted effects; None: with the task's own model.
-        refit: with options.refit, gives the model with parameters fitted to all trials.
+        refit: with options.refit, gives the model with parameters fitted to all trials; None: by
+            `grounded.fit`.
     """
     planner = planner or Planner(task, task)
     fingerprint = model_fingerprint(planner.plan)
@@ -167,8 +185,8 @@ def propose(
         return Proposal(now, now.outstanding, is_new=False)
     if now.phase != "propose":
         return Proposal(now, None, is_new=False)
-    if options.refit and refit is not None and now.incumbent is not None:
-        planner = planner.with_model(refit(planner.plan, trials))
+    if options.refit and now.incumbent is not None:
+        planner = planner.with_model((refit or refitted)(planner.plan, trials))
     make = _Maker(planner, now, identity or f"c{len(candidates) + 1:04d}", fingerprint)
     if now.incumbent is None:
         policy, _ = first_policy(planner.plan, now.caution)
@@ -176,7 +194,14 @@ def propose(
     return _improvement(make, now.incumbent, options)
 
 
-def _improvement(make: _Maker, incumbent: Tried, options: Options) -> Proposal:
+def refitted(task: Task, trials: Sequence[Trial]) -> Model:
+    """The task's model with parameters fitted to all trials that are finite to their end."""
+    from grounded.fit import fit
+
+    return fit(task, [t for t in trials if t.finite_steps == t.steps and t.steps > 2]).model
+
+
+def _improvement(make: _Maker, incumbent: Tried, options: SearchOptions) -> Proposal:
     """Steps 4 to 6: the first step, from the one that is due on, that the model believes in.
 
     A step whose predicted run loses is passed over in the model, at no trial's cost: d must satisfy
@@ -217,7 +242,7 @@ def _improvement(make: _Maker, incumbent: Tried, options: Options) -> Proposal:
         f"the model promises less than {100 * options.tolerance:g} % more from any step ([search] "
         f"tolerance): {incumbent.candidate.id} is the result"
     )
-    ended = dataclasses.replace(make.now, phase="converged", step=None, sentence=sentence)
+    ended = replace(make.now, phase="converged", step=None, sentence=sentence)
     return Proposal(ended, None, is_new=False)
 
 
@@ -256,33 +281,5 @@ class _Maker:
         found = objections(task, made, spread(task, self.now.history))
         if not found:
             return Proposal(self.now, made, is_new=True)
-        stopped = dataclasses.replace(self.now, phase="stopped", sentence=found[0])
+        stopped = replace(self.now, phase="stopped", sentence=found[0])
         return Proposal(stopped, None, is_new=False, notes=tuple(found))
-
-
-def learn(
-    task: Task,
-    run: Callable[[Candidate], Trial],
-    options: Options,
-    *,
-    max_iterations: int | None = None,
-) -> tuple[Standing, list[Candidate], list[Trial]]:
-    """Steps 1 to 7 for a real system that is a function call: `run` executes a candidate once.
-
-    Args:
-        task: the manoeuvre.
-        run: executes a candidate and returns its trial; its `candidate` field is set here.
-        options: the [search] table.
-        max_iterations: ends after so many accepted improvements.
-    """
-    candidates: list[Candidate] = []
-    trials: list[Trial] = []
-    while True:
-        proposal = propose(task, candidates, trials, options)
-        done = max_iterations is not None and proposal.standing.iteration >= max_iterations
-        if proposal.candidate is None or (done and proposal.is_new):
-            return proposal.standing, candidates, trials
-        if proposal.is_new:
-            candidates.append(proposal.candidate)
-        trial = run(proposal.candidate)
-        trials.append(replace(trial, candidate=proposal.candidate.id))

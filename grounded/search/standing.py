@@ -13,16 +13,18 @@ Same candidates and trials, same state: nothing depends on the clock or on the p
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.policy import Policy
-from grounded.search.step_size import Step, after_failure, after_success, next_alpha
+from grounded.result import Result, document
+from grounded.search.step_size import Step, after_failure, after_success
 from grounded.task import Task
 from grounded.trial import Trial
 
@@ -31,7 +33,7 @@ MAX_CAUTION = 3  # times the first policy is designed again, ever more gently, a
 
 
 @dataclass(frozen=True)
-class Options:
+class SearchOptions:
     """The [search] table: see CONTRACT.md. `tolerance` ends a search that has nothing to gain."""
 
     method: Literal["ddp", "policy-gradient"] = "ddp"
@@ -60,7 +62,7 @@ class Options:
 
     @property
     def damps(self) -> bool:
-        """Whether steps are damped by `trust`, or only halved as in the paper."""
+        """Whether steps are damped as well (see `step_size`), or only halved as in the paper."""
         return self.method == "ddp" and self.step == "damped"
 
     def first_step(self) -> Step:
@@ -69,14 +71,11 @@ class Options:
 
     def next_step(self, step: Step) -> Step | None:
         """The step after one that did not improve; None when the search has failed (step 7)."""
-        if self.damps:
-            return after_failure(step, self.max_halvings)
-        alpha = next_alpha([step.alpha], self.max_halvings)
-        return None if alpha is None else Step(step.damping, alpha)
+        return after_failure(step, self.max_halvings, damps=self.damps)
 
 
-@dataclass(frozen=True, eq=False)
-class Candidate:
+@dataclass(frozen=True, eq=False, repr=False)
+class Candidate(Result):
     """A policy to run, and how it came about."""
 
     id: str  # c0001, c0002 ...: the order of proposal
@@ -88,13 +87,28 @@ class Candidate:
     predicted_states: Array  # (H + 1, n) in the (biased) model
     predicted_inputs: Array  # (H, m)
     predicted_utility: float
-    damping: float = 1.0  # lambda of `trust`
+    damping: float = 1.0  # lambda of `step_size`
     predicted_gain: float = float("nan")  # over the mean trial of its base
     caution: int = 0  # how often the first policy was redesigned after a crash
 
+    def summary(self) -> str:
+        """Its name, its step and what the model predicts."""
+        predicted = f"predicted utility {self.predicted_utility:.4g}"
+        return f"{self.id}: iteration {self.iteration}, alpha {self.alpha:g}, {predicted}"
 
-@dataclass(frozen=True, eq=False)
-class Tried:
+    def to_json(self) -> dict[str, Any]:
+        """How it came about; its policy is what `grounded export` writes."""
+        return document(
+            candidate=self.id,
+            iteration=self.iteration,
+            alpha=self.alpha,
+            base=self.base or None,
+            predicted_utility=self.predicted_utility,
+        )
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Tried(Result):
     """A candidate with its trials: mean utility and, for two trials or more, its standard error."""
 
     candidate: Candidate
@@ -115,9 +129,38 @@ class Tried:
             return float("nan")
         return float(np.std(self.utilities, ddof=1) / np.sqrt(len(self.utilities)))
 
+    def verdict(self, last: bool = True) -> str:
+        """What became of the candidate: first, better, no better; or why that is not decided.
 
-@dataclass(frozen=True, eq=False)
-class Standing:
+        Args:
+            last: whether it is the latest one; an earlier one without a trial will get none.
+        """
+        if self.in_doubt:
+            return "in doubt"
+        if self.accepted is None:
+            return "waiting" if last or self.trials else "no trial"
+        if not self.accepted:
+            return "no better"
+        return "better" if self.candidate.base else "first"
+
+    def summary(self) -> str:
+        """Its name, its utility and what became of it."""
+        mean = f"utility {self.utility:.4g}, trials {len(self.trials)}"
+        return f"{self.candidate.id}: {mean}, {self.verdict()}"
+
+    def to_json(self) -> dict[str, Any]:
+        """The candidate's document, and what its trials were worth."""
+        return self.candidate.to_json() | document(
+            utility=self.utility,
+            standard_error=self.standard_error,
+            trials=[trial.id for trial in self.trials],
+            accepted=self.accepted,
+            verdict=self.verdict(),
+        )
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Standing(Result):
     """Where the search stands, with the sentence that says it."""
 
     phase: Phase
@@ -136,12 +179,34 @@ class Standing:
         """Utility of the model's policy, then after each accepted improvement."""
         return [t.utility for t in self.history if t.accepted]
 
+    def summary(self) -> str:
+        """Its phase and the best candidate."""
+        best = self.incumbent
+        known = f"best {best.candidate.id}, utility {best.utility:.4g}" if best else "none yet"
+        return f"{self.phase}: trials {self.trials}, {known}"
+
+    def to_json(self) -> dict[str, Any]:
+        """The document of `grounded status --json`, with the whole history."""
+        best, last = self.incumbent, self.history[-1] if self.history else None
+        return document(
+            phase=self.phase,
+            iteration=self.iteration,
+            best=best and {"candidate": best.candidate.id, "utility": best.utility},
+            utilities=self.utilities,
+            trials=self.trials,
+            outstanding=self.outstanding.id if self.outstanding else None,
+            missing=self.missing,
+            sentence=self.sentence,
+            certainty=last_improvement(self.history),
+            history=[t.to_json() | {"verdict": t.verdict(t is last)} for t in self.history],
+        )
+
 
 def standing(
     task: Task,
     candidates: Sequence[Candidate],
     trials: Sequence[Trial],
-    options: Options,
+    options: SearchOptions,
     model: str,
 ) -> Standing:
     """Steps 6 and 7 over stored trials.
@@ -158,69 +223,64 @@ def standing(
     last = history[-1] if history else None
     doubt = next((t for t in history if t.in_doubt), None)
 
-    def state(phase: Phase, sentence: str, **more: object) -> Standing:
-        fields = {"outstanding": None, "missing": 0, "step": None, "caution": 0} | more
-        return Standing(
-            phase,
-            iteration,
-            incumbent,
-            history=history,
-            trials=total,
-            sentence=sentence,
-            **fields,  # type: ignore[arg-type]
-        )
-
+    now = Standing(
+        phase="propose",
+        iteration=iteration,
+        incumbent=incumbent,
+        outstanding=None,
+        missing=0,
+        step=None,
+        caution=0,
+        history=history,
+        trials=total,
+        sentence="the model's own policy comes first",
+    )
     if doubt is not None and incumbent is not None:
         own = incumbent.candidate.id
-        return state(
-            "await-trial",
-            f"{doubt.candidate.id} lost to {own} by less than luck may do: {own} is waiting for "
-            "another trial",
+        return replace(
+            now,
+            phase="await-trial",
             outstanding=incumbent.candidate,
             missing=1,
+            sentence=f"{doubt.candidate.id} lost to {own} by less than luck may do: {own} is "
+            "waiting for another trial",
         )
     if last is not None and last.accepted is None and last.candidate.model == model:
         missing = options.repeats - len(last.trials)
-        return state(
-            "await-trial",
-            f"{last.candidate.id} is waiting for {missing} trial{'s' * (missing > 1)}",
+        return replace(
+            now,
+            phase="await-trial",
             outstanding=last.candidate,
             missing=missing,
+            sentence=f"{last.candidate.id} is waiting for {missing} trial{'s' * (missing > 1)}",
         )
     if total + options.repeats > options.max_trials:
         used = "all" if total >= options.max_trials else f"{total} of"
         needs = f"; a candidate needs {options.repeats}" * (total < options.max_trials)
-        return state(
-            "stopped",
-            f"{used} {options.max_trials} trials are used up{needs} ([search] max_trials)",
-        )
+        sentence = f"{used} {options.max_trials} trials are used up{needs} ([search] max_trials)"
+        return replace(now, phase="stopped", sentence=sentence)
     if incumbent is None:
         failed = sum(t.accepted is False for t in history)
         if failed > MAX_CAUTION:
-            return state(
-                "stopped",
+            sentence = (
                 f"the first policy crashed {failed} times, designed more gently each time: the "
-                "model is too far off to start from; mend it (fit, diagnose) and propose again",
+                "model is too far off to start from; mend it (fit, diagnose) and propose again"
             )
-        return state(
-            "propose",
-            "the model's own policy comes first",
-            step=options.first_step(),
-            caution=failed,
-        )
+            return replace(now, phase="stopped", sentence=sentence)
+        return replace(now, step=options.first_step(), caution=failed)
     own = incumbent.candidate.id
     step = _next_step(history, incumbent, options, model)
     if step is None:
-        return state(
-            "converged",
+        sentence = (
             f"no step improved on {own} down to alpha = {2.0**-options.max_halvings:g}: "
-            f"{own} is the result (step 7)",
+            f"{own} is the result (step 7)"
         )
-    return state("propose", f"improve on {own} with alpha = {step.alpha:g}", step=step)
+        return replace(now, phase="converged", sentence=sentence)
+    return replace(now, step=step, sentence=f"improve on {own} with alpha = {step.alpha:g}")
 
 
 def _next_step(
-    history: tuple[Tried, ...], incumbent: Tried, options: Options, model: str
+    history: tuple[Tried, ...], incumbent: Tried, options: SearchOptions, model: str
 ) -> Step | None:
     """Damping and alpha after what the trials have shown; a direction belongs to one model."""
     made = incumbent.candidate
@@ -241,7 +301,7 @@ def _judge(
     task: Task,
     candidates: Sequence[Candidate],
     trials: Sequence[Trial],
-    options: Options,
+    options: SearchOptions,
     model: str,
 ) -> tuple[tuple[Tried, ...], Tried | None, int]:
     """Every candidate with its trials, accepted or not; the incumbent; iterations done."""
@@ -290,3 +350,44 @@ def _in_doubt(incumbent: Tried, loser: Tried, most: int) -> bool:
     scatter = incumbent.standard_error * np.sqrt(len(incumbent.trials))
     error = scatter * np.sqrt(1 / len(incumbent.trials) + 1 / len(loser.trials))
     return not incumbent.utility - loser.utility > 2 * error
+
+
+def utility_noise(history: Sequence[Tried]) -> tuple[float, int]:
+    """Standard deviation of a single trial's utility, pooled, and its degrees of freedom."""
+    square, freedom = 0.0, 0
+    for tried in history:
+        known = [u for u in tried.utilities if math.isfinite(u)]
+        if len(known) > 1:
+            square += float(np.var(known, ddof=1)) * (len(known) - 1)
+            freedom += len(known) - 1
+    return (math.sqrt(square / freedom) if freedom else float("nan")), freedom
+
+
+def last_improvement(history: Sequence[Tried]) -> str:
+    """How sure the last accepted improvement is, as a sentence; "" before there is one.
+
+    Two candidates differ for certain where the difference of their means exceeds its standard
+    error; Welch's t-test gives the probability. Single trials say nothing about noise: then the
+    scatter of any candidate that was repeated stands in for it.
+    """
+    accepted = [t for t in history if t.accepted]
+    if len(accepted) < 2:
+        return ""
+    before, after = accepted[-2], accepted[-1]
+    gain = after.utility - before.utility
+    noise, freedom = utility_noise(history)
+    if not freedom:
+        return (
+            f"the last gain is {gain:.3g}; every candidate was run once, so the noise of a "
+            "trial is unknown: run the best one again"
+        )
+    error = noise * math.sqrt(1 / len(before.utilities) + 1 / len(after.utilities))
+    if error == 0:
+        return f"the last gain is {gain:.3g}; repeated trials agree exactly"
+    from scipy.stats import t as student
+
+    probability = float(student.cdf(gain / error, freedom))
+    return (
+        f"the last gain is {gain:.3g} +- {error:.2g} (noise of one trial {noise:.2g}): "
+        f"an improvement with probability {probability:.2f}"
+    )

@@ -1,34 +1,31 @@
-"""Trust: how far the model's promise is believed, read off the trials that kept or broke it.
+"""Steps 6 and 7: how large a step is tried next on the REAL system, after what trials have shown.
 
-Two numbers say which step is tried next on the real system:
+A step is two numbers:
 
     damping   lambda in [0, 1]: the price lambda (R + S) |u - u_trial|^2 on leaving the trial's
               inputs, within which DDP converges (`improve.damped`)
-    alpha     the paper's step along the direction that results, 1, 1/2, 1/4 ...
+    alpha     the paper's step along the direction that results: 1, then halved until a trial
+              improves the utility (footnote 11)
 
 At lambda = 1 the step is the cautious one that a crude model deserves; at 0 it is the paper's, DDP
 to convergence. Neither is right for every robot: on a car with unmodelled effects converged steps
-stall, and on the aircraft, whose model keeps its promises to a per cent, damped ones are still 4
-to 172 % from the optimum after five iterations (docs/experiments.md). So the promise decides
-(Levenberg 1944, Marquardt 1963; the ratio of Conn, Gould & Toint, *Trust-Region Methods*, 2000,
-section 6.1):
+stall, and on the aircraft, whose model predicts gains to a per cent, damped ones are still 4 to
+172 % from the optimum after five iterations (docs/experiments.md). So the predictions that came
+true decide (Levenberg 1944, Marquardt 1963; the ratio of Conn, Gould & Toint, *Trust-Region
+Methods*, 2000, section 6.1):
 
     rho = real gain / predicted gain   of the last accepted step
     rho >= 0.9 at alpha = 1            lambda / 30
     rho <  0.25                        10 lambda, at most 1
     a trial without improvement        10 lambda until 1, and from there alpha / 2
 
-Steps 6 and 7: the line search on the REAL system.
-
-alpha = 1 first, then halved until a trial improves the utility (footnote 11). Real trials are the
-evaluations, so the search is not a loop but a question put to the trials so far: which alpha is
-next? An alpha may also be passed over because its predicted run leaves the safe region.
+Real trials are the evaluations of this line search, so it is no loop but a question put to the
+trials so far. A step may also be passed over because its predicted run leaves the safe region.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 KEPT, BROKEN = 0.9, 0.25
 EASED, RAISED = 30.0, 10.0
@@ -58,21 +55,15 @@ def after_success(step: Step, predicted: float, real: float) -> Step:
     return Step(step.damping)
 
 
-def after_failure(step: Step, max_halvings: int) -> Step | None:
-    """A more cautious step along the way down; None when the search has failed (step 7)."""
-    if step.damping < 1.0:
-        return Step(min(step.damping * RAISED, 1.0), step.alpha)
-    alpha = step.alpha / 2
-    return Step(1.0, alpha) if alpha >= 2.0**-max_halvings * (1 - 1e-12) else None
-
-
-def next_alpha(tried: Iterable[float], max_halvings: int) -> float | None:
-    """The step to try after those that did not improve; None when the search has failed (step 7).
+def after_failure(step: Step, max_halvings: int, *, damps: bool = True) -> Step | None:
+    """The next, more cautious step; None when the search has failed (step 7).
 
     Args:
-        tried: alphas of the trials along this direction that did not improve the utility.
-        max_halvings: alphas go down to 2^-max_halvings.
+        step: the one that did not improve the utility.
+        max_halvings: alpha goes down to 2^-max_halvings.
+        damps: whether the damping is raised before alpha is halved.
     """
-    smallest = min(tried, default=2.0)
-    alpha = smallest / 2
-    return alpha if alpha >= 2.0**-max_halvings * (1 - 1e-12) else None
+    if damps and step.damping < 1.0:
+        return replace(step, damping=min(step.damping * RAISED, 1.0))
+    alpha = step.alpha / 2
+    return replace(step, alpha=alpha) if alpha >= 2.0**-max_halvings * (1 - 1e-12) else None

@@ -10,7 +10,7 @@ from grounded.errors import GroundedError
 from grounded_cli.main import cli
 from grounded_trials.store.store import Store
 from grounded_trials.workspace.challenge import open_label, read_manifest, score_case
-from grounded_trials.workspace.folder import Workspace
+from grounded_trials.workspace.folder import Folder
 
 
 @pytest.fixture(scope="module")
@@ -26,9 +26,9 @@ def test_cases_are_workspaces_that_can_be_read(made):
     folder, _, document = made
     assert document["cases"] == ["single-0000", "single-0001"]
     for name in document["cases"]:
-        workspace = Workspace(folder / name)
+        workspace = Folder(folder / name)
         assert len(workspace.task_trials()) >= 3
-        assert all(t.is_data for t in workspace.trials())
+        assert all(not t.trial.candidate for t in workspace.trials())
 
 
 def test_no_file_of_a_case_holds_the_answer(made):
@@ -66,7 +66,7 @@ def test_a_label_that_was_changed_is_not_opened(made, tmp_path):
 def test_a_case_without_a_diagnosis_says_what_to_run(made):
     folder, labels, document = made
     name = document["cases"][1]
-    with pytest.raises(GroundedError, match=r"was not diagnosed: run `grounded challenge run "):
+    with pytest.raises(GroundedError, match=r"was not diagnosed"):
         score_case(folder, labels, name, read_manifest(folder)[name])
 
 

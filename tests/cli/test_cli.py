@@ -102,7 +102,8 @@ def test_a_folder_that_is_no_workspace_is_exit_1(name, tmp_path):
     done = grounded("-C", tmp_path, name)
     assert done.code == 1 and not done.out
     assert done.err.startswith("error: ") and "this is not a workspace" in done.err
-    assert "grounded init DIR --example car-turn" in done.err and done.err.count("\n") == 1
+    assert done.err.endswith("\nnext: grounded init DIR --example car-turn\n")
+    assert done.err.count("\n") == 2
 
 
 def test_dash_c_works_before_and_after_the_command(w):

@@ -497,13 +497,13 @@ def test_strange_files_in_the_workspace_disturb_nothing(w, trial):
 
 
 def test_more_than_9999_candidates(w):
-    from grounded_trials.workspace.folder import Workspace
+    from grounded_trials.workspace.folder import Folder
 
     grounded("-C", w, "propose")
     data = (w / "candidates" / "c0001.mcap").read_bytes()
     for name in ("c9999", "c10000"):
         (w / "candidates" / f"{name}.mcap").write_bytes(data)
-    workspace = Workspace(w)
+    workspace = Folder(w)
     assert workspace.candidate_ids() == ["c0001", "c9999", "c10000"]
     assert workspace.next_id() == "c10001"
 

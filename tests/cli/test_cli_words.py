@@ -76,9 +76,9 @@ def test_a_failed_first_policy_is_no_measure_of_the_gain(tmp_path):
     folder = make(tmp_path / "w").folder
     assert grounded("-C", folder, "learn", "--trials", 2).code == 0
     from grounded_trials.store.trial_file import read_trial, trial_bytes
-    from grounded_trials.workspace.folder import Workspace
+    from grounded_trials.workspace.folder import Folder
 
-    w = Workspace(folder)
+    w = Folder(folder)
     stored = w.store.list()[0]
     trial, meta, policy = read_trial(w.store.read(stored))
     about = {key: meta[key] for key in ("kind", "iteration", "alpha", "task")}

@@ -15,10 +15,10 @@ from grounded.diagnosis.diagnose import Options, diagnose
 from grounded.diagnosis.limits import limits
 from grounded.diagnosis.search import Search
 from grounded.effects import Library, memory_of, wrap
+from grounded.errors import NextCommand
 from grounded_trials.store.trial_file import write_trial
-from grounded_trials.workspace.diagnosing import _chosen, diagnosable
-from grounded_trials.workspace.diagnosis_file import diagnosis_of
-from grounded_trials.workspace.folder import Workspace
+from grounded_trials.workspace.diagnosing import _chosen, diagnosable, read_diagnosis
+from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.next_step import after_diagnosis
 
 LAG = 0.12
@@ -67,8 +67,8 @@ def test_what_is_left_beside_an_adopted_lag_is_named():
     found = diagnose(better, lifted, options)
     assert found.effects == ("coulomb_friction:v",)
     assert found.ranking[0].params["c"].value == pytest.approx(0.4, rel=0.05)
-    assert 0.8 < found.gap["after"] < 1.2
-    text = json.dumps(found.to_dict())
+    assert 0.8 < found.gap.after < 1.2
+    text = json.dumps(found.to_json())
     assert memory[0] not in text.replace("first_order_lag_u_tau", "")
 
 
@@ -76,7 +76,7 @@ def test_nothing_is_left_beside_what_is_all():
     model, runs = lagging(0.0)
     better, lifted, memory = adopted(model, runs)
     found = diagnose(better, lifted, Options(hidden=memory, but={"first_order_lag:u"}))
-    assert found.kind == "none" and not found.leftover and found.gap["after"] < 1.2
+    assert found.kind == "none" and not found.leftover and found.gap.after < 1.2
 
 
 def test_a_memory_is_known_at_the_start_and_disturbed_by_nothing():
@@ -143,9 +143,10 @@ def test_more_of_an_adopted_effect_changes_its_numbers(tmp_path):
         [row("parameter:viscous_friction_omega_k", d=0.05), row("parameter:l", d=0.01)],
     )
     names = ["parameter:viscous_friction_omega_k", "parameter:l"]
-    read = diagnosis_of(json.loads((tmp_path / "ws" / "reports" / "diagnosis.json").read_text()))
-    advice = after_diagnosis(Workspace(tmp_path / "ws"), read)
-    assert advice == f"grounded adopt {' '.join(names)}"  # fit knows the model's own numbers only
+    read = read_diagnosis(tmp_path / "ws" / "reports")
+    assert read is not None
+    advice = after_diagnosis(Folder(tmp_path / "ws"), read)
+    assert advice == NextCommand("adopt", tuple(names))  # fit knows the model's own numbers only
     for _ in range(2):  # twice is once
         done = grounded("-C", tmp_path / "ws", "adopt", *names)
         assert done.code == 0, done.err
@@ -183,7 +184,7 @@ def test_gaps_in_a_state_and_guesses_cost_their_samples_only(tmp_path):
         write_trial(path, run, meta)
         done = grounded("-C", tmp_path / "ws", "ingest", "--data", path)
         assert done.code == 0, done.err
-    workspace = Workspace(tmp_path / "ws")
+    workspace = Folder(tmp_path / "ws")
     assert [trial.steps for trial in diagnosable(workspace)] == [40, 40, 40]
     known = [np.isfinite(trial.states).sum(axis=0).tolist() for trial in _chosen(workspace, ())]
     assert known == [[41, 41], [41, 31], [41, 0]]

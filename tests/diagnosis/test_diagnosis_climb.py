@@ -11,8 +11,8 @@ from grounded.experiments.pendulum import model as real_pendulum
 from grounded.models.car import model as car
 from grounded.models.pendulum import model as pendulum
 from grounded.plant import Noise, Plant
-from grounded.search.improve import learn
-from grounded.search.standing import Options
+from grounded.search.ask_tell import learn
+from grounded.search.standing import SearchOptions
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -50,7 +50,7 @@ def test_a_parameter_at_its_bound_does_not_hold_up_the_others():
     def run(candidate):
         return plant.run(candidate.policy, {}, rng)
 
-    _, _, trials = learn(task, run, Options(max_trials=4))
+    trials = learn(task, run, SearchOptions(max_trials=4)).trials
     found = diagnose(task, trials)
     row = found.ranking[0]
     assert row.effect == "coulomb_friction:omega" and row.claimed
@@ -58,16 +58,16 @@ def test_a_parameter_at_its_bound_does_not_hold_up_the_others():
     assert row.fixed["width"] == pytest.approx(0.05, rel=0.2)  # it builds up over 0.05 rad/s
     same = {"input_gain:torque", "parameter:m", "rate_gain:omega"}  # what a mass does to a torque
     assert set(found.effects) <= {"coulomb_friction:omega", *same}
-    assert found.gap["before"] > 50 * found.gap["after"] and found.gap["after"] < 3
+    assert found.gap.before > 50 * found.gap.after and found.gap.after < 3
 
 
 def test_without_noise_the_demo_names_the_friction_alone():
     """The last digits of a step are no claim."""
     task = pendulum_task(pendulum)
     plant, rng = Plant(real_pendulum), np.random.default_rng(0)
-    _, _, trials = learn(
-        task, lambda candidate: plant.run(candidate.policy, {}, rng), Options(max_trials=3)
-    )
+    trials = learn(
+        task, lambda candidate: plant.run(candidate.policy, {}, rng), SearchOptions(max_trials=3)
+    ).trials
     found = diagnose(task, trials)
     assert found.effects == ("coulomb_friction:omega",)
     assert found.ranking[0].params["c"].value == pytest.approx(

@@ -7,7 +7,7 @@ import pytest
 from test_diagnosis import DT, cart
 
 from grounded.diagnosis.diagnose import Options, diagnose
-from grounded.diagnosis.split import Split, repeated
+from grounded.diagnosis.split import SquaredErrors, repeated
 from grounded.effects import Library
 from grounded.task import Task
 from grounded.utility import Reward
@@ -34,7 +34,7 @@ def parts(row):
 
 def test_an_effect_that_is_found_explains_the_error():
     model, trials = cart(friction=0.4)
-    document = diagnose(task_of(model), trials).to_dict()
+    document = diagnose(task_of(model), trials).to_json()
     split = document["where"]["split"]
     assert tuple(split) == HORIZONS
     for row in split.values():
@@ -53,10 +53,10 @@ def test_an_effect_that_is_found_explains_the_error():
 def test_without_an_effect_the_error_is_noise():
     model, trials = cart()
     found = diagnose(model, trials)
-    row = found.split["horizon"]
-    assert row["all"]["explained"] == 0
-    assert row["all"]["irreducible"] > 0.85
-    assert row["irreducible_from"] == "noise"
+    row = found.where.split["horizon"]
+    assert row.whole.explained == 0
+    assert row.whole.irreducible > 0.85
+    assert row.irreducible_from == "noise"
     assert found.utility_prediction is None
 
 
@@ -64,8 +64,8 @@ def test_what_no_effect_explains_stays_unexplained_and_is_not_white():
     model, trials = cart(asymmetric=0.8, trials=6)
     poor = Options(library=Library((Library().family("trend"),)))  # nothing that could explain it
     found = diagnose(task_of(model), trials, poor)
-    assert found.leftover and found.whiteness["v"] < 0.01
-    assert found.split["horizon"]["channels"][1]["explained"] < 1
+    assert found.leftover and found.where.whiteness["v"] < 0.01
+    assert found.where.split["horizon"].channels[1].explained < 1
 
 
 def test_repeats_of_a_candidate_tell_the_noise():
@@ -80,9 +80,9 @@ def test_repeats_of_a_candidate_tell_the_noise():
             states.append(x)
         y = np.array(states) + np.array([0.002, 0.01]) * noise.standard_normal((121, 2))
         same.append(replace(trials[0], states=y, candidate="c0001"))
-    row = diagnose(model, same).split["horizon"]
-    assert row["irreducible_from"] == "repeats"
-    assert row["all"]["irreducible"] > 0.7
+    row = diagnose(model, same).where.split["horizon"]
+    assert row.irreducible_from == "repeats"
+    assert row.whole.irreducible > 0.7
 
 
 def test_groups_of_repeats():
@@ -91,8 +91,8 @@ def test_groups_of_repeats():
 
 def test_shares_are_of_what_there_was():
     before, after, noise = np.array([4.0, 1.0]), np.array([1.0, 2.0]), np.array([0.5, 0.4])
-    found = Split(1.0, before, after, noise, None).shares()
+    found = SquaredErrors(1.0, before, after, noise, None).shares()
     np.testing.assert_allclose(found[:, 0], [0.75, 0.125, 0.125])
     np.testing.assert_allclose(found[:, 1], [0.0, 0.6, 0.4])
-    by_trials = Split(1.0, before, after, noise, np.array([1.0, 0.4])).shares()
+    by_trials = SquaredErrors(1.0, before, after, noise, np.array([1.0, 0.4])).shares()
     np.testing.assert_allclose(by_trials[:, 0], [0.75, 0.0, 0.25])

@@ -50,8 +50,8 @@ def test_a_speed_that_is_never_measured_is_no_effect(seed):
     """Runs of 450 steps are cut in three: each part starts with a speed that nobody knows."""
     found = diagnose(pendulum, list(seen_every(swings(3, 450, seed), 1, 0)))
     assert found.kind == "none" and not found.leftover
-    assert 0.85 < found.gap["after"] < 1.15
-    assert found.noise["process"]["omega"] == pytest.approx(DISTURBED[1], rel=0.4)
+    assert 0.85 < found.gap.after < 1.15
+    assert found.noise.process["omega"] == pytest.approx(DISTURBED[1], rel=0.4)
 
 
 @pytest.mark.parametrize(("state", "every"), [(0, 5), (0, 10), (1, 10)])
@@ -62,7 +62,7 @@ def test_a_state_that_is_measured_now_and_then_leaves_its_noise_to_be_found(stat
     assert np.exp(noise.log_q[1] / 2) == pytest.approx(DISTURBED[1], rel=0.3)
     assert np.exp(noise.floor[state] / 2) < 0.1 * DISTURBED[state]
     found = diagnose(pendulum, trials)
-    assert found.kind == "none" and 0.85 < found.gap["after"] < 1.15
+    assert found.kind == "none" and 0.85 < found.gap.after < 1.15
 
 
 def test_a_friction_is_still_found_with_an_angle_at_every_tenth_step():

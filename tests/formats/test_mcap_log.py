@@ -12,7 +12,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from grounded.errors import GroundedError
+from grounded.errors import GroundedError, NextCommand
 from grounded.policy import Policy
 from grounded.trial import Trial
 from grounded_trials.formats.mcap_writer import file_descriptor_set
@@ -133,8 +133,9 @@ def test_a_live_trial_that_is_cut_off_keeps_all_but_its_last_second(tmp_path: Pa
         writer.append(k * 0.02, np.array([k]), np.array([-k]))
     on_disk = path.stat().st_size  # without close: the battery is gone
     assert on_disk > 0.75 * 250 * 2 * 40
-    with pytest.raises(GroundedError, match="grounded recover"):
+    with pytest.raises(GroundedError) as refused:
         read_trial(path)
+    assert refused.value.then == NextCommand("recover", (str(path),))
     writer.close()
     writer.close()
     trial, _, _ = read_trial(path)

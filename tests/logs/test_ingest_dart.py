@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from cli import grounded
-from grounded_trials.workspace.folder import Workspace
+from grounded_trials.workspace.folder import Folder
 
 MODEL = '''"""The DART car, a JetRacer: kinematic, with a first-order speed response."""
 
@@ -126,8 +126,8 @@ def test_the_log_is_stored_as_data_on_the_control_grid(dart):
     assert (told["trial"], told["candidate"], told["utility"]) == ("t0001", None, None)
     rates = {s["name"]: s["rate_hz"] for s in told["signals"]}
     assert set(rates) == {"x", "y", "psi", "steering", "throttle"} and rates["x"] > 8
-    (stored,) = Workspace(folder).trials()
-    assert stored.is_data and stored.meta["estimated"] == "v,delta"
+    (stored,) = Folder(folder).trials()
+    assert not stored.trial.candidate and stored.meta["estimated"] == "v,delta"
     assert stored.meta["source"] == log.name
     trial = stored.trial
     assert trial.dt == 0.05 and trial.steps > 400 and trial.finite_steps == trial.steps
@@ -163,7 +163,7 @@ def test_a_circle_for_that_car_inside_its_limits(dart, fitted):
     folder = dart[0]
     done = grounded("-C", folder, "propose", "--json")
     assert done.code == 0 and done.json["candidate"] == "c0001", done.err
-    candidate, _ = Workspace(folder).candidate("c0001")
+    candidate, _ = Folder(folder).candidate("c0001")
     u, x = candidate.predicted_inputs, candidate.predicted_states
     assert np.abs(u[:, 0]).max() <= 1.0 and u[:, 1].min() >= 0.0 and u[:, 1].max() <= 0.4
     assert np.ptp(u[:, 1]) > 0.02  # it does something

@@ -194,7 +194,7 @@ def test_what_a_person_is_told(tmp_path: Path) -> None:
     refused(tmp_path / "no.mcap", U, "does not exist")
     refused(floats(tmp_path / "b.mcap", 0, 0), U, "the log has no topic '/u': none is defined")
     (tmp_path / "c.mcap").write_bytes(path.read_bytes()[:-40])
-    refused(tmp_path / "c.mcap", U, "`grounded recover")
+    refused(tmp_path / "c.mcap", U, "`recover` saves")
 
 
 def one_message(path: Path, encoding: str, schema: tuple[str, str, bytes], body: bytes) -> Path:

@@ -11,11 +11,11 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from grounded_trials.report.findings import Lost
+from grounded.diagnosis.report import Diagnosis
+from grounded.errors import NextCommand
 from grounded_trials.report.gathering import gather
 from grounded_trials.report.page.page import page
-from grounded_trials.workspace.diagnosis_file import diagnosis_of
-from grounded_trials.workspace.folder import Workspace
+from grounded_trials.workspace.folder import Folder, Lost
 from page_browser import browser, missing
 from reported import DIAGNOSIS, car, cart, many_flights
 
@@ -64,7 +64,7 @@ def _parsed(text: str) -> _Tags:
 
 
 def test_page_is_well_formed_and_needs_nothing_else(cart):
-    text = page(gather(Workspace(cart)))
+    text = page(gather(Folder(cart)))
     tags = _parsed(text)
     assert not [t for t, a in tags.seen if t in ("link", "img", "iframe") or "src" in a]
     assert set(re.findall(r"https?://[^\s\"']+", text)) <= {"http://www.w3.org/2000/svg"}
@@ -73,7 +73,7 @@ def test_page_is_well_formed_and_needs_nothing_else(cart):
 
 
 def test_page_shows_what_the_issue_lists(cart):
-    text = "".join(_parsed(page(gather(Workspace(cart)))).text)
+    text = "".join(_parsed(page(gather(Folder(cart)))).text)
     for words in (
         "Utility of each candidate",
         "Step size",
@@ -111,21 +111,21 @@ def test_page_shows_what_the_issue_lists(cart):
 
 
 def test_page_of_an_older_diagnosis_leaves_out_what_it_lacks(cart):
-    findings = gather(Workspace(cart))
+    findings = gather(Folder(cart))
     new = ("split", "whiteness")
     where = {key: value for key, value in DIAGNOSIS["where"].items() if key not in new}
     old = {k: v for k, v in DIAGNOSIS.items() if k not in ("utility_prediction", "lookalikes")}
-    text = page(replace(findings, diagnosis=diagnosis_of(old | {"where": where})))
+    text = page(replace(findings, diagnosis=Diagnosis.from_json(old | {"where": where})))
     for words in ("What the error is made of", "Is the rest noise", "Look-alikes", "predicted<"):
         assert words not in text
 
 
 def test_page_without_a_diagnosis_names_the_command(car):
-    assert "grounded diagnose" in page(gather(Workspace(car)))
+    assert "grounded diagnose" in page(gather(Folder(car)))
 
 
 def test_page_is_the_same_every_time(cart):
-    assert page(gather(Workspace(cart))) == page(gather(Workspace(cart)))
+    assert page(gather(Folder(cart))) == page(gather(Folder(cart)))
 
 
 def test_page_of_many_long_trials_is_small_and_quick():
@@ -139,7 +139,7 @@ def test_page_of_many_long_trials_is_small_and_quick():
 
 def hostile(folder):
     """Findings with hostile text wherever a stranger could put it."""
-    findings = gather(Workspace(folder))
+    findings = gather(Folder(folder))
     document = json.loads(json.dumps(DIAGNOSIS).replace("viscous_friction:v", "EVIL"))
     document = json.loads(json.dumps(document).replace('"EVIL"', json.dumps(EVIL)))
     document["verdict"]["sentence"] = document["next_trial"] = document["gap"]["unit"] = EVIL
@@ -163,8 +163,8 @@ def hostile(folder):
         method=EVIL,
         standing=standing,
         lost=(Lost(EVIL, EVIL),),
-        diagnosis=diagnosis_of(document),
-        next_command=EVIL,
+        diagnosis=Diagnosis.from_json(document),
+        then=NextCommand(EVIL),
     )
 
 
@@ -193,7 +193,7 @@ def test_hostile_names_run_nothing_in_a_browser(cart, tmp_path, window):
 @pytest.mark.parametrize("dark", [False, True])
 def test_page_in_a_browser(cart, tmp_path, window, width, dark):
     path = tmp_path / "page.html"
-    path.write_text(page(gather(Workspace(cart))))
+    path.write_text(page(gather(Folder(cart))))
     window.resize(width, 900)
     window.dark(dark)
     window.open(path)
@@ -220,7 +220,7 @@ def test_page_in_a_browser(cart, tmp_path, window, width, dark):
 
 @needs_browser
 def test_hovering_shows_the_values(cart, tmp_path, window):
-    findings = gather(Workspace(cart))
+    findings = gather(Folder(cart))
     path = tmp_path / "page.html"
     path.write_text(page(findings))
     window.resize(1400, 900)
@@ -247,7 +247,7 @@ def test_hovering_shows_the_values(cart, tmp_path, window):
 @needs_browser
 def test_marks_say_what_they_are_and_tables_can_be_copied(cart, tmp_path, window):
     path = tmp_path / "page.html"
-    path.write_text(page(gather(Workspace(cart))))
+    path.write_text(page(gather(Folder(cart))))
     window.open(path)
     window.run("document.querySelector('circle[data-note]').focus()")
     tip = window.run("return document.getElementById('tip').innerText")
@@ -279,7 +279,7 @@ def test_page_of_many_trials_in_a_browser(tmp_path, window):
 def test_a_value_without_an_interval_is_said_to_be_undetermined(cart, interval):
     value = {"value": 0.3, "std": 0.01, "unit": "1/s", "interval": interval}
     entry = DIAGNOSIS["ranking"][0] | {"params": {"k": value}}
-    findings = gather(Workspace(cart))
-    text = page(replace(findings, diagnosis=diagnosis_of(DIAGNOSIS | {"ranking": [entry]})))
+    findings = gather(Folder(cart))
+    text = page(replace(findings, diagnosis=Diagnosis.from_json(DIAGNOSIS | {"ranking": [entry]})))
     assert "k = –, not determined by these trials<" in text
     assert "0.280 to 0.320" not in text

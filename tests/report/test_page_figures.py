@@ -24,7 +24,7 @@ from grounded_trials.report.figures.runs import all_figures, error_figure
 from grounded_trials.report.forecast import forecast, forecast_error
 from grounded_trials.report.gathering import gather
 from grounded_trials.report.scene import scene_of
-from grounded_trials.workspace.folder import Workspace
+from grounded_trials.workspace.folder import Folder
 from reported import car, cart, many_flights
 
 __all__ = ["car", "cart"]
@@ -144,7 +144,7 @@ def test_words_are_spelled_with_letters_that_the_font_has():
 def test_pictures_are_drawn_in_their_colours(cart):
     from PIL import Image
 
-    figures = all_figures(gather(Workspace(cart)))
+    figures = all_figures(gather(Folder(cart)))
     assert [f.name for f in figures] == [
         "utility",
         "paths",
@@ -165,11 +165,11 @@ def test_pictures_are_drawn_in_their_colours(cart):
 
 
 def test_scenes_of_car_aircraft_and_cart(cart, car):
-    plane = scene_of(gather(Workspace(car)).task.model)
+    plane = scene_of(gather(Folder(car)).task.model)
     assert plane.names == ("x", "y") and plane.heading is not None and plane.spatial
     air = scene_of(many_flights(1).task.model)
     assert air.names == ("east", "north", "altitude") and air.map and len(air.attitude) == 3
-    assert not scene_of(gather(Workspace(cart)).task.model).spatial
+    assert not scene_of(gather(Folder(cart)).task.model).spatial
 
 
 def test_rotations_are_right_handed_and_point_along_the_heading():
@@ -224,7 +224,7 @@ def test_a_forecast_of_a_trial_without_steps_is_none():
 
 
 def test_what_is_cut_off_is_marked(cart):
-    findings = gather(Workspace(cart))
+    findings = gather(Folder(cart))
     first = findings.first
     assert first is not None
     whole = error_figure(findings)

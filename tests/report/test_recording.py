@@ -16,7 +16,7 @@ import pytest
 
 from grounded_trials.report.gathering import gather
 from grounded_trials.report.recording.recording import rate, write_recording
-from grounded_trials.workspace.folder import Workspace
+from grounded_trials.workspace.folder import Folder
 from reported import car, cart, many_flights
 
 __all__ = ["car", "cart"]
@@ -37,7 +37,7 @@ def _entities(path: Path) -> str:
 @needs_tool
 def test_rerun_accepts_the_recording_and_finds_all_of_it(cart, tmp_path):
     path = tmp_path / "cart.rrd"
-    findings = gather(Workspace(cart))
+    findings = gather(Folder(cart))
     write_recording(findings, path)
     done = _rerun("rrd", "verify", path)
     assert done.returncode == 0, done.stderr
@@ -62,7 +62,7 @@ def test_rerun_accepts_the_recording_and_finds_all_of_it(cart, tmp_path):
 
 @needs_tool
 def test_car_and_aircraft(car, tmp_path):
-    for name, findings in (("car", gather(Workspace(car))), ("aircraft", many_flights(2))):
+    for name, findings in (("car", gather(Folder(car))), ("aircraft", many_flights(2))):
         path = tmp_path / f"{name}.rrd"
         write_recording(findings, path)
         assert _rerun("rrd", "verify", path).returncode == 0
@@ -71,7 +71,7 @@ def test_car_and_aircraft(car, tmp_path):
 
 @needs_tool
 def test_recordings_of_single_trials_merge_into_one(cart, tmp_path):
-    findings = gather(Workspace(cart))
+    findings = gather(Folder(cart))
     parts = []
     for run in findings.runs[:2]:
         parts.append(tmp_path / f"{run.trial.id}.rrd")
@@ -89,7 +89,7 @@ def test_recordings_of_single_trials_merge_into_one(cart, tmp_path):
 @needs_tool
 def test_a_damaged_recording_is_noticed(cart, tmp_path):
     path = tmp_path / "cart.rrd"
-    write_recording(gather(Workspace(cart)), path)
+    write_recording(gather(Folder(cart)), path)
     data = bytearray(path.read_bytes())
     data[len(data) // 3] ^= 0xFF
     path.write_bytes(bytes(data[: len(data) // 2]))
@@ -121,7 +121,7 @@ def test_an_unwritable_place_is_a_sentence(cart, tmp_path):
     from grounded.errors import GroundedError
 
     with pytest.raises(GroundedError, match="can't be written"):
-        write_recording(gather(Workspace(cart)), tmp_path / "missing" / "cart.rrd")
+        write_recording(gather(Folder(cart)), tmp_path / "missing" / "cart.rrd")
 
 
 def test_the_bias_of_long_trials_is_averaged_not_thinned_out():
@@ -150,7 +150,7 @@ def _ended(command: list[str], log: Path, seconds: float) -> str:
 def test_the_viewer_shows_the_paths(car, tmp_path):
     """Half a minute: the viewer draws in software."""
     path, shot = tmp_path / "car.rrd", tmp_path / "shot.png"
-    write_recording(gather(Workspace(car)), path)
+    write_recording(gather(Folder(car)), path)
     screen = ["xvfb-run", "-a", "-s", "-screen 0 1600x1000x24"]
     flags = ["--new", "--bind", "127.0.0.1", "--window-size", "1400x900", "--renderer", "vulkan"]
     command = [*screen, str(RERUN), *flags, "--screenshot-to", str(shot), str(path)]

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from cli import grounded, plain
+from grounded.diagnosis.report import Diagnosis
 from grounded_trials.report.diagnosis_words import calibrated_sentence
 from grounded_trials.report.findings import prediction_error, rms, tracking_error
 from grounded_trials.report.gathering import gather
 from grounded_trials.report.reporting import save_optimum
-from grounded_trials.workspace.diagnosis_file import diagnosis_of
-from grounded_trials.workspace.folder import Workspace
+from grounded_trials.workspace.folder import Folder
 from reported import DIAGNOSIS, car, cart, copied, damage
 from workspaces import make
 
@@ -98,7 +98,7 @@ def test_a_workspace_without_trials_has_a_report(tmp_path):
 
 
 def test_findings_measure_what_they_say(cart):
-    findings = gather(Workspace(cart))
+    findings = gather(Folder(cart))
     task, best = findings.task, findings.best
     assert best is not None
     off = best.trial.states[:, 0] - task.target[:, 0]
@@ -112,7 +112,7 @@ def test_findings_measure_what_they_say(cart):
 
 
 def test_the_diagnosed_effect_leaves_less_of_the_bias(cart):
-    best = gather(Workspace(cart)).best
+    best = gather(Folder(cart)).best
     assert best is not None and best.explained is not None
     assert rms(best.explained)[1] < rms(best.residual)[1]
 
@@ -169,14 +169,15 @@ def test_a_damaged_candidate_is_taken_from_the_trial_that_ran_it(cart, tmp_path)
 def test_a_damaged_diagnosis_is_named(cart, tmp_path, text):
     folder = copied(cart, tmp_path / "w")
     (folder / "reports" / "diagnosis.json").write_text(text)
-    done = grounded("-C", folder, "report")
+    done = grounded("-C", folder, "report", "--json")
     assert done.code == 3
-    assert "is not what `grounded diagnose` writes" in " ".join(plain(done.out).split())
+    (lost,) = done.json["lost"]
+    assert lost["file"] == "diagnosis.json" and "can't be read" in lost["reason"]
 
 
 def test_a_short_trial_is_shown_as_failed(cart, tmp_path):
     folder = copied(cart, tmp_path / "w")
-    workspace = Workspace(folder)
+    workspace = Folder(folder)
     from dataclasses import replace
 
     from grounded_trials.store.trial_file import trial_bytes
@@ -207,7 +208,7 @@ def test_a_trial_that_names_a_file_elsewhere_reads_nothing_there(cart, tmp_path)
     from grounded_trials.store.trial_file import trial_bytes
 
     folder = copied(cart, tmp_path / "w")
-    workspace = Workspace(folder)
+    workspace = Folder(folder)
     (tmp_path / "outside.mcap").write_bytes(workspace.candidate_bytes("c0001"))
     model = workspace.base_model
     evil = replace(workspace.trials()[0].trial, candidate="../../outside", id="")
@@ -220,7 +221,7 @@ def test_a_trial_that_names_a_file_elsewhere_reads_nothing_there(cart, tmp_path)
 
 def test_the_optimum_is_shown_where_a_study_left_it(cart, tmp_path):
     folder = copied(cart, tmp_path / "w")
-    save_optimum(Workspace(folder), -0.0123)
+    save_optimum(Folder(folder), -0.0123)
     assert "optimum -0.01230" in grounded("-C", folder, "report").out
 
 
@@ -274,7 +275,7 @@ def test_text_says_what_was_calibrated_and_what_the_figures_are_measured_in(cart
 
 def test_at_most_three_parameters_are_named_the_most_changed_first():
     table = {f"p{k}": {"value": 1.0 + 0.1 * k, "std": 0.01, "unit": "m"} for k in range(6)}
-    found = diagnosis_of(DIAGNOSIS | {"parameters": table})
+    found = Diagnosis.from_json(DIAGNOSIS | {"parameters": table})
     text = calibrated_sentence(found, dict.fromkeys(table, 1.0))
     assert text == (
         "calibrated beside them: p5 1.00 -> 1.50 m, p4 1.00 -> 1.40 m, p3 1.00 -> 1.30 m "

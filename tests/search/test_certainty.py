@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import ttest_ind
 
-from grounded.search.certainty import last_improvement, utility_noise
-from grounded.search.standing import Tried
+from grounded.search.standing import Tried, last_improvement, utility_noise
 
 
 def tried(*utilities, accepted=True):

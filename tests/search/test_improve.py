@@ -18,15 +18,15 @@ from grounded.model import Model, Param
 from grounded.models import car, pendulum
 from grounded.plant import Plant
 from grounded.rollout import simulate
+from grounded.search.ask_tell import learn
 from grounded.search.improve import (
     damped,
     direction,
     first_policy,
-    learn,
     model_fingerprint,
     propose,
 )
-from grounded.search.standing import Options
+from grounded.search.standing import SearchOptions
 from grounded.solve.bias import ground
 from grounded.task import Task
 from grounded.trial import Trial
@@ -40,9 +40,8 @@ PAPER = {"turn": 0.97, "circle": 0.88, "figure8": 0.63}  # section 5.2
 @pytest.mark.parametrize("name", NAMES)
 def test_the_papers_improvement_on_the_car(name):
     task, plant = car_task(name, car.model), real_plant()
-    now, candidates, trials = learn(
-        task, lambda c: drive(task, plant, c), Options(), max_iterations=10
-    )
+    found = learn(task, lambda c: drive(task, plant, c), max_iterations=10)
+    now, candidates, trials = found.standing, found.candidates, found.trials
     gain = 1 - now.utilities[-1] / now.utilities[0]
     assert gain >= PAPER[name] and now.iteration <= 10 and len(trials) <= 40
     assert now.utilities == sorted(now.utilities)
@@ -54,19 +53,21 @@ def test_the_papers_improvement_on_the_car(name):
 def test_the_pendulum_closes_the_gap_to_its_optimum():
     task, truth = pendulum_task(pendulum.model), pendulum_task(real_pendulum)
     plant = Plant(real_pendulum)
-    now, _, trials = learn(task, lambda c: drive(task, plant, c), Options(max_trials=15))
-    best, _, _ = learn(truth, lambda c: drive(truth, plant, c), Options(max_trials=15))
+    options = SearchOptions(max_trials=15)
+    found = learn(task, lambda c: drive(task, plant, c), options)
+    best = learn(truth, lambda c: drive(truth, plant, c), options).standing
+    now = found.standing
     gap = best.utilities[-1] - now.utilities[0]
-    assert now.utilities[-1] - now.utilities[0] > 0.99 * gap > 0 and len(trials) <= 5
+    assert now.utilities[-1] - now.utilities[0] > 0.99 * gap > 0 and len(found.trials) <= 5
 
 
 @pytest.mark.parametrize("step", ["damped", "full"])
 def test_a_perfect_model_has_nothing_to_learn(step):
     task = rover_task(latency=np.array([0.05, 0.05]))
     plant = Plant(task.model, latency={"speed": 0.05, "turn": 0.05}, substeps=1)
-    now, candidates, _ = learn(
-        task, lambda c: drive(task, plant, c), Options(step=step, tolerance=0.02)
-    )
+    options = SearchOptions(step=step, tolerance=0.02)
+    found = learn(task, lambda c: drive(task, plant, c), options)
+    now, candidates = found.standing, found.candidates
     assert now.phase == "converged" and len(candidates) <= 3
     assert now.utilities[0] == pytest.approx(candidates[0].predicted_utility, rel=1e-9)
 
@@ -89,13 +90,13 @@ def story(name):
     }[name]
     candidates, trials = [], []
     for _ in range(2):
-        candidates.append(propose(task, candidates, trials, Options()).candidate)
+        candidates.append(propose(task, candidates, trials, SearchOptions()).candidate)
         trials.append(drive(task, plant, candidates[-1]))
     return task, candidates, trials
 
 
 def digest(task, candidates, trials):
-    made = propose(task, candidates, trials, Options()).candidate
+    made = propose(task, candidates, trials, SearchOptions()).candidate
     sha = hashlib.sha256(model_fingerprint(task).encode())
     for c in (*candidates, made):
         parts = (c.policy.feedforward, c.policy.gain, c.policy.reference, c.predicted_states)
@@ -123,7 +124,7 @@ def test_the_same_trials_give_the_same_candidate_bit_for_bit(name, tmp_path):
 def test_nothing_that_was_given_is_changed():
     task, candidates, trials = story("rover")
     before = [t.states.tobytes() for t in trials], [c.policy.gain.tobytes() for c in candidates]
-    propose(task, candidates, trials, Options())
+    propose(task, candidates, trials, SearchOptions())
     after = [t.states.tobytes() for t in trials], [c.policy.gain.tobytes() for c in candidates]
     assert before == after and len(candidates) == len(trials) == 2
 
@@ -146,10 +147,10 @@ def test_the_first_policy_is_locally_optimal_in_the_model():
 def test_predictions_are_made_in_the_exact_model():
     """The planning model is smoothed, what is promised is not."""
     task = rover_task(smoothing=0.3)
-    first = propose(task, [], [], Options()).candidate
+    first = propose(task, [], [], SearchOptions()).candidate
     assert first.predicted_utility == simulate(task.problem(exact=True), first.policy).utility
     trial = drive(task, Plant(other(task.model)), first)
-    second = propose(task, [first], [trial], Options()).candidate
+    second = propose(task, [first], [trial], SearchOptions()).candidate
     exact = ground(task, trial, exact=True, match_inputs=True).on(task.problem(exact=True))
     run = simulate(exact, second.policy)
     assert second.predicted_utility == run.utility
@@ -166,7 +167,7 @@ def test_the_smoothed_model_never_judges_a_trial():
 def test_alpha_1_is_ddps_own_policy_and_halves_lie_between():
     task, candidates, trials = story("rover")
     base, trial = candidates[-1], trials[-1]
-    whole = direction(task, base.policy, ground(task, trial), Options())
+    whole = direction(task, base.policy, ground(task, trial), SearchOptions())
     half = base.policy.toward(whole, 0.5)
     exact = task.problem(ground(task, trial, exact=True).bias, exact=True)
     runs = [simulate(exact, p) for p in (base.policy, half, whole)]
@@ -198,9 +199,9 @@ def test_damping_is_a_price_on_leaving_the_trials_inputs():
 def test_the_bias_goes_to_the_original_model_not_to_the_last_biased_one():
     """After two trials only the incumbent's own bias counts: errors do not pile up."""
     task, candidates, trials = story("rover")
-    made = propose(task, candidates, trials, Options()).candidate
+    made = propose(task, candidates, trials, SearchOptions()).candidate
     worse = replace(trials[0], states=trials[0].states + 5.0)
-    again = propose(task, candidates, [worse, trials[1]], Options()).candidate
+    again = propose(task, candidates, [worse, trials[1]], SearchOptions()).candidate
     assert made.base == again.base == "c0002"
     grounding = ground(task, trials[1], exact=True, match_inputs=True)
     exact = grounding.on(task.problem(exact=True))
@@ -228,7 +229,7 @@ def test_footnote_9_one_iteration_finds_the_optimum_whatever_the_bias(b):
         high=np.array([100.0]),
     )
     plant = Plant(crude.with_values({"b": 0.0}), substeps=1)
-    now, _, _ = learn(task, lambda c: drive(task, plant, c), Options(step="full"))
+    now = learn(task, lambda c: drive(task, plant, c), SearchOptions(step="full")).standing
     assert now.utilities[0] == pytest.approx(-(b**2)) and now.utilities[1] > -1e-10 * b**2
 
 
@@ -245,16 +246,17 @@ def test_logs_with_wrapped_headings_learn_as_well():
         states[:, 2] = (states[:, 2] + np.pi) % (2 * np.pi) - np.pi
         return replace(trial, states=states)
 
-    plain, _, _ = learn(task, lambda c: drive(task, plant, c), Options(max_trials=12))
-    wrapped, _, _ = learn(task, run, Options(max_trials=12))
+    options = SearchOptions(max_trials=12)
+    plain = learn(task, lambda c: drive(task, plant, c), options).standing
+    wrapped = learn(task, run, options).standing
     assert wrapped.utilities[-1] == pytest.approx(plain.utilities[-1], rel=0.02)
 
 
 def test_a_black_box_simulator_is_learned_from_too():
     task = cart_task(model=black_box)
-    now, _, _ = learn(
-        task, lambda c: drive(task, Plant(other(black_box, 1.5)), c), Options(max_trials=8)
-    )
+    now = learn(
+        task, lambda c: drive(task, Plant(other(black_box, 1.5)), c), SearchOptions(max_trials=8)
+    ).standing
     assert now.utilities[-1] > 0.9 * now.utilities[0] and now.iteration >= 1
 
 
@@ -279,9 +281,9 @@ def test_refit_plans_with_parameters_from_all_trials():
         asked.append((given, len(all_trials)))
         return other(task.model)
 
-    made = propose(task, candidates, trials, Options(refit=True), refit=refit).candidate
+    made = propose(task, candidates, trials, SearchOptions(refit=True), refit=refit).candidate
     assert [n for _, n in asked] == [2]
-    plain = propose(task, candidates, trials, Options()).candidate
+    plain = propose(task, candidates, trials, SearchOptions()).candidate
     assert np.abs(made.policy.feedforward - plain.policy.feedforward).max() > 1e-6
     assert isinstance(trials[0], Trial)
 

@@ -7,13 +7,13 @@ import pytest
 
 from grounded.search.improve import propose
 from grounded.search.safety import MAX_GAIN, objections
-from grounded.search.standing import Options
+from grounded.search.standing import SearchOptions
 from small_tasks import cart_task
 
 
 @pytest.fixture(scope="module")
 def made():
-    return propose(cart_task(), [], [], Options()).candidate
+    return propose(cart_task(), [], [], SearchOptions()).candidate
 
 
 def test_nothing_speaks_against_a_sound_candidate(made):
@@ -51,7 +51,7 @@ def test_a_gain_beyond_reason(made):
 def test_a_predicted_run_outside_the_safe_region_names_state_time_and_bound():
     low, high = np.array([-np.inf, -np.inf]), np.array([0.9, np.inf])
     task = cart_task(safety_low=low, safety_high=high)
-    proposal = propose(task, [], [], Options())
+    proposal = propose(task, [], [], SearchOptions())
     assert proposal.candidate is None and proposal.standing.phase == "stopped"
     (note,) = proposal.notes
     assert note == proposal.standing.sentence

@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 
 from grounded.errors import GroundedError
 from grounded.plant import Noise, Plant
-from grounded.search.improve import learn, model_fingerprint, propose
-from grounded.search.standing import MAX_CAUTION, Options, standing
+from grounded.search.ask_tell import learn
+from grounded.search.improve import model_fingerprint, propose
+from grounded.search.standing import MAX_CAUTION, SearchOptions, standing
 from grounded.search.step_size import Step
 from grounded.trial import Trial, mean_trial
 from grounded.utility import Reward
@@ -32,7 +33,7 @@ class Story:
 
     def __init__(self, task=TASK, plant=PLANT, **options):
         self.task, self.plant = task, plant
-        self.options = Options(**{"rerun_incumbent": False} | options)
+        self.options = SearchOptions(**{"rerun_incumbent": False} | options)
         self.candidates, self.trials = [], []
 
     def propose(self):
@@ -274,7 +275,8 @@ def test_a_start_away_from_s0_does_not_stop_the_search(off, repeats, least):
         start = {"x": off * rng.standard_normal(), "v": 0.0}
         return PLANT.run(candidate.policy, start, rng)
 
-    now, candidates, trials = learn(TASK, run, Options(max_trials=12 * repeats, repeats=repeats))
+    found = learn(TASK, run, SearchOptions(max_trials=12 * repeats, repeats=repeats))
+    now, candidates, trials = found.standing, found.candidates, found.trials
     assert now.iteration >= 1 and len(candidates) >= 3
     assert TASK.utility(drive(TASK, PLANT, now.incumbent.candidate)) > least
     if repeats == 3:  # scatter is no gain to look for: the search ends before trials run out
@@ -294,7 +296,7 @@ def test_repeats_that_do_not_fit_any_more_are_not_begun():
         "3 of 5 trials are used up; a candidate needs 3 ([search] max_trials)"
     )
     with pytest.raises(GroundedError, match="repeats = 3 is more than max_trials = 2"):
-        Options(repeats=3, max_trials=2)
+        SearchOptions(repeats=3, max_trials=2)
 
 
 def test_a_search_with_nothing_to_gain_ends_before_a_trial_is_spent():
@@ -361,13 +363,13 @@ def test_the_order_of_stored_trials_decides_nothing():
 )
 def test_options_out_of_range_are_refused(change):
     with pytest.raises(GroundedError, match=next(iter(change))):
-        Options(**change)
+        SearchOptions(**change)
 
 
 def test_first_steps():
-    assert Options().first_step() == Step(1.0, 1.0)
-    assert Options(step="full").first_step() == Step(0.0, 1.0)
-    assert not Options(method="policy-gradient").damps
+    assert SearchOptions().first_step() == Step(1.0, 1.0)
+    assert SearchOptions(step="full").first_step() == Step(0.0, 1.0)
+    assert not SearchOptions(method="policy-gradient").damps
 
 
 def test_the_mean_of_one_trial_is_itself_and_held_inputs_are_averaged():
@@ -479,10 +481,9 @@ ODD = {
 def test_odd_tasks_are_searched_or_ended_with_a_sentence(name, options):
     task = cart_task(**ODD[name])
     plant = Plant(other(task.model, 1.5), latency={"force": 0.02})
-    now, _candidates, trials = learn(
-        task, lambda c: drive(task, plant, c), Options(max_trials=4, **options)
-    )
-    assert now.phase in ("converged", "stopped") and now.sentence and trials
+    found = learn(task, lambda c: drive(task, plant, c), SearchOptions(max_trials=4, **options))
+    now = found.standing
+    assert now.phase in ("converged", "stopped") and now.sentence and found.trials
     assert now.utilities == sorted(now.utilities) and all(np.isfinite(now.utilities))
-    for trial in trials:
+    for trial in found.trials:
         assert (trial.inputs >= task.low).all() and (trial.inputs <= task.high).all()

@@ -15,7 +15,7 @@ from grounded.plant import Plant
 from grounded.policy import Policy
 from grounded.rollout import augmented, simulate
 from grounded.search.improve import propose
-from grounded.search.standing import Options
+from grounded.search.standing import SearchOptions
 from grounded.solve.bias import effective_inputs, ground, residuals
 from grounded.trial import Trial
 from small_tasks import black_box, cart_task, drive, other, rover_task
@@ -93,7 +93,7 @@ def test_any_fraction_of_latency_is_replayed(delay, exact):
 def test_a_feedback_policy_replays_its_own_trial():
     """The policy that ran the trial gives the trial's states AND inputs in the biased model."""
     task = rover_task()
-    first = propose(task, [], [], Options()).candidate
+    first = propose(task, [], [], SearchOptions()).candidate
     plant = Plant(other(task.model, 1.15), latency={"speed": 0.05, "turn": 0.05}, substeps=5)
     trial = drive(task, plant, first)
     run = simulate(task.problem(ground(task, trial, exact=True).bias, exact=True), first.policy)
@@ -103,7 +103,7 @@ def test_a_feedback_policy_replays_its_own_trial():
 
 def test_the_car_of_the_paper_is_replayed_by_its_crude_model():
     task = car_task("figure8", car.model)
-    first = propose(task, [], [], Options()).candidate
+    first = propose(task, [], [], SearchOptions()).candidate
     trial = drive(task, real_plant(), first)
     run = simulate(task.problem(ground(task, trial, exact=True).bias, exact=True), first.policy)
     assert np.abs(run.states - trial.states).max() < 1e-9

@@ -9,8 +9,9 @@ from grounded.experiments.bench import bench, optimum
 from grounded.experiments.car_tasks import car_task
 from grounded.experiments.real_car import real_plant
 from grounded.models.car import model as car
-from grounded.search.improve import first_policy, learn
-from grounded.search.standing import Options
+from grounded.search.ask_tell import learn
+from grounded.search.improve import first_policy
+from grounded.search.standing import SearchOptions
 from grounded.solve.bias import ground
 from grounded.solve.levenberg_marquardt import Batch, solve
 
@@ -60,10 +61,10 @@ def test_one_trial_closes_most_of_the_gap_of_a_miscalibrated_car():
         best = optimum(case)[1]
         for matched in shares:
             number = iter(range(100))
-            options = Options(max_trials=2, match_inputs=matched)
-            _, _, trials = learn(
+            options = SearchOptions(max_trials=2, match_inputs=matched)
+            trials = learn(
                 case.task, lambda c, n=number, case=case: case.real(c.policy, next(n)), options
-            )
+            ).trials
             first, second = (case.task.utility(t) for t in trials)
             shares[matched].append((max(second, first) - first) / (best - first))
     assert min(shares[True]) > 0.98

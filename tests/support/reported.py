@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 from cli import grounded
+from grounded.errors import NextCommand
 from grounded.experiments.figure8 import flight_task
 from grounded.models import aircraft
 from grounded.policy import Policy
-from grounded.search.standing import Candidate, Options, standing
+from grounded.search.standing import Candidate, SearchOptions, standing
 from grounded.solve.bias import residuals
 from grounded.trial import Trial
 from grounded_trials.report.findings import Findings, Run
@@ -136,7 +137,7 @@ def many_flights(trials: int = 50) -> Findings:
         candidates.append(made)
         trial = Trial(states, inputs, task.dt, task.model.state_names, task.model.input_names)
         runs.append(replace(trial, id=f"t{k + 1:04d}", candidate=name))
-    now = standing(task, candidates, runs, Options(max_trials=1000), "m")
+    now = standing(task, candidates, runs, SearchOptions(max_trials=1000), "m")
     by_id = {t.candidate.id: t for t in now.history}
     return Findings(
         name="many",
@@ -161,5 +162,5 @@ def many_flights(trials: int = 50) -> Findings:
         diagnosis=None,
         optimum=None,
         noise=float("nan"),
-        next_command="grounded propose",
+        then=NextCommand("propose"),
     )

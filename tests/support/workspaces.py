@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from grounded_trials.workspace.examples import EXAMPLES, write_example
-from grounded_trials.workspace.folder import Workspace
+from grounded_trials.workspace.folder import Folder
 
 MODEL = """import numpy as np
 
@@ -53,7 +53,7 @@ model = "real.py"
 """
 
 
-def make(folder: Path, example: str = "cart", **files: str) -> Workspace:
+def make(folder: Path, example: str = "cart", **files: str) -> Folder:
     """A workspace; `files` replaces texts: config, model, real, target."""
     if example in EXAMPLES:
         write_example(folder, example)
@@ -74,7 +74,7 @@ def make(folder: Path, example: str = "cart", **files: str) -> Workspace:
     }
     for key, text in files.items():
         (folder / names[key]).write_text(text)
-    return Workspace(folder)
+    return Folder(folder)
 
 
 def _rest_to_rest(t: float) -> float:

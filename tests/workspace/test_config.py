@@ -12,11 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from grounded.errors import GroundedError
-from grounded.search.standing import Options
+from grounded.search.standing import SearchOptions
 from grounded_trials.logs.log_table import log_mapping
 from grounded_trials.toml_table import Table
 from grounded_trials.workspace.config import ModelTable, SystemTable, TaskTable, read_config
-from grounded_trials.workspace.folder import Workspace
+from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.running import simulated_plant
 from grounded_trials.workspace.unmeasured import EstimateTable, read_estimate
 from workspaces import CONFIG, make
@@ -24,13 +24,15 @@ from workspaces import CONFIG, make
 REFERENCE = Path(__file__).resolve().parents[2] / "docs" / "configuration.md"
 
 
-@pytest.mark.parametrize("table", [ModelTable, TaskTable, Options, SystemTable, EstimateTable])
+@pytest.mark.parametrize(
+    "table", [ModelTable, TaskTable, SearchOptions, SystemTable, EstimateTable]
+)
 def test_the_reference_lists_every_key_with_its_default(table):
     rows = re.findall(r"^\| `(\w+)` \| (.*?) \|", REFERENCE.read_text(), re.M)
     listed = dict(rows)
     for key in fields(table):
         assert key.name in listed, f"docs/configuration.md does not say what {key.name} is"
-        if table is Options:
+        if table is SearchOptions:
             default = key.default
             shown = listed[key.name].strip("`")
             assert shown == (
@@ -277,14 +279,14 @@ def test_a_file_that_is_not_toml_or_not_ours(with_config, text, parts):
 
 def test_a_folder_that_is_no_workspace(tmp_path):
     with pytest.raises(GroundedError, match="this is not a workspace"):
-        _ = Workspace(tmp_path).config
+        _ = Folder(tmp_path).config
     (tmp_path / "grounded.toml").mkdir()
     with pytest.raises(GroundedError, match="can't be read"):
-        _ = Workspace(tmp_path).config
+        _ = Folder(tmp_path).config
     (tmp_path / "x").mkdir()
     (tmp_path / "x" / "grounded.toml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(GroundedError, match="can't be read"):
-        _ = Workspace(tmp_path / "x").config
+        _ = Folder(tmp_path / "x").config
 
 
 SCALARS = st.one_of(
@@ -339,7 +341,7 @@ def test_any_value_at_any_key_is_valid_or_one_sentence(tmp_path_factory, at, val
     before = module.read_toml
     module.read_toml = lambda path: Table(table, path)
     try:
-        everything(Workspace(folder))
+        everything(Folder(folder))
     except GroundedError as error:
         assert str(error)
     finally:

@@ -16,7 +16,7 @@ from workspaces import CONFIG, make
 def exported(w, folder, form):
     propose_in(w)
     path = folder / f"c.{form}"
-    assert export_candidate(w, "c0001", form, path) == "c0001"
+    assert export_candidate(w, "c0001", form, path).candidate == "c0001"
     return path
 
 

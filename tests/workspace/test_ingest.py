@@ -24,7 +24,7 @@ def w(tmp_path):
 
 
 def run(w):
-    return run_candidate(w, propose_in(w).proposal.candidate.id)
+    return run_candidate(w, propose_in(w).candidate.id).trial_file
 
 
 def plain(T=40, **changes):
@@ -54,11 +54,13 @@ def test_a_trial_of_ours_is_stored_byte_for_byte(w):
 
 
 def test_a_simulated_run_is_a_function_of_the_seed_and_its_number(w):
-    first, again = run(w), run_candidate(w, "c0001")
+    first, again = run(w), run_candidate(w, "c0001").trial_file
     assert (first.name, again.name) == ("c0001-1.mcap", "c0001-2.mcap")
     assert first.read_bytes() == again.read_bytes()
     ingest_log(w, first)
-    assert run_candidate(w, "c0001").read_bytes() != again.read_bytes()  # its number is in it
+    assert (
+        run_candidate(w, "c0001").trial_file.read_bytes() != again.read_bytes()
+    )  # its number is in it
 
 
 def test_repeated_runs_of_a_noiseless_system_are_trials_of_their_own(tmp_path):
@@ -87,14 +89,14 @@ def test_without_an_outstanding_candidate_it_must_be_named(w, tmp_path):
         ingest_log(w, tmp_path / "t.mcap", "c0001")
     found = ingest_log(w, tmp_path / "t.mcap", data=True)
     assert found.candidate == "" and found.utility is None and found.accepted is None
-    assert w.trials()[0].is_data
+    assert not w.trials()[0].trial.candidate
 
 
 def test_data_never_moves_the_search(w):
     ingest_log(w, run(w))
     before = propose_in(w).proposal.candidate
     (w.folder / "candidates" / "c0002.mcap").unlink()
-    path = run_candidate(w, "c0001")
+    path = run_candidate(w, "c0001").trial_file
     ingest_log(w, path, data=True)
     after = propose_in(w).proposal.candidate
     assert before.id == after.id == "c0002"
@@ -176,5 +178,5 @@ def test_a_trial_of_a_deleted_candidate_still_counts(w):
     Path(w.candidate_path("c0001")).unlink()
     fresh = type(w)(w.folder)
     assert standing_in(fresh).incumbent.candidate.id == "c0001"
-    again = run_candidate(fresh, "c0001")
+    again = run_candidate(fresh, "c0001").trial_file
     assert ingest_log(fresh, again).candidate == "c0001"

@@ -10,7 +10,7 @@ from cli import grounded
 from grounded.errors import GroundedError
 from grounded_trials.workspace.config import read_config
 from grounded_trials.workspace.examples import EXAMPLES, write_example
-from grounded_trials.workspace.folder import Workspace
+from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.task_file import read_target, target_arrays, write_target
 from workspaces import CONFIG, MODEL, make
 
@@ -19,7 +19,7 @@ from workspaces import CONFIG, MODEL, make
 def test_an_examples_files_say_what_its_task_is(name, tmp_path):
     """The files that `init` writes give the very task that the studies use."""
     write_example(tmp_path, name)
-    found, own = Workspace(tmp_path).task, EXAMPLES[name].task()
+    found, own = Folder(tmp_path).task, EXAMPLES[name].task()
     assert (found.dt, found.horizon, found.feedback) == (own.dt, own.horizon, own.feedback)
     np.testing.assert_allclose(found.target, own.target, rtol=1e-7, atol=1e-7)
     for part in ("start", "past", "low", "high", "latency", "safety_low"):
@@ -33,7 +33,7 @@ def test_an_examples_files_say_what_its_task_is(name, tmp_path):
 
 
 def test_nothing_is_read_before_it_is_asked_for(tmp_path):
-    w = Workspace(tmp_path / "nowhere")
+    w = Folder(tmp_path / "nowhere")
     assert w.store.list() == () and w.candidate_ids() == [] and w.next_id() == "c0001"
 
 
@@ -144,5 +144,5 @@ def test_a_hundred_trials_are_listed_quickly(tmp_path):
     for k in range(100):
         w.store.add(trial_bytes(trial, keep | {"number": str(k)}, policy))
     start = time.perf_counter()
-    assert len(Workspace(w.folder).trials()) == 100
+    assert len(Folder(w.folder).trials()) == 100
     assert time.perf_counter() - start < 3.0

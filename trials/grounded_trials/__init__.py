@@ -1,8 +1,28 @@
 """The disk: logs, the store, the workspace, reports. A file is data, never code.
 
+`from grounded_trials import Workspace` is the front door (`door.py`): a method for every command.
+
 formats/    bytes of log files as arrays
 logs/       foreign logs: which signal is which state, samples on the control grid
 store/      our own files, content-addressed
 workspace/  START HERE: a folder with a task, and what each command does in it
 report/     text, page, pictures, recording
 """
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from grounded_trials.door import Workspace
+
+__all__ = ["Workspace"]
+
+
+def __getattr__(name: str) -> Any:
+    """Imports the door when it is opened: `import grounded_trials` alone costs nothing."""
+    if name != "Workspace":
+        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+    from grounded_trials.door import Workspace
+
+    return Workspace

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from grounded.errors import GroundedError, nearest
+from grounded.errors import GroundedError, NextCommand, nearest
 
 _WORDS = {str: "a text", bool: "true or false", float: "a number", int: "a whole number"}
 _REQUIRED = object()
@@ -125,8 +125,8 @@ def read_toml(path: Path) -> Table:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise GroundedError(
-            f"{path} does not exist: this is not a workspace; make one with "
-            "'grounded init DIR --example car-turn' or name one with -C DIR"
+            f"{path} does not exist: this is not a workspace; name one with -C DIR, or make one",
+            NextCommand("init", ("DIR", "--example", "car-turn")),
         ) from None
     except NotADirectoryError:
         raise GroundedError(

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 import re
+import shlex
 from textwrap import TextWrapper
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from grounded.errors import NextCommand
     from grounded.search.standing import Tried
 
 WIDTH = 80  # columns of a terminal
@@ -70,6 +72,17 @@ def wrapped(text: str, first: str, rest: str) -> list[str]:
     wrapper = TextWrapper(WIDTH, initial_indent=first, subsequent_indent=rest)
     wrapper.break_on_hyphens = wrapper.break_long_words = False
     return [line.replace("\xa0", " ") for line in wrapper.wrap(whole)]
+
+
+def rendered(then: NextCommand, folder: str | None = None) -> str:
+    """A command as a shell takes it: `grounded run c0003`, with `-C DIR` where a folder is given.
+
+    Args:
+        then: the command as data.
+        folder: the workspace as the user named it, None where it is the current folder.
+    """
+    words = ["grounded", *(["-C", folder] if folder is not None else []), then.verb]
+    return shlex.join([*words, *then.arguments])
 
 
 def folded(command: str, lead: str = "next: ") -> str:

@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator
 from struct import Struct
 from typing import BinaryIO
 
-from grounded.errors import GroundedError
+from grounded.errors import GroundedError, NextCommand
 from grounded_trials.formats.mcap_records import (
     CHANNEL,
     CHUNK,
@@ -51,9 +51,9 @@ class DamagedFile(GroundedError):
 
     def __init__(self, name: str, offset: int, found: str, advice: str | None = None) -> None:
         self.found, self.offset = found, offset
-        if advice is None:
-            advice = f"`grounded recover {name}` saves what can be saved"
-        super().__init__(f"{name}: {found} (at byte {offset}); {advice}")
+        then = NextCommand("recover", (name,)) if advice is None else None
+        advice = advice or "`recover` saves what can be saved"
+        super().__init__(f"{name}: {found} (at byte {offset}); {advice}", then)
 
 
 OnDamage = Callable[[DamagedFile], None]

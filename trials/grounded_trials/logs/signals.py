@@ -14,7 +14,7 @@ from typing import Literal
 
 import numpy as np
 
-from grounded.errors import GroundedError, nearest
+from grounded.errors import GroundedError, NextCommand, nearest
 from grounded_trials.formats.cdr import cdr_messages, ros1_messages
 from grounded_trials.formats.idl_schema import parse_idl
 from grounded_trials.formats.json_messages import json_messages
@@ -134,7 +134,8 @@ class _Log:
         if unknown:
             raise GroundedError(
                 f"{self.name}: a message belongs to channel {unknown[0]}, which is not defined; "
-                f"`grounded recover {self.name}` saves the others"
+                "`recover` saves the others",
+                NextCommand("recover", (self.name,)),
             )
         for identity, (decoder, wanting) in self.wanted.items():
             if identity >= len(present) or not present[identity]:

@@ -11,11 +11,12 @@ import math
 import re
 from collections.abc import Mapping
 
+from grounded.diagnosis.report import Diagnosis, Gap, Split
 from grounded_trials.wording import count, figure, percent, with_unit
-from grounded_trials.workspace.diagnosis_error import Split, coloured
-from grounded_trials.workspace.diagnosis_file import Diagnosis, Gap
 
 MOST = 3  # parameters that are named
+WHITE = 0.01  # p-value below which what is left is no longer taken for white noise
+HORIZONS = {"one_step": "one step", "horizon": "{}", "whole_run": "whole run ({})"}
 
 
 def error_lines(diagnosis: Diagnosis, before: Mapping[str, float]) -> list[tuple[str, str]]:
@@ -30,16 +31,17 @@ def error_lines(diagnosis: Diagnosis, before: Mapping[str, float]) -> list[tuple
     if diagnosis.no_cause:
         return []
     found = []
-    if diagnosis.gap is not None:
+    if diagnosis.gap.measured:
         found.append(("gap", gap_sentence(diagnosis.gap)))
     if text := calibrated_sentence(diagnosis, before):
         found.append(("parameters", text))
-    if diagnosis.split:
-        found.append(("error", parts_sentence(diagnosis.split)))
-    if diagnosis.whiteness:
-        found.append(("rest", whiteness_sentence(diagnosis.whiteness)))
-    if diagnosis.utility_prediction is not None:
-        found.append(("utility", utility_sentence(diagnosis)))
+    where = diagnosis.where
+    if where.split:
+        found.append(("error", parts_sentence(where.split)))
+    if where.whiteness:
+        found.append(("rest", whiteness_sentence(where.whiteness)))
+    if text := utility_sentence(diagnosis):
+        found.append(("utility", text))
     for effect in dict.fromkeys(one.effect for one in diagnosis.lookalikes):
         like = [
             f"{one.like} {'makes ' * (k == 0)}{percent(one.share)}"
@@ -63,36 +65,47 @@ def calibrated_sentence(diagnosis: Diagnosis, before: Mapping[str, float]) -> st
     """The model's own parameters that were fitted beside the effects, most changed first."""
     if all(name.startswith("parameter:") for name in diagnosis.effects):
         return ""
-    moved, then = [], {**before, **dict(diagnosis.nominal)}
-    for v in diagnosis.parameters:
-        old = then.get(v.name, math.nan)
-        if abs(v.value - old) > 1e-6 * max(abs(v.value), abs(old)):
-            change = abs(v.value - old) / abs(old) if old else math.inf
-            text = with_unit(f"{v.name} {figure(old, 3)} -> {figure(v.value, 3)}", v.unit)
+    made = diagnosis.made
+    moved, then = [], {**before, **(made.nominal if made is not None else {})}
+    for name, e in diagnosis.parameters.items():
+        old = then.get(name, math.nan)
+        if abs(e.value - old) > 1e-6 * max(abs(e.value), abs(old)):
+            change = abs(e.value - old) / abs(old) if old else math.inf
+            text = with_unit(f"{name} {figure(old, 3)} -> {figure(e.value, 3)}", e.unit)
             moved.append((-change, text))
     named = [text for _, text in sorted(moved)[:MOST]]
     more = f" (and {len(moved) - MOST} more)" * (len(moved) > MOST)
     return f"calibrated beside them: {', '.join(named)}{more}" if named else ""
 
 
-def main_horizon(splits: tuple[Split, ...]) -> Split:
-    """The horizon that the gap is measured at."""
-    return next((one for one in splits if one.key == "horizon"), splits[0])
+def horizons(splits: Mapping[str, Split]) -> list[tuple[str, Split]]:
+    """How far ahead in words ("one step", "1 s", "whole run (3 s)"), nearest first."""
+    return [
+        (words.format(f"{splits[key].horizon_s:.3g} s"), splits[key])
+        for key, words in HORIZONS.items()
+        if key in splits
+    ]
 
 
-def parts_sentence(splits: tuple[Split, ...]) -> str:
+def main_horizon(splits: Mapping[str, Split]) -> tuple[str, Split]:
+    """The horizon that the gap is measured at, with how far ahead it is in words."""
+    return horizons({"horizon": splits["horizon"]} if "horizon" in splits else splits)[0]
+
+
+def parts_sentence(splits: Mapping[str, Split]) -> str:
     """`1 s ahead 99.7 % of the squared error is explained, 0.1 % is not, 0.2 % is noise`."""
-    main = main_horizon(splits)
+    ahead, main = main_horizon(splits)
     parts = main.whole
     return (
-        f"{main.ahead} ahead, {percent(parts.explained)} of the squared error is explained, "
+        f"{ahead} ahead, {percent(parts.explained)} of the squared error is explained, "
         f"{percent(parts.unexplained)} is not, {percent(parts.irreducible)} is noise"
     )
 
 
-def whiteness_sentence(whiteness: tuple[tuple[str, float], ...]) -> str:
+def whiteness_sentence(whiteness: Mapping[str, float]) -> str:
     """Whether what the effects leave of each state is noise, or still has a pattern."""
-    names, total = coloured(whiteness), len(whiteness)
+    clear = sorted((p, name) for name, p in whiteness.items() if p < WHITE)
+    names, total = [name for _, name in clear], len(whiteness)
     if not names:
         return "what is left of every state looks like white noise (Ljung-Box, p >= 0.01)"
     which = "every state" if len(names) == total else f"{', '.join(names)}"
@@ -105,7 +118,7 @@ def whiteness_sentence(whiteness: tuple[tuple[str, float], ...]) -> str:
 def utility_sentence(diagnosis: Diagnosis) -> str:
     """How well utilities of whole trials are predicted; "" where none was."""
     found = diagnosis.utility_prediction
-    if found is None:
+    if found is None or not found.trials:
         return ""
     without, better = (
         f"by {figure(value, 3)}" if math.isfinite(value) else "beyond all measure"

@@ -11,24 +11,18 @@ from functools import cached_property
 
 import numpy as np
 
+from grounded.diagnosis.report import Diagnosis
+from grounded.errors import NextCommand
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.search.planner import Planner
 from grounded.search.standing import Candidate, Standing, Tried
 from grounded.task import Task
 from grounded.trial import Trial, mean_trial
-from grounded_trials.wording import figure, shown
+from grounded_trials.wording import figure, rendered, shown
 from grounded_trials.workspace.adopting import Better
-from grounded_trials.workspace.diagnosis_file import Diagnosis
+from grounded_trials.workspace.folder import Lost
 from grounded_trials.workspace.next_step import Since
-
-
-@dataclass(frozen=True)
-class Lost:
-    """A file that should be there, or be read, and why it is not in the report."""
-
-    file: str
-    reason: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,9 +67,15 @@ class Findings:
     diagnosis: Diagnosis | None
     optimum: float | None  # of the real system, where a study computed it
     noise: float  # standard deviation of one trial's utility, NaN while unknown
-    next_command: str
+    then: NextCommand
     better: Better | None = None  # the model as diagnosed, or with adopted effects
     since: Since = field(default_factory=Since)  # the diagnosis
+    folder: str | None = None  # as the user named it, None where it is the current one
+
+    @property
+    def next_command(self) -> str:
+        """What to type next, in the workspace's own folder."""
+        return rendered(self.then)
 
     @property
     def crude(self) -> Planner:

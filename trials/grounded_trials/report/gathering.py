@@ -8,46 +8,44 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from grounded.diagnosis.report import Diagnosis
 from grounded.errors import GroundedError
 from grounded.frozen import Array
-from grounded.search.certainty import utility_noise
 from grounded.search.planner import Planner
-from grounded.search.standing import Candidate, Standing, standing
+from grounded.search.standing import Standing, utility_noise
 from grounded.solve.bias import residuals
 from grounded.task import Task
-from grounded.trial import Trial, bridge
-from grounded_trials.report.findings import Findings, Log, Lost, Run
-from grounded_trials.store.trial_file import read_trial
+from grounded.trial import Trial
+from grounded_trials.report.findings import Findings, Log, Run
 from grounded_trials.workspace.adopting import Better, better_model
-from grounded_trials.workspace.diagnosing import LEAST_STEPS
-from grounded_trials.workspace.diagnosis_file import Diagnosis, read_diagnosis
-from grounded_trials.workspace.folder import Workspace, candidate_of
+from grounded_trials.workspace.diagnosing import LEAST_STEPS, read_diagnosis
+from grounded_trials.workspace.folder import Contents, Folder, Lost
 from grounded_trials.workspace.next_step import Since, next_command, since_diagnosis
+from grounded_trials.workspace.proposing import standing_in
 
 RUNAWAY = 1e15  # in any unit: the number of a run that diverged
 
 
-def gather(workspace: Workspace) -> Findings:
+def gather(workspace: Folder) -> Findings:
     """Reads all that a report shows.
 
     Raises:
         GroundedError: if the task can't be built.
     """
-    task = workspace.task
-    trials, policies, lost = _trials(workspace)
-    candidates = _candidates(workspace, trials, policies, lost)
-    own = [t for t in trials if _fits(task, t) and t.candidate in {c.id for c in candidates}]
-    data = [_drawable(t) for t in trials if _fits(task, t) and not t.candidate]
-    now = _settled(workspace, candidates, own, _standing(workspace, candidates, own))
+    task, contents = workspace.task, workspace.read(strict=False)
+    known, lost = {c.id for c in contents.candidates}, list(contents.lost)
+    fitting = [t.trial for t in contents.trials if workspace.fits(t.trial)]
+    own = [t for t in fitting if t.candidate in known]
+    data = [_drawable(t) for t in fitting if not t.candidate]
+    now = _standing(workspace, contents)
     diagnosis = _diagnosis(workspace, lost)
     better = _better(workspace, diagnosis, lost)
-    usable = [t.id for t in trials if _fits(task, t) and t.known_steps >= LEAST_STEPS]
+    usable = [t.id for t in fitting if t.known_steps >= LEAST_STEPS]
     return Findings(
         name=workspace.folder.resolve().name,
         task=task,
@@ -57,94 +55,28 @@ def gather(workspace: Workspace) -> Findings:
         standing=now,
         runs=tuple(_runs(task, now, own, better, lost)),
         logs=tuple(Log(t, _residual(Planner(task, task), t)) for t in data),
-        others=len(trials) - len(own) - len(data),
+        others=len(contents.trials) - len(own) - len(data),
         lost=tuple(lost),
         diagnosis=diagnosis,
         optimum=_optimum(workspace.reports),
         noise=utility_noise(now.history)[0],
-        next_command=next_command(workspace, now, diagnosis, usable),
+        then=next_command(workspace, now, diagnosis, usable),
         better=better,
         since=since_diagnosis(workspace, diagnosis, usable) if diagnosis else Since(),
+        folder=workspace.address,
     )
 
 
-def _trials(workspace: Workspace) -> tuple[list[Trial], dict[str, bytes], list[Lost]]:
-    """The readable trials, the policies that they carry, and what is damaged or gone."""
-    trials: list[Trial] = []
-    policies: dict[str, bytes] = {}
-    lost: list[Lost] = []
-    numbers = []
-    for stored in workspace.store.list():
-        numbers.append(stored.number)
-        try:
-            trial, _, policy = read_trial(workspace.store.read(stored), stored.path.name)
-        except GroundedError as error:
-            lost.append(Lost(stored.path.name, str(error)))
-            continue
-        trials.append(bridge(replace(trial, id=stored.id)).trial)
-        if policy is not None:
-            policies.setdefault(trial.candidate, policy)
-    for number in sorted(set(range(1, max(numbers, default=0))) - set(numbers)):
-        name = f"{workspace.store.prefix}{number:04d}"
-        lost.append(Lost(name, f"trials/ has no file of the number {name}: it was removed"))
-    return trials, policies, lost
-
-
-def _candidates(
-    workspace: Workspace, trials: list[Trial], policies: dict[str, bytes], lost: list[Lost]
-) -> list[Candidate]:
-    """The search's candidates of this task, from their files or from trials that ran them."""
-    files = {path.stem for path in (workspace.folder / "candidates").glob("c[0-9]*.mcap")}
-    found = []
-    named = {t.candidate for t in trials if t.candidate}
-    for identity in sorted(name for name in files | named if re.fullmatch(r"c\d+", name)):
-        path = workspace.candidate_path(identity)
-        sources = [path.read_bytes()] if path.is_file() else []
-        sources += [policies[identity]] if identity in policies else []
-        reason = "its file is gone and no trial carries it"
-        for data in sources:
-            try:
-                candidate, meta = candidate_of(data, f"candidates/{identity}.mcap")
-            except GroundedError as error:
-                reason = str(error)
-                continue
-            if meta.get("kind") == "search" and meta.get("task") == workspace.task.hash:
-                found.append(candidate)
-            break
-        else:
-            lost.append(Lost(f"{identity}.mcap", reason))
-    return found
-
-
-def _fits(task: Task, trial: Trial) -> bool:
-    names = (task.model.state_names, task.model.input_names)
-    return (trial.state_names, trial.input_names) == names and abs(trial.dt - task.dt) < 1e-9
-
-
-def _standing(workspace: Workspace, candidates: list[Candidate], trials: list[Trial]) -> Standing:
-    from grounded.search.improve import model_fingerprint
-
-    task, options = workspace.task, workspace.config.search
-    return standing(task, candidates, trials, options, model_fingerprint(workspace.planner.plan))
-
-
-def _settled(
-    workspace: Workspace, candidates: list[Candidate], trials: list[Trial], now: Standing
-) -> Standing:
+def _standing(workspace: Folder, contents: Contents) -> Standing:
     """The standing, ended where the model sees nothing more to gain: only planning can tell."""
-    from grounded.search.improve import propose
-
-    options = workspace.config.search
-    if now.phase != "propose" or now.incumbent is None or options.refit:
-        return now
     try:
-        planner = workspace.planner
-        return propose(workspace.task, candidates, trials, options, planner=planner).standing
+        ahead = not workspace.config.search.refit
+        return standing_in(workspace, ahead=ahead, contents=contents)
     except GroundedError:
-        return now
+        return standing_in(workspace, contents=contents)
 
 
-def _better(workspace: Workspace, diagnosis: Diagnosis | None, lost: list[Lost]) -> Better | None:
+def _better(workspace: Folder, diagnosis: Diagnosis | None, lost: list[Lost]) -> Better | None:
     try:
         return better_model(workspace, diagnosis)
     except GroundedError as error:
@@ -190,7 +122,7 @@ def _residual(planner: Planner, trial: Trial) -> Array:
     return residual
 
 
-def _diagnosis(workspace: Workspace, lost: list[Lost]) -> Diagnosis | None:
+def _diagnosis(workspace: Folder, lost: list[Lost]) -> Diagnosis | None:
     try:
         return read_diagnosis(workspace.reports)
     except GroundedError as error:
@@ -207,7 +139,7 @@ def _optimum(reports: Path) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _method(workspace: Workspace) -> str:
+def _method(workspace: Folder) -> str:
     options = workspace.config.search
     words: list[str] = [options.method]
     if options.method == "ddp":

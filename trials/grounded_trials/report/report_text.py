@@ -7,6 +7,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from grounded.diagnosis.report import Estimate
+from grounded.errors import NextCommand
 from grounded.search.standing import Tried
 from grounded_trials.report.diagnosis_words import error_lines, sentences
 from grounded_trials.report.findings import (
@@ -26,11 +28,12 @@ from grounded_trials.wording import (
     figure,
     folded,
     per_second,
+    rendered,
     verdict,
     with_unit,
     wrapped,
 )
-from grounded_trials.workspace.diagnosis_file import Value
+from grounded_trials.workspace.next_step import DIAGNOSE
 
 ROWS = 12  # candidates in the table; the others are counted
 ITERATIONS = 5  # of the bias
@@ -60,7 +63,7 @@ def report_text(findings: Findings, table: Table, bars: Callable[[Sequence[float
         for one in findings.lost:
             lines += _wrapped(f"{one.file}: {one.reason}", "  ")
         parts.append("\n".join(lines))
-    parts.append(folded(findings.next_command))
+    parts.append(folded(rendered(findings.then, findings.folder)))
     return "\n\n".join(parts)
 
 
@@ -88,7 +91,8 @@ def _utilities(findings: Findings, table: Table, bars: Callable[[Sequence[float]
     header = ("candidate", "iter.", "alpha", "predicted", "real", "+-", "trials", "")
     lines = ["utility", table(rows, header), f"  {LEGEND}"]
     if left:
-        lines.append(f"  ({left} more between them: grounded status shows all)")
+        status = rendered(NextCommand("status"), findings.folder)
+        lines += _wrapped(f"({left} more between them: {status} shows all)", "  ")
     spark = bars(spaced([t.utility for t in history if t.utilities][-WIDTH // 2 :]))
     if spark:
         lines.append(f"\n  {spark}  by candidate, higher is better")
@@ -167,10 +171,10 @@ def _biases(findings: Findings, table: Table) -> str:
 def _diagnosis(findings: Findings, table: Table) -> str:
     diagnosis, since = findings.diagnosis, findings.since
     if diagnosis is None:
-        return "gap to the model\n  not diagnosed yet: grounded diagnose"
+        command = rendered(DIAGNOSE, findings.folder)
+        return "\n".join(["gap to the model", *_wrapped(f"not diagnosed yet: {command}", "  ")])
     lines = ["gap to the model"]
-    if since.sentence:
-        lines += _wrapped(since.sentence, "  ")
+    lines += _wrapped(since.told(findings.folder), "  ")
     then = "before that: " * bool(since.adopted)
     for k, sentence in enumerate(sentences(diagnosis.sentence or diagnosis.kind)):
         lines += _wrapped(then * (k == 0) + sentence, "  ")
@@ -183,7 +187,7 @@ def _diagnosis(findings: Findings, table: Table) -> str:
                 r.effect[:30],
                 figure(r.evidence, 3),
                 figure(r.gap_after, 3),
-                _fitting(list(map(_value, r.params)), VALUES).ljust(VALUES),
+                _fitting([_value(*one) for one in r.params.items()], VALUES).ljust(VALUES),
             )
             for r in diagnosis.ranking[:EFFECTS]
         ]
@@ -209,9 +213,9 @@ def _logs(findings: Findings, table: Table) -> str:
     return title + table(rows, ("state", "unit", *(log.trial.id for log in logs)))
 
 
-def _value(value: Value) -> str:
+def _value(name: str, value: Estimate) -> str:
     spread = f" +- {value.std:.2g}" if 0 < value.std < math.inf else ""
-    return with_unit(f"{value.name} = {value.value:.3g}{spread}", value.unit)
+    return with_unit(f"{name} = {value.value:.3g}{spread}", value.unit)
 
 
 def _wrapped(text: str, indent: str) -> list[str]:

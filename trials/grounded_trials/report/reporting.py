@@ -1,20 +1,78 @@
-"""reports/: the files that a report is made of. All of it may be deleted and made again."""
+"""report: the findings of a workspace and the files that show them, in reports/.
+
+All of reports/ may be deleted and made again.
+"""
 
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from grounded.errors import GroundedError
-from grounded_trials.report.findings import Findings
+from grounded.result import Result
+from grounded.task import Task
+from grounded_trials.report.findings import Findings, Run, prediction_error, rms, tracking_error
 from grounded_trials.report.gathering import gather
 from grounded_trials.store.store import write_atomically
-from grounded_trials.workspace.folder import Workspace
+from grounded_trials.wording import rendered
+from grounded_trials.workspace.folder import Folder
 
 RECORDING, PAGE, OPTIMUM = "recording.rrd", "report.html", "optimum.json"
 
 
-def save_recording(workspace: Workspace, findings: Findings | None = None) -> Path:
+@dataclass(frozen=True, eq=False, repr=False)
+class Report(Result):
+    """What `report` shows: the findings, and the files that were written."""
+
+    findings: Findings
+    paths: tuple[Path, ...]
+
+    def summary(self) -> str:
+        """How much it shows, and its files."""
+        return ", ".join([f"{len(self.findings.runs)} trials", *map(str, self.paths)])
+
+    def to_json(self) -> dict[str, Any]:
+        """The document of `report --json`, with the figures of the text by state and input."""
+        findings, diagnosis = self.findings, self.findings.diagnosis
+        document: dict[str, Any] = {
+            "paths": {path.suffix[1:]: str(path) for path in self.paths if path.suffix != ".png"},
+            "utilities": findings.standing.utilities,
+            "phase": findings.standing.phase,
+            "sentence": findings.standing.sentence,
+            "optimum": findings.optimum,
+            "lost": [vars(one) for one in findings.lost],
+            "next": rendered(findings.then, findings.folder),
+            "model_policy": _measures(findings.task, findings.first),
+            "best": _measures(findings.task, findings.best),
+        }
+        pictures = [str(path) for path in self.paths if path.suffix == ".png"]
+        if pictures:
+            document["paths"]["png"] = pictures
+        if diagnosis is not None:
+            verdict = {"kind": diagnosis.kind, "effects": diagnosis.effects}
+            document["verdict"] = verdict | {"sentence": diagnosis.sentence}
+            document["outdated"] = findings.since.sentence or None
+        return document
+
+
+def _measures(task: Task, run: Run | None) -> dict[str, Any] | None:
+    """How far a run was from its target, from its prediction and from the model's, by state."""
+    if run is None:
+        return None
+    measures = {
+        "tracking_error": rms(tracking_error(task, run.trial)),
+        "prediction_error": rms(prediction_error(task, run)),
+        "bias_rate": rms(run.residual) / task.dt,
+    }
+    return {"candidate": run.candidate.id, "utility": run.utility} | {
+        name: dict(zip(task.model.state_names, map(float, values), strict=True))
+        for name, values in measures.items()
+    }
+
+
+def save_recording(workspace: Folder, findings: Findings | None = None) -> Path:
     """reports/recording.rrd for the Rerun viewer."""
     from grounded_trials.report.recording.recording import write_recording
 
@@ -23,50 +81,36 @@ def save_recording(workspace: Workspace, findings: Findings | None = None) -> Pa
     return path
 
 
-def save_page(workspace: Workspace, findings: Findings | None = None) -> Path:
+def save_page(workspace: Folder, findings: Findings) -> Path:
     """reports/report.html."""
     from grounded_trials.report.page.page import page
 
     path = _place(workspace) / PAGE
-    write_atomically(path, page(findings or gather(workspace)).encode())
+    write_atomically(path, page(findings).encode())
     return path
 
 
-def save_pictures(workspace: Workspace, findings: Findings | None = None) -> list[Path]:
+def save_pictures(workspace: Folder, findings: Findings) -> list[Path]:
     """reports/utility.png, paths.png and so on: the figures of the page."""
     from grounded_trials.report.figures.png import png
     from grounded_trials.report.figures.runs import all_figures
 
     paths = []
-    for figure in all_figures(findings or gather(workspace)):
+    for figure in all_figures(findings):
         path = _place(workspace) / f"{figure.name}.png"
         write_atomically(path, png(figure))
         paths.append(path)
     return paths
 
 
-def save_optimum(workspace: Workspace, utility: float | None) -> None:
+def save_optimum(workspace: Folder, utility: float | None) -> None:
     """Leaves the optimum of the real system, where a study knows it, for the report to show."""
     if utility is not None:
         document = json.dumps({"utility": utility}, allow_nan=False)
         write_atomically(_place(workspace) / OPTIMUM, document.encode())
 
 
-def save(
-    workspace: Workspace, findings: Findings, *, html: bool, png: bool, rrd: bool
-) -> list[Path]:
-    """Writes what was asked for; returns the files."""
-    paths = []
-    if html:
-        paths.append(save_page(workspace, findings))
-    if png:
-        paths += save_pictures(workspace, findings)
-    if rrd:
-        paths.append(save_recording(workspace, findings))
-    return paths
-
-
-def _place(workspace: Workspace) -> Path:
+def _place(workspace: Folder) -> Path:
     try:
         workspace.reports.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -119,7 +119,7 @@ class TrialWriter:
         except OSError as error:
             raise GroundedError(
                 f"the trial can't be written: {error.strerror}; what is in the file already can be "
-                "saved with `grounded recover`"
+                "saved with `recover`"
             ) from None
 
     def __enter__(self) -> TrialWriter:

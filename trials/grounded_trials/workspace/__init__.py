@@ -1,6 +1,7 @@
 """A workspace, a folder with a task, its trials and candidates; what each command does in it.
 
 Read `folder.py` first (how a folder becomes a task, trials and candidates). `config.py`,
-`task_file.py` and `model_file.py` read what the user wrote; `proposing.py`, `running.py`,
-`ingest.py`, `fitting.py`, `diagnosing.py`, `adopting.py` and `exporting.py` are a verb each.
+`task_file.py` and `model_file.py` read what the user wrote; `proposing.py` (status too),
+`running.py`, `ingest.py`, `fitting.py`, `diagnosing.py`, `adopting.py`, `exporting.py` and
+`inspecting.py` are a verb each; `grounded_trials.door` makes them the methods of one class.
 """

@@ -3,8 +3,9 @@
     [model]
     effects = [ { name = "dead_zone:throttle", c = 0.146 } ]
 
-A pure delay becomes latency of the task, a queue that the robot's runner knows; everything else
-wraps the model (`grounded.effects`), with memory states where the effect has a memory.
+Families come with grounded and with other packages (`installed_effects`). A pure delay becomes
+latency of the task, a queue that the robot's runner knows; everything else wraps the model
+(`grounded.effects`), with memory states where the effect has a memory.
 """
 
 from __future__ import annotations
@@ -22,6 +23,33 @@ from grounded.errors import GroundedError
 from grounded.model import Model
 from grounded.search.planner import Planner, planner_for
 from grounded.task import Task
+
+
+def installed_effects() -> Library:
+    """The effects that may be blamed: built in, and those of other packages.
+
+    A package adds families by the entry point group `grounded.effects`: a family, or a sequence of
+    families.
+
+    Raises:
+        GroundedError: for an entry point that can't be loaded or holds something else.
+    """
+    from importlib.metadata import entry_points
+
+    found: list[Family] = []
+    for point in entry_points(group="grounded.effects"):
+        try:
+            loaded = point.load()
+        except Exception as error:
+            raise GroundedError(
+                f"the effects of package '{point.value}' can't be loaded: {error}; mend or "
+                "uninstall it"
+            ) from None
+        families = [loaded] if isinstance(loaded, Family) else list(loaded)
+        if not all(isinstance(family, Family) for family in families):
+            raise GroundedError(f"'{point.value}' must be an effect family or a sequence of them")
+        found += families
+    return Library().with_families(found)
 
 
 def planner_with(

@@ -1,39 +1,50 @@
 """adopt in a workspace: diagnosed effects join the model of grounded.toml, with their values.
 
-The model after the diagnosis: its parameters and effects put in, drawn beside the crude one.
-
-A diagnosis estimates the model's parameters beside the effects, so both belong to what it claims;
-once effects are adopted and nothing newer was diagnosed, it is the model that plans.
+A diagnosis estimates the model's parameters beside the effects, so both belong to what it claims
+and are adopted together. `better_model` is that model before anybody adopts it, for reports to draw
+beside the crude one; once effects are adopted and nothing newer was diagnosed, it is the model that
+plans.
 """
 
 from __future__ import annotations
 
-import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from grounded.errors import GroundedError, nearest
+from grounded.diagnosis.report import Diagnosis
+from grounded.errors import GroundedError, NextCommand, nearest
+from grounded.result import Result
 from grounded.search.planner import Planner
 from grounded_trials.workspace.config import set_in_model
-from grounded_trials.workspace.diagnosis_file import FILE, MALFORMED, Diagnosis, diagnosis_of
-from grounded_trials.workspace.folder import Workspace
+from grounded_trials.workspace.diagnosing import read_diagnosis
+from grounded_trials.workspace.folder import Folder
 
 Effect = dict[str, Any]  # {"name": "dead_zone:throttle", "c": 0.146}
+AGAIN, PROPOSE = NextCommand("diagnose"), NextCommand("propose")
 
 
-@dataclass(frozen=True)
-class Adopted:
+@dataclass(frozen=True, repr=False)
+class Adopted(Result):
     """What the model has now."""
 
     effects: tuple[Mapping[str, Any], ...]  # all that are adopted
     params: Mapping[str, float]  # of the model, written with them
     claimed: bool  # the diagnosis claims the new ones; else one was taken by itself
+    then: NextCommand = PROPOSE
+
+    def summary(self) -> str:
+        """The effects that the model has now."""
+        return ", ".join(str(effect["name"]) for effect in self.effects)
+
+    def to_json(self) -> dict[str, Any]:
+        """The document of `adopt --json`."""
+        effects = [dict(effect) for effect in self.effects]
+        return {"effects": effects, "params": dict(self.params), "claimed": self.claimed}
 
 
-def adopt_effects(
-    workspace: Workspace, names: Sequence[str], *, parameters: bool = True
-) -> Adopted:
+def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool = True) -> Adopted:
     """Adds diagnosed effects to [model] effects, and the parameters that belong to them.
 
     Where the diagnosis calibrated the model's own parameters beside the effects that it claims,
@@ -44,19 +55,21 @@ def adopt_effects(
         GroundedError: if nothing was diagnosed, an effect is not in its ranking, or they were not
             fitted together; nothing is written then.
     """
-    document, names = _document(workspace), list(dict.fromkeys(names))
-    ranking = {str(entry["effect"]): entry for entry in document["ranking"]}
-    before = {str(e["name"]): e for e in document.get("diagnosed", {}).get("adopted", [])}
-    _check(names, list(ranking), workspace, before)
-    claimed = _claimed(document, names)
+    found = read_diagnosis(workspace.reports)
+    if found is None:
+        raise GroundedError("nothing was diagnosed yet: diagnose first", then=AGAIN)
+    names = list(dict.fromkeys(names))
+    before = {} if found.made is None else found.made.effects
+    _check(names, [row.effect for row in found.ranking], workspace, before)
+    claimed = _claimed(found, names)
     adopted: list[Effect] = [dict(effect) for effect in workspace.config.model.effects]
-    found = document.get("parameters", {}) if parameters and claimed else {}
-    params = {key: _rounded(p["value"]) for key, p in found.items()}
+    calibrated = found.parameters if parameters and claimed else {}
+    params = {key: _rounded(estimate.value) for key, estimate in calibrated.items()}
     for name in names:
-        values = _values(ranking[name])
+        values = {key: _rounded(value) for key, value in found.values(name).items()}
         family, _, target = name.partition(":")
         if family == "parameter":
-            params[target] = _rounded(_nominal(document, workspace, target) + values["d"])
+            params[target] = _rounded(_nominal(found, workspace, target) + values["d"])
         elif name in before:  # a delay more
             values["d"] = _rounded(float(before[name]["d"]) + values["d"])
             adopted = [e | values if e["name"] == name else e for e in adopted]
@@ -68,15 +81,15 @@ def adopt_effects(
     return Adopted(tuple(adopted), own, claimed)
 
 
-def _nominal(document: Mapping[str, Any], workspace: Workspace, name: str) -> float:
+def _nominal(found: Diagnosis, workspace: Folder, name: str) -> float:
     """A parameter's value when the diagnosis was made."""
-    values = document.get("diagnosed", {}).get("nominal", {})
-    if name in values:
-        return float(values[name])
+    if found.made is not None and name in found.made.nominal:
+        return found.made.nominal[name]
     if name not in workspace.base_model.params:
         raise GroundedError(
-            f"the last diagnosis does not say from which value of '{name}' it counts: run "
-            "`grounded diagnose` again"
+            f"the last diagnosis does not say from which value of '{name}' it counts: diagnose "
+            "again",
+            then=AGAIN,
         )
     return float(workspace.base_model.params[name].value)
 
@@ -95,7 +108,7 @@ def _settled(
 
 
 def _check(
-    names: Sequence[str], known: Sequence[str], workspace: Workspace, before: Mapping[str, Any]
+    names: Sequence[str], known: Sequence[str], workspace: Folder, before: Mapping[str, Any]
 ) -> None:
     """Each must have been weighed, and not be adopted since."""
     adopted = [e["name"] for e in workspace.config.model.effects if e["name"] not in before]
@@ -110,49 +123,28 @@ def _check(
             )
 
 
-def _claimed(document: Mapping[str, Any], names: Sequence[str]) -> bool:
+def _claimed(found: Diagnosis, names: Sequence[str]) -> bool:
     """Whether the verdict claims them all; several that it doesn't were fitted as rivals."""
-    found = diagnosis_of(dict(document))
     if found.no_cause:
         raise GroundedError(
             f"too little is known to adopt anything ({found.sentence}): run another trial, ingest "
-            "it, then `grounded diagnose`"
+            "it, then diagnose again"
         )
     rivals = [name for name in names if name not in found.effects]
     if rivals and len(names) > 1:
-        own = f"`grounded adopt {' '.join(found.effects)}`, " * bool(found.effects)
+        own = f"those that it claims ({', '.join(found.effects)}), or " * bool(found.effects)
         raise GroundedError(
             f"the last diagnosis does not claim {', '.join(rivals)}: these effects were fitted one "
-            "instead of another, not together; expected effects that it claims together, or one "
-            f"alone: {own}or `grounded adopt {rivals[0]}`"
+            f"instead of another, not together; expected {own}one alone",
+            then=NextCommand("adopt", found.effects or (rivals[0],)),
         )
     return not rivals
 
 
-def _values(entry: Mapping[str, Any]) -> dict[str, float]:
-    """An effect's quantities, those that were estimated and those that are fixed."""
-    values = {key: _rounded(p["value"]) for key, p in entry["params"].items()}
-    return values | {key: _rounded(value) for key, value in entry.get("fixed", {}).items()}
-
-
 def _rounded(value: float) -> float:
+    if not math.isfinite(value):
+        raise GroundedError("the last diagnosis lacks a value: diagnose again", then=AGAIN)
     return float(f"{float(value):.8g}")
-
-
-def _document(workspace: Workspace) -> dict[str, Any]:
-    path = workspace.reports / FILE
-    try:
-        document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        _ = diagnosis_of(document)
-        for entry in document["ranking"]:
-            _ = str(entry["effect"]), entry["params"].items()
-    except FileNotFoundError:
-        raise GroundedError("nothing was diagnosed yet: run `grounded diagnose` first") from None
-    except (OSError, *MALFORMED) as error:
-        raise GroundedError(
-            f"{path} can't be read ({error}): run `grounded diagnose` again"
-        ) from None
-    return document
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +155,7 @@ class Better:
     name: str
 
 
-def better_model(workspace: Workspace, diagnosis: Diagnosis | None) -> Better | None:
+def better_model(workspace: Folder, diagnosis: Diagnosis | None) -> Better | None:
     """The diagnosed model, or else the one with adopted effects; None where there is neither.
 
     Raises:
@@ -181,20 +173,19 @@ def better_model(workspace: Workspace, diagnosis: Diagnosis | None) -> Better | 
     return Better(planner_with(estimated, effects), "as diagnosed")
 
 
-def _new(diagnosis: Diagnosis | None, adopted: set[str]) -> list[dict[str, Any]]:
+def _new(diagnosis: Diagnosis | None, adopted: set[str]) -> list[Effect]:
     """The effects that the verdict names and the model lacks, with their quantities."""
     if diagnosis is None:
         return []
-    ranked = {r.effect: r for r in diagnosis.ranking}
     return [
-        {"name": name, **dict(ranked[name].fixed), **{v.name: v.value for v in ranked[name].params}}
+        {"name": name, **diagnosis.values(name)}
         for name in diagnosis.effects
-        if name in ranked and name not in adopted
+        if name not in adopted and diagnosis.ranked(name) is not None
     ]
 
 
-def _parameters(workspace: Workspace, diagnosis: Diagnosis | None) -> dict[str, float]:
+def _parameters(workspace: Folder, diagnosis: Diagnosis | None) -> dict[str, float]:
     """The model's parameters as the diagnosis estimated them; its own names only."""
     known = workspace.task.model.params
-    found = diagnosis.parameters if diagnosis is not None else ()
-    return {v.name: v.value for v in found if v.name in known and v.value == v.value}
+    found = diagnosis.parameters if diagnosis is not None else {}
+    return {n: e.value for n, e in found.items() if n in known and e.value == e.value}

@@ -24,14 +24,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from grounded.errors import GroundedError
+from grounded.errors import GroundedError, NextCommand
 from grounded_trials.store.store import DIGITS, Store, write_atomically
 from grounded_trials.store.trial_file import trial_bytes
 from grounded_trials.workspace.config import FILE
+from grounded_trials.workspace.diagnosing import FILE as DIAGNOSIS
 from grounded_trials.workspace.diagnosing import diagnose_in
-from grounded_trials.workspace.diagnosis_file import FILE as DIAGNOSIS
 from grounded_trials.workspace.examples import toml_of
-from grounded_trials.workspace.folder import Workspace
+from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.task_file import write_target
 
 if TYPE_CHECKING:
@@ -112,7 +112,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     Raises:
         GroundedError: if there is none.
     """
-    path, advice = folder / MANIFEST, "name the folder that `grounded challenge make` wrote"
+    path, advice = folder / MANIFEST, "name the folder that `challenge make` wrote"
     if not folder.is_dir():
         raise GroundedError(f"there is no folder {folder}: {advice}")
     try:
@@ -140,7 +140,7 @@ def open_label(labels: Path, name: str, entry: dict[str, Any]) -> dict[str, Any]
     except FileNotFoundError:
         there = f"{labels} holds no {path.name}" if labels.is_dir() else f"there is no {labels}"
         raise GroundedError(
-            f"{there}: expected the folder in which `grounded challenge make` put the label of "
+            f"{there}: expected the folder in which `challenge make` put the label of "
             f"every case; look for {path.name}"
         ) from None
     except OSError as error:
@@ -160,7 +160,7 @@ def score_case(folder: Path, labels: Path, name: str, entry: dict[str, Any]) -> 
     """
     from grounded.challenge import judge, oracle
 
-    workspace = Workspace(folder / name)
+    workspace = Folder(folder / name)
     hashes = [hashlib.sha256(workspace.store.read(s)).hexdigest() for s in workspace.store.list()]
     if hashes != entry["trials_sha256"]:
         raise GroundedError(f"{folder / name}: its trials are not those that were made")
@@ -169,7 +169,7 @@ def score_case(folder: Path, labels: Path, name: str, entry: dict[str, Any]) -> 
         diagnosis = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         raise GroundedError(
-            f"{folder / name} was not diagnosed: run `grounded challenge run {folder}`"
+            f"{folder / name} was not diagnosed", NextCommand("challenge", ("run", str(folder)))
         ) from None
     label = open_label(labels, name, entry)
     task = workspace.task
@@ -233,7 +233,7 @@ def diagnose_case(folder: str, name: str, without: Sequence[str]) -> dict[str, A
     from grounded.effects import Library
 
     begin = time.process_time()
-    diagnose_in(Workspace(Path(folder) / name), library=Library().without(without))
+    diagnose_in(Folder(Path(folder) / name), library=Library().without(without))
     return {"case": name, "cpu_s": time.process_time() - begin}
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from grounded.errors import GroundedError
-from grounded.search.standing import Options
+from grounded.search.standing import SearchOptions
 from grounded_trials.store.store import write_atomically
 from grounded_trials.toml_table import Table, read_toml
 
@@ -52,6 +52,11 @@ class SystemTable:
     noise: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     seed: int = 0
 
+    @property
+    def reachable(self) -> bool:
+        """Whether `run` can reach the system; else candidates are run by hand."""
+        return bool(self.command or self.model)
+
 
 @dataclass(frozen=True)
 class Config:
@@ -63,7 +68,7 @@ class Config:
     reward: Table
     limits: Table
     safety: Table
-    search: Options
+    search: SearchOptions
     system: SystemTable
     log: Table
     estimate: Table
@@ -136,8 +141,8 @@ def _task(table: Table) -> TaskTable:
     return found
 
 
-def _search(table: Table) -> Options:
-    defaults = Options()
+def _search(table: Table) -> SearchOptions:
+    defaults = SearchOptions()
     method = table.choice("method", ("ddp", "policy-gradient"), defaults.method)
     step = table.choice("step", ("damped", "full"), defaults.step)
     options = {
@@ -151,7 +156,7 @@ def _search(table: Table) -> Options:
     }
     table.finish()
     try:
-        return Options(method=method, step=step, **options)  # type: ignore[arg-type]
+        return SearchOptions(method=method, step=step, **options)  # type: ignore[arg-type]
     except GroundedError as error:
         raise GroundedError(f"{table.file.name}: {error}") from None
 

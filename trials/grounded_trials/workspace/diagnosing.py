@@ -1,6 +1,8 @@
-"""diagnose in a workspace: which trials, which model, where the result is kept.
+"""diagnose in a workspace: which trials, which model, where the result is kept and read again.
 
-The stored trials that a diagnosis can use: gaps in single states stay, what diverged goes.
+A diagnosis uses the stored trials up to the first missing input or runaway number; gaps in single
+states stay gaps. reports/diagnosis.json keeps the result; it may come from another version, or from
+a stranger, so no text in it is trusted.
 """
 
 from __future__ import annotations
@@ -8,40 +10,35 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-from grounded.errors import GroundedError, nearest
-from grounded.result import plain
-from grounded.trial import Trial
+from grounded.diagnosis.report import Diagnosis, Made
+from grounded.errors import GroundedError, NextCommand, nearest
 from grounded_trials.store.store import write_atomically
-from grounded_trials.workspace.diagnosis_file import FILE
-from grounded_trials.workspace.folder import Workspace
+from grounded_trials.wording import rendered
 
 if TYPE_CHECKING:
-    from grounded.diagnosis.report import Diagnosis
     from grounded.effects import Library
     from grounded.trial import Trial
+    from grounded_trials.workspace.folder import Folder
 
-
-@dataclass(frozen=True, eq=False)
-class Diagnosed:
-    """A diagnosis, its document as CONTRACT.md has it, and the probe that was written, if any."""
-
-    diagnosis: Diagnosis
-    document: dict[str, Any]
-    probe: str  # a candidate's id, "" for none
+FILE = "diagnosis.json"
+LEAST_STEPS = 2
 
 
 def diagnose_in(
-    workspace: Workspace,
+    workspace: Folder,
     *,
     trials: Sequence[str] = (),
     max_effects: int = 3,
     library: Library | None = None,
     progress: Callable[[str], None] | None = None,
-) -> Diagnosed:
+) -> Diagnosis:
     """Diagnoses the gap between the model and the stored trials; keeps reports/diagnosis.json.
+
+    Where two effects tie, it writes the candidate that would tell them apart, `.probe`.
 
     Args:
         workspace: the model is diagnosed with the effects that were adopted.
@@ -56,37 +53,55 @@ def diagnose_in(
     from grounded.diagnosis.diagnose import Options, diagnose
     from grounded.effects import Library
 
-    names = [str(effect["name"]) for effect in workspace.config.model.effects]
+    effects = [dict(effect) for effect in workspace.config.model.effects]
+    names = [str(effect["name"]) for effect in effects]
     adopted = {name for name in names if not name.startswith("delay:")}  # whose d is no parameter
     library = library or Library()
     planner, used = workspace.planner, _chosen(workspace, trials)
     memory = planner.plan.model.state_names[planner.task.model.n :]
     options = Options(library=library, max_effects=max_effects, hidden=tuple(memory), but=adopted)
     lifted = [planner.lift(trial) for trial in used]
-    found = diagnose(planner.plan, lifted, options, progress=progress)
-    document = found.to_dict()
-    document["diagnosed"] = {
-        "trials": [trial.id for trial in used],
-        "adopted": [dict(effect) for effect in workspace.config.model.effects],
-        "params": dict(workspace.config.model.params),
-        "nominal": {name: p.value for name, p in planner.plan.model.params.items()},
-    }
-    _keep(workspace, document)
+    made = Made(
+        trials=tuple(trial.id for trial in used),
+        adopted=tuple(effects),
+        params=dict(workspace.config.model.params),
+        nominal={name: p.value for name, p in planner.plan.model.params.items()},
+    )
+    found = replace(diagnose(planner.plan, lifted, options, progress=progress), made=made)
+    _keep(workspace, found)
     probe = _probe(workspace, found, lifted, library)
-    if probe:
-        document["next_trial"] = f"{probe[1]} ({probe[0]}: grounded run {probe[0]})"
-        document["probe"] = probe[0]
-        _keep(workspace, document)
-    return Diagnosed(found, document, probe[0] if probe else "")
+    if probe is not None:
+        identity, words = probe
+        run = rendered(NextCommand("run", (identity,)))
+        found = replace(found, next_trial=f"{words} ({identity}: {run})", probe=identity)
+        _keep(workspace, found)
+    return found
 
 
-def _keep(workspace: Workspace, document: dict[str, Any]) -> None:
+def _keep(workspace: Folder, found: Diagnosis) -> None:
     workspace.reports.mkdir(exist_ok=True)
-    text = json.dumps(plain(document), indent=1, ensure_ascii=False, allow_nan=False)
+    text = json.dumps(found.to_json(), indent=1, ensure_ascii=False, allow_nan=False)
     write_atomically(workspace.reports / FILE, (text + "\n").encode())
 
 
-def _chosen(workspace: Workspace, names: Sequence[str]) -> list[Trial]:
+def read_diagnosis(folder: Path) -> Diagnosis | None:
+    """The diagnosis in a reports folder; None when there is none.
+
+    Raises:
+        GroundedError: if the file can't be read, or holds something else.
+    """
+    path = folder / FILE
+    try:
+        return Diagnosis.from_json(json.loads(path.read_text(encoding="utf-8")))
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, RecursionError, GroundedError) as error:
+        raise GroundedError(
+            f"{path} can't be read ({error}): diagnose again", then=NextCommand("diagnose")
+        ) from None
+
+
+def _chosen(workspace: Folder, names: Sequence[str]) -> list[Trial]:
     """The trials to diagnose: gaps in a state stay, what a smoother made of them is no evidence."""
     used = diagnosable(workspace)
     if not used:
@@ -113,11 +128,9 @@ def _measured(trial: Trial, guessed: Sequence[str]) -> Trial:
 
 
 def _probe(
-    workspace: Workspace, found: Diagnosis, trials: Sequence[Trial], library: Library
+    workspace: Folder, found: Diagnosis, trials: Sequence[Trial], library: Library
 ) -> tuple[str, str] | None:
     """Writes the candidate that would tell two tied effects apart: (id, sentence)."""
-    planner = workspace.planner
-    task = planner.plan
     if not found.indistinguishable:
         return None
     from grounded.diagnosis.excitation import probe
@@ -129,6 +142,8 @@ def _probe(
     best = standing_in(workspace).incumbent
     if best is None:
         return None
+    planner = workspace.planner
+    task = planner.plan
     base = planner.widened(best.candidate.policy)
     made = probe(task, base, found, trials, library)
     if made is None:
@@ -150,10 +165,7 @@ def _probe(
     return candidate.id, made.sentence
 
 
-LEAST_STEPS = 2
-
-
-def diagnosable(workspace: Workspace) -> list[Trial]:
+def diagnosable(workspace: Folder) -> list[Trial]:
     """In order of arrival, up to the first missing input or number beyond all bounds.
 
     A fit needs whole states; a diagnosis only needs some, so a sensor that dropped out for a while

@@ -1,12 +1,10 @@
-"""A candidate for other languages: csv, json or npz, with its units and time base inside.
+"""export: a candidate for other languages, as csv, json or npz, with units and time base inside.
 
 All three say the same. With z = [state, past inputs] (names in `z_names`),
 
     u_t = clip(feedforward_t + gain_t (z - reference_t), low, high)
 
 for the step t nearest to (time since start) / dt; differences of angles wrap to [-pi, pi].
-
-Every byte that a workspace keeps, checked: trials by hash, candidates by their own checksums.
 """
 
 from __future__ import annotations
@@ -14,37 +12,62 @@ from __future__ import annotations
 import csv
 import io
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from grounded.errors import GroundedError
+from grounded.errors import GroundedError, nearest
 from grounded.policy import Policy, to_arrays
-from grounded_trials.store.candidate_file import read_candidate
+from grounded.result import Result
 from grounded_trials.store.store import write_atomically
-from grounded_trials.workspace.folder import Workspace
+from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.proposing import candidate_named
 
 LAW = "u_t = clip(feedforward_t + gain_t (z - reference_t), low, high); z = [state, past inputs]"
 
 
-def export_candidate(workspace: Workspace, identity: str, form: str, path: Path) -> str:
-    """Writes a candidate; returns its id ("best" is resolved).
+@dataclass(frozen=True, repr=False)
+class Exported(Result):
+    """A candidate's file for other languages."""
+
+    candidate: str
+    file: Path
+    format: str
+
+    def summary(self) -> str:
+        """The candidate and its file."""
+        return f"{self.candidate}: {self.file}"
+
+    def to_json(self) -> dict[str, Any]:
+        """The document of `export --json`."""
+        return {"file": str(self.file), "candidate": self.candidate, "format": self.format}
+
+
+def export_candidate(
+    workspace: Folder, identity: str, form: str | None = None, path: Path | None = None
+) -> Exported:
+    """Writes a candidate, `best` or by its id; without `form` as `path` is named, else as json.
 
     Raises:
-        GroundedError: for an unknown candidate, or a place that can't be written.
+        GroundedError: for an unknown candidate or format, or a place that can't be written.
     """
+    encoders = {"csv": _csv, "json": _json, "npz": _npz}
+    named = path.suffix.lstrip(".").lower() if path else ""
+    form = form or (named if named in encoders else "json")
+    path = path or Path(f"{identity}.{form}")
+    if form not in encoders:
+        raise GroundedError(f"there is no format '{form}': {nearest(form, encoders)}")
     identity = candidate_named(workspace, identity)
     candidate, meta = workspace.candidate(identity)
     about = {"candidate": identity, "task": meta["task"], "model": meta["model"]}
     about["created_by"] = "grounded"
-    encode = {"csv": _csv, "json": _json, "npz": _npz}[form]
-    write_atomically(path, encode(candidate.policy, _units(workspace), about))
-    return identity
+    write_atomically(path, encoders[form](candidate.policy, _units(workspace), about))
+    return Exported(identity, path, form)
 
 
-def _units(workspace: Workspace) -> dict[str, str]:
+def _units(workspace: Folder) -> dict[str, str]:
     model = workspace.base_model
     return {**model.states, **model.inputs}
 
@@ -109,15 +132,3 @@ def _csv(policy: Policy, units: dict[str, str], about: dict[str, str]) -> bytes:
     for step, row in enumerate(values):
         writer.writerow([f"{step * policy.dt:.10g}", *(repr(float(v)) for v in row)])
     return stream.getvalue().encode()
-
-
-def damaged_files(workspace: Workspace) -> tuple[int, list[tuple[str, str]]]:
-    """How many files were checked, and (file, reason) for each that is not what it was."""
-    damaged = [(str(d.path), d.reason) for d in workspace.store.verify()]
-    candidates = sorted((workspace.folder / "candidates").glob("*.mcap"))
-    for path in candidates:
-        try:
-            read_candidate(path)
-        except GroundedError as error:
-            damaged.append((str(path), str(error)))
-    return len(workspace.store.list()) + len(candidates), damaged

@@ -3,21 +3,60 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from grounded.errors import GroundedError
+from grounded.errors import GroundedError, NextCommand
+from grounded.result import Result
 from grounded.trial import Trial
 from grounded_trials.workspace.config import set_in_model, set_latency
-from grounded_trials.workspace.folder import Workspace
+from grounded_trials.workspace.folder import Folder
 
 if TYPE_CHECKING:
     from grounded.fit import Fit
 
 
-def usable_trials(workspace: Workspace) -> list[Trial]:
+@dataclass(frozen=True, eq=False, repr=False)
+class Fitted(Result):
+    """What `fit` found, and whether grounded.toml has it."""
+
+    fit: Fit
+    applied: bool
+    asked: tuple[str, ...] = ()  # the options of the command that fits the same again
+
+    @property
+    def then(self) -> NextCommand:
+        """Write the values to grounded.toml, or go on with those that were written."""
+        return NextCommand("propose" if self.applied else "fit", self.asked)
+
+    def summary(self) -> str:
+        """The values."""
+        return ", ".join(f"{name} = {e.value:.4g}" for name, e in self.fit.params.items())
+
+    def to_json(self) -> dict[str, Any]:
+        """The document of `fit --json`: values, intervals, held-out prediction errors."""
+        keys = ("value", "std", "low", "high", "unit", "identified", "start")
+        fit = self.fit
+        document: dict[str, Any] = {
+            "params": {name: {k: getattr(e, k) for k in keys} for name, e in fit.params.items()},
+            "status": fit.status,
+            "sentence": fit.sentence,
+            "samples": fit.samples,
+            "applied": self.applied,
+        }
+        for name, error in (("before", fit.before), ("after", fit.after)):
+            if error is not None:
+                document[f"prediction_error_{name}"] = {
+                    "horizon_s": error.horizon_s,
+                    "one_step": dict(zip(error.names, error.one_step.tolist(), strict=True)),
+                    "ahead": dict(zip(error.names, error.ahead.tolist(), strict=True)),
+                }
+        return document
+
+
+def usable_trials(workspace: Folder) -> list[Trial]:
     """Every stored trial of this model up to its first sample that is not a finite number.
 
     Raises:
@@ -35,7 +74,7 @@ def usable_trials(workspace: Workspace) -> list[Trial]:
     return found
 
 
-def fit_trials(workspace: Workspace, names: Sequence[str] | None, *, latency: bool = False) -> Fit:
+def fit_trials(workspace: Folder, names: Sequence[str] | None, *, latency: bool = False) -> Fit:
     """Parameters of the workspace's model from its trials."""
     from grounded.estimate import of_states, record_of
     from grounded.fit import fit
@@ -53,7 +92,7 @@ def fit_trials(workspace: Workspace, names: Sequence[str] | None, *, latency: bo
     )
 
 
-def apply_fit(workspace: Workspace, found: Fit) -> None:
+def apply_fit(workspace: Folder, found: Fit) -> None:
     """Writes all fitted values (and a fitted latency) to grounded.toml.
 
     Those that the data do not identify by themselves go too: the others were fitted beside them,

@@ -12,25 +12,27 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
-from grounded.errors import GroundedError
+from grounded.errors import GroundedError, NextCommand
+from grounded.result import Result
 from grounded.search.standing import Tried
-from grounded.trial import Trial
+from grounded.trial import Trial, bridge
 from grounded_trials.formats.mcap_walk import read_records
 from grounded_trials.logs.log_files import kind_of, log_files, open_log
 from grounded_trials.logs.log_table import log_mapping, read_log
 from grounded_trials.logs.signal_report import SignalReport
 from grounded_trials.store.own_files import CANDIDATE, FILE_LIMIT, TRIAL, read_file
+from grounded_trials.store.store import hash_file
 from grounded_trials.store.trial_file import read_trial, trial_bytes
-from grounded_trials.wording import verdict
 from grounded_trials.workspace.config import FILE
-from grounded_trials.workspace.folder import Workspace
+from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.proposing import standing_in
 from grounded_trials.workspace.trial_check import warnings_about
 
 
-@dataclass(frozen=True, eq=False)
-class Ingested:
+@dataclass(frozen=True, eq=False, repr=False)
+class Ingested(Result):
     """One log that was taken in."""
 
     trial: str  # its short name, t0007
@@ -41,7 +43,32 @@ class Ingested:
     accepted: bool | None  # None: data, or not decided yet
     warnings: tuple[str, ...]
     signals: tuple[SignalReport, ...]  # for a foreign log
-    verdict: str = ""  # a word of `words.verdict`, run again, probe; "" for data
+    verdict: str = ""  # a word of `wording.verdict`, run again, probe; "" for data
+
+    @property
+    def then(self) -> NextCommand:
+        """The command to type next."""
+        after_run = "diagnose" if self.verdict == "probe" else "propose"
+        return NextCommand(after_run if self.candidate else "fit")
+
+    def summary(self) -> str:
+        """The trial, what it ran and what became of that."""
+        return f"{self.trial}: {f'{self.candidate}, {self.verdict}' if self.candidate else 'data'}"
+
+    def to_json(self) -> dict[str, Any]:
+        """Its entry in `ingest --json`; a failed run's utility is null and `failed` true."""
+        return {
+            "trial": self.trial,
+            "sha256": self.sha256,
+            "known": self.known,
+            "candidate": self.candidate or None,
+            "utility": self.utility,
+            "failed": self.utility == float("-inf"),
+            "accepted": self.accepted,
+            "verdict": self.verdict or None,
+            "warnings": list(self.warnings),
+            "signals": [vars(signal) for signal in self.signals],
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +80,7 @@ class _Read:
 
 
 def ingest_log(
-    workspace: Workspace, path: Path, candidate: str | None = None, *, data: bool = False
+    workspace: Folder, path: Path, candidate: str | None = None, *, data: bool = False
 ) -> Ingested:
     """Checks a log and stores it as a trial.
 
@@ -75,7 +102,7 @@ def ingest_log(
         raise GroundedError("--data is for a log that ran no candidate; drop it or --candidate")
     read = (_own if kind == TRIAL else _foreign)(workspace, path, candidate, data)
     added = workspace.store.add(read.data)
-    workspace.forget()
+    workspace.forget_trials()
     trial = replace(read.trial, id=added.id)
     warnings = (*read.warnings, *warnings_about(workspace, trial))
     tried = _tried(workspace, trial)
@@ -84,7 +111,7 @@ def ingest_log(
         sha256=added.sha256,
         known=added.known,
         candidate=trial.candidate,
-        utility=workspace.task.utility(_bridged(trial)) if trial.candidate else None,
+        utility=workspace.task.utility(bridge(trial).trial) if trial.candidate else None,
         accepted=tried.accepted if tried else None,
         warnings=warnings,
         signals=read.signals,
@@ -96,16 +123,10 @@ def _verdict(trial: Trial, tried: Tried | None, repeats: int) -> str:
     if tried is None:
         return "probe" if trial.candidate else ""
     ran = [one.id for one in tried.trials[:repeats]]
-    return "run again" if tried.accepted and trial.id not in ran else verdict(tried)
+    return "run again" if tried.accepted and trial.id not in ran else tried.verdict()
 
 
-def _bridged(trial: Trial) -> Trial:
-    from grounded.trial import bridge
-
-    return bridge(trial).trial
-
-
-def _tried(workspace: Workspace, trial: Trial) -> Tried | None:
+def _tried(workspace: Folder, trial: Trial) -> Tried | None:
     """How the trial's candidate fares now."""
     if not trial.candidate:
         return None
@@ -113,7 +134,7 @@ def _tried(workspace: Workspace, trial: Trial) -> Tried | None:
     return next((t for t in history if t.candidate.id == trial.candidate), None)
 
 
-def _own(workspace: Workspace, path: Path, candidate: str | None, data: bool) -> _Read:
+def _own(workspace: Folder, path: Path, candidate: str | None, data: bool) -> _Read:
     """A trial of ours: every name, the time grid and the task must be this workspace's."""
     content = read_file(path, FILE_LIMIT)
     trial, meta, policy = read_trial(content, str(path))
@@ -140,25 +161,19 @@ def _own(workspace: Workspace, path: Path, candidate: str | None, data: bool) ->
         }
         about |= {"kind": "data", "ran": trial.candidate}
         trial = replace(trial, candidate="")
-        return _Read(trial, _encode(workspace, trial, about, None))
+        return _Read(trial, _encode(workspace, trial, about))
     if candidate is not None and trial.candidate not in ("", candidate):
         raise GroundedError(f"{path} says that it ran {trial.candidate}, not {candidate}")
-    if not trial.candidate:
-        return _claimed(workspace, path, trial, candidate)
-    _check_candidate(workspace, path, trial.candidate, meta.get("task", ""), policy)
-    return _Read(trial, content)
-
-
-def _claimed(workspace: Workspace, path: Path, trial: Trial, candidate: str | None) -> _Read:
-    """A trial of ours that doesn't say what it ran."""
-    chosen = candidate or _outstanding(workspace, path)
-    trial = replace(trial, candidate=chosen)
-    _check_candidate(workspace, path, chosen, "", None)
-    return _Read(trial, _encode(workspace, trial, _about(workspace, chosen), chosen))
+    if trial.candidate:
+        _check_candidate(workspace, path, trial.candidate, meta.get("task", ""), policy)
+        return _Read(trial, content)
+    trial = replace(trial, candidate=candidate or _outstanding(workspace, path))
+    _check_candidate(workspace, path, trial.candidate)
+    return _Read(trial, _encode(workspace, trial, _about(workspace, trial.candidate)))
 
 
 def _check_candidate(
-    workspace: Workspace, path: Path, candidate: str, task: str, policy: bytes | None
+    workspace: Folder, path: Path, candidate: str, task: str = "", policy: bytes | None = None
 ) -> None:
     """The candidate must be one of this workspace and task, the policy the one in its file."""
     if candidate not in workspace.candidate_ids():
@@ -181,7 +196,7 @@ def _check_candidate(
         )
 
 
-def _foreign(workspace: Workspace, path: Path, candidate: str | None, data: bool) -> _Read:
+def _foreign(workspace: Folder, path: Path, candidate: str | None, data: bool) -> _Read:
     """Somebody else's log, through [log]."""
     model, task = workspace.base_model, workspace.config.task
     files = log_files(path)
@@ -190,7 +205,8 @@ def _foreign(workspace: Workspace, path: Path, candidate: str | None, data: bool
         _check_is_log(path, files)
         raise GroundedError(
             f"{path} is not a trial that grounded wrote, and grounded.toml has no [log] table to "
-            f"map it: `grounded inspect {path}` prints one"
+            "map it: `inspect` prints one",
+            NextCommand("inspect", (str(path),)),
         )
     chosen = "" if data else candidate or _outstanding(workspace, path)
     estimated: tuple[str, ...] = ()
@@ -234,8 +250,8 @@ def _foreign(workspace: Workspace, path: Path, candidate: str | None, data: bool
     if estimated:
         about["estimated"] = ",".join(estimated)
     if chosen:
-        _check_candidate(workspace, path, chosen, "", None)
-    encoded = _encode(workspace, trial, about, chosen, found.start_ns)
+        _check_candidate(workspace, path, chosen)
+    encoded = _encode(workspace, trial, about, found.start_ns)
     return _Read(trial, encoded, found.warnings, found.reports)
 
 
@@ -250,15 +266,12 @@ def _check_is_log(path: Path, files: Sequence[Path]) -> None:
 
 def _hashed(files: Sequence[Path]) -> str:
     """SHA-256 over a log's files, or over their hashes when there are several."""
-    hashes = []
-    for file in files:
-        with file.open("rb") as stream:
-            hashes.append(hashlib.file_digest(stream, "sha256").hexdigest())
+    hashes = [hash_file(file) for file in files]
     joined = "".join(hashes).encode()
     return hashes[0] if len(hashes) == 1 else hashlib.sha256(joined).hexdigest()
 
 
-def _outstanding(workspace: Workspace, path: Path) -> str:
+def _outstanding(workspace: Folder, path: Path) -> str:
     waiting = standing_in(workspace).outstanding
     if waiting is None:
         raise GroundedError(
@@ -268,7 +281,7 @@ def _outstanding(workspace: Workspace, path: Path) -> str:
     return waiting.id
 
 
-def _about(workspace: Workspace, candidate: str) -> dict[str, str]:
+def _about(workspace: Folder, candidate: str) -> dict[str, str]:
     """The metadata of a trial that is written here."""
     if not candidate:
         return {"kind": "data"}
@@ -278,17 +291,11 @@ def _about(workspace: Workspace, candidate: str) -> dict[str, str]:
     }
 
 
-def _encode(
-    workspace: Workspace,
-    trial: Trial,
-    about: dict[str, str],
-    candidate: str | None,
-    start_ns: int = 0,
-) -> bytes:
+def _encode(workspace: Folder, trial: Trial, about: dict[str, str], start_ns: int = 0) -> bytes:
     return trial_bytes(
         trial,
         about,
-        workspace.candidate_bytes(candidate) if candidate else None,
+        workspace.candidate_bytes(trial.candidate) if trial.candidate else None,
         state_units=dict(workspace.base_model.states),
         input_units=dict(workspace.base_model.inputs),
         start_ns=start_ns,

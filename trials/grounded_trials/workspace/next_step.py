@@ -1,8 +1,7 @@
-"""The command to type next: one answer for every command and the page.
+"""What a person does next: one answer for every command, the page and the text.
 
-What happened since a diagnosis: newer trials, adopted effects, other parameters.
-
-A verdict is about the model and the trials of its day; what was adopted since is no longer missing.
+And what happened since a diagnosis: newer trials, adopted effects, other parameters. A verdict is
+about the model and the trials of its day; what was adopted since is no longer missing.
 """
 
 from __future__ import annotations
@@ -10,17 +9,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from grounded.diagnosis.report import Diagnosis, Made
+from grounded.errors import NextCommand
 from grounded.search.standing import Standing
+from grounded_trials.wording import rendered
 from grounded_trials.workspace.diagnosing import diagnosable
-from grounded_trials.workspace.diagnosis_file import Diagnosis
-from grounded_trials.workspace.folder import Workspace
+from grounded_trials.workspace.folder import Folder
 
-EXPORT = "grounded export best --format npz"
+PROPOSE = NextCommand("propose")
+DIAGNOSE = NextCommand("diagnose")
+EXPORT = NextCommand("export", ("best", "--format", "npz"))
 
 
 def next_command(
-    workspace: Workspace, now: Standing, diagnosis: Diagnosis | None, usable: Sequence[str]
-) -> str:
+    workspace: Folder, now: Standing, diagnosis: Diagnosis | None, usable: Sequence[str]
+) -> NextCommand:
     """What a person does next, given where the search stands and what was diagnosed.
 
     Args:
@@ -32,40 +35,39 @@ def next_command(
     if now.phase == "await-trial":
         return another_trial(workspace, now)
     if diagnosis is None:
-        return "grounded propose" if now.phase == "propose" else "grounded diagnose"
+        return PROPOSE if now.phase == "propose" else DIAGNOSE
     since = since_diagnosis(workspace, diagnosis, usable)
     follow = after_diagnosis(workspace, diagnosis)
     if now.phase == "propose":  # what logs have shown is adopted before the first candidate
-        if now.history or since.changed or not follow:
-            return "grounded propose"
-        return "grounded diagnose" if since.newer else follow
+        if now.history or since.changed or follow is None:
+            return PROPOSE
+        return DIAGNOSE if since.newer else follow
     if since.changed or since.newer:
-        return "grounded diagnose"
+        return DIAGNOSE
     if diagnosis.no_cause:
         return another_trial(workspace, now)
     return follow or EXPORT
 
 
-def another_trial(workspace: Workspace, now: Standing) -> str:
+def another_trial(workspace: Folder, now: Standing) -> NextCommand:
     """How to get one more trial: of what waits, of what comes next, or of the best again."""
-    system = workspace.config.system
-    here = bool(system.command or system.model)
-    if now.phase == "await-trial":
-        return "grounded run" if here else "grounded ingest TRIAL.mcap"
-    if now.phase == "propose" or now.incumbent is None:
-        return "grounded propose"
-    return "grounded run best" if here else "grounded ingest TRIAL.mcap"
+    waiting = now.phase == "await-trial"
+    if not waiting and (now.phase == "propose" or now.incumbent is None):
+        return PROPOSE
+    if not workspace.config.system.reachable:
+        return NextCommand("ingest", ("TRIAL.mcap",))
+    return NextCommand("run", () if waiting else ("best",))
 
 
-def after_diagnosis(workspace: Workspace, diagnosis: Diagnosis) -> str:
-    """What to do about the effects that a diagnosis claims, "" where there is nothing to do."""
+def after_diagnosis(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
+    """What to do about the effects that a diagnosis claims, None where there is nothing to do."""
     new = diagnosis.open(workspace.config.model.effects)
     if diagnosis.kind not in ("effect", "several") or not new:
-        return ""
+        return None
     own = {f"parameter:{name}" for name in workspace.base_model.params}
     if own.issuperset(new):
-        return "grounded fit"  # the model's form is right: all of its numbers at once
-    return " ".join(["grounded adopt", *new])
+        return NextCommand("fit")  # the model's form is right: all of its numbers at once
+    return NextCommand("adopt", new)
 
 
 @dataclass(frozen=True)
@@ -81,7 +83,15 @@ class Since:
 
     @property
     def sentence(self) -> str:
-        """Why it is no longer the last word; "" where it is."""
+        """Why it is no longer the last word, and what to run; "" where it is."""
+        return self.told()
+
+    def told(self, folder: str | None = None) -> str:
+        """The same for who is elsewhere.
+
+        Args:
+            folder: the workspace as the user named it.
+        """
         parts = []
         if self.newer:
             parts.append(f"diagnosed with {self.used} of {self.usable} trials")
@@ -90,10 +100,11 @@ class Since:
             parts.append(f"adopted since: {', '.join(self.adopted)}{but}")
         elif self.changed:
             parts.append("the model was changed since")
-        return "; ".join([*parts, "run `grounded diagnose` again"]) if parts else ""
+        again = f"run `{rendered(DIAGNOSE, folder)}` again"
+        return "; ".join([*parts, again]) if parts else ""
 
 
-def usable_ids(workspace: Workspace) -> list[str]:
+def usable_ids(workspace: Folder) -> list[str]:
     """The trials that a diagnosis can use, in order of arrival.
 
     Raises:
@@ -102,7 +113,7 @@ def usable_ids(workspace: Workspace) -> list[str]:
     return [trial.id for trial in diagnosable(workspace)]
 
 
-def since_diagnosis(workspace: Workspace, diagnosis: Diagnosis, usable: Sequence[str]) -> Since:
+def since_diagnosis(workspace: Folder, diagnosis: Diagnosis, usable: Sequence[str]) -> Since:
     """What a diagnosis does not know.
 
     Args:
@@ -110,12 +121,12 @@ def since_diagnosis(workspace: Workspace, diagnosis: Diagnosis, usable: Sequence
         diagnosis: as it was kept.
         usable: the trials that can be used now, in order of arrival.
     """
-    model, seen = workspace.config.model, set(diagnosis.trials)
-    params = None if diagnosis.model_params is None else dict(diagnosis.model_params)
+    model, made = workspace.config.model, diagnosis.made or Made()
+    seen, params = set(made.trials), made.params
     last = max((k for k, name in enumerate(usable) if name in seen), default=-1)
     missing = diagnosis.open(model.effects)
     adopted = tuple(name for name in diagnosis.effects if name not in missing)
-    same = [dict(e) for e in model.effects] == [dict(e) for e in diagnosis.adopted]
+    same = [dict(e) for e in model.effects] == [dict(e) for e in made.adopted]
     return Since(
         used=sum(name in seen for name in usable),
         usable=len(usable),

@@ -1,34 +1,57 @@
 """run: hand a candidate to the real system and get a trial file back.
 
-The system is a command of the user's (a robot, another simulator) that is given the paths of the
-candidate and of the trial it must write; or a simulated one, a model in the workspace.
-
-The optimum of a SIMULATED real system, for studies and demos: the search never sees it.
-
-The same search, given the true model and the true latency as its crude model, on the quiet system.
+The real system is a command of the user's (a robot, another simulator), which is given the paths of
+the candidate and of the trial that it must write; or a simulated one, a model in the workspace.
+Where it is simulated, `optimum` says for studies and demos how good a candidate could get, by the
+same search in the true model; the search of the workspace never sees that.
 """
 
 from __future__ import annotations
 
 import shlex
 import subprocess
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from grounded.errors import GroundedError, nearest
+from grounded.errors import GroundedError, NextCommand, nearest
 from grounded.plant import Noise, Plant
-from grounded.search.improve import learn
-from grounded.search.standing import Candidate, Options
+from grounded.result import Result
+from grounded.search.ask_tell import learn
+from grounded.search.standing import Candidate, SearchOptions
 from grounded.trial import Trial
 from grounded_trials.store.trial_file import write_trial
-from grounded_trials.workspace.folder import Workspace
+from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.model_file import load_module, model_in
 
+TRIALS = 30  # of the search for the optimum
 
-def run_candidate(workspace: Workspace, identity: str) -> Path:
-    """Runs a candidate once and returns the new trial file, runs/cNNNN-K.mcap.
+
+@dataclass(frozen=True, repr=False)
+class Ran(Result):
+    """A candidate that was run, and the file of its trial, to be ingested."""
+
+    candidate: str
+    trial_file: Path
+
+    @property
+    def then(self) -> NextCommand:
+        """Take the trial in."""
+        return NextCommand("ingest", (str(self.trial_file),))
+
+    def summary(self) -> str:
+        """What was run, and where its trial is."""
+        return f"{self.candidate}: {self.trial_file}"
+
+    def to_json(self) -> dict[str, Any]:
+        """The document of `run --json`."""
+        return {"trial_file": str(self.trial_file), "candidate": self.candidate}
+
+
+def run_candidate(workspace: Folder, identity: str) -> Ran:
+    """Runs a candidate once; its trial file is runs/cNNNN-K.mcap.
 
     Raises:
         GroundedError: if no system is configured, it failed, or it wrote no trial.
@@ -43,13 +66,14 @@ def run_candidate(workspace: Workspace, identity: str) -> Path:
     else:
         raise GroundedError(
             "grounded.toml has no [system]: run the candidate "
-            f"{workspace.candidate_path(identity)} on your robot by hand and `grounded ingest` its "
-            'log, or give [system] command = "python drive.py {candidate} {trial}"'
+            f"{workspace.candidate_path(identity)} on your robot by hand and ingest its log, or "
+            'give [system] command = "python drive.py {candidate} {trial}"',
+            NextCommand("ingest", ("TRIAL.mcap",)),
         )
-    return path
+    return Ran(identity, path)
 
 
-def simulated_plant(workspace: Workspace) -> Plant:
+def simulated_plant(workspace: Folder) -> Plant:
     """The simulated system of [system] model.
 
     Raises:
@@ -82,7 +106,7 @@ def _next_run(folder: Path, identity: str) -> Path:
     return folder / f"{identity}-{number}.mcap"
 
 
-def _call(workspace: Workspace, command: str, identity: str, path: Path) -> None:
+def _call(workspace: Folder, command: str, identity: str, path: Path) -> None:
     """The user's command, its output passed on to stderr."""
     words = {
         "candidate": str(workspace.candidate_path(identity).resolve()),
@@ -112,15 +136,13 @@ def _call(workspace: Workspace, command: str, identity: str, path: Path) -> None
         raise GroundedError(f"[system] command ended well but wrote no trial to {{trial}} = {path}")
 
 
-def _simulate(workspace: Workspace, identity: str, path: Path) -> None:
+def _simulate(workspace: Folder, identity: str, path: Path) -> None:
     candidate, meta = workspace.candidate(identity)
     task, plant = workspace.task, simulated_plant(workspace)
     start = dict(zip(task.model.state_names, map(float, task.start), strict=True))
     number = len(workspace.store.list()) + 1
     rng = np.random.default_rng([workspace.config.system.seed, number])
     trial = plant.run(candidate.policy, start, rng)
-    from dataclasses import replace
-
     write_trial(
         path,
         replace(trial, candidate=identity),
@@ -138,10 +160,7 @@ def _simulate(workspace: Workspace, identity: str, path: Path) -> None:
     )
 
 
-TRIALS = 30
-
-
-def optimum(workspace: Workspace) -> float | None:
+def optimum(workspace: Folder) -> float | None:
     """The best utility found with the true model; None where the system is not simulated.
 
     Also None where the true model has other states than the crude one: then no task fits it.
@@ -159,5 +178,5 @@ def optimum(workspace: Workspace) -> float | None:
     def run(candidate: Candidate) -> Trial:
         return plant.run(candidate.policy, start, np.random.default_rng(0))
 
-    standing, _, _ = learn(truth, run, Options(max_trials=TRIALS, tolerance=1e-4))
-    return standing.incumbent.utility if standing.incumbent else None
+    best = learn(truth, run, SearchOptions(max_trials=TRIALS, tolerance=1e-4)).best
+    return best.utility if best else None

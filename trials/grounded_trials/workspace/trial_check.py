@@ -8,12 +8,12 @@ from grounded.frozen import Array
 from grounded.policy import Policy, z_difference
 from grounded.task import Task
 from grounded.trial import HUGE, Trial, bridge
-from grounded_trials.workspace.folder import Workspace
+from grounded_trials.workspace.folder import Folder
 
 FAR = 0.1  # of a state's range in the trial: a start this far from s_0 is worth a warning
 
 
-def warnings_about(workspace: Workspace, trial: Trial) -> tuple[str, ...]:
+def warnings_about(workspace: Folder, trial: Trial) -> tuple[str, ...]:
     """Gaps, an early end, a start far from s_0, inputs outside the limits or logged late."""
     task = workspace.task
     filled = bridge(trial)

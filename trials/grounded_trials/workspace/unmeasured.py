@@ -23,7 +23,7 @@ from grounded.model import Model
 from grounded_trials.logs.log_table import LogMapping, read_log
 from grounded_trials.logs.resample import Gridded
 from grounded_trials.toml_table import Table
-from grounded_trials.workspace.folder import Workspace
+from grounded_trials.workspace.folder import Folder
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ def read_estimate(table: Table, model: Model) -> EstimateTable:
 
 
 def read_with_estimates(
-    workspace: Workspace, files: Sequence[Path], mapping: LogMapping, *, data: bool
+    workspace: Folder, files: Sequence[Path], mapping: LogMapping, *, data: bool
 ) -> tuple[Gridded, tuple[str, ...]]:
     """A log with all the model's states, and the names of those that were estimated.
 
@@ -89,7 +89,7 @@ def read_with_estimates(
 
 
 def _smoothed(
-    workspace: Workspace, found: Gridded, measured: list[str], table: EstimateTable
+    workspace: Folder, found: Gridded, measured: list[str], table: EstimateTable
 ) -> Array:
     """All states (T + 1, n): the smoother's, with the measured ones as they were measured."""
     from grounded.estimate import Noise, Record, noise_of, of_states, smooth_trials

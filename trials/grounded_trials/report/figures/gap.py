@@ -1,22 +1,24 @@
-"""The figures of the diagnosis: where the gap is, which effects explain it, how far it shrinks.
+"""The figures of the gap.
 
-The figure of the gap in time: the model set on the real state every second, and then alone.
+What was diagnosed: where the gap lies, which effects explain it, how far it shrinks. And the gap in
+time: the model set on the real state every second, and then left alone.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from grounded.diagnosis.report import Diagnosis
 from grounded.trial import Trial
 from grounded_trials.report.figures.axis import fitted, without_astray
 from grounded_trials.report.figures.figure import Bar, Bars, Curve, Figure, Panel, legend
 from grounded_trials.report.findings import Findings
 from grounded_trials.report.forecast import SECONDS, forecast
-from grounded_trials.wording import figure, labelled, shown
-from grounded_trials.workspace.diagnosis_file import Diagnosis, Share
+from grounded_trials.wording import figure, labelled, shown, with_unit
 
 MOST = 12
 
@@ -25,18 +27,26 @@ def gap_figure(diagnosis: Diagnosis | None) -> Figure | None:
     """Shares of the gap by channel, time and region; evidence; the gap before and after."""
     if diagnosis is None:
         return None
+    where = diagnosis.where
+    by_channel = [
+        (c.name, c.share, ", " + with_unit(f"{c.rms:.3g}", c.unit)) for c in where.channels
+    ]
+    by_time = [(f"{t.start:g} to {t.end:g} s", t.share, "") for t in where.times]
+    by_region = [
+        (r.when, r.share, f", {100 * r.occupancy:.0f} % of the time") for r in where.regions
+    ]
     panels = [
-        Bars(title, _shares(shares, role))
-        for title, shares, role in (
-            ("Share of the gap by channel", diagnosis.channels, "best"),
-            ("Share of the gap by time", diagnosis.times, "step2"),
-            ("Share of the gap by region", diagnosis.regions, "accepted"),
+        Bars(f"Share of the gap by {word}", _shares(shares, role))
+        for word, shares, role in (
+            ("channel", by_channel, "best"),
+            ("time", by_time, "step2"),
+            ("region", by_region, "accepted"),
         )
         if shares
     ]
     if diagnosis.ranking:
         panels.append(Bars("Evidence for an effect [nats]", _ranking(diagnosis)))
-    if diagnosis.gap is not None:
+    if diagnosis.gap.measured:
         panels.append(_shrinkage(diagnosis))
     if not panels:
         return None
@@ -47,12 +57,12 @@ def gap_figure(diagnosis: Diagnosis | None) -> Figure | None:
     return Figure("gap", "Gap between model and reality", caption, tuple(panels))
 
 
-def _shares(shares: tuple[Share, ...], role: str) -> tuple[Bar, ...]:
-    found = []
-    for share in shares[:MOST]:
-        text = f"{100 * share.share:.0f} %" + (f", {share.note}" if share.note else "")
-        found.append(Bar(share.label, share.share, text, role))
-    return tuple(found)
+def _shares(shares: Sequence[tuple[str, float, str]], role: str) -> tuple[Bar, ...]:
+    """Bars of (label, share, what else is said of it)."""
+    return tuple(
+        Bar(label, share, f"{100 * share:.0f} %{note}", role)
+        for label, share, note in shares[:MOST]
+    )
 
 
 def _ranking(diagnosis: Diagnosis) -> tuple[Bar, ...]:
@@ -65,7 +75,6 @@ def _ranking(diagnosis: Diagnosis) -> tuple[Bar, ...]:
 
 def _shrinkage(diagnosis: Diagnosis) -> Bars:
     gap = diagnosis.gap
-    assert gap is not None
     title = f"Prediction error {gap.horizon_s:g} s ahead" if math.isfinite(gap.horizon_s) else "Gap"
     rows = (
         ("model", gap.before, "model"),

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from html import escape
 
+from grounded.diagnosis.report import ChannelParts, Diagnosis, Parts, Split
 from grounded_trials.report.diagnosis_words import (
+    WHITE,
     gap_sentence,
+    horizons,
     main_horizon,
     parts_sentence,
     sentences,
@@ -22,10 +26,8 @@ from grounded_trials.report.page.page_tables import (
     leftover_table,
     table,
 )
-from grounded_trials.wording import percent
-from grounded_trials.workspace.diagnosis_error import WHITE, Parts, Split
-from grounded_trials.workspace.diagnosis_file import Diagnosis
-from grounded_trials.workspace.next_step import Since
+from grounded_trials.wording import percent, rendered
+from grounded_trials.workspace.next_step import DIAGNOSE, Since
 
 
 def gap_section(findings: Findings) -> str:
@@ -34,7 +36,7 @@ def gap_section(findings: Findings) -> str:
     if diagnosis is None:
         return (
             "<p>Not diagnosed yet. This says where the model is wrong, and which effect makes it "
-            f"so: {command('grounded diagnose', 'c-diagnose')}</p>{_forecasts(findings)}"
+            f"so: {command(rendered(DIAGNOSE), 'c-diagnose')}</p>{_forecasts(findings)}"
         )
     return _diagnosed(diagnosis, findings.since) + _forecasts(findings)
 
@@ -57,10 +59,9 @@ def _diagnosed(diagnosis: Diagnosis, since: Since) -> str:
     parts.append(_alike(diagnosis))
     if diagnosis.leftover:
         parts.append(f"<h3>What no known effect explains</h3>{leftover_table(diagnosis)}")
-    parts += [_made_of(diagnosis.split), _rest(diagnosis), _utility(diagnosis)]
-    gap = diagnosis.gap
-    if gap is not None:
-        parts.append(f'<p class="soft">Gap: {escape(gap_sentence(gap))}.</p>')
+    parts += [_made_of(diagnosis.where.split), _rest(diagnosis), _utility(diagnosis)]
+    if diagnosis.gap.measured:
+        parts.append(f'<p class="soft">Gap: {escape(gap_sentence(diagnosis.gap))}.</p>')
     return "".join(parts)
 
 
@@ -96,27 +97,28 @@ def _alike(diagnosis: Diagnosis) -> str:
     return "".join(parts)
 
 
-def _made_of(splits: tuple[Split, ...]) -> str:
+def _made_of(splits: Mapping[str, Split]) -> str:
     """The squared error in three parts: at each horizon in all, and by state."""
     if not splits:
         return ""
     header = ("ahead", "explained", "unexplained", "noise")
-    rows = [(s.ahead, *_shares(s.whole)) for s in splits]
-    main = main_horizon(splits)
-    by_state = [(parts.channel, *_shares(parts)) for parts in main.channels]
-    source = "repeated trials" if any(s.from_repeats for s in splits) else "the estimated noise"
+    rows = [(words, *_shares(one.whole)) for words, one in horizons(splits)]
+    ahead, main = main_horizon(splits)
+    by_state = [(parts.name, *_shares(parts)) for parts in main.channels]
+    repeated = any(one.irreducible_from == "repeats" for one in splits.values())
+    source = "repeated trials" if repeated else "the estimated noise"
     return (
         f"<h3>What the error is made of</h3><p>{escape(_begun(parts_sentence(splits)))}. Explained "
         "is what the effects take away on trials that were held out, unexplained what they leave "
         f"above the noise; how large the noise is comes from {source}.</p>"
         + table("split", header, rows)
-        + f"<details><summary>By state, {escape(main.ahead)} ahead</summary>"
+        + f"<details><summary>By state, {escape(ahead)} ahead</summary>"
         + table("split-states", ("state", *header[1:]), by_state)
         + "</details>"
     )
 
 
-def _shares(parts: Parts) -> tuple[str, str, str]:
+def _shares(parts: Parts | ChannelParts) -> tuple[str, str, str]:
     shares = (parts.explained, parts.unexplained, parts.irreducible)
     explained, unexplained, noise = (f"{100 * s:.1f} %" if s == s else "-" for s in shares)
     return explained, unexplained, noise
@@ -124,15 +126,16 @@ def _shares(parts: Parts) -> tuple[str, str, str]:
 
 def _rest(diagnosis: Diagnosis) -> str:
     """Whether what the effects leave is noise, by state."""
-    if not diagnosis.whiteness:
+    whiteness = diagnosis.where.whiteness
+    if not whiteness:
         return ""
     rows = [
         (name, f"{p:.2g}" if p >= 1e-4 else "< 0.0001", "pattern" if p < WHITE else "white noise")
-        for name, p in diagnosis.whiteness
+        for name, p in whiteness.items()
     ]
     return (
         "<h3>Is the rest noise?</h3>"
-        f"<p>{escape(_begun(whiteness_sentence(diagnosis.whiteness)))}.</p>"
+        f"<p>{escape(_begun(whiteness_sentence(whiteness)))}.</p>"
         + table("whiteness", ("state", "p (white noise)", "what is left "), rows)
     )
 

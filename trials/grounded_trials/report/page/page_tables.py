@@ -9,6 +9,7 @@ import math
 from collections.abc import Collection, Sequence
 from html import escape
 
+from grounded.diagnosis.report import Diagnosis, Estimate, Ranked
 from grounded_trials.report.figures.draw import draw, svg
 from grounded_trials.report.figures.figure import COLOURS, DASHES, Figure, Key
 from grounded_trials.report.findings import (
@@ -22,7 +23,6 @@ from grounded_trials.report.findings import (
 )
 from grounded_trials.report.forecast import SECONDS, forecast_error
 from grounded_trials.wording import figure, shown, verdict, with_unit
-from grounded_trials.workspace.diagnosis_file import Diagnosis, Ranked, Value
 from grounded_trials.workspace.next_step import Since
 
 WIDEST = 1e6  # an interval so many times its value, or so wide, says nothing
@@ -85,7 +85,7 @@ def effect_table(diagnosis: Diagnosis, since: Since) -> str:
             r.effect + " (adopted since)" * (r.effect in since.adopted),
             figure(r.evidence, 3),
             figure(r.gap_after, 3),
-            f"{100 * r.shrinkage:.0f} %" if math.isfinite(r.shrinkage) else "-",
+            _hundredths(r.shrinkage),
             _params(r),
         )
         for r in diagnosis.ranking
@@ -96,15 +96,14 @@ def effect_table(diagnosis: Diagnosis, since: Since) -> str:
 
 
 def _params(ranked: Ranked) -> str:
-    return "; ".join(map(_value, ranked.params)) or "-"
+    texts = []
+    for name, value in ranked.params.items():
+        text = _interval(value)
+        texts.append(f"{name} = {text if text == UNKNOWN else with_unit(text, value.unit)}")
+    return "; ".join(texts) or "-"
 
 
-def _value(v: Value) -> str:
-    text = _interval(v)
-    return f"{v.name} = {text if text == UNKNOWN else with_unit(text, v.unit)}"
-
-
-def _interval(v: Value) -> str:
+def _interval(v: Estimate) -> str:
     """A value and its 95 % interval as the diagnosis has it; a dash where there is none."""
     if v.interval is None:
         return figure(v.value)
@@ -113,14 +112,18 @@ def _interval(v: Value) -> str:
     return f"{figure(v.value)} ({figure(low, 3)} to {figure(high, 3)})" if known else UNKNOWN
 
 
+def _hundredths(share: float) -> str:
+    return f"{100 * share:.0f} %" if math.isfinite(share) else "-"
+
+
 def leftover_table(diagnosis: Diagnosis) -> str:
     """What no known effect explains."""
     rows = [
         (
             left.channel,
             with_unit(figure(left.size, 3), left.unit),
-            left.when or "-",
-            f"{100 * left.share:.0f} %" if math.isfinite(left.share) else "-",
+            "-" if left.region is None else left.region.when,
+            "-" if left.region is None else _hundredths(left.region.share),
             figure(left.evidence, 3),
         )
         for left in diagnosis.leftover
@@ -131,7 +134,7 @@ def leftover_table(diagnosis: Diagnosis) -> str:
 
 def parameter_table(findings: Findings) -> str:
     """The model's parameters, and what the diagnosis would make of them."""
-    estimated = {v.name: v for v in findings.diagnosis.parameters} if findings.diagnosis else {}
+    estimated = findings.diagnosis.parameters if findings.diagnosis is not None else {}
     rows = []
     for name, param in findings.task.model.params.items():
         nominal = findings.nominal.get(name)

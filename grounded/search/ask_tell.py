@@ -1,0 +1,146 @@
+"""Steps 1 to 7 as a loop: ask for a candidate, run it on the real system, tell the trial.
+
+    search = Search(task)
+    while (candidate := search.ask()) is not None:
+        search.tell(run(candidate))
+
+A `Search` holds the candidates that were asked for and the trials that were told, nothing else;
+where it stands is derived from them (`propose`, `standing`). `learn` is this loop for a real system
+that is a function call.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+
+from grounded.errors import GroundedError, nearest
+from grounded.policy import Policy
+from grounded.search.improve import Proposal, propose
+from grounded.search.standing import Candidate, SearchOptions, Standing, Tried
+from grounded.task import Task
+from grounded.trial import Trial
+
+
+class Search:
+    """A search that is asked and told, without a disk.
+
+    Args:
+        task: the manoeuvre and the crude model.
+        options: the [search] table; None: its defaults.
+        candidates: those of a search that goes on, in the order in which they were asked for.
+        trials: their trials, in the order in which they were told.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        options: SearchOptions | None = None,
+        *,
+        candidates: Iterable[Candidate] = (),
+        trials: Iterable[Trial] = (),
+    ) -> None:
+        self.task, self.options = task, options or SearchOptions()
+        self._candidates, self._trials = list(candidates), list(trials)
+        self._planned: Proposal | None = None  # what follows from them, once that is asked for
+
+    def __repr__(self) -> str:
+        return f"<Search: candidates {len(self._candidates)}, trials {len(self._trials)}>"
+
+    @property
+    def candidates(self) -> tuple[Candidate, ...]:
+        """The candidates that were asked for."""
+        return tuple(self._candidates)
+
+    @property
+    def trials(self) -> tuple[Trial, ...]:
+        """The trials that were told."""
+        return tuple(self._trials)
+
+    @property
+    def proposal(self) -> Proposal:
+        """What `ask` would return, or why there is nothing more to run."""
+        if self._planned is None:
+            self._planned = propose(self.task, self._candidates, self._trials, self.options)
+        return self._planned
+
+    @property
+    def standing(self) -> Standing:
+        """Where the search stands; plans the next candidate, which alone tells whether it ends."""
+        return self.proposal.standing
+
+    @property
+    def best(self) -> Tried | None:
+        """The best candidate so far with its trials; None before the first whole trial."""
+        return self.standing.incumbent
+
+    @property
+    def policy(self) -> Policy | None:
+        """The best policy so far; None before the first whole trial."""
+        return self.best.candidate.policy if self.best else None
+
+    def ask(self) -> Candidate | None:
+        """The candidate to run next, the same one until its trial is told; None at the end."""
+        proposal = self.proposal
+        if proposal.candidate is not None and proposal.is_new:
+            self._candidates.append(proposal.candidate)
+            self._planned = None
+        return proposal.candidate
+
+    def tell(self, trial: Trial) -> None:
+        """Adds a real trial.
+
+        Args:
+            trial: its `candidate` says what was run; without one, it was the outstanding candidate.
+
+        Raises:
+            GroundedError: for a trial of no candidate of this search, of other states or inputs, or
+                on another time grid.
+        """
+        task, ids = self.task, [c.id for c in self._candidates]
+        found = (trial.state_names, trial.input_names, trial.dt)
+        expected = (task.model.state_names, task.model.input_names, task.dt)
+        if found != expected:
+            raise GroundedError(
+                f"a trial of this task has states, inputs and dt {expected}, found {found}"
+            )
+        if not trial.candidate:
+            waiting = self.standing.outstanding
+            if waiting is None:
+                raise GroundedError(
+                    "no candidate is waiting for a trial: ask() for one first, or name the one "
+                    "that was run as the trial's `candidate`"
+                )
+            trial = replace(trial, candidate=waiting.id)
+        if trial.candidate not in ids:
+            raise GroundedError(
+                f"this search has no candidate '{trial.candidate}': {nearest(trial.candidate, ids)}"
+            )
+        self._trials.append(trial)
+        self._planned = None
+
+
+def learn(
+    task: Task,
+    run: Callable[[Candidate], Trial],
+    options: SearchOptions | None = None,
+    *,
+    max_iterations: int | None = None,
+) -> Search:
+    """Runs a search to its end on a real system that is a function call.
+
+    Args:
+        task: the manoeuvre and the crude model.
+        run: executes a candidate once and returns its trial; its `candidate` field is set here.
+        options: the [search] table; None: its defaults.
+        max_iterations: ends after so many accepted improvements.
+    """
+    search = Search(task, options)
+    while True:
+        proposal = search.proposal
+        done = max_iterations is not None and proposal.standing.iteration >= max_iterations
+        if proposal.candidate is None or (done and proposal.is_new):
+            return search
+        candidate = search.ask()
+        assert candidate is not None
+        search.tell(replace(run(candidate), candidate=candidate.id))

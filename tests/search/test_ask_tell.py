@@ -1,0 +1,129 @@
+"""The front door: a search that is asked and told, and results that a notebook can show."""
+
+import json
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import grounded as gr
+from grounded.plant import Plant
+from grounded.search.improve import propose
+from small_tasks import drive, other, rover_task
+
+TASK = rover_task()
+PLANT = Plant(other(TASK.model, 1.15), latency={"speed": 0.06, "turn": 0.06})
+OPTIONS = gr.SearchOptions(max_trials=6)
+
+
+def run(candidate):
+    return drive(TASK, PLANT, candidate)
+
+
+def numbers(candidates):
+    parts = [
+        (c.policy.feedforward, c.policy.gain, c.policy.reference, c.predicted_states, c.alpha)
+        for c in candidates
+    ]
+    return [np.asarray(array).tobytes() for part in parts for array in part]
+
+
+@pytest.fixture(scope="module")
+def search():
+    return gr.learn(TASK, run, OPTIONS)
+
+
+def test_ask_and_tell_give_the_candidates_of_propose_bit_for_bit(search):
+    candidates, trials = [], []
+    while (proposal := propose(TASK, candidates, trials, OPTIONS)).candidate is not None:
+        candidates.append(proposal.candidate)
+        trials.append(run(proposal.candidate))
+    asked = gr.Search(TASK, OPTIONS)
+    while (candidate := asked.ask()) is not None:
+        assert asked.ask() is candidate and asked.standing.phase == "await-trial"
+        asked.tell(replace(run(candidate), candidate=""))
+    assert len(candidates) > 2
+    assert numbers(candidates) == numbers(asked.candidates) == numbers(search.candidates)
+    ends = [found.standing.to_json() for found in (proposal, asked, search)]
+    assert ends[0] == ends[1] == ends[2]
+
+
+def test_a_search_goes_on_from_its_candidates_and_trials(search):
+    half = gr.Search(TASK, OPTIONS, candidates=search.candidates[:2], trials=search.trials[:2])
+    assert numbers([half.ask()]) == numbers([search.candidates[2]])
+
+
+def test_the_best_policy_is_that_of_the_best_candidate(search):
+    assert gr.Search(TASK).policy is None
+    best = max(search.standing.history, key=lambda tried: tried.utility)
+    assert search.best.candidate is best.candidate and search.policy is best.candidate.policy
+    assert search.best.utility == search.standing.utilities[-1]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"candidate": "c0009"}, ["no candidate 'c0009'", "c0001"]),
+        ({"candidate": ""}, ["no candidate is waiting", "ask()"]),
+        ({"dt": 0.1, "candidate": "c0001"}, ["dt", "0.05", "0.1"]),
+        ({"input_names": ("turn", "speed"), "candidate": "c0001"}, ["inputs", "'turn', 'speed'"]),
+    ],
+)
+def test_a_trial_that_is_none_of_this_search_is_refused(change, said):
+    asked = gr.Search(TASK)
+    trial = run(asked.ask())
+    asked.tell(trial)
+    with pytest.raises(gr.GroundedError) as error:
+        asked.tell(replace(trial, **change))
+    assert all(word in str(error.value) for word in said) and asked.trials == (trial,)
+
+
+def test_results_are_one_line_a_table_and_a_document(search):
+    fitted = gr.fit(TASK, search.trials[:1], ["gain"])
+    found = [search.standing, search.best, search.best.candidate, search.proposal, fitted]
+    for result in found:
+        shown = repr(result)
+        assert "\n" not in shown and len(shown) < 120 and type(result).__name__ in shown
+        assert "<table>" in result._repr_html_()
+        assert json.loads(json.dumps(result.to_json(), allow_nan=False)) == result.to_json()
+    assert search.best.candidate.id in repr(search.standing)
+    assert len(repr(search)) < 80
+
+
+def test_the_documents_have_the_commands_keys(search):
+    now = search.standing.to_json()
+    best = {"candidate": search.best.candidate.id, "utility": search.best.utility}
+    assert now["best"] == best and now["trials"] == 3 == len(now["history"])
+    assert [row["verdict"] for row in now["history"]][:2] == ["first", "better"]
+    assert now["certainty"].startswith("the last gain is")
+    ended = search.proposal.to_json()
+    assert ended["candidate"] is None and ended["phase"] == "converged" and "new" not in ended
+    first = propose(TASK, [], [], OPTIONS).to_json()
+    assert first["candidate"] == "c0001" and first["new"] and first["best_utility"] is None
+
+
+def test_fit_stays_the_function_after_its_room_was_imported():
+    import grounded.fit.parameters  # noqa: F401
+
+    assert callable(gr.fit) and gr.fit.__name__ == "fit"
+    assert set(gr.__all__) <= set(dir(gr))
+    with pytest.raises(AttributeError, match="no attribute 'fitt'"):
+        gr.fitt  # noqa: B018
+
+
+def test_the_front_door_opens_at_once():
+    """`import grounded` costs no more than 0.15 s over bare Python, and loads no numbers."""
+    code = "import sys, grounded; print(' '.join(m for m in sys.modules if '.' not in m))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert not {"numpy", "scipy", "llvmlite"} & set(done.stdout.split())
+
+    def spent(code):
+        start = time.perf_counter()
+        subprocess.run([sys.executable, "-c", code], check=True)
+        return time.perf_counter() - start
+
+    extra = [spent("import grounded") - spent("pass") for _ in range(5)]
+    assert min(extra) < 0.15

@@ -1,0 +1,299 @@
+"""The front door: a workspace with a method for every command.
+
+    from grounded_trials import Workspace
+
+    w = Workspace.create("turn", example="car-turn")
+    w.learn(trials=5)
+    w.diagnose()
+    w.report(html=True)
+
+Each method does what the command of its name does, on the files as they are now, and returns a
+frozen result whose `to_json()` is the document that the command prints with --json.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+from grounded.errors import GroundedError, NextCommand
+from grounded.result import Result
+from grounded_trials.workspace.folder import Folder, Lost
+
+if TYPE_CHECKING:
+    from grounded.diagnosis.report import Diagnosis
+    from grounded.effects import Library
+    from grounded.search.standing import Candidate
+    from grounded_trials.report.reporting import Report
+    from grounded_trials.workspace.adopting import Adopted
+    from grounded_trials.workspace.exporting import Exported
+    from grounded_trials.workspace.fitting import Fitted
+    from grounded_trials.workspace.ingest import Ingested
+    from grounded_trials.workspace.inspecting import Inspected
+    from grounded_trials.workspace.proposing import Proposed, Status
+    from grounded_trials.workspace.running import Ran
+
+
+@dataclass(frozen=True, repr=False)
+class Verified(Result):
+    """How many files were checked, and those that are not what they were."""
+
+    checked: int
+    damaged: tuple[Lost, ...]
+
+    def summary(self) -> str:
+        """How many are good, how many not."""
+        return f"{self.checked} files, {len(self.damaged)} damaged"
+
+    def to_json(self) -> dict[str, Any]:
+        """The document of `verify --json`."""
+        return {"checked": self.checked, "damaged": [vars(one) for one in self.damaged]}
+
+
+class Workspace(Folder):
+    """A folder with a task, its trials and its candidates, and what can be done in it.
+
+    Every method raises a GroundedError for what is the user's to mend: a file that is missing or
+    damaged, a name that is not known, a system that fails.
+
+    Args:
+        folder: where grounded.toml lies.
+
+    Raises:
+        GroundedError: if there is none, or it is wrong.
+    """
+
+    def __init__(self, folder: str | Path = ".") -> None:
+        super().__init__(folder)
+        _ = self.config
+
+    @classmethod
+    def create(cls, folder: str | Path, *, example: str) -> Self:
+        """Makes a workspace from an example; an existing file is never overwritten.
+
+        Args:
+            folder: where it is made.
+            example: car-turn, car-circle, car-figure8, flight-figure8 or pendulum.
+
+        Raises:
+            GroundedError: if there is no such example, or the folder holds a workspace already.
+        """
+        from grounded_trials.workspace.examples import write_example
+
+        write_example(Path(folder), example)
+        return cls(folder)
+
+    def __repr__(self) -> str:
+        return f"Workspace({str(self.folder)!r})"
+
+    def propose(self) -> Proposed:
+        """Says what to run next and writes its candidate file.
+
+        The outstanding candidate is named again while its trial is missing.
+        """
+        from grounded_trials.workspace.proposing import propose_in
+
+        return propose_in(self._afresh())
+
+    def run(self, candidate: str | None = None) -> Ran:
+        """Runs a candidate on [system] and writes a trial file to be ingested.
+
+        Args:
+            candidate: c0003, or `best`; None: the outstanding one.
+        """
+        from grounded_trials.workspace.proposing import candidate_named, standing_in
+        from grounded_trials.workspace.running import run_candidate
+
+        here = self._afresh()
+        if candidate is None:
+            waiting = standing_in(here).outstanding
+            if waiting is None:
+                raise GroundedError(
+                    "no candidate is waiting to be run: `propose` makes the next one, or says that "
+                    "the search has ended; name a candidate to run it again",
+                    NextCommand("propose"),
+                )
+            candidate = waiting.id
+        return run_candidate(here, candidate_named(here, candidate))
+
+    def ingest(
+        self, path: str | Path, *, candidate: str | None = None, data: bool = False
+    ) -> Ingested:
+        """Checks, resamples and stores a trial; one that is known already is stored once.
+
+        Args:
+            path: a trial of grounded's, another MCAP log, or the folder of a bag.
+            candidate: which candidate was run, or `best`; None: as the trial says, else the
+                outstanding one.
+            data: the log ran no candidate: for fitting and diagnosis only.
+        """
+        from grounded_trials.workspace.ingest import ingest_log
+        from grounded_trials.workspace.proposing import candidate_named
+
+        here = self._afresh()
+        ran = candidate and candidate_named(here, candidate)
+        return ingest_log(here, Path(path), ran, data=data)
+
+    def learn(
+        self,
+        trials: int | None = None,
+        *,
+        progress: Callable[[str], None] | None = None,
+        each: Callable[[Candidate, Ingested], None] | None = None,
+    ) -> Status:
+        """Proposes, runs and ingests until the search ends.
+
+        Args:
+            trials: at most so many now; None: until the search ends.
+            progress: told what is being done.
+            each: given every candidate with its trial, once that is stored.
+        """
+        from grounded_trials.workspace.ingest import ingest_log
+        from grounded_trials.workspace.proposing import propose_in, standing_in, status_of
+        from grounded_trials.workspace.running import run_candidate
+
+        here, tell, done = self._afresh(), progress or (lambda stage: None), 0
+        while trials is None or done < trials:
+            tell("planning")
+            proposed = propose_in(here)
+            made = proposed.candidate
+            if made is None:
+                return status_of(here, proposed.standing, proposed.proposal.notes)
+            tell(f"running {made.id}")
+            path = run_candidate(here, made.id).trial_file
+            found = ingest_log(here, path, made.id)
+            path.unlink()  # its bytes are in the store now
+            done += 1
+            if each is not None:
+                each(made, found)
+        status = status_of(here, standing_in(here))
+        goes_on = status.standing.phase == "propose"
+        return replace(status, then=NextCommand("learn")) if goes_on else status
+
+    def status(self) -> Status:
+        """Where the search stands; nothing is written."""
+        from grounded_trials.workspace.proposing import standing_in, status_of
+
+        return status_of(self._afresh(), standing_in(self, ahead=True))
+
+    def fit(
+        self, params: Sequence[str] | None = None, *, latency: bool = False, apply: bool = False
+    ) -> Fitted:
+        """Estimates the model's parameters from all trials.
+
+        Args:
+            params: only these; None: all of them.
+            latency: fit one transport delay of all inputs too.
+            apply: write the values to grounded.toml.
+        """
+        from grounded_trials.workspace.fitting import Fitted, apply_fit, fit_trials
+
+        found = fit_trials(self._afresh(), params, latency=latency)
+        if apply:
+            apply_fit(self, found)
+            return Fitted(found, applied=True)
+        chosen = ("--params", ",".join(params)) if params else ()
+        return Fitted(found, False, (*chosen, *["--latency"] * latency, "--apply"))
+
+    def diagnose(
+        self,
+        trials: Sequence[str] = (),
+        *,
+        max_effects: int = 3,
+        without: Sequence[str] = (),
+        library: Library | None = None,
+        progress: Callable[[str], None] | None = None,
+    ) -> Diagnosis:
+        """Explains the gap between model and trials; keeps reports/diagnosis.json.
+
+        Args:
+            trials: short names, t0007; none: all that can be used.
+            max_effects: blame at most so many effects at once.
+            without: families not to blame.
+            library: the effects that may be blamed; None: those that are installed.
+            progress: told of each stage.
+        """
+        from grounded_trials.workspace.adopted import installed_effects
+        from grounded_trials.workspace.diagnosing import diagnose_in
+
+        library = library or installed_effects()
+        return diagnose_in(
+            self._afresh(),
+            trials=trials,
+            max_effects=max_effects,
+            library=library.without(without),
+            progress=progress,
+        )
+
+    def adopt(self, *effects: str, parameters: bool = True) -> Adopted:
+        """Adds effects of the last diagnosis to the model of grounded.toml.
+
+        Args:
+            effects: `family:target`; those that were claimed together, or one alone.
+            parameters: take over the model's own parameters that were calibrated beside them.
+        """
+        from grounded_trials.workspace.adopting import adopt_effects
+
+        return adopt_effects(self._afresh(), effects, parameters=parameters)
+
+    def report(self, *, html: bool = False, png: bool = False, rrd: bool = False) -> Report:
+        """Utilities, trajectories, bias and gap of all stored trials.
+
+        A damaged or missing file is left out, and named in `findings.lost`.
+
+        Args:
+            html: write reports/report.html.
+            png: write its figures, reports/*.png.
+            rrd: write reports/recording.rrd for the Rerun viewer.
+        """
+        from grounded_trials.report import reporting
+        from grounded_trials.report.gathering import gather
+
+        findings, paths = gather(self._afresh()), []
+        if html:
+            paths.append(reporting.save_page(self, findings))
+        if png:
+            paths += reporting.save_pictures(self, findings)
+        if rrd:
+            paths.append(reporting.save_recording(self, findings))
+        return reporting.Report(findings, tuple(paths))
+
+    def export(
+        self, candidate: str = "best", path: str | Path | None = None, *, form: str | None = None
+    ) -> Exported:
+        """Writes a candidate for other languages.
+
+        Args:
+            candidate: c0003, or `best`.
+            path: the file; None: named after the candidate, in the current folder.
+            form: csv, json or npz; None: as the file is named, else json.
+        """
+        from grounded_trials.workspace.exporting import export_candidate
+
+        return export_candidate(self._afresh(), candidate, form, Path(path) if path else None)
+
+    def verify(self) -> Verified:
+        """Checks every stored trial against its hash, every candidate against its checksums."""
+        from grounded_trials.store.candidate_file import read_candidate
+
+        damaged = [Lost(str(one.path), one.reason) for one in self.store.verify()]
+        candidates = sorted((self.folder / "candidates").glob("*.mcap"))
+        for path in candidates:
+            try:
+                read_candidate(path)
+            except GroundedError as error:
+                damaged.append(Lost(str(path), str(error)))
+        return Verified(len(self.store.list()) + len(candidates), tuple(damaged))
+
+    def inspect(self, log: str | Path) -> Inspected:
+        """Shows what a log holds, and guesses a [log] table for this workspace's model."""
+        from grounded_trials.workspace.inspecting import inspect_in
+
+        return inspect_in(self._afresh(), log)
+
+    def _afresh(self) -> Self:
+        """The folder as it is now: what was read for an earlier call may have been changed."""
+        self.forget()
+        return self

@@ -1,0 +1,92 @@
+"""inspect: what a log holds, and a [log] table for the workspace's model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from grounded.errors import GroundedError, NextCommand
+from grounded.result import Result
+from grounded_trials.logs.inspect_log import inspect_log
+from grounded_trials.logs.inspect_report import LogReport
+from grounded_trials.store.own_files import CANDIDATE, TRIAL
+from grounded_trials.workspace.config import FILE
+from grounded_trials.workspace.folder import Folder
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Inspected(Result):
+    """A log's topics, and the [log] table that was guessed for it."""
+
+    log: str
+    report: LogReport
+    log_table: str  # TOML; "" where none is guessed
+    why_none: str = ""  # why no table is guessed for a log that needs one
+
+    @property
+    def format(self) -> str:
+        """What a file of grounded's own says that it is; "" for a foreign log."""
+        return self.report.meta.get("format", "")
+
+    @property
+    def stored(self) -> bool:
+        """Whether it is a trial in the store of a workspace."""
+        return self.format == TRIAL and Path(self.log).resolve().parent.name == "trials"
+
+    @property
+    def then(self) -> NextCommand:
+        """What to do with the file."""
+        if self.report.damage:
+            return NextCommand("recover", (self.log if len(self.report.files) == 1 else "FILE",))
+        if self.format == CANDIDATE:
+            return NextCommand("run", (Path(self.log).stem,))
+        if self.stored:
+            return NextCommand("report")
+        ready = self.format == TRIAL or self.log_table
+        return NextCommand("ingest" if ready else "inspect", (self.log,))
+
+    def summary(self) -> str:
+        """The log and its size."""
+        return f"{self.log}: {self.report.messages} messages"
+
+    def to_json(self) -> dict[str, Any]:
+        """The document of `inspect --json`."""
+        report = self.report
+        return {
+            "files": [str(f) for f in report.files],
+            "format": self.format or None,
+            "library": report.library,
+            "duration_s": report.duration_s,
+            "messages": report.messages,
+            "topics": [vars(t) | {"fields": [vars(f) for f in t.fields]} for t in report.topics],
+            "remarks": list(report.remarks),
+            "damage": report.damage,
+            "log_table": self.log_table,
+        }
+
+
+def inspect_in(workspace: Folder, log: str | Path) -> Inspected:
+    """Looks into a log; a table is guessed for foreign ones that are whole.
+
+    Args:
+        workspace: whose model names the states and inputs; without one no table is guessed.
+        log: an MCAP file or a bag's folder.
+
+    Raises:
+        GroundedError: if the log can't be read at all.
+    """
+    from grounded_trials.logs.inspect_guess import guess_mapping, is_simulated, mapping_toml
+
+    report = inspect_log(log)
+    if report.meta.get("format") or report.damage:
+        return Inspected(str(log), report, "")
+    try:
+        model = workspace.base_model
+    except GroundedError as error:
+        here = (workspace.folder / FILE).exists()
+        why = f": {error}" if here else " outside a workspace (-C DIR names one)"
+        return Inspected(str(log), report, "", why)
+    states, inputs = guess_mapping(report, model.state_names, model.input_names)
+    table = mapping_toml(states, inputs, simulated=is_simulated(report))
+    return Inspected(str(log), report, table)
