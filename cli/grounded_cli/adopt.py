@@ -34,6 +34,7 @@ def command(effects: tuple[str, ...], effect_only: bool, json_: bool) -> None:
     grounded.toml, or give them their old values.
     """
     workspace = open_workspace()
+    before = workspace.base_model.params
     done = workspace.adopt(*effects, parameters=not effect_only)
     if json_:
         show_json(done.to_json())
@@ -44,7 +45,6 @@ def command(effects: tuple[str, ...], effect_only: bool, json_: bool) -> None:
         remark("note", f"{effects[0]} {UNCLAIMED}")
     if done.params:
         show("written to [model] params, calibrated beside the effects:")
-    before = workspace.base_model.params
     for name, value in done.params.items():
         text = with_unit(f"{number(before[name].value)} -> {number(value)}", before[name].unit)
         show(field(name, text, "  "))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from grounded.errors import GroundedError, NextCommand
-from grounded_cli.options import as_json, next_line, parallel
+from grounded_cli.options import as_json, parallel, typed
 from grounded_cli.terminal import bar, names_in, number, show, show_json, table
 from grounded_trials.wording import count
 
@@ -59,7 +59,7 @@ def make_cases(
         return
     made = count(len(names), "case")
     show(f"{made} in {folder}, the labels in {sealed} (keep them away from it)")
-    show(f"\n{next_line(NextCommand('challenge', ('run', folder)))}")
+    show(f"\nnext: {typed(NextCommand('challenge', ('run', folder)))}")
 
 
 @command.command("run", short_help="Diagnose the cases that were not yet.")
@@ -139,8 +139,8 @@ def _labels(folder: str, labels: str | None) -> Path:
 def _scored(folder: str) -> str:
     """How the cases are scored; it says what is to be filled in where the labels are elsewhere."""
     if Path(f"{folder}-labels").is_dir():
-        return next_line(NextCommand("challenge", ("score", folder)))
-    line = next_line(NextCommand("challenge", ("score", folder, "--labels", "DIR")))
+        return f"next: {typed(NextCommand('challenge', ('score', folder)))}"
+    line = f"next: {typed(NextCommand('challenge', ('score', folder, '--labels', 'DIR')))}"
     return f"{line}\nDIR is the folder with the labels, where `make` wrote them"
 
 

@@ -75,21 +75,17 @@ class LazyGroup(click.Group):
         ctx.fail(f"no command '{name}': {nearest(name, COMMANDS)}")
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Runs a command; a GroundedError is printed, with the command that mends it."""
+        """Runs a command; an error's text ends with the command that mends it, as typed here."""
         try:
             return super().invoke(ctx)
         except Exception as error:
             from grounded.errors import GroundedError
 
-            if not isinstance(error, GroundedError):
+            if not isinstance(error, GroundedError) or error.then is None:
                 raise
             from grounded_cli.options import next_line
-            from grounded_cli.terminal import style
 
-            click.echo(f"{style('error:', fg='red', bold=True)} {error}", err=True)
-            if error.then is not None:
-                click.echo(next_line(error.then), err=True)
-            ctx.exit(1)
+            raise GroundedError(f"{error}\n{next_line(error.then)}") from None
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
         """Names for the TAB key without importing any command."""
@@ -135,6 +131,15 @@ def main() -> NoReturn:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 0
+    except Exception as error:
+        from grounded.errors import GroundedError
+
+        if not isinstance(error, GroundedError):
+            raise
+        from grounded_cli.terminal import style
+
+        click.echo(f"{style('error:', fg='red', bold=True)} {error}", err=True)
+        code = 1
     sys.exit(code if isinstance(code, int) else 0)
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from grounded_cli.options import as_json, next_line
+from grounded_cli.options import as_json, typed
 from grounded_cli.terminal import field, progress, say, show, show_json
 from grounded_trials.wording import count
 
@@ -98,18 +98,18 @@ def _next(found: Recovery) -> str:
     if found.format == CANDIDATE:
         return (
             f"a candidate is not for repair: remove {found.source}\n"
-            f"{next_line(NextCommand('propose'))}   writes the one that is waiting again"
+            f"next: {typed(NextCommand('propose'))}   writes the one that is waiting again"
         )
     if not _is_trial(found):
-        return next_line(NextCommand("inspect", (target,)))
+        return f"next: {typed(NextCommand('inspect', (target,)))}"
     if found.hole:
         why = "a trial with a hole can't be used: it has to be run again"
         again = NextCommand("run", (found.candidate,))
-        return f"{why}\n{next_line(again)}" if found.candidate else why
+        return f"{why}\nnext: {typed(again)}" if found.candidate else why
     short = found.planned is None or found.steps < found.planned
     if found.complete or not (found.candidate and short):
-        return next_line(NextCommand("ingest", (target,)))
+        return f"next: {typed(NextCommand('ingest', (target,)))}"
     return (
-        f"{next_line(NextCommand('ingest', ('--data', target)))}   for fit and diagnose only;\n"
+        f"next: {typed(NextCommand('ingest', ('--data', target)))}   for fit and diagnose only;\n"
         "without --data it counts as a run that failed, as one that ended early does"
     )

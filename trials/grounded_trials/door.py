@@ -193,6 +193,7 @@ class Workspace(Folder):
         found = fit_trials(self._afresh(), params, latency=latency)
         if apply:
             apply_fit(self, found)
+            self.forget()
             return Fitted(found, applied=True)
         chosen = ("--params", ",".join(params)) if params else ()
         return Fitted(found, False, (*chosen, *["--latency"] * latency, "--apply"))
@@ -236,7 +237,9 @@ class Workspace(Folder):
         """
         from grounded_trials.workspace.adopting import adopt_effects
 
-        return adopt_effects(self._afresh(), effects, parameters=parameters)
+        done = adopt_effects(self._afresh(), effects, parameters=parameters)
+        self.forget()
+        return done
 
     def report(self, *, html: bool = False, png: bool = False, rrd: bool = False) -> Report:
         """Utilities, trajectories, bias and gap of all stored trials.

@@ -66,7 +66,7 @@ class Table:
             raise self.error(key, f"must be a finite number, found {value}")
         return value
 
-    def choice(self, key: str, options: Iterable[str], default: str) -> str:
+    def choice(self, key: str, options: Iterable[str], default: Any = _REQUIRED) -> str:
         """A text that is one of the options."""
         value: str = self.take(key, str, default)
         names = list(options)
@@ -88,6 +88,10 @@ class Table:
         found = {name: table.take(name, float) for name in valid if table.has(name)}
         table.finish(valid)
         return found
+
+    def all_numbers(self) -> dict[str, float]:
+        """This table as name -> number, whatever the names."""
+        return {name: self.take(name, float) for name in self.names()}
 
     def pairs(self, names: Iterable[str]) -> dict[str, tuple[float, float]]:
         """This table as name -> [low, high]."""

@@ -1,16 +1,13 @@
-"""The blind challenge on disk: workspaces to diagnose, and their labels sealed apart.
+"""The blind challenge on disk: cases are written, diagnosed without their labels, then scored.
 
     DIR/single-0007/       a workspace: module, parameters, target, trials; nothing says the answer
     DIR/manifest.json      for each case the SHA-256 of its label and of each of its trials
+    DIR/times.json         CPU time of the diagnoses [s]
     LABELS/single-0007.json  the answer; it is opened only if it has the announced hash
 
-Labels belong on another disk while the cases are diagnosed.
-
-A challenge's cases as independent jobs: diagnosed without labels, scored with them.
-
-Both run on one machine or on a Dask cluster that sees the same disk (`grounded.experiments.jobs`).
-A diagnosis is kept in its own workspace, so a run that was cut off goes on where it was; what it
-cost is kept beside the manifest, in times.json.
+Labels belong on another disk while the cases are diagnosed. Cases are independent jobs, on one
+machine or on a Dask cluster that sees the same disk (`grounded.experiments.jobs`). A diagnosis is
+kept in its own workspace, so a run that was cut off goes on where it was.
 """
 
 from __future__ import annotations
@@ -38,8 +35,7 @@ if TYPE_CHECKING:
     from grounded.challenge import Case
     from grounded.experiments.jobs import Engine, Progress
 
-
-MANIFEST = "manifest.json"
+MANIFEST, TIMES = "manifest.json", "times.json"
 
 
 def write_cases(
@@ -152,33 +148,32 @@ def open_label(labels: Path, name: str, entry: dict[str, Any]) -> dict[str, Any]
     return dict(json.loads(data))
 
 
-def score_case(folder: Path, labels: Path, name: str, entry: dict[str, Any]) -> dict[str, Any]:
-    """One case's marks, from its reports/diagnosis.json.
+def score_case(
+    folder: str | Path, labels: str | Path, name: str, entry: dict[str, Any]
+) -> dict[str, Any]:
+    """A job: one case's marks, from its reports/diagnosis.json.
 
     Raises:
         GroundedError: if it was not diagnosed, or a trial or label was changed.
     """
     from grounded.challenge import judge, oracle
 
-    workspace = Folder(folder / name)
+    workspace = Folder(Path(folder) / name)
     hashes = [hashlib.sha256(workspace.store.read(s)).hexdigest() for s in workspace.store.list()]
     if hashes != entry["trials_sha256"]:
-        raise GroundedError(f"{folder / name}: its trials are not those that were made")
+        raise GroundedError(f"{workspace.folder}: its trials are not those that were made")
     path = workspace.reports / "diagnosis.json"
     try:
         diagnosis = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         raise GroundedError(
-            f"{folder / name} was not diagnosed", NextCommand("challenge", ("run", str(folder)))
+            f"{workspace.folder} was not diagnosed", NextCommand("challenge", ("run", str(folder)))
         ) from None
-    label = open_label(labels, name, entry)
+    label = open_label(Path(labels), name, entry)
     task = workspace.task
     latency = np.zeros(task.model.m) if task.latency is None else task.latency
     known = oracle(task.model, workspace.task_trials(), latency, label)
     return judge(label, diagnosis, known)
-
-
-TIMES = "times.json"
 
 
 def diagnose_cases(
@@ -253,15 +248,10 @@ def score_cases(
 
     entries = read_manifest(folder)
     where = {"folder": str(folder.resolve()), "labels": str(labels.resolve())}
-    jobs = [Job(score_one, where | {"name": name, "entry": e}) for name, e in entries.items()]
+    jobs = [Job(score_case, where | {"name": name, "entry": e}) for name, e in entries.items()]
     times = read_times(folder)
     marks = run_jobs(jobs, engine, progress=progress)
     return [m | {"cpu_s": times[m["case"]]} if m["case"] in times else m for m in marks]
-
-
-def score_one(folder: str, labels: str, name: str, entry: dict[str, Any]) -> dict[str, Any]:
-    """A job: one case's marks."""
-    return score_case(Path(folder), Path(labels), name, entry)
 
 
 def read_times(folder: Path) -> dict[str, float]:

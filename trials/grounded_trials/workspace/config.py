@@ -8,9 +8,9 @@ Changes (tomlkit) leave the user's comments and layout alone.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from grounded.errors import GroundedError
 from grounded.search.standing import SearchOptions
@@ -39,8 +39,8 @@ class TaskTable:
     horizon: int
     target: str
     start: Mapping[str, float]
-    feedback: bool
     latency: Mapping[str, float]
+    feedback: bool = True
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ def read_config(folder: Path) -> Config:
     """
     table = read_toml(folder / FILE)
     table.expect(*(field.name for field in fields(Config) if field.name != "file"))
-    config = Config(
+    return Config(
         file=folder / FILE,
         model=_model(table.sub("model")),
         task=_task(table.sub("task")),
@@ -94,26 +94,34 @@ def read_config(folder: Path) -> Config:
         log=table.sub("log"),
         estimate=table.sub("estimate"),
     )
-    return config
+
+
+def _values(table: Table, kind: type, *others: str) -> dict[str, Any]:
+    """The keys of a table that are there, each checked to be what its field holds.
+
+    Args:
+        table: what the user wrote; a key that is no field is complained about.
+        kind: a dataclass whose fields are numbers, texts, choices, or tables of numbers.
+        others: fields that are read elsewhere.
+    """
+    table.expect(*(one.name for one in fields(kind)))
+    found: dict[str, Any] = {}
+    types = get_type_hints(kind)
+    for one in fields(kind):
+        name, of = one.name, types[one.name]
+        if name in others:
+            continue
+        if get_origin(of) is Mapping:
+            found[name] = table.sub(name).all_numbers()
+        elif get_origin(of) is Literal and table.has(name):
+            found[name] = table.choice(name, get_args(of))
+        elif one.default is MISSING or table.has(name):
+            found[name] = table.take(name, of)
+    return found
 
 
 def _model(table: Table) -> ModelTable:
-    table.expect(*(field.name for field in fields(ModelTable)))
-    params = table.sub("params")
-    effects = table.take("effects", list, [])
-    for effect in effects:
-        if not isinstance(effect, dict) or not isinstance(effect.get("name"), str):
-            raise table.error(
-                "effects",
-                f'must hold tables like {{ name = "dead_zone:throttle" }}, found {effect!r}',
-            )
-    found = ModelTable(
-        file=table.take("file", str, ""),
-        module=table.take("module", str, ""),
-        params={name: params.take(name, float) for name in params.names()},
-        effects=tuple(effects),
-        smoothing=table.take("smoothing", float, 0.05),
-    )
+    found = ModelTable(**_values(table, ModelTable, "effects"), effects=_effects(table))
     if bool(found.file) == bool(found.module):
         raise table.error(
             "file", 'give exactly one of file = "model.py" and module = "package.name"'
@@ -123,17 +131,19 @@ def _model(table: Table) -> ModelTable:
     return found
 
 
+def _effects(table: Table) -> tuple[Mapping[str, Any], ...]:
+    effects = table.take("effects", list, [])
+    for effect in effects:
+        if not isinstance(effect, dict) or not isinstance(effect.get("name"), str):
+            raise table.error(
+                "effects",
+                f'must hold tables like {{ name = "dead_zone:throttle" }}, found {effect!r}',
+            )
+    return tuple(effects)
+
+
 def _task(table: Table) -> TaskTable:
-    table.expect(*(field.name for field in fields(TaskTable)))
-    start, latency = table.sub("start"), table.sub("latency")
-    found = TaskTable(
-        dt=table.take("dt", float),
-        horizon=table.take("horizon", int),
-        target=table.take("target", str),
-        start={name: start.take(name, float) for name in start.names()},
-        feedback=table.take("feedback", bool, True),
-        latency={name: latency.take(name, float) for name in latency.names()},
-    )
+    found = TaskTable(**_values(table, TaskTable))
     if found.dt <= 0:
         raise table.error("dt", f"must be a positive number of seconds, found {found.dt:g}")
     if found.horizon < 1:
@@ -142,21 +152,9 @@ def _task(table: Table) -> TaskTable:
 
 
 def _search(table: Table) -> SearchOptions:
-    defaults = SearchOptions()
-    method = table.choice("method", ("ddp", "policy-gradient"), defaults.method)
-    step = table.choice("step", ("damped", "full"), defaults.step)
-    options = {
-        "match_inputs": table.take("match_inputs", bool, defaults.match_inputs),
-        "refit": table.take("refit", bool, defaults.refit),
-        "rerun_incumbent": table.take("rerun_incumbent", bool, defaults.rerun_incumbent),
-        "max_halvings": table.take("max_halvings", int, defaults.max_halvings),
-        "repeats": table.take("repeats", int, defaults.repeats),
-        "max_trials": table.take("max_trials", int, defaults.max_trials),
-        "tolerance": table.take("tolerance", float, defaults.tolerance),
-    }
-    table.finish()
+    values = _values(table, SearchOptions)
     try:
-        return SearchOptions(method=method, step=step, **options)  # type: ignore[arg-type]
+        return SearchOptions(**values)
     except GroundedError as error:
         raise GroundedError(f"{table.file.name}: {error}") from None
 
@@ -166,18 +164,12 @@ def _system(table: Table) -> SystemTable:
     kinds = {}
     for kind in ("start", "process", "measurement"):
         inner = noise.sub(kind)
-        kinds[kind] = {name: inner.take(name, float) for name in inner.names()}
+        kinds[kind] = inner.all_numbers()
         for name, std in kinds[kind].items():
             if std < 0:
                 raise inner.error(name, f"must not be negative, found {std:g}")
     noise.finish()
-    found = SystemTable(
-        command=table.take("command", str, ""),
-        model=table.take("model", str, ""),
-        noise=kinds,
-        seed=table.take("seed", int, 0),
-    )
-    table.finish()
+    found = SystemTable(**_values(table, SystemTable, "noise"), noise=kinds)
     if found.command and found.model:
         raise table.error("command", "give command or model, not both")
     if found.seed < 0:
@@ -197,25 +189,28 @@ def set_in_model(
     """
     import tomlkit
 
-    document = tomlkit.parse(file.read_text(encoding="utf-8"))
-    model: Any = document["model"]
+    changes: dict[str, Any] = {}
     if params is not None:
-        model["params"] = _inline(params)
+        changes["params"] = _inline(params)
     if effects is not None:
         array = tomlkit.array()
         for effect in effects:
             array.append(_inline(effect))
-        model["effects"] = array.multiline(len(effects) > 1)
-    write_atomically(file, tomlkit.dumps(document).encode())
+        changes["effects"] = array.multiline(len(effects) > 1)
+    _change(file, "model", changes)
 
 
 def set_latency(file: Path, latency: Mapping[str, float]) -> None:
     """Replaces [task] latency."""
+    _change(file, "task", {"latency": _inline(latency)})
+
+
+def _change(file: Path, where: str, changes: Mapping[str, Any]) -> None:
     import tomlkit
 
     document = tomlkit.parse(file.read_text(encoding="utf-8"))
-    task: Any = document["task"]
-    task["latency"] = _inline(latency)
+    table: Any = document[where]
+    table.update(changes)
     write_atomically(file, tomlkit.dumps(document).encode())
 
 

@@ -25,7 +25,6 @@ class Example:
     task: Callable[[], Task]
     model: str  # import name of the crude model's module, copied to model.py
     real: str  # text of real.py
-    optimum: str = ""  # import name of `optimum() -> float`, for the demo
 
 
 _REAL_CAR = '''"""The simulated REAL car, in place of your robot. The search never sees it."""

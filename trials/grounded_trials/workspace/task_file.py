@@ -1,6 +1,6 @@
-"""From a checked grounded.toml and a loaded model to the Task of the method.
+"""From grounded.toml, target.csv and a loaded model to the Task of the method.
 
-target.csv: what the states are to do, a row a control step; a state without a column is free.
+target.csv says what the states are to do, a row a control step; a state without a column is free.
 """
 
 from __future__ import annotations

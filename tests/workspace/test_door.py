@@ -1,0 +1,133 @@
+"""The front door: a method for every command, with the document that the command prints."""
+
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from test_next_step import diagnosed
+
+from cli import grounded
+from grounded.errors import GroundedError, NextCommand
+from grounded.result import Result, plain
+from grounded_trials import Workspace
+from reported import cart, copied
+from workspaces import make
+
+__all__ = ["cart"]
+
+
+def test_importing_the_package_costs_nothing():
+    code = "import sys, grounded_trials; assert 'numpy' not in sys.modules; "
+    code += "from grounded_trials import Workspace; print('scipy' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "False\n"
+
+
+def test_a_name_that_is_not_there():
+    import grounded_trials
+
+    with pytest.raises(AttributeError, match="Workshop"):
+        _ = grounded_trials.Workshop
+
+
+def test_a_folder_that_is_no_workspace(tmp_path):
+    with pytest.raises(GroundedError) as refused:
+        Workspace(tmp_path)
+    assert refused.value.then is not None and refused.value.then.verb == "init"
+
+
+def test_a_session_from_an_example_to_a_report(tmp_path):
+    w = Workspace.create(tmp_path / "w", example="pendulum")
+    first = w.propose()
+    assert first.then == NextCommand("run") and first.candidate.id == "c0001"
+    ran = w.run()
+    assert ran.then == NextCommand("ingest", (str(ran.trial_file),))
+    found = w.ingest(ran.trial_file)
+    assert (found.trial, found.verdict, found.then) == ("t0001", "first", NextCommand("propose"))
+    seen = []
+    status = w.learn(1, each=lambda candidate, trial: seen.append((candidate.id, trial.trial)))
+    assert seen == [("c0002", "t0002")] and status.standing.trials == 2
+    report = w.report(html=True)
+    assert [path.name for path in report.paths] == ["report.html"] and not report.findings.lost
+    assert w.verify().damaged == ()
+
+
+@pytest.mark.parametrize(
+    ("verb", "options"),
+    [
+        ("propose", ()),
+        ("status", ()),
+        ("fit", ()),
+        ("report", ("--html",)),
+        ("verify", ()),
+        ("inspect", ("trials/t.mcap",)),
+        ("export", ("best", "-o", "best.csv")),
+        ("adopt", ("viscous_friction:v",)),
+    ],
+)
+def test_the_document_is_the_command_s(cart, tmp_path, monkeypatch, verb, options):
+    """Two copies of one folder, each the current one when it is asked."""
+    for side in ("a", "b"):
+        copied(cart, tmp_path / side)
+        (first, *_) = (tmp_path / side / "trials").glob("t0001-*")
+        shutil.copy(first, tmp_path / side / "trials" / "t.mcap")
+    monkeypatch.chdir(tmp_path / "a")
+    printed = grounded(verb, *options, "--json")
+    assert printed.code == 0, printed.err
+    monkeypatch.chdir(tmp_path / "b")
+    w = Workspace()
+    calls = {"report": lambda: w.report(html=True), "export": lambda: w.export("best", "best.csv")}
+    found = calls.get(verb, lambda: getattr(w, verb)(*options))()
+    assert isinstance(found, Result)
+    assert plain(found.to_json()) == printed.json
+    assert repr(found).startswith(f"<{type(found).__name__} ") and len(repr(found)) < 200
+    assert "<table>" in found._repr_html_()
+
+
+def test_what_was_changed_on_the_disk_is_seen_by_the_next_call(cart, tmp_path):
+    w = Workspace(copied(cart, tmp_path / "w"))
+    before = w.planner.plan.model.state_names
+    assert w.status().then == NextCommand("adopt", ("viscous_friction:v",))
+    done = w.adopt("viscous_friction:v")
+    assert [effect["name"] for effect in done.effects] == ["viscous_friction:v"]
+    assert w.config.model.effects and w.planner.plan.model.state_names == before
+    assert w.status().then == NextCommand("propose")
+    diagnosed(w.folder, verdict={"kind": "none", "effects": [], "sentence": "None."})
+    (w.folder / "grounded.toml").write_text("[model]\nfile = 3\n")
+    with pytest.raises(GroundedError, match="must be a text"):
+        w.status()
+
+
+def test_one_reader_strict_or_telling_what_it_lost(cart, tmp_path):
+    w = Workspace(copied(cart, tmp_path / "w"))
+    whole = w.read()
+    assert not whole.lost and len(whole.trials) > 2
+    (second,) = w.store.folder.glob("t0002-*")
+    second.chmod(0o644)
+    second.write_bytes(second.read_bytes()[:-30])
+    (third,) = w.store.folder.glob("t0003-*")
+    third.unlink()
+    (w.folder / "candidates" / "c0001.mcap").write_bytes(b"no")
+    w.forget()
+    with pytest.raises(GroundedError, match="t0002"):
+        w.read()
+    found = w.read(strict=False)
+    assert [one.file for one in found.lost] == [second.name, "t0003"]
+    assert len(found.trials) == len(whole.trials) - 2
+    assert [c.id for c in found.candidates] == [c.id for c in whole.candidates]
+    assert np.array_equal(
+        found.candidates[0].predicted_states, whole.candidates[0].predicted_states
+    )
+
+
+def test_fit_says_how_its_values_are_written(tmp_path):
+    folder = make(tmp_path / "w").folder
+    w = Workspace(folder)
+    w.learn(2)
+    found = w.fit(["mass"])
+    assert found.then == NextCommand("fit", ("--params", "mass", "--apply")) and not found.applied
+    again = w.fit(["mass"], apply=True)
+    assert again.then == NextCommand("propose")
+    assert w.base_model.params["mass"].value == pytest.approx(again.fit.params["mass"].value)
