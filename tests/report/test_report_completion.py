@@ -12,6 +12,7 @@ import pytest
 from cli import grounded, process
 from grounded_cli import completion
 from grounded_cli.main import COMMANDS
+from grounded_cli.options import in_workspace
 from reported import cart
 
 __all__ = ["cart"]
@@ -32,12 +33,11 @@ def test_commands_and_their_options():
 
 
 def _context(folder) -> click.Context:
-    return click.Context(click.Command("export"), info_name="export", obj=None)
+    return in_workspace(click.Command("export")).make_context("export", ["-C", str(folder)])
 
 
 def test_candidates_trials_and_effects(cart, tmp_path):
     ctx = _context(cart)
-    ctx.params["folder"] = str(cart)
     param = click.Argument(["x"])
 
     def names(items):
@@ -48,7 +48,7 @@ def test_candidates_trials_and_effects(cart, tmp_path):
     assert names(completion.trials(ctx, param, "t000"))[0] == "t0001"
     assert names(completion.effects(ctx, param, "visc")) == ["viscous_friction:v"]
     assert "car-turn" in names(completion.examples(ctx, param, "car"))
-    ctx.params["folder"] = str(tmp_path)
+    ctx = _context(tmp_path)
     assert names(completion.trials(ctx, param, "")) == []
     assert names(completion.effects(ctx, param, "")) == []
     (tmp_path / "reports").mkdir()
