@@ -50,7 +50,7 @@ def command(
     if name is None:
         show("\n".join(f"{key:15} {text}" for key, (_, _, _, text) in STUDIES.items()))
         return
-    from grounded_trials.store.study_store import StudyStore
+    from grounded_trials.store.store import StudyStore
 
     module, function, kind, _ = STUDIES[name]
     study = getattr(importlib.import_module(f"grounded.experiments.{module}"), function)
@@ -65,7 +65,7 @@ def command(
             given["progress"] = progress
         result = study(**given)
     if png:
-        from grounded_trials.report.studies.trends import draw_study
+        from grounded_trials.report.studies.pictures import draw_study
 
         draw_study(name, result, Path(png))
     if json_:

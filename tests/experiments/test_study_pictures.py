@@ -18,7 +18,7 @@ from grounded.experiments.theorem1 import Theorem1Result, Theorem1Row
 from grounded_cli.experiment import STUDIES
 from grounded_trials.report.figures.draw import Box, Spot, Stroke, draw
 from grounded_trials.report.figures.figure import Bars
-from grounded_trials.report.studies.trends import PICTURES, draw_study
+from grounded_trials.report.studies.pictures import PICTURES, draw_study
 
 ANGLE = np.linspace(0, 2 * np.pi, 61)
 LOOP = np.column_stack([40 * np.sin(ANGLE), 40 * np.cos(ANGLE), 0 * ANGLE])

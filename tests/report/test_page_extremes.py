@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from grounded_cli.terminal import sparkline, table
-from grounded_trials.report.figures.all_figures import all_figures
 from grounded_trials.report.figures.png import png
+from grounded_trials.report.figures.runs import all_figures
 from grounded_trials.report.gathering import _drawable
 from grounded_trials.report.page.page import page
 from grounded_trials.report.recording.recording import write_recording

@@ -16,13 +16,11 @@ from grounded.rollout import simulate
 from grounded.search.improve import first_policy
 from grounded.search.planner import Planner
 from grounded.trial import Trial
-from grounded_trials.report.figures.all_figures import all_figures
 from grounded_trials.report.figures.axis import Axis, fitted, round_up, thinned, without_astray
-from grounded_trials.report.figures.draw import Stroke, draw
+from grounded_trials.report.figures.draw import Stroke, draw, svg
 from grounded_trials.report.figures.figure import Band, Curve, Dot, Panel
 from grounded_trials.report.figures.png import dashed, plain, png
-from grounded_trials.report.figures.runs import error_figure
-from grounded_trials.report.figures.svg import svg
+from grounded_trials.report.figures.runs import all_figures, error_figure
 from grounded_trials.report.forecast import forecast, forecast_error
 from grounded_trials.report.gathering import gather
 from grounded_trials.report.scene import scene_of

@@ -1,5 +1,7 @@
 """How sure an improvement is, in a sentence; what became of a candidate, in a word."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.stats import ttest_ind
@@ -43,3 +45,22 @@ def test_failed_runs_are_left_out_and_trials_that_agree_say_so():
     assert utility_noise([tried(-5.0, -np.inf)])[1] == 0
     found = last_improvement([tried(-5.0, -5.0), tried(-4.0, -4.0)])
     assert holds(found, 1, "exactly") and "+-" not in found and "probability" not in found
+
+
+@pytest.mark.parametrize(
+    ("accepted", "base", "doubt", "trials", "last", "word"),
+    [
+        (True, "", False, 1, True, "first"),
+        (True, "c0001", False, 1, False, "better"),
+        (False, "c0001", False, 1, False, "no better"),
+        (False, "", False, 1, False, "no better"),
+        (None, "c0001", True, 1, True, "in doubt"),
+        (None, "c0001", False, 0, True, "waiting"),
+        (None, "c0001", False, 1, False, "waiting"),
+        (None, "c0001", False, 0, False, "no trial"),
+    ],
+)
+def test_a_verdict_is_one_of_a_few_words(accepted, base, doubt, trials, last, word):
+    candidate = SimpleNamespace(base=base)
+    tried = Tried(candidate, (None,) * trials, (), accepted, in_doubt=doubt)
+    assert tried.verdict(last) == word

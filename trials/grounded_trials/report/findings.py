@@ -5,7 +5,7 @@ Text, page, pictures and recording are four ways to show the same findings; none
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -14,11 +14,12 @@ import numpy as np
 from grounded.diagnosis.report import Diagnosis
 from grounded.errors import NextCommand
 from grounded.frozen import Array
+from grounded.model import Model
 from grounded.search.planner import Planner
 from grounded.search.standing import Candidate, Standing, Tried
 from grounded.task import Task
 from grounded.trial import Trial, mean_trial
-from grounded_trials.wording import rendered
+from grounded_trials.wording import figure, rendered, shown
 from grounded_trials.workspace.adopting import Better
 from grounded_trials.workspace.folder import Lost
 from grounded_trials.workspace.next_step import Since
@@ -139,6 +140,24 @@ class Findings:
             np.mean([r.residual for r in runs], axis=0),
             np.mean(explained, axis=0) if len(explained) == len(runs) else None,
         )
+
+
+def compared(findings: Findings) -> list[tuple[str, Run]]:
+    """The two runs that all views compare, by role: the model's policy and the best so far."""
+    first, best = findings.first, findings.best
+    if first is not None and best is not None and first.candidate is best.candidate:
+        return [("model", first)]
+    return [(role, run) for role, run in (("model", first), ("best", best)) if run is not None]
+
+
+def by_state(
+    model: Model, columns: Sequence[Array], unit: Callable[[str], str] = shown
+) -> list[tuple[str, ...]]:
+    """Rows of a table: each state's name, its unit, and its number in each column (n,)."""
+    return [
+        (name, unit(each), *(figure(float(column[i]), 3) for column in columns))
+        for i, (name, each) in enumerate(model.states.items())
+    ]
 
 
 def standard_error(tried: Tried) -> float:

@@ -13,6 +13,8 @@ from grounded.search.standing import Tried
 from grounded_trials.report.diagnosis_words import error_lines, sentences
 from grounded_trials.report.findings import (
     Findings,
+    by_state,
+    compared,
     prediction_error,
     rms,
     selection,
@@ -27,7 +29,6 @@ from grounded_trials.wording import (
     folded,
     per_second,
     rendered,
-    shown,
     verdict,
     with_unit,
     wrapped,
@@ -126,9 +127,8 @@ def _rows(history: Sequence[Tried]) -> tuple[list[Tried], int]:
         index = np.unique(np.rint(np.linspace(0, len(accepted) - 1, ROWS - 2)).astype(int))
         accepted = [accepted[i] for i in index]
     keep |= set(accepted)
-    for k in range(len(history) - 1, -1, -1):
-        if len(keep) < ROWS:
-            keep.add(k)
+    others = [k for k in reversed(range(len(history))) if k not in keep]
+    keep |= set(others[: ROWS - len(keep)])
     return [history[k] for k in sorted(keep)], len(history) - len(keep)
 
 
@@ -148,17 +148,10 @@ def _candidate(tried: Tried, last: bool) -> tuple[str, ...]:
 
 def _trajectories(findings: Findings, table: Table) -> str:
     """Distance to the target, and what the model had promised, rms over the run."""
-    task, first, best = findings.task, findings.first, findings.best
-    assert best is not None
-    runs = [run for run in (first, best) if run is not None]
-    if first is not None and first.candidate is best.candidate:
-        runs = [best]
+    task, runs = findings.task, [run for _, run in compared(findings)]
     columns = [rms(tracking_error(task, run.trial)) for run in runs]
     columns += [rms(prediction_error(task, run)) for run in runs]
-    rows = [
-        (name, shown(unit), *(figure(float(c[i]), 3) for c in columns))
-        for i, (name, unit) in enumerate(task.model.states.items())
-    ]
+    rows = by_state(task.model, columns)
     ids = [run.candidate.id for run in runs]
     header = ("state", "unit", *(f"{i} off" for i in ids), *(f"{i} gap" for i in ids))
     note = "  off: from the desired path; gap: from what the model predicted for that run"
@@ -170,11 +163,7 @@ def _biases(findings: Findings, table: Table) -> str:
     runs = selection(findings.improvements, ITERATIONS)
     if not runs:
         return "bias\n  no whole trial yet"
-    columns = [rms(run.residual) / task.dt for run in runs]
-    rows = [
-        (name, per_second(unit), *(figure(float(c[i]), 3) for c in columns))
-        for i, (name, unit) in enumerate(task.model.states.items())
-    ]
+    rows = by_state(task.model, [rms(run.residual) / task.dt for run in runs], per_second)
     header = ("state", "unit", *(f"iter. {run.candidate.iteration}" for run in runs))
     return f"bias: what the {findings.plain} lacks, rms over the run\n" + table(rows, header)
 
@@ -219,10 +208,7 @@ def _logs(findings: Findings, table: Table) -> str:
     """How far the crude model is off 1 s ahead on logs that ran no candidate."""
     logs = findings.logs[-ITERATIONS:]
     columns = [forecast_error(findings.crude, log.trial) for log in logs]
-    rows = [
-        (name, shown(unit), *(figure(float(c[i]), 3) for c in columns))
-        for i, (name, unit) in enumerate(findings.task.model.states.items())
-    ]
+    rows = by_state(findings.task.model, columns)
     title = f"data: error of the {findings.plain} {SECONDS:g} s ahead, rms\n"
     return title + table(rows, ("state", "unit", *(log.trial.id for log in logs)))
 

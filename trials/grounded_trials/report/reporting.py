@@ -92,8 +92,8 @@ def save_page(workspace: Folder, findings: Findings) -> Path:
 
 def save_pictures(workspace: Folder, findings: Findings) -> list[Path]:
     """reports/utility.png, paths.png and so on: the figures of the page."""
-    from grounded_trials.report.figures.all_figures import all_figures
     from grounded_trials.report.figures.png import png
+    from grounded_trials.report.figures.runs import all_figures
 
     paths = []
     for figure in all_figures(findings):

@@ -42,6 +42,11 @@ class Scene:
         found[:, : len(self.axes)] = states[:, list(self.axes)]
         return found
 
+    def finite(self, states: Array) -> Array:
+        """Positions (k, 3) of those states that have one."""
+        points = self.points(states)
+        return points[np.isfinite(points).all(axis=1)]
+
     def rotations(self, states: Array) -> Array:
         """Body axes (nose, left, up) as the columns of rotation matrices (T, 3, 3)."""
         if self.attitude:

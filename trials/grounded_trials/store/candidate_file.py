@@ -19,12 +19,9 @@ from grounded_trials.store.own_files import (
     CANDIDATE,
     Meta,
     OwnFile,
-    Target,
     Units,
-    deliver,
     read_own,
-    rows,
-    with_meta,
+    stated,
     with_units,
 )
 
@@ -40,53 +37,10 @@ def candidate_bytes(
     state_units: Units | None = None,
     input_units: Units | None = None,
 ) -> bytes:
-    """A candidate as the bytes of a file; equal arguments give equal bytes."""
-    from grounded_trials.formats.mcap_writer import LogWriter, encode_doubles, encode_lists
-
-    _refuse_unfinite(policy)
-    states = rows(predicted_states, policy.horizon + 1, len(policy.state_names))
-    inputs = rows(predicted_inputs, policy.horizon, len(policy.input_names))
-    table = {
-        "format": CANDIDATE,
-        "dt": repr(float(policy.dt)),
-        "states": json.dumps(with_units(policy.state_names, state_units)),
-        "inputs": json.dumps(with_units(policy.input_names, input_units)),
-        "steps": str(policy.horizon),
-        "policy": json.dumps(_policy_table(policy)),
-    }
-    stream = io.BytesIO()
-    log = LogWriter(stream)
-    log.metadata("grounded", with_meta(table, meta))
-    log.attachment("about", "text/plain", _ABOUT)
-    topic = log.channel("/policy", "Policy", ["feedforward", "gain", "reference"], repeated=True)
-    state = log.channel("/predicted_state", "State", policy.state_names)
-    input = log.channel("/predicted_input", "Input", policy.input_names)
-    controls, moves = encode_lists(_controls(policy)), encode_doubles(inputs)
-    for k, reached in enumerate(encode_doubles(states)):
-        time = round(k * policy.dt * 1e9)
-        if k < policy.horizon:
-            log.message(topic, time, controls[k])
-            log.message(input, time, moves[k])
-        log.message(state, time, reached)
-    log.finish()
-    return stream.getvalue()
-
-
-def write_candidate(
-    target: Target,
-    policy: Policy,
-    predicted_states: Array,
-    predicted_inputs: Array,
-    meta: Meta,
-    *,
-    state_units: Units | None = None,
-    input_units: Units | None = None,
-) -> None:
-    """Writes a candidate; the file appears complete or not at all.
+    """A candidate as the bytes of a file; equal arguments give equal bytes.
 
     Args:
-        target: a path (replaced if it exists) or a writable binary stream.
-        policy: what the robot runs.
+        policy: what the robot runs, H steps.
         predicted_states: (H+1, n).
         predicted_inputs: (H, m).
         meta: entries of the metadata record besides the reserved ones.
@@ -94,18 +48,42 @@ def write_candidate(
         input_units: the same for the inputs.
 
     Raises:
-        GroundedError: if the file can't be written, or the policy holds a number that is
-            not finite.
+        GroundedError: if the policy holds a number that is not finite, the shapes do not fit, or
+            an entry of `meta` is reserved.
     """
-    data = candidate_bytes(
-        policy,
-        predicted_states,
-        predicted_inputs,
+    from grounded_trials.formats.mcap_writer import LogWriter, encode_doubles, encode_lists
+
+    _refuse_unfinite(policy)
+    H, n, m = policy.horizon, len(policy.state_names), len(policy.input_names)
+    states, inputs = np.asarray(predicted_states, float), np.asarray(predicted_inputs, float)
+    for array, shape in ((states, (H + 1, n)), (inputs, (H, m))):
+        if array.shape != shape:
+            raise GroundedError(f"expected an array of shape {shape}, got {array.shape}")
+    table = stated(
+        CANDIDATE,
+        policy.dt,
+        with_units(policy.state_names, state_units),
+        with_units(policy.input_names, input_units),
         meta,
-        state_units=state_units,
-        input_units=input_units,
+        steps=str(H),
+        policy=json.dumps(_policy_table(policy)),
     )
-    deliver(target, data)
+    stream = io.BytesIO()
+    log = LogWriter(stream)
+    log.metadata("grounded", table)
+    log.attachment("about", "text/plain", _ABOUT)
+    topic = log.channel("/policy", "Policy", ["feedforward", "gain", "reference"], repeated=True)
+    state = log.channel("/predicted_state", "State", policy.state_names)
+    input = log.channel("/predicted_input", "Input", policy.input_names)
+    controls, moves = encode_lists(_controls(policy)), encode_doubles(inputs)
+    for k, reached in enumerate(encode_doubles(states)):
+        time = round(k * policy.dt * 1e9)
+        if k < H:
+            log.message(topic, time, controls[k])
+            log.message(input, time, moves[k])
+        log.message(state, time, reached)
+    log.finish()
+    return stream.getvalue()
 
 
 def read_candidate(
@@ -124,13 +102,10 @@ def read_candidate(
     n, m = len(states), len(inputs)
     depths = _depths(own, own.floats(table.get("depths"), "policy.depths", m))
     nz = n + sum(depths)
-    lists = own.lists("/policy", {"feedforward": m, "gain": m * nz, "reference": nz})
-    feedforward, gain, reference = lists
+    feedforward, gain, reference = own.lists(
+        "/policy", {"feedforward": m, "gain": m * nz, "reference": nz}
+    )
     H, steps = len(feedforward), own.integer("steps")
-    if gain.size == 0 and reference.size == 0:
-        feedback: tuple[Array | None, Array | None] = (None, None)
-    else:
-        feedback = (gain.reshape(H, m, nz), reference)
     policy = Policy(
         feedforward=feedforward,
         low=own.floats(table.get("low"), "policy.low", m, null=-np.inf),
@@ -141,8 +116,8 @@ def read_candidate(
         depths=depths,
         angles=tuple(bool(a) for a in own.floats(table.get("angles"), "policy.angles", n)),
         past=own.floats(table.get("past"), "policy.past", m),
-        gain=feedback[0],
-        reference=feedback[1],
+        gain=gain.reshape(-1, m, nz) if gain.size else None,
+        reference=reference if reference.size else None,
     )
     _refuse_unfinite(policy, own.name)
     x, u = own.doubles("/predicted_state", states), own.doubles("/predicted_input", inputs)
@@ -173,9 +148,7 @@ def _controls(policy: Policy) -> list[Array]:
 
 def _depths(own: OwnFile, depths: Array) -> tuple[int, ...]:
     if not all(d.is_integer() and 0 <= d <= DEPTH_LIMIT for d in depths.tolist()):
-        raise GroundedError(
-            f"{own.name}: its metadata 'policy.depths' must be integers from 0 to {DEPTH_LIMIT}"
-        )
+        raise own.bad("policy.depths", f"must be integers from 0 to {DEPTH_LIMIT}")
     return tuple(int(d) for d in depths)
 
 

@@ -1,9 +1,8 @@
-"""Reading a file that we wrote: all of it, checked, or a message that says what is wrong.
+"""What trial files and candidate files share: how they state their contents, and a strict reader.
 
-The whole file is read before any number leaves: a data checksum must be there and must fit, so
-that no flipped bit goes unnoticed. Limits keep a file from a stranger from taking all memory.
-
-What writing a trial and writing a candidate have in common.
+The whole file is read before any number leaves it: a data checksum must be there and must fit, so
+that no flipped bit goes unnoticed. Limits keep a file from a stranger from taking all memory. What
+is wrong with a file is a message that names the file and the place.
 """
 
 from __future__ import annotations
@@ -12,12 +11,13 @@ import hashlib
 import io
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from grounded.errors import GroundedError
 from grounded.frozen import Array
@@ -31,31 +31,22 @@ from grounded_trials.formats.mcap_records import (
 )
 from grounded_trials.formats.mcap_walk import DamagedFile, read_records
 from grounded_trials.formats.messages import Array as ArrayType
-from grounded_trials.formats.messages import BadMessage, Ints, Number, Struct
-from grounded_trials.formats.protobuf import protobuf_messages, uniform_doubles
+from grounded_trials.formats.messages import BadMessage, Number, Struct
+from grounded_trials.formats.protobuf import ProtobufItems, protobuf_messages, uniform_doubles
 from grounded_trials.formats.protobuf_schema import BadSchema, parse_descriptor_set
-from grounded_trials.store.store import write_atomically
 
 FILE_LIMIT = 1 * 2**30  # [bytes]
 STEP_LIMIT = 2_000_000  # messages of a channel
 NAME_LIMIT = 1000  # states, or inputs
 
 TRIAL, CANDIDATE = "grounded trial 1", "grounded candidate 1"
-RESERVED = (
-    "format",
-    "dt",
-    "states",
-    "inputs",
-    "candidate",
-    "start_inputs",
-    "start_ns",
-    "policy",
-    "steps",
-)
+RESERVED = ["format", "dt", "states", "inputs", "policy", "steps"]
+RESERVED += ["candidate", "start_inputs", "start_ns"]
+DOUBLES = ArrayType(Number("f8"))
 
+Counts = NDArray[np.integer[Any]]
 Meta = Mapping[str, str]
 Units = Mapping[str, str]
-Target = str | Path | IO[bytes]
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +59,15 @@ class OwnFile:
     attachments: dict[str, bytes]
     types: dict[str, Struct]
     messages: dict[str, list[Messages]]
+
+    @property
+    def sha256(self) -> str:
+        """The hash of the whole file."""
+        return hashlib.sha256(self.data).hexdigest()
+
+    def bad(self, key: str, found: str) -> GroundedError:
+        """The error that an entry of the table is not what it should be."""
+        return GroundedError(f"{self.name}: its metadata '{key}' {found}")
 
     def entry(self, key: str) -> str:
         """An entry of the table, which must be there."""
@@ -83,26 +83,32 @@ class OwnFile:
         except ValueError:
             value = math.nan
         if not (math.isfinite(value) and value > 0):
-            raise GroundedError(
-                f"{self.name}: its metadata '{key}' is '{text[:40]}', not a positive number"
-            )
+            raise self.bad(key, f"is '{text[:40]}', not a positive number")
         return value
 
-    def json(self, key: str, kind: type, *, optional: bool = False) -> Any:
-        """A JSON entry of the table; None for null where `optional`."""
+    def integer(self, key: str) -> int:
+        """An integer of the table that is not negative."""
+        text = self.entry(key)
+        if not (text.isascii() and text.isdigit() and len(text) < 20):
+            raise self.bad(key, f"is '{text[:40]}', not an integer")
+        return int(text)
+
+    def json(self, key: str, kind: type[list[Any] | dict[str, Any]]) -> Any:
+        """A list or an object of the table, written as JSON."""
         try:
             value = json.loads(self.entry(key))
         except (ValueError, RecursionError):
-            raise GroundedError(f"{self.name}: its metadata '{key}' is not JSON") from None
-        if value is None and optional:
-            return None
-        if (
-            not isinstance(value, dict | list)
-            or not isinstance(value, kind)
-            or len(value) > NAME_LIMIT
-        ):
-            raise GroundedError(f"{self.name}: its metadata '{key}' is not a {kind.__name__}")
+            raise self.bad(key, "is not JSON") from None
+        if not isinstance(value, kind) or len(value) > NAME_LIMIT:
+            raise self.bad(key, f"is not a {kind.__name__}")
         return value
+
+    def names(self, key: str) -> list[str]:
+        """The names of a JSON object of the table, in order."""
+        table = self.json(key, dict)
+        if not table or not all(isinstance(unit, str) for unit in table.values()):
+            raise self.bad(key, "must give each name a unit")
+        return list(table)
 
     def floats(self, value: Any, what: str, size: int, null: float | None = None) -> Array:
         """A list of `size` numbers from JSON; `null` stands for None."""
@@ -110,101 +116,42 @@ class OwnFile:
             numbers = [null if item is None else item for item in value]
             if all(isinstance(item, int | float) for item in numbers):
                 return np.array(numbers, dtype=np.float64)
-        raise GroundedError(f"{self.name}: its metadata '{what}' must be a list of {size} numbers")
+        raise self.bad(what, f"must be a list of {size} numbers")
 
     def doubles(self, topic: str, names: list[str]) -> Array:
         """The numbers of a topic's messages, (N, len(names))."""
-        type, batches = self._topic(topic)
-        for name in names:
-            field = type.by_name.get(name)
-            if field is None or not isinstance(field.type, Number):
-                raise GroundedError(f"{self.name}: {topic} has no number '{name}'")
+        type, batches = self._topic(topic, names, listed=False)
         numbers = [type.by_name[name].number for name in names]
-        blocks = [self._doubles(type, names, numbers, batch) for batch in batches]
-        return np.concatenate(blocks) if blocks else np.zeros((0, len(names)))
-
-    def times(self, topic: str) -> Ints:
-        """When a topic's messages were sampled (N,) [ns]."""
-        _, batches = self._topic(topic)
-        return np.concatenate([b.publish_times for b in batches] or [np.zeros(0, np.int64)])
-
-    def integer(self, key: str) -> int:
-        """An integer of the table that is not negative."""
-        text = self.entry(key)
-        if not (text.isascii() and text.isdigit() and len(text) < 20):
-            raise GroundedError(
-                f"{self.name}: its metadata '{key}' is '{text[:40]}', not an integer"
-            )
-        return int(text)
-
-    def _doubles(
-        self, type: Struct, names: list[str], numbers: list[int], batch: Messages
-    ) -> Array:
-        fast = uniform_doubles(batch.buffer, batch.starts, batch.ends, numbers)
-        if fast is not None:
-            return fast
-        try:
-            root = protobuf_messages(batch.buffer, type, batch.starts, batch.ends)
-            return np.column_stack([root.field(name).numbers() for name in names])
-        except BadMessage as error:
-            raise DamagedFile(self.name, 0, f"message {error.message}: {error}") from None
-
-    @property
-    def sha256(self) -> str:
-        """The hash of the whole file."""
-        return hashlib.sha256(self.data).hexdigest()
-
-    def names(self, key: str) -> list[str]:
-        """The names of a JSON object of the table, in order."""
-        table = self.json(key, dict)
-        if not table or not all(isinstance(unit, str) for unit in table.values()):
-            raise GroundedError(f"{self.name}: its metadata '{key}' must give each name a unit")
-        return list(table)
-
-    def lists(self, topic: str, sizes: dict[str, int]) -> list[Array]:
-        """Lists of a topic's messages, (N, size) each; (0, size) where no message has any."""
-        type, batches = self._topic(topic)
-        found: dict[str, list[Array]] = {name: [] for name in sizes}
-        count = sum(len(batch) for batch in batches)
+        blocks = []
         for batch in batches:
-            for name in sizes:
-                field = type.by_name.get(name)
-                if field is None or field.type != ArrayType(Number("f8")):
-                    raise GroundedError(f"{self.name}: {topic} has no list '{name}' of doubles")
-                try:
-                    root = protobuf_messages(batch.buffer, type, batch.starts, batch.ends)
-                    items = root.field(name).items(0, -1)
-                    found[name].append(self._list(topic, name, sizes[name], items, len(batch)))
-                except BadMessage as error:
-                    raise DamagedFile(self.name, 0, f"message {error.message}: {error}") from None
-        lists = []
+            block = uniform_doubles(batch.buffer, batch.starts, batch.ends, numbers)
+            if block is None:
+                block = np.column_stack([self._values(type, batch, name)[0] for name in names])
+            blocks.append(block)
+        return np.concatenate(blocks or [np.zeros((0, len(names)))])
+
+    def lists(self, topic: str, sizes: Mapping[str, int]) -> list[Array]:
+        """Lists of a topic's messages, (N, size) each; (0, size) where no message has any."""
+        type, batches = self._topic(topic, sizes, listed=True)
+        found = []
         for name, size in sizes.items():
-            values = np.concatenate(found[name] or [np.zeros((0, size))])
-            if len(values) not in (0, count):
-                raise GroundedError(f"{self.name}: only some messages of {topic} have a '{name}'")
-            lists.append(values)
-        return lists
-
-    def _list(self, topic: str, name: str, size: int, items: Any, count: int) -> Array:
-        lengths = np.bincount(items.rows, minlength=count)
-        if not lengths.any():
-            return np.zeros((0, size))
-        if (lengths != size).any():
-            k = int(np.argmax(lengths != size))
-            raise GroundedError(
-                f"{self.name}: {topic} message {k} has {lengths[k]} numbers in '{name}', not {size}"
-            )
-        values: Array = items.numbers().reshape(count, size)
-        return values
-
-    def _topic(self, topic: str) -> tuple[Struct, list[Messages]]:
-        if topic not in self.types:
-            raise GroundedError(f"{self.name}: it has no channel {topic}")
-        return self.types[topic], self.messages.get(topic, [])
+            parts = [self._values(type, batch, name) for batch in batches]
+            counts = np.concatenate([count for _, count in parts] or [np.zeros(0, int)])
+            if counts.any() and (counts != size).any():
+                k = int(np.argmax(counts != size))
+                raise GroundedError(
+                    f"{self.name}: {topic} message {k} has {counts[k]} numbers in '{name}', "
+                    f"not {size}"
+                )
+            values = np.concatenate([v for v, _ in parts] or [np.zeros(0)])
+            found.append(values.reshape(-1, size))
+        return found
 
     def check_grid(self, topic: str, start_ns: int, dt: float) -> None:
         """Refuses a topic whose samples do not lie within half a step of start + k dt."""
-        times = (self.times(topic) - start_ns) * 1e-9
+        batches = self.messages.get(topic, [])
+        stamps = np.concatenate([b.publish_times for b in batches] or [np.zeros(0, np.int64)])
+        times = (stamps - start_ns) * 1e-9
         off = np.abs(times - dt * np.arange(len(times))) > 0.5 * dt
         if off.any():
             k = int(np.argmax(off))
@@ -213,6 +160,31 @@ class OwnFile:
                 f"grid of {dt} s is {k * dt:.4f} s: samples are missing, or came late. A trial "
                 "needs one at every step: run it again"
             )
+
+    def _topic(
+        self, topic: str, names: Iterable[str], *, listed: bool
+    ) -> tuple[Struct, list[Messages]]:
+        """A topic's messages and their type, which must have these numbers, or lists of them."""
+        if topic not in self.types:
+            raise GroundedError(f"{self.name}: it has no channel {topic}")
+        fields = self.types[topic].by_name
+        for name in names:
+            kind = fields[name].type if name in fields else None
+            if not (kind == DOUBLES if listed else isinstance(kind, Number)):
+                what = f"list '{name}' of doubles" if listed else f"number '{name}'"
+                raise GroundedError(f"{self.name}: {topic} has no {what}")
+        return self.types[topic], self.messages.get(topic, [])
+
+    def _values(self, type: Struct, batch: Messages, name: str) -> tuple[Array, Counts]:
+        """A field's numbers in the messages of a batch, and how many of them each message has."""
+        try:
+            root = protobuf_messages(batch.buffer, type, batch.starts, batch.ends)
+            found = root.field(name)
+            if isinstance(found, ProtobufItems):
+                found = found.items(0, -1)
+            return found.numbers(), np.bincount(found.rows, minlength=len(batch))
+        except BadMessage as error:
+            raise DamagedFile(self.name, 0, f"message {error.message}: {error}") from None
 
 
 def read_own(source: str | Path | bytes, name: str, kind: str) -> OwnFile:
@@ -295,31 +267,22 @@ def _type(channel: Channel, schemas: dict[int, Schema], name: str) -> Struct:
         raise GroundedError(f"{name}: {channel.topic}: {error}") from None
 
 
-def with_meta(table: dict[str, str], meta: Meta) -> dict[str, str]:
-    """The table with the entries of `meta`; a reserved one is refused."""
-    for key, value in meta.items():
+def stated(
+    kind: str, dt: float, states: Units, inputs: Units, meta: Meta, **more: str
+) -> dict[str, str]:
+    """The metadata record of a file: what each states, what its kind adds, and the caller's own.
+
+    Raises:
+        GroundedError: if an entry of `meta` is reserved.
+    """
+    for key in meta:
         if key in RESERVED:
             raise GroundedError(f"metadata '{key}' is written by grounded itself; use another name")
-        table[key] = str(value)
-    return table
+    always = {"format": kind, "dt": repr(float(dt))}
+    always |= {"states": json.dumps(dict(states)), "inputs": json.dumps(dict(inputs))}
+    return always | more | {key: str(value) for key, value in meta.items()}
 
 
 def with_units(names: tuple[str, ...], units: Units | None) -> dict[str, str]:
     """Name -> unit for each name, "1" where none is known."""
     return {name: (units or {}).get(name, "1") for name in names}
-
-
-def rows(values: Array, count: int, size: int) -> Array:
-    """The values as doubles of shape (count, size), or a GroundedError."""
-    array = np.asarray(values, dtype=np.float64)
-    if array.shape != (count, size):
-        raise GroundedError(f"expected an array of shape {(count, size)}, got {array.shape}")
-    return array
-
-
-def deliver(target: Target, data: bytes) -> None:
-    """Writes the bytes to a stream, or to a path at once."""
-    if isinstance(target, str | Path):
-        write_atomically(Path(target), data)
-    else:
-        target.write(data)

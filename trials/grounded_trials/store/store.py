@@ -8,17 +8,21 @@ were joined, are ordered by their hashes.) The hash is computed again at every r
 A file is copied to a temporary name in the same folder, synced, renamed, and the folder synced;
 only then is it acknowledged. A lock keeps other processes out. What a killed process leaves
 behind is a temporary file, which the next one removes.
+
+The results of a study's jobs are kept by other rules: see `StudyStore`.
 """
 
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, MutableMapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from grounded.errors import GroundedError
 
@@ -36,12 +40,8 @@ _BLOCK = 2**20
 
 
 @dataclass(frozen=True)
-class Stored:
-    """A file of the store."""
-
+class _Named:
     path: Path
-    number: int
-    digest: str  # the first 16 hex digits of its SHA-256, from its name
 
     @property
     def id(self) -> str:
@@ -50,17 +50,19 @@ class Stored:
 
 
 @dataclass(frozen=True)
-class Added:
+class Stored(_Named):
+    """A file of the store."""
+
+    number: int
+    digest: str  # the first 16 hex digits of its SHA-256, from its name
+
+
+@dataclass(frozen=True)
+class Added(_Named):
     """What became of a file that was given to the store."""
 
     sha256: str
-    path: Path
     known: bool  # it was there already
-
-    @property
-    def id(self) -> str:
-        """Its short name, such as t0007."""
-        return self.path.name.split("-")[0]
 
 
 @dataclass(frozen=True)
@@ -168,19 +170,17 @@ class Store:
 
     def _place(self, temporary: Path, digest: str, suffix: str) -> Added:
         entries = self.list()
-        for entry in entries:
-            if entry.digest == digest[:DIGITS]:
-                if hash_file(entry.path) == digest:
-                    return Added(digest, entry.path, known=True)
-                entry.path.replace(entry.path.with_name(entry.path.name + ".damaged"))
-                temporary.rename(entry.path)
-                sync_folder(self.folder)
-                return Added(digest, entry.path, known=False)
-        number = entries[-1].number + 1 if entries else 1
-        path = self.folder / f"{self.prefix}{number:04d}-{digest[:DIGITS]}{suffix}"
+        path = next((e.path for e in entries if e.digest == digest[:DIGITS]), None)
+        if path is None:
+            number = entries[-1].number + 1 if entries else 1
+            path = self.folder / f"{self.prefix}{number:04d}-{digest[:DIGITS]}{suffix}"
+        elif hash_file(path) == digest:
+            return Added(path, digest, known=True)
+        else:
+            path.replace(path.with_name(path.name + ".damaged"))
         temporary.rename(path)
         sync_folder(self.folder)
-        return Added(digest, path, known=False)
+        return Added(path, digest, known=False)
 
     def _sweep(self) -> None:
         """Removes what killed processes left; the lock says that none is at work."""
@@ -219,12 +219,9 @@ def write_atomically(path: Path, data: bytes) -> None:
     """
     temporary = path.with_name(f".{path.name}-{os.getpid()}.tmp")
     try:
-        try:
-            _copy(data, temporary, mode=0o644)
-            temporary.replace(path)
-            sync_folder(path.parent)
-        finally:
-            _remove(temporary)
+        _copy(data, temporary, mode=0o644)
+        temporary.replace(path)
+        sync_folder(path.parent)
     except FileNotFoundError:
         raise GroundedError(
             f"{path} can't be written: the folder {path.parent} does not exist; make it, or name "
@@ -232,6 +229,8 @@ def write_atomically(path: Path, data: bytes) -> None:
         ) from None
     except OSError as error:
         raise GroundedError(f"{path} can't be written: {error.strerror}") from None
+    finally:
+        _remove(temporary)
 
 
 def _remove(path: Path) -> None:
@@ -285,3 +284,45 @@ def hash_file(path: Path) -> str:
     for block in _blocks(path):
         hasher.update(block)
     return hasher.hexdigest()
+
+
+class StudyStore(MutableMapping[str, dict[str, Any]]):
+    """Results of a study's jobs by key, a small file each: a study that was cut off goes on.
+
+    A file is named by the hash of the job's key and holds key and result; one that can't be read,
+    or that holds another key, counts as not there.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise GroundedError(f"{folder} can't be made: {error.strerror}") from None
+
+    def _path(self, key: str) -> Path:
+        return self.folder / f"{hashlib.sha256(key.encode()).hexdigest()[:24]}.json"
+
+    def _read(self, path: Path) -> dict[str, dict[str, Any]]:
+        """A file's key and result; nothing where it can't be read."""
+        try:
+            entry = json.loads(path.read_text(encoding="utf-8"))
+            return {str(entry["key"]): dict(entry["result"])}
+        except (OSError, ValueError, KeyError, TypeError):
+            return {}
+
+    def __getitem__(self, key: str) -> dict[str, Any]:
+        return self._read(self._path(key))[key]
+
+    def __setitem__(self, key: str, value: dict[str, Any]) -> None:
+        write_atomically(self._path(key), json.dumps({"key": key, "result": value}).encode())
+
+    def __delitem__(self, key: str) -> None:
+        self._path(key).unlink()
+
+    def __iter__(self) -> Iterator[str]:
+        for path in sorted(self.folder.glob("*.json")):
+            yield from self._read(path)
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)

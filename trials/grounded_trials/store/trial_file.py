@@ -10,24 +10,15 @@ import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
-from typing import IO
+from typing import IO, TypedDict, Unpack
 
 import numpy as np
 
 from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.trial import Trial
-from grounded_trials.store.own_files import (
-    TRIAL,
-    Meta,
-    Target,
-    Units,
-    deliver,
-    read_own,
-    with_meta,
-    with_units,
-)
+from grounded_trials.store.own_files import TRIAL, Meta, Units, read_own, stated, with_units
+from grounded_trials.store.store import write_atomically
 
 FLUSH_NS = 10**9  # at most this much trial time is lost when the robot's battery is
 
@@ -52,7 +43,7 @@ class TrialWriter:
 
     def __init__(
         self,
-        target: Target,
+        target: str | Path | IO[bytes],
         dt: float,
         states: Units,
         inputs: Units,
@@ -66,16 +57,16 @@ class TrialWriter:
         from grounded_trials.formats.mcap_writer import DoublesEncoder, LogWriter
 
         held = None if start_inputs is None else np.asarray(start_inputs, float).tolist()
-        table = {
-            "format": TRIAL,
-            "dt": repr(float(dt)),
-            "states": json.dumps(dict(states)),
-            "inputs": json.dumps(dict(inputs)),
-            "candidate": candidate,
-            "start_inputs": json.dumps(held),
-            "start_ns": str(int(start_ns)),
-        }
-        table = with_meta(table, meta)
+        table = stated(
+            TRIAL,
+            dt,
+            states,
+            inputs,
+            meta,
+            candidate=candidate,
+            start_inputs=json.dumps(held),
+            start_ns=str(int(start_ns)),
+        )
         self._n, self._m, self._start_ns = len(states), len(inputs), start_ns
         self._owned = isinstance(target, str | Path)
         self._stream = _create(Path(target)) if isinstance(target, str | Path) else target
@@ -135,36 +126,42 @@ class TrialWriter:
     def __enter__(self) -> TrialWriter:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
 
+class _About(TypedDict, total=False):
+    state_units: Units
+    input_units: Units
+    start_ns: int
+
+
 def trial_bytes(
-    trial: Trial,
-    meta: Meta,
-    policy: bytes | None = None,
-    *,
-    state_units: Units | None = None,
-    input_units: Units | None = None,
-    start_ns: int = 0,
+    trial: Trial, meta: Meta, policy: bytes | None = None, **about: Unpack[_About]
 ) -> bytes:
-    """A trial as the bytes of a file; equal arguments give equal bytes."""
+    """A trial as the bytes of a file; equal arguments give equal bytes.
+
+    Args:
+        trial: states (T+1, n) and inputs (T, m).
+        meta: entries of the metadata record besides the reserved ones.
+        policy: the bytes of the candidate's file that was run.
+        **about: `state_units` and `input_units` (name -> unit; "1" where missing), and `start_ns`,
+            the absolute time of t = 0 [ns].
+
+    Raises:
+        GroundedError: if an entry of `meta` is reserved.
+    """
     stream = io.BytesIO()
     with TrialWriter(
         stream,
         trial.dt,
-        with_units(trial.state_names, state_units),
-        with_units(trial.input_names, input_units),
+        with_units(trial.state_names, about.get("state_units")),
+        with_units(trial.input_names, about.get("input_units")),
         meta,
         candidate=trial.candidate,
         policy=policy,
         start_inputs=trial.start_inputs,
-        start_ns=start_ns,
+        start_ns=about.get("start_ns", 0),
     ) as writer:
         for k, state in enumerate(trial.states):
             writer.append(k * trial.dt, state, trial.inputs[k] if k < trial.steps else None)
@@ -172,33 +169,14 @@ def trial_bytes(
 
 
 def write_trial(
-    target: Target,
-    trial: Trial,
-    meta: Meta,
-    policy: bytes | None = None,
-    *,
-    state_units: Units | None = None,
-    input_units: Units | None = None,
-    start_ns: int = 0,
+    path: str | Path, trial: Trial, meta: Meta, policy: bytes | None = None, **about: Unpack[_About]
 ) -> None:
-    """Writes a whole trial; the file appears complete or not at all.
-
-    Args:
-        target: a path (replaced if it exists) or a writable binary stream.
-        trial: states (T+1, n) and inputs (T, m).
-        meta: entries of the metadata record besides the reserved ones.
-        policy: the bytes of the candidate's file that was run.
-        state_units: name -> unit; "1" where missing.
-        input_units: the same for the inputs.
-        start_ns: absolute time of t = 0 [ns].
+    """Writes a whole trial as `trial_bytes` has it; the file appears complete or not at all.
 
     Raises:
         GroundedError: if the file can't be written or an entry of `meta` is reserved.
     """
-    data = trial_bytes(
-        trial, meta, policy, state_units=state_units, input_units=input_units, start_ns=start_ns
-    )
-    deliver(target, data)
+    write_atomically(Path(path), trial_bytes(trial, meta, policy, **about))
 
 
 def read_trial(
@@ -227,7 +205,9 @@ def read_trial(
         raise GroundedError(f"{own.name}: {len(x)} states need {len(x) - 1} inputs, found {len(u)}")
     for topic in ("/state", "/input"):
         own.check_grid(topic, own.integer("start_ns"), dt)
-    held = own.json("start_inputs", list, optional=True)
+    held = None
+    if own.entry("start_inputs") != "null":
+        held = own.floats(own.json("start_inputs", list), "start_inputs", len(inputs))
     trial = Trial(
         states=x,
         inputs=u,
@@ -236,7 +216,7 @@ def read_trial(
         input_names=tuple(inputs),
         id=own.sha256,
         candidate=own.meta.get("candidate", ""),
-        start_inputs=None if held is None else own.floats(held, "start_inputs", len(inputs)),
+        start_inputs=held,
     )
     return trial, own.meta, own.attachments.get("policy")
 

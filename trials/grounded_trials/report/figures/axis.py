@@ -1,10 +1,9 @@
-"""Axes: round numbers to write beside them, and where a value lies.
+"""Axes and curves in pixels: ranges that hold the data, round numbers beside them, fewer points.
 
-Fewer points for the same picture: what is left out lies within a pixel of what is drawn.
-
-First, of the points in one column of pixels only the first, lowest, highest and last are kept (so
-that no peak is lost). Then every second point that lies on the line between its neighbours is
-dropped, a few times over.
+A curve is thinned so that what is left out lies within a pixel of what is drawn. First, of the
+points in one column of pixels only the first, lowest, highest and last are kept (so that no peak
+is lost). Then every second point that lies on the line between its neighbours is dropped, a few
+times over.
 """
 
 from __future__ import annotations

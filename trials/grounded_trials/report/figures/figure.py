@@ -1,8 +1,9 @@
-"""Figures: what is drawn, before it is known how: a page and a picture show the same ones.
+"""Figures as plain values: what is drawn, before it is known how.
 
-A figure is a title, a caption and panels; a panel has axes and what lies in them. `figures_draw`
-turns a panel into shapes at places, `figures_svg` and `figures_png` turn shapes into files. Colours
-are roles ("best", "desired"), so that a page can follow the reader's light or dark.
+A figure is a title, a caption and panels; a panel has axes and what lies in them. `draw.py` turns
+a panel into shapes at places and into SVG, `png.py` makes PNG files of them: a page and a
+picture show the same. Colours are roles ("best", "desired"): a page follows the reader's light or
+dark.
 """
 
 from __future__ import annotations
@@ -26,7 +27,14 @@ COLOURS = {
     "step2": ("#e69f00", "#f0e442"),
     "step3": ("#9a9a9a", "#8d8d8d"),
 }
+STEPS = ("step1", "step2", "step3")  # roles of iterations, in order
+WIDTHS = {"best": 2.5, "desired": 1.0}  # of paths; 1.5 for the other roles
 DASHES = {"desired": (6.0, 3.0), "predicted": (2.0, 2.0), "limit": (8.0, 2.0, 2.0, 2.0)}
+
+
+def rgb(colour: str) -> tuple[int, int, int]:
+    """Red, green and blue of "#rrggbb"."""
+    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,14 +72,12 @@ class Rule:
 
 @dataclass(frozen=True)
 class Band:
-    """A horizontal band, or a vertical one, across the panel."""
+    """A faint horizontal band across the panel."""
 
     low: float
     high: float
     role: str
     note: str
-    vertical: bool = False
-    opacity: float = 0.15
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ import numpy as np
 
 from grounded.frozen import Array
 from grounded_trials.report.figures.draw import Box, Drawing, Spot, Stroke, Words, draw
-from grounded_trials.report.figures.figure import COLOURS, DASHES, Figure, Key
+from grounded_trials.report.figures.figure import COLOURS, DASHES, Figure, Key, rgb
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -25,18 +25,8 @@ HEAD, GAP = 64, 16
 LINE = 14  # of the legend
 SIZES = {"text": 12.0, "title": 13.0, "faint": 11.5}
 GREY = {"text": (26, 26, 26), "title": (0, 0, 0), "faint": (92, 92, 92)}
-SPELLED = {
-    "−": "-",
-    "’": "'",
-    "∞": "inf",
-    "α": "alpha",
-    "θ": "theta",
-    "ψ": "psi",
-    "φ": "phi",
-    "ω": "omega",
-    "δ": "delta",
-    "…": "...",
-}
+GREEK = {"α": "alpha", "θ": "theta", "ψ": "psi", "φ": "phi", "ω": "omega", "δ": "delta"}
+SPELLED = str.maketrans(GREEK | {"−": "-", "’": "'", "∞": "inf", "…": "..."})
 
 
 def png(figure: Figure) -> bytes:
@@ -69,13 +59,9 @@ def png(figure: Figure) -> bytes:
 
 def plain(text: str) -> str:
     """The text in letters that the font has."""
-    text = "".join(SPELLED.get(letter, letter) for letter in text)
-    text = unicodedata.normalize("NFKD", text)
-    return "".join(c if ord(c) < 128 or c == "±" else "?" for c in text if not _accent(c))
-
-
-def _accent(letter: str) -> bool:
-    return unicodedata.combining(letter) != 0
+    text = unicodedata.normalize("NFKD", text.translate(SPELLED))
+    letters = [c for c in text if not unicodedata.combining(c)]  # accents are dropped
+    return "".join(c if ord(c) < 128 or c == "±" else "?" for c in letters)
 
 
 def _panel(drawing: Drawing) -> Image.Image:
@@ -158,12 +144,11 @@ def dashed(points: Array, lengths: Array) -> list[Array]:
 def _spot(pen: Any, spot: Spot, factor: int) -> None:
     colour, r = _rgb(spot.role), 4.5 * factor
     x, y = spot.x * factor, spot.y * factor
+    around = [x - r, y - r, x + r, y + r]
     if spot.shape == "disc":
-        pen.ellipse([x - r, y - r, x + r, y + r], fill=colour)
+        pen.ellipse(around, fill=colour)
     elif spot.shape == "ring":
-        pen.ellipse(
-            [x - r, y - r, x + r, y + r], fill="white", outline=colour, width=factor * 3 // 2
-        )
+        pen.ellipse(around, fill="white", outline=colour, width=factor * 3 // 2)
     elif spot.shape == "cross":
         for sign in (-1, 1):
             pen.line([(x - r, y - sign * r), (x + r, y + sign * r)], fill=colour, width=2 * factor)
@@ -202,8 +187,7 @@ def _legend(pen: Any, keys: tuple[Key, ...], places: list[tuple[float, int]]) ->
 
 
 def _rgb(role: str) -> tuple[int, int, int]:
-    colour = COLOURS[role][0]
-    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
+    return rgb(COLOURS[role][0])
 
 
 def _mixed(role: str, opacity: float) -> tuple[int, int, int]:

@@ -105,22 +105,16 @@ def _dots(findings: Findings, tried: Tried, at: int) -> list[Dot]:
 
 def _record(tried: list[Tried], number: dict[str, int]) -> tuple[Curve, ...]:
     """The best utility so far, as steps."""
-    best = -math.inf
-    x: list[float] = []
-    y: list[float] = []
+    best, steps = -math.inf, []
     for t in tried:
         if t.accepted and t.utility > best:
-            if x:
-                x.append(float(number[t.candidate.id]))
-                y.append(best)
             best = t.utility
-            x.append(float(number[t.candidate.id]))
-            y.append(best)
-    if not x:
+            steps.append((float(number[t.candidate.id]), best))
+    if not steps:
         return ()
-    x.append(float(max(number.values())))
-    y.append(best)
-    return (Curve(np.array(x), np.array(y), "best", "", 1.2),)
+    at, values = np.array(steps).T
+    x = np.append(np.repeat(at, 2)[1:], float(max(number.values())))
+    return (Curve(x, np.repeat(values, 2), "best", "", 1.2),)
 
 
 def _steps(findings: Findings, number: dict[str, int]) -> Panel:

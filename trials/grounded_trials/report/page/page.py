@@ -44,14 +44,10 @@ def page(findings: Findings) -> str:
         "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'; "
         f"script-src 'sha256-{digest}'"
     )
-    sections = [(title, body) for title, body in _sections(findings) if body]
-    links = "".join(
-        f'<a href="#s{number}">{escape(title)}</a>' for number, (title, _) in enumerate(sections)
-    )
-    bodies = "".join(
-        f'<section id="s{number}"><h2>{escape(title)}</h2>{body}</section>'
-        for number, (title, body) in enumerate(sections)
-    )
+    links = bodies = ""
+    for number, (title, body) in enumerate(s for s in _sections(findings) if s[1]):
+        links += f'<a href="#s{number}">{escape(title)}</a>'
+        bodies += f'<section id="s{number}"><h2>{escape(title)}</h2>{body}</section>'
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
@@ -103,13 +99,13 @@ def _tiles(findings: Findings) -> str:
     if first is not None and best is not None and -math.inf < first.utility < 0:
         gain = 100 * (1 - best.utility / first.utility)
         tiles.append((f"{gain:.1f} %", "of the first policy’s loss is gone"))
-    trials, better = findings.standing.trials, count(findings.standing.iteration, "improvement")
-    if findings.history or not findings.logs:
-        tiles.append((str(trials), f"trial{'s' * (trials != 1)}, {better}"))
-    if findings.logs:
-        logs = len(findings.logs)
+    now, logs = findings.standing, len(findings.logs)
+    if findings.history or not logs:
+        better = count(now.iteration, "improvement")
+        tiles.append((str(now.trials), f"trial{'s' * (now.trials != 1)}, {better}"))
+    if logs:
         tiles.append((str(logs), f"log{'s' * (logs != 1)} of data"))
-    tiles.append((findings.standing.phase, "phase of the search"))
+    tiles.append((now.phase, "phase of the search"))
     inside = "".join(
         f'<div class="tile"><b>{escape(a)}</b><span>{escape(b)}</span></div>' for a, b in tiles
     )
@@ -119,13 +115,9 @@ def _tiles(findings: Findings) -> str:
 def _lost(findings: Findings) -> str:
     if not findings.lost:
         return ""
-    items = "".join(
-        f"<li><b>{escape(one.file)}</b>: {escape(one.reason)}</li>" for one in findings.lost
-    )
-    return (
-        '<div class="lost" id="lost"><b>This report is not complete.</b> Left out: '
-        f"<ul>{items}</ul></div>"
-    )
+    items = [f"<li><b>{escape(one.file)}</b>: {escape(one.reason)}</li>" for one in findings.lost]
+    said = "<b>This report is not complete.</b> Left out: "
+    return f'<div class="lost" id="lost">{said}<ul>{"".join(items)}</ul></div>'
 
 
 def _utility(findings: Findings) -> str:

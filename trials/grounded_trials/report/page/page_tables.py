@@ -1,23 +1,21 @@
-"""The page's tables: trials, errors, effects, parameters, states and inputs.
+"""The page's pieces: its tables, figures with their legends, commands to copy, and colours.
 
-Pieces of the page. Every text goes through `escape`: names come from strangers' files too.
+Every text goes through `escape`: names come from strangers' files too.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from html import escape
 
-import numpy as np
-
 from grounded.diagnosis.report import Diagnosis, Estimate, Ranked
-from grounded_trials.report.figures.draw import draw
+from grounded_trials.report.figures.draw import draw, svg
 from grounded_trials.report.figures.figure import COLOURS, DASHES, Figure, Key
-from grounded_trials.report.figures.svg import svg
 from grounded_trials.report.findings import (
     Findings,
-    Run,
+    by_state,
+    compared,
     prediction_error,
     rms,
     standard_error,
@@ -33,58 +31,35 @@ UNKNOWN = "–, not determined by these trials"
 
 def candidate_table(findings: Findings) -> str:
     """Every candidate with its trials."""
-    rows: list[tuple[str, ...]] = []
-    strong, best = -1, findings.standing.incumbent
+    rows, best = [], findings.standing.incumbent
     for tried in findings.history:
         c = tried.candidate
-        if best is not None and c is best.candidate:
-            strong = len(rows)
-        rows.append(
-            (
-                c.id,
-                str(c.iteration),
-                f"{c.alpha:g}",
-                f"{c.damping:.2g}" if c.base else "-",
-                figure(c.predicted_utility),
-                figure(tried.utility),
-                figure(standard_error(tried), 2),
-                verdict(tried, tried is findings.history[-1]),
-                " ".join(t.id for t in tried.trials) or "none",
-            )
-        )
-    header = (
-        "candidate",
-        "iteration",
-        "alpha",
-        "damping",
-        "predicted utility",
-        "real utility",
-        "std. error",
-        "verdict ",
-        "trials ",
-    )
-    return table("candidates", header, rows, {strong})
+        cells = {
+            "candidate": c.id,
+            "iteration": str(c.iteration),
+            "alpha": f"{c.alpha:g}",
+            "damping": f"{c.damping:.2g}" if c.base else "-",
+            "predicted utility": figure(c.predicted_utility),
+            "real utility": figure(tried.utility),
+            "std. error": figure(standard_error(tried), 2),
+            "verdict ": verdict(tried, tried is findings.history[-1]),
+            "trials ": " ".join(t.id for t in tried.trials) or "none",
+        }
+        rows.append(cells)
+    strong = {k for k, t in enumerate(findings.history) if best and t.candidate is best.candidate}
+    return table("candidates", list(rows[0]), [list(cells.values()) for cells in rows], strong)
 
 
 def error_table(findings: Findings) -> str:
     """Rms by state: off the target, off the prediction, and the bias."""
-    task, best = findings.task, findings.best
-    if best is None:
+    task, runs = findings.task, [run for _, run in compared(findings)]
+    if findings.best is None:
         return ""
-    runs = [r for r in (findings.first, best) if r is not None]
-    if len(runs) == 2 and runs[0].candidate is runs[1].candidate:
-        runs = runs[1:]
-    measures: list[tuple[str, Callable[[Run], np.ndarray]]] = [
-        ("off target", lambda run: rms(tracking_error(task, run.trial))),
-        ("off prediction", lambda run: rms(prediction_error(task, run))),
-        ("bias per s", lambda run: rms(run.residual) / task.dt),
-    ]
-    columns = [(f"{what}, {run.candidate.id}", get(run)) for what, get in measures for run in runs]
-    rows = [
-        (name, shown(unit), *(figure(float(values[i]), 3) for _, values in columns))
-        for i, (name, unit) in enumerate(task.model.states.items())
-    ]
-    return table("errors", ("state", "unit", *(name for name, _ in columns)), rows)
+    columns = {f"off target, {r.candidate.id}": rms(tracking_error(task, r.trial)) for r in runs}
+    columns |= {f"off prediction, {r.candidate.id}": rms(prediction_error(task, r)) for r in runs}
+    columns |= {f"bias per s, {r.candidate.id}": rms(r.residual) / task.dt for r in runs}
+    rows = by_state(task.model, [*columns.values()])
+    return table("errors", ("state", "unit", *columns), rows)
 
 
 def forecast_table(findings: Findings) -> str:
@@ -96,17 +71,11 @@ def forecast_table(findings: Findings) -> str:
     planners = [("without adopted effects" if findings.effects else "crude", findings.crude)]
     if findings.better is not None:
         planners.append((findings.better.name, findings.better.planner))
-    columns = []
-    for trial in trials:
-        name = trial.id or trial.candidate
-        columns += [(f"{name}, {words}", forecast_error(p, trial)) for words, p in planners]
-    rows = [
-        (state, shown(unit), *(figure(float(values[i]), 3) for _, values in columns))
-        for i, (state, unit) in enumerate(findings.task.model.states.items())
-    ]
-    header = ("state", "unit", *(name for name, _ in columns))
+    names = [f"{t.id or t.candidate}, {words}" for t in trials for words, _ in planners]
+    columns = [forecast_error(planner, t) for t in trials for _, planner in planners]
     title = f"<h3>Error of the model {SECONDS:g} s ahead, rms</h3>"
-    return title + table("forecasts", header, rows)
+    rows = by_state(findings.task.model, columns)
+    return title + table("forecasts", ("state", "unit", *names), rows)
 
 
 def effect_table(diagnosis: Diagnosis, since: Since) -> str:
@@ -169,12 +138,11 @@ def parameter_table(findings: Findings) -> str:
     rows = []
     for name, param in findings.task.model.params.items():
         nominal = findings.nominal.get(name)
-        changed = "" if nominal is None or nominal == param.value else figure(nominal)
-        limits = (
-            "free" if param.low is None and param.high is None else _range(param.low, param.high)
-        )
+        changed = "-" if nominal == param.value else figure(nominal)
+        free = param.low is None and param.high is None
+        limits = "free" if free else _range(param.low, param.high)
         found = _interval(estimated[name]) if name in estimated else "-"
-        rows.append((name, figure(param.value), shown(param.unit), changed or "-", limits, found))
+        rows.append((name, figure(param.value), shown(param.unit), changed, limits, found))
     if not rows:
         return "<p>The model has no parameters.</p>"
     header = ("parameter", "value", "unit", "in model.py", "bounds", "diagnosed, 95 %")
@@ -183,13 +151,11 @@ def parameter_table(findings: Findings) -> str:
 
 def channel_table(findings: Findings) -> str:
     """States and inputs with units, weights, limits and latency."""
-    task, rows = findings.task, []
-    reward = task.reward
+    task, reward, rows = findings.task, findings.task.reward, []
     assert task.latency is not None
     for i, (name, unit) in enumerate(task.model.states.items()):
-        weight = f"{reward.state[i]:g}" + (
-            f", terminal {reward.terminal[i]:g}" if reward.terminal[i] else ""
-        )
+        weight = f"{reward.state[i]:g}"
+        weight += f", terminal {reward.terminal[i]:g}" if reward.terminal[i] else ""
         rows.append((name, "state", shown(unit), weight, "-", "-"))
     for j, (name, unit) in enumerate(task.model.inputs.items()):
         weight = f"{reward.input[j]:g}, change {reward.input_change[j]:g}"
@@ -255,16 +221,16 @@ def role_styles() -> str:
     return f"{light}{dashes}@media screen and (prefers-color-scheme: dark){{{dark}}}"
 
 
+MARKS = {  # of a legend, by the shape of its entry
+    "line": '<path class="{} line" stroke-width="25" d="M0 60h260"/>',
+    "dash": '<path class="{} line whole" stroke-width="25" d="M60 60h140"/>',
+    "cross": '<path class="{} line" stroke-width="20" d="M85 15l90 90m0-90l-90 90"/>',
+    "band": '<rect class="{} fill" fill-opacity="0.3" width="260" height="120"/>',
+    "disc": '<circle class="{} fill" cx="130" cy="60" r="45"/>',
+    "ring": '<circle class="{} hollow" cx="130" cy="60" r="45"/>',
+}
+
+
 def _key(key: Key) -> str:
-    if key.shape == "line" or key.shape == "dash":
-        length = "M0 60h260" if key.shape == "line" else "M60 60h140"
-        solid = " whole" if key.shape == "dash" else ""
-        mark = f'<path class="{key.role} line{solid}" stroke-width="25" d="{length}"/>'
-    elif key.shape == "cross":
-        mark = f'<path class="{key.role} line" stroke-width="20" d="M85 15l90 90m0-90l-90 90"/>'
-    elif key.shape == "band":
-        mark = f'<rect class="{key.role} fill" fill-opacity="0.3" width="260" height="120"/>'
-    else:
-        kind = "fill" if key.shape == "disc" else "hollow"
-        mark = f'<circle class="{key.role} {kind}" cx="130" cy="60" r="45"/>'
+    mark = MARKS[key.shape].format(key.role)
     return f'<svg viewBox="0 0 260 120" aria-hidden="true">{mark}</svg>'

@@ -1,4 +1,4 @@
 """The workspace as a Rerun recording, one .rrd file. Only this room imports rerun.
 
-Read `recording.py` first, then `layout.py` (the views) and `marks.py` (curves, paths and bodies).
+Read `recording.py` first (what is recorded, and how), then `layout.py` (the viewer's views).
 """

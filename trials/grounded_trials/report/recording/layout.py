@@ -45,8 +45,11 @@ def blueprint(findings: Findings, scene: Scene) -> Any:
 def _overview(findings: Findings, scene: Scene) -> Any:
     import rerun.blueprint as rrb
 
-    model = findings.task.model
-    chosen = _interesting(findings)
+    model, reward = findings.task.model, findings.task.reward
+    weighed = reward.state + reward.terminal != 0
+    chosen = sorted(model.states, key=lambda n: not weighed[model.state_names.index(n)])[:FIRST]
+    axes = [labelled(name, unit) for name, unit in zip(scene.names, scene.units, strict=True)]
+    title = "Paths: " + " over ".join(reversed(axes)) if len(axes) == 2 else "Paths"
     named = [(f"/state/{n}", f"{n} [{model.states[n]}]") for n in chosen]
     named += [(f"/input/{n}", labelled(n, u)) for n, u in list(model.inputs.items())[:2]]
     named += [
@@ -54,7 +57,7 @@ def _overview(findings: Findings, scene: Scene) -> Any:
     ]
     plots = [_plot(origin, name, legend=False) for origin, name in named]
     left = rrb.Vertical(
-        _space(findings, scene, "/", ["/paths/**"], _axes(scene)),
+        _space(findings, scene, ["/paths/**"], title),
         rrb.Horizontal(
             rrb.BarChartView(
                 origin="/utilities",
@@ -65,43 +68,28 @@ def _overview(findings: Findings, scene: Scene) -> Any:
         ),
         row_shares=[3, 2],
     )
-    return rrb.Horizontal(
-        left, rrb.Grid(*plots, grid_columns=2), name="Overview", column_shares=[1, 1]
-    )
-
-
-def _axes(scene: Scene) -> str:
-    axes = [labelled(name, unit) for name, unit in zip(scene.names, scene.units, strict=True)]
-    return "Paths: " + " over ".join(reversed(axes)) if len(axes) == 2 else "Paths"
-
-
-def _interesting(findings: Findings) -> list[str]:
-    """The states with a weight in the reward, then the others."""
-    task = findings.task
-    weight = task.reward.state + task.reward.terminal
-    order = sorted(range(task.model.n), key=lambda i: (weight[i] == 0, i))
-    return [task.model.state_names[i] for i in order[:FIRST]]
+    right = rrb.Grid(*plots, grid_columns=2)
+    return rrb.Horizontal(left, right, name="Overview", column_shares=[1, 1])
 
 
 def _trials(findings: Findings, scene: Scene) -> list[Any]:
     import rerun.blueprint as rrb
 
-    tabs = []
+    shown = []
     for run in findings.runs[-TRIALS:]:
-        at = f"/trials/{run.trial.id}"
-        contents = ["/paths/desired", f"{at}/path", f"{at}/predicted", f"{at}/body"]
         names = dict(NAMES)
         if run.explained is not None:
             names["explained"] = "bias that is left after the diagnosis"
-        plots = [_plot(f"{at}/{key}", name) for key, name in names.items()]
-        space = _space(findings, scene, "/", contents, f"{run.label}, utility {run.utility:.4g}")
-        tabs.append(rrb.Horizontal(space, rrb.Vertical(*plots), name=run.trial.id))
+        about = f"{run.label}, utility {run.utility:.4g}"
+        shown.append((f"/trials/{run.trial.id}", about, names, ["path", "predicted", "body"]))
     for log in findings.logs[-TRIALS:]:
-        at = f"/data/{log.trial.id}"
-        plots = [_plot(f"{at}/{key}", name) for key, name in NAMES.items()]
-        contents = ["/paths/desired", f"{at}/path", f"{at}/body"]
-        space = _space(findings, scene, "/", contents, f"{log.trial.id}, data")
-        tabs.append(rrb.Horizontal(space, rrb.Vertical(*plots), name=log.trial.id))
+        shown.append((f"/data/{log.trial.id}", f"{log.trial.id}, data", NAMES, ["path", "body"]))
+    tabs = []
+    for at, about, names, drawn in shown:
+        contents = ["/paths/desired", *(f"{at}/{part}" for part in drawn)]
+        plots = [_plot(f"{at}/{key}", name) for key, name in names.items()]
+        space = _space(findings, scene, contents, about)
+        tabs.append(rrb.Horizontal(space, rrb.Vertical(*plots), name=at.split("/")[-1]))
     return tabs
 
 
@@ -112,7 +100,7 @@ def _plot(origin: str, name: str, legend: bool = True) -> Any:
     return rrb.TimeSeriesView(origin=origin, name=name, plot_legend=key)
 
 
-def _space(findings: Findings, scene: Scene, origin: str, contents: list[str], name: str) -> Any:
+def _space(findings: Findings, scene: Scene, contents: list[str], name: str) -> Any:
     """A view of space: from above for a plane (so that y points up), from the side for a volume."""
     import rerun.blueprint as rrb
 
@@ -128,17 +116,16 @@ def _space(findings: Findings, scene: Scene, origin: str, contents: list[str], n
     spacing = 10.0 ** math.floor(math.log10(max(extent, 1e-3) / 2))
     grid = rrb.LineGrid3D(visible=True, spacing=spacing, color=(90, 90, 90, 60))
     return rrb.Spatial3DView(
-        origin=origin, contents=contents, name=name, eye_controls=eye, line_grid=grid
+        origin="/", contents=contents, name=name, eye_controls=eye, line_grid=grid
     )
 
 
 def _bounds(findings: Findings, scene: Scene) -> tuple[Array, float]:
     """The middle and the size of all that is drawn, without runs that went astray."""
-    shown = [findings.task.target] if findings.task.target is not None else []
+    shown = [findings.task.target]
     shown += [run.trial.states for run in (findings.best, findings.first) if run is not None]
     shown += [log.trial.states for log in findings.logs] if not findings.runs else []
-    points = np.vstack([scene.points(s) for s in shown])
-    points = points[np.isfinite(points).all(axis=1)]
+    points = np.vstack([scene.finite(s) for s in shown])
     if not len(points):
         return np.zeros(3), 1.0
     low, high = points.min(axis=0), points.max(axis=0)

@@ -1,22 +1,22 @@
-"""The recording: a workspace for the Rerun viewer, one .rrd file. Only `recording*` imports rerun.
+"""The recording: a workspace for the Rerun viewer, one .rrd file.
 
     /paths/...                desired, the model's own policy, the best so far and its prediction
     /state/x/...              the same over time, a plot a state;  /input/u/...  with their limits
     /bias/x/...               what the crude model lacks along the run [unit/s], by iteration
     /trials/t0007/...         everything of one trial: path, prediction, body, state, input, bias
     /data/t0003/...           the same of a log that ran no candidate
-    /utilities, /summary      by iteration, and in words
+    /utilities, /summary      by iteration, and in words (Markdown)
 
 One timeline, `time`, in seconds since the start of a trial. Numbers go in by whole columns, names
 and colours once. A file is derived from trials: it may be deleted, and files of single trials of
 one workspace merge into one recording (`rerun rrd merge`), for their identity is the same.
-
-The recording's summary, in Markdown.
 """
 
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -25,14 +25,30 @@ import numpy as np
 from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.trial import Trial
-from grounded_trials.report.findings import Findings, Log, Run, selection, tracked
-from grounded_trials.report.recording import marks
+from grounded_trials.report.figures.figure import COLOURS as PAGE
+from grounded_trials.report.figures.figure import rgb
+from grounded_trials.report.findings import Findings, Run, selection, tracked
 from grounded_trials.report.recording.layout import blueprint
 from grounded_trials.report.scene import Scene, scene_of
 from grounded_trials.wording import count, labelled, per_second
 
+COLOURS = {role: rgb(dark) for role, (_, dark) in PAGE.items()}
+COLOURS |= {"desired": (170, 170, 170), "other": (110, 110, 110), "model_policy": COLOURS["model"]}
+SERIES = [COLOURS[role] for role in ("best", "limit", "accepted", "step2", "predicted", "model")]
+CAR = (
+    [(-0.5, -0.25, 0), (0.5, -0.25, 0), (0.5, 0.25, 0), (-0.5, 0.25, 0), (-0.5, -0.25, 0)],
+    [(0.5, -0.25, 0), (0.85, 0, 0), (0.5, 0.25, 0)],
+)
+AIRCRAFT = (
+    [(-0.6, 0, 0), (0.5, 0, 0)],
+    [(-0.1, 0.8, 0), (0.2, 0, 0), (-0.1, -0.8, 0), (-0.1, 0.8, 0)],
+    [(-0.6, 0.25, 0), (-0.6, -0.25, 0)],
+    [(-0.4, 0, 0), (-0.65, 0, 0.25), (-0.6, 0, 0)],
+)
 ITERATIONS = 4  # of the bias, in one plot
 FINE = 600  # steps; the bias of longer trials is averaged over a few steps, or files get large
+FRAMES = 600  # poses of a body in an animation
+VERTICES = 1000  # of a path in space
 
 
 def write_recording(findings: Findings, path: Path) -> None:
@@ -51,7 +67,7 @@ def write_recording(findings: Findings, path: Path) -> None:
     try:
         stream.save(temporary, default_blueprint=blueprint(findings, scene))
         stream.send_recording_name(findings.name)
-        _everything(stream, findings, scene)
+        _Recorder(stream, findings, scene).everything()
         stream.flush()
         stream.disconnect()
         temporary.replace(path)
@@ -61,100 +77,176 @@ def write_recording(findings: Findings, path: Path) -> None:
         temporary.unlink(missing_ok=True)
 
 
-def _everything(stream: Any, findings: Findings, scene: Scene) -> None:
-    import rerun as rr
+class _Recorder:
+    """Findings on their way into a stream: first what is recorded, then how."""
 
-    stream.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    stream.log(
-        "summary", rr.TextDocument(summary(findings), media_type="text/markdown"), static=True
-    )
-    values = [u for u in findings.standing.utilities if np.isfinite(u)]
-    if values:
-        stream.log("utilities", rr.BarChart(values, color=marks.COLOURS["best"]), static=True)
-    _paths(stream, findings, scene)
-    _compared(stream, findings)
-    _biases(stream, findings)
-    for run in findings.runs:
-        _trial(stream, findings, scene, run)
-    for log in findings.logs:
-        _log(stream, findings, scene, log)
+    def __init__(self, stream: Any, findings: Findings, scene: Scene) -> None:
+        self.stream, self.findings, self.scene = stream, findings, scene
+        self.task, self.dt = findings.task, findings.task.dt
+        self.compared = {"model_policy": findings.first, "best": findings.best}
+        self.per_second = {n: per_second(u) for n, u in findings.task.model.states.items()}
 
+    def everything(self) -> None:
+        import rerun as rr
 
-def _paths(stream: Any, findings: Findings, scene: Scene) -> None:
-    """The paths that one wants to see first, with a body on each that was really run."""
-    task, first, best = findings.task, findings.first, findings.best
-    if all(np.isfinite(task.target[:, i]).all() for i in scene.axes):
-        marks.path(stream, "paths/desired", scene.points(task.target), "desired", 2.0)
-    shown = {"model_policy": first}
-    waiting = findings.standing.outstanding
-    if first is None and waiting is not None:
-        planned = scene.points(waiting.predicted_states)
-        marks.path(stream, "paths/predicted", planned, "predicted", 1.5)
-    if best is not None and (first is None or best.candidate is not first.candidate):
-        predicted = scene.points(best.candidate.predicted_states)
-        marks.path(stream, "paths/predicted", predicted, "predicted", 1.0)
-        shown["best"] = best
-    for role, run in shown.items():
-        if run is not None:
-            _moving(stream, findings, scene, f"paths/{role}", run, role)
+        log, findings = self.stream.log, self.findings
+        log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        log("summary", rr.TextDocument(summary(findings), media_type="text/markdown"), static=True)
+        values = [u for u in findings.standing.utilities if np.isfinite(u)]
+        if values:
+            log("utilities", rr.BarChart(values, color=COLOURS["best"]), static=True)
+        self.paths()
+        self.over_time()
+        self.biases()
+        for run in findings.runs:
+            self.trial(run)
+        for one in findings.logs:
+            self.moving(f"data/{one.trial.id}", one.trial, "best", "/path", 1.5)
+            self.signals(f"data/{one.trial.id}", one.trial, one.residual)
 
+    def paths(self) -> None:
+        """The paths that one wants to see first, with a body on each that was really run."""
+        task, first, best = self.task, self.findings.first, self.findings.best
+        if all(np.isfinite(task.target[:, i]).all() for i in self.scene.axes):
+            self.path("paths/desired", task.target, "desired", 2.0)
+        waiting = self.findings.standing.outstanding
+        if first is None and waiting is not None:
+            self.path("paths/predicted", waiting.predicted_states, "predicted", 1.5)
+        shown = [("model_policy", first)]
+        if best is not None and (first is None or best.candidate is not first.candidate):
+            self.path("paths/predicted", best.candidate.predicted_states, "predicted", 1.0)
+            shown.append(("best", best))
+        for role, run in shown:
+            if run is not None:
+                self.moving(f"paths/{role}", run.trial, role)
 
-def _moving(
-    stream: Any, findings: Findings, scene: Scene, at: str, run: Run, colour: str, path: str = ""
-) -> None:
-    """A path that was run, and the body that moves along it."""
-    states, size = run.trial.states, _size(findings, scene)
-    marks.path(stream, at + path, scene.points(states), colour, 2.0)
-    marks.body(stream, f"{at}/body", scene, states, findings.task.dt, size, colour)
+    def over_time(self) -> None:
+        """States and inputs over time, a plot each: target and limits beside what was run."""
+        task, best, known = self.task, self.findings.best, tracked(self.task)
+        for i, name in enumerate(task.model.state_names):
+            if i in known:
+                self.line(f"state/{name}/desired", task.target[:, i], self.dt, "desired")
+            self.runs(f"state/{name}", "states", i)
+            if best is not None:
+                predicted = best.candidate.predicted_states[:, i]
+                self.line(f"state/{name}/predicted", predicted, self.dt, "predicted", width=1)
+        for j, name in enumerate(task.model.input_names):
+            self.runs(f"input/{name}", "inputs", j)
+            for bound, limit in (("low", task.low[j]), ("high", task.high[j])):
+                if np.isfinite(limit):
+                    span, whole = np.full(2, limit), self.dt * task.horizon
+                    self.line(f"input/{name}/{bound}", span, whole, "limit", width=1)
 
+    def runs(self, at: str, kind: str, column: int) -> None:
+        """One quantity along the model's policy and along the best so far."""
+        words = {"model_policy": "the model's policy", "best": "best so far"}
+        for role, run in self.compared.items():
+            if run is not None:
+                values = getattr(run.trial, kind)[:, column]
+                name, width = f"{words[role]}, {run.label}", 3.0 if role == "best" else 1.5
+                self.line(f"{at}/{role}", values, self.dt, role, name, width)
 
-def _compared(stream: Any, findings: Findings) -> None:
-    """States and inputs over time, a plot each: target and limits beside what was run."""
-    task, best = findings.task, findings.best
-    known = tracked(task)
-    for i, name in enumerate(task.model.state_names):
-        if i in known:
-            marks.line(stream, f"state/{name}/desired", task.target[:, i], task.dt, "desired")
-        _runs(stream, findings, f"state/{name}", "states", i)
-        if best is not None:
-            predicted = best.candidate.predicted_states[:, i]
-            marks.line(stream, f"state/{name}/predicted", predicted, task.dt, "predicted", width=1)
-    for j, name in enumerate(task.model.input_names):
-        _runs(stream, findings, f"input/{name}", "inputs", j)
-        for bound, limit in (("low", task.low[j]), ("high", task.high[j])):
-            if np.isfinite(limit):
-                span, whole = np.full(2, limit), task.dt * task.horizon
-                marks.line(stream, f"input/{name}/{bound}", span, whole, "limit", width=1)
+    def biases(self) -> None:
+        """What the crude model lacks, by iteration; what the diagnosed effects leave of it."""
+        best, better = self.findings.best, self.findings.better
+        shown = selection(self.findings.improvements, ITERATIONS)
+        for number, run in enumerate(shown):
+            last = number == len(shown) - 1 and number > 0
+            colour = "best" if last else ("model_policy", "accepted", "other")[number % 3]
+            self.rates(f"iteration {run.candidate.iteration}", run.residual, colour)
+        if best is not None and best.explained is not None and better is not None:
+            self.rates(f"left, {better.name}", best.explained, "limit")
 
+    def rates(self, key: str, residual: Array, colour: str) -> None:
+        rates, dt = rate(residual, self.dt)
+        for i, name in enumerate(self.task.model.state_names):
+            at = f"bias/{name}/{key.replace(' ', '_').replace(',', '')}"
+            self.line(at, rates[:, i], dt, colour, key, 1.0)
 
-def _runs(stream: Any, findings: Findings, at: str, kind: str, column: int) -> None:
-    """One quantity along the model's policy and along the best so far."""
-    for role, run in (("model_policy", findings.first), ("best", findings.best)):
-        if run is not None:
-            name, width = _words(role, run), 3.0 if role == "best" else 1.5
-            values = getattr(run.trial, kind)[:, column]
-            marks.line(stream, f"{at}/{role}", values, findings.task.dt, role, name, width)
+    def trial(self, run: Run) -> None:
+        """Everything of one trial, under its own name."""
+        at, colour = f"trials/{run.trial.id}", "accepted" if run.accepted else "other"
+        for role, chosen in self.compared.items():
+            if chosen is not None and run.candidate is chosen.candidate:
+                colour = role
+        self.moving(at, run.trial, colour, "/path")
+        self.path(f"{at}/predicted", run.candidate.predicted_states, "predicted", 1.0)
+        self.signals(at, run.trial, run.residual)
+        if run.explained is not None:
+            self.columns(f"{at}/explained", *rate(run.explained, self.dt), self.per_second)
 
+    def signals(self, at: str, trial: Trial, residual: Array) -> None:
+        """States, inputs and bias, each as one entity with named columns."""
+        model = self.task.model
+        self.columns(f"{at}/state", trial.states, self.dt, model.states)
+        self.columns(f"{at}/input", trial.inputs, self.dt, model.inputs)
+        self.columns(f"{at}/bias", *rate(residual, self.dt), self.per_second)
 
-def _biases(stream: Any, findings: Findings) -> None:
-    """What the crude model lacks, by iteration; and what the diagnosed effects leave of it."""
-    best = findings.best
-    shown = selection(findings.improvements, ITERATIONS)
-    colours = ["model_policy", "accepted", "other", "best"]
-    for number, run in enumerate(shown):
-        last = number == len(shown) - 1 and number > 0
-        key = f"iteration {run.candidate.iteration}"
-        colour = "best" if last else colours[number % 3]
-        _rates(stream, findings, key, run.residual, colour)
-    if best is not None and best.explained is not None and findings.better is not None:
-        _rates(stream, findings, f"left, {findings.better.name}", best.explained, "limit")
+    @cached_property
+    def size(self) -> float:
+        """The length of a body that can be seen beside the path."""
+        shown = self.findings.runs or self.findings.logs
+        points = self.scene.finite(shown[0].trial.states if shown else self.task.target)
+        return 0.07 * (float(np.ptp(points, axis=0).max()) or 1.0) if len(points) else 0.07
 
+    def moving(
+        self, at: str, trial: Trial, colour: str, path: str = "", width: float = 2.0
+    ) -> None:
+        """A path that was run, and the body that moves and turns along it."""
+        import rerun as rr
 
-def _rates(stream: Any, findings: Findings, key: str, residual: Array, colour: str) -> None:
-    rates, dt = rate(residual, findings.task.dt)
-    for i, name in enumerate(findings.task.model.state_names):
-        at = f"bias/{name}/{key.replace(' ', '_').replace(',', '')}"
-        marks.line(stream, at, rates[:, i], dt, colour, key, 1.0)
+        self.path(at + path, trial.states, colour, width)
+        rows = np.flatnonzero(np.isfinite(trial.states).all(axis=1))
+        rows = rows[:: max(1, len(rows) // FRAMES)]
+        if self.scene.spatial:
+            strips = [self.size * np.array(s) for s in (AIRCRAFT if self.scene.volume else CAR)]
+            thin = rr.Radius.ui_points(2)
+            body: Any = rr.LineStrips3D(strips, colors=COLOURS[colour], radii=thin)
+        else:
+            thick = rr.Radius.ui_points(6)
+            body = rr.Points3D([[0, 0, 0]], colors=COLOURS[colour], radii=thick)
+        self.stream.log(f"{at}/body", body, static=True)
+        pose = rr.Transform3D.columns(
+            translation=self.scene.points(trial.states[rows]),
+            mat3x3=self.scene.rotations(trial.states[rows]),
+        )
+        times = [rr.TimeColumn("time", duration=rows * self.dt)]
+        self.stream.send_columns(f"{at}/body", times, pose)
+
+    def path(self, at: str, states: Array, colour: str, width: float) -> None:
+        """A path in space, all of it at once."""
+        import rerun as rr
+
+        points = self.scene.finite(states)
+        if not len(points):
+            return
+        points = points[np.unique(np.linspace(0, len(points) - 1, VERTICES).astype(int))]
+        strip = rr.LineStrips3D([points], colors=COLOURS[colour], radii=rr.Radius.ui_points(width))
+        self.stream.log(at, strip, static=True)
+
+    def line(
+        self, at: str, values: Array, dt: float, colour: str, name: str = "", width: float = 1.5
+    ) -> None:
+        """One curve over time, named by default after its colour; only what is finite."""
+        import rerun as rr
+
+        style = rr.SeriesLines(colors=COLOURS[colour], names=name or colour, widths=width)
+        self.stream.log(at, style, static=True)
+        keep = np.flatnonzero(np.isfinite(values))
+        times = [rr.TimeColumn("time", duration=keep * dt)]
+        self.stream.send_columns(at, times, rr.Scalars.columns(scalars=values[keep]))
+
+    def columns(self, at: str, values: Array, dt: float, units: Mapping[str, str]) -> None:
+        """All columns of an array as one entity; `units` by the names of the columns."""
+        import rerun as rr
+
+        steps, width = values.shape
+        names = [labelled(name, unit) for name, unit in units.items()]
+        colours = [SERIES[i % len(SERIES)] for i in range(width)]
+        self.stream.log(at, rr.SeriesLines(colors=colours, names=names), static=True)
+        scalars = rr.Scalars.columns(scalars=np.ascontiguousarray(values).reshape(-1))
+        times = [rr.TimeColumn("time", duration=np.arange(steps) * dt)]
+        self.stream.send_columns(at, times, scalars.partition([width] * steps))
 
 
 def rate(residual: Array, dt: float) -> tuple[Array, float]:
@@ -164,55 +256,6 @@ def rate(residual: Array, dt: float) -> tuple[Array, float]:
         return residual / dt, dt
     whole = residual[: len(residual) // step * step]
     return whole.reshape(-1, step, residual.shape[1]).mean(axis=1) / dt, step * dt
-
-
-def _trial(stream: Any, findings: Findings, scene: Scene, run: Run) -> None:
-    """Everything of one trial, under its own name."""
-    task, at = findings.task, f"trials/{run.trial.id}"
-    colour = "accepted" if run.accepted else "other"
-    for role, chosen in (("model_policy", findings.first), ("best", findings.best)):
-        if chosen is not None and run.candidate is chosen.candidate:
-            colour = role
-    _moving(stream, findings, scene, at, run, colour, "/path")
-    predicted = scene.points(run.candidate.predicted_states)
-    marks.path(stream, f"{at}/predicted", predicted, "predicted", 1.0)
-    _signals(stream, findings, at, run.trial, run.residual)
-    if run.explained is not None:
-        rates = [labelled(n, per_second(u)) for n, u in task.model.states.items()]
-        marks.columns(stream, f"{at}/explained", *rate(run.explained, task.dt), rates)
-
-
-def _log(stream: Any, findings: Findings, scene: Scene, log: Log) -> None:
-    """A log that ran no candidate, and the model set on it anew every second."""
-    task, at, trial = findings.task, f"data/{log.trial.id}", log.trial
-    size = _size(findings, scene)
-    marks.path(stream, f"{at}/path", scene.points(trial.states), "best", 1.5)
-    marks.body(stream, f"{at}/body", scene, trial.states, task.dt, size, "best")
-    _signals(stream, findings, at, trial, log.residual)
-
-
-def _signals(stream: Any, findings: Findings, at: str, trial: Trial, residual: Array) -> None:
-    """States, inputs and bias, each as one entity with named columns."""
-    model, dt = findings.task.model, findings.task.dt
-    states = [labelled(n, u) for n, u in model.states.items()]
-    inputs = [labelled(n, u) for n, u in model.inputs.items()]
-    rates = [labelled(n, per_second(u)) for n, u in model.states.items()]
-    marks.columns(stream, f"{at}/state", trial.states, dt, states)
-    marks.columns(stream, f"{at}/input", trial.inputs, dt, inputs)
-    marks.columns(stream, f"{at}/bias", *rate(residual, dt), rates)
-
-
-def _words(role: str, run: Run) -> str:
-    return ("the model's policy" if role == "model_policy" else "best so far") + f", {run.label}"
-
-
-def _size(findings: Findings, scene: Scene) -> float:
-    """The length of a body that can be seen beside the path."""
-    shown = findings.runs or findings.logs
-    states = shown[0].trial.states if shown else findings.task.target
-    points = scene.points(states)
-    points = points[np.isfinite(points).all(axis=1)]
-    return 0.07 * (float(np.ptp(points, axis=0).max()) or 1.0) if len(points) else 0.07
 
 
 def summary(findings: Findings) -> str:

@@ -1,4 +1,4 @@
-"""Pictures of tables: bars with their numbers, one below the other."""
+"""The studies whose picture is bars: a number a row, one below the other."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from grounded.experiments.baselines import BUDGET, SHARES, BaselinesResult, Line
 from grounded.experiments.car import PAPER
-from grounded.experiments.estimated import CAMERA, WAYS, EstimatedResult, EstimatedRun
+from grounded.experiments.estimated import CAMERA, WAYS, EstimatedResult
 from grounded.experiments.fit_car import FitCarResult
 from grounded.experiments.footnote9 import Footnote9Result
 from grounded.experiments.jobs import improvement
@@ -29,58 +29,42 @@ QUANTITIES = (("Position", "mm", 1e3), ("Heading", "mrad", 1e3), ("Speed", "m/s"
 
 def footnote9_figure(result: Footnote9Result) -> Figure:
     """Shares of the optimum for each b: the model's policy, one iteration, policy gradient."""
-    kinds = (("model", "model-based"), ("best", "one iteration"), ("other", "policy gradient"))
-    bars = [
-        Bar(f"b = {row.b:g}, {name}", value, f"{value:.3g}", role)
-        for row in result.rows
-        for (role, name), value in zip(
-            kinds, (row.model_based, row.solved, row.gradient), strict=True
-        )
-    ]
-    key = tuple(Key(role, name, "disc") for role, name in kinds)
+    kinds = {"model": "model-based", "best": "one iteration", "other": "policy gradient"}
+    bars = []
+    for row in result.rows:
+        values = (row.model_based, row.solved, row.gradient)
+        for (role, name), value in zip(kinds.items(), values, strict=True):
+            bars.append(Bar(f"b = {row.b:g}, {name}", value, f"{value:.3g}", role))
     title = "Footnote 9: a model that is wrong by b"
     panel = Bars("Real utility as a share of the optimum", tuple(bars))
-    return Figure("footnote9", title, "", (panel,), key)
+    return Figure("footnote9", title, "", (panel,), _discs(**kinds))
 
 
 def nondeterminism_figure(result: NondeterminismResult) -> Figure:
     """The largest distance between end-points, by scatter and sequence, on one scale."""
     roles = ("other", "best", "model")
-    levels = sorted({s.level for s in result.spreads})
-    bars = [
-        Bar(
-            f"{s.sequence}, x{level:g}",
-            100 * s.largest,
-            f"{100 * s.largest:.1f} cm",
-            roles[min(i, len(roles) - 1)],
-        )
-        for i, level in enumerate(levels)
-        for s in result.spreads
-        if s.level == level
-    ]
+    bars, keys = [], []
+    for i, level in enumerate(sorted({s.level for s in result.spreads})):
+        role = roles[min(i, len(roles) - 1)]
+        keys.append(Key(role, f"scatter x{level:g}", "disc"))
+        for s in result.spreads:
+            if s.level == level:
+                cm = 100 * s.largest
+                bars.append(Bar(f"{s.sequence}, x{level:g}", cm, f"{cm:.1f} cm", role))
     bars.append(Bar("the paper’s car, at most", PAPER_SPREAD, f"{PAPER_SPREAD:.0f} cm", "desired"))
-    keys = [
-        Key(roles[min(i, len(roles) - 1)], f"scatter x{level:g}", "disc")
-        for i, level in enumerate(levels)
-    ]
     panel = Bars(f"Largest distance between end-points, {result.runs} runs of 2 s", tuple(bars))
     return Figure("nondeterminism", "The same inputs, again and again", "", (panel,), tuple(keys))
 
 
 def baselines_figure(result: BaselinesResult) -> Figure:
     """Real trials that each method needs, a panel a manoeuvre and error; long bars are cut."""
-    cases = dict.fromkeys((line.manoeuvre, line.kind) for line in result.lines)
     panels = []
-    for manoeuvre, kind in cases:
+    for manoeuvre, kind in dict.fromkeys((line.manoeuvre, line.kind) for line in result.lines):
         own = [li for li in result.lines if (li.manoeuvre, li.kind) == (manoeuvre, kind)]
         methods = dict.fromkeys(line.method for line in own)
-        bars = [_method([line for line in own if line.method == m]) for m in methods]
-        panels.append(Bars(f"{manoeuvre}, {KINDS.get(kind, kind)}", tuple(bars)))
-    key = (
-        Key("best", "this tool", "disc"),
-        Key("other", "other methods", "disc"),
-        Key("model", "most seeds never get there", "disc"),
-    )
+        bars = tuple(_method([line for line in own if line.method == m]) for m in methods)
+        panels.append(Bars(f"{manoeuvre}, {KINDS.get(kind, kind)}", bars))
+    key = _discs(best="this tool", other="other methods", model="most seeds never get there")
     title = f"Real trials to close {SHARES[LEVEL]:.0%} of the gap, median; bars end at {BUDGET}"
     return Figure("baselines", title, "", tuple(panels), key)
 
@@ -125,16 +109,12 @@ def estimated_figure(result: EstimatedResult) -> Figure:
     names = list(dict.fromkeys(run.manoeuvre for run in result.runs))
     bars = [bar for name in names for bar in _gains(result, name)]
     panels = [Bars("Share of the model’s cost that is gone", tuple(bars))]
-    filmed = {name: [r for r in result.of(name, "camera") if r.live] for name in names}
     for i, (what, unit, factor) in enumerate(QUANTITIES):
-        rows = [bar for name in names for bar in _errors(name, filmed[name], i, unit, factor)]
+        rows = [bar for name in names for bar in _errors(result, name, i, unit, factor)]
         if rows:
             panels.append(Bars(f"{what}: error of the estimates, rms", tuple(rows)))
-    key = (
-        Key("best", "on estimated states", "disc"),
-        Key("accepted", "on true states", "disc"),
-        Key("other", "optimum, and the paper’s car", "disc"),
-    )
+    others = "optimum, and the paper’s car"
+    key = _discs(best="on estimated states", accepted="on true states", other=others)
     title = f"The closed loop on estimated states, markers ±{1e3 * CAMERA:g} mm"
     return Figure("estimated", title, "", tuple(panels), key)
 
@@ -151,16 +131,17 @@ def _gains(result: EstimatedResult, name: str) -> list[Bar]:
     return [*bars, Bar(f"{name}, the paper’s", PAPER[name], f"{PAPER[name]:.0%}", "other")]
 
 
-def _errors(
-    name: str, runs: Sequence[EstimatedRun], which: int, unit: str, factor: float
-) -> list[Bar]:
-    if not runs:
-        return []
+def _errors(result: EstimatedResult, name: str, which: int, unit: str, factor: float) -> list[Bar]:
+    """The rms error of one quantity, live and smoothed, over the runs that were filmed."""
+    runs = [run for run in result.of(name, "camera") if run.live]
     bars = []
-    for words, found in (
-        ("live filter", [run.live for run in runs]),
-        ("smoother", [run.smoothed for run in runs]),
-    ):
-        rms = factor * float(np.sqrt(np.mean(np.array(found, dtype=float)[:, which] ** 2)))
+    for words in ("live filter", "smoother") if runs else ():
+        found = np.array([run.live if words == "live filter" else run.smoothed for run in runs])
+        rms = factor * float(np.sqrt(np.mean(found[:, which] ** 2)))
         bars.append(Bar(f"{name}, {words}", rms, f"{rms:.3g} {unit}"))
     return bars
+
+
+def _discs(**names: str) -> tuple[Key, ...]:
+    """A legend of discs: role = its name."""
+    return tuple(Key(role, name, "disc") for role, name in names.items())

@@ -1,4 +1,4 @@
-"""A picture of each family's signature.
+"""A picture of each family's signature, for docs/effects.md.
 
 Made by `python -m grounded_trials.report.studies.effect_pictures docs`.
 
@@ -38,6 +38,8 @@ WIDE, HIGH, GAP, TOP = 170, 84, 14, 18  # of a panel [px]
 ROW = 4  # panels side by side
 SEEN = 0.25  # of a state's range
 
+Drawn = tuple[str, Array, Array]  # a state's name, and it without and with an effect (T + 1,)
+
 
 def commands() -> Array:
     """Steering and throttle, lively and of both signs, with steps."""
@@ -70,8 +72,8 @@ def settings(effect: Effect) -> list[dict[str, float]]:
     return [middle | {q.name: float(np.clip(s, q.low, q.high)) for q in linear} for s in strengths]
 
 
-def signature(effect: Effect, inputs: Array, plain: Array) -> tuple[str, Array, Array]:
-    """The state that changes most: its name, without and with the effect (T + 1,)."""
+def signature(effect: Effect, inputs: Array, plain: Array) -> Drawn:
+    """The state that changes most."""
     size = np.maximum(np.ptp(plain, axis=0), 1e-9)
     fast = [car.state_names.index(name) for name in places.dynamic(car)]
     found = []
@@ -85,33 +87,22 @@ def signature(effect: Effect, inputs: Array, plain: Array) -> tuple[str, Array, 
     return min(found, key=lambda each: each[0])[1:]
 
 
-def panel(title: str, state: str, plain: Array, changed: Array, x: float, y: float) -> str:
-    """One small plot."""
-    both = np.stack([plain, changed])
-    low, size = both.min(), max(float(np.ptp(both)), 1e-9)
-    lines = []
-    for values, colour in ((plain, "#999999"), (changed, "#d9480f")):
-        across = x + WIDE * np.arange(len(values)) / (len(values) - 1)
-        up = y + TOP + HIGH * (1 - (values - low) / size)
-        points = " ".join(f"{a:.0f},{b:.1f}" for a, b in zip(across, up, strict=True))
-        lines.append(
-            f'<polyline points="{points}" fill="none" stroke="{colour}" stroke-width="1.6"/>'
-        )
-    words = f'<text x="{x:.0f}" y="{y + 12:.0f}" fill="#777777">{title} ({state})</text>'
-    return words + "".join(lines)
-
-
-def strip(named: Mapping[str, tuple[str, Array, Array]]) -> str:
-    """Panels in rows, as one SVG."""
-    rows = -(-len(named) // ROW)
-    step = TOP + HIGH + GAP
-    body = [
-        panel(name, *drawn, (i % ROW) * (WIDE + GAP), (i // ROW) * step)
-        for i, (name, drawn) in enumerate(named.items())
-    ]
-    wide = min(len(named), ROW) * (WIDE + GAP)
+def strip(named: Mapping[str, Drawn]) -> str:
+    """Small plots in rows, as one SVG."""
+    step, body = TOP + HIGH + GAP, []
+    for i, (title, (state, *curves)) in enumerate(named.items()):
+        x, y = (i % ROW) * (WIDE + GAP), (i // ROW) * step
+        low, size = np.min(curves), max(float(np.ptp(curves)), 1e-9)
+        body.append(f'<text x="{x}" y="{y + 12}" fill="#777777">{title} ({state})</text>')
+        for values, colour in zip(curves, ("#999999", "#d9480f"), strict=True):
+            across = x + WIDE * np.arange(len(values)) / (len(values) - 1)
+            up = y + TOP + HIGH * (1 - (values - low) / size)
+            points = " ".join(f"{a:.0f},{b:.1f}" for a, b in zip(across, up, strict=True))
+            look = f'fill="none" stroke="{colour}" stroke-width="1.6"'
+            body.append(f'<polyline points="{points}" {look}/>')
+    wide, high = min(len(named), ROW) * (WIDE + GAP), -(-len(named) // ROW) * step
     return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{wide}" height="{rows * step}" '
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{wide}" height="{high}" '
         f'font-family="sans-serif" font-size="11">{"".join(body)}</svg>\n'
     )
 
@@ -128,7 +119,7 @@ def draw_all(folder: Path) -> list[Path]:
     inputs = commands()
     plain = run(car, car, inputs)
     scales = scales_of(car, plain, inputs, DT, STEPS * DT)
-    strips: dict[str, dict[str, tuple[str, Array, Array]]] = {}
+    strips: dict[str, dict[str, Drawn]] = {}
     for effect in Library().candidates(car, scales):
         named = strips.setdefault(kind_of(effect), {})
         drawn = signature(effect, inputs, plain)
@@ -142,7 +133,7 @@ def draw_all(folder: Path) -> list[Path]:
     return paths
 
 
-def _change(drawn: tuple[str, Array, Array]) -> float:
+def _change(drawn: Drawn) -> float:
     """How far apart the lines are, in units of the first one's range; at most SEEN counts."""
     _, plain, changed = drawn
     far = float(np.abs(changed - plain).max() / max(float(np.ptp(plain)), 1e-9))

@@ -1,0 +1,260 @@
+"""The picture of each of the paper's studies, drawn as the page draws its figures.
+
+Here are those with curves: the aircraft's paths (Figure 1), the car's (Figures 4 and 5), Theorem 1
+over epsilon, and the line search over the scatter; `bars.py` has the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from grounded.errors import GroundedError
+from grounded.experiments.car import PAPER, CarResult, CarRun
+from grounded.experiments.figure8 import DT
+from grounded.experiments.flight import FIGURE_STEP, FlightResult
+from grounded.experiments.jobs import mean_se
+from grounded.experiments.repeats import NoiseResult, Outcome
+from grounded.experiments.theorem1 import Theorem1Result, Theorem1Row
+from grounded.frozen import Array
+from grounded_trials.report.figures.figure import (
+    STEPS,
+    WIDTHS,
+    Bar,
+    Bars,
+    Curve,
+    Dot,
+    Figure,
+    Key,
+    Panel,
+    Rule,
+    legend,
+)
+from grounded_trials.report.figures.png import png
+from grounded_trials.report.studies.bars import (
+    baselines_figure,
+    estimated_figure,
+    fit_car_figure,
+    footnote9_figure,
+    nondeterminism_figure,
+)
+from grounded_trials.store.store import write_atomically
+
+FIRST, LAST, DESIRED = "the model’s controller", "after learning", "desired"
+FACTORS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
+PAPER_FIGURE = {"turn": 4, "circle": 5, "figure8": 5}
+RULE_ROLES = ("model", "step2", "accepted", "best", "other", "predicted", "desired")
+SMALLEST = 1e-300  # instead of the logarithm of nothing
+
+
+def flight_figure(result: FlightResult) -> Figure:
+    """Figure 1: North-East (also enlarged) and altitude over time; utilities."""
+    shown = result.representative
+    after = f"after {len(shown.utilities) - 1} iterations"
+    paths = [
+        ("model", FIRST, np.array(shown.paths["model"])),
+        ("best", after, np.array(shown.paths["learned"])),
+        ("desired", DESIRED, np.array(result.desired)),
+    ]
+    times = np.arange(len(result.desired), dtype=np.float64) * DT * FIGURE_STEP
+    height = [Curve(times[: len(p)], p[:, 2], role, name) for role, name, p in paths]
+    factor = _enlarged(paths[0][2], paths[2][2])
+    panels = (
+        _plane("Figure 1: North over East", paths, 1.0),
+        _plane(f"The same, deviations {factor:g} times as large", paths, factor),
+        Panel("Figure 1: altitude above the start", "time [s]", "m", tuple(height)),
+        _utilities(result),
+    )
+    more = {"other": "utilities of the other runs", "accepted": "optimum with the true parameters"}
+    key = (*legend(panels[:1]), *(Key(role, name) for role, name in more.items()))
+    title = f"The aircraft’s figure-8: the median of {len(result.flown)} runs, seed {shown.seed}"
+    return Figure("flight", title, "", panels, key)
+
+
+def _enlarged(path: Array, desired: Array) -> float:
+    """A round factor that makes the deviation of a path visible beside the desired one's size."""
+    off = np.abs(path - desired[: len(path)])[:, :2].max()
+    room = 0.2 * np.ptp(desired[:, :2], axis=0).max()
+    return max((f for f in FACTORS if f * off <= room), default=1.0)
+
+
+def _plane(title: str, paths: list[tuple[str, str, Array]], factor: float) -> Panel:
+    """Paths from above, each `factor` times as far from the desired one as it was."""
+    desired = paths[-1][2]
+    curves = []
+    for role, name, path in paths:
+        near = desired[: len(path)]
+        p = near + factor * (path - near)
+        curves.append(Curve(p[:, 1], p[:, 0], role, name, WIDTHS.get(role, 1.5)))
+    return Panel(title, "East [m]", "North [m]", tuple(curves), equal=True)
+
+
+def _utilities(result: FlightResult) -> Panel:
+    """Utility by iteration, a line a run, above the optimum with the true parameters."""
+    curves = []
+    for run in sorted(result.flown, key=lambda run: run is result.representative):
+        x, y = np.arange(len(run.utilities), dtype=np.float64), np.array(run.utilities)
+        role, width = ("best", 2.0) if run is result.representative else ("other", 1.0)
+        curves.append(Curve(x, y, role, f"run {run.seed}", width))
+    title, x_name = "Utility of every run, logarithmic", "iteration (0: the model’s controller)"
+    rules = (Rule(result.optimum, "accepted", "optimum"),)
+    return Panel(title, x_name, "utility", tuple(curves), rules=rules, loss=True)
+
+
+def car_figure(result: CarResult) -> Figure:
+    """Figure 4, the turn through its iterations; Figure 5, circle and figure-8; improvements."""
+    names = list(dict.fromkeys(run.manoeuvre for run in result.runs))
+    shown = [(result.of(name, True) or result.of(name, False))[0] for name in names]
+    panels = [_manoeuvre(run, stages=run.manoeuvre == "turn") for run in shown]
+    key = [Key("desired", DESIRED), Key("model", FIRST)]
+    if "turn" in names:
+        key += [Key(role, f"iteration {i + 1}") for i, role in enumerate(STEPS)]
+    key.append(Key("best", LAST))
+    return Figure("car", "The RC car", "", (*panels, _improvements(result, names)), tuple(key))
+
+
+def _manoeuvre(run: CarRun, stages: bool) -> Panel:
+    """The path of the first and the last iteration, and those between."""
+    every = [p for name, p in run.paths.items() if name != "target"]
+    roles = ["model", *STEPS, *["other"] * len(every)][: len(every)]
+    roles[-1] = "best" if len(every) > 1 else "model"
+    curves = []
+    for role, path in (*zip(roles, every, strict=True), ("desired", run.paths["target"])):
+        if stages or role in ("model", "best", "desired"):
+            x, y = np.array(path).T
+            curves.append(Curve(x, y, role, role, WIDTHS.get(role, 1.5)))
+    number = PAPER_FIGURE.get(run.manoeuvre)
+    ending = f"{len(every) - 1} iterations" if len(every) != 2 else "1 iteration"
+    title = f"Figure {number}: {run.manoeuvre}, {ending}"
+    return Panel(title, "x [m]", "y [m]", tuple(curves), equal=True)
+
+
+def _improvements(result: CarResult, names: Sequence[str]) -> Bars:
+    """Share of the cost that is gone, beside the paper's."""
+    bars = []
+    for name in names:
+        for noisy, words in ((False, "quiet"), (True, "with scatter")):
+            gains = [run.improvement for run in result.of(name, noisy)]
+            if gains:
+                mean, _ = mean_se(gains)
+                bars.append(Bar(f"{name}, {words}", mean, f"{mean:.1%}"))
+        bars.append(Bar(f"{name}, the paper’s car", PAPER[name], f"{PAPER[name]:.0%}", "other"))
+    return Bars("Share of the model’s cost that is gone", tuple(bars))
+
+
+def theorem1_figure(result: Theorem1Result) -> Figure:
+    """Gradient error and squared gradient over epsilon, log-log, with the theorem's slopes."""
+    slopes = result.slopes()
+    panels = (
+        _trend(result, "Gradient error", lambda row: row.error, slopes["gradient_error"], 1),
+        _trend(
+            result,
+            "Squared gradient at the end",
+            lambda row: row.squared,
+            slopes["squared_gradient"],
+            2,
+            bound=lambda row: 2 * (row.K * row.epsilon) ** 2,
+        ),
+    )
+    key = (
+        Key("best", "median of the seeds"),
+        Key("best", "each seed", "ring"),
+        Key("desired", "the theorem’s slope through it"),
+        Key("model", "the theorem’s bound, at its lowest"),
+    )
+    return Figure("theorem1", "Theorem 1: a model wrong by epsilon", "", panels, key)
+
+
+def _trend(
+    result: Theorem1Result,
+    name: str,
+    value: Callable[[Theorem1Row], float],
+    slope: tuple[float, float],
+    theory: int,
+    bound: Callable[[Theorem1Row], float] | None = None,
+) -> Panel:
+    """A quantity by epsilon: a ring a seed, the median, a line of the theorem's slope."""
+    rows = result.rows
+    dots = tuple(
+        Dot(_log(r.epsilon), _log(value(r)), "best", f"seed {r.seed}: {value(r):.3g}", "ring")
+        for r in rows
+    )
+    epsilons = sorted({row.epsilon for row in rows})
+    groups = [[row for row in rows if row.epsilon == epsilon] for epsilon in epsilons]
+    x = np.array([_log(epsilon) for epsilon in epsilons])
+    y = np.array([_log(float(np.median([value(row) for row in own]))) for own in groups])
+    line = y.mean() + theory * (x - x.mean())
+    curves = [Curve(x, y, "best", "median", 2.0), Curve(x, line, "desired", "theorem", 1.2)]
+    if bound is not None:
+        lowest = np.array([_log(min(bound(row) for row in own)) for own in groups])
+        curves.append(Curve(x, lowest, "model", "bound"))
+    error = f" ± {slope[1]:.3f}" if np.isfinite(slope[1]) else ""
+    title = f"{name}: slope {slope[0]:.3f}{error}, theorem {theory}"
+    return Panel(title, "log₁₀ epsilon", "log₁₀ of it", tuple(curves), dots)
+
+
+def _log(value: float) -> float:
+    return float(np.log10(max(value, SMALLEST)))
+
+
+def noise_figure(result: NoiseResult) -> Figure:
+    """Share of the gap closed by each rule over the scatter: the median seed and the worst."""
+    panels = []
+    for name in dict.fromkeys(o.manoeuvre for o in result.outcomes):
+        own = [o for o in result.outcomes if o.manoeuvre == name]
+        panels.append(_shares(own, f"{name}: gap closed, median of the seeds", np.median))
+        if len({o.seed for o in own}) > 1:
+            panels.append(_shares(own, f"{name}: gap closed, the worst seed", np.min))
+    title = f"The line search under noise; recommended: {result.recommended}"
+    return Figure("noise", title, "", tuple(panels), legend(panels))
+
+
+def _shares(outcomes: Sequence[Outcome], title: str, of: Callable[[Array], Any]) -> Panel:
+    """A curve a rule."""
+    curves, dots = [], []
+    for k, rule in enumerate(dict.fromkeys(o.rule for o in outcomes)):
+        closed: dict[float, list[float]] = {}
+        for o in sorted((o for o in outcomes if o.rule == rule), key=lambda o: o.level):
+            closed.setdefault(o.level, []).append(o.closed)
+        shares = {level: 100 * float(of(np.array(some))) for level, some in closed.items()}
+        role = RULE_ROLES[k % len(RULE_ROLES)]
+        curves.append(Curve(np.array([*shares]), np.array([*shares.values()]), role, rule))
+        for level, share in shares.items():
+            dots.append(Dot(level, share, role, f"{rule}, scatter x{level:g}: {share:.1f} %"))
+    return Panel(title, "scatter, times the car’s own", "%", tuple(curves), tuple(dots))
+
+
+PICTURES: dict[str, Callable[[Any], Figure]] = {
+    "flight": flight_figure,
+    "car": car_figure,
+    "fit-car": fit_car_figure,
+    "estimated": estimated_figure,
+    "nondeterminism": nondeterminism_figure,
+    "footnote9": footnote9_figure,
+    "theorem1": theorem1_figure,
+    "baselines": baselines_figure,
+    "noise": noise_figure,
+}
+
+
+def draw_study(name: str, result: Any, path: Path) -> None:
+    """Writes the picture of a study's result as a PNG file.
+
+    Args:
+        name: of the study, as in `grounded experiment NAME`.
+        result: what its function returned.
+        path: of the file; its folder is made.
+
+    Raises:
+        GroundedError: if the name is unknown or the file can't be written.
+    """
+    if name not in PICTURES:
+        raise GroundedError(f"no picture of '{name}', only of {', '.join(PICTURES)}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise GroundedError(f"{path.parent} can't be made: {error.strerror}") from None
+    write_atomically(path, png(PICTURES[name](result)))
