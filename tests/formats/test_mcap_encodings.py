@@ -13,23 +13,23 @@ import pytest
 
 from grounded_trials.formats.cdr import cdr_messages, ros1_messages
 from grounded_trials.formats.idl_schema import parse_idl
-from grounded_trials.formats.json_messages import json_messages
 from grounded_trials.formats.message_path import parse_path
 from grounded_trials.formats.messages import (
     Array,
     BadMessage,
     BadPath,
+    BadSchema,
     Dynamic,
     Node,
     Number,
     Struct,
     Text,
     Type,
+    json_messages,
 )
 from grounded_trials.formats.path_walk import bind, evaluate
 from grounded_trials.formats.protobuf import protobuf_messages
-from grounded_trials.formats.protobuf_schema import BadSchema, parse_descriptor_set
-from grounded_trials.formats.ros_schema import parse_ros
+from grounded_trials.formats.schemas import parse_protobuf, parse_ros
 from path_reference import follow
 
 Root = Callable[[bytes, Any, Any], Node]
@@ -388,7 +388,7 @@ def fill(message: Any, type: Struct, rng: random.Random) -> Any:
 def test_random_protobuf_messages(seed: int) -> None:
     rng = random.Random(seed)
     descriptor, make = random_proto(rng, seed)
-    type = parse_descriptor_set(descriptor, "p.T0")
+    type = parse_protobuf(descriptor, "p.T0")
     objects, messages = [], []
     for _ in range(6):
         message = make()
@@ -410,7 +410,7 @@ def test_protobuf_from_an_older_or_other_writer() -> None:
         kind_number = getattr(FieldDescriptorProto, f"TYPE_{kind}")
         message.field.add(name=name, number=number, type=kind_number, label=1)
     message.field[3].default_value = "2.5"
-    type = parse_descriptor_set(files.SerializeToString(), "p.M")
+    type = parse_protobuf(files.SerializeToString(), "p.M")
     root = lambda b, s, e: protobuf_messages(b, type, s, e)  # noqa: E731
     negative = bytes([8, 0xFB, *[0xFF] * 8, 1])  # int32 -5 takes ten bytes
     twice = bytes([8, 1, 8, 2])
@@ -437,13 +437,13 @@ def test_protobuf_definitions_that_are_none() -> None:
     rng = np.random.default_rng(1)
     good, _ = random_proto(random.Random(3), 3)
     with pytest.raises(BadSchema, match=r"no message .p\.Nothing"):
-        parse_descriptor_set(good, "p.Nothing")
+        parse_protobuf(good, "p.Nothing")
     for _ in range(500):
         bad = bytearray(good)
         for _ in range(3):
             bad[rng.integers(len(bad))] = rng.integers(256)
         try:
-            parse_descriptor_set(bytes(bad), "p.T0")
+            parse_protobuf(bytes(bad), "p.T0")
         except BadSchema:
             continue
 

@@ -23,6 +23,7 @@ from grounded_trials.formats.messages import (
     Array,
     BadMessage,
     BadPath,
+    BadSchema,
     Dynamic,
     Floats,
     Ints,
@@ -31,7 +32,6 @@ from grounded_trials.formats.messages import (
     Type,
 )
 from grounded_trials.formats.path_walk import Bound, bind, evaluate, is_time
-from grounded_trials.formats.protobuf_schema import BadSchema
 from grounded_trials.logs.inspect_report import (
     FieldReport,
     LogReport,

@@ -31,9 +31,9 @@ from grounded_trials.formats.mcap_records import (
 )
 from grounded_trials.formats.mcap_walk import DamagedFile, read_records
 from grounded_trials.formats.messages import Array as ArrayType
-from grounded_trials.formats.messages import BadMessage, Ints, Number, Struct
+from grounded_trials.formats.messages import BadMessage, BadSchema, Ints, Number, Struct
 from grounded_trials.formats.protobuf import protobuf_messages, uniform_doubles
-from grounded_trials.formats.protobuf_schema import BadSchema, parse_descriptor_set
+from grounded_trials.formats.schemas import struct_of
 from grounded_trials.store.store import write_atomically
 
 FILE_LIMIT = 1 * 2**30  # [bytes]
@@ -290,7 +290,7 @@ def _type(channel: Channel, schemas: dict[int, Schema], name: str) -> Struct:
     if channel.encoding != "protobuf" or schema is None or schema.encoding != "protobuf":
         raise GroundedError(f"{name}: {channel.topic} is not protobuf")
     try:
-        return parse_descriptor_set(schema.data, schema.name)
+        return struct_of(schema)
     except BadSchema as error:
         raise GroundedError(f"{name}: {channel.topic}: {error}") from None
 
