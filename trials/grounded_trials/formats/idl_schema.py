@@ -182,7 +182,9 @@ class _Parser:
 
     def check_depth(self, name: str, depth: int) -> None:
         if depth > DEPTH_LIMIT:
-            raise BadSchema(f"its IDL definition of '{name[:80]}' contains itself")
+            raise BadSchema(
+                f"its IDL definition of '{name[:80]}' contains itself, or goes too deep"
+            )
 
     def member(self, written: list[str], scope: tuple[str, ...], depth: int) -> list[Field]:
         kind, rest = self.type(written, scope, depth)

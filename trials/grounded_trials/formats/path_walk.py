@@ -14,6 +14,8 @@ import numpy as np
 from grounded.errors import nearest
 from grounded_trials.formats.message_path import (
     ANGLES,
+    BINARY,
+    UNARY,
     Field,
     Filter,
     Function,
@@ -240,7 +242,8 @@ def _apply(node: Node, functions: Sequence[Function]) -> tuple[Ints, Floats]:
         rows, values, rest = node.rows, node.numbers(), tuple(functions)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         for function in rest:
-            values = _FUNCTIONS[function.name](values, function.argument)
+            argument = (function.argument,) if function.name in BINARY else ()
+            values = _FUNCTIONS[function.name](values, *argument)
     return rows, values
 
 
@@ -276,26 +279,7 @@ def _norm(node: Node) -> Floats:
     return np.sqrt(squares)
 
 
-_FUNCTIONS: dict[str, Callable[[Floats, float], Floats]] = {
-    "abs": lambda v, c: np.abs(v),
-    "negative": lambda v, c: -v,
-    "sign": lambda v, c: np.sign(v),
-    "sqrt": lambda v, c: np.sqrt(v),
-    "sin": lambda v, c: np.sin(v),
-    "cos": lambda v, c: np.cos(v),
-    "tan": lambda v, c: np.tan(v),
-    "asin": lambda v, c: np.arcsin(v),
-    "acos": lambda v, c: np.arccos(v),
-    "atan": lambda v, c: np.arctan(v),
-    "exp": lambda v, c: np.exp(v),
-    "log": lambda v, c: np.log(v),
-    "ceil": lambda v, c: np.ceil(v),
-    "floor": lambda v, c: np.floor(v),
-    "round": lambda v, c: np.round(v),
-    "deg2rad": lambda v, c: np.deg2rad(v),
-    "rad2deg": lambda v, c: np.rad2deg(v),
-    "add": lambda v, c: v + c,
-    "sub": lambda v, c: v - c,
-    "mul": lambda v, c: v * c,
-    "div": lambda v, c: v / c,
-}
+_NUMPY = {"asin": "arcsin", "acos": "arccos", "atan": "arctan"}  # where its name is another
+_FUNCTIONS: dict[str, Callable[..., Floats]] = {
+    name: getattr(np, _NUMPY.get(name, name)) for name in UNARY
+} | {"add": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.divide}

@@ -27,13 +27,12 @@ from grounded_trials.formats.mcap_records import (
     MESSAGE_INDEX,
     METADATA,
     PARSERS,
-    BadChunk,
+    BadRecord,
     Fields,
     Messages,
     Record,
-    Short,
     batch,
-    decompress,
+    chunk_content,
     decompress_part,
 )
 from grounded_trials.formats.mcap_walk import (
@@ -134,21 +133,16 @@ class Salvage:
                 record = PARSERS[opcode](Fields(content))
                 self._tables += opcode in (METADATA, ATTACHMENT)
                 yield record
-        except (BadChunk, Short, UnicodeDecodeError) as error:
+        except BadRecord as error:
             what = _NAMES.get(opcode, f"a record of type {opcode}")
             self.losses.append(f"{what} was dropped, at byte {pos}: {error}")
             if opcode == CHUNK and len(content) >= 16:
                 self.dropped.append(_SPAN.unpack_from(content))
 
     def _chunk(self, content: bytes) -> Iterator[Record]:
-        fields = Fields(content)
-        fields.skip(16)
-        size, crc, compression = fields.u64(), fields.u32(), fields.text()
-        data = decompress(compression, fields.blob(), size, RECORD_LIMIT)
-        if crc and zlib.crc32(data) != crc:
-            raise BadChunk("its checksum does not fit its content")
+        data, checked = chunk_content(content, RECORD_LIMIT)
         for record in list(chunk_records(data)):
-            if isinstance(record, Messages) and not crc:
+            if isinstance(record, Messages) and not checked:
                 self._outside += len(record)
             yield record
 
@@ -180,9 +174,9 @@ class Salvage:
     def _count_lost(self, content: bytes) -> None:
         try:
             fields = Fields(content)
-            channel = fields.u16()
-            self.lost_messages[channel] += fields.u32() // 16
-        except Short:
+            channel = fields.uint(16)
+            self.lost_messages[channel] += fields.uint(32) // 16
+        except BadRecord:
             return
 
     def _is_cut_chunk(self, pos: int) -> bool:
@@ -208,13 +202,13 @@ class Salvage:
             fields = Fields(content)
             fields.skip(28)
             compression = fields.text()
-        except (Short, UnicodeDecodeError):
+        except BadRecord:
             return
         data = decompress_part(compression, content[fields.pos + 8 :], RECORD_LIMIT)
         whole = _whole_records(data)
         try:
             yield from list(chunk_records(data[:whole]))
-        except (BadChunk, Short, UnicodeDecodeError):
+        except BadRecord:
             return
 
     def _tail(self, end: int) -> None:
@@ -223,7 +217,7 @@ class Salvage:
 
 
 def _messages(data: bytes) -> Messages:
-    positions, _ = message_positions(data, 0, len(data), lambda found, offset: BadChunk(found))
+    positions, _ = message_positions(data, 0, len(data))
     return batch(data, positions)
 
 
