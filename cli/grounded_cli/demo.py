@@ -75,7 +75,8 @@ def _tell(document: dict[str, Any]) -> None:
     show(field("gap", document["verdict"]["sentence"]))
     for kind, path in document["paths"].items():
         show(field(kind, path))
-    show(f"\nnext: grounded -C {shlex.quote(document['workspace'])} view")
+    verb = "view" if "rrd" in document["paths"] else "report"
+    show(f"\nnext: grounded -C {shlex.quote(document['workspace'])} {verb}")
 
 
 def _optimum(workspace: Workspace) -> float | None:

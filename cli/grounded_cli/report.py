@@ -51,11 +51,16 @@ def command(html: bool, png: bool, rrd: bool, folder: str | None, json_: bool) -
 
 
 def write_all(workspace: Workspace) -> dict[str, str]:
-    """The page and the recording; their files by kind."""
+    """The page, and the recording where rerun is installed; their files by kind."""
+    from importlib.util import find_spec
+
     from grounded_trials.report.gathering import gather
     from grounded_trials.report.reporting import save
 
-    paths = save(workspace, gather(workspace), html=True, png=False, rrd=True)
+    rrd = find_spec("rerun") is not None
+    paths = save(workspace, gather(workspace), html=True, png=False, rrd=rrd)
+    if not rrd:
+        remark("note", "no recording was written: pip install 'grounded[view]' brings the viewer")
     return {path.suffix[1:]: str(path) for path in paths}
 
 
