@@ -29,7 +29,7 @@ def test_a_command_names_the_extra_that_it_needs(tmp_path, monkeypatch, module, 
 def test_a_picture_names_the_extra_that_it_needs(monkeypatch):
     monkeypatch.setitem(sys.modules, "PIL", None)
     with pytest.raises(GroundedError, match=r"grounded\[png\]"):
-        png(Figure("utility", "Utility", ()))
+        png(Figure("utility", "Utility", "", ()))
 
 
 def test_the_demos_report_does_without_a_recording(tmp_path, monkeypatch, capsys):
