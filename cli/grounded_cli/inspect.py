@@ -13,7 +13,7 @@ from grounded_cli.terminal import number, progress, remark, show, show_json, tab
 from grounded_trials.wording import count
 
 if TYPE_CHECKING:
-    from grounded_trials.logs.inspect_report import LogReport, TopicReport
+    from grounded_trials.logs.inspect_log import LogReport, TopicReport
 
 
 @click.command("inspect")

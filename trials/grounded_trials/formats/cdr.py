@@ -216,13 +216,8 @@ def _sizes(type: Type, coding: Coding) -> _Table | None:
         return None
     if not type.fields:
         return _Table((int(coding.terminated),) * 8)
-    total = np.zeros(8, dtype=np.int64)
-    for field in type.fields:
-        sizes = _sizes(field.type, coding)
-        if sizes is None:
-            return None
-        total = total + sizes.once[(np.arange(8) + total) & 7]
-    return _Table(tuple(total.tolist()))
+    first, *others = _parts(type.fields, coding)
+    return first if isinstance(first, _Table) and not others else None
 
 
 @lru_cache(maxsize=4096)

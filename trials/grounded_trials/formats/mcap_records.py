@@ -64,6 +64,15 @@ class Messages:
     def __len__(self) -> int:
         return len(self.starts)
 
+    def channel_ids(self) -> list[int]:
+        """The channels that have messages here, in rising order."""
+        return np.flatnonzero(np.bincount(self.channels)).tolist()
+
+    def of(self, channel: int) -> Messages:
+        """The messages of one channel."""
+        chosen = self.channels == channel
+        return self if chosen.all() else self.take(chosen)
+
     def take(self, chosen: NDArray[np.bool_]) -> Messages:
         """The messages where `chosen` (N,) is true."""
         _, *columns = vars(self).values()

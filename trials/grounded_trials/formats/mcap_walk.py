@@ -198,8 +198,12 @@ class _Walk:
             raise self.damaged(f"{self.size - self.offset} bytes follow after the end")
 
 
-def chunk_records(data: bytes) -> Iterator[Record]:
+def chunk_records(data: bytes, *, cut: bool = False) -> Iterator[Record]:
     """Yields the schemas and channels of a decompressed chunk, then its messages as one batch.
+
+    Args:
+        data: the chunk's content.
+        cut: its end is missing: stop at the first record that is not wholly there.
 
     Raises:
         BadRecord: if the records do not fit the chunk.
@@ -207,10 +211,10 @@ def chunk_records(data: bytes) -> Iterator[Record]:
     positions: list[int] = []
     pos, end = 0, len(data)
     while pos < end:
-        if end - pos < 9:
-            raise BadRecord("it ends inside a record")
-        opcode, length = _HEAD.unpack_from(data, pos)
+        opcode, length = _HEAD.unpack_from(data, pos) if end - pos >= 9 else (0, end)
         if length > end - pos - 9:
+            if cut:
+                break
             raise BadRecord("it ends inside a record")
         if opcode == MESSAGE:
             more, pos = message_positions(data, pos, end)

@@ -1,10 +1,8 @@
-"""Reading a damaged file: every record that can be trusted, and a list of what can not.
+"""Reading a damaged MCAP file: every record that can be trusted, and a list of what can not.
 
-Finding records again after damage: the next place from which the chain of them holds.
-
-Nothing marks the start of a record, but each says where the next one starts. A place is believed
-when it begins a chunk whose inner lengths fit each other, or the first of several records in a
-row, or the last ones of the file.
+Nothing marks the start of a record, but each says where the next one starts. After damage, the
+next place is sought from which that chain holds again: one that begins a chunk whose inner lengths
+fit each other, or the first of several records in a row, or the last ones of the file.
 """
 
 from __future__ import annotations
@@ -47,6 +45,8 @@ _SPAN = Struct("<QQ")  # a chunk's first and last time
 _NAMES = {1: "the header", 3: "a schema", 4: "a channel", 5: "a message", 6: "a block of messages"}
 _NAMES |= {9: "an attached file", 12: "a table of metadata"}
 BATCH = 2**22  # [bytes] of messages outside chunks that are handed on together
+CHAIN = 3  # records in a row that make a place believed
+_BLOCK = 2**20
 
 
 class Salvage:
@@ -156,7 +156,7 @@ class Salvage:
         if self._pending:
             data = b"".join(self._pending)
             self._pending = []
-            yield _messages(data)
+            yield batch(data, message_positions(data, 0, len(data))[0])
 
     def _data_end(self, record: bytes) -> None:
         stated = int.from_bytes(record[9:13], "little")
@@ -205,35 +205,14 @@ class Salvage:
         except BadRecord:
             return
         data = decompress_part(compression, content[fields.pos + 8 :], RECORD_LIMIT)
-        whole = _whole_records(data)
         try:
-            yield from list(chunk_records(data[:whole]))
+            yield from list(chunk_records(data, cut=True))
         except BadRecord:
             return
 
     def _tail(self, end: int) -> None:
         if read_at(self.stream, end, 9) != MAGIC:
             self.losses.append("the file does not end as an MCAP file does")
-
-
-def _messages(data: bytes) -> Messages:
-    positions, _ = message_positions(data, 0, len(data))
-    return batch(data, positions)
-
-
-def _whole_records(data: bytes) -> int:
-    """Where the last record that is wholly there ends."""
-    pos = 0
-    while len(data) - pos >= 9:
-        _, length = _HEAD.unpack_from(data, pos)
-        if length > len(data) - pos - 9:
-            break
-        pos += 9 + int(length)
-    return pos
-
-
-_BLOCK = 2**20
-CHAIN = 3  # records in a row that make a place believed
 
 
 def read_at(stream: BinaryIO, offset: int, count: int) -> bytes:

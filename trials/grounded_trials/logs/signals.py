@@ -128,19 +128,17 @@ class _Log:
             self.wanted[channel.id] = (decoder, wanting)
 
     def messages(self, batch: Messages) -> None:
-        present = np.bincount(batch.channels, minlength=1)
-        unknown = [c for c in np.flatnonzero(present).tolist() if c not in self.channels]
+        present = batch.channel_ids()
+        unknown = [c for c in present if c not in self.channels]
         if unknown:
             raise GroundedError(
                 f"{self.name}: a message belongs to channel {unknown[0]}, which is not defined; "
                 f"`grounded recover {self.name}` saves the others"
             )
         for identity, (decoder, wanting) in self.wanted.items():
-            if identity >= len(present) or not present[identity]:
+            if identity not in present:
                 continue
-            own = (
-                batch if present[identity] == len(batch) else batch.take(batch.channels == identity)
-            )
+            own = batch.of(identity)
             for collector in wanting:
                 try:
                     collector.collect(decoder, own)

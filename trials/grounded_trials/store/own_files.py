@@ -274,13 +274,13 @@ def read_file(path: Path, limit: int) -> bytes:
 def _sort(
     batch: Messages, channels: dict[int, Channel], messages: dict[str, list[Messages]], name: str
 ) -> None:
-    for identity in sorted(set(batch.channels.tolist())):  # np.unique would import numpy.ma
+    for identity in batch.channel_ids():
         if identity not in channels:
             raise DamagedFile(
                 name, 0, f"a message belongs to channel {identity}, which is not defined"
             )
         own = messages.setdefault(channels[identity].topic, [])
-        own.append(batch.take(batch.channels == identity))
+        own.append(batch.of(identity))
         if sum(len(part) for part in own) > STEP_LIMIT:
             raise GroundedError(f"{name}: more than {STEP_LIMIT} messages on one channel")
 
