@@ -8,9 +8,9 @@ each after a line of '=' and a line "MSG: package/Type". A line is "type name [d
 "type NAME=value" for a constant, which is not sent. Service events ("..._Event") are stored as
 the service's request and response, with '---' between; what is sent is an info and both of them.
 
-Why not the parsers of rosbags: they refuse service events, other separators, constants in lower
-case, IDL with several files, base types or arrays of arrays; they set no bounds, and 230 bytes of
-nested sequences keep them busy for minutes.
+Why not rosbags' parsers (0.11.9): they refuse service events, line ends of Windows, constants in
+lower case, IDL with several files, base types or arrays of arrays; they take 20 to 40 times as
+long, and more than 20 s for 25 sequences in each other, which is 230 bytes.
 """
 
 from __future__ import annotations

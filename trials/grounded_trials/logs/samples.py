@@ -244,17 +244,24 @@ def check_clocks(series: Mapping[str, Series]) -> None:
     Raises:
         GroundedError: naming two of them, and the difference.
     """
-    skews = {name: _skew(s) or 0.0 for name, s in series.items()}
-    if not skews:
-        return
-    first, last = min(skews, key=skews.__getitem__), max(skews, key=skews.__getitem__)
-    if skews[last] - skews[first] > MIXED_S:
+    first, last, apart = _furthest({name: _skew(s) for name, s in series.items()})
+    if apart > MIXED_S:
         a, b = series[first].spec.clock, series[last].spec.clock
         raise GroundedError(
             f"'{first}' (clock {a}) and '{last}' (clock {b}) are on clocks that differ by "
-            f"{skews[last] - skews[first]:.3f} s (simulation time, or an unset clock?); read both "
+            f"{apart:.3f} s (simulation time, or an unset clock?); read both "
             'by the same one, such as clock = "log"'
         )
+
+
+def _furthest(skews: Mapping[str, float | None]) -> tuple[str, str, float]:
+    """The signals whose clocks are the furthest behind and ahead of the log's, and how far apart.
+
+    None is the log's own clock.
+    """
+    known = {name: skew or 0.0 for name, skew in skews.items()}
+    first, last = min(known, key=known.__getitem__), max(known, key=known.__getitem__)
+    return first, last, known[last] - known[first]
 
 
 def warnings_of(reports: tuple[SignalReport, ...], late: float) -> tuple[str, ...]:
@@ -277,10 +284,7 @@ def warnings_of(reports: tuple[SignalReport, ...], late: float) -> tuple[str, ..
             )
         if r.samples == 1:
             found.append(f"'{r.name}': held from a single sample")
-    skews = {r.name: r.skew_s or 0.0 for r in reports}
-    low, high = min(skews, key=skews.__getitem__), max(skews, key=skews.__getitem__)
-    if len({r.clock for r in reports}) > 1 and skews[high] - skews[low] > SKEW_S:
-        found.append(
-            f"'{low}' and '{high}' are on clocks that differ by {skews[high] - skews[low]:.3f} s"
-        )
+    low, high, apart = _furthest({r.name: r.skew_s for r in reports})
+    if len({r.clock for r in reports}) > 1 and apart > SKEW_S:
+        found.append(f"'{low}' and '{high}' are on clocks that differ by {apart:.3f} s")
     return tuple(found)
