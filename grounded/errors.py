@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from importlib import import_module
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -53,3 +55,24 @@ def nearest(name: str, valid: Iterable[str]) -> str:
     if not names:
         return "none is defined"
     return "valid names: " + ", ".join(names)
+
+
+def needs(module: str, extra: str) -> Any:
+    """Imports a library that comes with an extra, so that a plain install stays small.
+
+    Args:
+        module: its import name, such as "rerun".
+        extra: of grounded, such as "view".
+
+    Returns:
+        The module.
+
+    Raises:
+        GroundedError: if it can't be imported, with the command that installs it.
+    """
+    try:
+        return import_module(module)
+    except ImportError as error:
+        raise GroundedError(
+            f"this needs the package '{module}' ({error}): pip install 'grounded[{extra}]'"
+        ) from None

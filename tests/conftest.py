@@ -4,12 +4,26 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 
 from grounded_trials.workspace.folder import Folder
 from shared_data import DATA
+
+EXTRAS = {"view": "rerun", "png": "PIL", "studies": "joblib", "cluster": "distributed"}
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.addinivalue_line("markers", "extra(*names): skipped where such an extra is missing")
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    names = [name for mark in item.iter_markers("extra") for name in mark.args]
+    missing = [name for name in names if find_spec(EXTRAS[name]) is None]
+    if missing:
+        pytest.skip(f"the extra '{missing[0]}' is not installed ({EXTRAS[missing[0]]})")
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from grounded.errors import GroundedError, NextCommand
 from grounded_cli.learn import narrated
 from grounded_cli.options import as_json, next_line
 from grounded_cli.status import summary
-from grounded_cli.terminal import field, number, progress, say, show, show_json
+from grounded_cli.terminal import field, number, progress, remark, say, show, show_json
 from grounded_trials.wording import count
 
 
@@ -43,7 +44,10 @@ def command(name: str, folder: str | None, json_: bool) -> None:
     with progress("diagnosing the gap"):
         diagnosed = workspace.diagnose()
     with progress("writing the report"):
-        report = workspace.report(html=True, rrd=True)
+        rrd = find_spec("rerun") is not None
+        report = workspace.report(html=True, rrd=rrd)
+    if not rrd:
+        remark("note", "no recording was written: the viewer comes with the extra `view`")
     document = {
         "workspace": str(target),
         "utilities": status.standing.utilities,
@@ -74,4 +78,5 @@ def _tell(document: dict[str, Any]) -> None:
     show(field("gap", document["verdict"]["sentence"]))
     for kind, path in document["paths"].items():
         show(field(kind, path))
-    show(f"\n{next_line(NextCommand('view'), document['workspace'])}")
+    verb = "view" if "rrd" in document["paths"] else "report"
+    show(f"\n{next_line(NextCommand(verb), document['workspace'])}")

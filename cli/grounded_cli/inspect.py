@@ -11,7 +11,7 @@ from grounded_cli.terminal import number, progress, remark, show, show_json, tab
 from grounded_trials.wording import count
 
 if TYPE_CHECKING:
-    from grounded_trials.logs.inspect_report import TopicReport
+    from grounded_trials.logs.inspect_log import TopicReport
     from grounded_trials.workspace.inspecting import Inspected
 
 

@@ -31,7 +31,7 @@ from typing import Any, TypedDict, TypeVar, Unpack
 
 import numpy as np
 
-from grounded.errors import GroundedError
+from grounded.errors import GroundedError, needs
 
 Progress = Callable[[int, int], None]  # jobs done, jobs in all
 CONNECT_S = 10.0  # for a cluster's scheduler to answer
@@ -189,7 +189,7 @@ def _results(jobs: Sequence[Job], engine: Engine) -> Iterator[tuple[str, dict[st
     if engine.name == "local" and engine.jobs == 1:
         yield from map(_call, jobs)
         return
-    joblib = _import("joblib", "pip install joblib")
+    joblib = needs("joblib", "studies")
     with _backend(engine, joblib):
         parallel = joblib.Parallel(
             n_jobs=-1 if engine.name == "dask" else engine.jobs,
@@ -208,7 +208,7 @@ def _backend(engine: Engine, joblib: Any) -> Iterator[None]:
         with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
             yield
         return
-    distributed = _import("distributed", 'pip install "grounded[cluster]"')
+    distributed = needs("distributed", "cluster")
     try:
         client = distributed.Client(engine.address, timeout=CONNECT_S)
     except OSError as error:
@@ -234,13 +234,6 @@ def _lost() -> tuple[type[BaseException], ...]:
         except ImportError:
             continue
     return tuple(kinds)
-
-
-def _import(name: str, remedy: str) -> Any:
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise GroundedError(f"this needs the package '{name}': {remedy}") from error
 
 
 @dataclass(frozen=True)

@@ -63,6 +63,7 @@ def test_demo_of_an_unknown_example(tmp_path):
 
 
 @needs("report")
+@pytest.mark.extra("view", "png")
 def test_report_as_text_and_as_a_document(w):
     text = grounded("-C", w, "report")
     assert text.code == 0 and "utility" in text.out and "trajectories" in text.out

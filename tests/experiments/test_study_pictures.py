@@ -85,6 +85,7 @@ def test_every_study_has_its_picture():
 
 
 @pytest.mark.parametrize("name", list(STUDIES))
+@pytest.mark.extra("png")
 def test_the_picture_holds_its_figure(name, tmp_path):
     from PIL import Image
 
@@ -130,6 +131,7 @@ def test_methods_that_need_too_many_trials_are_cut_and_say_so():
     assert differences.value == 40 and differences.text == "600"
 
 
+@pytest.mark.extra("png")
 def test_a_study_without_a_picture_and_a_place_without_room_are_told(tmp_path):
     with pytest.raises(GroundedError, match="no picture of 'taxi'"):
         draw_study("taxi", None, tmp_path / "a.png")

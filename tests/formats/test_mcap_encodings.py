@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import random
+import time
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -13,23 +14,23 @@ import pytest
 
 from grounded_trials.formats.cdr import cdr_messages, ros1_messages
 from grounded_trials.formats.idl_schema import parse_idl
-from grounded_trials.formats.json_messages import json_messages
 from grounded_trials.formats.message_path import parse_path
 from grounded_trials.formats.messages import (
     Array,
     BadMessage,
     BadPath,
+    BadSchema,
     Dynamic,
     Node,
     Number,
     Struct,
     Text,
     Type,
+    json_messages,
 )
 from grounded_trials.formats.path_walk import bind, evaluate
 from grounded_trials.formats.protobuf import protobuf_messages
-from grounded_trials.formats.protobuf_schema import BadSchema, parse_descriptor_set
-from grounded_trials.formats.ros_schema import parse_ros
+from grounded_trials.formats.schemas import parse_protobuf, parse_ros
 from path_reference import follow
 
 Root = Callable[[bytes, Any, Any], Node]
@@ -284,6 +285,42 @@ def test_idl_definitions_that_can_not_be_read() -> None:
             parse_idl(bad, "M")
 
 
+MEGABYTE = 10**6
+HOSTILE = {
+    "texts that do not end": '"\\\\' * (MEGABYTE // 2),
+    "comments that do not end": "/*a" * (MEGABYTE // 3),
+    "nothing but line ends": "\n" * MEGABYTE,
+    "a separator and line ends": "===\n" + "\n" * MEGABYTE,
+    "sequences in sequences": "struct M {" + "sequence<" * (MEGABYTE // 9),
+    "arrays of arrays": "struct M {double a" + "[9]" * (MEGABYTE // 3) + ";};",
+    "modules in modules": "module a {" * (MEGABYTE // 10),
+    "constants by constants": "const long A0=1;"
+    + "".join(f"const long A{i}=A{i - 1};" for i in range(1, 30_000))
+    + "struct M {double a[A29999];};",
+    "bases with many fields": "struct B {"
+    + "double a;" * 10_000
+    + "};"
+    + "".join(f"struct S{i}:B{{}};" for i in range(10_000))
+    + "struct M {"
+    + "".join(f"S{i} a;" for i in range(10_000))
+    + "};",
+}
+
+
+@pytest.mark.parametrize("what", HOSTILE)
+def test_a_hostile_idl_definition_takes_no_longer_than_it_is_long(what: str) -> None:
+    start = time.process_time()
+    with pytest.raises(BadSchema):
+        parse_idl(HOSTILE[what], "M")
+    assert time.process_time() - start < 10
+
+
+def test_constants_may_refer_to_constants_and_sequences_to_sequences() -> None:
+    text = "module m { const long A = 3; const long B = A; struct M { sequence<sequence<double>> s;"
+    type = parse_idl(text + " double x[B][2]; }; };", "m/M")
+    assert [str(field.type) for field in type.fields] == ["float64[][]", "float64[2][3]"]
+
+
 @pytest.mark.parametrize("seed", range(200))
 def test_any_damaged_idl_is_told(seed: int) -> None:
     rng = random.Random(seed)
@@ -304,6 +341,7 @@ def test_ros_definitions_that_are_none() -> None:
         ("???", "no field"),
         ("A a\n" + "=" * 80 + "\nMSG: x/A\nA a", "contains itself"),
         ("float64[999999999] a", "999999999 items"),
+        (f"float64[{'9' * 5000}] a", "99999 items"),
         ("int8 a\n" + "=" * 80 + "\nIDL: x/A\n", "expected 'MSG"),
     ):
         with pytest.raises(BadSchema, match=says):
@@ -388,7 +426,7 @@ def fill(message: Any, type: Struct, rng: random.Random) -> Any:
 def test_random_protobuf_messages(seed: int) -> None:
     rng = random.Random(seed)
     descriptor, make = random_proto(rng, seed)
-    type = parse_descriptor_set(descriptor, "p.T0")
+    type = parse_protobuf(descriptor, "p.T0")
     objects, messages = [], []
     for _ in range(6):
         message = make()
@@ -410,7 +448,7 @@ def test_protobuf_from_an_older_or_other_writer() -> None:
         kind_number = getattr(FieldDescriptorProto, f"TYPE_{kind}")
         message.field.add(name=name, number=number, type=kind_number, label=1)
     message.field[3].default_value = "2.5"
-    type = parse_descriptor_set(files.SerializeToString(), "p.M")
+    type = parse_protobuf(files.SerializeToString(), "p.M")
     root = lambda b, s, e: protobuf_messages(b, type, s, e)  # noqa: E731
     negative = bytes([8, 0xFB, *[0xFF] * 8, 1])  # int32 -5 takes ten bytes
     twice = bytes([8, 1, 8, 2])
@@ -434,16 +472,23 @@ def test_protobuf_from_an_older_or_other_writer() -> None:
 
 
 def test_protobuf_definitions_that_are_none() -> None:
+    from google.protobuf import descriptor_pb2
+
     rng = np.random.default_rng(1)
     good, _ = random_proto(random.Random(3), 3)
     with pytest.raises(BadSchema, match=r"no message .p\.Nothing"):
-        parse_descriptor_set(good, "p.Nothing")
+        parse_protobuf(good, "p.Nothing")
+    for number, code in ((0, 1), (2**29, 1), (1, 10)):
+        file = descriptor_pb2.FileDescriptorProto(name="a")
+        file.message_type.add(name="M").field.add(name="f", number=number, type=code, label=1)
+        with pytest.raises(BadSchema, match="field 'f'"):
+            parse_protobuf(descriptor_pb2.FileDescriptorSet(file=[file]).SerializeToString(), "M")
     for _ in range(500):
         bad = bytearray(good)
         for _ in range(3):
             bad[rng.integers(len(bad))] = rng.integers(256)
         try:
-            parse_descriptor_set(bytes(bad), "p.T0")
+            parse_protobuf(bytes(bad), "p.T0")
         except BadSchema:
             continue
 

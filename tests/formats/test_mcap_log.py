@@ -15,7 +15,9 @@ from mcap_protobuf.decoder import DecoderFactory
 from grounded.errors import GroundedError, NextCommand
 from grounded.policy import Policy
 from grounded.trial import Trial
+from grounded_trials.formats.mcap_records import Schema
 from grounded_trials.formats.mcap_writer import file_descriptor_set
+from grounded_trials.formats.schemas import parse_protobuf, struct_of
 from grounded_trials.store.candidate_file import candidate_bytes, read_candidate
 from grounded_trials.store.trial_file import TrialWriter, read_trial, trial_bytes, write_trial
 
@@ -222,7 +224,6 @@ def with_metadata(source: bytes, key: str, value: str | None) -> bytes:
         Header,
         Messages,
         Metadata,
-        Schema,
     )
     from grounded_trials.formats.mcap_walk import read_records
     from grounded_trials.formats.mcap_writer import CopyWriter
@@ -297,3 +298,15 @@ def test_a_candidate_that_lost_its_end_is_refused() -> None:
     candidate = candidate_bytes(a_policy(), np.zeros((21, 3)), np.zeros((20, 2)), {})
     with pytest.raises(GroundedError, match="a policy of 21 steps needs 21 messages"):
         read_candidate(with_metadata(candidate, "steps", "21"))
+
+
+@pytest.mark.parametrize("repeated", [False, True])
+@pytest.mark.parametrize("names", [[], ["x"], ["n" * 10, "k" * 33, "w" * 127], ["ü"], ["w" * 130]])
+def test_our_own_definitions_are_known_without_the_library(
+    names: list[str], repeated: bool
+) -> None:
+    data = file_descriptor_set("State", names, repeated=repeated)
+    wanted = parse_protobuf(data, "grounded.State")
+    found = struct_of(Schema(1, "grounded.State", "protobuf", data))
+    assert found.name == wanted.name
+    assert [vars(f) for f in found.fields] == [vars(f) for f in wanted.fields]

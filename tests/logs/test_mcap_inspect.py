@@ -12,10 +12,10 @@ from mcap.writer import Writer
 
 from grounded.errors import GroundedError
 from grounded_trials.formats.messages import Dynamic
-from grounded_trials.formats.ros_schema import parse_ros
+from grounded_trials.formats.path_walk import number_paths
+from grounded_trials.formats.schemas import parse_ros
 from grounded_trials.logs.inspect_guess import Guess, guess_mapping, is_simulated, mapping_toml
-from grounded_trials.logs.inspect_log import inspect_log, number_paths
-from grounded_trials.logs.inspect_report import find_twins
+from grounded_trials.logs.inspect_log import find_twins, inspect_log
 from grounded_trials.logs.log_table import LogMapping, read_log
 from grounded_trials.logs.signals import SignalSpec
 from shared_data import data, files, needs_data

@@ -39,6 +39,7 @@ def flights():
 
 
 @pytest.mark.parametrize("case", CASES)
+@pytest.mark.extra("view", "png")
 def test_a_report_is_made_of_any_numbers(flights, tmp_path, case):
     runs = []
     for run in flights.runs:

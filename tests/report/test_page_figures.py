@@ -141,6 +141,7 @@ def test_words_are_spelled_with_letters_that_the_font_has():
     assert plain("log₂ α − 1 … Ünï 漢") == "log2 alpha - 1 ... Uni ?"
 
 
+@pytest.mark.extra("png")
 def test_pictures_are_drawn_in_their_colours(cart):
     from PIL import Image
 

@@ -82,6 +82,7 @@ def test_json_holds_what_the_contract_says(cart):
     assert document["best"]["tracking_error"]["v"] is None  # no target: not a number
 
 
+@pytest.mark.extra("view", "png")
 def test_json_names_the_files_that_were_written(cart, tmp_path):
     folder = copied(cart, tmp_path / "w")
     paths = grounded("-C", folder, "report", "--html", "--rrd", "--png", "--json").json["paths"]
@@ -90,6 +91,7 @@ def test_json_names_the_files_that_were_written(cart, tmp_path):
     assert {Path(p).stem for p in paths["png"]} >= {"utility", "paths", "states", "bias", "gap"}
 
 
+@pytest.mark.extra("view", "png")
 def test_a_workspace_without_trials_has_a_report(tmp_path):
     make(tmp_path / "w")
     done = grounded("-C", tmp_path / "w", "report", "--html", "--png", "--rrd")
@@ -117,6 +119,7 @@ def test_the_diagnosed_effect_leaves_less_of_the_bias(cart):
     assert rms(best.explained)[1] < rms(best.residual)[1]
 
 
+@pytest.mark.extra("view", "png")
 def test_a_damaged_trial_is_left_out_and_named(cart, tmp_path):
     folder = copied(cart, tmp_path / "w")
     path = damage(folder, "trials/t0002-*")
@@ -140,6 +143,7 @@ def test_a_removed_trial_is_named(cart, tmp_path):
     assert "t0002: trials/ has no file of the number t0002" in done.out
 
 
+@pytest.mark.extra("view", "png")
 def test_the_first_trial_may_be_lost(cart, tmp_path):
     folder = copied(cart, tmp_path / "w")
     damage(folder, "trials/t0001-*")
@@ -147,6 +151,7 @@ def test_the_first_trial_may_be_lost(cart, tmp_path):
     assert done.code == 3, done.err
 
 
+@pytest.mark.extra("view", "png")
 def test_all_trials_may_be_lost(cart, tmp_path):
     folder = copied(cart, tmp_path / "w")
     for number, path in enumerate(sorted(folder.glob("trials/*.mcap"))):
@@ -175,6 +180,7 @@ def test_a_damaged_diagnosis_is_named(cart, tmp_path, text):
     assert lost["file"] == "diagnosis.json" and "can't be read" in lost["reason"]
 
 
+@pytest.mark.extra("view", "png")
 def test_a_short_trial_is_shown_as_failed(cart, tmp_path):
     folder = copied(cart, tmp_path / "w")
     workspace = Folder(folder)
@@ -238,6 +244,7 @@ def test_nothing_heavy_is_imported_for_text(cart):
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.extra("view", "png")
 def test_a_workspace_of_data_only_shows_the_model_against_the_data(cart, tmp_path):
     folder = tmp_path / "data"
     make(folder)
@@ -251,6 +258,7 @@ def test_a_workspace_of_data_only_shows_the_model_against_the_data(cart, tmp_pat
     assert "2 logs of data" in out and "error of the crude model 1 s ahead" in out
 
 
+@pytest.mark.extra("view", "png")
 def test_a_candidate_that_was_not_run_yet_is_shown_as_predicted(tmp_path):
     make(tmp_path / "w")
     assert grounded("-C", tmp_path / "w", "propose").code == 0

@@ -15,6 +15,7 @@ __all__ = ["cart"]
 needs_posix = pytest.mark.skipif(sys.platform == "win32", reason="needs a POSIX shell")
 
 
+@pytest.mark.extra("view")
 def test_without_a_screen_the_recording_is_written_and_named(cart, tmp_path, monkeypatch):
     folder = copied(cart, tmp_path / "w")
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
@@ -28,6 +29,7 @@ def test_without_a_screen_the_recording_is_written_and_named(cart, tmp_path, mon
 
 @needs_posix
 @pytest.mark.parametrize(("ending", "code"), [("exit 3", 1), ("exit 0", 0), ("sleep 3", 0)])
+@pytest.mark.extra("view")
 def test_the_viewer_is_started_for_this_machine_alone(cart, tmp_path, monkeypatch, ending, code):
     folder = copied(cart, tmp_path / "w")
     program = tmp_path / "rerun"

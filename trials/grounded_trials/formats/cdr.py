@@ -25,6 +25,7 @@ from grounded_trials.formats.messages import (
     Field,
     Floats,
     Ints,
+    Node,
     Number,
     Struct,
     Text,
@@ -57,60 +58,42 @@ _KINDS = {
 
 
 @dataclass(frozen=True, eq=False)
-class CdrNode:
+class _CdrNode(Node):
     """Row i is the value of `type` at buffer[pos[i]], in a message from base[i] to end[i]."""
 
-    buffer: bytes
-    coding: Coding
-    type: Type
-    rows: Ints
     base: Ints
     pos: Ints
     end: Ints
+    buffer: bytes
+    coding: Coding
 
-    def keep(self, chosen: Bools) -> CdrNode:
-        """See `nodes.Node`."""
-        return self._pick(self.type, np.flatnonzero(chosen))
-
-    def numbered(self, rows: Ints) -> CdrNode:
-        """See `nodes.Node`."""
-        return replace(self, rows=rows)
-
-    def names(self) -> tuple[str, ...]:
-        """See `nodes.Node`."""
-        return tuple(self.type.by_name) if isinstance(self.type, Struct) else ()
-
-    def field(self, name: str) -> CdrNode:
-        """See `nodes.Node`."""
+    def field(self, name: str) -> _CdrNode:
         assert isinstance(self.type, Struct)
         node = self
         for part in _before(self.type, name, self.coding):
             node = node._at(node._after(part))
         return replace(node, type=self.type.by_name[name].type)
 
-    def items(self, start: int, stop: int) -> CdrNode:
-        """See `nodes.Node`."""
+    def items(self, start: int, stop: int) -> _CdrNode:
         assert isinstance(self.type, Array)
         item = self.type.item
         counts, body = self._counts()
         row, index = choose_items(counts, start, stop)
         if len(row) > ROW_LIMIT:
             raise BadPath(f"it finds {len(row)} values at once; name the items that are meant")
-        inside = body._pick(item, row)
+        inside = replace(body.pick(row), type=item)
         sizes = _sizes(item, self.coding)
         if sizes is not None:
             return inside._at(inside._over(sizes, index))
         return inside._at(body._positions(item, row, index))
 
     def numbers(self) -> Floats:
-        """See `nodes.Node`."""
         assert isinstance(self.type, Number)
         kind = "u1" if self.type.kind == "b1" else self.type.kind
         values = self._aligned(self.type.size)._read(kind)
         return np.asarray(values != 0 if self.type.kind == "b1" else values, dtype=np.float64)
 
     def equals(self, text: str) -> Bools:
-        """See `nodes.Node`."""
         counts, body = self._counts()
         length = counts.copy()
         if self.coding.terminated:
@@ -119,21 +102,10 @@ class CdrNode:
             length -= (counts > 0) & (last == 0)
         return texts_equal(self.buffer, body.pos, length, text.encode())
 
-    def _pick(self, type: Type, row: Ints) -> CdrNode:
-        return CdrNode(
-            self.buffer,
-            self.coding,
-            type,
-            self.rows[row],
-            self.base[row],
-            self.pos[row],
-            self.end[row],
-        )
-
-    def _at(self, pos: Ints) -> CdrNode:
+    def _at(self, pos: Ints) -> _CdrNode:
         return replace(self, pos=pos)
 
-    def _aligned(self, size: int) -> CdrNode:
+    def _aligned(self, size: int) -> _CdrNode:
         multiple = min(size, self.coding.align)
         return self._at(self.pos + ((self.base - self.pos) & (multiple - 1)))
 
@@ -148,7 +120,7 @@ class CdrNode:
         if over.any():
             raise BadMessage(self.rows[over][0], f"it ends inside a {self.type}")
 
-    def _counts(self) -> tuple[Ints, CdrNode]:
+    def _counts(self) -> tuple[Ints, _CdrNode]:
         """How many items a list or text has, and the cursors at the first."""
         if isinstance(self.type, Array) and self.type.count is not None:
             return np.full(len(self.rows), self.type.count, dtype=np.int64), self
@@ -200,9 +172,8 @@ class CdrNode:
         ends = np.searchsorted(index[order], np.arange(last + 1), "right")
         for i in range(last):
             live = np.unique(row[order[ends[i] :]])
-            moved = node._pick(item, live)
             pos = node.pos.copy()
-            pos[live] = moved._after(item)
+            pos[live] = node.pick(live)._after(item)
             node = node._at(pos)
             here = order[ends[i] : ends[i + 1]]
             found[here] = pos[row[here]]
@@ -245,13 +216,8 @@ def _sizes(type: Type, coding: Coding) -> _Table | None:
         return None
     if not type.fields:
         return _Table((int(coding.terminated),) * 8)
-    total = np.zeros(8, dtype=np.int64)
-    for field in type.fields:
-        sizes = _sizes(field.type, coding)
-        if sizes is None:
-            return None
-        total = total + sizes.once[(np.arange(8) + total) & 7]
-    return _Table(tuple(total.tolist()))
+    first, *others = _parts(type.fields, coding)
+    return first if isinstance(first, _Table) and not others else None
 
 
 @lru_cache(maxsize=4096)
@@ -278,12 +244,12 @@ def _parts(fields: tuple[Field, ...], coding: Coding) -> tuple[Type | _Table, ..
     return tuple(parts)
 
 
-def ros1_messages(buffer: bytes, type: Struct, start: Ints, end: Ints) -> CdrNode:
+def ros1_messages(buffer: bytes, type: Struct, start: Ints, end: Ints) -> Node:
     """ROS 1 messages of one type at buffer[start[i]:end[i]] as the root of a path."""
-    return CdrNode(buffer, ROS1, type, np.arange(len(start)), start, start, end)
+    return _CdrNode(type, np.arange(len(start)), start, start, end, buffer, ROS1)
 
 
-def cdr_messages(buffer: bytes, type: Struct, start: Ints, end: Ints) -> CdrNode:
+def cdr_messages(buffer: bytes, type: Struct, start: Ints, end: Ints) -> Node:
     """CDR messages of one type at buffer[start[i]:end[i]] as the root of a path.
 
     Raises:
@@ -309,4 +275,4 @@ def cdr_messages(buffer: bytes, type: Struct, start: Ints, end: Ints) -> CdrNode
             )
     coding = _KINDS[int(kinds[0])] if len(kinds) else _KINDS[1]
     base = start + 4
-    return CdrNode(buffer, coding, type, np.arange(len(start)), base, base, end)
+    return _CdrNode(type, np.arange(len(start)), base, base, end, buffer, coding)

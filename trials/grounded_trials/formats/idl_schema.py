@@ -3,6 +3,9 @@
 The text holds modules, structs, typedefs, enums and constants; with ros2idl several files follow
 each other, each after a line of '=' and a line "IDL: package/msg/Type". Annotations and comments
 are stepped over. Unions, maps and optional members are not plain CDR and are refused.
+
+Every token is looked at once, and what a name means is remembered: the time taken grows with the
+length of the text, whatever it says.
 """
 
 from __future__ import annotations
@@ -10,47 +13,33 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, field
 
-from grounded_trials.formats.messages import Array, Field, Number, Struct, Text, Type
-from grounded_trials.formats.protobuf_schema import BadSchema
+from grounded_trials.formats.messages import Array, BadSchema, Field, Number, Struct, Text, Type
+from grounded_trials.formats.schemas import COUNT_LIMIT, DEPTH_LIMIT, NUMBERS
 
+# What is not ended (a comment, a text) goes on to the end: nothing is scanned twice.
 _TOKEN = re.compile(
-    r'//[^\n]*|/\*.*?\*/|^\s*#[^\n]*|^={3,}\s*\nIDL:[^\n]*|"(?:[^"\\]|\\.)*"|\'(?:[^\'\\]|\\.)*\''
+    r"//[^\n]*|/\*.*?(?:\*/|\Z)|^[^\S\n]*#[^\n]*|^={3,}\s*\nIDL:[^\n]*"
+    r'|"(?:[^"\\]|\\.)*(?:"|\\?\Z)|\'(?:[^\'\\]|\\.)*(?:\'|\\?\Z)'
     r"|@?[A-Za-z_]\w*(?:::\w+)*|::\w+(?:::\w+)*|[-+]?[\d.]\w*|\S",
     re.DOTALL | re.MULTILINE,
 )
 _SKIPPED = ("//", "/*", "#", "===")
-_NUMBERS = {
-    "boolean": "b1",
-    "octet": "u1",
-    "char": "u1",
-    "int8": "i1",
-    "uint8": "u1",
-    "short": "i2",
-    "int16": "i2",
-    "uint16": "u2",
-    "long": "i4",
-    "int32": "i4",
-    "uint32": "u4",
-    "long long": "i8",
-    "int64": "i8",
-    "uint64": "u8",
-    "unsigned short": "u2",
-    "unsigned long": "u4",
-    "unsigned long long": "u8",
-    "float": "f4",
-    "double": "f8",
+_NUMBERS = {name: number for name, number in NUMBERS.items() if "int" in name} | {
+    "boolean": Number("b1"),
+    "octet": Number("u1"),
+    "char": Number("u1"),
+    "short": Number("i2"),
+    "long": Number("i4"),
+    "long long": Number("i8"),
+    "unsigned short": Number("u2"),
+    "unsigned long": Number("u4"),
+    "unsigned long long": Number("u8"),
+    "float": Number("f4"),
+    "double": Number("f8"),
 }
 _REFUSED = ("union", "map", "bitset", "bitmask", "any", "interface", "valuetype")
-DEPTH_LIMIT, COUNT_LIMIT = 64, 10**8
-
-
-@dataclass
-class _Open:
-    """A struct as written: its base, its members' tokens, and where names are looked up from."""
-
-    scope: tuple[str, ...]
-    base: str
-    members: list[list[str]] = field(default_factory=list)
+NAME_LIMIT = 256  # characters of a module's name
+FIELD_LIMIT = 1_000_000  # of all structs together
 
 
 def parse_idl(text: str, name: str) -> Struct:
@@ -66,19 +55,28 @@ def parse_idl(text: str, name: str) -> Struct:
         raise BadSchema(f"its IDL definition is damaged: {error}") from None
 
 
+@dataclass
+class _Definition:
+    """A struct, typedef, enum or const as written, and where its names are looked up from."""
+
+    kind: str
+    scope: tuple[str, ...]
+    parts: list[list[str]] = field(default_factory=list)  # a struct's members; what the name is
+    base: str = ""  # of a struct
+
+
 class _Parser:
     def __init__(self, tokens: list[str]) -> None:
         self.tokens, self.pos = tokens, 0
-        self.structs: dict[str, _Open] = {}
-        self.types: dict[str, tuple[tuple[str, ...], list[str]]] = {}  # typedefs, as written
-        self.enums: set[str] = set()
-        self.constants: dict[str, str] = {}
+        self.defined: dict[str, _Definition] = {}
+        self.found: dict[tuple[str, tuple[str, ...]], str] = {}
         self.built: dict[str, Struct] = {}
+        self.fields = 0
 
     def read(self, name: str) -> Struct:
         while self.pos < len(self.tokens):
             self.definition(())
-        if name not in self.structs:
+        if name not in self.defined or self.defined[name].kind != "struct":
             raise BadSchema(f"its IDL definition has no struct '{name}'")
         return self.struct(name, 0)
 
@@ -118,6 +116,8 @@ class _Parser:
             self.annotation(token)
         elif token == "module":
             inner = (*scope, self.take())
+            if len(inner) > DEPTH_LIMIT or len(inner[-1]) > NAME_LIMIT:
+                raise BadSchema(f"its IDL definition has a module '{inner[-1][:40]}' in too many")
             self.expect("{")
             while self.tokens[self.pos] != "}":
                 self.definition(inner)
@@ -125,115 +125,133 @@ class _Parser:
         elif token == "struct":
             self.open_struct(scope)
         elif token == "enum":
-            self.enums.add("::".join((*scope, self.take())))
+            self.define(self.take(), _Definition(token, scope))
             self.until("}")
         elif token == "typedef":
             written = self.until(";")
             at = written.index("[") if "[" in written else len(written)
-            alias = written[at - 1]
-            self.types["::".join((*scope, alias))] = (scope, written[: at - 1] + written[at:])
+            parts = [written[: at - 1] + written[at:]]
+            self.define(written[at - 1], _Definition(token, scope, parts))
         elif token == "const":
             written = self.until(";")
             at = written.index("=")
-            self.constants["::".join((*scope, written[at - 1]))] = "".join(written[at + 1 :])
+            self.define(written[at - 1], _Definition(token, scope, [written[at + 1 :]]))
         elif token in _REFUSED:
             raise BadSchema(f"its IDL definition has a {token}, which can't be read")
         elif token != ";":
             raise BadSchema(f"its IDL definition has '{token[:40]}' where a definition should be")
 
+    def define(self, name: str, definition: _Definition) -> None:
+        self.defined["::".join((*definition.scope, name))] = definition
+
     def open_struct(self, scope: tuple[str, ...]) -> None:
-        name, base = self.take(), ""
+        name, opened = self.take(), _Definition("struct", scope)
         if self.tokens[self.pos] == ";":  # a forward declaration
             return
         if self.tokens[self.pos] == ":":
             self.pos += 1
-            base = self.take()
+            opened.base = self.take()
         self.expect("{")
-        opened = _Open((*scope, name), base)
         while True:
             while self.tokens[self.pos].startswith("@"):
                 self.annotation(self.take())
             if self.tokens[self.pos] == "}":
                 break
-            opened.members.append(self.until(";"))
+            opened.parts.append(self.until(";"))
         self.pos += 1
-        self.structs["::".join((*scope, name))] = opened
+        self.define(name, opened)
+        opened.scope = (*scope, name)
 
     def struct(self, name: str, depth: int) -> Struct:
         if name not in self.built:
-            if depth > DEPTH_LIMIT:
-                raise BadSchema(f"its IDL definition of '{name}' contains itself")
-            opened = self.structs[name]
+            self.check_depth(name, depth)
+            opened = self.defined[name]
             fields: list[Field] = []
             if opened.base:
-                fields += self.struct(self.find(opened.base, opened.scope), depth + 1).fields
-            for written in opened.members:
+                base = self.find(opened.base, opened.scope)
+                fields += self.struct(base, depth + 1).fields
+            for written in opened.parts:
                 fields += self.member(written, opened.scope, depth)
+            self.fields += len(fields)
+            if self.fields > FIELD_LIMIT:
+                raise BadSchema(f"its IDL definition has more than {FIELD_LIMIT} fields")
             # ROS gives a struct without members one byte, under a name that nobody uses.
             fields = [f for f in fields if f.name != "structure_needs_at_least_one_member"]
             self.built[name] = Struct(name.replace("::", "/"), tuple(fields))
         return self.built[name]
+
+    def check_depth(self, name: str, depth: int) -> None:
+        if depth > DEPTH_LIMIT:
+            raise BadSchema(
+                f"its IDL definition of '{name[:80]}' contains itself, or goes too deep"
+            )
 
     def member(self, written: list[str], scope: tuple[str, ...], depth: int) -> list[Field]:
         kind, rest = self.type(written, scope, depth)
         fields, at = [], 0
         while at < len(rest):
             name, at = rest[at], at + 1
-            counts: list[int] = []
+            counts: list[str] = []
             while at < len(rest) and rest[at] == "[":
-                counts.append(self.count(rest[at + 1], scope))
+                counts.append(rest[at + 1])
                 at += 3
-            inner = kind
-            for count in reversed(counts):
-                inner = Array(inner, count)
-            fields.append(Field(name, inner))
+            fields.append(Field(name, self.array(kind, counts, scope)))
             at += 1  # the comma
         return fields
+
+    def array(self, kind: Type, counts: list[str], scope: tuple[str, ...]) -> Type:
+        """An array of arrays, the first count outermost."""
+        self.check_depth("[...]", len(counts))
+        for text in reversed(counts):
+            count = self.count(text, scope, 0)
+            if not 0 <= count <= COUNT_LIMIT:
+                raise BadSchema(f"its IDL definition has an array of {count} items")
+            kind = Array(kind, count)
+        return kind
+
+    def count(self, text: str, scope: tuple[str, ...], depth: int) -> int:
+        """A number, or the constant of that name."""
+        if not text[:1].isalpha():
+            return int(text)
+        self.check_depth(text, depth)
+        constant = self.defined[self.find(text, scope)]
+        return self.count("".join(constant.parts[0]), constant.scope, depth + 1)
 
     def type(
         self, written: list[str], scope: tuple[str, ...], depth: int
     ) -> tuple[Type, list[str]]:
         """The type at the front of the tokens, and the tokens after it."""
         first = written[0]
+        self.check_depth(first, depth)
         if first in ("string", "wstring"):
             after = 4 if len(written) > 1 and written[1] == "<" else 1
             return Text(1 if first == "string" else 0), written[after:]
         if first == "sequence":
-            item, rest = self.type(written[2:], scope, depth)
+            item, rest = self.type(written[2:], scope, depth + 1)
             return Array(item), rest[3:] if rest[0] == "," else rest[1:]
         for words in (3, 2, 1):
             number = _NUMBERS.get(" ".join(written[:words]))
-            if number:
-                if written[words : words + 1] == ["double"]:
-                    break
-                return Number(number), written[words:]
+            if number and written[words : words + 1] != ["double"]:
+                return number, written[words:]
         if first in _REFUSED or first in ("long", "wchar"):
             raise BadSchema(f"its IDL definition uses {first}, which can't be read")
         name = self.find(first, scope)
-        if name in self.enums:
+        definition = self.defined[name]
+        if definition.kind == "enum":
             return Number("u4"), written[1:]
-        if name in self.types:
-            if depth > DEPTH_LIMIT:
-                raise BadSchema(f"its IDL definition of '{name}' contains itself")
-            inner_scope, tokens = self.types[name]
-            kind, rest = self.type(tokens, inner_scope, depth + 1)
-            for i in reversed(range(0, len(rest), 3)):
-                kind = Array(kind, self.count(rest[i + 1], inner_scope))
-            return kind, written[1:]
-        return self.struct(name, depth + 1), written[1:]
+        if definition.kind == "struct":
+            return self.struct(name, depth + 1), written[1:]
+        kind, rest = self.type(definition.parts[0], definition.scope, depth + 1)
+        return self.array(kind, rest[1::3], definition.scope), written[1:]
 
     def find(self, name: str, scope: tuple[str, ...]) -> str:
         """The full name that a name means, looked up from the inside out."""
-        for i in range(len(scope), -1, -1):
-            full = "::".join((*scope[:i], name.removeprefix("::")))
-            if full in self.structs or full in self.types or full in self.enums:
-                return full
-        raise BadSchema(f"its IDL definition uses '{name}', which it does not define")
-
-    def count(self, text: str, scope: tuple[str, ...]) -> int:
-        for i in range(len(scope), -1, -1):
-            text = self.constants.get("::".join((*scope[:i], text)), text)
-        count = int(text)
-        if not 0 <= count <= COUNT_LIMIT:
-            raise BadSchema(f"its IDL definition has an array of {count} items")
-        return count
+        if (name, scope) not in self.found:
+            for i in range(len(scope), -1, -1):
+                full = "::".join((*scope[:i], name.removeprefix("::")))
+                if full in self.defined:
+                    self.found[name, scope] = full
+                    break
+            else:
+                raise BadSchema(f"its IDL definition uses '{name[:80]}', which it does not define")
+        return self.found[name, scope]

@@ -1,20 +1,16 @@
-"""MCAP's records: what each holds, and how its bytes are read.
+"""MCAP's records: what each holds, how its bytes are read, and how a chunk is decompressed.
 
 Integers are little-endian; a text is u32 length and UTF-8; a table is u32 length and pairs of
 texts. Messages come in batches: one buffer and the positions of the messages in it, so that a
-million of them can be decoded by array operations.
-
-The compressions a chunk may have: none, lz4, zstd; decompressed to its stated size, never more.
-
-The libraries are imported when the first chunk needs them.
+million of them can be decoded by array operations. A chunk (lz4, zstd or neither) is decompressed
+to the size that it states, never further.
 """
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from struct import Struct
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +18,6 @@ from numpy.typing import NDArray
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 1, 2, 3, 4, 5, 6
 MESSAGE_INDEX, ATTACHMENT, METADATA, DATA_END = 7, 9, 12, 15
 MESSAGE_HEADER = 22  # channel u16, sequence u32, log time u64, publish time u64
-
-_U16, _U32, _U64 = Struct("<H"), Struct("<I"), Struct("<Q")
 
 
 @dataclass(frozen=True)
@@ -70,17 +64,19 @@ class Messages:
     def __len__(self) -> int:
         return len(self.starts)
 
+    def channel_ids(self) -> list[int]:
+        """The channels that have messages here, in rising order."""
+        return np.flatnonzero(np.bincount(self.channels)).tolist()
+
+    def of(self, channel: int) -> Messages:
+        """The messages of one channel."""
+        chosen = self.channels == channel
+        return self if chosen.all() else self.take(chosen)
+
     def take(self, chosen: NDArray[np.bool_]) -> Messages:
         """The messages where `chosen` (N,) is true."""
-        return Messages(
-            self.buffer,
-            self.starts[chosen],
-            self.ends[chosen],
-            self.channels[chosen],
-            self.sequences[chosen],
-            self.log_times[chosen],
-            self.publish_times[chosen],
-        )
+        _, *columns = vars(self).values()
+        return Messages(self.buffer, *(column[chosen] for column in columns))
 
 
 @dataclass(frozen=True)
@@ -134,11 +130,8 @@ def batch(buffer: bytes, positions: list[int]) -> Messages:
     )
 
 
-class Short(Exception):
-    """A record's content ends too early."""
-
-    def __str__(self) -> str:
-        return "it is too short for what it must hold"
+class BadRecord(Exception):
+    """Why a record or a chunk can't be read; the walk over the file says where."""
 
 
 class Fields:
@@ -151,34 +144,29 @@ class Fields:
         """The next `count` bytes."""
         end = self.pos + count
         if end > len(self.content):
-            raise Short
+            raise BadRecord("it is too short for what it must hold")
         piece = self.content[self.pos : end]
         self.pos = end
         return piece
 
-    def u16(self) -> int:
+    def uint(self, bits: int) -> int:
         """The next number."""
-        return int(_U16.unpack(self.skip(2))[0])
-
-    def u32(self) -> int:
-        """The next number."""
-        return int(_U32.unpack(self.skip(4))[0])
-
-    def u64(self) -> int:
-        """The next number."""
-        return int(_U64.unpack(self.skip(8))[0])
+        return int.from_bytes(self.skip(bits // 8), "little")
 
     def text(self) -> str:
         """The next text."""
-        return self.skip(self.u32()).decode("utf-8")
+        try:
+            return self.skip(self.uint(32)).decode("utf-8")
+        except UnicodeDecodeError as error:
+            raise BadRecord(str(error)) from None
 
     def blob(self) -> bytes:
         """The next bytes, after their length."""
-        return self.skip(self.u64())
+        return self.skip(self.uint(64))
 
     def table(self) -> dict[str, str]:
         """The next table of texts."""
-        inner = Fields(self.skip(self.u32()))
+        inner = Fields(self.skip(self.uint(32)))
         pairs: dict[str, str] = {}
         while inner.pos < len(inner.content):
             key = inner.text()
@@ -186,44 +174,43 @@ class Fields:
         return pairs
 
 
-def _header(f: Fields) -> Header:
-    return Header(f.text(), f.text())
-
-
-def _schema(f: Fields) -> Schema:
-    return Schema(f.u16(), f.text(), f.text(), f.skip(f.u32()))
-
-
 def _channel(f: Fields) -> Channel:
-    identity, schema_id = f.u16(), f.u16()
+    identity, schema_id = f.uint(16), f.uint(16)
     return Channel(identity, f.text(), f.text(), schema_id, f.table())
 
 
 def _attachment(f: Fields) -> Attachment:
-    log_time, create_time = f.u64(), f.u64()
+    log_time, create_time = f.uint(64), f.uint(64)
     attachment = Attachment(f.text(), f.text(), f.blob(), log_time, create_time)
     end = f.pos
-    stated = f.u32()
+    stated = f.uint(32)
     if stated and zlib.crc32(f.content[:end]) != stated:
-        raise BadChunk("its checksum does not fit its content")
+        raise BadRecord("its checksum does not fit its content")
     return attachment
 
 
-def _metadata(f: Fields) -> Metadata:
-    return Metadata(f.text(), f.table())
-
-
 PARSERS: dict[int, Callable[[Fields], Record]] = {
-    HEADER: _header,
-    SCHEMA: _schema,
+    HEADER: lambda f: Header(f.text(), f.text()),
+    SCHEMA: lambda f: Schema(f.uint(16), f.text(), f.text(), f.skip(f.uint(32))),
     CHANNEL: _channel,
     ATTACHMENT: _attachment,
-    METADATA: _metadata,
+    METADATA: lambda f: Metadata(f.text(), f.table()),
 }
 
 
-class BadChunk(Exception):
-    """Why a chunk can't be read; the walk over the file says where."""
+def chunk_content(content: bytes, limit: int) -> tuple[bytes, bool]:
+    """The records in a chunk, and whether a checksum vouches for them.
+
+    Raises:
+        BadRecord: for a checksum that doesn't fit, and see `decompress`.
+    """
+    fields = Fields(content)
+    fields.skip(16)
+    size, crc, compression = fields.uint(64), fields.uint(32), fields.text()
+    data = decompress(compression, fields.blob(), size, limit)
+    if crc and zlib.crc32(data) != crc:
+        raise BadRecord("its checksum does not fit its content")
+    return data, bool(crc)
 
 
 def decompress(compression: str, data: bytes, size: int, limit: int) -> bytes:
@@ -236,76 +223,59 @@ def decompress(compression: str, data: bytes, size: int, limit: int) -> bytes:
         limit: the largest size that is accepted [bytes].
 
     Raises:
-        BadChunk: for another compression, a size beyond the limit, or content of another size.
+        BadRecord: for another compression, a size beyond the limit, or content of another size.
     """
     if size > limit:
-        raise BadChunk(f"it claims {size} bytes when decompressed, the limit is {limit}")
-    if compression == "":
-        content = data
-    elif compression == "zstd":
-        content = _zstd(data, size)
-    elif compression == "lz4":
-        content = _lz4(data, size)
-    else:
-        raise BadChunk(f"its compression '{compression}' is not one of zstd, lz4 and none")
+        raise BadRecord(f"it claims {size} bytes when decompressed, the limit is {limit}")
+    if compression not in ("", "zstd", "lz4"):
+        raise BadRecord(f"its compression '{compression}' is not one of zstd, lz4 and none")
+    content, error = _expand(compression, data, size + 1, whole=True)
+    if error is not None:
+        raise BadRecord(f"it can't be decompressed ({error})")
     if len(content) != size:
-        raise BadChunk(f"it holds {len(content)} bytes, not the {size} that it states")
-    return content
-
-
-def _zstd(data: bytes, size: int) -> bytes:
-    import zstandard
-
-    decoder = zstandard.ZstdDecompressor(max_window_size=2**27)
-    try:
-        with decoder.stream_reader(data) as reader:
-            content: bytes = reader.read(size + 1)
-    except zstandard.ZstdError as error:
-        raise BadChunk(f"it can't be decompressed ({error})") from None
-    return content
-
-
-def _lz4(data: bytes, size: int) -> bytes:
-    from lz4.frame import LZ4FrameDecompressor
-
-    decoder = LZ4FrameDecompressor()
-    try:
-        content: bytes = decoder.decompress(data, max_length=size + 1)
-    except (RuntimeError, EOFError, ValueError, MemoryError) as error:
-        raise BadChunk(f"it can't be decompressed ({error})") from None
+        raise BadRecord(f"it holds {len(content)} bytes, not the {size} that it states")
     return content
 
 
 def decompress_part(compression: str, data: bytes, limit: int) -> bytes:
     """What can still be decompressed of a chunk whose end is missing, at most `limit` bytes."""
-    if compression == "zstd":
-        return _zstd_part(data, limit)
-    if compression == "lz4":
-        return _lz4_part(data, limit)
-    return data[:limit] if compression == "" else b""
+    return _expand(compression, data, limit, whole=False)[0][:limit]
 
 
-def _zstd_part(data: bytes, limit: int) -> bytes:
+def _expand(
+    compression: str, data: bytes, limit: int, *, whole: bool
+) -> tuple[bytes, Exception | None]:
+    """The content up to about `limit` bytes or to an error, and the error.
+
+    Piece by piece unless `whole`: what comes before an error is kept then.
+    """
+    parts: list[bytes] = []
+    pieces = {"zstd": _zstd, "lz4": _lz4}.get(compression)
+    try:
+        for part in pieces(data, limit, whole) if pieces else (data,) * (compression == ""):
+            parts.append(part)
+            if sum(map(len, parts)) >= limit:
+                break
+    except (RuntimeError, EOFError, ValueError, MemoryError) as error:
+        return b"".join(parts), error
+    return b"".join(parts), None
+
+
+def _zstd(data: bytes, limit: int, whole: bool) -> Iterator[bytes]:
     import zstandard
 
-    parts: list[bytes] = []
     decoder = zstandard.ZstdDecompressor(max_window_size=2**27)
-    with decoder.stream_reader(data) as reader:
-        try:
-            while sum(map(len, parts)) < limit and (part := reader.read(2**17)):
-                parts.append(part)
-        except zstandard.ZstdError:
-            pass
-    return b"".join(parts)
+    try:
+        with decoder.stream_reader(data) as reader:
+            while part := reader.read(limit if whole else 2**17):
+                yield part
+    except zstandard.ZstdError as error:
+        raise ValueError(str(error)) from None
 
 
-def _lz4_part(data: bytes, limit: int) -> bytes:
+def _lz4(data: bytes, limit: int, whole: bool) -> Iterator[bytes]:
     from lz4.frame import LZ4FrameDecompressor
 
-    decoder, parts = LZ4FrameDecompressor(), []
-    try:
-        for start in range(0, len(data), 2**12):
-            parts.append(decoder.decompress(data[start : start + 2**12], max_length=limit))
-    except (RuntimeError, EOFError, ValueError, MemoryError):
-        pass
-    return b"".join(parts)[:limit]
+    decoder, step = LZ4FrameDecompressor(), max(1, len(data)) if whole else 2**12
+    for start in range(0, len(data), step):
+        yield decoder.decompress(data[start : start + step], max_length=limit)

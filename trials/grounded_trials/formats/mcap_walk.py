@@ -14,7 +14,7 @@ of a truncated file, and checks neither summary nor attachments; its import cost
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from struct import Struct
 from typing import BinaryIO
 
@@ -28,14 +28,13 @@ from grounded_trials.formats.mcap_records import (
     MESSAGE_HEADER,
     PARSERS,
     SCHEMA,
-    BadChunk,
+    BadRecord,
     End,
     Fields,
     Messages,
     Record,
-    Short,
     batch,
-    decompress,
+    chunk_content,
 )
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -56,32 +55,25 @@ class DamagedFile(GroundedError):
         super().__init__(f"{name}: {found} (at byte {offset}); {advice}", then)
 
 
-OnDamage = Callable[[DamagedFile], None]
-
-
-def read_records(
-    stream: BinaryIO, name: str, *, limit: int = RECORD_LIMIT, on_damage: OnDamage | None = None
-) -> Iterator[Record]:
+def read_records(stream: BinaryIO, name: str, *, limit: int = RECORD_LIMIT) -> Iterator[Record]:
     """Yields the records of an MCAP stream in order, ending with `End`.
 
     Args:
         stream: a seekable binary file, read from its beginning.
         name: of the file, for messages.
         limit: largest record, and largest chunk when decompressed [bytes].
-        on_damage: told of a damaged chunk or record that could be stepped over; without it
-            the first damage raises.
 
     Raises:
         DamagedFile: where the bytes are not a complete, undamaged MCAP file.
     """
-    yield from _Walk(stream, name, limit, on_damage).records()
+    yield from _Walk(stream, name, limit).records()
 
 
 class _Walk:
     """One pass over a file; `buffer[pos:]` is what has been read and not used yet."""
 
-    def __init__(self, stream: BinaryIO, name: str, limit: int, on_damage: OnDamage | None) -> None:
-        self.stream, self.name, self.limit, self.on_damage = stream, name, limit, on_damage
+    def __init__(self, stream: BinaryIO, name: str, limit: int) -> None:
+        self.stream, self.name, self.limit = stream, name, limit
         self.size = stream.seek(0, 2)
         stream.seek(0)
         self.buffer, self.pos, self.base = b"", 0, 0
@@ -162,40 +154,27 @@ class _Walk:
 
     def _run_of_messages(self) -> Messages:
         """All message records that follow each other in the buffer."""
-        start = self.pos
-        positions, self.pos = message_positions(self.buffer, start, len(self.buffer), self.damaged)
+        try:
+            positions, self.pos = message_positions(self.buffer, self.pos, len(self.buffer))
+        except BadRecord as error:
+            raise self.damaged(str(error)) from None
         return batch(self.buffer, positions)
 
     def _data_record(self, opcode: int, content: bytes, at: int) -> Iterator[Record]:
         try:
             if opcode == CHUNK:
-                yield from self._chunk(content, at)
+                yield from chunk_records(chunk_content(content, self.limit)[0])
             elif opcode in PARSERS:
                 yield PARSERS[opcode](Fields(content))
-        except (BadChunk, Short, UnicodeDecodeError) as error:
+        except BadRecord as error:
             names = {CHUNK: "a chunk", SCHEMA: "a schema", CHANNEL: "a channel"}
             what = names.get(opcode, f"a record of type {opcode}")
-            damage = self.damaged(f"{what} is damaged: {error}", at)
-            if self.on_damage is None:
-                raise damage from None
-            self.on_damage(damage)
-
-    def _chunk(self, content: bytes, at: int) -> Iterator[Record]:
-        fields = Fields(content)
-        fields.skip(16)
-        size, crc, compression = fields.u64(), fields.u32(), fields.text()
-        data = decompress(compression, fields.blob(), size, self.limit)
-        if crc and zlib.crc32(data) != crc:
-            raise BadChunk("its checksum does not fit its content")
-        yield from chunk_records(data)
+            raise self.damaged(f"{what} is damaged: {error}", at) from None
 
     def _data_end(self, content: bytes) -> None:
-        stated = Fields(content).u32() if len(content) >= 4 else 0
+        stated = Fields(content).uint(32) if len(content) >= 4 else 0
         if stated and stated != self.fold():
-            damage = self.damaged("the checksum of the data section does not fit its content")
-            if self.on_damage is None:
-                raise damage
-            self.on_damage(damage)
+            raise self.damaged("the checksum of the data section does not fit its content")
         self.data_crc = bool(stated)
         start = self.pos + 9 + len(content)
         self.crc, self.crc_pos = 0, start
@@ -219,26 +198,26 @@ class _Walk:
             raise self.damaged(f"{self.size - self.offset} bytes follow after the end")
 
 
-def chunk_records(data: bytes) -> Iterator[Record]:
+def chunk_records(data: bytes, *, cut: bool = False) -> Iterator[Record]:
     """Yields the schemas and channels of a decompressed chunk, then its messages as one batch.
 
+    Args:
+        data: the chunk's content.
+        cut: its end is missing: stop at the first record that is not wholly there.
+
     Raises:
-        BadChunk: if the records do not fit the chunk.
+        BadRecord: if the records do not fit the chunk.
     """
-
-    def bad(found: str, offset: int | None = None) -> BadChunk:
-        return BadChunk(found)
-
     positions: list[int] = []
     pos, end = 0, len(data)
     while pos < end:
-        if end - pos < 9:
-            raise BadChunk("it ends inside a record")
-        opcode, length = _HEAD.unpack_from(data, pos)
+        opcode, length = _HEAD.unpack_from(data, pos) if end - pos >= 9 else (0, end)
         if length > end - pos - 9:
-            raise BadChunk("it ends inside a record")
+            if cut:
+                break
+            raise BadRecord("it ends inside a record")
         if opcode == MESSAGE:
-            more, pos = message_positions(data, pos, end, bad)
+            more, pos = message_positions(data, pos, end)
             positions.extend(more)
             continue
         if opcode in (SCHEMA, CHANNEL):
@@ -247,13 +226,11 @@ def chunk_records(data: bytes) -> Iterator[Record]:
     yield batch(data, positions)
 
 
-def message_positions(
-    buffer: bytes, pos: int, end: int, bad: Callable[[str, int | None], Exception]
-) -> tuple[list[int], int]:
+def message_positions(buffer: bytes, pos: int, end: int) -> tuple[list[int], int]:
     """Starts of the complete message records from `pos` on, and where they stop.
 
     Raises:
-        Exception: what `bad` makes of a message that is shorter than its header.
+        BadRecord: for a message that is shorter than its header.
     """
     positions: list[int] = []
     append, unpack = positions.append, _HEAD.unpack_from
@@ -262,7 +239,7 @@ def message_positions(
         if opcode != MESSAGE or length > end - pos - 9:
             break
         if length < MESSAGE_HEADER:
-            raise bad(f"a message claims {length} bytes, it needs {MESSAGE_HEADER}", None)
+            raise BadRecord(f"a message claims {length} bytes, it needs {MESSAGE_HEADER}")
         append(pos)
         pos += 9 + length
     return positions, pos

@@ -25,15 +25,28 @@ from grounded_trials.formats.mcap_records import (
 LIBRARY = "grounded"
 
 
-class LogWriter:
+class _Writer:
+    """An MCAP file being written to a stream."""
+
+    def __init__(self, stream: IO[bytes], header: Header, *, compressed: bool) -> None:
+        from mcap.writer import CompressionType, Writer
+
+        kind = CompressionType.ZSTD if compressed else CompressionType.NONE
+        self._stream = stream
+        self._writer = Writer(stream, compression=kind, enable_data_crcs=True)
+        self._writer.start(profile=header.profile, library=header.library)
+
+    def finish(self) -> None:
+        """Ends the file; the stream stays open."""
+        self._writer.finish()  # type: ignore[no-untyped-call]
+        self._stream.flush()
+
+
+class LogWriter(_Writer):
     """Writes one file: metadata and attachments first, then messages, flushed in time."""
 
     def __init__(self, stream: IO[bytes]) -> None:
-        from mcap.writer import CompressionType, Writer
-
-        self._stream = stream
-        self._writer = Writer(stream, compression=CompressionType.NONE, enable_data_crcs=True)
-        self._writer.start(profile="", library=LIBRARY)
+        super().__init__(stream, Header("", LIBRARY), compressed=False)
         self._sequences: dict[int, int] = {}
 
     def metadata(self, name: str, table: Mapping[str, str]) -> None:
@@ -62,22 +75,12 @@ class LogWriter:
         """Hands everything written so far to the operating system."""
         self._writer.flush()  # type: ignore[no-untyped-call]
 
-    def finish(self) -> None:
-        """Ends the file; the stream stays open."""
-        self._writer.finish()  # type: ignore[no-untyped-call]
-        self._stream.flush()
 
-
-class CopyWriter:
+class CopyWriter(_Writer):
     """Writes records as they were read; ids are given anew."""
 
     def __init__(self, stream: IO[bytes], header: Header, *, compressed: bool) -> None:
-        from mcap.writer import CompressionType, Writer
-
-        kind = CompressionType.ZSTD if compressed else CompressionType.NONE
-        self._stream = stream
-        self._writer = Writer(stream, compression=kind, enable_data_crcs=True)
-        self._writer.start(profile=header.profile, library=header.library)
+        super().__init__(stream, header, compressed=compressed)
         self._schemas: dict[Schema, int] = {}
 
     def channel(self, channel: Channel, schema: Schema | None) -> int:
@@ -110,11 +113,6 @@ class CopyWriter:
         self._writer.add_attachment(
             record.create_time, record.log_time, record.name, record.media_type, record.data
         )
-
-    def finish(self) -> None:
-        """Ends the file; the stream stays open."""
-        self._writer.finish()  # type: ignore[no-untyped-call]
-        self._stream.flush()
 
 
 def file_descriptor_set(message: str, names: Sequence[str], *, repeated: bool = False) -> bytes:

@@ -154,11 +154,9 @@ class _Parser:
             if start is None:
                 self.fail("expected an index such as [0], or [:] for all items")
             return Slice(start, start)
-        if not self.take(":"):
-            self.fail("expected ':' or ']'")
+        self.expect(":", "':' or ']'")
         stop = self.integer()
-        if not self.take("]"):
-            self.fail("expected ']'")
+        self.expect("]")
         return Slice(0 if start is None else start, -1 if stop is None else stop)
 
     def integer(self) -> int | None:
@@ -175,8 +173,7 @@ class _Parser:
         found = [self.filter()]
         while self.take("&&"):
             found.append(self.filter())
-        if not self.take("}"):
-            self.fail("expected '}'")
+        self.expect("}")
         return found
 
     def filter(self) -> Filter:
@@ -224,8 +221,7 @@ class _Parser:
         if not self.take("("):
             self.fail(f"'@{name}' needs a number, such as @{name}(2)")
         value = float(self.match(_NUMBER, "a number"))
-        if not self.take(")"):
-            self.fail("expected ')'")
+        self.expect(")")
         if not math.isfinite(value) or (name == "div" and value == 0):
             self.fail(f"'@{name}' needs a finite number other than a division by 0")
         return value
@@ -256,10 +252,12 @@ class _Parser:
         self.pos += len(mark)
         return True
 
+    def expect(self, mark: str, what: str = "") -> None:
+        if not self.take(mark):
+            self.fail(f"expected {what or repr(mark)}")
+
     def blank(self) -> None:
-        found = _BLANK.match(self.text, self.pos)
-        assert found is not None
-        self.pos = found.end()
+        self.match(_BLANK, "a blank or none")
 
     def match(self, pattern: re.Pattern[str], what: str) -> str:
         found = pattern.match(self.text, self.pos)

@@ -1,20 +1,19 @@
-"""Message types, whatever language defined them: numbers, text, structs and arrays of these.
+"""What messages hold, whatever encoded them: a tree of types, and nodes that walk it.
 
-Definitions in ROS, protobuf and JSON schema become this one tree, and `message_path` walks it.
-
-What a message path walks over: the same place in many messages at once.
-
-A node stands for one value of a type in each of its rows; row i belongs to message `rows[i]`.
-Walking yields new nodes: `field` goes into a struct, `items` into an array (a message then has as
-many rows as items, or none), `keep` drops rows. `numbers` and `texts` read the values. CDR,
-ROS 1, protobuf and JSON each implement this and nothing else.
+A definition in ROS, IDL or protobuf becomes a `Type`: numbers, texts, structs and arrays of these.
+A `Node` is one place of that tree in many messages at once: row i is a value in message `rows[i]`.
+`field` goes into a struct, `items` into an array (a message then has as many rows as items, or
+none), `keep` drops rows; `numbers` and `equals` read the values. `cdr.py` and `protobuf.py` have
+nodes that decode bytes by array operations. JSON's are here: each message tells its own types, so
+they are parsed one by one.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,12 +96,16 @@ class Dynamic:
 
 Type = Number | Text | Array | Struct | Dynamic
 
-
 ROW_LIMIT = 10_000_000  # values that one path may find in one batch of messages
+JSON_LIMIT = 16 * 2**20  # [bytes] of a message; parsed, JSON takes many times its size
 
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]
+
+
+class BadSchema(Exception):
+    """A definition that can't be used; the text says why."""
 
 
 class BadMessage(Exception):
@@ -117,37 +120,46 @@ class BadPath(Exception):
     """A path does not fit the type of the messages; the text says where and what would fit."""
 
 
-class Node(Protocol):
+@dataclass(frozen=True, eq=False)
+class Node:
     """One value of `type` in each row; rows are sorted by message."""
 
-    @property
-    def type(self) -> Type:
-        """What each row holds."""
-
-    @property
-    def rows(self) -> Ints:
-        """The message of each row."""
+    type: Type
+    rows: Ints
 
     def field(self, name: str) -> Node:
         """The struct's field; rows where it is absent drop out."""
+        raise NotImplementedError
 
     def items(self, start: int, stop: int) -> Node:
         """The array's items from start to stop, both included; negative counts from the end."""
+        raise NotImplementedError
 
-    def keep(self, chosen: Bools) -> Node:
+    def pick(self, index: Ints) -> Self:
+        """These rows, in this order; a row may come several times."""
+        arrays = ((k, v) for k, v in vars(self).items() if isinstance(v, np.ndarray))
+        columns: dict[str, Any] = {name: column[index] for name, column in arrays}
+        return replace(self, **columns)
+
+    def keep(self, chosen: Bools) -> Self:
         """The rows where `chosen` is true."""
+        return self.pick(np.flatnonzero(chosen))
 
-    def numbered(self, rows: Ints) -> Node:
+    def numbered(self, rows: Ints) -> Self:
         """The same values with other numbers for their rows."""
+        return replace(self, rows=rows)
 
     def names(self) -> tuple[str, ...]:
         """The fields of a struct."""
+        return tuple(self.type.by_name) if isinstance(self.type, Struct) else ()
 
     def numbers(self) -> Floats:
         """The values of a number, a row each."""
+        raise NotImplementedError
 
     def equals(self, text: str) -> Bools:
         """Where a text is `text`."""
+        raise NotImplementedError
 
 
 def choose_items(counts: Ints, start: int, stop: int) -> tuple[Ints, Ints]:
@@ -177,3 +189,73 @@ def texts_equal(buffer: bytes, start: Ints, length: Ints, text: bytes) -> Bools:
     result = np.zeros(len(start), dtype=np.bool_)
     result[at] = True
     return result
+
+
+def json_messages(buffer: bytes, start: Ints, end: Ints) -> Node:
+    """JSON messages at buffer[start[i]:end[i]] as the root of a path.
+
+    null is a number that was not one, since JSON has no NaN; NaN itself is read too, since some
+    write it all the same.
+
+    Raises:
+        BadMessage: for one that is not JSON.
+    """
+    objects = []
+    for i, (a, b) in enumerate(zip(start.tolist(), end.tolist(), strict=True)):
+        if b - a > JSON_LIMIT:
+            raise BadMessage(i, f"it has {b - a} bytes of JSON, the limit is {JSON_LIMIT}")
+        try:
+            objects.append(json.loads(buffer[a:b]))
+        except (ValueError, RecursionError) as error:
+            raise BadMessage(i, f"it is not JSON: {error}") from None
+    return _JsonNode(Dynamic(), np.arange(len(objects)), _as_array(objects))
+
+
+@dataclass(frozen=True, eq=False)
+class _JsonNode(Node):
+    """Row i is the parsed value objects[i]; what a message lacks drops out."""
+
+    objects: NDArray[np.object_]
+
+    def names(self) -> tuple[str, ...]:
+        """Those of the first row that is an object."""
+        return next((tuple(o) for o in self.objects if isinstance(o, dict)), ())
+
+    def field(self, name: str) -> _JsonNode:
+        index = [i for i, o in enumerate(self.objects) if isinstance(o, dict) and name in o]
+        inner = _as_array([self.objects[i][name] for i in index])
+        return replace(self, rows=self.rows[np.array(index, dtype=np.int64)], objects=inner)
+
+    def items(self, start: int, stop: int) -> _JsonNode:
+        lists = [o if isinstance(o, list) else [] for o in self.objects]
+        row, index = choose_items(np.array(list(map(len, lists)), dtype=np.int64), start, stop)
+        pairs = zip(row.tolist(), index.tolist(), strict=True)
+        return replace(
+            self, rows=self.rows[row], objects=_as_array([lists[i][j] for i, j in pairs])
+        )
+
+    def numbers(self) -> Floats:
+        values = np.empty(len(self.objects))
+        for i, o in enumerate(self.objects):
+            if o is None:
+                values[i] = np.nan
+            elif isinstance(o, int | float):
+                values[i] = _as_float(o)
+            else:
+                what = {"dict": "an object", "list": "a list"}.get(type(o).__name__, "a text")
+                raise BadPath(f"it ends at {what} in message {self.rows[i]}, not at a number")
+        return values
+
+    def equals(self, text: str) -> Bools:
+        return np.array([o == text for o in self.objects], dtype=np.bool_)
+
+
+def _as_array(objects: list[Any]) -> NDArray[np.object_]:
+    return np.fromiter(objects, np.object_, len(objects))
+
+
+def _as_float(value: float) -> float:
+    try:
+        return float(value)
+    except OverflowError:  # an integer of hundreds of digits
+        return np.inf if value > 0 else -np.inf

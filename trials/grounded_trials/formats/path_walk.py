@@ -1,25 +1,32 @@
-"""Applying a message path to messages: checked against their type once, then array operations.
+"""Message paths and messages: which paths a type has, whether one fits it, what it finds.
 
-`bind` says whether a path fits a type, and where the time stamp of its value lies: in the deepest
-struct on the way that has a `header.stamp`, a `stamp` or a `timestamp`. `evaluate` walks nodes.
+`bind` checks a path against a type once, and says where the time stamp of its value lies: in the
+deepest struct on the way that has a `header.stamp`, a `stamp` or a `timestamp`. `evaluate` then
+walks the nodes of many messages by array operations. `number_paths` lists the paths of an unknown
+type.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
+from typing import Any
 
 import numpy as np
 
 from grounded.errors import nearest
 from grounded_trials.formats.message_path import (
     ANGLES,
+    BINARY,
+    UNARY,
     Field,
     Filter,
     Function,
     MessagePath,
     Slice,
     Step,
+    is_name,
 )
 from grounded_trials.formats.messages import (
     Array,
@@ -240,7 +247,8 @@ def _apply(node: Node, functions: Sequence[Function]) -> tuple[Ints, Floats]:
         rows, values, rest = node.rows, node.numbers(), tuple(functions)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         for function in rest:
-            values = _FUNCTIONS[function.name](values, function.argument)
+            argument = (function.argument,) if function.name in BINARY else ()
+            values = _FUNCTIONS[function.name](values, *argument)
     return rows, values
 
 
@@ -276,26 +284,57 @@ def _norm(node: Node) -> Floats:
     return np.sqrt(squares)
 
 
-_FUNCTIONS: dict[str, Callable[[Floats, float], Floats]] = {
-    "abs": lambda v, c: np.abs(v),
-    "negative": lambda v, c: -v,
-    "sign": lambda v, c: np.sign(v),
-    "sqrt": lambda v, c: np.sqrt(v),
-    "sin": lambda v, c: np.sin(v),
-    "cos": lambda v, c: np.cos(v),
-    "tan": lambda v, c: np.tan(v),
-    "asin": lambda v, c: np.arcsin(v),
-    "acos": lambda v, c: np.arccos(v),
-    "atan": lambda v, c: np.arctan(v),
-    "exp": lambda v, c: np.exp(v),
-    "log": lambda v, c: np.log(v),
-    "ceil": lambda v, c: np.ceil(v),
-    "floor": lambda v, c: np.floor(v),
-    "round": lambda v, c: np.round(v),
-    "deg2rad": lambda v, c: np.deg2rad(v),
-    "rad2deg": lambda v, c: np.rad2deg(v),
-    "add": lambda v, c: v + c,
-    "sub": lambda v, c: v - c,
-    "mul": lambda v, c: v * c,
-    "div": lambda v, c: v / c,
-}
+_NUMPY = {"asin": "arcsin", "acos": "arccos", "atan": "arctan"}  # where its name is another
+_FUNCTIONS: dict[str, Callable[..., Floats]] = {
+    name: getattr(np, _NUMPY.get(name, name)) for name in UNARY
+} | {"add": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.divide}
+
+
+FIELD_LIMIT = 200  # paths of one topic
+ITEM_LIMIT = 12  # items of a list that are named one by one
+DEPTH_LIMIT = 12
+VISIT_LIMIT = 20_000  # parts of a type that are looked at; a hostile one has no end
+
+
+def number_paths(type: Type, sample: Any = None) -> list[str]:
+    """Paths (without the topic) to the numbers of a type, quaternions also as angles.
+
+    Args:
+        type: of the messages.
+        sample: one parsed message, where only it tells the type (JSON).
+    """
+    inside = sample if isinstance(type, Dynamic) else type
+    return list(islice(_paths_in(inside, 0, iter(range(VISIT_LIMIT))), FIELD_LIMIT))
+
+
+def _paths_in(thing: Any, depth: int, patience: Iterator[int]) -> Iterator[str]:
+    """Paths inside a type, or inside a parsed JSON value."""
+    if depth > DEPTH_LIMIT or next(patience, None) is None:
+        return
+    if isinstance(thing, Number | int | float):
+        yield ""
+    names = tuple(thing.by_name) if isinstance(thing, Struct) else ()
+    if names == QUATERNION or (isinstance(thing, dict) and set(thing) == set(QUATERNION)):
+        yield from (f".@rpy.{angle}" for angle in ANGLES)
+    for step, inner in _steps_into(thing):
+        for rest in _paths_in(inner, depth + 1, patience):
+            yield step + rest
+
+
+def _steps_into(thing: Any) -> list[tuple[str, Any]]:
+    """The parts of a struct or array that are named one by one, by the step that leads there."""
+    if isinstance(thing, Array):
+        count = ITEM_LIMIT if thing.count is None else thing.count
+        named = (count if isinstance(thing.item, Number) else 1) * (count <= ITEM_LIMIT)
+        return [(f"[{i}]", thing.item) for i in range(named)]
+    if isinstance(thing, Struct) and not is_time(thing):
+        return [(f".{_spell(field.name)}", field.type) for field in thing.fields]
+    if isinstance(thing, list):
+        return [(f"[{i}]", item) for i, item in enumerate(thing[:ITEM_LIMIT])]
+    if isinstance(thing, dict):
+        return [(f".{_spell(n)}", inner) for n, inner in thing.items() if n and '"' not in n]
+    return []
+
+
+def _spell(name: str) -> str:
+    return name if is_name(name) else f'"{name}"'

@@ -21,9 +21,9 @@ from grounded_trials.formats.messages import (
     Bools,
     Floats,
     Ints,
+    Node,
     Number,
     Struct,
-    Type,
     choose_items,
     texts_equal,
 )
@@ -35,39 +35,16 @@ MOST_FIELDS = 200_000  # in one message; a hostile one would take minutes
 
 
 @dataclass(frozen=True, eq=False)
-class ProtobufNode:
+class _ProtobufNode(Node):
     """Row i is the bytes start[i]:end[i] of the buffer, coded as wire[i]; start -1: absent."""
 
-    buffer: bytes
-    type: Type
-    rows: Ints
     start: Ints
     end: Ints
     wire: Ints
+    buffer: bytes
     default: float = 0.0
 
-    def keep(self, chosen: Bools) -> ProtobufNode:
-        """See `nodes.Node`."""
-        return ProtobufNode(
-            self.buffer,
-            self.type,
-            self.rows[chosen],
-            self.start[chosen],
-            self.end[chosen],
-            self.wire[chosen],
-            self.default,
-        )
-
-    def numbered(self, rows: Ints) -> ProtobufNode:
-        """See `nodes.Node`."""
-        return replace(self, rows=rows)
-
-    def names(self) -> tuple[str, ...]:
-        """See `nodes.Node`."""
-        return tuple(self.type.by_name) if isinstance(self.type, Struct) else ()
-
-    def field(self, name: str) -> ProtobufNode | ProtobufItems:
-        """See `nodes.Node`."""
+    def field(self, name: str) -> Node:
         assert isinstance(self.type, Struct)
         field = self.type.by_name[name]
         owner, start, end, wire = _occurrences(self, field.number)
@@ -75,7 +52,7 @@ class ProtobufNode:
             item = field.type.item
             if isinstance(item, Number):
                 owner, start, end, wire = _unpack(self, item, owner, start, end, wire)
-            items = ProtobufNode(self.buffer, item, self.rows[owner], start, end, wire)
+            items = _ProtobufNode(item, self.rows[owner], start, end, wire, self.buffer)
             return ProtobufItems(field.type, self.rows, owner, items)
         last = np.full(len(self.rows), -1, dtype=np.int64)
         last[owner] = np.arange(len(owner))  # a later occurrence replaces an earlier one
@@ -85,16 +62,10 @@ class ProtobufNode:
         else:
             rows = self.rows
             start, end, wire = (np.append(a, -1) for a in (start, end, wire))
-        return ProtobufNode(
-            self.buffer, field.type, rows, start[last], end[last], wire[last], field.default
-        )
-
-    def items(self, start: int, stop: int) -> ProtobufNode:
-        """See `nodes.Node`; only an array has items."""
-        raise NotImplementedError
+        place = start[last], end[last], wire[last]
+        return _ProtobufNode(field.type, rows, *place, self.buffer, field.default)
 
     def numbers(self) -> Floats:
-        """See `nodes.Node`."""
         assert isinstance(self.type, Number)
         values = np.full(len(self.rows), self.default)
         for wire in sorted(set(self.wire.tolist())):
@@ -114,64 +85,33 @@ class ProtobufNode:
         return np.asarray(windows(self.buffer, f"<{kind.kind}")[start], dtype=np.float64)
 
     def equals(self, text: str) -> Bools:
-        """See `nodes.Node`."""
         start = np.maximum(self.start, 0)
         return texts_equal(self.buffer, start, self.end - self.start, text.encode())
 
 
 @dataclass(frozen=True, eq=False)
-class ProtobufItems:
+class ProtobufItems(Node):
     """The items of a repeated field, all rows' in one node; owner[j] is the row of item j."""
 
-    type: Array
-    rows: Ints
     owner: Ints
-    all: ProtobufNode
+    all: _ProtobufNode
 
     def keep(self, chosen: Bools) -> ProtobufItems:
-        """See `nodes.Node`."""
-        new = np.cumsum(chosen) - 1
         stays = chosen[self.owner]
-        return ProtobufItems(
-            self.type, self.rows[chosen], new[self.owner[stays]], self.all.keep(stays)
-        )
+        owner = (np.cumsum(chosen) - 1)[self.owner[stays]]
+        return replace(self, rows=self.rows[chosen], owner=owner, all=self.all.keep(stays))
 
-    def items(self, start: int, stop: int) -> ProtobufNode:
-        """See `nodes.Node`."""
+    def items(self, start: int, stop: int) -> _ProtobufNode:
         counts = np.bincount(self.owner, minlength=len(self.rows)).astype(np.int64)
         first = np.cumsum(counts) - counts
         owner, index = choose_items(counts, start, stop)
-        chosen = first[owner] + index
-        a = self.all
-        return ProtobufNode(
-            a.buffer, a.type, self.rows[owner], a.start[chosen], a.end[chosen], a.wire[chosen]
-        )
-
-    def numbered(self, rows: Ints) -> ProtobufItems:
-        """See `nodes.Node`."""
-        return ProtobufItems(self.type, rows, self.owner, self.all)
-
-    def names(self) -> tuple[str, ...]:
-        """See `nodes.Node`."""
-        return ()
-
-    def field(self, name: str) -> ProtobufNode | ProtobufItems:
-        """See `nodes.Node`; only a struct has fields."""
-        raise NotImplementedError
-
-    def numbers(self) -> Floats:
-        """See `nodes.Node`; only a number has numbers."""
-        raise NotImplementedError
-
-    def equals(self, text: str) -> Bools:
-        """See `nodes.Node`; only a text equals one."""
-        raise NotImplementedError
+        return self.all.pick(first[owner] + index).numbered(self.rows[owner])
 
 
-def protobuf_messages(buffer: bytes, type: Struct, start: Ints, end: Ints) -> ProtobufNode:
+def protobuf_messages(buffer: bytes, type: Struct, start: Ints, end: Ints) -> Node:
     """Messages of one type at buffer[start[i]:end[i]] as the root of a path."""
     wire = np.full(len(start), BYTES, dtype=np.int64)
-    return ProtobufNode(buffer, type, np.arange(len(start)), start, end, wire)
+    return _ProtobufNode(type, np.arange(len(start)), start, end, wire, buffer)
 
 
 def uniform_doubles(buffer: bytes, start: Ints, end: Ints, numbers: list[int]) -> Floats | None:
@@ -192,7 +132,7 @@ def uniform_doubles(buffer: bytes, start: Ints, end: Ints, numbers: list[int]) -
     return pairs["value"].astype(np.float64)
 
 
-def _occurrences(node: ProtobufNode, number: int) -> tuple[Ints, Ints, Ints, Ints]:
+def _occurrences(node: _ProtobufNode, number: int) -> tuple[Ints, Ints, Ints, Ints]:
     """Where field `number` occurs: (row index, start, end, wire), by row, then in wire order."""
     cursor, active = node.start.copy(), np.flatnonzero(node.start < node.end)
     found: list[tuple[Ints, Ints, Ints, Ints]] = []
@@ -276,7 +216,7 @@ def _integers(kind: Number, raw: Words) -> Floats:
 
 
 def _unpack(
-    node: ProtobufNode, item: Number, owner: Ints, start: Ints, end: Ints, wire: Ints
+    node: _ProtobufNode, item: Number, owner: Ints, start: Ints, end: Ints, wire: Ints
 ) -> tuple[Ints, Ints, Ints, Ints]:
     """Occurrences of a repeated number as its items: packed ones are taken apart."""
     packed = wire == BYTES

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from grounded_trials.logs.inspect_report import FieldReport, LogReport, TopicReport
+from grounded_trials.logs.inspect_log import FieldReport, LogReport, TopicReport
 
 SURE = 1.5  # how much better than the next topic's best a guess must be
 LEAST = 2.0  # below this score nothing is proposed

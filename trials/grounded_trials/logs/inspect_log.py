@@ -1,49 +1,184 @@
 """What is in an unknown log: topics, types, rates, and every number with its range.
 
-One pass over the file. A topic with very many messages has its ranges from every k-th of them.
-
-The numbers inside a message type, as the paths that lead to them.
+One pass over the files; a topic with very many messages has its ranges from every k-th of them.
+Signals of different topics that show one motion are compared: a motion capture's pitch and the
+on-board estimate's should rise together. Where they rise opposite, one of them follows another
+convention, and a log that mixes them is wrong.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import combinations
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from grounded.errors import GroundedError
 from grounded_trials.formats.mcap_records import Channel, Header, Messages, Metadata, Schema
 from grounded_trials.formats.mcap_walk import DamagedFile, read_records
-from grounded_trials.formats.message_path import is_name, is_topic, parse_path
+from grounded_trials.formats.message_path import is_topic, parse_path
 from grounded_trials.formats.messages import (
-    Array,
     BadMessage,
     BadPath,
+    BadSchema,
     Dynamic,
     Floats,
     Ints,
-    Number,
-    Struct,
-    Type,
 )
-from grounded_trials.formats.path_walk import Bound, bind, evaluate, is_time
-from grounded_trials.formats.protobuf_schema import BadSchema
-from grounded_trials.logs.inspect_report import (
-    FieldReport,
-    LogReport,
-    TopicReport,
-    find_twins,
-    kind_of,
-)
+from grounded_trials.formats.path_walk import Bound, bind, evaluate, number_paths
 from grounded_trials.logs.log_files import log_files, open_log
 from grounded_trials.logs.signals import Decoder, decoder_of
 
 NOISE_SAMPLES = 10  # in a batch, to tell a signal's noise
 DECODED = 20_000  # messages of a topic whose numbers are looked at
+GAP = 10.0  # intervals; a longer gap is remarked on
+SKEW_S = 0.1  # a header stamp further from the log's clock is remarked on
+
+
+@dataclass(frozen=True)
+class FieldReport:
+    """A number in a topic's messages, by its message path."""
+
+    path: str
+    low: float | None  # smallest and largest finite value; None if there is none
+    high: float | None
+    not_finite: int
+    noise: float = 0.0  # standard deviation of what changes from sample to sample
+
+
+@dataclass(frozen=True)
+class TopicReport:
+    """A topic: how its messages come, and what is in them."""
+
+    topic: str
+    type: str
+    encoding: str
+    messages: int
+    rate_hz: float  # 1 / median interval of the log times; 0 for fewer than two messages
+    jitter_s: float  # half the width that holds 90 % of the intervals
+    largest_gap_s: float
+    first_s: float | None  # after the log's first message; None without messages
+    last_s: float | None
+    stamped: bool  # messages have a header stamp
+    skew_s: float | None  # median of header stamp minus log time
+    fields: tuple[FieldReport, ...]
+    problem: str = ""  # why its numbers can't be read
+
+
+@dataclass(frozen=True)
+class LogReport:
+    """A log: its files, its length, its topics, and whether it is damaged."""
+
+    files: tuple[Path, ...]
+    library: str  # who wrote it
+    start_ns: int
+    duration_s: float
+    messages: int
+    topics: tuple[TopicReport, ...]
+    twins: tuple[Twins, ...]  # signals of different topics with one motion
+    damage: str = ""  # where reading it ended early, and why
+    meta: Mapping[str, str] = field(default_factory=dict)  # of a file of ours: its own table
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Sentences about what a person should know before using the log."""
+        return _remarks(self)
+
+
+def _remarks(log: LogReport) -> tuple[str, ...]:
+    found = [log.damage] if log.damage else []
+    for topic in log.topics:
+        if topic.problem:
+            found.append(f"{topic.topic} ({topic.type}) can't be read: {topic.problem}")
+        if topic.messages == 0:
+            found.append(f"{topic.topic} has no messages")
+        elif topic.messages == 1:
+            found.append(f"{topic.topic} has a single message, {topic.first_s:.3f} s into the log")
+        elif topic.rate_hz and topic.largest_gap_s > GAP / topic.rate_hz:
+            found.append(f"{topic.topic} has a gap of {topic.largest_gap_s:.3f} s")
+        if topic.skew_s is not None and abs(topic.skew_s) > SKEW_S:
+            found.append(
+                f"{topic.topic} is stamped {topic.skew_s:.3f} s from the log's clock "
+                "(simulation time, or an unset clock?)"
+            )
+        bad = [f.path for f in topic.fields if f.not_finite]
+        if bad:
+            found.append(f"{topic.topic} has values that are no numbers, first in {bad[0]}")
+    for twins in log.twins:
+        if twins.opposite:
+            found.append(
+                f"{twins.first} and {twins.second} show the same motion with OPPOSITE SIGN "
+                f"(correlation {twins.correlation:.3f})"
+            )
+    return tuple(found)
+
+
+SAME = 0.95  # correlation from which two signals show the same motion
+LEAST = 30  # samples
+KINDS = (
+    *(f"@rpy.{angle}" for angle in ("roll", "pitch", "yaw")),
+    *(f"{place}.{axis}" for place in ("position", "translation") for axis in "xyz"),
+    *(f"{rate}.{axis}" for rate in ("linear", "angular") for axis in "xyz"),
+)
+
+
+@dataclass(frozen=True)
+class Twins:
+    """Two signals with one motion; a negative correlation says that a sign differs."""
+
+    first: str  # message paths
+    second: str
+    correlation: float
+
+    @property
+    def opposite(self) -> bool:
+        """Whether one of them has the other's sign reversed."""
+        return self.correlation < 0
+
+
+def kind_of(path: str) -> str:
+    """What a path measures, such as position.x; "" if that can't be told from its name."""
+    return next((kind for kind in KINDS if path.endswith("." + kind)), "")
+
+
+def find_twins(samples: Mapping[str, tuple[Ints, Floats]]) -> tuple[Twins, ...]:
+    """Compares signals of the same kind.
+
+    Args:
+        samples: by message path, stamps [ns] and values.
+    """
+    found = []
+    for first, second in combinations(samples, 2):
+        if kind_of(first) == kind_of(second) != "":
+            correlation = _correlation(samples[first], samples[second])
+            if abs(correlation) >= SAME:
+                found.append(Twins(first, second, correlation))
+    return tuple(found)
+
+
+def _correlation(a: tuple[Ints, Floats], b: tuple[Ints, Floats]) -> float:
+    """Of the rarer signal with the other at its stamps."""
+    (ta, ya), (tb, yb) = sorted((_clean(*a), _clean(*b)), key=lambda s: len(s[0]))
+    inside = (ta >= tb[0]) & (ta <= tb[-1]) if len(tb) else np.zeros(len(ta), dtype=np.bool_)
+    if inside.sum() < LEAST:
+        return 0.0
+    other = np.interp((ta[inside] - ta[0]) * 1e-9, (tb - ta[0]) * 1e-9, yb)
+    one = ya[inside]
+    if min(one.std(), other.std()) < 1e-3 * max(one.std(), other.std(), 1e-9):
+        return 0.0
+    return float(np.corrcoef(one, other)[0, 1])
+
+
+def _clean(t: Ints, y: Floats) -> tuple[Ints, Floats]:
+    finite = np.isfinite(y)
+    t, y = t[finite], y[finite]
+    order = np.argsort(t, kind="stable")
+    t, y = t[order], y[order]
+    keep = np.append(True, np.diff(t) > 0) if len(t) else finite[:0]
+    return t[keep], y[keep]
 
 
 def inspect_log(paths: str | Path | Sequence[str | Path]) -> LogReport:
@@ -99,9 +234,9 @@ class _Look:
         elif isinstance(record, Metadata) and record.name == "grounded":
             self.meta = record.data
         elif isinstance(record, Messages):
-            for identity in np.unique(record.channels).tolist():
+            for identity in record.channel_ids():
                 if identity in self.channels:
-                    self.channels[identity].add(record.take(record.channels == identity))
+                    self.channels[identity].add(record.of(identity))
 
     def report(self, files: tuple[Path, ...]) -> LogReport:
         times = [t for topic in self.topics.values() for t in topic.log_times]
@@ -252,68 +387,3 @@ def _field(path: str, found: _Range) -> FieldReport:
 def _noise(values: Floats) -> float:
     """Deviation of white noise on a smooth signal, from its second differences; outliers aside."""
     return float(np.median(np.abs(np.diff(values, 2))) / (0.6745 * np.sqrt(6)))
-
-
-FIELD_LIMIT = 200  # paths of one topic
-ITEM_LIMIT = 12  # items of a list that are named one by one
-DEPTH_LIMIT = 12
-VISIT_LIMIT = 20_000  # parts of a type that are looked at; a hostile one has no end
-QUATERNION = ("x", "y", "z", "w")
-
-
-def number_paths(type: Type, sample: Any = None) -> list[str]:
-    """Paths (without the topic) to the numbers of a type, quaternions also as angles.
-
-    Args:
-        type: of the messages.
-        sample: one parsed message, where only it tells the type (JSON).
-    """
-    found: list[str] = []
-    patience = iter(range(VISIT_LIMIT))
-    walk = _of_value(sample, 0) if isinstance(type, Dynamic) else _of_type(type, 0, patience)
-    for path in walk:
-        found.append(path)
-        if len(found) >= FIELD_LIMIT:
-            break
-    return found
-
-
-def _of_type(type: Type, depth: int, patience: Iterator[int]) -> Iterator[str]:
-    if depth > DEPTH_LIMIT or next(patience, None) is None:
-        return
-    if isinstance(type, Number):
-        yield ""
-    elif isinstance(type, Array):
-        count = ITEM_LIMIT if type.count is None else type.count
-        if count <= ITEM_LIMIT:
-            for i in range(count if isinstance(type.item, Number) else 1):
-                for rest in _of_type(type.item, depth + 1, patience):
-                    yield f"[{i}]{rest}"
-    elif isinstance(type, Struct) and not is_time(type):
-        if tuple(type.by_name) == QUATERNION:
-            yield from (f".@rpy.{angle}" for angle in ("roll", "pitch", "yaw"))
-        for field in type.fields:
-            for rest in _of_type(field.type, depth + 1, patience):
-                yield f".{_spell(field.name)}{rest}"
-
-
-def _of_value(value: Any, depth: int) -> Iterator[str]:
-    if depth > DEPTH_LIMIT:
-        return
-    if isinstance(value, int | float):
-        yield ""
-    elif isinstance(value, list):
-        for i, item in enumerate(value[:ITEM_LIMIT]):
-            for rest in _of_value(item, depth + 1):
-                yield f"[{i}]{rest}"
-    elif isinstance(value, dict):
-        if set(value) == set(QUATERNION):
-            yield from (f".@rpy.{angle}" for angle in ("roll", "pitch", "yaw"))
-        for name, inner in value.items():
-            if name and '"' not in name:
-                for rest in _of_value(inner, depth + 1):
-                    yield f".{_spell(name)}{rest}"
-
-
-def _spell(name: str) -> str:
-    return name if is_name(name) else f'"{name}"'

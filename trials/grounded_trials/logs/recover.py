@@ -15,8 +15,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO
 
-import numpy as np
-
 from grounded.errors import GroundedError
 from grounded_trials.formats.mcap_records import (
     Attachment,
@@ -184,8 +182,8 @@ class _Copy:
 
     def messages(self, batch: Messages, *, final: bool) -> None:
         """Writes the messages of known channels, keeps or counts the others."""
-        for identity in np.unique(batch.channels).tolist():
-            own = batch.take(batch.channels == identity)
+        for identity in batch.channel_ids():
+            own = batch.of(identity)
             channel = self.channels.get(identity)
             schema = self.schemas.get(channel.schema_id) if channel else None
             if channel is None or (schema is None and channel.schema_id):
@@ -199,10 +197,9 @@ class _Copy:
             self.start().messages(own, self.numbers[identity])
             self.counts[channel.topic] += len(own)
             self.anything = True
-            if len(own):
-                ends = (int(own.log_times.min()), int(own.log_times.max()))
-                first, last = self.span or ends
-                self.span = (min(first, ends[0]), max(last, ends[1]))
+            ends = (int(own.log_times.min()), int(own.log_times.max()))
+            first, last = self.span or ends
+            self.span = (min(first, ends[0]), max(last, ends[1]))
 
     def topic(self, channel: int) -> str:
         """The name of a channel's topic, if it is known."""

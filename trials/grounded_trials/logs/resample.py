@@ -18,8 +18,14 @@ import numpy as np
 
 from grounded.errors import GroundedError
 from grounded_trials.formats.messages import Floats
-from grounded_trials.logs.samples import Samples, tidy
-from grounded_trials.logs.signal_report import SignalReport, check_clocks, report_of, warnings_of
+from grounded_trials.logs.samples import (
+    Samples,
+    SignalReport,
+    check_clocks,
+    report_of,
+    tidy,
+    warnings_of,
+)
 from grounded_trials.logs.signals import Clock, Series, SignalSpec
 
 START, END = "[log.span] start", "[log.span] end"  # names of the series that a span watches

@@ -1,10 +1,8 @@
-"""Reading a damaged file: every record that can be trusted, and a list of what can not.
+"""Reading a damaged MCAP file: every record that can be trusted, and a list of what can not.
 
-Finding records again after damage: the next place from which the chain of them holds.
-
-Nothing marks the start of a record, but each says where the next one starts. A place is believed
-when it begins a chunk whose inner lengths fit each other, or the first of several records in a
-row, or the last ones of the file.
+Nothing marks the start of a record, but each says where the next one starts. After damage, the
+next place is sought from which that chain holds again: one that begins a chunk whose inner lengths
+fit each other, or the first of several records in a row, or the last ones of the file.
 """
 
 from __future__ import annotations
@@ -27,13 +25,12 @@ from grounded_trials.formats.mcap_records import (
     MESSAGE_INDEX,
     METADATA,
     PARSERS,
-    BadChunk,
+    BadRecord,
     Fields,
     Messages,
     Record,
-    Short,
     batch,
-    decompress,
+    chunk_content,
     decompress_part,
 )
 from grounded_trials.formats.mcap_walk import (
@@ -48,6 +45,8 @@ _SPAN = Struct("<QQ")  # a chunk's first and last time
 _NAMES = {1: "the header", 3: "a schema", 4: "a channel", 5: "a message", 6: "a block of messages"}
 _NAMES |= {9: "an attached file", 12: "a table of metadata"}
 BATCH = 2**22  # [bytes] of messages outside chunks that are handed on together
+CHAIN = 3  # records in a row that make a place believed
+_BLOCK = 2**20
 
 
 class Salvage:
@@ -134,21 +133,16 @@ class Salvage:
                 record = PARSERS[opcode](Fields(content))
                 self._tables += opcode in (METADATA, ATTACHMENT)
                 yield record
-        except (BadChunk, Short, UnicodeDecodeError) as error:
+        except BadRecord as error:
             what = _NAMES.get(opcode, f"a record of type {opcode}")
             self.losses.append(f"{what} was dropped, at byte {pos}: {error}")
             if opcode == CHUNK and len(content) >= 16:
                 self.dropped.append(_SPAN.unpack_from(content))
 
     def _chunk(self, content: bytes) -> Iterator[Record]:
-        fields = Fields(content)
-        fields.skip(16)
-        size, crc, compression = fields.u64(), fields.u32(), fields.text()
-        data = decompress(compression, fields.blob(), size, RECORD_LIMIT)
-        if crc and zlib.crc32(data) != crc:
-            raise BadChunk("its checksum does not fit its content")
+        data, checked = chunk_content(content, RECORD_LIMIT)
         for record in list(chunk_records(data)):
-            if isinstance(record, Messages) and not crc:
+            if isinstance(record, Messages) and not checked:
                 self._outside += len(record)
             yield record
 
@@ -162,7 +156,7 @@ class Salvage:
         if self._pending:
             data = b"".join(self._pending)
             self._pending = []
-            yield _messages(data)
+            yield batch(data, message_positions(data, 0, len(data))[0])
 
     def _data_end(self, record: bytes) -> None:
         stated = int.from_bytes(record[9:13], "little")
@@ -180,9 +174,9 @@ class Salvage:
     def _count_lost(self, content: bytes) -> None:
         try:
             fields = Fields(content)
-            channel = fields.u16()
-            self.lost_messages[channel] += fields.u32() // 16
-        except Short:
+            channel = fields.uint(16)
+            self.lost_messages[channel] += fields.uint(32) // 16
+        except BadRecord:
             return
 
     def _is_cut_chunk(self, pos: int) -> bool:
@@ -208,38 +202,17 @@ class Salvage:
             fields = Fields(content)
             fields.skip(28)
             compression = fields.text()
-        except (Short, UnicodeDecodeError):
+        except BadRecord:
             return
         data = decompress_part(compression, content[fields.pos + 8 :], RECORD_LIMIT)
-        whole = _whole_records(data)
         try:
-            yield from list(chunk_records(data[:whole]))
-        except (BadChunk, Short, UnicodeDecodeError):
+            yield from list(chunk_records(data, cut=True))
+        except BadRecord:
             return
 
     def _tail(self, end: int) -> None:
         if read_at(self.stream, end, 9) != MAGIC:
             self.losses.append("the file does not end as an MCAP file does")
-
-
-def _messages(data: bytes) -> Messages:
-    positions, _ = message_positions(data, 0, len(data), lambda found, offset: BadChunk(found))
-    return batch(data, positions)
-
-
-def _whole_records(data: bytes) -> int:
-    """Where the last record that is wholly there ends."""
-    pos = 0
-    while len(data) - pos >= 9:
-        _, length = _HEAD.unpack_from(data, pos)
-        if length > len(data) - pos - 9:
-            break
-        pos += 9 + int(length)
-    return pos
-
-
-_BLOCK = 2**20
-CHAIN = 3  # records in a row that make a place believed
 
 
 def read_at(stream: BinaryIO, offset: int, count: int) -> bytes:

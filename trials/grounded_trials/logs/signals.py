@@ -16,25 +16,24 @@ import numpy as np
 
 from grounded.errors import GroundedError, NextCommand, nearest
 from grounded_trials.formats.cdr import cdr_messages, ros1_messages
-from grounded_trials.formats.idl_schema import parse_idl
-from grounded_trials.formats.json_messages import json_messages
 from grounded_trials.formats.mcap_records import Channel, Messages, Schema
 from grounded_trials.formats.mcap_walk import read_records
 from grounded_trials.formats.message_path import MessagePath, parse_path
 from grounded_trials.formats.messages import (
     BadMessage,
     BadPath,
+    BadSchema,
     Dynamic,
     Floats,
     Ints,
     Node,
     Struct,
     Type,
+    json_messages,
 )
 from grounded_trials.formats.path_walk import Bound, Values, bind, evaluate
 from grounded_trials.formats.protobuf import protobuf_messages
-from grounded_trials.formats.protobuf_schema import BadSchema, parse_descriptor_set
-from grounded_trials.formats.ros_schema import parse_ros
+from grounded_trials.formats.schemas import struct_of
 from grounded_trials.logs.log_files import log_files, open_log
 
 Clock = Literal["header", "log", "publish"]
@@ -129,8 +128,8 @@ class _Log:
             self.wanted[channel.id] = (decoder, wanting)
 
     def messages(self, batch: Messages) -> None:
-        present = np.bincount(batch.channels, minlength=1)
-        unknown = [c for c in np.flatnonzero(present).tolist() if c not in self.channels]
+        present = batch.channel_ids()
+        unknown = [c for c in present if c not in self.channels]
         if unknown:
             raise GroundedError(
                 f"{self.name}: a message belongs to channel {unknown[0]}, which is not defined; "
@@ -138,11 +137,9 @@ class _Log:
                 NextCommand("recover", (self.name,)),
             )
         for identity, (decoder, wanting) in self.wanted.items():
-            if identity >= len(present) or not present[identity]:
+            if identity not in present:
                 continue
-            own = (
-                batch if present[identity] == len(batch) else batch.take(batch.channels == identity)
-            )
+            own = batch.of(identity)
             for collector in wanting:
                 try:
                     collector.collect(decoder, own)
@@ -197,25 +194,6 @@ def decoder_of(channel: Channel, schema: Schema | None) -> Decoder:
         raise BadSchema(f"the messages are {encoding} without a schema, which says what they hold")
     type, read = struct_of(schema), _READERS[encoding]
     return Decoder(channel.topic, name, type, lambda b, s, e: read(b, type, s, e))
-
-
-def struct_of(schema: Schema) -> Struct:
-    """The message type that a schema defines.
-
-    Raises:
-        BadSchema: if it can't be parsed, or its language is unknown.
-    """
-    if schema.encoding == "protobuf":
-        return parse_descriptor_set(schema.data, schema.name)
-    if schema.encoding in ("ros1msg", "ros2msg"):
-        text = schema.data.decode("utf-8", "replace")
-        return parse_ros(text, schema.name, ros1=schema.encoding == "ros1msg")
-    if schema.encoding in ("ros2idl", "omgidl"):
-        return parse_idl(schema.data.decode("utf-8", "replace"), schema.name)
-    raise BadSchema(
-        f"the schema's language '{schema.encoding}' can't be read; ros1msg, ros2msg, ros2idl, "
-        "omgidl and protobuf can"
-    )
 
 
 class _Collector:

@@ -31,9 +31,9 @@ from grounded_trials.formats.mcap_records import (
 )
 from grounded_trials.formats.mcap_walk import DamagedFile, read_records
 from grounded_trials.formats.messages import Array as ArrayType
-from grounded_trials.formats.messages import BadMessage, Number, Struct
+from grounded_trials.formats.messages import BadMessage, BadSchema, Number, Struct
 from grounded_trials.formats.protobuf import ProtobufItems, protobuf_messages, uniform_doubles
-from grounded_trials.formats.protobuf_schema import BadSchema, parse_descriptor_set
+from grounded_trials.formats.schemas import struct_of
 
 FILE_LIMIT = 1 * 2**30  # [bytes]
 STEP_LIMIT = 2_000_000  # messages of a channel
@@ -246,13 +246,13 @@ def read_file(path: Path, limit: int) -> bytes:
 def _sort(
     batch: Messages, channels: dict[int, Channel], messages: dict[str, list[Messages]], name: str
 ) -> None:
-    for identity in sorted(set(batch.channels.tolist())):  # np.unique would import numpy.ma
+    for identity in batch.channel_ids():
         if identity not in channels:
             raise DamagedFile(
                 name, 0, f"a message belongs to channel {identity}, which is not defined"
             )
         own = messages.setdefault(channels[identity].topic, [])
-        own.append(batch.take(batch.channels == identity))
+        own.append(batch.of(identity))
         if sum(len(part) for part in own) > STEP_LIMIT:
             raise GroundedError(f"{name}: more than {STEP_LIMIT} messages on one channel")
 
@@ -262,7 +262,7 @@ def _type(channel: Channel, schemas: dict[int, Schema], name: str) -> Struct:
     if channel.encoding != "protobuf" or schema is None or schema.encoding != "protobuf":
         raise GroundedError(f"{name}: {channel.topic} is not protobuf")
     try:
-        return parse_descriptor_set(schema.data, schema.name)
+        return struct_of(schema)
     except BadSchema as error:
         raise GroundedError(f"{name}: {channel.topic}: {error}") from None
 

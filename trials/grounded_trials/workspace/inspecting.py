@@ -8,8 +8,7 @@ from typing import Any
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result
-from grounded_trials.logs.inspect_log import inspect_log
-from grounded_trials.logs.inspect_report import LogReport
+from grounded_trials.logs.inspect_log import LogReport, inspect_log
 from grounded_trials.store.own_files import CANDIDATE, TRIAL
 from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.folder import Folder

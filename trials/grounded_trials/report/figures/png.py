@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from grounded.errors import needs
 from grounded.frozen import Array
 from grounded_trials.report.figures.draw import Box, Drawing, Spot, Stroke, Words, draw
 from grounded_trials.report.figures.figure import COLOURS, DASHES, Figure, Key, rgb
@@ -30,7 +31,12 @@ SPELLED = str.maketrans(GREEK | {"−": "-", "’": "'", "∞": "inf", "…": ".
 
 
 def png(figure: Figure) -> bytes:
-    """The PNG file of a figure: its title, its legend, its panels."""
+    """The PNG file of a figure: its title, its legend, its panels.
+
+    Raises:
+        GroundedError: if Pillow is not installed.
+    """
+    needs("PIL", "png")
     from PIL import Image, ImageDraw
 
     drawings = [draw(panel) for panel in figure.panels]

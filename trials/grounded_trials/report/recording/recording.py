@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from grounded.errors import GroundedError
+from grounded.errors import GroundedError, needs
 from grounded.frozen import Array
 from grounded.trial import Trial
 from grounded_trials.report.figures.figure import COLOURS as PAGE
@@ -55,10 +55,9 @@ def write_recording(findings: Findings, path: Path) -> None:
     """Writes the .rrd file of a workspace.
 
     Raises:
-        GroundedError: if it can't be written.
+        GroundedError: if it can't be written, or rerun is not installed.
     """
-    import rerun as rr
-
+    rr = needs("rerun", "view")
     rr.set_strict_mode(True)
     identity = hashlib.sha256(f"{findings.name} {findings.task.hash}".encode()).hexdigest()[:32]
     stream = rr.RecordingStream("grounded", recording_id=identity)
