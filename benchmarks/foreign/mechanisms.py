@@ -1,7 +1,8 @@
 """Mechanisms in MuJoCo, and the crude models that plan for them.
 
 The crude models of the cart-pole and the two-link arm are their equations of motion in plain NumPy,
-with the simulator's own masses and lengths: what a set-up withholds is all that differs.
+with the simulator's own masses and lengths: what a set-up withholds is all that differs. The
+seven-joint arm is planned in MuJoCo itself, the pushed block in a quasi-static model.
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ class MujocoRobot:
         mujoco.set_mju_user_warning(lambda _: None)  # or a file MUJOCO_LOG.TXT appears
         self.data = mujoco.MjData(self.model)
         self.start = start
+        self.columns = slice(None) if columns is None else columns
         self.timestep = float(self.model.opt.timestep)
-        self.torques = self.model.nu == 0
 
     def reset(self) -> None:
         self.mj.mj_resetData(self.model, self.data)
@@ -38,13 +39,10 @@ class MujocoRobot:
         self.mj.mj_forward(self.model, self.data)
 
     def measure(self) -> np.ndarray:
-        return np.concatenate([self.data.qpos, self.data.qvel])
+        return np.concatenate([self.data.qpos, self.data.qvel])[self.columns]
 
     def advance(self, u: np.ndarray) -> None:
-        if self.torques:
-            self.data.qfrc_applied[:] = u
-        else:
-            self.data.ctrl[:] = u
+        self.data.ctrl[:] = u
         self.mj.mj_step(self.model, self.data)
 
 
@@ -209,7 +207,7 @@ def holding(model: Model, q: np.ndarray) -> np.ndarray:
     """Torques that hold an arm still: tau at which the accelerations vanish (linear in tau)."""
     n, m = model.n, model.m
     x = np.append(q, np.zeros(n - m))[None]
-    at = lambda u: model.system.step(x, u[None], model.values, 0.001)[0, m:]  # noqa: E731
+    at = lambda u: model.system.step(x, u[None], model.values, 0.005)[0, m:]  # noqa: E731
     free = at(np.zeros(m))
     return np.linalg.solve(np.column_stack([at(e) - free for e in np.eye(m)]), -free)
 
@@ -226,3 +224,126 @@ def arm_xml(
     return ARM.format(
         payload=payload, f1=f1, f2=f2, armature=armature, gear=gear, integrator=integrator
     )
+
+
+# Seven joints: MuJoCo itself is the crude model, through the adapter.
+
+LINKS = (  # axis, offset [m], mass [kg]
+    ("0 0 1", 0.16, 4.0), ("0 1 0", 0.18, 4.0), ("0 0 1", 0.18, 3.0), ("0 -1 0", 0.22, 2.7),
+    ("0 0 1", 0.18, 1.7), ("0 1 0", 0.22, 1.8), ("0 0 1", 0.08, 0.4),
+)  # fmt: skip
+TORQUES = np.array([176.0, 176.0, 110.0, 110.0, 110.0, 40.0, 40.0])
+
+
+def arm7_xml(payload: float = 0.1, friction: float = 0.0, timestep: float = 0.005) -> str:
+    """A chain of seven links with alternating axes, masses and lengths about an iiwa's."""
+    body = end = ""
+    for i, (axis, offset, mass) in enumerate(LINKS, start=1):
+        body += (
+            f'<body name="link{i}" pos="0 0 {offset}">'
+            f'<joint name="q{i}" axis="{axis}" damping="0.5" armature="0.05" '
+            f'frictionloss="{friction}"/>'
+            f'<inertial pos="0 0.01 0.09" mass="{mass}" '
+            f'diaginertia="{0.006 * mass} {0.006 * mass} {0.003 * mass}"/>'
+        )
+        end += "</body>"
+    hand = f'<inertial pos="0 0 0" mass="{payload}" diaginertia="1e-4 1e-4 1e-4"/>'
+    motors = "".join(f'<motor name="tau{i}" joint="q{i}"/>' for i in range(1, 8))
+    return (
+        f'<mujoco model="arm7"><option timestep="{timestep}" integrator="implicitfast"/>'
+        f'<worldbody>{body}<body name="hand" pos="0 0 0.1">{hand}</body>{end}</worldbody>'
+        f"<actuator>{motors}</actuator></mujoco>"
+    )
+
+
+def arm7_task() -> Task:
+    from grounded.adapters import mujoco
+
+    model = mujoco.model(arm7_xml(), params=("hand.mass", "q2.damping", "q4.damping"))
+    start = np.array([0.0, 0.4, 0.0, -1.2, 0.0, 0.8, 0.0])
+    end = np.array([0.8, 0.9, 0.4, -0.6, -0.5, 1.2, 0.6])
+    t = 0.02 * np.arange(61)
+    path = minimum_jerk(start, end, t / 0.9)
+    return task_of(
+        model,
+        0.02,
+        np.hstack([path, np.full((61, 7), np.nan)]),
+        np.append(start, np.zeros(7)),
+        TORQUES,
+        state=dict.fromkeys(model.state_names[:7], 20.0),
+        input=(2e-2 / TORQUES**2).tolist(),
+        change=(2e-1 / TORQUES**2).tolist(),
+        past=holding(model, start),
+    )
+
+
+# A block pushed over a floor with dry friction.
+
+BLOCK = """
+<mujoco model="block">
+  <option timestep="0.002" cone="elliptic" impratio="10"/>
+  <worldbody>
+    <body name="pusher" pos="-0.07 0 0">
+      <joint name="px" type="slide" axis="1 0 0" damping="1"/>
+      <joint name="py" type="slide" axis="0 1 0" damping="1"/>
+      <geom type="cylinder" size="0.02 0.05" mass="0.5" friction="0.4"/>
+    </body>
+    <body name="block">
+      <joint name="bx" type="slide" axis="1 0 0" frictionloss="1.5"/>
+      <joint name="by" type="slide" axis="0 1 0" frictionloss="1.5"/>
+      <joint name="byaw" axis="0 0 1" frictionloss="0.05"/>
+      <geom type="box" size="0.05 0.05 0.05" mass="{mass}" friction="0.4"/>
+    </body>
+  </worldbody>
+  <actuator>
+    <velocity name="vx" joint="px" kv="100"/><velocity name="vy" joint="py" kv="100"/>
+  </actuator>
+</mujoco>"""
+HALF, RADIUS, GAP = 0.05, 0.02, 0.07
+
+
+def push_dynamics(s: Any, a: Any, p: Any) -> dict[str, Any]:
+    """ds/dt of quasi-static pushing by the left face: what overlaps moves away, and turns."""
+    cos, sin = np.cos(s.byaw), np.sin(s.byaw)
+    dx, dy = s.px - GAP - s.bx, s.py - s.by
+    ahead, aside = cos * dx + sin * dy, cos * dy - sin * dx
+    overlap = ahead + HALF + RADIUS
+    push = p.k * 0.002 * np.logaddexp(0.0, overlap / 0.002)
+    return {
+        "px": a.vx,
+        "py": a.vy,
+        "bx": cos * push,
+        "by": sin * push,
+        "byaw": -push * aside / p.c,
+    }
+
+
+def push_model() -> Model:
+    return Model(
+        name="pushed block",
+        states={"px": "m", "py": "m", "bx": "m", "by": "m", "byaw": "rad"},
+        inputs={"vx": "m/s", "vy": "m/s"},
+        params={"k": Param(20.0, "1/s", 5.0, 60.0), "c": Param(0.002, "m^2", 0.0005, 0.01)},
+        derivative=push_dynamics,
+    )
+
+
+def push_task() -> Task:
+    """Forward by 0.3 m with a turn of a quarter radian, in 2.5 s."""
+    t = 0.05 * np.arange(61)
+    block = minimum_jerk(np.zeros(3), np.array([0.3, 0.04, 0.25]), t / 2.5)
+    return task_of(
+        push_model(),
+        0.05,
+        np.hstack([np.full((61, 2), np.nan), block]),
+        np.zeros(5),
+        0.4,
+        state={"bx": 100.0, "by": 100.0, "byaw": 5.0},
+        input=0.05,
+        change=0.2,
+    )
+
+
+def push_robot(mass: float = 0.5) -> Robot:
+    """The block in MuJoCo: its velocities are not measured."""
+    return Robot(MujocoRobot(BLOCK.format(mass=mass), np.zeros(10), columns=list(range(5))))
