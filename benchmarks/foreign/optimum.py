@@ -21,11 +21,13 @@ from grounded.policy import Policy
 from grounded.search.improve import first_policy, learn
 from grounded.search.standing import Options
 from grounded.solve import ddp
+from grounded.task import Task
 from grounded.trial import Trial
 
 FILE = Path(__file__).with_name("optima.json")
 SHIFT = 1e-4  # of the range of an input: the step of the differences
 ROUNDS = 8
+STARTS = 20
 LOST = 1e3  # residual of every step after a run has ended early
 
 
@@ -49,10 +51,8 @@ def optimum(setup: Setup, say=lambda line: None) -> tuple[float, str]:
     starts = {} if best is None else {"the search": best.candidate.policy}
     first = best.candidate.policy if best is not None else first_policy(setup.task)[0]
     if setup.truth is not None:
-        for start in (first, first_policy(setup.task)[0]):
-            solved = ddp.solve(
-                setup.truth.problem(), start.feedforward, options=ddp.Options(max_iterations=40)
-            )
+        for start in (first.feedforward, *planned(setup.task)):
+            solved = ddp.solve(setup.truth.problem(), start, options=ddp.Options(max_iterations=40))
             if solved.ok:
                 starts[f"DDP in the simulator ({len(starts)})"] = narrowed(setup, solved)
     found = []
@@ -62,6 +62,27 @@ def optimum(setup: Setup, say=lambda line: None) -> tuple[float, str]:
         say(f"{setup.name}: {origin} {utility:.5g}, polished {better:.5g}")
         found += [(utility, origin), (better, f"{origin}, polished")]
     return max(found)
+
+
+def planned(task: Task) -> list[np.ndarray]:
+    """Inputs (H, m) of the best two plans in the crude model, from many starts.
+
+    Beside the first policy: held inputs, and held inputs with smooth random changes. The crude
+    model is compiled, so a solve takes milliseconds.
+    """
+    rng, H = np.random.default_rng(0), task.horizon
+    span = np.where(np.isfinite(task.high - task.low), task.high - task.low, 1.0)
+    starts = [first_policy(task)[0].feedforward, np.tile(task.past, (H, 1))]
+    if task.model.system.how == "compiled":
+        for _ in range(STARTS):
+            knots = rng.uniform(-0.3, 0.3, (6, task.model.m)) * span
+            at, grid = np.linspace(0, 5, H), np.arange(6)
+            moved = np.column_stack([np.interp(at, grid, column) for column in knots.T])
+            starts.append(np.clip(task.past + moved, task.low, task.high))
+    options = ddp.Options(max_iterations=500)
+    solved = [ddp.solve(task.problem(), start, options=options) for start in starts]
+    good = sorted((s for s in solved if np.isfinite(s.cost)), key=lambda s: s.cost)
+    return [s.u for s in good[:2]]
 
 
 def narrowed(setup: Setup, solved: ddp.Result) -> Policy:

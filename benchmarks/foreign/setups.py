@@ -36,8 +36,8 @@ class Setup:
         return self.robot.run(policy)
 
 
-def cart(name: str, withheld: str, **what: object) -> Setup:
-    task = mech.cart_task()
+def cart(name: str, withheld: str, kind: str = "gentle", **what: object) -> Setup:
+    task = mech.cart_task(kind)
     return Setup(name, withheld, task, *mech.mujoco_setup(task, mech.cart_xml(**what)))
 
 
@@ -52,7 +52,8 @@ def arm7(name: str, withheld: str, **what: float) -> Setup:
 
 
 def block(name: str, withheld: str, **what: float) -> Setup:
-    return Setup(name, withheld, mech.push_task(), mech.push_robot(**what))
+    task = mech.push_task()
+    return Setup(name, withheld, task, *mech.push_setup(task, **what))
 
 
 def cessna(name: str, withheld: str, **what: float) -> Setup:
@@ -63,17 +64,19 @@ def car(name: str, withheld: str, kind: str, acceleration: float) -> Setup:
     return Setup(name, withheld, cars.task(acceleration), cars.robot(kind, acceleration))
 
 
+FRICTION = {"timestep": 0.002, "integrator": "implicitfast", "friction": 0.8}
 SLIP = "slip, tyres, load"
 SETUPS: dict[str, tuple[Callable[..., Setup], str, dict[str, object]]] = {
     "cart-pole": (cart, "nothing", {}),
     "cart-pole-integrator": (
         cart, "implicit Euler of 2 ms", {"timestep": 0.002, "integrator": "implicitfast"},
     ),
-    "cart-pole-friction": (
-        cart, "cart friction 0.8 N",
-        {"timestep": 0.002, "integrator": "implicitfast", "friction": 0.8},
-    ),
+    "cart-pole-friction": (cart, "cart friction 0.8 N", FRICTION),
     "cart-pole-lag": (cart, "activation filter 50 ms", {"lag": 0.05}),
+    "swing-up": (cart, "nothing", {"kind": "smooth"}),
+    "swing-up-friction": (cart, "cart friction 0.8 N", FRICTION | {"kind": "smooth"}),
+    "swing-up-lag": (cart, "activation filter 50 ms", {"kind": "smooth", "lag": 0.05}),
+    "swing-up-hasty": (cart, "nothing", {"kind": "hasty"}),
     "arm": (arm, "nothing", {"integrator": "RK4"}),
     "arm-payload": (arm, "payload 0.5 kg", {"payload": 0.5}),
     "arm-friction": (arm, "joint friction 0.6 N m", {"f1": 0.6, "f2": 0.6}),

@@ -25,7 +25,19 @@ from grounded.trial import Trial
 
 SHARES = (0.9, 0.97, 0.99)
 CLOSE = 0.005
-PATIENCE = 300.0  # [s] of wall time for each method
+PATIENCE = 60.0  # [s] of CPU time for each method
+
+
+@dataclass(frozen=True)
+class Other:
+    """Another method's best utility, the trial that had it, and why it did not finish, if so."""
+
+    utility: float
+    trial: int
+    trouble: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.utility:.4g} ({self.trial}{', ' if self.trouble else ''}{self.trouble})"
 
 
 @dataclass(frozen=True)
@@ -39,10 +51,8 @@ class Row:
     trials: int
     reached: tuple[int | None, ...]
     optimum: float | None
-    refit: float
-    refit_trials: int
-    ilc: float
-    ilc_trials: int
+    refit: Other
+    ilc: Other
     seconds: float
     phase: str
     sentence: str
@@ -58,18 +68,18 @@ class OutOfTime(Exception):
 
 @contextmanager
 def patience(seconds: float) -> Iterator[None]:
-    """Raises OutOfTime inside the block after so many seconds."""
+    """Raises OutOfTime inside the block after so many seconds of CPU time."""
 
     def late(*_: object) -> None:
         raise OutOfTime
 
-    before = signal.signal(signal.SIGALRM, late)
-    signal.setitimer(signal.ITIMER_REAL, seconds)
+    before = signal.signal(signal.SIGPROF, late)
+    signal.setitimer(signal.ITIMER_PROF, seconds)
     try:
         yield
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, before)
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
+        signal.signal(signal.SIGPROF, before)
 
 
 def measured(setup: Setup) -> Row:
@@ -87,14 +97,12 @@ def measured(setup: Setup) -> Row:
             standing, _, _ = learn(setup.task, run, Options())
         phase, sentence = standing.phase, standing.sentence
     except OutOfTime:
-        phase, sentence = "out of time", f"not done after {PATIENCE:g} s"
+        phase, sentence = "out of time", f"not done after {PATIENCE:g} s of CPU time"
     except Exception as error:
         phase, sentence = "error", f"{type(error).__name__}: {error}"
     seconds = time.process_time() - start
     best = known().get(setup.name, {}).get("utility")
     final = max(utilities, default=-np.inf)
-    refit, refit_trials = other(setup, refit_alone)
-    ilc, ilc_trials = other(setup, learning_control)
     return Row(
         name=setup.name,
         withheld=setup.withheld,
@@ -103,35 +111,33 @@ def measured(setup: Setup) -> Row:
         trials=len(utilities),
         reached=trials_to(setup, utilities, best),
         optimum=best,
-        refit=refit,
-        refit_trials=refit_trials,
-        ilc=ilc,
-        ilc_trials=ilc_trials,
+        refit=other(setup, refit_alone),
+        ilc=other(setup, learning_control),
         seconds=seconds,
         phase=phase,
         sentence=sentence,
     )
 
 
-def other(setup: Setup, method: Callable[[Setup, Options], list[Kept]]) -> tuple[float, int]:
+def other(setup: Setup, method: Callable[[Setup, Options], list[Kept]]) -> Other:
     """The best utility that another method had, and after how many trials."""
-    best, trials, count = -np.inf, 0, 0
-    run = setup.robot.run
+    utilities: list[float] = []
 
     def counted(policy: Policy) -> Trial:
-        nonlocal best, trials, count
-        trial, count = run(policy), count + 1
-        utility = setup.task.utility(trial)
-        if utility > best:
-            best, trials = utility, count
+        trial = setup.robot.run(policy)
+        utilities.append(setup.task.utility(trial))
         return trial
 
+    trouble = ""
     try:
         with patience(PATIENCE):
             method(_Counted(setup, counted), Options())
-    except (OutOfTime, Exception):  # what it had until then counts
-        pass
-    return best, trials
+    except OutOfTime:
+        trouble = "out of time"
+    except Exception as error:  # what it had until then counts
+        trouble = type(error).__name__
+    best = int(np.argmax(utilities)) if utilities else -1
+    return Other(utilities[best] if utilities else -np.inf, best + 1, trouble)
 
 
 class _Counted:
@@ -178,7 +184,7 @@ def table(rows: list[Row]) -> str:
         reached = "/".join("-" if t is None else str(t) for t in r.reached)
         cells = (
             r.name, r.withheld, number(r.first), number(r.final), number(r.optimum), str(r.trials),
-            reached, f"{number(r.refit)} ({r.refit_trials})", f"{number(r.ilc)} ({r.ilc_trials})",
+            reached, str(r.refit), str(r.ilc),
             f"{r.seconds:.1f}", f"{r.phase}: {r.sentence}",
         )  # fmt: skip
         lines.append("| " + " | ".join(cells) + " |")
