@@ -1,0 +1,142 @@
+"""What was possible: the best run of the simulator itself that anybody found.
+
+Three candidates: what the search ends with; DDP in the simulator as a Model, where it is one; and
+each of these polished by Gauss-Newton on the robot, whose derivatives by the feed-forward are
+differenced: one run for every input of every step, the gains of the policy kept. The best of them
+counts. It costs thousands of runs, so it is computed once and kept in optima.json:
+
+    python -m benchmarks.foreign --optimum [--only NAME]
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.foreign.setups import Setup
+from grounded.policy import Policy
+from grounded.search.improve import first_policy, learn
+from grounded.search.standing import Options
+from grounded.solve import ddp
+from grounded.task import Task
+from grounded.trial import Trial
+
+FILE = Path(__file__).with_name("optima.json")
+SHIFT = 1e-4  # of the range of an input: the step of the differences
+ROUNDS = 8
+STARTS = 20
+LOST = 1e3  # residual of every step after a run has ended early
+
+
+def known() -> dict[str, dict[str, object]]:
+    """Utility and origin of each set-up's optimum, as far as computed."""
+    return json.loads(FILE.read_text()) if FILE.is_file() else {}
+
+
+def remember(name: str, utility: float, origin: str) -> None:
+    """Keeps the better of the known optimum and this one."""
+    found = known()
+    if name not in found or utility > found[name]["utility"]:
+        found[name] = {"utility": utility, "from": origin}
+        FILE.write_text(json.dumps(dict(sorted(found.items())), indent=1) + "\n")
+
+
+def optimum(setup: Setup, say=lambda line: None) -> tuple[float, str]:
+    """The best utility found with the simulator's own derivatives, and how."""
+    standing, _, _ = learn(setup.task, setup.run, Options())
+    best = standing.incumbent
+    starts = {} if best is None else {"the search": best.candidate.policy}
+    first = best.candidate.policy if best is not None else first_policy(setup.task)[0]
+    if setup.truth is not None:
+        for start in (first.feedforward, *planned(setup.task)):
+            solved = ddp.solve(setup.truth.problem(), start, options=ddp.Options(max_iterations=40))
+            if solved.ok:
+                starts[f"DDP in the simulator ({len(starts)})"] = narrowed(setup, solved)
+    found = []
+    for origin, policy in starts.items():
+        utility = setup.task.utility(setup.real(policy, 0))
+        _, better = polish(setup, policy)
+        say(f"{setup.name}: {origin} {utility:.5g}, polished {better:.5g}")
+        found += [(utility, origin), (better, f"{origin}, polished")]
+    return max(found)
+
+
+def planned(task: Task) -> list[np.ndarray]:
+    """Inputs (H, m) of the best two plans in the crude model, from many starts.
+
+    Beside the first policy: held inputs, and held inputs with smooth random changes. The crude
+    model is compiled, so a solve takes milliseconds.
+    """
+    rng, H = np.random.default_rng(0), task.horizon
+    span = np.where(np.isfinite(task.high - task.low), task.high - task.low, 1.0)
+    starts = [first_policy(task)[0].feedforward, np.tile(task.past, (H, 1))]
+    if task.model.system.how == "compiled":
+        for _ in range(STARTS):
+            knots = rng.uniform(-0.3, 0.3, (6, task.model.m)) * span
+            at, grid = np.linspace(0, 5, H), np.arange(6)
+            moved = np.column_stack([np.interp(at, grid, column) for column in knots.T])
+            starts.append(np.clip(task.past + moved, task.low, task.high))
+    options = ddp.Options(max_iterations=500)
+    solved = [ddp.solve(task.problem(), start, options=options) for start in starts]
+    good = sorted((s for s in solved if np.isfinite(s.cost)), key=lambda s: s.cost)
+    return [s.u for s in good[:2]]
+
+
+def narrowed(setup: Setup, solved: ddp.Result) -> Policy:
+    """The policy of a solve in the simulator, over what the robot measures."""
+    policy, model = setup.truth.policy(solved.u, solved.K, solved.z[:-1]), setup.task.model
+    angles = tuple(bool(a) for a in model.angle_mask)
+    return policy.laid_out(model.state_names, angles, policy.depths)
+
+
+def polish(setup: Setup, policy: Policy) -> tuple[Policy, float]:
+    """Gauss-Newton (Levenberg-Marquardt) on the robot's own runs, by the feed-forward."""
+    task = setup.task
+    v = np.array(policy.feedforward)
+    best = task.utility(setup.real(policy, 0))
+    span = np.where(np.isfinite(task.high - task.low), task.high - task.low, 1.0)
+    scale = np.tile(span, len(v))
+    mu = 1e-3
+    for _ in range(ROUNDS):
+        r = residual(setup, policy, v)
+        J = np.empty((len(r), v.size))
+        for i in range(v.size):
+            moved = v.ravel().copy()
+            moved[i] += SHIFT * scale[i]
+            J[:, i] = (residual(setup, policy, moved.reshape(v.shape)) - r) / SHIFT
+        A, g = J.T @ J, J.T @ r  # in units of the ranges
+        before = best
+        for _ in range(8):
+            step = -np.linalg.solve(A + mu * np.diag(np.diag(A) + 1e-9 * A.max()), g)
+            moved = v + (scale * step).reshape(v.shape)
+            utility = task.utility(setup.real(replace(policy, feedforward=moved), 0))
+            if utility > best:
+                v, best, mu = moved, utility, max(mu / 10, 1e-9)
+                break
+            mu *= 5
+        if best - before <= 2e-4 * abs(best):
+            break
+    return replace(policy, feedforward=v), best
+
+
+def residual(setup: Setup, policy: Policy, v: np.ndarray) -> np.ndarray:
+    """The square roots of every penalty of a run: utility = -|residual|^2."""
+    trial: Trial = setup.real(replace(policy, feedforward=v), 0)
+    task, reward, T = setup.task, setup.task.reward, trial.steps
+    error = np.nan_to_num(task.model.difference(trial.states, task.target[: T + 1]))
+    weight = np.tile(reward.state, (T + 1, 1))
+    if task.horizon == T:
+        weight[-1] += reward.terminal
+    change = np.diff(np.vstack([task.past, trial.inputs]), axis=0)
+    off = trial.inputs - task.input_target[:T]
+    whole = np.full((task.horizon + 1, task.model.n + 2 * task.model.m), LOST)
+    whole[: T + 1, : task.model.n] = np.sqrt(weight) * error
+    whole[:T, task.model.n :] = np.hstack(
+        [np.sqrt(reward.input) * off, np.sqrt(reward.input_change) * change]
+    )
+    if task.horizon == T:
+        whole[-1, task.model.n :] = 0.0
+    return whole.ravel()

@@ -1,0 +1,104 @@
+"""The set-ups by name: a task with the crude model, and the robot that differs from it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from benchmarks.foreign import aircraft, cars
+from benchmarks.foreign import mechanisms as mech
+from benchmarks.foreign.robots import Robot
+from grounded.policy import Policy
+from grounded.search.standing import Candidate
+from grounded.task import Task
+from grounded.trial import Trial
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """One system and what is withheld from its crude model.
+
+    truth: the same task planned in the simulator, where the simulator can be a Model.
+    """
+
+    name: str
+    withheld: str
+    task: Task
+    robot: Robot
+    truth: Task | None = None
+
+    def run(self, candidate: Candidate) -> Trial:
+        """The candidate, run once on the robot."""
+        return self.robot.run(candidate.policy)
+
+    def real(self, policy: Policy, run: int) -> Trial:
+        """A policy on the robot; every run is the same (`grounded.experiments.methods`)."""
+        return self.robot.run(policy)
+
+
+def cart(name: str, withheld: str, kind: str = "gentle", **what: object) -> Setup:
+    task = mech.cart_task(kind)
+    return Setup(name, withheld, task, *mech.mujoco_setup(task, mech.cart_xml(**what)))
+
+
+def arm(name: str, withheld: str, delay: float = 0.0, **what: object) -> Setup:
+    task = mech.arm_task()
+    return Setup(name, withheld, task, *mech.mujoco_setup(task, mech.arm_xml(**what), delay))
+
+
+def arm7(name: str, withheld: str, **what: float) -> Setup:
+    task = mech.arm7_task()
+    return Setup(name, withheld, task, *mech.mujoco_setup(task, mech.arm7_xml(**what)))
+
+
+def block(name: str, withheld: str, **what: float) -> Setup:
+    task = mech.push_task()
+    return Setup(name, withheld, task, *mech.push_setup(task, **what))
+
+
+def cessna(name: str, withheld: str, **what: float) -> Setup:
+    return Setup(name, withheld, aircraft.task(), aircraft.robot(**what))
+
+
+def car(name: str, withheld: str, kind: str, acceleration: float) -> Setup:
+    return Setup(name, withheld, cars.task(acceleration), cars.robot(kind, acceleration))
+
+
+FRICTION = {"timestep": 0.002, "integrator": "implicitfast", "friction": 0.8}
+SLIP = "slip, tyres, load"
+SETUPS: dict[str, tuple[Callable[..., Setup], str, dict[str, object]]] = {
+    "cart-pole": (cart, "nothing", {}),
+    "cart-pole-integrator": (
+        cart, "implicit Euler of 2 ms", {"timestep": 0.002, "integrator": "implicitfast"},
+    ),
+    "cart-pole-friction": (cart, "cart friction 0.8 N", FRICTION),
+    "cart-pole-lag": (cart, "activation filter 50 ms", {"lag": 0.05}),
+    "swing-up": (cart, "nothing", {"kind": "smooth"}),
+    "swing-up-friction": (cart, "cart friction 0.8 N", FRICTION | {"kind": "smooth"}),
+    "swing-up-lag": (cart, "activation filter 50 ms", {"kind": "smooth", "lag": 0.05}),
+    "swing-up-hasty": (cart, "nothing", {"kind": "hasty"}),
+    "arm": (arm, "nothing", {"integrator": "RK4"}),
+    "arm-payload": (arm, "payload 0.5 kg", {"payload": 0.5}),
+    "arm-friction": (arm, "joint friction 0.6 N m", {"f1": 0.6, "f2": 0.6}),
+    "arm-friction-1": (arm, "friction 0.6 N m in joint 1", {"f1": 0.6}),
+    "arm-both": (arm, "payload and joint friction", {"payload": 0.5, "f1": 0.6, "f2": 0.6}),
+    "arm-delay": (arm, "delay 30 ms", {"delay": 0.03}),
+    "arm-armature": (arm, "armature 0.1 kg m2", {"armature": 0.1}),
+    "arm-gear": (arm, "gear 0.8 of joint 1", {"gear": 0.8}),
+    "arm7": (arm7, "nothing", {}),
+    "arm7-payload": (arm7, "payload 1.4 kg", {"payload": 1.5}),
+    "arm7-friction": (arm7, "joint friction 1 N m", {"friction": 1.0}),
+    "block": (block, "inertia, contact, dry friction", {}),
+    "cessna": (cessna, "sideslip, speed, engine", {}),
+    "cessna-wind": (cessna, "the same and a cross-wind of 3 m/s", {"wind": 3.0}),
+    "drift-car-3": (car, f"{SLIP}, 3.2 m/s2", {"kind": "drift", "acceleration": 3.2}),
+    "drift-car-7": (car, f"{SLIP}, 7 m/s2", {"kind": "drift", "acceleration": 7.0}),
+    "multi-body-3": (car, f"{SLIP}, 3.2 m/s2", {"kind": "multi-body", "acceleration": 3.2}),
+    "multi-body-5": (car, f"{SLIP}, 5 m/s2", {"kind": "multi-body", "acceleration": 5.0}),
+}  # fmt: skip
+
+
+def setup(name: str) -> Setup:
+    """The set-up of that name."""
+    make, withheld, what = SETUPS[name]
+    return make(name, withheld, **what)

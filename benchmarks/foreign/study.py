@@ -1,0 +1,191 @@
+"""What the search reaches on a set-up, beside refit-and-replan and iterative learning control.
+
+Trials to a share of the gap count from the first trial, the model's own policy (where that one
+failed: from a run with the inputs held). A utility within half a per cent of the optimum counts as
+all of the gap, because with nothing withheld there is none.
+"""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from benchmarks.foreign.optimum import known
+from benchmarks.foreign.setups import Setup
+from grounded.experiments.methods import Kept, learning_control, refit_alone
+from grounded.policy import Policy
+from grounded.search.improve import learn
+from grounded.search.standing import Candidate, Options
+from grounded.trial import Trial
+
+SHARES = (0.9, 0.97, 0.99)
+CLOSE = 0.005
+PATIENCE = 30.0  # [s] of CPU time for each method
+
+
+@dataclass(frozen=True)
+class Other:
+    """Another method's best utility, the trial that had it, and why it did not finish, if so."""
+
+    utility: float
+    trial: int
+    trouble: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.utility:.4g} ({self.trial}{', ' if self.trouble else ''}{self.trouble})"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One set-up: utilities, trials to SHARES, the other methods, CPU time, the ending."""
+
+    name: str
+    withheld: str
+    first: float
+    final: float
+    trials: int
+    reached: tuple[int | None, ...]
+    optimum: float | None
+    refit: Other
+    ilc: Other
+    seconds: float
+    phase: str
+    sentence: str
+
+    def to_json(self) -> dict[str, object]:
+        """The row by name."""
+        return asdict(self)
+
+
+class OutOfTime(BaseException):
+    """A method took longer than PATIENCE; no `except Exception` on the way may keep it."""
+
+
+@contextmanager
+def patience(seconds: float) -> Iterator[None]:
+    """Raises OutOfTime inside the block after so many seconds of CPU time."""
+
+    def late(*_: object) -> None:
+        raise OutOfTime
+
+    before = signal.signal(signal.SIGPROF, late)
+    signal.setitimer(signal.ITIMER_PROF, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
+        signal.signal(signal.SIGPROF, before)
+
+
+def measured(setup: Setup) -> Row:
+    """The search, refit-and-replan and ILC on one set-up."""
+    utilities: list[float] = []
+
+    def run(candidate: Candidate) -> Trial:
+        trial = setup.run(candidate)
+        utilities.append(setup.task.utility(trial))
+        return trial
+
+    start = time.process_time()
+    try:
+        with patience(PATIENCE):
+            standing, _, _ = learn(setup.task, run, Options())
+        phase, sentence = standing.phase, standing.sentence
+    except OutOfTime:
+        phase, sentence = "out of time", f"not done after {PATIENCE:g} s of CPU time"
+    except Exception as error:
+        phase, sentence = "error", f"{type(error).__name__}: {error}"
+    seconds = time.process_time() - start
+    best = known().get(setup.name, {}).get("utility")
+    final = max(utilities, default=-np.inf)
+    return Row(
+        name=setup.name,
+        withheld=setup.withheld,
+        first=utilities[0] if utilities else -np.inf,
+        final=final,
+        trials=len(utilities),
+        reached=trials_to(setup, utilities, best),
+        optimum=best,
+        refit=other(setup, refit_alone),
+        ilc=other(setup, learning_control),
+        seconds=seconds,
+        phase=phase,
+        sentence=sentence,
+    )
+
+
+def other(setup: Setup, method: Callable[[Setup, Options], list[Kept]]) -> Other:
+    """The best utility that another method had, and after how many trials."""
+    utilities: list[float] = []
+
+    def counted(policy: Policy) -> Trial:
+        trial = setup.robot.run(policy)
+        utilities.append(setup.task.utility(trial))
+        return trial
+
+    trouble = ""
+    try:
+        with patience(PATIENCE):
+            method(_Counted(setup, counted), Options())
+    except OutOfTime:
+        trouble = "out of time"
+    except Exception as error:  # what it had until then counts
+        trouble = type(error).__name__
+    best = int(np.argmax(utilities)) if utilities else -1
+    return Other(utilities[best] if utilities else -np.inf, best + 1, trouble)
+
+
+class _Counted:
+    """A set-up whose runs are counted."""
+
+    def __init__(self, setup: Setup, run: Callable[[Policy], Trial]) -> None:
+        self.task, self._run = setup.task, run
+
+    def real(self, policy: Policy, run: int) -> Trial:
+        return self._run(policy)
+
+
+def trials_to(setup: Setup, utilities: list[float], best: float | None) -> tuple[int | None, ...]:
+    """The trial at which each share of the gap was first closed; None where it never was."""
+    if best is None or not utilities:
+        return (None,) * len(SHARES)
+    base = utilities[0]
+    if not np.isfinite(base):
+        base = setup.task.utility(setup.real(held(setup), 0))
+    so_far = np.maximum.accumulate(utilities)
+    levels = [min(best - (1 - share) * (best - base), best - CLOSE * abs(best)) for share in SHARES]
+    return tuple(
+        int(np.argmax(so_far >= level)) + 1 if (so_far >= level).any() else None for level in levels
+    )
+
+
+def held(setup: Setup) -> Policy:
+    """The inputs as they were before the start."""
+    return setup.task.policy(np.tile(setup.task.past, (setup.task.horizon, 1)), None, None)
+
+
+def table(rows: list[Row]) -> str:
+    """The rows as a Markdown table."""
+
+    def number(value: float | None) -> str:
+        return "-" if value is None else f"{value:.4g}"
+
+    head = (
+        "set-up", "withheld", "first", "final", "optimum", "trials", "to 90/97/99 %",
+        "refit (trial)", "ILC (trial)", "CPU s", "ended",
+    )  # fmt: skip
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    for r in rows:
+        reached = "/".join("-" if t is None else str(t) for t in r.reached)
+        cells = (
+            r.name, r.withheld, number(r.first), number(r.final), number(r.optimum), str(r.trials),
+            reached, str(r.refit), str(r.ilc),
+            f"{r.seconds:.1f}", f"{r.phase}: {r.sentence}",
+        )  # fmt: skip
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)

@@ -1,0 +1,312 @@
+"""A Model from an MJCF or URDF file, stepped by MuJoCo.
+
+    from grounded.adapters import mujoco
+    model = mujoco.model("arm.xml", params=("forearm.mass", "elbow.damping"))
+
+| in the file            | in the model                                                           |
+|------------------------|------------------------------------------------------------------------|
+| hinge, slide `elbow`   | states `elbow`, `elbow_vel`; a hinge without limits is an angle        |
+| ball joint `wrist`     | `wrist_rx _ry _rz`: rotation vector from the reference pose, in the    |
+|                        | frame of that pose; `wrist_wx _wy _wz`: angular velocity, body frame   |
+| free joint `torso`     | `torso_x _y _z`, `torso_rx ...`, `torso_vx ...`, `torso_wx ...`        |
+| actuator activation    | `motor_act`                                                            |
+| actuator `motor`       | input `motor` (`motor_ctrl` where a state has that name)               |
+| joint torque           | input `elbow_torque`, `slider_force`                                   |
+| parameter "pole.mass"  | `pole_mass`                                                            |
+
+Velocities are MuJoCo's qvel. The state is all that a step depends on: the constraint solver starts
+cold at every control step, so equal samples give equal results, bit for bit, alone or in a batch.
+A sample that MuJoCo finds unstable becomes NaN.
+"""
+
+from __future__ import annotations
+
+import copy
+import threading
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from grounded.adapters.mujoco_names import (
+    BALL,
+    FREE,
+    SLIDE,
+    Controls,
+    controls_of,
+    joint_name,
+    states_of,
+)
+from grounded.adapters.mujoco_params import Setting, setting_of
+from grounded.adapters.stepper import Stepper, library, model_of
+from grounded.adapters.tangent import Coordinates
+from grounded.errors import GroundedError, nearest
+from grounded.frozen import Array
+from grounded.model import Model, Param
+
+SHIFT = 1e-6  # relative step of the forward differences, as mjd_transitionFD uses it
+CHUNK = 4096  # samples stepped in one call
+HUGE = 1e9  # MuJoCo calls 1e10 unstable, warns and stops there
+
+
+def model(
+    xml: str | Path,
+    *,
+    params: Sequence[str] | Mapping[str, tuple[float, float]] = (),
+    inputs: str | Sequence[str] = "auto",
+    timestep: float | None = None,
+    reference: str | Sequence[float] | None = None,
+    threads: int = 1,
+    name: str = "",
+) -> Model:
+    """The Model of an MJCF or URDF file.
+
+    Args:
+        xml: path of the file, or MJCF text.
+        params: what may be fitted or diagnosed, "element.field": `mass` of a body (its inertia
+            scales with it); `damping`, `frictionloss`, `armature`, `stiffness` of a joint; `gear`,
+            `kp`, `kv`, `gain`, `tau` of an actuator; `friction` of a geom. With a mapping, the
+            bounds (low, high) of each. Nominal values are the file's.
+        inputs: "actuators", "torques" (generalised forces on all hinges and slides), the names of
+            the joints that get a torque, or "auto": actuators where there are any.
+        timestep: of the simulation [s], instead of the file's; dt must be a whole multiple.
+        reference: qpos (nq,), or the name of a keyframe, that rotation vectors are about.
+        threads: threads that step a batch; the result does not depend on them.
+        name: the model's name; the file's without one.
+
+    Raises:
+        GroundedError: without mujoco, for a file it can't load, for unknown names, and for
+            simulator memory that qpos, qvel and act do not hold (actuator delays, plugins).
+    """
+    mj = library("mujoco")
+    compiled = load(xml)
+    if timestep is not None:
+        compiled.opt.timestep = timestep
+    coordinates = _coordinates(compiled, _reference(compiled, reference))
+    states = states_of(compiled)
+    controls = controls_of(compiled, inputs, states)
+    bounds = params if isinstance(params, Mapping) else dict.fromkeys(params, (0.0, None))
+    settings = [setting_of(mj, compiled, spec) for spec in bounds]
+    values = {
+        setting.name: Param(setting.nominal, setting.unit, *limits)
+        for setting, limits in zip(settings, bounds.values(), strict=True)
+    }
+    stepper = MujocoStepper(compiled, coordinates, list(states), controls, settings, threads)
+    angles = [
+        joint_name(compiled, j)
+        for j in range(compiled.njnt)
+        if compiled.jnt_type[j] > SLIDE and not compiled.jnt_limited[j]
+    ]
+    return model_of(
+        stepper,
+        states=states,
+        inputs=dict(zip(stepper.inputs, controls.units, strict=True)),
+        params=values,
+        angles=tuple(angles),
+        name=name or compiled.names.split(b"\0", 1)[0].decode() or "mujoco",
+    )
+
+
+def limits(xml: str | Path, inputs: str | Sequence[str] = "auto") -> dict[str, tuple[float, float]]:
+    """The limits of each input by name, for [limits]: ctrlrange, or a joint's actuatorfrcrange.
+
+    Args:
+        xml: path of the file, or MJCF text.
+        inputs: as for `model`.
+
+    Returns:
+        (low, high) of every input that has a limit.
+    """
+    compiled = load(xml)
+    controls = controls_of(compiled, inputs, states_of(compiled))
+    found = {}
+    for name, column in zip(controls.names, controls.columns, strict=True):
+        if controls.torques:
+            joint = int(compiled.dof_jntid[column])
+            limited, span = compiled.jnt_actfrclimited[joint], compiled.jnt_actfrcrange[joint]
+        else:
+            limited, span = (
+                compiled.actuator_ctrllimited[column],
+                compiled.actuator_ctrlrange[column],
+            )
+        if limited:
+            found[name] = (float(span[0]), float(span[1]))
+    return found
+
+
+def load(xml: str | Path) -> Any:
+    """The compiled file (an MjModel).
+
+    Raises:
+        GroundedError: if the file is missing or MuJoCo refuses it, with MuJoCo's reason.
+    """
+    mj = library("mujoco")
+    text = str(xml).lstrip()
+    if not text.startswith("<") and not Path(xml).is_file():
+        raise GroundedError(f"there is no MJCF or URDF file {xml}")
+    try:
+        if text.startswith("<"):
+            return mj.MjModel.from_xml_string(text)
+        return mj.MjModel.from_xml_path(str(xml))
+    except ValueError as error:
+        shown = "the MJCF text" if text.startswith("<") else xml
+        raise GroundedError(f"MuJoCo can't load {shown}: {error}") from error
+
+
+class MujocoStepper(Stepper):
+    """Control steps of MuJoCo, many samples at a time."""
+
+    def __init__(
+        self,
+        compiled: Any,
+        coordinates: Coordinates,
+        states: Sequence[str],
+        controls: Controls,
+        settings: Sequence[Setting],
+        threads: int,
+    ) -> None:
+        super().__init__(states, controls.names, [s.name for s in settings])
+        mj = library("mujoco")
+        self.coordinates, self.controls, self.settings = coordinates, controls, tuple(settings)
+        self.threads = threads
+        self._model = copy.deepcopy(compiled)  # private: parameters are written into it
+        self._model.opt.disableflags |= mj.mjtDisableBit.mjDSBL_AUTORESET.value
+        self._made = np.array([s.nominal for s in settings])  # the parameters that it has now
+        self._prepare()
+
+    def _prepare(self) -> None:
+        mj, compiled = library("mujoco"), self._model
+        self._lock = threading.Lock()
+        self._data = [mj.MjData(compiled) for _ in range(self.threads)]
+        whole = mj.mjtState.mjSTATE_FULLPHYSICS.value
+        self._base = np.zeros(mj.mj_stateSize(compiled, whole))
+        mj.mj_getState(compiled, self._data[0], self._base, whole)
+        if len(self._base) != 1 + compiled.nq + compiled.nv + compiled.na:
+            raise GroundedError(
+                "the MuJoCo model remembers more than qpos, qvel and act (an actuator delay, a "
+                "plugin), which the states can't hold: remove it from the file; a delay of an "
+                "input belongs in [task] latency"
+            )
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {k: v for k, v in self.__dict__.items() if k not in ("_lock", "_data", "_base")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._prepare()
+
+    def advance(self, x: Array, u: Array, p: Array, dt: float) -> Array:
+        """The next states (N, n); NaN where a sample is unstable."""
+        steps = self._substeps(dt)
+        with self._lock:
+            self._set(p)
+            parts = [
+                self._step(x[at : at + CHUNK], u[at : at + CHUNK], steps)
+                for at in range(0, len(x), CHUNK)
+            ]
+        return np.concatenate(parts) if parts else np.zeros((0, len(self.states)))
+
+    def derivatives(self, x: Array, u: Array, p: Array, dt: float) -> tuple[Array, Array]:
+        """f_x and f_u by forward differences: n + m + 1 steps a sample, all in one batch."""
+        (N, n), d = x.shape, x.shape[1] + u.shape[1]
+        points = np.tile(np.hstack([x, u]), (d + 1, 1, 1))
+        i = np.arange(d)
+        points[i + 1, :, i] += SHIFT * np.maximum(1.0, np.abs(points[0, :, i]))
+        width = points[i + 1, :, i] - points[0, :, i]  # what was really stepped (d, N)
+        flat = points.reshape(-1, d)
+        y = self.advance(flat[:, :n], flat[:, n:], p, dt).reshape(d + 1, N, n)
+        J = ((y[1:] - y[0]) / width[:, :, None]).transpose(1, 2, 0)
+        return np.ascontiguousarray(J[:, :, :n]), np.ascontiguousarray(J[:, :, n:])
+
+    def _substeps(self, dt: float) -> int:
+        h = float(self._model.opt.timestep)
+        steps = round(dt / h)
+        if steps < 1 or abs(steps * h - dt) > 1e-6 * dt:
+            raise GroundedError(
+                f"the control step of {dt:g} s is not a whole multiple of the simulation's "
+                f"timestep of {h:g} s: give timestep={dt:g}/{max(1, round(dt / h))}, or another dt"
+            )
+        return steps
+
+    def _set(self, p: Array) -> None:
+        """Writes parameters into the private model, and what MuJoCo derives from them."""
+        if np.array_equal(p, self._made):
+            return
+        for setting, value in zip(self.settings, p, strict=True):
+            setting.write(self._model, float(value))
+        library("mujoco").mj_setConst(self._model, self._data[0])
+        self._made = np.array(p)
+
+    def _step(self, x: Array, u: Array, steps: int) -> Array:
+        mj, compiled, nv = library("mujoco"), self._model, self._model.nv
+        given = np.hstack([x, u])
+        wild = ~(np.abs(given) < HUGE).all(axis=1, keepdims=True)
+        x, u = np.where(wild, 0.0, x), np.where(wild, 0.0, u)
+        state = np.tile(self._base, (len(x), 1))
+        ends = np.cumsum([1, compiled.nq, nv])
+        state[:, 1 : ends[1]] = self.coordinates.to_qpos(x[:, :nv])
+        state[:, ends[1] :] = x[:, nv:]
+        wide = np.zeros((len(x), 1, nv if self.controls.torques else compiled.nu))
+        wide[:, 0, list(self.controls.columns)] = u
+        kind = (
+            mj.mjtState.mjSTATE_QFRC_APPLIED if self.controls.torques else mj.mjtState.mjSTATE_CTRL
+        )
+        heard = mj.get_mju_user_warning()
+        mj.set_mju_user_warning(_silent)  # or MuJoCo writes MUJOCO_LOG.TXT where it stands
+        try:
+            rolled, _ = library("mujoco.rollout").rollout(
+                compiled, self._data, state, wide, control_spec=kind, nstep=steps
+            )
+        finally:
+            mj.set_mju_user_warning(heard)
+        last = rolled[:, -1]
+        moved = np.hstack(
+            [self.coordinates.from_qpos(last[:, 1 : ends[1]], x[:, :nv]), last[:, ends[1] :]]
+        )
+        stopped = (
+            last[:, :1] < (steps - 0.5) * compiled.opt.timestep
+        )  # unstable: it went no further
+        wild = wild | stopped | ~(np.abs(moved) < HUGE).all(axis=1, keepdims=True)
+        return np.where(wild, np.nan, moved)
+
+
+def _silent(_: str) -> None:
+    return None
+
+
+def _reference(compiled: Any, given: str | Sequence[float] | None) -> Array:
+    if given is None:
+        return np.array(compiled.qpos0)
+    if isinstance(given, str):
+        keys = [compiled.key(i).name for i in range(compiled.nkey)]
+        if given not in keys:
+            raise GroundedError(f"there is no keyframe '{given}': {nearest(given, keys)}")
+        return np.array(compiled.key(given).qpos)
+    found = np.array(given, dtype=float)
+    if found.shape != (compiled.nq,):
+        raise GroundedError(f"reference must be a qpos of {compiled.nq} numbers, got {found.shape}")
+    return found
+
+
+def _coordinates(compiled: Any, reference: Array) -> Coordinates:
+    plain: list[int] = []
+    columns: list[int] = []
+    quaternions: list[int] = []
+    rotations: list[int] = []
+    for j in range(compiled.njnt):
+        place, column = int(compiled.jnt_qposadr[j]), int(compiled.jnt_dofadr[j])
+        kind = compiled.jnt_type[j]
+        straight = {FREE: 3, BALL: 0}.get(int(kind), 1)
+        plain += range(place, place + straight)
+        columns += range(column, column + straight)
+        if kind in (FREE, BALL):
+            quaternions.append(place + straight)
+            rotations.append(column + straight)
+    return Coordinates(
+        np.array(plain, dtype=np.int64),
+        np.array(columns, dtype=np.int64),
+        tuple(quaternions),
+        tuple(rotations),
+        reference,
+    )

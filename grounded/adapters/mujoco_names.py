@@ -1,0 +1,110 @@
+"""What the joints and actuators of a MuJoCo model are called in a Model, and where they stand."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from grounded.errors import GroundedError, nearest
+
+FREE, BALL, SLIDE = 0, 1, 2  # mjtJoint; a hinge is 3
+
+
+class Controls:
+    """The inputs: names, units, and columns of ctrl (nu) or of qfrc_applied (nv)."""
+
+    def __init__(
+        self, names: Sequence[str], units: Sequence[str], columns: Sequence[int], torques: bool
+    ) -> None:
+        self.names, self.units, self.columns = tuple(names), tuple(units), tuple(columns)
+        self.torques = torques
+
+
+def states_of(compiled: Any) -> dict[str, str]:
+    """Units by state: positions in the order of the degrees of freedom, velocities, activations."""
+    positions: dict[str, str] = {}
+    velocities: dict[str, str] = {}
+    for j in range(compiled.njnt):
+        name, kind = joint_name(compiled, j), compiled.jnt_type[j]
+        if kind == FREE:
+            positions |= {f"{name}_{axis}": "m" for axis in "xyz"}
+            velocities |= {f"{name}_v{axis}": "m/s" for axis in "xyz"}
+        if kind in (FREE, BALL):
+            positions |= {f"{name}_r{axis}": "rad" for axis in "xyz"}
+            velocities |= {f"{name}_w{axis}": "rad/s" for axis in "xyz"}
+        else:
+            unit = "m" if kind == SLIDE else "rad"
+            positions[name], velocities[f"{name}_vel"] = unit, f"{unit}/s"
+    if not positions:
+        raise GroundedError("the MuJoCo model has no joint, so it has no state")
+    activations: dict[str, str] = {}
+    for i in range(_actuators(compiled)):
+        count = int(compiled.actuator_actnum[i]) if compiled.actuator_actadr[i] >= 0 else 0
+        name = f"{_actuator_name(compiled, i)}_act"
+        activations |= {f"{name}{k or ''}": "1" for k in range(count)}
+    return positions | velocities | activations
+
+
+def controls_of(compiled: Any, inputs: str | Sequence[str], states: Mapping[str, str]) -> Controls:
+    """The inputs that were asked for."""
+    single = [j for j in range(compiled.njnt) if compiled.jnt_type[j] >= SLIDE]
+    by_name = {joint_name(compiled, j): j for j in single}
+    if inputs == "auto":
+        inputs = "actuators" if compiled.nu else "torques"
+    if inputs == "actuators":
+        if not compiled.nu:
+            raise GroundedError('the MuJoCo model has no actuator: give inputs="torques"')
+        names: list[str] = []
+        columns: list[int] = []
+        for i in range(_actuators(compiled)):
+            name = _actuator_name(compiled, i)
+            first = int(getattr(compiled, "actuator_ctrladr", range(compiled.nu))[i])
+            many = int(getattr(compiled, "actuator_ctrlnum", [1] * compiled.nu)[i])
+            name = f"{name}_ctrl" if name in states else name
+            names += [f"{name}{k or ''}" for k in range(many)]
+            columns += range(first, first + many)
+        return Controls(names, ["1"] * len(names), columns, torques=False)
+    chosen = list(by_name) if inputs == "torques" else inputs
+    if inputs == "torques" and not chosen:
+        raise GroundedError("the MuJoCo model has no hinge, slide or actuator: add an actuator")
+    if isinstance(chosen, str) or not chosen:
+        raise GroundedError(
+            'inputs must be "auto", "actuators", "torques" or the names of hinge and slide joints, '
+            f"got {inputs!r}"
+        )
+    for name in chosen:
+        if name not in by_name:
+            raise GroundedError(f"there is no hinge or slide '{name}': {nearest(name, by_name)}")
+    slides = [compiled.jnt_type[by_name[name]] == SLIDE for name in chosen]
+    return Controls(
+        [
+            f"{name}_{'force' if slide else 'torque'}"
+            for name, slide in zip(chosen, slides, strict=True)
+        ],
+        ["N" if slide else "N m" for slide in slides],
+        [int(compiled.jnt_dofadr[by_name[name]]) for name in chosen],
+        torques=True,
+    )
+
+
+def joint_name(compiled: Any, j: int) -> str:
+    """The joint's name; without one, its body's name for the only joint of a body."""
+    name, body = compiled.joint(j).name, int(compiled.jnt_bodyid[j])
+    if not name and compiled.body_jntnum[body] == 1:
+        name = compiled.body(body).name
+    return identifier(name or f"joint{j}")
+
+
+def _actuator_name(compiled: Any, i: int) -> str:
+    return identifier(compiled.actuator(i).name or f"actuator{i}")
+
+
+def _actuators(compiled: Any) -> int:
+    return int(getattr(compiled, "nactuator", compiled.nu))
+
+
+def identifier(name: str) -> str:
+    """A name of the file as a Python name: what can't stand in one becomes an underscore."""
+    plain = re.sub(r"\W", "_", name)
+    return f"_{plain}" if plain[:1].isdigit() else plain

@@ -1,0 +1,90 @@
+"""A step on whole arrays, called with names: what the adapters of other software share.
+
+Model calls `step(s, a, p, dt)` with one sample (numbers) or N samples (arrays (N,)) a name. A
+library steps arrays: states (N, n), inputs (N, m). `Stepper` translates between the two, for the
+step and for its derivatives.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from grounded.errors import GroundedError
+from grounded.frozen import Array
+from grounded.model import Model
+
+
+class Stepper:
+    """Steps and derivatives of software that computes on arrays; subclasses do the computing."""
+
+    def __init__(self, states: Sequence[str], inputs: Sequence[str], params: Sequence[str]) -> None:
+        self.states, self.inputs, self.params = tuple(states), tuple(inputs), tuple(params)
+
+    def __call__(
+        self, s: Mapping[str, Any], a: Mapping[str, Any], p: Mapping[str, Any], dt: float
+    ) -> dict[str, Any]:
+        """The next state by name: numbers for one sample, arrays (N,) for N samples."""
+        x, u, single = self._arrays(s, a)
+        moved = self.advance(x, u, self._values(p), float(dt))
+        columns = moved[0].tolist() if single else moved.T
+        return dict(zip(self.states, columns, strict=True))
+
+    def jacobian(
+        self, s: Mapping[str, Any], a: Mapping[str, Any], p: Mapping[str, Any], dt: float
+    ) -> tuple[Array, Array]:
+        """f_x (N, n, n) and f_u (N, n, m); without the first axis for one sample."""
+        x, u, single = self._arrays(s, a)
+        f_x, f_u = self.derivatives(x, u, self._values(p), float(dt))
+        return (f_x[0], f_u[0]) if single else (f_x, f_u)
+
+    def advance(self, x: Array, u: Array, p: Array, dt: float) -> Array:
+        """The next states (N, n) of states x (N, n), inputs u (N, m), parameters p (k,)."""
+        raise NotImplementedError
+
+    def derivatives(self, x: Array, u: Array, p: Array, dt: float) -> tuple[Array, Array]:
+        """f_x (N, n, n) and f_u (N, n, m) at N samples."""
+        raise NotImplementedError
+
+    def _arrays(self, s: Mapping[str, Any], a: Mapping[str, Any]) -> tuple[Array, Array, bool]:
+        """States (N, n), inputs (N, m), and whether they were plain numbers."""
+        columns = [s[name] for name in self.states] + [a[name] for name in self.inputs]
+        both = np.stack(np.broadcast_arrays(*(np.asarray(c, dtype=float) for c in columns)), -1)
+        single = both.ndim == 1
+        both = np.ascontiguousarray(both.reshape(-1, len(columns)))
+        n = len(self.states)
+        return np.ascontiguousarray(both[:, :n]), np.ascontiguousarray(both[:, n:]), single
+
+    def _values(self, p: Mapping[str, Any]) -> Array:
+        return np.array([float(p[name]) for name in self.params])
+
+
+def model_of(stepper: Stepper, **fields: Any) -> Model:
+    """The Model of a stepper, with its derivatives where Model takes them.
+
+    Args:
+        stepper: computes steps and derivatives.
+        fields: the other fields of Model: states, inputs, params, angles, name ...
+    """
+    if "jacobian" in inspect.signature(Model).parameters:
+        fields["jacobian"] = stepper.jacobian
+    return Model(step=stepper, **fields)
+
+
+def library(name: str) -> Any:
+    """An optional library, imported now.
+
+    Raises:
+        GroundedError: if it is not installed, naming the extra that installs it.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise GroundedError(
+            f"grounded.adapters.{name.partition('.')[0]} needs {name}, which can't be imported "
+            f"({error}): pip install 'grounded[{name.partition('.')[0]}]'"
+        ) from error
