@@ -14,10 +14,10 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 
 import numpy as np
+from grounded.experiments.methods import Kept, learning_control, refit_alone
 
 from benchmarks.foreign.optimum import known
 from benchmarks.foreign.setups import Setup
-from grounded.experiments.methods import Kept, learning_control, refit_alone
 from grounded.policy import Policy
 from grounded.search.improve import learn
 from grounded.search.standing import Candidate, Options

@@ -97,11 +97,13 @@ class ProtobufItems(Node):
     all: _ProtobufNode
 
     def keep(self, chosen: Bools) -> ProtobufItems:
+        """The lists of the chosen messages."""
         stays = chosen[self.owner]
         owner = (np.cumsum(chosen) - 1)[self.owner[stays]]
         return replace(self, rows=self.rows[chosen], owner=owner, all=self.all.keep(stays))
 
     def items(self, start: int, stop: int) -> _ProtobufNode:
+        """Items `start` to `stop` of every list, as `Node.items`."""
         counts = np.bincount(self.owner, minlength=len(self.rows)).astype(np.int64)
         first = np.cumsum(counts) - counts
         owner, index = choose_items(counts, start, stop)
