@@ -74,5 +74,6 @@ def needs(module: str, extra: str) -> Any:
         return import_module(module)
     except ImportError as error:
         raise GroundedError(
-            f"this needs the package '{module}' ({error}): pip install 'grounded[{extra}]'"
+            f"this needs the package '{module}' ({error}), which comes with the extra '{extra}': "
+            f"pip install '.[{extra}]' in grounded's own folder"
         ) from None

@@ -19,6 +19,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small; thread
 
 import click
 
+from grounded import __version__
 from grounded_cli.options import in_workspace
 
 if TYPE_CHECKING:
@@ -102,7 +103,7 @@ class LazyGroup(click.Group):
 
 @click.command(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
 @in_workspace
-@click.version_option(package_name="grounded")
+@click.version_option(__version__, prog_name="grounded")
 def cli() -> None:
     """Teach a real system a manoeuvre in a few trials, from a crude model.
 

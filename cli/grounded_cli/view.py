@@ -20,7 +20,7 @@ def command() -> None:
     """Open the recording in the Rerun viewer: paths, states, inputs, bias, trial by trial.
 
     The file reports/recording.rrd is written first. Without a screen, copy it to a computer that
-    has one (`pip install 'grounded[view]'`) and open it there: rerun recording.rrd
+    has one (extra `view`) and open it there: rerun recording.rrd
     """
     workspace = open_workspace()
     from grounded_trials.report.reporting import save_recording
@@ -45,7 +45,8 @@ def _open(path: Path) -> None:
     program = str(beside) if beside.exists() else shutil.which("rerun")
     if program is None:
         raise GroundedError(
-            f"the viewer is missing: pip install 'grounded[view]', then: rerun {path}"
+            "the viewer is missing: pip install '.[view]' in grounded's own folder, then: "
+            f"rerun {path}"
         )
     # A viewer of its own that no other machine can reach: it would listen on every address.
     words = [program, "--new", "--bind", "127.0.0.1", str(path)]

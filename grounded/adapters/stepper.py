@@ -86,5 +86,5 @@ def library(name: str) -> Any:
     except ImportError as error:
         raise GroundedError(
             f"grounded.adapters.{name.partition('.')[0]} needs {name}, which can't be imported "
-            f"({error}): pip install 'grounded[{name.partition('.')[0]}]'"
+            f"({error}): pip install '.[{name.partition('.')[0]}]' in grounded's own folder"
         ) from error

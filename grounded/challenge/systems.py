@@ -80,7 +80,7 @@ def _swing(rng: np.random.Generator, t: Array, model: Model) -> tuple[Array, Arr
 
 
 def _fly(rng: np.random.Generator, t: Array, model: Model) -> tuple[Array, Array]:
-    from grounded.models.aircraft import level_trim
+    from grounded.models.aircraft_trim import level_trim
 
     level = level_trim(model, np.array([10.0]), np.array([0.0]), float(t[1] - t[0]))
     u = np.tile(level.inputs[0], (len(t), 1))

@@ -3,7 +3,7 @@
 A job is a module-level function called with plain numbers and names, and returns plain JSON values.
 It draws all its randomness from its own seed, so the same seeds give the same results bit for bit
 on one worker or on fifty. The engine is joblib: processes on this machine, or an existing cluster
-through Dask's own joblib backend (extra `grounded[cluster]`); there is no scheduler of ours.
+through Dask's own joblib backend (extra `cluster`); there is no scheduler of ours.
 
     finished    a mapping from the job's key to its result; jobs found in it are not run again. The
                 caller may keep it on disk: a study that was cut off goes on where it was. The key

@@ -7,7 +7,8 @@ import pytest
 
 from grounded.errors import GroundedError
 from grounded.experiments.figure8 import DT, figure8_target, flight_task, perturbed
-from grounded.models.aircraft import PARAMS, dynamics, level_trim, lift_coefficient, model
+from grounded.models.aircraft import PARAMS, dynamics, lift_coefficient, model
+from grounded.models.aircraft_trim import level_trim
 from grounded.models.pendulum import model as pendulum
 
 VALUES = SimpleNamespace(**{name: param.value for name, param in PARAMS.items()})

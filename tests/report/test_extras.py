@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import sys
 
 import pytest
 
 from cli import grounded
 from grounded.errors import GroundedError, needs
-from grounded_cli.report import write_all
 from grounded_trials.report.figures.figure import Figure
 from grounded_trials.report.figures.png import png
 from workspaces import make
@@ -22,24 +22,24 @@ def test_a_command_names_the_extra_that_it_needs(tmp_path, monkeypatch, module, 
     make(tmp_path / "w")
     monkeypatch.setitem(sys.modules, module, None)
     done = grounded("-C", tmp_path / "w", *words)
-    assert done.code == 1 and f"pip install 'grounded[{extra}]'" in done.err
+    assert done.code == 1 and f"'.[{extra}]'" in done.err
     assert "Traceback" not in done.err and done.err.count("\n") == 1
 
 
 def test_a_picture_names_the_extra_that_it_needs(monkeypatch):
     monkeypatch.setitem(sys.modules, "PIL", None)
-    with pytest.raises(GroundedError, match=r"grounded\[png\]"):
+    with pytest.raises(GroundedError, match=r"\.\[png\]"):
         png(Figure("utility", "Utility", "", ()))
 
 
-def test_the_demos_report_does_without_a_recording(tmp_path, monkeypatch, capsys):
-    workspace = make(tmp_path / "w")
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    assert list(write_all(workspace)) == ["html"]
-    assert "grounded[view]" in capsys.readouterr().err
+def test_the_demo_does_without_a_recording(tmp_path, monkeypatch):
+    monkeypatch.setattr("grounded_cli.demo.find_spec", lambda name: None)
+    done = grounded("demo", "pendulum", "--dir", tmp_path / "d", "--json")
+    assert done.code == 0 and list(json.loads(done.out)["paths"]) == ["html"]
+    assert "extra `view`" in done.err
 
 
 def test_what_is_there_is_imported():
     assert needs("json", "all") is sys.modules["json"]
-    with pytest.raises(GroundedError, match=r"no_such_module.*grounded\[all\]"):
+    with pytest.raises(GroundedError, match=r"no_such_module.*\.\[all\]"):
         needs("no_such_module", "all")

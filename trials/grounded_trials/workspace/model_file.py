@@ -40,6 +40,7 @@ def load_module(
     found = importlib.util.module_from_spec(spec)
     before = set(sys.modules)
     sys.path.insert(0, str(folder))
+    sys.modules[spec.name] = found  # dataclasses look their module up there
     try:
         with contextlib.redirect_stdout(sys.stderr):  # what a model prints is no data of ours
             spec.loader.exec_module(found)
@@ -49,6 +50,7 @@ def load_module(
         raise GroundedError(_where(error, str(path))) from None
     finally:
         sys.path.remove(str(folder))
+        sys.modules.pop(spec.name, None)
         _forget_neighbours(folder, before)
     return found
 
