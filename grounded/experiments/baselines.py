@@ -18,7 +18,7 @@ from grounded.experiments.bench import KINDS, bench, optimum, standing_still, tr
 from grounded.experiments.car_tasks import NAMES
 from grounded.experiments.jobs import Engine, Job, Progress, Table, run_jobs
 from grounded.experiments.methods import METHODS, run_method
-from grounded.search.improve import first_policy
+from grounded.search.first_policy import first_policy
 from grounded.search.standing import Options
 
 SHARES = (0.5, 0.9, 0.97, 0.99)

@@ -34,7 +34,8 @@ from grounded.experiments.jobs import (
 from grounded.frozen import Array
 from grounded.models.aircraft import model as aircraft
 from grounded.rollout import simulate
-from grounded.search.improve import first_policy, learn, propose
+from grounded.search.first_policy import first_policy
+from grounded.search.improve import learn, propose
 from grounded.search.standing import Candidate, Options
 from grounded.task import Task
 from grounded.trial import Trial

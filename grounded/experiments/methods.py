@@ -24,7 +24,8 @@ from grounded.experiments.ilc import gradient_of, lifted, update
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.policy import Policy
-from grounded.search.improve import first_policy, propose
+from grounded.search.first_policy import first_policy
+from grounded.search.improve import propose
 from grounded.search.standing import Candidate, Options
 from grounded.task import Task
 from grounded.trial import Trial, mean_trial

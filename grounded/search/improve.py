@@ -34,7 +34,7 @@ from grounded.frozen import Array
 from grounded.model import Model
 from grounded.policy import Policy
 from grounded.rollout import simulate
-from grounded.search.first_policy import first_guess
+from grounded.search.first_policy import first_policy
 from grounded.search.planner import Planner
 from grounded.search.safety import objections, spread
 from grounded.search.standing import Candidate, Options, Standing, Tried, standing
@@ -45,7 +45,6 @@ from grounded.task import Task
 from grounded.trial import Trial, mean_trial
 
 PLANNING = ddp.Options(max_iterations=30, tolerance=1e-6)  # a direction needs no more digits
-CAUTION = 100.0  # factor on the input penalties each time the first policy crashed (FACTS.md 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,25 +73,6 @@ def model_fingerprint(task: Task) -> str:
     for array in (model.values, problem.delay, np.array([task.smoothing]), np.round(moved, 9)):
         digest.update(np.ascontiguousarray(array + 0.0).tobytes())
     return digest.hexdigest()[:16]
-
-
-def first_policy(task: Task, caution: int = 0) -> tuple[Policy, ddp.Result]:
-    """Steps 1 and 2: the (locally) optimal policy of the crude model.
-
-    Args:
-        task: the manoeuvre and the crude model.
-        caution: how often a first policy has crashed; each time penalises inputs CAUTION x more.
-    """
-    if caution:
-        reward = replace(
-            task.reward,
-            input=task.reward.input * CAUTION**caution,
-            input_change=np.maximum(task.reward.input_change, 1e-3) * CAUTION**caution,
-        )
-        task = replace(task, reward=reward)
-    guess = first_guess(task)
-    result = ddp.solve(task.problem(), guess.inputs, guess.gain, guess.z[:-1])
-    return task.policy(result.u, result.K, result.z[:-1]), result
 
 
 def direction(

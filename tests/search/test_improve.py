@@ -18,14 +18,8 @@ from grounded.model import Model, Param
 from grounded.models import car, pendulum
 from grounded.plant import Plant
 from grounded.rollout import simulate
-from grounded.search.improve import (
-    damped,
-    direction,
-    first_policy,
-    learn,
-    model_fingerprint,
-    propose,
-)
+from grounded.search.first_policy import first_policy
+from grounded.search.improve import damped, direction, learn, model_fingerprint, propose
 from grounded.search.standing import Options
 from grounded.solve.bias import ground
 from grounded.task import Task

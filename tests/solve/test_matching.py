@@ -9,7 +9,8 @@ from grounded.experiments.bench import bench, optimum
 from grounded.experiments.car_tasks import car_task
 from grounded.experiments.real_car import real_plant
 from grounded.models.car import model as car
-from grounded.search.improve import first_policy, learn
+from grounded.search.first_policy import first_policy
+from grounded.search.improve import learn
 from grounded.search.standing import Options
 from grounded.solve.bias import ground
 from grounded.solve.levenberg_marquardt import Batch, solve
