@@ -8,18 +8,22 @@ in which they were proposed, and the trials that came back, say all there is to 
     tried            the alphas along the present direction that did not improve (step 6)
     in doubt         a loss that may be luck: the incumbent is run once more before it is believed
 
+Two trials of one candidate that agree to the last bit say that the system is deterministic: nothing
+is run a second time from then on.
+
 Same candidates and trials, same state: nothing depends on the clock or on the process that asks.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
 
-from grounded.errors import GroundedError
+from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.search.step_size import Step, after_failure, after_success, next_alpha
@@ -27,6 +31,19 @@ from grounded.task import Task
 from grounded.trial import Trial
 
 Phase = Literal["propose", "await-trial", "converged", "stopped"]
+Ending = Literal[
+    "",  # it goes on
+    "nothing promised",  # the grounded model sees nothing more to gain
+    "no step improved",  # step 7: real trials lost down to the smallest step
+    "every step loses",  # in the grounded model already
+    "model diverges",  # grounded on the best trial
+    "crashed",  # every first policy
+    "not allowed",  # by [limits] or [safety]
+    "trials used up",
+]
+BOLDER = 3  # factors of 10 below the damping that is due, tried where all from it on lose
+LOST = 2  # steps in a row without improvement that ask for a diagnosis
+WILD = 100.0  # times its promise that a first trial's loss may be before it asks for one
 MAX_CAUTION = 3  # times the first policy is designed again, ever more gently, after a crash
 
 
@@ -73,6 +90,15 @@ class Options:
             return after_failure(step, self.max_halvings)
         alpha = next_alpha([step.alpha], self.max_halvings)
         return None if alpha is None else Step(step.damping, alpha)
+
+    def steps_from(self, step: Step | None) -> Iterator[Step]:
+        """The step that is due, the more cautious ones after it, then bolder ones than it."""
+        first = step
+        while step is not None:
+            yield step
+            step = self.next_step(step)
+        if first is not None and self.damps:
+            yield from (Step(first.damping / 10.0**k) for k in range(1, BOLDER + 1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,6 +156,8 @@ class Standing:
     history: tuple[Tried, ...]
     trials: int
     sentence: str
+    ending: Ending = ""
+    then: NextCommand | None = None  # what helps now, beside going on
 
     @property
     def utilities(self) -> list[float]:
@@ -193,6 +221,7 @@ def standing(
         return state(
             "stopped",
             f"{used} {options.max_trials} trials are used up{needs} ([search] max_trials)",
+            ending="trials used up",
         )
     if incumbent is None:
         failed = sum(t.accepted is False for t in history)
@@ -201,6 +230,8 @@ def standing(
                 "stopped",
                 f"the first policy crashed {failed} times, designed more gently each time: the "
                 "model is too far off to start from; mend it (fit, diagnose) and propose again",
+                ending="crashed",
+                then=NextCommand("diagnose"),
             )
         return state(
             "propose",
@@ -215,8 +246,30 @@ def standing(
             "converged",
             f"no step improved on {own} down to alpha = {2.0**-options.max_halvings:g}: "
             f"{own} is the result (step 7)",
+            ending="no step improved",
         )
-    return state("propose", f"improve on {own} with alpha = {step.alpha:g}", step=step)
+    sentence = f"improve on {own} with alpha = {step.alpha:g}"
+    if why := _suspicion(history, incumbent):
+        return state("propose", f"{sentence}; {why}", step=step, then=NextCommand("diagnose"))
+    return state("propose", sentence, step=step)
+
+
+def _suspicion(history: tuple[Tried, ...], incumbent: Tried) -> str:
+    """Why a diagnosis helps more than the next trial, "" where nothing says so."""
+    lost = 0
+    for tried in history:
+        lost = 0 if tried is incumbent or tried.accepted is None else lost + 1
+    if lost >= LOST:
+        return f"{lost} steps in a row did not improve: a diagnosis may say what the model lacks"
+    own = history[0]
+    if own is incumbent and own.utilities and not own.candidate.base:
+        predicted, real = own.candidate.predicted_utility, own.utility
+        if predicted - real > WILD * max(abs(predicted), 1e-9):
+            return (
+                f"its trial gave {real:.4g} where the model promised {predicted:.4g}: a diagnosis "
+                "may say what the model lacks"
+            )
+    return ""
 
 
 def _next_step(
@@ -248,13 +301,16 @@ def _judge(
     history: list[Tried] = []
     incumbent: Tried | None = None
     iteration = losses = 0  # accepted improvements; steps from the incumbent that did not improve
+    exact = False  # whether the system has repeated itself to the last bit
     ids = {c.id for c in candidates}
     spent = sum(t.candidate in ids for t in trials) >= options.max_trials
     for candidate in candidates:
         own = tuple(t.until(task.horizon) for t in trials if t.candidate == candidate.id)
         utilities = tuple(task.utility(t) for t in own)
         failed = any(u == -np.inf for u in utilities)
-        if len(own) < options.repeats and not failed:
+        exact = exact or _repeated_exactly(own)
+        enough = min(options.repeats, len(own)) if exact and own else options.repeats
+        if len(own) < enough and not failed:
             history.append(Tried(candidate, own, utilities, None))
             continue
         better = incumbent is None or float(np.mean(utilities)) > incumbent.utility
@@ -270,12 +326,17 @@ def _judge(
             losses += 1
             if (
                 options.rerun_incumbent
-                and not spent
+                and not (spent or exact)
                 and _in_doubt(incumbent, tried, losses + options.repeats)
             ):
                 tried = replace(tried, accepted=None, in_doubt=True)
         history.append(tried)
     return tuple(history), incumbent, iteration
+
+
+def _repeated_exactly(trials: Sequence[Trial]) -> bool:
+    """Whether two trials of a candidate have the very same states."""
+    return any(np.array_equal(a.states, b.states) for a, b in pairwise(trials))
 
 
 def _in_doubt(incumbent: Tried, loser: Tried, most: int) -> bool:

@@ -2,7 +2,7 @@
 
 Two numbers say which step is tried next on the real system:
 
-    damping   lambda in [0, 1]: the price lambda (R + S) |u - u_trial|^2 on leaving the trial's
+    damping   lambda in [0, 1000]: the price lambda (R + S) |u - u_trial|^2 on leaving the trial's
               inputs, within which DDP converges (`improve.damped`)
     alpha     the paper's step along the direction that results, 1, 1/2, 1/4 ...
 
@@ -16,7 +16,13 @@ section 6.1):
     rho = real gain / predicted gain   of the last accepted step
     rho >= 0.9 at alpha = 1            lambda / 30
     rho <  0.25                        10 lambda, at most 1
-    a trial without improvement        10 lambda until 1, and from there alpha / 2
+    a trial without improvement        10 lambda, at most 1000, and from there alpha / 2
+
+Why damping goes on rising where the paper halves alpha: a damped step is the best one of its length
+in the grounded model, a halved one is a mixture of two policies that neither was planned. On a
+cart-pole with a friction that its model lacks, damping ends within 0.1 % of the optimum in 11
+trials; halving stops 2.4 % off after 30 (docs/experiments.md). With `[search] step = "full"` alpha
+is halved from the start, as the paper has it.
 
 Steps 6 and 7: the line search on the REAL system.
 
@@ -32,7 +38,7 @@ from dataclasses import dataclass
 
 KEPT, BROKEN = 0.9, 0.25
 EASED, RAISED = 30.0, 10.0
-LEAST = 1e-6
+LEAST, MOST = 1e-6, 1e3
 
 
 @dataclass(frozen=True)
@@ -54,16 +60,16 @@ def after_success(step: Step, predicted: float, real: float) -> Step:
     if step.alpha == 1.0 and real >= KEPT * predicted:
         return Step(max(step.damping / EASED, LEAST))
     if real < BROKEN * predicted:
-        return Step(min(step.damping * RAISED, 1.0))
+        return Step(min(step.damping * RAISED, MOST))
     return Step(step.damping)
 
 
 def after_failure(step: Step, max_halvings: int) -> Step | None:
     """A more cautious step along the way down; None when the search has failed (step 7)."""
-    if step.damping < 1.0:
-        return Step(min(step.damping * RAISED, 1.0), step.alpha)
+    if step.damping < MOST:
+        return Step(min(step.damping * RAISED, MOST), step.alpha)
     alpha = step.alpha / 2
-    return Step(1.0, alpha) if alpha >= 2.0**-max_halvings * (1 - 1e-12) else None
+    return Step(MOST, alpha) if alpha >= 2.0**-max_halvings * (1 - 1e-12) else None
 
 
 def next_alpha(tried: Iterable[float], max_halvings: int) -> float | None:
