@@ -21,8 +21,9 @@ from grounded.estimate import Measurement, Noise, Record, Tracker, smooth_trials
 from grounded.experiments.driving import RATE, START
 from grounded.frozen import Array
 from grounded.model import Model
+from grounded.onboard import Runner
 from grounded.plant import Plant
-from grounded.policy import Policy, Runner
+from grounded.policy import Policy
 from grounded.task import Task
 from grounded.trial import Trial
 
