@@ -18,7 +18,7 @@ from models import MODELS
 from grounded.compile import Problem
 from grounded.experiments.car_tasks import car_task
 from grounded.experiments.figure8 import flight_task
-from grounded.search.first_policy import first_guess
+from grounded.search.first_guess import first_guess
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,8 @@ import numpy as np
 from grounded.errors import GroundedError, nearest
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded.policy import Policy, Runner
+from grounded.onboard import Runner
+from grounded.policy import Policy
 from grounded.trial import Trial
 
 

@@ -6,17 +6,8 @@ The past inputs in z (newest first, input by input, see `grounded.compile.proble
 whoever runs the policy: `Runner` keeps them. theta, the paper's policy parameters, are all
 feed-forwards and gains; `theta + alpha d` is `toward(other, alpha)`.
 
-On the robot:
-
-    runner = load("c0003.npz", states=("delta", "v", "x", "y", "psi", "psi_rate"))
-    while not runner.done(t):
-        send(runner.action(t, state))          # array (m,), inside the hard limits
-
-  - the controller for the step NEAREST to t is used (footnote 18), so it may be called at the rate
-    of the state estimate; it remembers the inputs that it sent, which the gains need;
-  - a state that is not finite switches the feedback off for that call: the feed-forward alone is
-    sent, and `blind` counts such calls;
-  - after the horizon it sends the input that was held before the start, never the last one.
+`load` gives a `Runner` of an exported policy; how it acts in the control loop is told in
+`onboard.py`, which is a file of its own so that it can be copied to a robot.
 """
 
 from __future__ import annotations
@@ -27,8 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from grounded.errors import GroundedError, NextCommand
+from grounded import onboard
+from grounded.errors import GroundedError
 from grounded.frozen import Array, readonly, wrapped
+from grounded.onboard import FORMAT, NUMBERS, Runner
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,65 +140,9 @@ def z_difference(a: Array, b: Array, angles: tuple[bool, ...]) -> Array:
     return wrapped(np.asarray(a, float) - np.asarray(b, float), angles)
 
 
-FORMAT = "grounded-policy-1"
-_NUMBERS = ("feedforward", "low", "high", "past")
-
-
-class Runner:
-    """Executes one run of a policy; make a new one for each run."""
-
-    def __init__(self, policy: Policy) -> None:
-        self.policy = policy
-        self.blind = 0  # calls with a state that was not finite
-        self._H = policy.horizon
-        self._deep = max(policy.depths, default=1)
-        self._sent = np.tile(policy.past, (self._H + self._deep, 1))
-        self._latest = -1
-        columns = [(j, i + 1) for j, d in enumerate(policy.depths) for i in range(d)]
-        self._queue_input = np.array([c[0] for c in columns], dtype=int)
-        self._queue_lag = np.array([c[1] for c in columns], dtype=int)
-        self._angles = np.flatnonzero(policy.angles)
-        self._n = len(policy.state_names)
-        self._z = np.empty(self._n + len(columns))
-
-    def done(self, t: float) -> bool:
-        """Whether t [s] since the start is past the last control step."""
-        return int(t / self.policy.dt + 0.5) >= self._H
-
-    def action(self, t: float, s: Any) -> Array:
-        """The inputs to send, (m,), for the state s (n,) at t seconds after the start."""
-        policy = self.policy
-        step = max(int(t / policy.dt + 0.5), 0)
-        if step >= self._H:
-            return np.array(policy.past)
-        base = step + self._deep
-        if step > self._latest + 1:  # calls were missed: the input was held meanwhile
-            self._sent[self._latest + 1 + self._deep : base] = self._sent[self._latest + self._deep]
-        u: Array = policy.feedforward[step]
-        if policy.gain is not None and policy.reference is not None:
-            z = self._z
-            z[: self._n] = s
-            z[self._n :] = self._sent[base - self._queue_lag, self._queue_input]
-            z -= policy.reference[step]
-            seen = bool(np.isfinite(z).all())
-            if seen:
-                for i in self._angles:
-                    z[i] -= 2 * np.pi * round(z[i] / (2 * np.pi))
-                correction = policy.gain[step] @ z
-                seen = bool(np.isfinite(correction).all())
-            if seen:
-                u = u + correction
-            else:
-                self.blind += 1
-        u = np.minimum(np.maximum(u, policy.low), policy.high)
-        self._sent[base] = u
-        self._latest = step
-        return u
-
-
 def to_arrays(policy: Policy, **about: str) -> dict[str, Any]:
     """A policy as arrays and strings for `numpy.savez`; `about` adds what a reader may check."""
-    arrays: dict[str, Any] = {name: getattr(policy, name) for name in _NUMBERS}
+    arrays: dict[str, Any] = {name: getattr(policy, name) for name in NUMBERS}
     arrays |= {
         "format": FORMAT,
         "dt": policy.dt,
@@ -227,7 +164,7 @@ def load(
     inputs: tuple[str, ...] | None = None,
     task: str | None = None,
 ) -> Runner:
-    """A runner from a candidate that was exported as .npz.
+    """A runner from an exported candidate (`grounded export ID --format npz`).
 
     Args:
         path: the .npz file; it is data, nothing in it is executed.
@@ -238,58 +175,7 @@ def load(
     Raises:
         GroundedError: if the file is no exported candidate, or one for another robot or task.
     """
-    data = _archive(path)
-    if str(data.get("format", "")) != FORMAT:
-        raise GroundedError(
-            f"{path} is not a candidate: expected one that was exported as npz",
-            then=NextCommand("export", ("best", "--format", "npz")),
-        )
     try:
-        policy = Policy(
-            **{name: data[name] for name in _NUMBERS},
-            dt=float(data["dt"]),
-            state_names=tuple(map(str, data["state_names"])),
-            input_names=tuple(map(str, data["input_names"])),
-            depths=tuple(map(int, data["depths"])),
-            angles=tuple(map(bool, data["angles"])),
-            gain=data.get("gain"),
-            reference=data.get("reference"),
-        )
-    except KeyError as error:
-        raise GroundedError(f"{path} lacks {error}; export it again") from None
-    except (TypeError, ValueError, GroundedError) as error:
-        raise GroundedError(f"{path} is garbled: {error}; export it again") from None
-    wanted = {"states": states, "inputs": inputs}
-    for kind, names in wanted.items():
-        found = policy.state_names if kind == "states" else policy.input_names
-        if names is not None and tuple(names) != found:
-            raise GroundedError(f"{path} is for {kind} {found}; this robot has {tuple(names)}")
-    if task is not None and str(data.get("task", "")) != task:
-        raise GroundedError(
-            f"{path} is for task {data.get('task')}; this robot is set up for {task}"
-        )
-    parts = ("feedforward", "gain", "reference", "past")
-    finite = all(np.isfinite(data[part]).all() for part in parts if part in data)
-    if not (finite and (policy.low <= policy.high).all()):  # NaN is not below anything
-        raise GroundedError(
-            f"{path} holds numbers that are not finite, or limits that exclude each other; "
-            "export it again"
-        )
-    return Runner(policy)
-
-
-def _archive(path: str | Path) -> dict[str, Any]:
-    """The arrays of an .npz file; nothing in it is executed."""
-    from io import BytesIO
-
-    try:
-        content = Path(path).read_bytes()
-    except OSError as error:
-        raise GroundedError(f"{path} can't be read: {error.strerror}") from None
-    try:
-        with np.load(BytesIO(content), allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
-    except Exception as error:  # numpy, zipfile and zlib each have errors of their own
-        raise GroundedError(
-            f"{path} is damaged, or no exported candidate (.npz): {error}; export it again"
-        ) from None
+        return Runner(Policy(**onboard.read(path, states, inputs, task)))
+    except ValueError as error:
+        raise GroundedError(str(error)) from None

@@ -18,7 +18,8 @@ import numpy as np
 
 from benchmarks.foreign.setups import Setup
 from grounded.policy import Policy
-from grounded.search.improve import first_policy, learn
+from grounded.search.first_policy import first_policy
+from grounded.search.improve import learn
 from grounded.search.standing import Options
 from grounded.solve import ddp
 from grounded.task import Task

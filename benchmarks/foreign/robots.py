@@ -14,7 +14,8 @@ from typing import Protocol
 import numpy as np
 
 from grounded.model import Model
-from grounded.policy import Policy, Runner
+from grounded.onboard import Runner
+from grounded.policy import Policy
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded.utility import Reward

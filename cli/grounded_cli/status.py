@@ -36,7 +36,7 @@ def command(json_: bool) -> None:
 
 def summary(status: Status) -> str:
     """The history as a table, with a line of bars and how sure the last improvement is."""
-    from grounded.search.standing import last_improvement
+    from grounded.search.certainty import last_improvement
     from grounded_trials.report.report_text import spaced
 
     standing, lines = status.standing, []

@@ -26,7 +26,8 @@ from grounded.diagnosis.report import Diagnosis
 from grounded.effects import Library, memory_start, scales_of, wrap, wrapping_order
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded.policy import Policy, Runner
+from grounded.onboard import Runner
+from grounded.policy import Policy
 from grounded.task import Task
 from grounded.trial import Trial
 

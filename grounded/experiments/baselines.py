@@ -40,7 +40,7 @@ from grounded.experiments.ilc import gradient_of, lifted, update
 from grounded.experiments.jobs import Running, StudyTable, run_study
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded.search.improve import first_policy
+from grounded.search.first_policy import first_policy
 from grounded.search.standing import SearchOptions
 from grounded.task import Task
 from grounded.trial import Trial, mean_trial

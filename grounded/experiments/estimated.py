@@ -34,8 +34,9 @@ from grounded.experiments.driving import RATE, START, film, hands, markers
 from grounded.experiments.jobs import Running, StudyTable, improvement, mean_text, run_study
 from grounded.frozen import Array
 from grounded.model import Model
+from grounded.onboard import Runner
 from grounded.plant import Plant
-from grounded.policy import Policy, Runner
+from grounded.policy import Policy
 from grounded.search.ask_tell import learn
 from grounded.search.standing import Candidate, SearchOptions
 from grounded.task import Task

@@ -25,7 +25,8 @@ from grounded.models.aircraft import model as aircraft
 from grounded.result import plain
 from grounded.rollout import simulate
 from grounded.search.ask_tell import learn
-from grounded.search.improve import first_policy, propose
+from grounded.search.first_policy import first_policy
+from grounded.search.improve import propose
 from grounded.search.standing import Candidate, SearchOptions
 from grounded.task import Task
 from grounded.trial import Trial

@@ -1,200 +1,130 @@
-"""Where DDP starts for the first policy: from the REFERENCE, not from zero inputs.
+"""Steps 1 and 2 of the paper: the policy that is optimal in the crude model.
 
 A long manoeuvre is rarely solved from an open-loop start: the first rollout wanders off and DDP
-never comes back. So the target itself is made a nominal run, in three moves:
+never comes back. A swing-up, on the other hand, is not near its target for most of its time, and a
+guess that stays there ends in a local optimum. So DDP starts from several runs, goes on from each
+until it has converged, and the plan with the lowest cost wins:
 
-1. Fill. The target gives some states. A heading or speed that it leaves out is read off its path
-   (roles `position`, `heading`, `speed`). The other states and the inputs are trimmed at each step
-   by itself, with f the model over one control step:
-
-       f(x_t, u_t)_i = target_{t+1, i}  (known i),       f(x_t, u_t)_i = x_{t, i}  (free i)
-
-   Free states hold still while the known ones move (a quasi-steady turn: steering angle, bank,
-   surfaces).
-2. Ground the model on the filled target, as step 4 does on a trial, and take one LQR about it.
-3. Roll that policy out, closed loop, in the model as it is: the start for DDP.
-
-The trim is Levenberg-Marquardt on many steps at once, inputs inside their limits. It starts from
-several inputs, because a stalled motor has no slope to follow; then every step tries again with one
-input set back, and tries the solutions of its neighbours, because a manoeuvre is continuous and a
-bad local minimum seldom is.
+    the reference    a closed-loop run of the model near the target (`first_guess`)
+    zero inputs      and the inputs held before the start, where they are others
+    smooth inputs    random, by fixed seeds: only where a solve takes milliseconds
 """
 
 from __future__ import annotations
 
-import dataclasses
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from grounded.compile import DescentOptions, Problem
 from grounded.frozen import Array
-from grounded.rollout import augmented
-from grounded.solve.bias import effective_inputs
-from grounded.solve.levenberg_marquardt import LeastSquares, Minimum, Rows, solve
+from grounded.policy import Policy
+from grounded.search.first_guess import first_guess
+from grounded.solve import ddp
 from grounded.task import Task
 
-STARTS = (0.0, 0.35, 0.7, -0.35)  # fractions of the way from the held input to its limit
-ITERATIONS, MORE = 30, 12  # of Levenberg-Marquardt: from the starts, from a solution nearby
-ROUNDS = 3
-FREE_WEIGHT = 0.3  # what is prescribed goes first where both can't be had
-KNOTS = 250  # steps that are solved from scratch; those between start from their neighbours
-EXACT = 1e-12  # of the mean squared rate: a trim this good is not tried again
+CAUTION = 100.0  # factor on the input penalties each time the first policy crashed
+ITERATIONS = 1000  # of DDP at the most, from one start
+AT_ONCE = 2e5  # control steps times iterations between two chances to interrupt: under a second
+STARTS = 12  # random ones
+KNOTS = 8  # of a random start's inputs
+AMPLITUDE = 0.075  # of its knots, standard deviation as a share of an input's range
+WORK = 2e7  # iterations x H x (n + m)^2 that all rivals of the reference may take
+FEWEST = 10  # iterations: a rival that gets no more is not started
+HOPELESS = 1e3  # times the best plan's cost: a start above it is not pursued
+
+Tick = Callable[[str], None]
 
 
-@dataclass(frozen=True, eq=False)
-class Guess:
-    """A nominal run of the model: inputs (H, m), gains (H, m, nz), augmented states (H + 1, nz)."""
-
-    inputs: Array
-    gain: Array
-    z: Array
-    cost: float
-
-
-def first_guess(task: Task) -> Guess:
-    """A closed-loop run of the task's model that stays near the target.
-
-    The cost is infinite when even this run diverges: the model can't follow the target.
-    """
-    x, u = filled_target(task)
-    problem = task.problem()
-    z = augmented(problem, x, u, task.past)
-    received = effective_inputs(z, u, problem.delay, problem.depths, task.model.n)
-    moved = problem.system.step(x[:-1], received, problem.p, problem.dt, problem.smoothing)
-    about = dataclasses.replace(problem, bias=x[1:] - moved, start=x[0])
-    sweep = problem.system.backward(about, z, u, np.zeros(task.model.m))
-    if sweep.failed_at >= 0 or not np.isfinite(sweep.K).all():
-        sweep = problem.system.backward(about, z, u, problem.change_weight + problem.input_weight)
-    swarm = problem.system.rollout(
-        problem, u, K=sweep.K, zbar=z[:-1], k=sweep.k, alphas=np.array([1.0, 0.5, 0.0])
-    )
-    cost = np.where(np.isfinite(swarm.cost), swarm.cost, np.inf)
-    best = int(np.argmin(cost))
-    return Guess(swarm.u[best], sweep.K, swarm.z[best], float(cost[best]))
-
-
-def filled_target(task: Task) -> tuple[Array, Array]:
-    """The target with every state and input filled in: x (H + 1, n), u (H, m)."""
-    x, known = _read_off_path(task)
-    trimmed, u = trim(task, x, known)
-    last = np.where(known, x[-1], trimmed[-1])
-    return np.vstack([trimmed, last]), u
-
-
-def _read_off_path(task: Task) -> tuple[Array, NDArray[np.bool_]]:
-    """Target states where given, heading and speed from the path, the start state elsewhere."""
-    model = task.model
-    given: NDArray[np.bool_] = np.asarray(np.isfinite(task.target).all(axis=0))
-    x = np.where(given, task.target, task.start)
-    names = list(model.state_names)
-    position = model.roles.get("position", ())
-    columns = [names.index(p) for p in position if p in names] if len(position) >= 2 else []
-    if len(columns) < 2 or not given[columns[:2]].all():
-        return x, given
-    velocity = np.gradient(x[:, columns], task.dt, axis=0)
-    speed = np.linalg.norm(velocity, axis=1)
-    heading, rate = model.roles.get("heading"), model.roles.get("speed")
-    if isinstance(heading, str) and heading in names and not given[names.index(heading)]:
-        column = names.index(heading)
-        moving = speed > 1e-3 * max(float(speed.max()), 1e-12)
-        angle = np.arctan2(velocity[:, 1], velocity[:, 0])
-        first = angle[np.argmax(moving)] if moving.any() else task.start[column]
-        last_moving = np.maximum.accumulate(np.where(moving, np.arange(len(x)), -1))
-        angle = np.where(last_moving >= 0, angle[last_moving], first)
-        start = task.start[column]
-        turns = 2 * np.pi * np.rint((start - angle[0]) / (2 * np.pi))
-        x[:, column] = np.unwrap(angle) + turns
-        given[column] = True
-    if isinstance(rate, str) and rate in names and not given[names.index(rate)]:
-        x[:, names.index(rate)] = speed  # a first value; the trim may change it
-    return x, given
-
-
-def trim(task: Task, x: Array, known: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """Free states and inputs along a nominal run.
+def first_policy(
+    task: Task, caution: int = 0, tick: Tick | None = None
+) -> tuple[Policy, ddp.Solution]:
+    """The best converged plan of the crude model, as a policy.
 
     Args:
-        task: the model, the limits and the input held before the start.
-        x: (H + 1, n), prescribed columns as they are to be, the others as a first guess.
-        known: (n,), which columns are prescribed.
+        task: the manoeuvre and the crude model.
+        caution: how often a first policy has crashed; each time penalises inputs CAUTION x more.
+        tick: told what is going on, about once a second.
 
     Returns:
-        x (H, n) with the free columns filled in, u (H, m).
+        The policy, and the result of DDP that it is made of: its `status` says whether the plan
+        has converged.
     """
-    H, free = task.horizon, np.flatnonzero(~known)
-    batch = _steps(task, x, known)
-    knots = np.linspace(0, H - 1, min(H, KNOTS)).round().astype(int)  # at least a step apart
-    coarse = _from_scratch(task, batch, x[knots][:, free], knots)
-    at = np.arange(H)
-    w = np.column_stack([np.interp(at, knots, column) for column in coarse.w.T])
-    if len(knots) < H:
-        w = solve(batch, w, at, MORE).w
-    filled = x[:-1].copy()
-    filled[:, free] = w[:, : len(free)]
-    return filled, w[:, len(free) :]
+    if caution:
+        reward = replace(
+            task.reward,
+            input=task.reward.input * CAUTION**caution,
+            input_change=np.maximum(task.reward.input_change, 1e-3) * CAUTION**caution,
+        )
+        task = replace(task, reward=reward)
+    problem, guess = task.problem(), first_guess(task)
+    best = finished(problem, guess.inputs, guess.gain, guess.z[:-1], tick=tick)
+    rivals = list(_rivals(task))
+    share = WORK / (max(len(rivals), 1) * problem.horizon * (problem.nz + task.model.m) ** 2)
+    most = int(np.clip(share, FEWEST, ITERATIONS))
+    for inputs in rivals if share >= FEWEST else rivals[:2]:
+        cost = float(problem.system.rollout(problem, inputs).cost[0])
+        if not np.isfinite(cost) or (best.ok and cost > HOPELESS * best.cost):
+            continue
+        found = finished(problem, inputs, most=most, tick=tick)
+        if found.ok and (not best.ok or found.cost < best.cost * (1 - 1e-6)):
+            best = found
+    if best.status == "max iterations" and len(best.trace) < ITERATIONS:
+        more = finished(problem, best.u, best.K, best.z[:-1], tick=tick)
+        best = replace(more, trace=(*best.trace, *more.trace))
+    return task.policy(best.u, best.K, best.z[:-1]), best
 
 
-def _steps(task: Task, x: Array, known: NDArray[np.bool_]) -> LeastSquares:
-    """The equations of every step in w = [free states, inputs], as rates."""
-    problem, free, n = task.problem(), np.flatnonzero(~known), x.shape[1]
-    weight = np.where(known, 1.0, FREE_WEIGHT) / problem.dt
-    settings = (problem.p, problem.dt, problem.smoothing)
+def finished(
+    problem: Problem,
+    inputs: Array,
+    K: Array | None = None,
+    z: Array | None = None,
+    *,
+    most: int = ITERATIONS,
+    tick: Tick | None = None,
+) -> ddp.Solution:
+    """DDP until it has converged, in pieces short enough for Ctrl-C.
 
-    def split(w: Array, rows: Rows) -> tuple[Array, Array]:
-        state = x[rows]
-        state[:, free] = w[:, : len(free)]
-        return state, np.ascontiguousarray(w[:, len(free) :])
-
-    def residual(w: Array, rows: Rows) -> Array:
-        state, u = split(w, rows)
-        with np.errstate(all="ignore"):
-            moved = problem.system.step(state, u, *settings)
-        return np.asarray((moved - np.where(known, x[rows + 1], state)) * weight)
-
-    def jacobian(w: Array, rows: Rows) -> Array:
-        state, u = split(w, rows)
-        f_x, f_u = problem.system.linearise(state, u, *settings)
-        J = np.concatenate([f_x[:, :, free] - np.eye(n)[:, free], f_u], axis=2)
-        return np.asarray(J * weight[:, None])
-
-    rate = np.diff(x, axis=0)[:, known] / problem.dt
-    nowhere = np.full(len(free), np.inf)
-    return LeastSquares(
-        residual,
-        jacobian,
-        low=np.append(-nowhere, task.low),
-        high=np.append(nowhere, task.high),
-        solved=EXACT * (float(np.mean(rate**2)) + 1e-12),
+    Args:
+        problem: what to solve.
+        inputs: (H, m) the first inputs.
+        K: (H, m, nz) feedback of the first rollout, about `z`.
+        z: (H, nz), see `K`.
+        most: iterations at the most.
+        tick: told how far it is, after each piece.
+    """
+    piece = int(np.clip(AT_ONCE / problem.horizon, 1, most))
+    result = ddp.solve(problem, inputs, K, z, DescentOptions(max_iterations=piece))
+    trace = list(result.trace)
+    while result.status == "max iterations" and len(trace) < most:
+        if tick is not None:
+            tick(f"planning: {len(trace)} iterations, cost {result.cost:.4g}")
+        options = DescentOptions(max_iterations=min(piece, most - len(trace)))
+        result = ddp.solve(problem, result.u, result.K, result.z[:-1], options)
+        trace += result.trace
+    return replace(
+        result,
+        trace=tuple(trace),
+        sentence=ddp.ending(result.status, len(trace)) or result.sentence,
     )
 
 
-def _from_scratch(task: Task, batch: LeastSquares, states: Array, knots: Rows) -> Minimum:
-    """From several inputs, then with one input set back, then from the neighbours' solutions."""
-    held = np.tile(np.clip(task.past, task.low, task.high), (len(knots), 1))
-    starts = [_toward_limit(task, held, part) for part in STARTS]
-    best = solve(batch, np.hstack([states, starts[0]]), knots, ITERATIONS)
-
-    def again(w: Array, iterations: int) -> Minimum:
-        open_ = np.flatnonzero(best.error > batch.solved)
-        if not len(open_):
-            return best
-        return best.better_of(solve(batch, w[open_], knots[open_], iterations), open_)
-
-    for start in starts[1:]:
-        best = again(np.hstack([states, start]), ITERATIONS)
-    for j in range(task.model.m):
-        for start in starts:
-            w = best.w.copy()
-            w[:, states.shape[1] + j] = start[:, j]
-            best = again(w, MORE)
-    for _ in range(ROUNDS):
-        for shift in (1, -1):
-            best = again(np.roll(best.w, shift, axis=0), MORE)
-    return best
-
-
-def _toward_limit(task: Task, held: Array, part: float) -> Array:
-    """Inputs that fraction of the way to the upper (negative: lower) limit, where there is one."""
-    limit = task.high if part >= 0 else task.low
-    return held + abs(part) * (np.where(np.isfinite(limit), limit, held) - held)
+def _rivals(task: Task) -> Iterator[Array]:
+    """Inputs (H, m) from which DDP may find a better plan than from the reference."""
+    H, m = task.horizon, task.model.m
+    zero = np.clip(np.zeros(m), task.low, task.high)
+    yield np.tile(zero, (H, 1))
+    held = np.clip(task.past, task.low, task.high)
+    if not np.array_equal(held, zero):
+        yield np.tile(held, (H, 1))
+    if task.model.system.how != "compiled":
+        return
+    low = np.where(np.isfinite(task.low), task.low, zero - 1.0)
+    high = np.where(np.isfinite(task.high), task.high, zero + 1.0)
+    steps, knots = np.arange(H), np.linspace(0, H - 1, KNOTS)
+    for seed in range(STARTS):
+        drawn = np.random.default_rng(seed).normal(0.0, AMPLITUDE, (KNOTS, m)) * (high - low)
+        smooth = [np.interp(steps, knots, column) for column in drawn.T]
+        yield np.clip(zero + np.column_stack(smooth), task.low, task.high)

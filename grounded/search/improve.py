@@ -30,15 +30,24 @@ from typing import Any
 import numpy as np
 
 from grounded.compile import DescentOptions, Problem
+from grounded.errors import NextCommand
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.policy import Policy
 from grounded.result import Result, document
 from grounded.rollout import simulate
-from grounded.search.first_policy import first_guess
+from grounded.search.first_policy import Tick, first_policy
 from grounded.search.planner import Planner
 from grounded.search.safety import objections, spread
-from grounded.search.standing import Candidate, SearchOptions, Standing, Tried, standing
+from grounded.search.standing import (
+    Candidate,
+    Ending,
+    Phase,
+    SearchOptions,
+    Standing,
+    Tried,
+    standing,
+)
 from grounded.search.step_size import Step
 from grounded.solve import ddp
 from grounded.solve.bias import Grounding, ground
@@ -46,7 +55,6 @@ from grounded.task import Task
 from grounded.trial import Trial, mean_trial
 
 PLANNING = DescentOptions(max_iterations=30, tolerance=1e-6)  # a direction needs no more digits
-CAUTION = 100.0  # factor on the input penalties each time the first policy crashed (FACTS.md 2)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -95,25 +103,6 @@ def model_fingerprint(task: Task) -> str:
     for array in (model.values, problem.delay, np.array([task.smoothing]), np.round(moved, 9)):
         digest.update(np.ascontiguousarray(array + 0.0).tobytes())
     return digest.hexdigest()[:16]
-
-
-def first_policy(task: Task, caution: int = 0) -> tuple[Policy, ddp.Solution]:
-    """Steps 1 and 2: the (locally) optimal policy of the crude model.
-
-    Args:
-        task: the manoeuvre and the crude model.
-        caution: how often a first policy has crashed; each time penalises inputs CAUTION x more.
-    """
-    if caution:
-        reward = replace(
-            task.reward,
-            input=task.reward.input * CAUTION**caution,
-            input_change=np.maximum(task.reward.input_change, 1e-3) * CAUTION**caution,
-        )
-        task = replace(task, reward=reward)
-    guess = first_guess(task)
-    result = ddp.solve(task.problem(), guess.inputs, guess.gain, guess.z[:-1])
-    return task.policy(result.u, result.K, result.z[:-1]), result
 
 
 def direction(
@@ -165,6 +154,7 @@ def propose(
     identity: str = "",
     planner: Planner | None = None,
     refit: Callable[[Task, Sequence[Trial]], Model] | None = None,
+    tick: Tick | None = None,
 ) -> Proposal:
     """What to run next: the outstanding candidate, a new one, or nothing.
 
@@ -177,6 +167,7 @@ def propose(
         planner: plans with adopted effects; None: with the task's own model.
         refit: with options.refit, gives the model with parameters fitted to all trials; None: by
             `grounded.fit`.
+        tick: told what is going on while planning takes its time.
     """
     planner = planner or Planner(task, task)
     fingerprint = model_fingerprint(planner.plan)
@@ -189,8 +180,12 @@ def propose(
         planner = planner.with_model((refit or refitted)(planner.plan, trials))
     make = _Maker(planner, now, identity or f"c{len(candidates) + 1:04d}", fingerprint)
     if now.incumbent is None:
-        policy, _ = first_policy(planner.plan, now.caution)
-        return make.checked(make.candidate(policy, planner.plan.problem(exact=True), Step()))
+        policy, plan = first_policy(planner.plan, now.caution, tick)
+        made = make.checked(make.candidate(policy, planner.plan.problem(exact=True), Step()))
+        if plan.status == "converged":
+            return made
+        note = f"the plan is not at the model's optimum: {plan.sentence}"
+        return replace(made, notes=(*made.notes, note))
     return _improvement(make, now.incumbent, options)
 
 
@@ -220,10 +215,17 @@ def _improvement(make: _Maker, incumbent: Tried, options: SearchOptions) -> Prop
     already = simulate(real, theta).utility
     already = already if np.isfinite(already) else incumbent.utility
     least = options.tolerance * abs(already)
+    losers = {
+        (t.candidate.damping, t.candidate.alpha)
+        for t in make.now.history
+        if t.candidate.base == incumbent.candidate.id and t.candidate.model == make.fingerprint
+    }
     unsafe: Proposal | None = None
+    promised: list[float] = []
     directions: dict[float, Policy] = {}
-    step = make.now.step
-    while step is not None:
+    for step in options.steps_from(make.now.step):
+        if (step.damping, step.alpha) in losers:
+            continue
         if step.damping not in directions:
             directions[step.damping] = direction(plan, theta, grounding, options, step.damping)
         policy = theta.toward(directions[step.damping], step.alpha)
@@ -233,17 +235,52 @@ def _improvement(make: _Maker, incumbent: Tried, options: SearchOptions) -> Prop
             if proposal.candidate is not None:
                 return proposal
             unsafe = proposal
-        elif abs(made.predicted_gain) <= least:
+            continue
+        promised.append(made.predicted_gain)
+        if abs(made.predicted_gain) <= least:
             break
-        step = options.next_step(step)
     if unsafe is not None:
         return unsafe
-    sentence = (
-        f"the model promises less than {100 * options.tolerance:g} % more from any step ([search] "
-        f"tolerance): {incumbent.candidate.id} is the result"
+    return Proposal(_ended(make, incumbent, promised, least, options.tolerance), None, False)
+
+
+def _ended(
+    make: _Maker, incumbent: Tried, promised: list[float], least: float, tolerance: float
+) -> Standing:
+    """The standing when no step is worth a trial, with the true reason."""
+    own, finite = incumbent.candidate.id, [gain for gain in promised if np.isfinite(gain)]
+    phase: Phase = "stopped"
+    ending: Ending
+    then: NextCommand | None = NextCommand("diagnose")
+    lost = sum(
+        t.accepted is False and t.candidate.base == own and t.candidate.model == make.fingerprint
+        for t in make.now.history
     )
-    ended = replace(make.now, phase="converged", step=None, sentence=sentence)
-    return Proposal(ended, None, is_new=False)
+    if promised and not finite:
+        ending = "model diverges"
+        sentence = (
+            f"the model diverges when it is grounded on {own}, whatever the step: it is too far "
+            "off there to say how to improve; a diagnosis may say what it lacks"
+        )
+    elif finite and max(finite) < -least and not lost:
+        ending = "every step loses"
+        sentence = (
+            f"every step from {own} loses in the grounded model, {-max(finite):.4g} at the least: "
+            "its slopes don't hold along this trial; a diagnosis may say what it lacks"
+        )
+    elif lost:
+        phase, then, ending = "converged", None, "no step improved"
+        sentence = (
+            f"{lost} step{'s' * (lost > 1)} from {own} did not improve, and the model promises "
+            f"less than {100 * tolerance:g} % from smaller ones: {own} is the result (step 7)"
+        )
+    else:
+        phase, then, ending = "converged", None, "nothing promised"
+        sentence = (
+            f"the model promises less than {100 * tolerance:g} % more from any step "
+            f"([search] tolerance): {own} is the result"
+        )
+    return replace(make.now, phase=phase, step=None, sentence=sentence, ending=ending, then=then)
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,5 +318,5 @@ class _Maker:
         found = objections(task, made, spread(task, self.now.history))
         if not found:
             return Proposal(self.now, made, is_new=True)
-        stopped = replace(self.now, phase="stopped", sentence=found[0])
+        stopped = replace(self.now, phase="stopped", sentence=found[0], ending="not allowed")
         return Proposal(stopped, None, is_new=False, notes=tuple(found))

@@ -8,27 +8,43 @@ in which they were proposed, and the trials that came back, say all there is to 
     tried            the alphas along the present direction that did not improve (step 6)
     in doubt         a loss that may be luck: the incumbent is run once more before it is believed
 
+Two trials of one candidate that agree to the last bit say that the system is deterministic: nothing
+is run a second time from then on.
+
 Same candidates and trials, same state: nothing depends on the clock or on the process that asks.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 
-from grounded.errors import GroundedError
+from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.result import Result, document
+from grounded.search.certainty import in_doubt, last_improvement, repeated_exactly
 from grounded.search.step_size import Step, after_failure, after_success
 from grounded.task import Task
 from grounded.trial import Trial
 
 Phase = Literal["propose", "await-trial", "converged", "stopped"]
+Ending = Literal[
+    "",  # it goes on
+    "nothing promised",  # the grounded model sees nothing more to gain
+    "no step improved",  # step 7: real trials lost down to the smallest step
+    "every step loses",  # in the grounded model already
+    "model diverges",  # grounded on the best trial
+    "crashed",  # every first policy
+    "not allowed",  # by [limits] or [safety]
+    "trials used up",
+]
+BOLDER = 3  # factors of 10 below the damping that is due, tried where all from it on lose
+LOST = 2  # steps in a row without improvement that ask for a diagnosis
+WILD = 100.0  # times its promise that a first trial's loss may be before it asks for one
 MAX_CAUTION = 3  # times the first policy is designed again, ever more gently, after a crash
 
 
@@ -42,7 +58,7 @@ class SearchOptions:
     match_inputs: bool = True  # False: the paper's bias alone, see `bias`
     max_halvings: int = 6
     repeats: int = 1
-    rerun_incumbent: bool = True  # see `_in_doubt`
+    rerun_incumbent: bool = True  # see `certainty.in_doubt`
     max_trials: int = 40
     tolerance: float = 1e-3  # stop when the model predicts less relative gain than this
 
@@ -72,6 +88,15 @@ class SearchOptions:
     def next_step(self, step: Step) -> Step | None:
         """The step after one that did not improve; None when the search has failed (step 7)."""
         return after_failure(step, self.max_halvings, damps=self.damps)
+
+    def steps_from(self, step: Step | None) -> Iterator[Step]:
+        """The step that is due, the more cautious ones after it, then bolder ones than it."""
+        first = step
+        while step is not None:
+            yield step
+            step = self.next_step(step)
+        if first is not None and self.damps:
+            yield from (Step(first.damping / 10.0**k) for k in range(1, BOLDER + 1))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -173,6 +198,8 @@ class Standing(Result):
     history: tuple[Tried, ...]
     trials: int
     sentence: str
+    ending: Ending = ""
+    then: NextCommand | None = None  # what helps now, beside going on
 
     @property
     def utilities(self) -> list[float]:
@@ -197,6 +224,7 @@ class Standing(Result):
             outstanding=self.outstanding.id if self.outstanding else None,
             missing=self.missing,
             sentence=self.sentence,
+            ending=self.ending or None,
             certainty=last_improvement(self.history),
             history=[t.to_json() | {"verdict": t.verdict(t is last)} for t in self.history],
         )
@@ -238,7 +266,7 @@ def standing(
         used = "all" if total >= options.max_trials else f"{total} of"
         needs = f"; a candidate needs {options.repeats}" * (total < options.max_trials)
         sentence = f"{used} {options.max_trials} trials are used up{needs} ([search] max_trials)"
-        return replace(now, phase="stopped", sentence=sentence)
+        return replace(now, phase="stopped", sentence=sentence, ending="trials used up")
     if incumbent is None:
         failed = sum(t.accepted is False for t in history)
         if failed > MAX_CAUTION:
@@ -246,7 +274,13 @@ def standing(
                 f"the first policy crashed {failed} times, designed more gently each time: the "
                 "model is too far off to start from; mend it (fit, diagnose) and propose again"
             )
-            return replace(now, phase="stopped", sentence=sentence)
+            return replace(
+                now,
+                phase="stopped",
+                sentence=sentence,
+                ending="crashed",
+                then=NextCommand("diagnose"),
+            )
         return replace(now, step=options.first_step(), caution=failed)
     own = incumbent.candidate.id
     step = _next_step(history, incumbent, options, model)
@@ -255,8 +289,30 @@ def standing(
             f"no step improved on {own} down to alpha = {2.0**-options.max_halvings:g}: "
             f"{own} is the result (step 7)"
         )
-        return replace(now, phase="converged", sentence=sentence)
-    return replace(now, step=step, sentence=f"improve on {own} with alpha = {step.alpha:g}")
+        return replace(now, phase="converged", sentence=sentence, ending="no step improved")
+    sentence = f"improve on {own} with alpha = {step.alpha:g}"
+    if why := _suspicion(history, incumbent):
+        then = NextCommand("diagnose")
+        return replace(now, step=step, sentence=f"{sentence}; {why}", then=then)
+    return replace(now, step=step, sentence=sentence)
+
+
+def _suspicion(history: tuple[Tried, ...], incumbent: Tried) -> str:
+    """Why a diagnosis helps more than the next trial, "" where nothing says so."""
+    lost = 0
+    for tried in history:
+        lost = 0 if tried is incumbent or tried.accepted is None else lost + 1
+    if lost >= LOST:
+        return f"{lost} steps in a row did not improve: a diagnosis may say what the model lacks"
+    own = history[0]
+    if own is incumbent and own.utilities and not own.candidate.base:
+        predicted, real = own.candidate.predicted_utility, own.utility
+        if predicted - real > WILD * max(abs(predicted), 1e-9):
+            return (
+                f"its trial gave {real:.4g} where the model promised {predicted:.4g}: a diagnosis "
+                "may say what the model lacks"
+            )
+    return ""
 
 
 def _awaited(now: Standing, options: SearchOptions, model: str) -> Standing | None:
@@ -306,13 +362,16 @@ def _judge(
     history: list[Tried] = []
     incumbent: Tried | None = None
     iteration = losses = 0  # accepted improvements; steps from the incumbent that did not improve
+    exact = False  # whether the system has repeated itself to the last bit
     ids = {c.id for c in candidates}
     spent = sum(t.candidate in ids for t in trials) >= options.max_trials
     for candidate in candidates:
         own = tuple(t.until(task.horizon) for t in trials if t.candidate == candidate.id)
         utilities = tuple(task.utility(t) for t in own)
         failed = any(u == -np.inf for u in utilities)
-        if len(own) < options.repeats and not failed:
+        exact = exact or repeated_exactly(own)
+        enough = min(options.repeats, len(own)) if exact and own else options.repeats
+        if len(own) < enough and not failed:
             history.append(Tried(candidate, own, utilities, None))
             continue
         better = incumbent is None or float(np.mean(utilities)) > incumbent.utility
@@ -328,64 +387,9 @@ def _judge(
             losses += 1
             if (
                 options.rerun_incumbent
-                and not spent
-                and _in_doubt(incumbent, tried, losses + options.repeats)
+                and not (spent or exact)
+                and in_doubt(incumbent, tried, losses + options.repeats)
             ):
                 tried = replace(tried, accepted=None, in_doubt=True)
         history.append(tried)
     return tuple(history), incumbent, iteration
-
-
-def _in_doubt(incumbent: Tried, loser: Tried, most: int) -> bool:
-    """Whether a loss may be luck: the incumbent's, whose trials were the best of several.
-
-    A lucky winner blocks every step from there on. So a loss within two standard errors of the
-    incumbent's own scatter (unknown after one trial) sends it out once more, until it has `most`
-    trials: one for each loss. Where trials repeat themselves exactly, it costs one trial a winner.
-    """
-    if not np.isfinite(loser.utility) or len(incumbent.trials) >= most:
-        return False
-    scatter = incumbent.standard_error * np.sqrt(len(incumbent.trials))
-    error = scatter * np.sqrt(1 / len(incumbent.trials) + 1 / len(loser.trials))
-    return not incumbent.utility - loser.utility > 2 * error
-
-
-def utility_noise(history: Sequence[Tried]) -> tuple[float, int]:
-    """Standard deviation of a single trial's utility, pooled, and its degrees of freedom."""
-    square, freedom = 0.0, 0
-    for tried in history:
-        known = [u for u in tried.utilities if math.isfinite(u)]
-        if len(known) > 1:
-            square += float(np.var(known, ddof=1)) * (len(known) - 1)
-            freedom += len(known) - 1
-    return (math.sqrt(square / freedom) if freedom else float("nan")), freedom
-
-
-def last_improvement(history: Sequence[Tried]) -> str:
-    """How sure the last accepted improvement is, as a sentence; "" before there is one.
-
-    Two candidates differ for certain where the difference of their means exceeds its standard
-    error; Welch's t-test gives the probability. Single trials say nothing about noise: then the
-    scatter of any candidate that was repeated stands in for it.
-    """
-    accepted = [t for t in history if t.accepted]
-    if len(accepted) < 2:
-        return ""
-    before, after = accepted[-2], accepted[-1]
-    gain = after.utility - before.utility
-    noise, freedom = utility_noise(history)
-    if not freedom:
-        return (
-            f"the last gain is {gain:.3g}; every candidate was run once, so the noise of a "
-            "trial is unknown: run the best one again"
-        )
-    error = noise * math.sqrt(1 / len(before.utilities) + 1 / len(after.utilities))
-    if error == 0:
-        return f"the last gain is {gain:.3g}; repeated trials agree exactly"
-    from scipy.stats import t as student
-
-    probability = float(student.cdf(gain / error, freedom))
-    return (
-        f"the last gain is {gain:.3g} +- {error:.2g} (noise of one trial {noise:.2g}): "
-        f"an improvement with probability {probability:.2f}"
-    )

@@ -2,10 +2,9 @@
 
 A step is two numbers:
 
-    damping   lambda in [0, 1]: the price lambda (R + S) |u - u_trial|^2 on leaving the trial's
+    damping   lambda in [0, 1000]: the price lambda (R + S) |u - u_trial|^2 on leaving the trial's
               inputs, within which DDP converges (`improve.damped`)
-    alpha     the paper's step along the direction that results: 1, then halved until a trial
-              improves the utility (footnote 11)
+    alpha     the paper's step along the direction that results: 1, then halved (footnote 11)
 
 At lambda = 1 the step is the cautious one that a crude model deserves; at 0 it is the paper's, DDP
 to convergence. Neither is right for every robot: on a car with unmodelled effects converged steps
@@ -16,8 +15,12 @@ Methods*, 2000, section 6.1):
 
     rho = real gain / predicted gain   of the last accepted step
     rho >= 0.9 at alpha = 1            lambda / 30
-    rho <  0.25                        10 lambda, at most 1
-    a trial without improvement        10 lambda until 1, and from there alpha / 2
+    rho <  0.25                        10 lambda, at most 1000
+    a trial without improvement        10 lambda, at most 1000, and from there alpha / 2
+
+Damping goes on rising where the paper halves alpha: a damped step is the best one of its length in
+the grounded model, a halved one a mixture of two policies that neither was planned for. With
+`[search] step = "full"` alpha is halved from the start, as the paper has it.
 
 Real trials are the evaluations of this line search, so it is no loop but a question put to the
 trials so far. A step may also be passed over because its predicted run leaves the safe region.
@@ -29,7 +32,7 @@ from dataclasses import dataclass, replace
 
 KEPT, BROKEN = 0.9, 0.25
 EASED, RAISED = 30.0, 10.0
-LEAST = 1e-6
+LEAST, MOST = 1e-6, 1e3
 
 
 @dataclass(frozen=True)
@@ -51,7 +54,7 @@ def after_success(step: Step, predicted: float, real: float) -> Step:
     if step.alpha == 1.0 and real >= KEPT * predicted:
         return Step(max(step.damping / EASED, LEAST))
     if real < BROKEN * predicted:
-        return Step(min(step.damping * RAISED, 1.0))
+        return Step(min(step.damping * RAISED, MOST))
     return Step(step.damping)
 
 
@@ -63,7 +66,7 @@ def after_failure(step: Step, max_halvings: int, *, damps: bool = True) -> Step 
         max_halvings: alpha goes down to 2^-max_halvings.
         damps: whether the damping is raised before alpha is halved.
     """
-    if damps and step.damping < 1.0:
-        return replace(step, damping=min(step.damping * RAISED, 1.0))
+    if damps and step.damping < MOST:
+        return replace(step, damping=min(step.damping * RAISED, MOST))
     alpha = step.alpha / 2
     return replace(step, alpha=alpha) if alpha >= 2.0**-max_halvings * (1 - 1e-12) else None

@@ -151,21 +151,25 @@ def _search(
 
 def _solution(problem: Problem, found: Descent) -> Solution:
     trace = tuple(Iteration(*line) for line in found.lines.tolist())
-    sentences: dict[Status, str] = {
-        "converged": f"converged after {len(trace)} iterations",
-        "max iterations": f"stopped after {len(trace)} iterations, still improving",
-        "no improvement": "no step along the search direction lowers the cost any more",
-    }
+    sentence = ending(found.status, len(trace))
     k, K = found.k, found.K
     if found.status == "not finite":
         k, K = np.zeros(found.u.shape), np.zeros((*found.u.shape, problem.nz))
-        sentences["not finite"] = (
+        sentence = (
             _first_bad(problem, found.z)
             if found.failed_at < 0
             else f"the sweep failed at step {found.failed_at}"
         )
-    sentence = sentences[found.status]
     return Solution(found.status, sentence, found.z, found.u, k, K, found.cost, trace)
+
+
+def ending(status: Status, iterations: int) -> str:
+    """Why a search ended, as a sentence; "" for one that left the finite numbers."""
+    return {
+        "converged": f"converged after {iterations} iterations",
+        "max iterations": f"stopped after {iterations} iterations, still improving",
+        "no improvement": "no step along the search direction lowers the cost any more",
+    }.get(status, "")
 
 
 def _first_bad(problem: Problem, z: Array) -> str:

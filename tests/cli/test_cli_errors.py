@@ -355,7 +355,7 @@ import numpy as np
 from grounded_trials.store.trial_file import TrialWriter
 from grounded_trials.store.candidate_file import read_candidate
 
-from grounded.policy import Runner
+from grounded.onboard import Runner
 
 policy, _, _, meta = read_candidate(sys.argv[1])
 runner = Runner(policy)

@@ -7,7 +7,7 @@ from grounded.errors import GroundedError
 from grounded.experiments.figure8 import flight_task
 from grounded.model import Model
 from grounded.models import aircraft, car, pendulum
-from grounded.search.first_policy import first_guess
+from grounded.search.first_guess import first_guess
 from grounded.solve import ddp
 from grounded.task import Task
 from grounded.utility import Reward

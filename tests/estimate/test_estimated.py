@@ -11,7 +11,7 @@ from grounded.experiments import estimated
 from grounded.experiments.car import real_case
 from grounded.experiments.driving import markers
 from grounded.experiments.estimated import Filmed
-from grounded.search.improve import first_policy
+from grounded.search.first_policy import first_policy
 
 NOISE = NoiseStd(np.array([0.047, 0.043, 1e-4, 2e-4, 2e-3, 1e-2]), np.full(4, 0.003), 1 / 30)
 

@@ -8,7 +8,7 @@ import pytest
 from grounded.experiments.bench import bench, many_runs, optimum, start_of
 from grounded.experiments.ilc import deepened, gradient_of, lifted
 from grounded.rollout import simulate
-from grounded.search.improve import first_policy
+from grounded.search.first_policy import first_policy
 
 
 @pytest.fixture(scope="module", params=["turn", "circle"])

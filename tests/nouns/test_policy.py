@@ -12,8 +12,9 @@ import pytest
 
 from facts import holding
 from grounded.errors import GroundedError
+from grounded.onboard import Runner
 from grounded.plant import Plant
-from grounded.policy import Policy, Runner, load, to_arrays, z_difference
+from grounded.policy import Policy, load, to_arrays, z_difference
 from small_tasks import other, rover_task
 
 STATES, INPUTS = ("x", "psi"), ("speed", "turn")

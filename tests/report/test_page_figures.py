@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from grounded.experiments.pendulum import pendulum_task
 from grounded.models import pendulum
 from grounded.rollout import simulate
-from grounded.search.improve import first_policy
+from grounded.search.first_policy import first_policy
 from grounded.search.planner import Planner
 from grounded.trial import Trial
 from grounded_trials.report.figures.axis import Axis, fitted, round_up, thinned, without_astray

@@ -7,7 +7,8 @@ import pytest
 from scipy.stats import ttest_ind
 
 from facts import holds
-from grounded.search.standing import Tried, last_improvement, utility_noise
+from grounded.search.certainty import last_improvement, utility_noise
+from grounded.search.standing import Tried
 
 
 def tried(*utilities, accepted=True):

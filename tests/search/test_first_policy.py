@@ -9,8 +9,8 @@ from grounded.experiments.car_tasks import NAMES, car_task, target
 from grounded.experiments.figure8 import flight_task
 from grounded.experiments.pendulum import pendulum_task
 from grounded.models import aircraft, car, pendulum
-from grounded.search.first_policy import filled_target, first_guess
-from grounded.search.improve import first_policy
+from grounded.search.first_guess import filled_target, first_guess
+from grounded.search.first_policy import first_policy
 from grounded.solve import ddp
 from small_tasks import cart_task, rover_task
 

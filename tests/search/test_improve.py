@@ -19,13 +19,8 @@ from grounded.models import car, pendulum
 from grounded.plant import Plant
 from grounded.rollout import simulate
 from grounded.search.ask_tell import learn
-from grounded.search.improve import (
-    damped,
-    direction,
-    first_policy,
-    model_fingerprint,
-    propose,
-)
+from grounded.search.first_policy import first_policy
+from grounded.search.improve import damped, direction, model_fingerprint, propose
 from grounded.search.standing import SearchOptions
 from grounded.solve.bias import ground
 from grounded.task import Task

@@ -5,7 +5,7 @@ import pytest
 
 from grounded.experiments.car_tasks import car_task, target
 from grounded.models import car
-from grounded.search.first_policy import filled_target, trim
+from grounded.search.first_guess import filled_target, trim
 from small_tasks import cart, cart_task, rover, rover_task
 
 

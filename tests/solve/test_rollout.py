@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from grounded.onboard import Runner
 from grounded.plant import Plant
-from grounded.policy import Runner
 from grounded.rollout import augmented, simulate
 from small_tasks import cart_task, rover, rover_task
 

@@ -16,8 +16,9 @@ import numpy as np
 from grounded.diagnosis.report import Diagnosis
 from grounded.errors import GroundedError
 from grounded.frozen import Array
+from grounded.search.certainty import utility_noise
 from grounded.search.planner import Planner
-from grounded.search.standing import Standing, utility_noise
+from grounded.search.standing import Standing
 from grounded.solve.bias import residuals
 from grounded.task import Task
 from grounded.trial import Trial

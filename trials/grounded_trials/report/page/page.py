@@ -124,7 +124,7 @@ def _utility(findings: Findings) -> str:
     if not findings.history:
         logs = count(len(findings.logs), "log")
         return f"<p>No candidate was proposed yet; {logs} of data.</p>"
-    from grounded.search.standing import last_improvement
+    from grounded.search.certainty import last_improvement
 
     sure = last_improvement(findings.history)
     begun = (sure[:1].upper() + sure[1:]).replace("+-", "±")

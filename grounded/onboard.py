@@ -1,0 +1,209 @@
+"""Runs an exported policy on the robot. Needs Python 3.8 and numpy, and nothing of grounded.
+
+    u_t = clip( ubar_t + K_t (z_t - zbar_t) ),     z_t = [x_t, inputs already sent]
+
+    runner = load("turn.npz", states=("delta", "v", "x", "y", "psi", "psi_rate"))
+    while not runner.done(t):
+        send(runner.action(t, state))          # array (m,), inside the hard limits
+
+`grounded export ID --runner` copies this file beside the candidate. Inside the control loop nothing
+is raised; what can't be used is left out, and `runner.blind` counts it:
+
+  - the controller for the step nearest to t is used, so `action` may be called at the rate of the
+    state estimate; inputs of calls that were missed count as held;
+  - a state that is not finite, has another length or is no array of numbers switches the feedback
+    off for that call: the feed-forward alone is sent;
+  - a time that runs backwards is taken as the latest one; one that is not a number sends the last
+    input again;
+  - after the last step the input that was held before the start is sent, inside the limits.
+"""
+
+from __future__ import annotations
+
+import sys
+from io import BytesIO
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, Optional, Tuple
+
+import numpy as np
+
+FORMAT = "grounded-policy-1"
+NUMBERS = ("feedforward", "low", "high", "past")
+Names = Optional[Tuple[str, ...]]
+
+
+class Runner:
+    """Executes one run of a policy; make a new one for each run.
+
+    Args:
+        policy: anything with the fields of an exported policy: feedforward (H, m), low, high and
+            past (m,), dt [s], state_names, depths, angles, gain (H, m, nz), reference (H, nz).
+    """
+
+    def __init__(self, policy: Any) -> None:
+        self.policy = policy
+        self.blind = 0  # calls whose state or time could not be used
+        self._H = len(policy.feedforward)
+        self._deep = max(policy.depths, default=1)
+        self._held = np.minimum(np.maximum(policy.past, policy.low), policy.high)
+        self._sent = np.tile(np.asarray(policy.past, float), (self._H + self._deep, 1))
+        self._latest = -1
+        columns = [(j, i + 1) for j, d in enumerate(policy.depths) for i in range(d)]
+        self._queue_input = np.array([c[0] for c in columns], dtype=int)
+        self._queue_lag = np.array([c[1] for c in columns], dtype=int)
+        self._angles = np.flatnonzero(policy.angles)
+        self._n = len(policy.state_names)
+        self._z = np.empty(self._n + len(columns))
+
+    def done(self, t: float) -> bool:
+        """Whether t [s] since the start is past the last control step."""
+        return self._step(t) >= self._H
+
+    def action(self, t: float, s: Any) -> Any:
+        """The inputs to send, (m,), for the state s (n,) at t seconds after the start."""
+        policy, step = self.policy, self._step(t)
+        if step < 0:  # the time is not a number
+            self.blind += 1
+            return np.array(
+                self._held if self._latest < 0 else self._sent[self._latest + self._deep]
+            )
+        step = max(step, self._latest)
+        if step >= self._H:
+            return np.array(self._held)
+        base = step + self._deep
+        if step > self._latest + 1:  # calls were missed: the input was held meanwhile
+            self._sent[self._latest + 1 + self._deep : base] = self._sent[self._latest + self._deep]
+        u = policy.feedforward[step]
+        if policy.gain is not None:
+            correction = self._correction(step, base, s)
+            if correction is None:
+                self.blind += 1
+            else:
+                u = u + correction
+        u = np.minimum(np.maximum(u, policy.low), policy.high)
+        self._sent[base] = u
+        self._latest = step
+        return u
+
+    def _step(self, t: float) -> int:
+        """The control step nearest to t; -1 where t is not a number, H where it is past the end."""
+        try:
+            where = float(t) / self.policy.dt + 0.5
+        except (TypeError, ValueError):
+            return -1
+        if where != where:
+            return -1
+        return int(min(max(where, 0.0), float(self._H)))
+
+    def _correction(self, step: int, base: int, s: Any) -> Any:
+        """K_t (z - zbar), (m,); None where the state can't be used."""
+        z = self._z
+        try:
+            state: Any = np.ma.filled(np.ma.asarray(s, dtype=float), np.nan)
+        except (TypeError, ValueError):
+            return None
+        if state.ndim > 1 or state.size != self._n:
+            return None
+        z[: self._n] = state
+        z[self._n :] = self._sent[base - self._queue_lag, self._queue_input]
+        z -= self.policy.reference[step]
+        if not np.isfinite(z).all():
+            return None
+        for i in self._angles:
+            z[i] -= 2 * np.pi * round(z[i] / (2 * np.pi))
+        correction = self.policy.gain[step] @ z
+        return correction if np.isfinite(correction).all() else None
+
+
+def load(
+    path: Any, states: Names = None, inputs: Names = None, task: Optional[str] = None
+) -> Runner:
+    """A runner from an exported candidate, an .npz file; nothing in it is executed.
+
+    Args:
+        path: the file.
+        states: the robot's state names in the order in which it will pass them.
+        inputs: the robot's input names in the order in which it will send them.
+        task: the task hash that the robot is set up for.
+
+    Raises:
+        ValueError: if the file is no exported candidate, or one for another robot or task.
+    """
+    return Runner(SimpleNamespace(**read(path, states, inputs, task)))
+
+
+def read(path: Any, states: Names, inputs: Names, task: Optional[str]) -> dict[str, Any]:
+    """The fields of an exported policy, checked; see `load`."""
+    data = _archive(path)
+    if str(data.get("format", "")) != FORMAT:
+        raise ValueError(f"{path} is not a candidate exported by `grounded export --format npz`")
+    try:
+        found: dict[str, Any] = {name: np.asarray(data[name], float) for name in NUMBERS}
+        found["dt"] = float(data["dt"])
+        found["state_names"] = tuple(map(str, data["state_names"]))
+        found["input_names"] = tuple(map(str, data["input_names"]))
+        found["depths"] = tuple(map(int, data["depths"]))
+        found["angles"] = tuple(map(bool, data["angles"]))
+        found["gain"], found["reference"] = data.get("gain"), data.get("reference")
+    except KeyError as error:
+        raise ValueError(f"{path} lacks {error}; export it again") from None
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path} is garbled: {error}; export it again") from None
+    for kind, names in (("states", states), ("inputs", inputs)):
+        own = found["state_names" if kind == "states" else "input_names"]
+        if names is not None and tuple(names) != own:
+            raise ValueError(f"{path} is for {kind} {own}; this robot has {tuple(names)}")
+    if task is not None and str(data.get("task", "")) != task:
+        raise ValueError(f"{path} is for task {data.get('task')}; this robot is set up for {task}")
+    _check(path, found)
+    return found
+
+
+def _check(path: Any, found: dict[str, Any]) -> None:
+    """That the arrays fit each other and hold numbers."""
+    ubar, gain, reference = found["feedforward"], found["gain"], found["reference"]
+    H, m = ubar.shape if ubar.ndim == 2 else (0, 0)
+    n, nz = len(found["state_names"]), len(found["state_names"]) + sum(found["depths"])
+    fits = H > 0 and all(found[name].shape == (m,) for name in NUMBERS[1:])
+    fits = fits and len(found["input_names"]) == m == len(found["depths"])
+    fits = fits and len(found["angles"]) == n and found["dt"] > 0
+    fits = fits and min(found["depths"], default=0) >= 1 and (gain is None) == (reference is None)
+    if gain is not None and reference is not None:
+        fits = fits and gain.shape == (H, m, nz) and reference.shape == (H, nz)
+    if not fits:
+        raise ValueError(f"{path} is garbled: its arrays don't fit each other; export it again")
+    parts = [found[name] for name in ("feedforward", "past", "gain", "reference")]
+    finite = all(np.isfinite(part).all() for part in parts if part is not None)
+    if not (finite and (found["low"] <= found["high"]).all()):  # NaN is not below anything
+        raise ValueError(
+            f"{path} holds numbers that are not finite, or limits that exclude each other; "
+            "export it again"
+        )
+
+
+def _archive(path: Any) -> dict[str, Any]:
+    try:
+        content = Path(path).read_bytes()
+    except OSError as error:
+        raise ValueError(f"{path} can't be read: {error.strerror}") from None
+    try:
+        with np.load(BytesIO(content), allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except Exception as error:  # numpy, zipfile and zlib each have errors of their own
+        raise ValueError(
+            f"{path} is damaged, or no exported candidate (.npz): {error}; export it again"
+        ) from None
+
+
+if __name__ == "__main__":  # what a file holds, before it is trusted with a robot
+    if len(sys.argv) != 2:
+        sys.exit(f"usage: python {sys.argv[0]} CANDIDATE.npz")
+    try:
+        shown = load(sys.argv[1]).policy
+    except ValueError as problem:
+        sys.exit(f"error: {problem}")
+    print(f"{len(shown.feedforward)} steps of {shown.dt:g} s")
+    print("states ", ", ".join(shown.state_names))
+    for name, low, high in zip(shown.input_names, shown.low, shown.high):
+        print(f"input   {name}, limits {low:g} to {high:g}")

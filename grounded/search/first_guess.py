@@ -1,0 +1,202 @@
+"""Where DDP starts for the first policy: from the REFERENCE, not from zero inputs.
+
+A long manoeuvre is rarely solved from an open-loop start: the first rollout wanders off and DDP
+never comes back. So the target itself is made a nominal run, in three moves:
+
+1. Fill. The target gives the states that the running reward weighs. A heading or speed that it
+   leaves out is read off its path
+   (roles `position`, `heading`, `speed`). The other states and the inputs are trimmed at each step
+   by itself, with f the model over one control step:
+
+       f(x_t, u_t)_i = target_{t+1, i}  (known i),       f(x_t, u_t)_i = x_{t, i}  (free i)
+
+   Free states hold still while the known ones move (a quasi-steady turn: steering angle, bank,
+   surfaces).
+2. Ground the model on the filled target, as step 4 does on a trial, and take one LQR about it.
+3. Roll that policy out, closed loop, in the model as it is: the start for DDP.
+
+The trim is Levenberg-Marquardt on many steps at once, inputs inside their limits. It starts from
+several inputs, because a stalled motor has no slope to follow; then every step tries again with one
+input set back, and tries the solutions of its neighbours, because a manoeuvre is continuous and a
+bad local minimum seldom is.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from grounded.frozen import Array
+from grounded.rollout import augmented
+from grounded.solve.bias import effective_inputs
+from grounded.solve.levenberg_marquardt import LeastSquares, Minimum, Rows, solve
+from grounded.task import Task
+
+STARTS = (0.0, 0.35, 0.7, -0.35)  # fractions of the way from the held input to its limit
+ITERATIONS, MORE = 30, 12  # of Levenberg-Marquardt: from the starts, from a solution nearby
+ROUNDS = 3
+FREE_WEIGHT = 0.3  # what is prescribed goes first where both can't be had
+KNOTS = 250  # steps that are solved from scratch; those between start from their neighbours
+EXACT = 1e-12  # of the mean squared rate: a trim this good is not tried again
+
+
+@dataclass(frozen=True, eq=False)
+class Guess:
+    """A nominal run of the model: inputs (H, m), gains (H, m, nz), augmented states (H + 1, nz)."""
+
+    inputs: Array
+    gain: Array
+    z: Array
+    cost: float
+
+
+def first_guess(task: Task) -> Guess:
+    """A closed-loop run of the task's model that stays near the target.
+
+    The cost is infinite when even this run diverges: the model can't follow the target.
+    """
+    x, u = filled_target(task)
+    problem = task.problem()
+    z = augmented(problem, x, u, task.past)
+    received = effective_inputs(z, u, problem.delay, problem.depths, task.model.n)
+    moved = problem.system.step(x[:-1], received, problem.p, problem.dt, problem.smoothing)
+    about = dataclasses.replace(problem, bias=x[1:] - moved, start=x[0])
+    sweep = problem.system.backward(about, z, u, np.zeros(task.model.m))
+    if sweep.failed_at >= 0 or not np.isfinite(sweep.K).all():
+        sweep = problem.system.backward(about, z, u, problem.change_weight + problem.input_weight)
+    swarm = problem.system.rollout(
+        problem, u, K=sweep.K, zbar=z[:-1], k=sweep.k, alphas=np.array([1.0, 0.5, 0.0])
+    )
+    cost = np.where(np.isfinite(swarm.cost), swarm.cost, np.inf)
+    best = int(np.argmin(cost))
+    return Guess(swarm.u[best], sweep.K, swarm.z[best], float(cost[best]))
+
+
+def filled_target(task: Task) -> tuple[Array, Array]:
+    """The target with every state and input filled in: x (H + 1, n), u (H, m)."""
+    x, known = _read_off_path(task)
+    trimmed, u = trim(task, x, known)
+    last = np.where(known, x[-1], trimmed[-1])
+    return np.vstack([trimmed, last]), u
+
+
+def _read_off_path(task: Task) -> tuple[Array, NDArray[np.bool_]]:
+    """Target states where given, heading and speed from the path, the start state elsewhere."""
+    model = task.model
+    weighed = task.reward.state if task.reward.state.any() else task.reward.terminal
+    given: NDArray[np.bool_] = np.isfinite(task.target).all(axis=0) & (weighed > 0)
+    x = np.where(given, task.target, task.start)
+    names = list(model.state_names)
+    position = model.roles.get("position", ())
+    columns = [names.index(p) for p in position if p in names] if len(position) >= 2 else []
+    if len(columns) < 2 or not given[columns[:2]].all():
+        return x, given
+    velocity = np.gradient(x[:, columns], task.dt, axis=0)
+    speed = np.linalg.norm(velocity, axis=1)
+    heading, rate = model.roles.get("heading"), model.roles.get("speed")
+    if isinstance(heading, str) and heading in names and not given[names.index(heading)]:
+        column = names.index(heading)
+        moving = speed > 1e-3 * max(float(speed.max()), 1e-12)
+        angle = np.arctan2(velocity[:, 1], velocity[:, 0])
+        first = angle[np.argmax(moving)] if moving.any() else task.start[column]
+        last_moving = np.maximum.accumulate(np.where(moving, np.arange(len(x)), -1))
+        angle = np.where(last_moving >= 0, angle[last_moving], first)
+        start = task.start[column]
+        turns = 2 * np.pi * np.rint((start - angle[0]) / (2 * np.pi))
+        x[:, column] = np.unwrap(angle) + turns
+        given[column] = True
+    if isinstance(rate, str) and rate in names and not given[names.index(rate)]:
+        x[:, names.index(rate)] = speed  # a first value; the trim may change it
+    return x, given
+
+
+def trim(task: Task, x: Array, known: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Free states and inputs along a nominal run.
+
+    Args:
+        task: the model, the limits and the input held before the start.
+        x: (H + 1, n), prescribed columns as they are to be, the others as a first guess.
+        known: (n,), which columns are prescribed.
+
+    Returns:
+        x (H, n) with the free columns filled in, u (H, m).
+    """
+    H, free = task.horizon, np.flatnonzero(~known)
+    batch = _steps(task, x, known)
+    knots = np.linspace(0, H - 1, min(H, KNOTS)).round().astype(int)  # at least a step apart
+    coarse = _from_scratch(task, batch, x[knots][:, free], knots)
+    at = np.arange(H)
+    w = np.column_stack([np.interp(at, knots, column) for column in coarse.w.T])
+    if len(knots) < H:
+        w = solve(batch, w, at, MORE).w
+    filled = x[:-1].copy()
+    filled[:, free] = w[:, : len(free)]
+    return filled, w[:, len(free) :]
+
+
+def _steps(task: Task, x: Array, known: NDArray[np.bool_]) -> LeastSquares:
+    """The equations of every step in w = [free states, inputs], as rates."""
+    problem, free, n = task.problem(), np.flatnonzero(~known), x.shape[1]
+    weight = np.where(known, 1.0, FREE_WEIGHT) / problem.dt
+    settings = (problem.p, problem.dt, problem.smoothing)
+
+    def split(w: Array, rows: Rows) -> tuple[Array, Array]:
+        state = x[rows]
+        state[:, free] = w[:, : len(free)]
+        return state, np.ascontiguousarray(w[:, len(free) :])
+
+    def residual(w: Array, rows: Rows) -> Array:
+        state, u = split(w, rows)
+        with np.errstate(all="ignore"):
+            moved = problem.system.step(state, u, *settings)
+        return np.asarray((moved - np.where(known, x[rows + 1], state)) * weight)
+
+    def jacobian(w: Array, rows: Rows) -> Array:
+        state, u = split(w, rows)
+        f_x, f_u = problem.system.linearise(state, u, *settings)
+        J = np.concatenate([f_x[:, :, free] - np.eye(n)[:, free], f_u], axis=2)
+        return np.asarray(J * weight[:, None])
+
+    rate = np.diff(x, axis=0)[:, known] / problem.dt
+    nowhere = np.full(len(free), np.inf)
+    return LeastSquares(
+        residual,
+        jacobian,
+        low=np.append(-nowhere, task.low),
+        high=np.append(nowhere, task.high),
+        solved=EXACT * (float(np.mean(rate**2)) + 1e-12),
+    )
+
+
+def _from_scratch(task: Task, batch: LeastSquares, states: Array, knots: Rows) -> Minimum:
+    """From several inputs, then with one input set back, then from the neighbours' solutions."""
+    held = np.tile(np.clip(task.past, task.low, task.high), (len(knots), 1))
+    starts = [_toward_limit(task, held, part) for part in STARTS]
+    best = solve(batch, np.hstack([states, starts[0]]), knots, ITERATIONS)
+
+    def again(w: Array, iterations: int) -> Minimum:
+        open_ = np.flatnonzero(best.error > batch.solved)
+        if not len(open_):
+            return best
+        return best.better_of(solve(batch, w[open_], knots[open_], iterations), open_)
+
+    for start in starts[1:]:
+        best = again(np.hstack([states, start]), ITERATIONS)
+    for j in range(task.model.m):
+        for start in starts:
+            w = best.w.copy()
+            w[:, states.shape[1] + j] = start[:, j]
+            best = again(w, MORE)
+    for _ in range(ROUNDS):
+        for shift in (1, -1):
+            best = again(np.roll(best.w, shift, axis=0), MORE)
+    return best
+
+
+def _toward_limit(task: Task, held: Array, part: float) -> Array:
+    """Inputs that fraction of the way to the upper (negative: lower) limit, where there is one."""
+    limit = task.high if part >= 0 else task.low
+    return held + abs(part) * (np.where(np.isfinite(limit), limit, held) - held)
