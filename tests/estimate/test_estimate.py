@@ -20,8 +20,8 @@ from grounded.estimate import (
 from grounded.estimate.filter import filter_batch, sensitivity
 from grounded.estimate.likelihood import _slope
 from grounded.estimate.record import batch_of
-from grounded.estimate.recursion import recursion, smooth
-from grounded.estimate.steps import ModelSteps, fixed_steps
+from grounded.estimate.recursion import fixed_steps, recursion, smooth
+from grounded.estimate.steps import ModelSteps
 from grounded.estimate.tracker import nearest_step
 from grounded.model import Model, Param
 from grounded.models.car import model as car
