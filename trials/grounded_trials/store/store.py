@@ -134,8 +134,15 @@ class Store:
             )
         return data
 
-    def add(self, source: str | Path | bytes, suffix: str = ".mcap") -> Added:
-        """Takes a copy of a file, or of bytes; the same content is kept once.
+    def add(
+        self, source: str | Path | bytes, suffix: str = ".mcap", *, again: bool = False
+    ) -> Added:
+        """Takes a copy of a file, or of bytes; the same content is kept once, unless `again`.
+
+        Args:
+            source: the file, or its bytes.
+            suffix: of its name in the store.
+            again: the same content is another file: a run that repeated itself to the last bit.
 
         When it returns, the content is on the disk. A stored file that was damaged is replaced by
         its good copy; the damaged one is kept as `NAME.damaged`.
@@ -148,7 +155,7 @@ class Store:
             try:
                 self._sweep()
                 digest = _copy(source, temporary)
-                return self._place(temporary, digest, suffix)
+                return self._place(temporary, digest, suffix, again)
             except OSError as error:
                 raise self._unwritable(error) from None
             finally:
@@ -168,10 +175,10 @@ class Store:
                 damaged.append(Damaged(entry.path, str(error)))
         return tuple(damaged)
 
-    def _place(self, temporary: Path, digest: str, suffix: str) -> Added:
+    def _place(self, temporary: Path, digest: str, suffix: str, again: bool) -> Added:
         entries = self.list()
         path = next((e.path for e in entries if e.digest == digest[:DIGITS]), None)
-        if path is None:
+        if path is None or (again and hash_file(path) == digest):
             number = entries[-1].number + 1 if entries else 1
             path = self.folder / f"{self.prefix}{number:04d}-{digest[:DIGITS]}{suffix}"
         elif hash_file(path) == digest:

@@ -101,10 +101,14 @@ def ingest_log(
     if candidate is not None and data:
         raise GroundedError("--data is for a log that ran no candidate; drop it or --candidate")
     read = (_own if kind == TRIAL else _foreign)(workspace, path, candidate, data)
-    added = workspace.store.add(read.data)
+    before = _repeated(workspace, path, read)
+    added = workspace.store.add(read.data, again=before != "")
     workspace.forget_trials()
     trial = replace(read.trial, id=added.id)
     warnings = (*read.warnings, *warnings_about(workspace, trial))
+    if before:
+        repeat = f"it repeats {before} to the last bit: the system is taken as deterministic"
+        warnings = (*warnings, f"{repeat}, and no candidate is run a second time from now on")
     tried = _tried(workspace, trial)
     return Ingested(
         trial=added.id,
@@ -117,6 +121,23 @@ def ingest_log(
         signals=read.signals,
         verdict=_verdict(trial, tried, workspace.config.search.repeats),
     )
+
+
+def _repeated(workspace: Folder, path: Path, read: _Read) -> str:
+    """The stored trial that a new run repeats to the last bit, "" for none.
+
+    The same bytes are a new run, not the old one ingested twice, where a run of that candidate is
+    being waited for and the file was written after the stored one.
+    """
+    digest = hashlib.sha256(read.data).hexdigest()
+    known = [one for one in workspace.store.list() if digest.startswith(one.digest)]
+    if not known or not read.trial.candidate:
+        return ""
+    waiting = standing_in(workspace).outstanding
+    files = log_files(path) if path.is_dir() else [path]
+    written = max(file.stat().st_mtime_ns for file in files)
+    fresh = written > known[-1].path.stat().st_mtime_ns
+    return known[-1].id if fresh and waiting and waiting.id == read.trial.candidate else ""
 
 
 def _verdict(trial: Trial, tried: Tried | None, repeats: int) -> str:

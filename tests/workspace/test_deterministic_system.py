@@ -1,0 +1,73 @@
+"""A real system that repeats itself to the last bit: the search ends, by `learn` and by hand."""
+
+import os
+import sys
+
+import pytest
+
+from grounded_trials import Workspace
+from workspaces import CONFIG, make
+
+DRIVE = '''
+import sys
+from grounded.models import pendulum
+from grounded.plant import Plant
+from grounded_trials.store.candidate_file import read_candidate
+from grounded_trials.store.trial_file import write_trial
+from grounded_trials.workspace.model_file import load_module, model_in
+from dataclasses import replace
+from pathlib import Path
+import numpy as np
+
+candidate, trial = map(Path, sys.argv[1:])
+policy, _, _, meta = read_candidate(candidate)
+model = model_in(load_module(Path("."), file="real.py", key="real"))
+ran = Plant(model, latency={"force": 0.02}).run(policy, {"x": 0.0, "v": 0.0}, np.random.default_rng(0))
+write_trial(trial, replace(ran, candidate=meta["id"]), {"kind": "trial", "task": meta["task"]},
+            policy=candidate.read_bytes(), state_units={"x": "m", "v": "m/s"}, input_units={"force": "N"})
+'''
+
+
+@pytest.fixture
+def workspace(tmp_path):
+    system = CONFIG[CONFIG.index("[system]") :]
+    command = f'[system]\ncommand = "{sys.executable} drive.py {{candidate}} {{trial}}"\n'
+    folder = make(tmp_path / "w", config=CONFIG.replace(system, command)).folder
+    (folder / "drive.py").write_text(DRIVE)
+    return Workspace(folder)
+
+
+def test_learn_ends(workspace):
+    status = workspace.learn()
+    assert status.standing.phase == "converged" and status.standing.ending
+    assert status.standing.trials < 12
+
+
+def test_run_and_ingest_by_hand_end_too_and_an_old_file_is_no_repeat(workspace):
+    files = []
+    for _ in range(12):
+        if workspace.propose().candidate is None:
+            break
+        ran = workspace.run()
+        workspace.ingest(ran.trial_file)
+        again = workspace.ingest(ran.trial_file)  # the same file twice is one trial
+        assert again.known
+        files.append(ran.trial_file)
+    assert workspace.propose().candidate is None
+    assert workspace.status().standing.trials == len(files)
+
+
+def test_the_same_bytes_written_anew_are_the_repeat_that_is_waited_for(workspace):
+    config = workspace.folder / "grounded.toml"
+    config.write_text(config.read_text().replace("max_trials = 12", "max_trials = 12\nrepeats = 3"))
+    workspace.propose()
+    first, second = workspace.run().trial_file, workspace.run().trial_file
+    assert first.read_bytes() == second.read_bytes()
+    one = workspace.ingest(first)
+    now = second.stat().st_mtime_ns + 10**9
+    os.utime(second, ns=(now, now))
+    two = workspace.ingest(second)
+    assert not two.known and two.sha256 == one.sha256 and two.trial != one.trial
+    assert "to the last bit" in two.warnings[-1]
+    assert workspace.status().standing.phase == "propose"  # two exact ones stand for three
+    assert workspace.verify().damaged == ()
