@@ -27,9 +27,14 @@ USES = {
     help="Default: as FILE is named, else json. npz is what `grounded.policy.load` reads.",
 )
 @click.option("-o", "--output", metavar="FILE", help="Default: ID.FORMAT in the current folder.")
+@click.option(
+    "--runner", is_flag=True, help="npz, and beside it the program that runs it: numpy alone."
+)
 @in_workspace
 @as_json
-def command(candidate: str, form: str | None, output: str | None, json_: bool) -> None:
+def command(
+    candidate: str, form: str | None, output: str | None, runner: bool, json_: bool
+) -> None:
     """Write a candidate as csv, npz or json, with units and the time base in the file.
 
     `best` names the best candidate so far.
@@ -37,9 +42,12 @@ def command(candidate: str, form: str | None, output: str | None, json_: bool) -
     named = Path(output or "").suffix.lstrip(".").lower()
     if form is not None and named in USES and named != form:
         raise click.UsageError(f"-o {output} is named as {named}, --format says {form}")
-    done = open_workspace().export(candidate, output, form=form)
+    done = open_workspace().export(candidate, output, form=form, runner=runner)
     if json_:
         show_json(done.to_json())
     else:
         show(f"{done.candidate} is written to {done.file}")
-        show(f"  {USES[done.format]}")
+        if done.runner is None:
+            show(f"  {USES[done.format]}")
+        else:
+            show(f"  on the robot, with Python 3.8 and numpy alone: {done.runner}")

@@ -8,9 +8,8 @@ import pytest
 from grounded_trials import Workspace
 from workspaces import CONFIG, make
 
-DRIVE = '''
+DRIVE = """
 import sys
-from grounded.models import pendulum
 from grounded.plant import Plant
 from grounded_trials.store.candidate_file import read_candidate
 from grounded_trials.store.trial_file import write_trial
@@ -22,10 +21,13 @@ import numpy as np
 candidate, trial = map(Path, sys.argv[1:])
 policy, _, _, meta = read_candidate(candidate)
 model = model_in(load_module(Path("."), file="real.py", key="real"))
-ran = Plant(model, latency={"force": 0.02}).run(policy, {"x": 0.0, "v": 0.0}, np.random.default_rng(0))
-write_trial(trial, replace(ran, candidate=meta["id"]), {"kind": "trial", "task": meta["task"]},
-            policy=candidate.read_bytes(), state_units={"x": "m", "v": "m/s"}, input_units={"force": "N"})
-'''
+start, rng = {"x": 0.0, "v": 0.0}, np.random.default_rng(0)
+ran = Plant(model, latency={"force": 0.02}).run(policy, start, rng)
+about = {"kind": "trial", "task": meta["task"]}
+units = {"state_units": {"x": "m", "v": "m/s"}, "input_units": {"force": "N"}}
+made = replace(ran, candidate=meta["id"])
+write_trial(trial, made, about, policy=candidate.read_bytes(), **units)
+"""
 
 
 @pytest.fixture

@@ -3,12 +3,15 @@
 import csv
 import json
 import math
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 
+from grounded.errors import GroundedError
 from grounded.policy import load
-from grounded_trials.workspace.exporting import export_candidate
+from grounded_trials.workspace.exporting import RUNNER, export_candidate
 from grounded_trials.workspace.proposing import propose_in
 from workspaces import CONFIG, make
 
@@ -94,3 +97,24 @@ def test_the_same_candidate_is_the_same_file(tmp_path):
         export_candidate(w, "c0001", form, path)
         if form != "npz":  # a zip holds the time
             assert path.read_bytes() == first
+
+
+def test_the_runner_beside_an_export_drives_without_grounded(tmp_path):
+    w = make(tmp_path / "w")
+    (tmp_path / "robot").mkdir()
+    propose_in(w)
+    done = export_candidate(w, "c0001", path=tmp_path / "robot" / "c.npz", runner=True)
+    assert done.format == "npz" and done.runner == tmp_path / "robot" / RUNNER
+    code = (
+        "import sys; sys.path.insert(0, sys.argv[1]); import grounded_runner as g\n"
+        "r = g.load(sys.argv[2], states=('x', 'v'), inputs=('force',))\n"
+        "print(*[float(r.action(0.05 * k, [0.01 * k, 0.0])[0]) for k in range(40)])\n"
+        "assert not any(n == 'grounded' or n.startswith('grounded.') for n in sys.modules)"
+    )
+    words = [sys.executable, "-I", "-c", code, str(done.runner.parent), str(done.file)]
+    found = subprocess.run(words, capture_output=True, text=True, check=True).stdout
+    here = load(done.file)
+    expected = [float(here.action(0.05 * k, [0.01 * k, 0.0])[0]) for k in range(40)]
+    assert [float(u) for u in found.split()] == expected
+    with pytest.raises(GroundedError, match="npz, not json"):
+        export_candidate(w, "c0001", "json", tmp_path / "c.json", runner=True)

@@ -264,7 +264,12 @@ class Workspace(Folder):
         return reporting.Report(findings, tuple(paths))
 
     def export(
-        self, candidate: str = "best", path: str | Path | None = None, *, form: str | None = None
+        self,
+        candidate: str = "best",
+        path: str | Path | None = None,
+        *,
+        form: str | None = None,
+        runner: bool = False,
     ) -> Exported:
         """Writes a candidate for other languages.
 
@@ -272,10 +277,12 @@ class Workspace(Folder):
             candidate: c0003, or `best`.
             path: the file; None: named after the candidate, in the current folder.
             form: csv, json or npz; None: as the file is named, else json.
+            runner: npz, and beside it the program that runs it on a robot with numpy alone.
         """
         from grounded_trials.workspace.exporting import export_candidate
 
-        return export_candidate(self._afresh(), candidate, form, Path(path) if path else None)
+        place = Path(path) if path else None
+        return export_candidate(self._afresh(), candidate, form, place, runner=runner)
 
     def verify(self) -> Verified:
         """Checks every stored trial against its hash, every candidate against its checksums."""

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from grounded import onboard
 from grounded.errors import GroundedError, nearest
 from grounded.policy import Policy, to_arrays
 from grounded.result import Result
@@ -25,6 +26,7 @@ from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.proposing import candidate_named
 
+RUNNER = "grounded_runner.py"
 LAW = "u_t = clip(feedforward_t + gain_t (z - reference_t), low, high); z = [state, past inputs]"
 
 
@@ -35,6 +37,7 @@ class Exported(Result):
     candidate: str
     file: Path
     format: str
+    runner: Path | None = None  # the program that runs it, where one was asked for
 
     def summary(self) -> str:
         """The candidate and its file."""
@@ -42,29 +45,42 @@ class Exported(Result):
 
     def to_json(self) -> dict[str, Any]:
         """The document of `export --json`."""
-        return {"file": str(self.file), "candidate": self.candidate, "format": self.format}
+        document = {"file": str(self.file), "candidate": self.candidate, "format": self.format}
+        return document | ({"runner": str(self.runner)} if self.runner else {})
 
 
 def export_candidate(
-    workspace: Folder, identity: str, form: str | None = None, path: Path | None = None
+    workspace: Folder,
+    identity: str,
+    form: str | None = None,
+    path: Path | None = None,
+    *,
+    runner: bool = False,
 ) -> Exported:
     """Writes a candidate, `best` or by its id; without `form` as `path` is named, else as json.
+
+    With `runner` it is an npz file, and RUNNER beside it runs it on a robot that has numpy alone.
 
     Raises:
         GroundedError: for an unknown candidate or format, or a place that can't be written.
     """
     encoders = {"csv": _csv, "json": _json, "npz": _npz}
     named = path.suffix.lstrip(".").lower() if path else ""
-    form = form or (named if named in encoders else "json")
+    form = form or (named if named in encoders else "npz" if runner else "json")
     path = path or Path(f"{identity}.{form}")
     if form not in encoders:
         raise GroundedError(f"there is no format '{form}': {nearest(form, encoders)}")
+    if runner and form != "npz":
+        raise GroundedError(f"the runner reads npz, not {form}: leave the format out, or name npz")
     identity = candidate_named(workspace, identity)
     candidate, meta = workspace.candidate(identity)
     about = {"candidate": identity, "task": meta["task"], "model": meta["model"]}
     about["created_by"] = "grounded"
     write_atomically(path, encoders[form](candidate.policy, _units(workspace), about))
-    return Exported(identity, path, form)
+    program = path.with_name(RUNNER) if runner else None
+    if program is not None:
+        write_atomically(program, Path(onboard.__file__).read_bytes())
+    return Exported(identity, path, form, program)
 
 
 def _units(workspace: Folder) -> dict[str, str]:
