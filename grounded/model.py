@@ -25,6 +25,7 @@ from grounded.errors import GroundedError, nearest
 from grounded.frozen import Array, readonly, wrapped
 
 Function = Callable[..., Mapping[str, Any]]
+MAX_SUBSTEPS = 1000
 
 
 @dataclass(frozen=True)
@@ -57,8 +58,11 @@ class Model:
         roles: optional meaning of states (position, heading, speed ...), for effects and pictures.
         derivative: ds/dt, integrated over a control step by `integrator` under a zero-order hold.
         step: the next state itself, any Python callable; instead of `derivative`.
-        integrator: "rk4" (one step of Runge-Kutta a control step) or "euler".
+        integrator: "rk4" or "euler".
         name: for messages and files.
+        substeps: steps of the integrator within a control step; more where the model is stiff.
+        jacobian: derivatives beside `step`: (s, a, p, dt) -> f_x (n, n), f_u (n, m), or with a
+            first axis of samples where the states are arrays; None: they are found.
 
     Raises:
         GroundedError: for a name used twice, an unknown angle or role, neither or both functions.
@@ -73,6 +77,8 @@ class Model:
     step: Function | None = None
     integrator: Literal["rk4", "euler"] = "rk4"
     name: str = "model"
+    substeps: int = 1
+    jacobian: Callable[..., tuple[Any, Any]] | None = None
 
     def __post_init__(self) -> None:
         for attribute in ("states", "inputs", "params", "roles"):
@@ -86,6 +92,12 @@ class Model:
             )
         if self.integrator not in ("rk4", "euler"):
             raise GroundedError(f"integrator must be 'rk4' or 'euler', got '{self.integrator}'")
+        if not (isinstance(self.substeps, int) and 1 <= self.substeps <= MAX_SUBSTEPS):
+            raise GroundedError(f"substeps must be 1 to {MAX_SUBSTEPS}, got {self.substeps}")
+        if self.step is not None and self.substeps > 1:
+            raise GroundedError("substeps divide a derivative; a step= makes its own")
+        if self.step is None and self.jacobian is not None:
+            raise GroundedError("jacobian= goes beside step=; a derivative= finds its own")
         if not self.states or not self.inputs:
             raise GroundedError(f"model '{self.name}' needs at least one state and one input")
         self._check_names()
@@ -157,6 +169,8 @@ class Model:
             inputs=self.input_names,
             params=self.param_names,
             integrator=self.integrator,
+            substeps=self.substeps,
+            jacobian=self.jacobian,
         )
 
     def difference(self, a: Array, b: Array) -> Array:

@@ -7,14 +7,13 @@ step and for its derivatives.
 
 from __future__ import annotations
 
-import importlib
 import inspect
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from grounded.errors import GroundedError
+from grounded.errors import needs
 from grounded.frozen import Array
 from grounded.model import Model
 
@@ -81,10 +80,4 @@ def library(name: str) -> Any:
     Raises:
         GroundedError: if it is not installed, naming the extra that installs it.
     """
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise GroundedError(
-            f"grounded.adapters.{name.partition('.')[0]} needs {name}, which can't be imported "
-            f"({error}): pip install '.[{name.partition('.')[0]}]' in grounded's own folder"
-        ) from error
+    return needs(name, name.partition(".")[0])

@@ -7,6 +7,7 @@ agree, so that nobody above needs to know which one it was.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from grounded.compile.names import Named, where
@@ -52,6 +53,8 @@ def system_of(
     inputs: Sequence[str],
     params: Sequence[str],
     integrator: Integrator = "rk4",
+    substeps: int = 1,
+    jacobian: Callable[..., tuple[Any, Any]] | None = None,
 ) -> System:
     """The System of a user's function.
 
@@ -62,6 +65,8 @@ def system_of(
         inputs: see `states`.
         params: see `states`.
         integrator: "rk4" or "euler", for a derivative.
+        substeps: steps of the integrator within a control step, for a derivative.
+        jacobian: f(s, a, p, dt) -> f_x (n, n), f_u (n, m) of a step; None: by the fastest path.
 
     Raises:
         GroundedError: if the function can't be a model of these names, naming its file and line.
@@ -70,6 +75,11 @@ def system_of(
     from grounded.compile.run.compiled import MAX_PLACES, CompiledSystem
 
     signature = Signature(function, kind, tuple(states), tuple(inputs), tuple(params))
+    if kind == "derivative" and substeps > 1:
+        signature = replace(signature, kind="step", within=(integrator, substeps))
+    if jacobian is not None:
+        note = "not compiled: it is run as it is, with the derivatives that come with it"
+        return DifferencedSystem(replace(signature, jacobian=jacobian), integrator, note)
     found = trace(signature, None, 1.0)
     if isinstance(found, str):
         return DifferencedSystem(signature, integrator, f"not compiled, {found}")

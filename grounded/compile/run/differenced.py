@@ -16,12 +16,13 @@ from typing import Any
 
 import numpy as np
 
-from grounded.compile.names import check_names, raised_at, wrong_value
+from grounded.compile.names import Named, check_names, raised_at, where, wrong_value
 from grounded.compile.run.interpreted import Interpreted
 from grounded.errors import GroundedError
 from grounded.frozen import Array
 
 RELATIVE_STEP = float(np.cbrt(np.finfo(float).eps))
+WRONG = 1e-2  # share of the largest by which a given derivative may differ from differences
 CHUNK = 4096  # samples in one call, so that long horizons don't fill the memory
 
 
@@ -46,7 +47,26 @@ class DifferencedSystem(Interpreted):
         )
 
     def check(self, x: Array, u: Array, p: Array, dt: float) -> None:
-        """Nothing to compare: this is the user's own function."""
+        """Compares derivatives that come with the model with differences, at three samples.
+
+        Raises:
+            GroundedError: where they differ by more than a hundredth of the largest.
+        """
+        own = self.signature.jacobian
+        if own is None:
+            return
+        at = np.unique(np.linspace(0, len(x) - 1, 3).astype(int))
+        given = self._given(x[at], u[at], p, dt)
+        found = self._by_state_and_input(np.concatenate([x[at], u[at]], axis=1), p, dt)
+        off = np.abs(given - found)
+        if off.max(initial=0.0) > WRONG * np.abs(found).max(initial=1e-9):
+            _, i, j = np.unravel_index(int(np.argmax(off)), off.shape)
+            by = (*self.signature.states, *self.signature.inputs)[j]
+            raise GroundedError(
+                f"{where(own)}: the derivative of '{self.states[i]}' by '{by}' differs from that "
+                f"of the step by {off.max():.3g}: jacobian and step don't belong together; leave "
+                "jacobian out to difference the step"
+            )
 
     def jacobian(
         self, x: Array, u: Array, p: Array, dt: float, smoothing: float, width: int
@@ -56,7 +76,9 @@ class DifferencedSystem(Interpreted):
         both = np.concatenate([x, u], axis=1)
         J = np.empty((len(x), self.n, width))
         size = max(1, CHUNK // (2 * shifted))
-        for at in range(0, len(x), size):
+        if self.signature.jacobian is not None:
+            J[:, :, :shifted], size = self._given(x, u, p, dt), 0
+        for at in range(0, len(x), size) if size else ():
             J[at : at + size, :, :shifted] = self._by_state_and_input(both[at : at + size], p, dt)
         for i in range(width - shifted):
             up, down = np.array(p, float), np.array(p, float)
@@ -65,6 +87,32 @@ class DifferencedSystem(Interpreted):
             change = self.step(x, u, up, dt) - self.step(x, u, down, dt)
             J[:, :, shifted + i] = change / (up[i] - down[i])
         return J
+
+    def _given(self, x: Array, u: Array, p: Array, dt: float) -> Array:
+        """The user's own derivatives [f_x f_u], (N, n, n + m): of arrays, or one by one."""
+        own, names = self.signature.jacobian, self.signature
+        assert own is not None
+        parameters = Named("parameter", names.params, np.asarray(p, float).tolist())
+
+        def call(xs: Sequence[Any], us: Sequence[Any]) -> Array:
+            s, a = Named("state", names.states, xs), Named("input", names.inputs, us)
+            f_x, f_u = own(s, a, parameters, dt)
+            return np.concatenate([np.asarray(f_x, float), np.asarray(f_u, float)], axis=-1)
+
+        shape = (len(x), self.n, self.n + self.m)
+        try:
+            found = call([*x.T], [*u.T]) if len(x) > 1 else None
+        except Exception:  # it takes one sample at a time
+            found = None
+        if found is not None and found.shape == shape:
+            return found
+        try:
+            return np.array([call([*s], [*a]) for s, a in zip(x, u, strict=True)]).reshape(shape)
+        except Exception as error:
+            raise GroundedError(
+                f"{where(own)}: jacobian must return f_x ({self.n}, {self.n}) and f_u "
+                f"({self.n}, {self.m}) for one sample: {error}"
+            ) from error
 
     def _by_state_and_input(self, both: Array, p: Array, dt: float) -> Array:
         """(N, n + m) points -> (N, n, n + m), in one call of the step."""

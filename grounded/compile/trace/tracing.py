@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from grounded.compile.names import Named, check_names, raised_at, wrong_value
-from grounded.compile.problem import Kind
+from grounded.compile.problem import STAGES, Integrator, Kind
 from grounded.compile.trace.derivative import jacobian
 from grounded.compile.trace.expression import Expression, NotTraceable, node_of
 from grounded.compile.trace.functions import rebound
@@ -34,6 +34,8 @@ class Signature:
     inputs: tuple[str, ...]
     params: tuple[str, ...]
     returns: tuple[str, ...] = ()  # names of what it returns; empty: the states
+    within: tuple[Integrator, int] | None = None  # a step made of so many steps of a derivative
+    jacobian: Callable[..., tuple[Any, Any]] | None = None  # the user's own f_x, f_u of a step
 
     @property
     def outputs(self) -> tuple[str, ...]:
@@ -49,10 +51,31 @@ class Signature:
         self, x: Sequence[Any], u: Sequence[Any], p: Sequence[Any], dt: Any
     ) -> Mapping[str, Any]:
         """What the function, or a copy of it, returns for n, m and k values and dt."""
-        s, a = Named("state", self.states, x), Named("input", self.inputs, u)
-        parameters = Named("parameter", self.params, p)
+        a, parameters = Named("input", self.inputs, u), Named("parameter", self.params, p)
+        if self.within is not None:
+            return self._integrated(list(x), a, parameters, dt)
         more = (dt,) if self.kind == "step" else ()
-        return self.function(s, a, parameters, *more)
+        return self.function(Named("state", self.states, x), a, parameters, *more)
+
+    def _integrated(self, x: list[Any], a: Named, p: Named, dt: Any) -> Mapping[str, Any]:
+        """The next state by equal steps of Runge-Kutta or Euler within a control step."""
+        assert self.within is not None
+        integrator, count = self.within
+        h = dt / count
+
+        def rate(at: list[Any]) -> list[Any]:
+            values = self.function(Named("state", self.states, at), a, p)
+            check_names(values, self.states, self.function)
+            return [values[name] for name in self.states]
+
+        for _ in range(count):
+            k: list[Any] = [0.0] * len(x)
+            moved = x
+            for c, b in STAGES[integrator]:
+                k = rate([xi + c * h * ki for xi, ki in zip(x, k, strict=True)])
+                moved = [m + b * h * ki for m, ki in zip(moved, k, strict=True)]
+            x = moved
+        return dict(zip(self.states, x, strict=True))
 
 
 @dataclass(frozen=True, eq=False)
