@@ -7,7 +7,6 @@ step and for its derivatives.
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -63,15 +62,13 @@ class Stepper:
 
 
 def model_of(stepper: Stepper, **fields: Any) -> Model:
-    """The Model of a stepper, with its derivatives where Model takes them.
+    """The Model of a stepper, with its derivatives.
 
     Args:
         stepper: computes steps and derivatives.
         fields: the other fields of Model: states, inputs, params, angles, name ...
     """
-    if "jacobian" in inspect.signature(Model).parameters:
-        fields["jacobian"] = stepper.jacobian
-    return Model(step=stepper, **fields)
+    return Model(step=stepper, jacobian=stepper.jacobian, **fields)
 
 
 def library(name: str) -> Any:

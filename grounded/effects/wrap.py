@@ -65,7 +65,14 @@ def plain_step(model: Model) -> Step:
         k4 = derivative(moved(s, k3, dt), a, p)
         return {n: s[n] + dt / 6 * (k1[n] + 2 * k2[n] + 2 * k3[n] + k4[n]) for n in names}
 
-    return rk4 if model.integrator == "rk4" else euler
+    once = rk4 if model.integrator == "rk4" else euler
+
+    def several(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
+        for _ in range(model.substeps):
+            s = Named("state", names, list(once(s, a, p, dt / model.substeps).values()))
+        return dict(s)
+
+    return once if model.substeps == 1 else several
 
 
 def wrap(effect: Effect, values: Mapping[str, float], dt: float) -> Model:

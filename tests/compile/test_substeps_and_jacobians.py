@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from grounded.effects import Library, wrap
 from grounded.errors import GroundedError
 from grounded.model import Model, Param
 
@@ -125,3 +126,16 @@ def test_derivatives_of_another_step_are_found_out():
 def test_what_does_not_go_together_is_said(fields, message):
     with pytest.raises(GroundedError, match=message):
         Model(**NAMES, **fields)
+
+
+def test_an_adopted_effect_keeps_the_substeps():
+    model = Model(**NAMES, derivative=rate, substeps=4)
+    effect = Library().effect("viscous_friction:v", model)
+    wrapped = wrap(effect, {q.name: 0.0 for q in effect.quantities}, 0.2)
+    x, u = samples()
+    np.testing.assert_allclose(
+        wrapped.system.step(x, u, wrapped.values, 0.2),
+        model.system.step(x, u, model.values, 0.2),
+        rtol=1e-12,
+        atol=1e-13,
+    )
