@@ -17,10 +17,11 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.foreign.setups import Setup
+from grounded.compile import DescentOptions
 from grounded.policy import Policy
+from grounded.search.ask_tell import learn
 from grounded.search.first_policy import first_policy
-from grounded.search.improve import learn
-from grounded.search.standing import Options
+from grounded.search.standing import SearchOptions
 from grounded.solve import ddp
 from grounded.task import Task
 from grounded.trial import Trial
@@ -47,13 +48,15 @@ def remember(name: str, utility: float, origin: str) -> None:
 
 def optimum(setup: Setup, say=lambda line: None) -> tuple[float, str]:
     """The best utility found with the simulator's own derivatives, and how."""
-    standing, _, _ = learn(setup.task, setup.run, Options())
+    standing = learn(setup.task, setup.run, SearchOptions()).standing
     best = standing.incumbent
     starts = {} if best is None else {"the search": best.candidate.policy}
     first = best.candidate.policy if best is not None else first_policy(setup.task)[0]
     if setup.truth is not None:
         for start in (first.feedforward, *planned(setup.task)):
-            solved = ddp.solve(setup.truth.problem(), start, options=ddp.Options(max_iterations=40))
+            solved = ddp.solve(
+                setup.truth.problem(), start, options=DescentOptions(max_iterations=40)
+            )
             if solved.ok:
                 starts[f"DDP in the simulator ({len(starts)})"] = narrowed(setup, solved)
     found = []
@@ -80,7 +83,7 @@ def planned(task: Task) -> list[np.ndarray]:
             at, grid = np.linspace(0, 5, H), np.arange(6)
             moved = np.column_stack([np.interp(at, grid, column) for column in knots.T])
             starts.append(np.clip(task.past + moved, task.low, task.high))
-    options = ddp.Options(max_iterations=500)
+    options = DescentOptions(max_iterations=500)
     solved = [ddp.solve(task.problem(), start, options=options) for start in starts]
     good = sorted((s for s in solved if np.isfinite(s.cost)), key=lambda s: s.cost)
     return [s.u for s in good[:2]]

@@ -32,7 +32,7 @@ class Setup:
         return self.robot.run(candidate.policy)
 
     def real(self, policy: Policy, run: int) -> Trial:
-        """A policy on the robot; every run is the same (`grounded.experiments.methods`)."""
+        """A policy on the robot; every run is the same (`grounded.experiments.baselines`)."""
         return self.robot.run(policy)
 
 

@@ -14,13 +14,14 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 
 import numpy as np
-from grounded.experiments.methods import Kept, learning_control, refit_alone
 
 from benchmarks.foreign.optimum import known
 from benchmarks.foreign.setups import Setup
+from grounded.experiments.baselines import learning_control, refit_alone
+from grounded.experiments.bench import Kept
 from grounded.policy import Policy
-from grounded.search.improve import learn
-from grounded.search.standing import Candidate, Options
+from grounded.search.ask_tell import learn
+from grounded.search.standing import Candidate, SearchOptions
 from grounded.trial import Trial
 
 SHARES = (0.9, 0.97, 0.99)
@@ -94,7 +95,7 @@ def measured(setup: Setup) -> Row:
     start = time.process_time()
     try:
         with patience(PATIENCE):
-            standing, _, _ = learn(setup.task, run, Options())
+            standing = learn(setup.task, run, SearchOptions()).standing
         phase, sentence = standing.phase, standing.sentence
     except OutOfTime:
         phase, sentence = "out of time", f"not done after {PATIENCE:g} s of CPU time"
@@ -119,7 +120,7 @@ def measured(setup: Setup) -> Row:
     )
 
 
-def other(setup: Setup, method: Callable[[Setup, Options], list[Kept]]) -> Other:
+def other(setup: Setup, method: Callable[[Setup, SearchOptions], list[Kept]]) -> Other:
     """The best utility that another method had, and after how many trials."""
     utilities: list[float] = []
 
@@ -131,7 +132,7 @@ def other(setup: Setup, method: Callable[[Setup, Options], list[Kept]]) -> Other
     trouble = ""
     try:
         with patience(PATIENCE):
-            method(_Counted(setup, counted), Options())
+            method(_Counted(setup, counted), SearchOptions())
     except OutOfTime:
         trouble = "out of time"
     except Exception as error:  # what it had until then counts
