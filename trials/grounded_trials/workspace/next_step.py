@@ -35,7 +35,7 @@ def next_command(
     if now.phase == "await-trial":
         return another_trial(workspace, now)
     if diagnosis is None:
-        return PROPOSE if now.phase == "propose" else DIAGNOSE
+        return now.then or (PROPOSE if now.phase == "propose" else DIAGNOSE)
     since = since_diagnosis(workspace, diagnosis, usable)
     follow = after_diagnosis(workspace, diagnosis)
     if now.phase == "propose":  # what logs have shown is adopted before the first candidate
