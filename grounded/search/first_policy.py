@@ -27,10 +27,10 @@ from grounded.task import Task
 CAUTION = 100.0  # factor on the input penalties each time the first policy crashed
 ITERATIONS = 1000  # of DDP at the most, from one start
 AT_ONCE = 2e5  # control steps times iterations between two chances to interrupt: under a second
-STARTS = 12  # random ones
-KNOTS = 8  # of a random start's inputs
-AMPLITUDE = 0.075  # of its knots, standard deviation as a share of an input's range
-WORK = 2e7  # iterations x H x (n + m)^2 that all rivals of the reference may take
+STARTS = 24  # random ones
+KNOTS = (5, 8, 14)  # of a random start's inputs, in turn
+AMPLITUDES = (0.05, 0.15, 0.4)  # of its knots, standard deviation as a share of an input's range
+WORK = 4e7  # iterations x H x (n + m)^2 that all rivals of the reference may take
 FEWEST = 10  # iterations: a rival that gets no more is not started
 HOPELESS = 1e3  # times the best plan's cost: a start above it is not pursued
 
@@ -123,8 +123,10 @@ def _rivals(task: Task) -> Iterator[Array]:
         return
     low = np.where(np.isfinite(task.low), task.low, zero - 1.0)
     high = np.where(np.isfinite(task.high), task.high, zero + 1.0)
-    steps, knots = np.arange(H), np.linspace(0, H - 1, KNOTS)
+    steps = np.arange(H)
     for seed in range(STARTS):
-        drawn = np.random.default_rng(seed).normal(0.0, AMPLITUDE, (KNOTS, m)) * (high - low)
+        count, amplitude = KNOTS[seed % len(KNOTS)], AMPLITUDES[seed % len(AMPLITUDES)]
+        knots = np.linspace(0, H - 1, count)
+        drawn = np.random.default_rng(seed).normal(0.0, amplitude, (count, m)) * (high - low)
         smooth = [np.interp(steps, knots, column) for column in drawn.T]
         yield np.clip(zero + np.column_stack(smooth), task.low, task.high)
