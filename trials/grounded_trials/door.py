@@ -97,11 +97,22 @@ class Workspace(Folder):
 
         return propose_in(self._afresh())
 
-    def run(self, candidate: str | None = None) -> Ran:
+    def run(
+        self,
+        candidate: str | None = None,
+        *,
+        anyway: bool = False,
+        warn: Callable[[str], None] | None = None,
+    ) -> Ran:
         """Runs a candidate on [system] and writes a trial file to be ingested.
+
+        It is refused if it is not the file that was proposed, or is void by now: [limits],
+        [safety], the task or the model were changed.
 
         Args:
             candidate: c0003, or `best`; None: the outstanding one.
+            anyway: run it though it is void.
+            warn: told what is overridden, before the robot moves.
         """
         from grounded_trials.workspace.proposing import candidate_named, standing_in
         from grounded_trials.workspace.running import run_candidate
@@ -116,7 +127,8 @@ class Workspace(Folder):
                     NextCommand("propose"),
                 )
             candidate = waiting.id
-        return run_candidate(here, candidate_named(here, candidate))
+        name = candidate_named(here, candidate)
+        return run_candidate(here, name, anyway=anyway, warn=warn)
 
     def ingest(
         self, path: str | Path, *, candidate: str | None = None, data: bool = False
@@ -264,28 +276,39 @@ class Workspace(Folder):
         return reporting.Report(findings, tuple(paths))
 
     def export(
-        self, candidate: str = "best", path: str | Path | None = None, *, form: str | None = None
+        self,
+        candidate: str = "best",
+        path: str | Path | None = None,
+        *,
+        form: str | None = None,
+        anyway: bool = False,
     ) -> Exported:
-        """Writes a candidate for other languages.
+        """Writes a candidate for other languages; refused as in `run`, an earlier task's is not.
 
         Args:
             candidate: c0003, or `best`.
             path: the file; None: named after the candidate, in the current folder.
             form: csv, json or npz; None: as the file is named, else json.
+            anyway: write it though it is void.
         """
         from grounded_trials.workspace.exporting import export_candidate
 
-        return export_candidate(self._afresh(), candidate, form, Path(path) if path else None)
+        file = Path(path) if path else None
+        return export_candidate(self._afresh(), candidate, form, file, anyway=anyway)
 
     def verify(self) -> Verified:
-        """Checks every stored trial against its hash, every candidate against its checksums."""
-        from grounded_trials.store.candidate_file import read_candidate
+        """Checks every stored trial against its hash, every candidate against its checksums.
+
+        A candidate must also be the one its file is named after, and do what it predicts.
+        """
+        from grounded_trials.store.own_files import FILE_LIMIT, read_file
+        from grounded_trials.workspace.handover import intact
 
         damaged = [Lost(str(one.path), one.reason) for one in self.store.verify()]
         candidates = sorted((self.folder / "candidates").glob("*.mcap"))
         for path in candidates:
             try:
-                read_candidate(path)
+                intact(read_file(path, FILE_LIMIT), path.stem)
             except GroundedError as error:
                 damaged.append(Lost(str(path), str(error)))
         return Verified(len(self.store.list()) + len(candidates), tuple(damaged))

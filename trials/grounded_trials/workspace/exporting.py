@@ -23,6 +23,7 @@ from grounded.policy import Policy, to_arrays
 from grounded.result import Result
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.handover import checked_candidate
 from grounded_trials.workspace.proposing import candidate_named
 
 LAW = "u_t = clip(feedforward_t + gain_t (z - reference_t), low, high); z = [state, past inputs]"
@@ -35,6 +36,8 @@ class Exported(Result):
     candidate: str
     file: Path
     format: str
+    notes: tuple[str, ...] = ()  # what to know about the candidate
+    overridden: tuple[str, ...] = ()  # what spoke against it, with `anyway`
 
     def summary(self) -> str:
         """The candidate and its file."""
@@ -46,12 +49,25 @@ class Exported(Result):
 
 
 def export_candidate(
-    workspace: Folder, identity: str, form: str | None = None, path: Path | None = None
+    workspace: Folder,
+    identity: str,
+    form: str | None = None,
+    path: Path | None = None,
+    *,
+    anyway: bool = False,
 ) -> Exported:
     """Writes a candidate, `best` or by its id; without `form` as `path` is named, else as json.
 
+    Args:
+        workspace: its own.
+        identity: c0003, or `best`; one of an earlier task will do if today's [limits] hold.
+        form: csv, json or npz.
+        path: the file; None: named after the candidate, in the current folder.
+        anyway: write it though it is void, see `handover`.
+
     Raises:
-        GroundedError: for an unknown candidate or format, or a place that can't be written.
+        GroundedError: if the candidate must not be handed over; for an unknown candidate or format,
+            or a place that can't be written.
     """
     encoders = {"csv": _csv, "json": _json, "npz": _npz}
     named = path.suffix.lstrip(".").lower() if path else ""
@@ -60,11 +76,12 @@ def export_candidate(
     if form not in encoders:
         raise GroundedError(f"there is no format '{form}': {nearest(form, encoders)}")
     identity = candidate_named(workspace, identity)
-    candidate, meta = workspace.candidate(identity)
+    handed = checked_candidate(workspace, identity, anyway=anyway, other_task=True)
+    meta = handed.meta
     about = {"candidate": identity, "task": meta["task"], "model": meta["model"]}
     about["created_by"] = "grounded"
-    write_atomically(path, encoders[form](candidate.policy, _units(workspace), about))
-    return Exported(identity, path, form)
+    write_atomically(path, encoders[form](handed.candidate.policy, _units(workspace), about))
+    return Exported(identity, path, form, handed.notes, handed.overridden)
 
 
 def _units(workspace: Folder) -> dict[str, str]:
