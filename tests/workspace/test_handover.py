@@ -138,6 +138,21 @@ def test_a_step_that_safety_forbids_now_gives_way_to_another(ran):
     assert ran.run().candidate == "c0003"
 
 
+def test_what_is_to_be_run_once_more_is_not_replaced_but_refused(tmp_path):
+    twice = CONFIG.replace("[search]", "[search]\nrepeats = 2")
+    real = "latency = {}\nfrom model import model\nmodel = model.with_values({'mass': 1.4})\n"
+    noisy = twice + "[system.noise]\nmeasurement = { x = 0.01 }\n"
+    make(tmp_path / "w", config=noisy, real=real)
+    w = Workspace(tmp_path / "w")
+    w.propose()
+    w.ingest(w.run().trial_file)
+    assert w.propose().candidate.id == "c0001"
+    configure(w, noisy + SAFETY.format(high=0.5))
+    with pytest.raises(GroundedError, match=r"c0001 is waiting for 1 trial, but .*--anyway"):
+        w.propose()
+    assert w.run(anyway=True).overridden and len(w.candidate_ids()) == 1
+
+
 def test_safety_holds_for_the_run_as_the_model_of_today_predicts_it(ran, tmp_path):
     """The best may be run again after a fit; where it leads is predicted anew."""
     best = ran.status().standing.incumbent

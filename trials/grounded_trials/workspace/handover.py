@@ -202,7 +202,7 @@ class _Check:
             yield f"{name} was written by an older version: its file has no checksum of its own"
         if not self.same_task:
             yield f"{name} was made for another task than that of grounded.toml"
-        if self.candidate.model != self.fingerprint:
+        elif self._changed:
             again = "predicted again" if self._predictable else "its prediction is the old one"
             yield f"the model was changed since {name} was made; {again}"
 

@@ -89,9 +89,13 @@ def propose_in(workspace: Folder) -> Proposed:
             proposal = replace(proposal, notes=(*proposal.notes, *handed.notes))
             break
         except Void as error:
-            ran = any(t.trial.candidate == candidate.id for t in workspace.trials())
-            if proposal.is_new or ran:
+            if proposal.is_new:
                 raise
+            if any(t.trial.candidate == candidate.id for t in workspace.trials()):
+                raise GroundedError(
+                    f"{proposal.standing.sentence}, but {'; '.join(error.reasons)}. Take back what "
+                    f"was changed, or run {candidate.id} all the same with --anyway"
+                ) from None
             void[candidate.id] = "; ".join(error.reasons)
     notes = [f"{name} was not run and is void: {why}" for name, why in void.items()]
     if candidate is not None and proposal.is_new:
