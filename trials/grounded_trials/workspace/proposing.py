@@ -75,19 +75,33 @@ def propose_in(workspace: Folder) -> Proposed:
         GroundedError: if the candidate must not be handed over (see `handover`), a stored file is
             damaged, or the task can't be planned.
     """
-    before, void = workspace.candidate_ids(), dict[str, str]()
+    before = workspace.candidate_ids()
+    proposal, void = _handed_over(workspace)
+    candidate = proposal.candidate
+    notes = [f"{name} was not run and is void: {why}" for name, why in void.items()]
+    if candidate is not None and proposal.is_new:
+        notes = notes or _void(workspace, before)
+        notes = [f"{note}; run {candidate.id} in its place" for note in notes]
+    proposal = replace(proposal, notes=(*proposal.notes, *notes))
+    if candidate is None:
+        return Proposed(proposal, None, status_of(workspace, proposal.standing).then)
+    here = workspace.config.system.reachable
+    then = NextCommand("run") if here else NextCommand("ingest", ("TRIAL.mcap",))
+    return Proposed(proposal, workspace.candidate_path(candidate.id), then)
+
+
+def _handed_over(workspace: Folder) -> tuple[Proposal, dict[str, str]]:
+    """What may be run, written and checked; and what may not, though it was waiting: id -> why."""
+    void: dict[str, str] = {}
     while True:
         proposal = _proposal(workspace, void)
         candidate = proposal.candidate
         if candidate is None:
-            break
-        path = workspace.candidate_path(candidate.id)
-        if proposal.is_new or not path.is_file():
+            return proposal, void
+        if proposal.is_new or not workspace.candidate_path(candidate.id).is_file():
             workspace.save_candidate(candidate, workspace.task)
         try:
             handed = checked_candidate(workspace, candidate.id)
-            proposal = replace(proposal, notes=(*proposal.notes, *handed.notes))
-            break
         except Void as error:
             if proposal.is_new:
                 raise
@@ -97,16 +111,8 @@ def propose_in(workspace: Folder) -> Proposed:
                     f"was changed, or run {candidate.id} all the same with --anyway"
                 ) from None
             void[candidate.id] = "; ".join(error.reasons)
-    notes = [f"{name} was not run and is void: {why}" for name, why in void.items()]
-    if candidate is not None and proposal.is_new:
-        notes = notes or _void(workspace, proposal, before)
-        notes = [f"{note}; run {candidate.id} in its place" for note in notes]
-    proposal = replace(proposal, notes=(*proposal.notes, *notes))
-    if candidate is None:
-        return Proposed(proposal, None, status_of(workspace, proposal.standing).then)
-    here = workspace.config.system.reachable
-    then = NextCommand("run") if here else NextCommand("ingest", ("TRIAL.mcap",))
-    return Proposed(proposal, path, then)
+        else:
+            return replace(proposal, notes=(*proposal.notes, *handed.notes)), void
 
 
 def _proposal(workspace: Folder, without: Collection[str]) -> Proposal:
@@ -124,7 +130,7 @@ def _proposal(workspace: Folder, without: Collection[str]) -> Proposal:
     )
 
 
-def _void(workspace: Folder, proposal: Proposal, before: Sequence[str]) -> list[str]:
+def _void(workspace: Folder, before: Sequence[str]) -> list[str]:
     """That the last candidate, which was never run, is replaced by a new one, and why."""
     last = before[-1] if before else ""
     if not last or any(t.trial.candidate == last for t in workspace.trials()):
