@@ -7,8 +7,8 @@ from pathlib import Path
 import click
 
 from grounded_cli import completion as complete
-from grounded_cli.options import as_json, in_workspace, open_workspace
-from grounded_cli.terminal import show, show_json
+from grounded_cli.options import anyway, as_json, in_workspace, open_workspace
+from grounded_cli.terminal import remark, show, show_json
 
 # the formats, and how a program begins with each
 USES = {
@@ -30,19 +30,30 @@ USES = {
 @click.option(
     "--runner", is_flag=True, help="npz, and beside it the program that runs it: numpy alone."
 )
+@anyway
 @in_workspace
 @as_json
 def command(
-    candidate: str, form: str | None, output: str | None, runner: bool, json_: bool
+    candidate: str,
+    form: str | None,
+    output: str | None,
+    runner: bool,
+    anyway: bool,
+    json_: bool,
 ) -> None:
     """Write a candidate as csv, npz or json, with units and the time base in the file.
 
-    `best` names the best candidate so far.
+    `best` names the best candidate so far. One that must not be run any more (see `grounded run`)
+    is refused; one of an earlier task is not, if it keeps today's [limits] and [safety].
     """
     named = Path(output or "").suffix.lstrip(".").lower()
     if form is not None and named in USES and named != form:
         raise click.UsageError(f"-o {output} is named as {named}, --format says {form}")
-    done = open_workspace().export(candidate, output, form=form, runner=runner)
+    done = open_workspace().export(candidate, output, form=form, runner=runner, anyway=anyway)
+    for reason in done.overridden:
+        remark("warning", f"{done.candidate} is exported all the same: {reason}")
+    for note in done.notes:
+        remark("note", note)
     if json_:
         show_json(done.to_json())
     else:

@@ -51,6 +51,12 @@ def as_json(function: F) -> F:
     return click.option("--json", "json_", is_flag=True, help="Print one JSON document.")(function)
 
 
+def anyway(function: F) -> F:
+    """Adds --anyway, for commands that hand a candidate over."""
+    text = "Hand the candidate over though [limits], [safety], task or model changed since."
+    return click.option("--anyway", is_flag=True, help=text)(function)
+
+
 def parallel(function: Callable[..., Any]) -> Callable[..., Any]:
     """Adds the options of a command that is a list of independent jobs; passed as `engine`."""
 

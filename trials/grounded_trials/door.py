@@ -97,11 +97,22 @@ class Workspace(Folder):
 
         return propose_in(self._afresh())
 
-    def run(self, candidate: str | None = None) -> Ran:
+    def run(
+        self,
+        candidate: str | None = None,
+        *,
+        anyway: bool = False,
+        warn: Callable[[str], None] | None = None,
+    ) -> Ran:
         """Runs a candidate on [system] and writes a trial file to be ingested.
+
+        It is refused if it is not the file that was proposed, or is void by now: [limits],
+        [safety], the task or the model were changed.
 
         Args:
             candidate: c0003, or `best`; None: the outstanding one.
+            anyway: run it though it is void.
+            warn: told what is overridden, before the robot moves.
         """
         from grounded_trials.workspace.proposing import candidate_named, standing_in
         from grounded_trials.workspace.running import run_candidate
@@ -116,7 +127,8 @@ class Workspace(Folder):
                     NextCommand("propose"),
                 )
             candidate = waiting.id
-        return run_candidate(here, candidate_named(here, candidate))
+        name = candidate_named(here, candidate)
+        return run_candidate(here, name, anyway=anyway, warn=warn)
 
     def ingest(
         self, path: str | Path, *, candidate: str | None = None, data: bool = False
@@ -270,29 +282,35 @@ class Workspace(Folder):
         *,
         form: str | None = None,
         runner: bool = False,
+        anyway: bool = False,
     ) -> Exported:
-        """Writes a candidate for other languages.
+        """Writes a candidate for other languages; refused as in `run`, an earlier task's is not.
 
         Args:
             candidate: c0003, or `best`.
             path: the file; None: named after the candidate, in the current folder.
             form: csv, json or npz; None: as the file is named, else json.
             runner: npz, and beside it the program that runs it on a robot with numpy alone.
+            anyway: write it though it is void.
         """
         from grounded_trials.workspace.exporting import export_candidate
 
-        place = Path(path) if path else None
-        return export_candidate(self._afresh(), candidate, form, place, runner=runner)
+        file, here = Path(path) if path else None, self._afresh()
+        return export_candidate(here, candidate, form, file, runner=runner, anyway=anyway)
 
     def verify(self) -> Verified:
-        """Checks every stored trial against its hash, every candidate against its checksums."""
-        from grounded_trials.store.candidate_file import read_candidate
+        """Checks every stored trial against its hash, every candidate against its checksums.
+
+        A candidate must also be the one its file is named after, and do what it predicts.
+        """
+        from grounded_trials.store.own_files import FILE_LIMIT, read_file
+        from grounded_trials.workspace.handover import intact
 
         damaged = [Lost(str(one.path), one.reason) for one in self.store.verify()]
         candidates = sorted((self.folder / "candidates").glob("*.mcap"))
         for path in candidates:
             try:
-                read_candidate(path)
+                intact(read_file(path, FILE_LIMIT), path.stem)
             except GroundedError as error:
                 damaged.append(Lost(str(path), str(error)))
         return Verified(len(self.store.list()) + len(candidates), tuple(damaged))

@@ -16,6 +16,7 @@ the metadata record `grounded`, a table of strings:
     start_ns          (trial) the stamp of t = 0 [ns]; a trial without its beginning is refused
     steps             (candidate) H; one without its end is refused
     policy            (candidate) JSON object: low, high (null: no limit), past, depths, angles, z
+    sha256            (candidate) of the rest of this table and all numbers; absent in files of 0.1
 
 and whatever the writer adds. A trial carries the candidate's file as attachment `policy`.
 Numbers in text are Python's repr: they come back exactly. Every file is complete and has all its

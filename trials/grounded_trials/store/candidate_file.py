@@ -1,18 +1,21 @@
 """A candidate as a file: the policy a robot runs and its predicted run.
 
-The format is described in this folder's `__init__`.
+The format is described in this folder's `__init__`. The file's own checksums find bits that
+flipped; `sha256` in its metadata finds a file that was written again with other contents.
 """
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from grounded.errors import GroundedError
+from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded_trials.store.own_files import (
@@ -68,6 +71,7 @@ def candidate_bytes(
         steps=str(H),
         policy=json.dumps(_policy_table(policy)),
     )
+    table["sha256"] = _hash(table, [*_controls(policy), states, inputs])
     stream = io.BytesIO()
     log = LogWriter(stream)
     log.metadata("grounded", table)
@@ -91,10 +95,11 @@ def read_candidate(
 ) -> tuple[Policy, Array, Array, dict[str, str]]:
     """Reads a candidate back: (policy, predicted states, predicted inputs, metadata).
 
-    The prediction has shapes (H+1, n) and (H, m).
+    The prediction has shapes (H+1, n) and (H, m). The metadata has no `sha256` where the file was
+    written by 0.1: then its contents can't be proven.
 
     Raises:
-        GroundedError: for a file that is damaged or not a candidate of ours.
+        GroundedError: for a file that is damaged, rewritten or not a candidate of ours.
     """
     own = read_own(source, name, CANDIDATE)
     states, inputs = own.names("states"), own.names("inputs")
@@ -128,6 +133,7 @@ def read_candidate(
         )
     for topic in ("/policy", "/predicted_state", "/predicted_input"):
         own.check_grid(topic, 0, policy.dt)
+    _refuse_rewritten(own, [*_controls(policy), x, u])
     return policy, x, u, own.meta
 
 
@@ -144,6 +150,27 @@ def _controls(policy: Policy) -> list[Array]:
     H, none = policy.horizon, np.zeros((policy.horizon, 0))
     gain = none if policy.gain is None else policy.gain.reshape(H, -1)
     return [policy.feedforward, gain, none if policy.reference is None else policy.reference]
+
+
+def _hash(table: Meta, arrays: Iterable[Array]) -> str:
+    """SHA-256 over the metadata, names and limits among it, and all numbers."""
+    known = {key: value for key, value in table.items() if key != "sha256"}
+    digest = hashlib.sha256(json.dumps(known, sort_keys=True).encode())
+    for array in arrays:
+        digest.update(repr(array.shape).encode())
+        digest.update(np.ascontiguousarray(array + 0.0, dtype="<f8").tobytes())
+    return digest.hexdigest()
+
+
+def _refuse_rewritten(own: OwnFile, arrays: Iterable[Array]) -> None:
+    stated, found = own.meta.get("sha256"), _hash(own.meta, arrays)
+    if stated not in (None, found):
+        raise GroundedError(
+            f"{own.name} is not the candidate that was proposed: the SHA-256 of its contents is "
+            f"{found[:12]}..., its metadata says '{stated[:12]}...'. It was rewritten: delete the "
+            "file and propose again",
+            NextCommand("propose"),
+        )
 
 
 def _depths(own: OwnFile, depths: Array) -> tuple[int, ...]:

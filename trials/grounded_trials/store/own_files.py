@@ -41,7 +41,7 @@ NAME_LIMIT = 1000  # states, or inputs
 
 TRIAL, CANDIDATE = "grounded trial 1", "grounded candidate 1"
 RESERVED = ["format", "dt", "states", "inputs", "policy", "steps"]
-RESERVED += ["candidate", "start_inputs", "start_ns"]
+RESERVED += ["candidate", "start_inputs", "start_ns", "sha256"]
 DOUBLES = ArrayType(Number("f8"))
 
 Counts = NDArray[np.integer[Any]]

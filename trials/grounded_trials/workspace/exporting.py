@@ -24,6 +24,7 @@ from grounded.policy import Policy, to_arrays
 from grounded.result import Result
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.handover import checked_candidate
 from grounded_trials.workspace.proposing import candidate_named
 
 RUNNER = "grounded_runner.py"
@@ -38,6 +39,8 @@ class Exported(Result):
     file: Path
     format: str
     runner: Path | None = None  # the program that runs it, where one was asked for
+    notes: tuple[str, ...] = ()  # what to know about the candidate
+    overridden: tuple[str, ...] = ()  # what spoke against it, with `anyway`
 
     def summary(self) -> str:
         """The candidate and its file."""
@@ -56,13 +59,21 @@ def export_candidate(
     path: Path | None = None,
     *,
     runner: bool = False,
+    anyway: bool = False,
 ) -> Exported:
     """Writes a candidate, `best` or by its id; without `form` as `path` is named, else as json.
 
-    With `runner` it is an npz file, and RUNNER beside it runs it on a robot that has numpy alone.
+    Args:
+        workspace: its own.
+        identity: c0003, or `best`; one of an earlier task will do if today's [limits] hold.
+        form: csv, json or npz.
+        path: the file; None: named after the candidate, in the current folder.
+        runner: npz, and RUNNER beside it, which runs it on a robot that has numpy alone.
+        anyway: write it though it is void, see `handover`.
 
     Raises:
-        GroundedError: for an unknown candidate or format, or a place that can't be written.
+        GroundedError: if the candidate must not be handed over; for an unknown candidate or format,
+            or a place that can't be written.
     """
     encoders = {"csv": _csv, "json": _json, "npz": _npz}
     named = path.suffix.lstrip(".").lower() if path else ""
@@ -73,14 +84,15 @@ def export_candidate(
     if runner and form != "npz":
         raise GroundedError(f"the runner reads npz, not {form}: leave the format out, or name npz")
     identity = candidate_named(workspace, identity)
-    candidate, meta = workspace.candidate(identity)
+    handed = checked_candidate(workspace, identity, anyway=anyway, other_task=True)
+    meta = handed.meta
     about = {"candidate": identity, "task": meta["task"], "model": meta["model"]}
     about["created_by"] = "grounded"
-    write_atomically(path, encoders[form](candidate.policy, _units(workspace), about))
+    write_atomically(path, encoders[form](handed.candidate.policy, _units(workspace), about))
     program = path.with_name(RUNNER) if runner else None
     if program is not None:
         write_atomically(program, Path(onboard.__file__).read_bytes())
-    return Exported(identity, path, form, program)
+    return Exported(identity, path, form, program, handed.notes, handed.overridden)
 
 
 def _units(workspace: Folder) -> dict[str, str]:

@@ -198,7 +198,7 @@ class Folder:
         Raises:
             GroundedError: if neither is there, or the file is damaged.
         """
-        return _candidate_of(self.candidate_bytes(identity), f"candidates/{identity}.mcap")
+        return candidate_of(self.candidate_bytes(identity), identity)
 
     def candidate_bytes(self, identity: str) -> bytes:
         """The candidate's file.
@@ -260,7 +260,7 @@ class Folder:
             why = GroundedError("its file is gone and no trial carries it")
             for data in self._sources(identity, trials):
                 try:
-                    candidate, meta = _candidate_of(data, f"candidates/{identity}.mcap")
+                    candidate, meta = candidate_of(data, identity)
                 except GroundedError as error:
                     if lost is None:
                         raise
@@ -291,8 +291,17 @@ class Folder:
                 yield one.policy
 
 
-def _candidate_of(data: bytes, name: str) -> tuple[Candidate, dict[str, str]]:
-    """A candidate and its metadata from the bytes of its file, called `name` in messages."""
+def candidate_of(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]:
+    """A candidate and its metadata from the bytes of its file.
+
+    Args:
+        data: the file.
+        identity: what the file is named, c0001; the candidate must have this id.
+
+    Raises:
+        GroundedError: if the file is damaged, rewritten, or another candidate's.
+    """
+    name = f"candidates/{identity}.mcap"
     policy, states, inputs, meta = read_candidate(data, name)
     try:
         about = {key: of((_ABSENT | meta)[key]) for key, of in _FIELDS.items() if key != "task"}
@@ -300,4 +309,9 @@ def _candidate_of(data: bytes, name: str) -> tuple[Candidate, dict[str, str]]:
         raise GroundedError(
             f"{name}: its metadata lacks or garbles {error}; it was not written by `propose`"
         ) from None
+    if about["id"] != identity:
+        raise GroundedError(
+            f"{name} holds the candidate '{about['id'][:40]}': a file has the name of its "
+            "candidate. Give it its own name again, or delete it if that one is there"
+        )
     return Candidate(policy=policy, predicted_states=states, predicted_inputs=inputs, **about), meta

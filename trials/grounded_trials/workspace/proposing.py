@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result
 from grounded_trials.workspace.folder import Contents, Folder
+from grounded_trials.workspace.handover import Void, checked_candidate, outside_limits
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Collection, Sequence
 
     from grounded.model import Model
     from grounded.search.improve import Proposal
@@ -66,41 +67,88 @@ class Status(Result):
 
 
 def propose_in(workspace: Folder) -> Proposed:
-    """The next candidate of a workspace; the outstanding one again while its trial is missing."""
+    """The next candidate of a workspace; the outstanding one again while its trial is missing.
+
+    An outstanding candidate that is void by now, and was not run, is replaced.
+
+    Raises:
+        GroundedError: if the candidate must not be handed over (see `handover`), a stored file is
+            damaged, or the task can't be planned.
+    """
+    before = workspace.candidate_ids()
+    proposal, void = _handed_over(workspace)
+    candidate = proposal.candidate
+    notes = [f"{name} was not run and is void: {why}" for name, why in void.items()]
+    if candidate is not None and proposal.is_new:
+        notes = notes or _void(workspace, before)
+        notes = [f"{note}; run {candidate.id} in its place" for note in notes]
+    proposal = replace(proposal, notes=(*proposal.notes, *notes))
+    if candidate is None:
+        return Proposed(proposal, None, status_of(workspace, proposal.standing).then)
+    here = workspace.config.system.reachable
+    then = NextCommand("run") if here else NextCommand("ingest", ("TRIAL.mcap",))
+    return Proposed(proposal, workspace.candidate_path(candidate.id), then)
+
+
+def _handed_over(workspace: Folder) -> tuple[Proposal, dict[str, str]]:
+    """What may be run, written and checked; and what may not, though it was waiting: id -> why."""
+    void: dict[str, str] = {}
+    while True:
+        proposal = _proposal(workspace, void)
+        candidate = proposal.candidate
+        if candidate is None:
+            return proposal, void
+        if proposal.is_new or not workspace.candidate_path(candidate.id).is_file():
+            workspace.save_candidate(candidate, workspace.task)
+        try:
+            handed = checked_candidate(workspace, candidate.id)
+        except Void as error:
+            if proposal.is_new:
+                raise
+            if any(t.trial.candidate == candidate.id for t in workspace.trials()):
+                raise GroundedError(
+                    f"{proposal.standing.sentence}, but {'; '.join(error.reasons)}. Take back what "
+                    f"was changed, or run {candidate.id} all the same with --anyway"
+                ) from None
+            void[candidate.id] = "; ".join(error.reasons)
+        else:
+            return replace(proposal, notes=(*proposal.notes, *handed.notes)), void
+
+
+def _proposal(workspace: Folder, without: Collection[str]) -> Proposal:
+    """What the search says if some candidates, which are void, had not been proposed."""
     from grounded.search.improve import propose
 
-    proposal = propose(
+    return propose(
         workspace.task,
-        workspace.read().candidates,
+        [c for c in workspace.read().candidates if c.id not in without],
         workspace.task_trials(),
         workspace.config.search,
         identity=workspace.next_id(),
         planner=workspace.planner,
         refit=refitted,
     )
-    candidate = proposal.candidate
-    if candidate is None:
-        return Proposed(proposal, None, status_of(workspace, proposal.standing).then)
-    path = workspace.candidate_path(candidate.id)
-    if proposal.is_new or not path.is_file():
-        workspace.save_candidate(candidate, workspace.task)
-    if void := _void(proposal):
-        proposal = replace(proposal, notes=(*proposal.notes, void))
-    here = workspace.config.system.reachable
-    then = NextCommand("run") if here else NextCommand("ingest", ("TRIAL.mcap",))
-    return Proposed(proposal, path, then)
 
 
-def _void(proposal: Proposal) -> str:
-    """That a candidate which was never run is replaced, "" where none is."""
-    history, made = proposal.standing.history, proposal.candidate
-    last = history[-1] if history else None
-    if made is None or not proposal.is_new or last is None or last.trials:
-        return ""
-    return (
-        f"{last.candidate.id} was not run and is void: the model was changed since it was made; "
-        f"run {made.id} in its place"
-    )
+def _void(workspace: Folder, before: Sequence[str]) -> list[str]:
+    """That the last candidate, which was never run, is replaced by a new one, and why."""
+    last = before[-1] if before else ""
+    if not last or any(t.trial.candidate == last for t in workspace.trials()):
+        return []
+    made, meta = workspace.candidate(last)
+    if meta.get("kind") != "search":
+        return []
+    if meta.get("task") == workspace.task.hash:
+        why = "the model was changed since it was made"
+    elif (made.policy.state_names, made.policy.input_names) != (
+        workspace.base_model.state_names,
+        workspace.base_model.input_names,
+    ):
+        why = "it is for another robot"
+    else:
+        wider = list(outside_limits(workspace.task, made.policy))
+        why = "; ".join(wider) or "the task was changed since it was made"
+    return [f"{last} was not run and is void: {why}"]
 
 
 def standing_in(

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import shlex
 import subprocess
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,8 +23,10 @@ from grounded.result import Result
 from grounded.search.ask_tell import learn
 from grounded.search.standing import Candidate, SearchOptions
 from grounded.trial import Trial
+from grounded_trials.store.store import write_atomically
 from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.handover import Handed, checked_candidate
 from grounded_trials.workspace.model_file import load_module, model_in
 
 TRIALS = 30  # of the search for the optimum
@@ -35,6 +38,8 @@ class Ran(Result):
 
     candidate: str
     trial_file: Path
+    notes: tuple[str, ...] = ()  # what to know about the candidate
+    overridden: tuple[str, ...] = ()  # what spoke against it, with `anyway`
 
     @property
     def then(self) -> NextCommand:
@@ -50,19 +55,35 @@ class Ran(Result):
         return {"trial_file": str(self.trial_file), "candidate": self.candidate}
 
 
-def run_candidate(workspace: Folder, identity: str) -> Ran:
+def run_candidate(
+    workspace: Folder,
+    identity: str,
+    *,
+    anyway: bool = False,
+    warn: Callable[[str], None] | None = None,
+) -> Ran:
     """Runs a candidate once; its trial file is runs/cNNNN-K.mcap.
 
+    Args:
+        workspace: whose system runs it.
+        identity: c0003.
+        anyway: run it though it is void, see `handover`.
+        warn: told what is overridden, before the robot moves.
+
     Raises:
-        GroundedError: if no system is configured, it failed, or it wrote no trial.
+        GroundedError: if the candidate must not be run, no system is configured, it failed, or it
+            wrote no trial.
     """
     system = workspace.config.system
-    workspace.candidate_bytes(identity)
+    handed = checked_candidate(workspace, identity, anyway=anyway)
+    if warn is not None:
+        for reason in handed.overridden:
+            warn(f"{identity} is run all the same: {reason}")
     path = _next_run(workspace.folder / "runs", identity)
     if system.command:
-        _call(workspace, system.command, identity, path)
+        _call(workspace, system.command, handed, path)
     elif system.model:
-        _simulate(workspace, identity, path)
+        _simulate(workspace, handed, path)
     else:
         raise GroundedError(
             "grounded.toml has no [system]: run the candidate "
@@ -70,7 +91,7 @@ def run_candidate(workspace: Folder, identity: str) -> Ran:
             'give [system] command = "python drive.py {candidate} {trial}"',
             NextCommand("ingest", ("TRIAL.mcap",)),
         )
-    return Ran(identity, path)
+    return Ran(identity, path, handed.notes, handed.overridden)
 
 
 def simulated_plant(workspace: Folder) -> Plant:
@@ -106,10 +127,13 @@ def _next_run(folder: Path, identity: str) -> Path:
     return folder / f"{identity}-{number}.mcap"
 
 
-def _call(workspace: Folder, command: str, identity: str, path: Path) -> None:
+def _call(workspace: Folder, command: str, handed: Handed, path: Path) -> None:
     """The user's command, its output passed on to stderr."""
+    file = workspace.candidate_path(handed.candidate.id)
+    if not file.is_file():  # it came from a trial that ran it
+        write_atomically(file, handed.data)
     words = {
-        "candidate": str(workspace.candidate_path(identity).resolve()),
+        "candidate": str(file.resolve()),
         "trial": str(path.resolve()),
     }
     for name in words:
@@ -136,8 +160,8 @@ def _call(workspace: Folder, command: str, identity: str, path: Path) -> None:
         raise GroundedError(f"[system] command ended well but wrote no trial to {{trial}} = {path}")
 
 
-def _simulate(workspace: Folder, identity: str, path: Path) -> None:
-    candidate, meta = workspace.candidate(identity)
+def _simulate(workspace: Folder, handed: Handed, path: Path) -> None:
+    candidate, meta = handed.candidate, handed.meta
     task, plant = workspace.task, simulated_plant(workspace)
     start = dict(zip(task.model.state_names, map(float, task.start), strict=True))
     number = len(workspace.store.list()) + 1
@@ -145,7 +169,7 @@ def _simulate(workspace: Folder, identity: str, path: Path) -> None:
     trial = plant.run(candidate.policy, start, rng)
     write_trial(
         path,
-        replace(trial, candidate=identity),
+        replace(trial, candidate=candidate.id),
         {
             "kind": "trial",
             "iteration": meta["iteration"],
@@ -154,7 +178,7 @@ def _simulate(workspace: Folder, identity: str, path: Path) -> None:
             "system": f"simulated: {workspace.config.system.model}",
             "number": str(number),
         },
-        policy=workspace.candidate_bytes(identity),
+        policy=handed.data,
         state_units=dict(task.model.states),
         input_units=dict(task.model.inputs),
     )

@@ -1,0 +1,297 @@
+"""A candidate is checked when it is handed over: what changed since it was made is found."""
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cli import grounded, plain
+from grounded.errors import GroundedError
+from grounded_trials import Workspace
+from grounded_trials.store.candidate_file import candidate_bytes, read_candidate
+from grounded_trials.workspace.handover import checked_candidate, outside_limits
+from rewriting import with_metadata
+from workspaces import CONFIG, MODEL, make
+
+LIMITS, NARROW = "force = [-5.0, 5.0]", "force = [-0.5, 0.5]"
+SAFETY = "\n[safety]\nx = [-1.0, {high}]\n"
+UNITS = {"state_units": {"x": "m", "v": "m/s"}, "input_units": {"force": "N"}}
+RESERVED = ("format", "dt", "states", "inputs", "steps", "policy", "sha256")
+
+
+@pytest.fixture
+def w(tmp_path):
+    """A workspace whose first candidate waits to be run."""
+    make(tmp_path / "w")
+    workspace = Workspace(tmp_path / "w")
+    assert workspace.propose().candidate.id == "c0001"
+    return workspace
+
+
+@pytest.fixture
+def ran(w):
+    """The same, once that candidate was run."""
+    w.ingest(w.run().trial_file)
+    return w
+
+
+def configure(w, text=CONFIG, **models):
+    """The user edits grounded.toml, or the model."""
+    (w.folder / "grounded.toml").write_text(text)
+    for name, source in models.items():
+        (w.folder / f"{name}.py").write_text(source)
+    w.forget()
+
+
+def rewrite(w, checksum, **arrays):
+    """Somebody writes c0001 with other numbers, and an old checksum, a new one, or none."""
+    path = w.candidate_path("c0001")
+    policy, x, u, meta = read_candidate(path)
+    own = {key: value for key, value in meta.items() if key not in RESERVED}
+    data = candidate_bytes(replace(policy, **arrays), x, u, own, **UNITS)
+    if checksum != "new":
+        data = with_metadata(data, "sha256", meta["sha256"] if checksum == "old" else None)
+    path.write_bytes(data)
+
+
+def hand_overs(w, tmp_path, **how):
+    """Every way to hand c0001 over by its name."""
+    file = tmp_path / "c.json"
+    return [
+        lambda: w.run("c0001", **how),
+        lambda: w.export("c0001", file, **how),
+        lambda: checked_candidate(w, "c0001", **how),
+    ]
+
+
+def refused(w, tmp_path, *parts, **how):
+    for hand_over in hand_overs(w, tmp_path, **how):
+        with pytest.raises(GroundedError) as caught:
+            hand_over()
+        for part in parts:
+            assert part in str(caught.value)
+    assert not list((w.folder / "runs").glob("*.mcap")) and not (tmp_path / "c.json").exists()
+
+
+def test_what_was_just_proposed_is_handed_over_without_a_word(w, tmp_path):
+    assert w.propose().proposal.notes == ()
+    ran, exported = w.run("c0001"), w.export("c0001", tmp_path / "c.json")
+    assert ran.notes == ran.overridden == exported.notes == exported.overridden == ()
+
+
+def test_limits_that_were_narrowed_make_it_void(w, tmp_path):
+    configure(w, CONFIG.replace(LIMITS, NARROW))
+    wider = "its own limits of force are [-5, 5], wider than [limits] force = [-0.5, 0.5] N"
+    refused(w, tmp_path, "c0001 is not handed over", wider, "--anyway")
+    with pytest.raises(GroundedError, match="no candidate is waiting"):
+        w.run()
+    made = w.propose()
+    assert made.candidate.id == "c0002" and made.proposal.is_new
+    (note,) = made.proposal.notes
+    assert note == f"c0001 was not run and is void: {wider}; run c0002 in its place"
+    assert w.run().candidate == "c0002"
+    assert w.propose().proposal.notes == ()  # said once
+
+
+def test_another_target_makes_it_void_too(w, tmp_path):
+    configure(w, CONFIG.replace("x = 10.0", "x = 11.0"))
+    with pytest.raises(GroundedError, match="made for another task") as caught:
+        w.run("c0001")
+    assert caught.value.then.verb == "propose"
+    (note,) = w.propose().proposal.notes
+    assert "c0001 was not run and is void: the task was changed" in note and "c0002" in note
+    exported = w.export("c0001", tmp_path / "c.json")  # the limits hold
+    assert "another task" in exported.notes[0]
+
+
+def test_a_best_of_an_earlier_task_is_exported_only_inside_the_limits(ran, tmp_path):
+    configure(ran, CONFIG.replace(LIMITS, "force = [-9.0, 9.0]"))
+    ran.export("c0001", tmp_path / "c.json")
+    configure(ran, CONFIG.replace(LIMITS, NARROW))
+    with pytest.raises(GroundedError, match="wider than"):
+        ran.export("c0001", tmp_path / "d.json")
+    assert (tmp_path / "c.json").exists() and not (tmp_path / "d.json").exists()
+
+
+def test_safety_that_was_narrowed_replaces_it_or_ends_the_search(w, tmp_path):
+    configure(w, CONFIG + SAFETY.format(high=0.5))
+    refused(w, tmp_path, "is predicted to take x to", "outside [safety] x = [-1, 0.5]")
+    with pytest.raises(GroundedError, match="outside \\[safety\\]"):
+        w.run()
+    made = w.propose()
+    assert made.candidate is None and made.standing.ending == "not allowed"
+    assert any("c0001 was not run and is void" in note for note in made.proposal.notes)
+    configure(w, CONFIG)
+    assert w.propose().candidate.id == "c0001"
+
+
+def test_a_step_that_safety_forbids_now_gives_way_to_another(ran):
+    second = ran.propose().candidate
+    assert second.id == "c0002"
+    most = float(second.predicted_states[:, 0].max())
+    configure(ran, CONFIG + SAFETY.format(high=most - 1e-3))
+    made = ran.propose()
+    assert any("c0002 was not run and is void" in note for note in made.proposal.notes)
+    assert made.candidate.id == "c0003"
+    assert made.candidate.predicted_states[:, 0].max() < most - 1e-3
+    assert ran.run().candidate == "c0003"
+
+
+def test_what_is_to_be_run_once_more_is_not_replaced_but_refused(tmp_path):
+    twice = CONFIG.replace("[search]", "[search]\nrepeats = 2")
+    real = "latency = {}\nfrom model import model\nmodel = model.with_values({'mass': 1.4})\n"
+    noisy = twice + "[system.noise]\nmeasurement = { x = 0.01 }\n"
+    make(tmp_path / "w", config=noisy, real=real)
+    w = Workspace(tmp_path / "w")
+    w.propose()
+    w.ingest(w.run().trial_file)
+    assert w.propose().candidate.id == "c0001"
+    configure(w, noisy + SAFETY.format(high=0.5))
+    with pytest.raises(GroundedError, match=r"c0001 is waiting for 1 trial, but .*--anyway"):
+        w.propose()
+    assert w.run(anyway=True).overridden and len(w.candidate_ids()) == 1
+
+
+def test_safety_holds_for_the_run_as_the_model_of_today_predicts_it(ran, tmp_path):
+    """The best may be run again after a fit; where it leads is predicted anew."""
+    best = ran.status().standing.incumbent
+    real = float(best.trials[0].states[:, 0].max())
+    stored = float(best.candidate.predicted_states[:, 0].max())
+    assert abs(real - stored) > 0.01  # the crude model's own prediction was off
+    assert real > stored
+    heavier = MODEL.replace("Param(1.0", "Param(1.3")
+    configure(ran, CONFIG + SAFETY.format(high=real + 1e-6), model=heavier)
+    assert "predicted again" in ran.run("best").notes[0]
+    configure(ran, CONFIG + SAFETY.format(high=(real + stored) / 2))
+    with pytest.raises(GroundedError, match=f"is predicted to take x to {real:.3f}"):
+        ran.run("best")
+
+
+def test_a_model_that_was_changed_makes_an_unrun_candidate_void(w, tmp_path):
+    configure(w, model=MODEL.replace("Param(1.0", "Param(1.2"))
+    refused(w, tmp_path, "not run and is void: the model was changed")
+    made = w.propose()
+    (note,) = made.proposal.notes
+    assert made.candidate.id == "c0002" and "c0001 was not run and is void: the model" in note
+
+
+@pytest.mark.parametrize("checksum", ["old", "new", "none"])
+@pytest.mark.parametrize("anyway", [False, True])
+def test_a_rewritten_candidate_is_refused_whatever_its_checksum(w, tmp_path, checksum, anyway):
+    """FACTS 9: 5.4e6 N were sent, and `verify` found nothing."""
+    wide = {"low": np.array([-1e9]), "high": np.array([1e9])}
+    rewrite(w, checksum, feedforward=np.full((40, 1), 5.4e6), **wide)
+    refused(w, tmp_path, "is not the candidate that was proposed", "rewritten", anyway=anyway)
+    with pytest.raises(GroundedError, match="is not the candidate that was proposed"):
+        w.propose()
+    (found,) = w.verify().damaged
+    assert "c0001.mcap" in found.file and "rewritten" in found.reason
+
+
+def test_deleting_what_was_rewritten_brings_the_candidate_back(w):
+    before = w.candidate_bytes("c0001")
+    rewrite(w, "old", feedforward=np.ones((40, 1)))
+    w.candidate_path("c0001").unlink()
+    assert w.propose().candidate.id == "c0001" and w.candidate_bytes("c0001") == before
+
+
+def test_wider_limits_in_the_file_are_found_without_a_checksum(w, tmp_path):
+    rewrite(w, "none", low=np.array([-50.0]), high=np.array([50.0]))
+    refused(w, tmp_path, "its own limits of force are [-50, 50]")
+
+
+def test_a_file_that_is_not_what_its_trial_ran_is_refused(ran, tmp_path):
+    gain = read_candidate(ran.candidate_path("c0001"))[0].gain
+    rewrite(ran, "new", gain=gain * (1 + 1e-12))  # the prediction can't show so little
+    with pytest.raises(GroundedError, match="is not the policy that t0001 ran"):
+        ran.export("best", tmp_path / "c.json")
+
+
+def test_a_renamed_or_copied_candidate_is_refused(w, tmp_path):
+    shutil.copy(w.candidate_path("c0001"), w.candidate_path("c0007"))
+    for hand_over in (lambda: w.run("c0007"), lambda: w.export("c0007"), w.propose, w.run):
+        with pytest.raises(GroundedError, match=r"c0007\.mcap holds the candidate 'c0001'"):
+            hand_over()
+    (found,) = w.verify().damaged
+    assert "c0007.mcap" in found.file
+    w.candidate_path("c0001").unlink()
+    with pytest.raises(GroundedError, match="holds the candidate 'c0001'"):
+        w.propose()
+
+
+@pytest.mark.parametrize("key", ["task", "id", "model", "predicted_utility", "kind"])
+def test_metadata_that_was_rewritten_is_found(w, key):
+    path = w.candidate_path("c0001")
+    path.write_bytes(with_metadata(path.read_bytes(), key, "0"))
+    with pytest.raises(GroundedError, match="rewritten"):
+        w.run("c0001")
+    assert len(w.verify().damaged) == 1
+
+
+def test_a_file_of_an_older_version_is_handed_over_with_a_note(w):
+    path = w.candidate_path("c0001")
+    path.write_bytes(with_metadata(path.read_bytes(), "sha256", None))
+    (note,) = w.propose().proposal.notes
+    assert "c0001 was written by an older version" in note
+    assert w.run().notes == (note,) and w.verify().damaged == ()
+
+
+def test_another_robots_candidate_is_refused_even_anyway(w, tmp_path):
+    other = MODEL.replace("s.v", "s.w").replace('"v"', '"w"')
+    configure(w, model=other, real=other)
+    refused(w, tmp_path, "another robot", "x, v", "x, w", anyway=True)
+
+
+def test_other_units_and_another_dt_are_refused(w, tmp_path):
+    configure(w, model=MODEL.replace('"N"', '"kN"'))
+    refused(w, tmp_path, "it has force in N, the model of today in kN")
+    configure(w, CONFIG.replace("dt = 0.05", "dt = 0.1"), model=MODEL)
+    rows = [f"{0.1 * i:.1f},0.5" for i in range(41)]
+    (w.folder / "target.csv").write_text("t,x\n" + "\n".join(rows) + "\n")
+    refused(w, tmp_path, "it runs every 0.05 s, [task] dt is 0.1 s")
+
+
+def test_anyway_says_what_it_overrides_before_the_robot_moves(w, tmp_path):
+    configure(w, CONFIG.replace(LIMITS, NARROW))
+    told = []
+
+    def warn(text):
+        told.append(text)
+        assert not list((w.folder / "runs").glob("*.mcap"))
+
+    ran = w.run("c0001", anyway=True, warn=warn)
+    assert ran.trial_file.is_file() and len(told) == len(ran.overridden) == 2
+    assert "wider than [limits]" in told[0] and "another task" in told[1]
+    exported = w.export("c0001", tmp_path / "c.json", anyway=True)
+    assert len(exported.overridden) == 1 and exported.file.is_file()
+
+
+def test_the_commands_refuse_and_warn_on_stderr(w, tmp_path):
+    configure(w, CONFIG.replace(LIMITS, NARROW))
+    out = tmp_path / "c.csv"
+    for command in (("run", "c0001"), ("export", "c0001", "-o", out)):
+        done = grounded("-C", w.folder, *command)
+        assert done.code == 1 and "wider than [limits]" in words(done.err)
+        assert "grounded -C" in done.err and "propose" in done.err
+        done = grounded("-C", w.folder, *command, "--anyway")
+        assert done.code == 0 and "warning: c0001 is" in words(done.err)
+        assert "all the same: its own limits of force" in words(done.err)
+        assert "warning" not in done.out
+    done = grounded("-C", w.folder, "propose")
+    assert "note: c0001 was not run and is void" in words(done.err)
+
+
+def words(text):
+    return " ".join(plain(text).split())
+
+
+def test_an_open_loop_policy_must_send_and_hold_what_is_allowed(w):
+    policy = replace(w.candidate("c0001")[0].policy, gain=None, reference=None)
+    sent = np.zeros((40, 1))
+    sent[7] = 5.1
+    (found,) = outside_limits(w.task, replace(policy, feedforward=sent))
+    assert found == "it sends force = 5.1, outside [limits] force = [-5, 5] N"
+    (found,) = outside_limits(w.task, replace(policy, feedforward=0 * sent, past=np.array([-6.0])))
+    assert found == "it holds force at -6, outside [limits] force = [-5, 5] N"
+    assert not list(outside_limits(w.task, replace(policy, feedforward=0 * sent)))

@@ -1,0 +1,295 @@
+"""What a candidate must be at the moment it is handed over, whenever it was made.
+
+`propose`, `run` and `export` come through here. The configuration, the model and the file may have
+changed since a candidate was proposed, so nothing of that day is believed:
+
+    the file      it holds the candidate it is named after, as it was proposed (never overridden)
+    the robot     state and input names (never overridden), units, dt
+    the task      the task hash; another task's candidate is only exported
+    [limits]      the policy's own limits, what it sends and holds, inside today's
+    the model     a candidate that no trial ran is void once the model was changed
+    [safety]      the predicted run, predicted again where the model was changed
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from grounded.errors import GroundedError, NextCommand
+from grounded.frozen import Array
+from grounded.policy import Policy, z_difference
+from grounded.search.standing import Candidate
+from grounded.task import Task
+from grounded.trial import Trial
+from grounded_trials.workspace.folder import Contents, Folder, candidate_of
+
+AGREES = 1e-6  # of an input's size: how well a policy repeats its own predicted inputs
+
+
+@dataclass(frozen=True, eq=False)
+class Handed:
+    """A candidate that may be handed over, as the bytes that were checked."""
+
+    candidate: Candidate
+    meta: dict[str, str]
+    data: bytes
+    notes: tuple[str, ...] = ()  # what to know about it
+    overridden: tuple[str, ...] = ()  # why it would have been refused
+
+
+class Void(GroundedError):
+    """A candidate that must not be handed over; `reasons` says why, a sentence each."""
+
+    def __init__(self, identity: str, reasons: Sequence[str]) -> None:
+        super().__init__(
+            f"{identity} is not handed over: {'; '.join(reasons)}. Propose another, or hand it "
+            "over all the same with --anyway",
+            NextCommand("propose"),
+        )
+        self.reasons = tuple(reasons)
+
+
+def checked_candidate(
+    workspace: Folder, identity: str, *, anyway: bool = False, other_task: bool = False
+) -> Handed:
+    """A candidate, checked against the workspace as it is now.
+
+    Args:
+        workspace: whose model, task, [limits] and [safety] must hold.
+        identity: c0003.
+        anyway: hand it over all the same; what speaks against it is in `overridden`.
+        other_task: a candidate of another task will do, such as the best of an earlier one.
+
+    Raises:
+        Void: if it must not be handed over, unless `anyway`.
+        GroundedError: if its file is damaged, rewritten, renamed, or for another robot, always.
+    """
+    data = workspace.candidate_bytes(identity)
+    candidate, meta = intact(data, identity)
+    check = _Check(workspace, candidate, meta, other_task)
+    check.refuse_foreign()
+    reasons = tuple(check.reasons())
+    if reasons and not anyway:
+        raise Void(identity, reasons)
+    return Handed(candidate, meta, data, tuple(check.notes()), reasons)
+
+
+def intact(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]:
+    """A candidate whose file is whole, and whose policy sends what its prediction says.
+
+    The second finds what was rewritten where there is no checksum, or a new one.
+
+    Args:
+        data: the file.
+        identity: what it is named.
+
+    Raises:
+        GroundedError: if it is damaged, rewritten or renamed.
+    """
+    candidate, meta = candidate_of(data, identity)
+    predicted = candidate.predicted_inputs
+    with np.errstate(all="ignore"):
+        off = np.abs(_sent(candidate) - predicted)
+        wrong = off > AGREES * (1 + np.abs(predicted).max(axis=0))
+    if wrong.any():
+        t, j = (int(i) for i in np.argwhere(wrong)[0])
+        raise GroundedError(
+            f"candidates/{identity}.mcap is not the candidate that was proposed: at t = "
+            f"{t * candidate.policy.dt:g} s its policy sends {candidate.policy.input_names[j]} = "
+            f"{predicted[t, j] + off[t, j]:g} or {predicted[t, j] - off[t, j]:g}, its own "
+            f"prediction says {predicted[t, j]:g}. It was rewritten: delete the file and propose "
+            "again",
+            NextCommand("propose"),
+        )
+    return candidate, meta
+
+
+def _sent(candidate: Candidate) -> Array:
+    """What the policy sends along its predicted run, (H, m)."""
+    policy, x, u = candidate.policy, candidate.predicted_states, candidate.predicted_inputs
+    asked = policy.feedforward
+    if policy.gain is not None and policy.reference is not None:
+        columns = [x[:-1]]
+        for j, depth in enumerate(policy.depths):
+            sent = np.concatenate([np.full(depth, policy.past[j]), u[:, j]])
+            columns += [sent[depth - 1 - i : -1 - i, None] for i in range(depth)]
+        off = z_difference(np.hstack(columns), policy.reference, policy.angles)
+        asked = asked + np.einsum("tij,tj->ti", policy.gain, off)
+    return np.clip(asked, policy.low, policy.high)
+
+
+@dataclass(frozen=True)
+class _Check:
+    """A candidate against the workspace of today."""
+
+    workspace: Folder
+    candidate: Candidate
+    meta: dict[str, str]
+    other_task: bool
+
+    @cached_property
+    def contents(self) -> Contents:
+        """The workspace's files; a damaged one doesn't keep the others from being used."""
+        try:
+            return self.workspace.read()
+        except GroundedError:
+            return self.workspace.read(strict=False)
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Of the model that plans today."""
+        from grounded.search.improve import model_fingerprint
+
+        return model_fingerprint(self.workspace.planner.plan)
+
+    @property
+    def same_task(self) -> bool:
+        """Whether the candidate was made for the task of today."""
+        return self.meta.get("task") == self.workspace.task.hash
+
+    def refuse_foreign(self) -> None:
+        """Refuses a candidate for another robot, and one that differs from what was run."""
+        made, model = self.candidate, self.workspace.base_model
+        for what, found, own in (
+            ("states", made.policy.state_names, model.state_names),
+            ("inputs", made.policy.input_names, model.input_names),
+        ):
+            if found != own:
+                raise GroundedError(
+                    f"{made.id} is for the {what} {', '.join(found)}; this workspace's model has "
+                    f"{', '.join(own)}: it is a candidate of another robot",
+                    NextCommand("propose"),
+                )
+        for one in self.contents.trials:
+            if one.trial.candidate != made.id or one.policy is None:
+                continue
+            if not _same(made.policy, candidate_of(one.policy, made.id)[0].policy):
+                raise GroundedError(
+                    f"candidates/{made.id}.mcap is not the policy that {one.stored.id} ran: it was "
+                    "rewritten, or comes from another workspace; delete the file, the trial "
+                    "carries the one that was run"
+                )
+
+    def reasons(self) -> Iterator[str]:
+        """Why it must not be handed over, a sentence each."""
+        made, config = self.candidate, self.workspace.config
+        if abs(made.policy.dt - config.task.dt) > 1e-9:
+            yield f"it runs every {made.policy.dt:g} s, [task] dt is {config.task.dt:g} s"
+        model = self.workspace.base_model
+        for kind, own in (("states", model.states), ("inputs", model.inputs)):
+            for name, unit in json.loads(self.meta[kind]).items():
+                if unit != own[name]:
+                    yield f"it has {name} in {unit}, the model of today in {own[name]}"
+        yield from outside_limits(self.workspace.task, made.policy)
+        if not self.same_task and not self.other_task:
+            yield (
+                "it was made for another task (other target, reward, limits, start, feedback or "
+                "horizon)"
+            )
+        elif self.void:
+            yield "it was not run and is void: the model was changed since it was made"
+        yield from self._unsafe()
+
+    def notes(self) -> Iterator[str]:
+        """What a person should know of it, though nothing speaks against it."""
+        name = self.candidate.id
+        if "sha256" not in self.meta:
+            yield f"{name} was written by an older version: its file has no checksum of its own"
+        if not self.same_task:
+            yield f"{name} was made for another task than that of grounded.toml"
+        elif self._changed:
+            again = "predicted again" if self._predictable else "its prediction is the old one"
+            yield f"the model was changed since {name} was made; {again}"
+
+    @property
+    def void(self) -> bool:
+        """Whether it is a step of the search in another model that no trial ran."""
+        searched = self.meta.get("kind") == "search" and self.same_task
+        return searched and not self._trials(self.candidate.id) and self._changed
+
+    @property
+    def _changed(self) -> bool:
+        return self.candidate.model != self.fingerprint
+
+    @property
+    def _predictable(self) -> bool:
+        """Whether the run can be predicted in the task of today: it has the same time grid."""
+        policy, task = self.candidate.policy, self.workspace.task
+        return policy.horizon == task.horizon and abs(policy.dt - task.dt) <= 1e-9
+
+    def _trials(self, identity: str) -> list[Trial]:
+        found = [t.trial for t in self.contents.trials]
+        return [t for t in found if t.candidate == identity and self.workspace.fits(t)]
+
+    def _unsafe(self) -> list[str]:
+        """What [safety] says; a step that no trial ran may stray as earlier ones did."""
+        from grounded.search.safety import objections, spread
+        from grounded.search.standing import standing
+
+        workspace, made = self.workspace, self.candidate
+        if self._changed and self._predictable:
+            made = self._predicted()
+        strays = None
+        if self._predictable and not self._trials(made.id):
+            trials = [t.trial for t in self.contents.trials if workspace.fits(t.trial)]
+            candidates, options = self.contents.candidates, workspace.config.search
+            now = standing(workspace.task, candidates, trials, options, self.fingerprint)
+            strays = spread(workspace.task, now.history)
+        return objections(workspace.task, made, strays)
+
+    def _predicted(self) -> Candidate:
+        """The candidate as the model of today predicts it, grounded on its trials or its base's."""
+        from grounded.rollout import simulate
+        from grounded.solve.bias import ground
+        from grounded.trial import mean_trial
+
+        planner, made = self.workspace.planner, self.candidate
+        plan, horizon = planner.plan, planner.task.horizon
+        problem = plan.problem(exact=True)
+        for identity in (made.id, made.base):
+            ran = [t.until(horizon) for t in self._trials(identity)] if identity else []
+            whole = [t for t in ran if t.finite_steps == horizon]
+            if whole:
+                own = planner.lift(mean_trial(whole, planner.task.model.angle_mask))
+                matched = self.workspace.config.search.match_inputs
+                shift = ground(plan, own, match_inputs=matched).shift
+                problem = ground(plan, own, exact=True, shift=shift).on(problem)
+                break
+        run = simulate(problem, planner.widened(made.policy))
+        states = run.states[:, : planner.task.model.n]
+        return replace(made, predicted_states=states, predicted_inputs=run.inputs)
+
+
+def outside_limits(task: Task, policy: Policy) -> Iterator[str]:
+    """Where a policy may leave the hard limits of a task: a sentence for each input.
+
+    A feed-forward with feedback may lie outside, since its sum with the feedback is clipped to the
+    policy's own limits; the sum is what must be inside, and is when these are.
+    """
+    for j, (name, unit) in enumerate(task.model.inputs.items()):
+        low, high = task.low[j], task.high[j]
+        today = f"[limits] {name} = [{low:g}, {high:g}] {unit}"
+        if policy.low[j] < low or policy.high[j] > high:
+            own = f"[{policy.low[j]:g}, {policy.high[j]:g}]"
+            yield f"its own limits of {name} are {own}, wider than {today}"
+        room = 1e-9 * max([1.0, *(abs(v) for v in (low, high) if np.isfinite(v))])
+        parts = {f"holds {name} at": policy.past[j : j + 1]}
+        if policy.gain is None:
+            parts[f"sends {name} ="] = policy.feedforward[:, j]
+        for what, values in parts.items():
+            excess = np.maximum(low - values, values - high)
+            if excess.max() > room:
+                yield f"it {what} {values[np.argmax(excess)]:g}, outside {today}"
+
+
+def _same(a: Policy, b: Policy) -> bool:
+    """Whether two policies are one, to the last bit."""
+    return a.z_names == b.z_names and all(
+        np.array_equal(getattr(a, name), getattr(b, name))
+        for name in ("feedforward", "low", "high", "past", "gain", "reference")
+    )
