@@ -1,4 +1,4 @@
-"""grounded export: a candidate for other languages."""
+"""grounded export: a candidate as a file that the robot's own program reads."""
 
 from __future__ import annotations
 
@@ -28,7 +28,9 @@ USES = {
 )
 @click.option("-o", "--output", metavar="FILE", help="Default: ID.FORMAT in the current folder.")
 @click.option(
-    "--runner", is_flag=True, help="npz, and beside it the program that runs it: numpy alone."
+    "--runner",
+    is_flag=True,
+    help="Write npz, and beside it grounded_runner.py, which runs it with numpy alone.",
 )
 @in_workspace
 @as_json
