@@ -42,7 +42,7 @@ def _tell(workspace: Workspace, proposed: Proposed) -> None:
     for note in proposed.proposal.notes:
         remark("note", note)
     if note := workspace.planner.plan.model.system.note:
-        remark("note", f"the model is not compiled: {note}")
+        remark("note", f"the model is {note}")
     if candidate is None:
         show(field("end", f"nothing to run: {standing.sentence}"))
         show(f"\n{next_line(proposed.then)}")

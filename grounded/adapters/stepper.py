@@ -79,12 +79,13 @@ def library(name: str) -> Any:
     """An optional library, imported now.
 
     Raises:
-        GroundedError: if it is not installed, naming the extra that installs it.
+        GroundedError: if it is not installed, with the command that installs it.
     """
+    package = name.partition(".")[0]
     try:
         return importlib.import_module(name)
     except ImportError as error:
         raise GroundedError(
-            f"grounded.adapters.{name.partition('.')[0]} needs {name}, which can't be imported "
-            f"({error}): pip install '.[{name.partition('.')[0]}]' in grounded's own folder"
+            f"grounded.adapters.{package} needs {name}, which can't be imported ({error}): "
+            f"pip install {package}"
         ) from error
