@@ -13,7 +13,7 @@ from grounded_cli.terminal import show, show_json
 # the formats, and how a program begins with each
 USES = {
     "csv": "a row a control step; the control law is in its head",
-    "npz": "on the robot: grounded.policy.load (docs/robot.md)",
+    "npz": "on the robot: grounded.policy.load; --runner adds a file for numpy alone",
     "json": "the control law, names and units are in it (docs/robot.md)",
 }
 
