@@ -8,8 +8,24 @@
     found = gr.diagnose(search.task, search.trials)
 
 The algorithm is that of Abbeel, Quigley & Ng, "Using Inaccurate Models in Reinforcement Learning",
-ICML 2006; start reading in `grounded.search.improve`. What this page names is imported when it is
-first used.
+ICML 2006; start reading in `grounded.search.improve`. The files of this folder are the nouns:
+
+model, task, utility    the crude model, the manoeuvre, its quadratic reward
+trial, rollout, plant   a real run, a simulated one, a simulated real system
+policy, onboard         what a robot runs, and the one file that runs it with numpy alone
+result, errors, frozen  what results, mistakes and arrays have in common
+
+Its rooms, from the paper's loop down:
+
+search       what to run next, from stored trials
+solve        optimal control in the model, and the bias that makes it replay a trial
+compile      a model in NumPy, differentiated and compiled
+diagnosis    what the model lacks; `effects` it may be; `challenge`, blind cases for it
+estimate     states and noise from measurements; `fit`, parameters from trials
+models       systems that come with grounded; `adapters`, models that other software computes
+experiments  the paper's studies
+
+What `__all__` names is imported when it is first used.
 """
 
 from __future__ import annotations

@@ -1,1 +1,6 @@
-"""The words: one command a file. A command loads, calls one function, shows, saves."""
+"""The commands of `grounded`, one a file, named after it.
+
+Read `main.py` first (the list of commands, and how errors become exit codes), then any command:
+options, one call of `grounded_trials.Workspace`, a printout and `--json`. `options.py` has what
+commands share, `terminal.py` how words, tables and progress are shown, `completion.py` the TAB key.
+"""

@@ -26,9 +26,16 @@ def command() -> None:
 
 @command.command("make", short_help="Write cases, and their labels, sealed, elsewhere.")
 @click.argument("folder", metavar="DIR")
-@click.option("--kind", type=click.Choice(["single", "double", "none", "withheld"]), required=True)
+@click.option(
+    "--kind",
+    type=click.Choice(["single", "double", "none", "withheld"]),
+    required=True,
+    help="One effect, two, none, or one that the library lacks.",
+)
 @click.option("--cases", type=click.IntRange(1), required=True, metavar="N", help="How many.")
-@click.option("--seed", type=click.IntRange(0), required=True, metavar="S", help="Of everything.")
+@click.option(
+    "--seed", type=click.IntRange(0), required=True, metavar="S", help="Of all that is drawn."
+)
 @click.option("--labels", metavar="DIR", help="Where the labels go (default: DIR-labels).")
 @click.option(
     "--param-error",
@@ -62,10 +69,10 @@ def make_cases(
     show(f"\nnext: {typed(NextCommand('challenge', ('run', folder)))}")
 
 
-@command.command("run", short_help="Diagnose the cases that were not yet.")
+@command.command("run", short_help="Diagnose the cases that have no diagnosis yet.")
 @click.argument("folder", metavar="DIR")
 @click.option("--without", multiple=True, metavar="F1,F2,...", help="Families not to blame.")
-@click.option("--again", is_flag=True, help="Those that were diagnosed before too.")
+@click.option("--again", is_flag=True, help="Diagnose the others once more, too.")
 @parallel
 @as_json
 def run_cases(
@@ -75,7 +82,7 @@ def run_cases(
     engine: Engine,
     json_: bool,
 ) -> None:
-    """Diagnose the cases of DIR that were not yet; a run that was cut off goes on."""
+    """Diagnose the cases of DIR that have no diagnosis yet; a run that was cut off goes on."""
     from grounded_trials.workspace.challenge import diagnose_cases, undiagnosed
 
     families = [name for text in without for name in names_in(text)]

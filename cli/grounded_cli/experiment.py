@@ -47,6 +47,9 @@ def command(
 
     Without NAME the studies are listed. Finished jobs are kept: a study that was cut off goes on.
     """
+    if name is None and json_:
+        show_json({"studies": {key: text for key, (_, _, _, text) in STUDIES.items()}})
+        return
     if name is None:
         show("\n".join(f"{key:15} {text}" for key, (_, _, _, text) in STUDIES.items()))
         return

@@ -1,4 +1,4 @@
-"""grounded export: a candidate for other languages."""
+"""grounded export: a candidate as a file that the robot's own program reads."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from grounded_cli.terminal import remark, show, show_json
 # the formats, and how a program begins with each
 USES = {
     "csv": "a row a control step; the control law is in its head",
-    "npz": "on the robot: grounded.policy.load (docs/robot.md)",
+    "npz": "on the robot: grounded.policy.load; --runner adds a file for numpy alone",
     "json": "the control law, names and units are in it (docs/robot.md)",
 }
 
@@ -28,7 +28,9 @@ USES = {
 )
 @click.option("-o", "--output", metavar="FILE", help="Default: ID.FORMAT in the current folder.")
 @click.option(
-    "--runner", is_flag=True, help="npz, and beside it the program that runs it: numpy alone."
+    "--runner",
+    is_flag=True,
+    help="Write npz, and beside it grounded_runner.py, which runs it with numpy alone.",
 )
 @anyway
 @in_workspace

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from grounded.search.step_size import Step
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
 from grounded_cli.terminal import field, number, progress, remark, show, show_json
 from grounded_trials.wording import count, with_unit
@@ -41,7 +42,7 @@ def _tell(workspace: Workspace, proposed: Proposed) -> None:
     for note in proposed.proposal.notes:
         remark("note", note)
     if note := workspace.planner.plan.model.system.note:
-        remark("note", f"the model is not compiled: {note}")
+        remark("note", f"the model is {note}")
     if candidate is None:
         show(field("end", f"nothing to run: {standing.sentence}"))
         show(f"\n{next_line(proposed.then)}")
@@ -67,8 +68,8 @@ def _what(candidate: Candidate, task: Task) -> str:
     """Where a candidate comes from."""
     seconds = f"{task.horizon * task.dt:g} s"
     if candidate.base:
-        step = f"alpha = {candidate.alpha:g} from {candidate.base}"
-        return f"iteration {candidate.iteration}: {step}, {seconds}"
+        step = Step(candidate.damping, candidate.alpha)
+        return f"iteration {candidate.iteration}: {step} from {candidate.base}, {seconds}"
     crashes = candidate.caution
     gently = f", designed more gently after {count(crashes, 'crash', 'crashes')}" * bool(crashes)
     return f"the model's own policy{gently}, {seconds}"

@@ -1,9 +1,11 @@
 """Models that other software computes: MuJoCo, JAX, CasADi.
 
-mujoco    a Model from an MJCF or URDF file: joints are states, actuators or torques are inputs
+stepper   what the three share: named samples in, arrays through, named samples out
 jax       a Model from a JAX function
 casadi    a Model from a CasADi function
-stepper   what the three share: named samples in, arrays through, named samples out
+mujoco    a Model from an MJCF or URDF file: joints are states, actuators or torques are inputs
 
+Read `stepper` first, then `jax`, the shortest. `mujoco_names` and `mujoco_params` say what joints,
+actuators and parameters of a file are called; `tangent` turns rotations into plain coordinates.
 Each adapter imports its library when a model is made, not before.
 """

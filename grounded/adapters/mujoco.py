@@ -225,7 +225,8 @@ class MujocoStepper(Stepper):
         if steps < 1 or abs(steps * h - dt) > 1e-6 * dt:
             raise GroundedError(
                 f"the control step of {dt:g} s is not a whole multiple of the simulation's "
-                f"timestep of {h:g} s: give timestep={dt:g}/{max(1, round(dt / h))}, or another dt"
+                f"timestep of {h:g} s: give timestep={dt / max(1, steps):g}, or another dt "
+                "(a simulated real system takes `substeps = 1` in real.py)"
             )
         return steps
 

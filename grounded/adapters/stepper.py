@@ -75,6 +75,6 @@ def library(name: str) -> Any:
     """An optional library, imported now.
 
     Raises:
-        GroundedError: if it is not installed, naming the extra that installs it.
+        GroundedError: if it is not installed, with the command that installs it.
     """
     return needs(name, name.partition(".")[0])

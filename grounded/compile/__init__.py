@@ -2,6 +2,10 @@
 
 `system_of` is the door: it returns the fastest path that a user's function allows, and the paths
 agree, so that nobody above needs to know which one it was.
+
+Read `problem` first (what is solved, and what an engine must answer), then the rooms in the order
+in which a function passes through them: `trace` (run once on expressions, differentiated), `emit`
+(written as LLVM IR), `run` (the three engines). `names` hands arrays to the function by name.
 """
 
 from __future__ import annotations

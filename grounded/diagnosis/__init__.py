@@ -1,6 +1,7 @@
 """The sim-to-real gap: where it lies, which effect makes it, how far it shrinks.
 
-Read `diagnose` first; its docstring lists the stages. Below them lie, from the data upwards:
+Read `diagnose` first; its docstring lists the stages. `report` is what comes out, `attribution` the
+question "which effect?". Below them lie, from the data upwards:
 
     data                  trials as one record, cut into runs of equal length
     hypothesis            effects with their values, and what they predict
@@ -11,4 +12,9 @@ Read `diagnose` first; its docstring lists the stages. Below them lie, from the 
     refine, fitted        many hypotheses up their likelihood at once; where each ends
     scan                  a first look at every candidate effect
     hypotheses, search    what was fitted, what it is worth, what to try next
+    held_out, claims      what other trials confirm; what is claimed, with intervals
+    lookalike, leftover   what acts nearly the same; what no effect explains
+    prediction_error, split     where the gap lies, and what the error is made of
+    limits, excitation    what the data can't tell; the trial that would
+    verdict               the same in words
 """

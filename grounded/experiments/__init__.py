@@ -10,4 +10,6 @@ and a result with `to_json` and `tables`:
     baselines        seven methods (`ilc` is one) on one `bench`
     theorem1, footnote9     what the paper proves
     pendulum         the smallest example, for `grounded demo`
+
+Read `footnote9` first (the smallest), then `car`.
 """

@@ -1,5 +1,5 @@
 """Systems that come with grounded, by the same door as the user's own: a module with a `model`.
 
-Read `pendulum` first (the smallest), then `car` (section 5.2), then `aircraft` (section 5.1, with
-the trims that it flies straight and in turns).
+Read `pendulum` first (the smallest), then `car` (section 5.2), then `aircraft` (section 5.1) with
+`aircraft_trim`, its steady straight flight and turns.
 """

@@ -78,6 +78,7 @@ class Proposal(Result):
             file=None,
             iteration=made.iteration if made else now.iteration,
             alpha=made and made.alpha,
+            damping=made.damping if made and made.base else None,
             predicted_utility=made and made.predicted_utility,
             phase="await-trial" if made else now.phase,
             sentence=now.sentence,
@@ -265,7 +266,7 @@ def _ended(
     elif finite and max(finite) < -least and not lost:
         ending = "every step loses"
         sentence = (
-            f"every step from {own} loses in the grounded model, {-max(finite):.4g} at the least: "
+            f"every step from {own} loses in the grounded model, by at least {-max(finite):.4g}: "
             "its slopes don't hold along this trial; a diagnosis may say what it lacks"
         )
     elif lost:

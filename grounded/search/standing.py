@@ -5,7 +5,7 @@ in which they were proposed, and the trials that came back, say all there is to 
 
     the incumbent    the best candidate so far, pi_theta^(i); its trials measure the next bias
     outstanding      the candidate that was proposed and has not been run often enough
-    tried            the alphas along the present direction that did not improve (step 6)
+    tried            the steps from the incumbent that did not improve (step 6)
     in doubt         a loss that may be luck: the incumbent is run once more before it is believed
 
 Two trials of one candidate that agree to the last bit say that the system is deterministic: nothing
@@ -127,6 +127,7 @@ class Candidate(Result):
             candidate=self.id,
             iteration=self.iteration,
             alpha=self.alpha,
+            damping=self.damping if self.base else None,
             base=self.base or None,
             predicted_utility=self.predicted_utility,
         )
@@ -290,7 +291,7 @@ def standing(
             f"{own} is the result (step 7)"
         )
         return replace(now, phase="converged", sentence=sentence, ending="no step improved")
-    sentence = f"improve on {own} with alpha = {step.alpha:g}"
+    sentence = f"improve on {own} with {step}"
     if why := _suspicion(history, incumbent):
         then = NextCommand("diagnose")
         return replace(now, step=step, sentence=f"{sentence}; {why}", then=then)

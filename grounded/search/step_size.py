@@ -42,6 +42,9 @@ class Step:
     damping: float = 1.0
     alpha: float = 1.0
 
+    def __str__(self) -> str:
+        return f"alpha = {self.alpha:g}" + f", damping {self.damping:.2g}" * (self.damping > 0)
+
 
 def after_success(step: Step, predicted: float, real: float) -> Step:
     """The first step of the next iteration.

@@ -116,6 +116,12 @@ def test_colour_only_on_a_terminal(w):
         assert "\x1b" not in done.err + done.out
 
 
+def test_studies_are_listed_as_words_and_as_json():
+    listed = grounded("experiment", "--json").json["studies"]
+    assert "flight" in listed and all(listed.values())
+    assert list(listed) == [line.split()[0] for line in grounded("experiment").out.splitlines()]
+
+
 # the loop
 
 
@@ -195,6 +201,8 @@ def test_learn_runs_to_the_end_and_says_what_is_next(w):
     ended = grounded("-C", w, "propose", "--json")
     assert ended.code == 0 and ended.json["candidate"] is None
     assert ended.json["phase"] == done["phase"] and ended.json["sentence"]
+    damping = [tried["damping"] for tried in status["history"]]
+    assert damping[:2] == [None, 1.0] and all(value > 0 for value in damping[1:])
     again = grounded("-C", w, "learn", "--json")
     assert again.json["trials"] == done["trials"] and again.code == 0
     text = grounded("-C", w, "status")

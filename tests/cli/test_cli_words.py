@@ -33,6 +33,14 @@ def here(tmp_path, monkeypatch):
     return tmp_path / "w"
 
 
+def test_a_model_that_is_not_compiled_is_named_once(here):
+    (here / "model.py").write_text(
+        MODEL.replace("    return", "    if s.x > 99:\n        return {}\n    return")
+    )
+    text = " ".join(said(grounded("propose")).split())
+    assert text.count("not compiled") == 1 and "model.py" in text
+
+
 def test_a_session_from_the_first_trial_to_the_export(here):
     assert "N, limits -5 to 5" in said(grounded("propose"))
     said(grounded("run"))

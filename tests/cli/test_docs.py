@@ -281,6 +281,16 @@ def test_files_and_modules_that_a_page_names_are_there(page):
         assert name == "grounded.toml" or pkgutil.resolve_name(name) is not None
 
 
+@pytest.mark.skipif(not (ROOT / "grounded").is_dir(), reason="only a checkout has the code's files")
+def test_every_room_says_where_to_begin_and_names_files_that_are_there():
+    for package in ("grounded", "trials/grounded_trials", "cli/grounded_cli"):
+        for room in (ROOT / package).rglob("__init__.py"):
+            text = ast.get_docstring(ast.parse(room.read_text())) or ""
+            assert re.search(r"\b[Rr]ead|START HERE", text), f"{room}: where does one begin?"
+            for name in re.findall(r"`(\w+\.py)`", text):
+                assert (room.parent / name).exists(), f"{room}: {name} is not there"
+
+
 def test_every_command_is_documented():
     from grounded_cli.main import COMMANDS
 

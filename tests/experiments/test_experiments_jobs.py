@@ -91,9 +91,7 @@ def test_engines_that_make_no_sense_are_refused():
 @pytest.fixture
 def cluster(tmp_path):
     """A scheduler and two worker processes of their own: (address, workers)."""
-    pytest.importorskip(
-        "distributed", reason='dask is not installed: pip install "grounded[cluster]"'
-    )
+    pytest.importorskip("distributed", reason='dask is not installed: pip install ".[cluster]"')
     path = [str(SUPPORT), os.environ.get("PYTHONPATH", "")]
     env = os.environ | {"PYTHONPATH": os.pathsep.join(path), "OPENBLAS_NUM_THREADS": "1"}
 

@@ -2,11 +2,13 @@
 
 `from grounded_trials import Workspace` is the front door (`door.py`): a method for every command.
 
-formats/    bytes of log files as arrays
-logs/       foreign logs: which signal is which state, samples on the control grid
-store/      our own files, content-addressed
 workspace/  START HERE: a folder with a task, and what each command does in it
+store/      our own files, content-addressed
+logs/       foreign logs: which signal is which state, samples on the control grid
+formats/    bytes of log files as arrays
 report/     text, page, pictures, recording
+
+`toml_table.py` takes a user's table apart key by key; `wording.py` puts numbers and units in words.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """Foreign logs: what is in them, which signal is which state, their samples on the grid.
 
-Read `log_table.py` first (the [log] table and how it is followed), then `signals.py`, `samples.py`
-and `resample.py`. `inspect_log.py` looks at an unknown log, `inspect_guess.py` guesses its table;
+Read `log_table.py` first (the [log] table and how it is followed), then `log_files.py` (which files
+a log is), `signals.py`, `samples.py` and `resample.py`. `inspect_log.py` looks at an unknown log,
+`inspect_guess.py` guesses its table;
 `recover.py` saves what a damaged one still holds, which `salvage.py` finds.
 """

@@ -4,4 +4,6 @@ Read `folder.py` first (how a folder becomes a task, trials and candidates). `co
 `task_file.py` and `model_file.py` read what the user wrote; `proposing.py` (status too),
 `running.py`, `ingest.py`, `fitting.py`, `diagnosing.py`, `adopting.py`, `exporting.py` and
 `inspecting.py` are a verb each; `grounded_trials.door` makes them the methods of one class.
+`next_step.py` says what a person does next. Of single use: `trial_check.py` and `unmeasured.py` for
+`ingest`, `adopted.py` for planning with adopted effects, `examples.py` for `init`, `challenge.py`.
 """

@@ -1,4 +1,5 @@
 """Pictures of the paper's studies and of each effect's signature.
 
-`pictures.py` holds the table of studies and draws curves, `bars.py` draws bars.
+Read `pictures.py` first: it holds the table of studies and draws curves; `bars.py` draws bars,
+`effect_pictures.py` the signatures of docs/effects.md.
 """
