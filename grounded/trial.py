@@ -1,8 +1,8 @@
 """Trial: one real run on the control grid. A simulated run is a Rollout, never a Trial.
 
 Samples get lost: a camera that misses the car for half a second loses states, not the trial. Short
-gaps are interpolated (`interpolate_gaps`), and with them the bias (FACTS.md 2: 2 % lost samples are
-harmless); long ones end the trial. Inputs are never invented: a trial ends before its first unknown
+gaps are interpolated (`interpolate_gaps`), and with them the bias (2 % lost samples are harmless);
+long ones end the trial. Inputs are never invented: a trial ends before its first unknown
 input.
 """
 

@@ -1,7 +1,7 @@
 """What a diagnosis says: one tree of frozen values, and the JSON document that it is kept as.
 
 Command, page, pictures, recording and notebook all take a `Diagnosis`; `to_json` gives the document
-of `diagnose --json` (CONTRACT.md) and `from_json` reads it back, an older one too.
+of `diagnose --json` and `from_json` reads it back, an older one too.
 """
 
 from __future__ import annotations
@@ -234,7 +234,7 @@ class Made(Document):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Diagnosis(Document):
-    """All that a diagnosis found, as `diagnose --json` has it (CONTRACT.md)."""
+    """All that a diagnosis found, as `diagnose --json` has it."""
 
     verdict: Verdict
     where: Where = field(default_factory=Where)

@@ -36,7 +36,7 @@ LARGE = 8  # states, above which one correlation time and half the shortlist hav
 
 
 class HypothesisSearch(FittedHypotheses):
-    """The fits of one attribution (`Found`), and the ways to more of them."""
+    """The fits of one attribution (`FittedHypotheses`), and the ways to more of them."""
 
     def __init__(
         self,

@@ -64,7 +64,7 @@ class CarResult:
         return [run for run in self.runs if (run.manoeuvre, run.noisy) == (manoeuvre, noisy)]
 
     def to_json(self) -> dict[str, Any]:
-        """Like the flight's: see CONTRACT.md."""
+        """The document of `grounded experiment car --json`: a row a run, with its improvement."""
         runs = [
             {key: value for key, value in vars(run).items() if key != "paths"}
             | {"improvement": run.improvement}

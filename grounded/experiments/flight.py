@@ -100,7 +100,7 @@ class FlightResult:
         }
 
     def to_json(self) -> dict[str, Any]:
-        """See CONTRACT.md."""
+        """The document of `grounded experiment flight --json`: a row a run, and the means."""
         runs = [
             {k: v for k, v in vars(run).items() if k != "paths"} | {"optimum": self.optimum}
             for run in self.runs

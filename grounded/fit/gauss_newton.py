@@ -3,7 +3,7 @@
 What is fitted, parameters of the model and delays of its inputs, is one vector theta (`Unknowns`).
 The least-squares problem are the whitened innovations of the filter and their slopes,
 
-    eps(theta): the filter's, with f(.; theta);      W = d eps / d theta  (`estimate.sensitivity`)
+    eps(theta): the filter's, with f(.; theta);      W = d eps / d theta  (`filter.sensitivity`)
     delta = -(W'W + lambda diag(W'W))^-1 W' eps,     theta <- clip(theta + delta)
 
 The sum of squares of eps is what is left unexplained, measured in the noise; the log-likelihood

@@ -134,7 +134,7 @@ def damped(problem: Problem, inputs: Array, factor: float = 1.0) -> Problem:
     """The problem with a price mu |u_t - inputs_t|^2 on leaving the trial's inputs (H, m).
 
     The fully converged step goes to the optimum of the biased MODEL, and that need not be uphill in
-    the real system (FACTS.md 2); with mu it turns towards the gradient, which is uphill while the
+    the real system; with mu it turns towards the gradient, which is uphill while the
     model's derivatives are within 90 degrees (section 3). mu = R + S, the problem's own weights on
     inputs: the same idea as norm-optimal iterative learning control. Both quadratic penalties on
     u_t are one: weight R + mu about (R u_target + mu inputs) / (R + mu).

@@ -50,7 +50,7 @@ MAX_CAUTION = 3  # times the first policy is designed again, ever more gently, a
 
 @dataclass(frozen=True)
 class SearchOptions:
-    """The [search] table: see CONTRACT.md. `tolerance` ends a search that has nothing to gain."""
+    """The [search] table of grounded.toml; docs/configuration.md says what each key means."""
 
     method: Literal["ddp", "policy-gradient"] = "ddp"
     step: Literal["damped", "full"] = "damped"

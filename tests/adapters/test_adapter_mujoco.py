@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-mj: Any = pytest.importorskip("mujoco", reason="the adapter's extra, grounded[mujoco]")
+mj: Any = pytest.importorskip("mujoco", reason="the adapter's extra, .[mujoco]")
 
 from grounded.adapters import mujoco as adapter  # noqa: E402
 from grounded.adapters.stepper import Stepper  # noqa: E402
