@@ -26,6 +26,13 @@ def test_a_command_names_the_extra_that_it_needs(tmp_path, monkeypatch, module, 
     assert "Traceback" not in done.err and done.err.count("\n") == 1
 
 
+def test_nothing_is_written_where_an_extra_is_missing(tmp_path, monkeypatch):
+    make(tmp_path / "w")
+    monkeypatch.setitem(sys.modules, "PIL", None)
+    done = grounded("-C", tmp_path / "w", "report", "--html", "--png")
+    assert done.code == 1 and not (tmp_path / "w" / "reports" / "report.html").exists()
+
+
 def test_a_picture_names_the_extra_that_it_needs(monkeypatch):
     monkeypatch.setitem(sys.modules, "PIL", None)
     with pytest.raises(GroundedError, match=r"\.\[png\]"):

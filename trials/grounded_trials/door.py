@@ -262,10 +262,17 @@ class Workspace(Folder):
             html: write reports/report.html.
             png: write its figures, reports/*.png.
             rrd: write reports/recording.rrd for the Rerun viewer.
+
+        Raises:
+            GroundedError: if an extra is missing that one of them needs; nothing is written then.
         """
+        from grounded.errors import needs
         from grounded_trials.report import reporting
         from grounded_trials.report.gathering import gather
 
+        for asked, module, extra in ((png, "PIL", "png"), (rrd, "rerun", "view")):
+            if asked:
+                needs(module, extra)
         findings, paths = gather(self._afresh()), []
         if html:
             paths.append(reporting.save_page(self, findings))
