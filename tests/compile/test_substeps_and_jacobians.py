@@ -139,3 +139,13 @@ def test_an_adopted_effect_keeps_the_substeps():
         rtol=1e-12,
         atol=1e-13,
     )
+
+
+def test_a_function_that_takes_one_sample_at_a_time_says_so():
+    model = Model(**NAMES, derivative=opaque)
+    before = model.system.note
+    assert before.startswith("not compiled") and "one sample" not in before
+    x, u = samples()
+    model.system.step(x, u, model.values, 0.1)
+    model.system.step(x, u, model.values, 0.1)
+    assert model.system.note.count("one sample at a time") == 1

@@ -23,6 +23,10 @@ from grounded.frozen import Array
 
 RELATIVE_STEP = float(np.cbrt(np.finfo(float).eps))
 WRONG = 1e-2  # share of the largest by which a given derivative may differ from differences
+SLOW = (
+    "; it can't take arrays of samples either and is called one sample at a time: planning takes "
+    "seconds to minutes (np.where in place of `if` and np.sin in place of math.sin mend it)"
+)
 CHUNK = 4096  # samples in one call, so that long horizons don't fill the memory
 
 
@@ -42,6 +46,7 @@ class DifferencedSystem(Interpreted):
             if result is not None:
                 return result
             self._batches = False
+            self.note += SLOW
         return np.array([self._single(a, b, p, dt) for a, b in zip(x, u, strict=True)]).reshape(
             len(x), len(self.signature.outputs)
         )
