@@ -34,7 +34,15 @@ from grounded.diagnosis.held_out import (
 from grounded.diagnosis.hypothesis import Hypothesis
 from grounded.diagnosis.leftover import Leftover, leftovers, whiteness
 from grounded.diagnosis.limits import Limits, knowable, limits
-from grounded.diagnosis.prediction_error import Horizon, by_region, by_time, explained, horizon
+from grounded.diagnosis.prediction_error import (
+    Horizon,
+    by_region,
+    by_time,
+    errors,
+    explained,
+    horizon,
+    normalised,
+)
 from grounded.diagnosis.report import (
     Change,
     ChannelShare,
@@ -147,12 +155,20 @@ class _Writer:
             gain = gain.copy()
             gain[..., i] += self.left[0].improvement
         ranking = self.claims.ranking(where, shrunk.gap_before)
+        without = self.without_effects(where)
         groups = self.claims.groups()
         alike = self.claims.nearly(groups)
         remainder = tuple(self.remainder(left) for left in self.left)
         return Diagnosis(
             verdict=verdict(
-                self.claims, shrunk.gap_before, shrunk.gap_after, ranking, groups, alike, remainder
+                self.claims,
+                shrunk.gap_before,
+                shrunk.gap_after,
+                ranking,
+                groups,
+                alike,
+                remainder,
+                without,
             ),
             where=Where(
                 channels=self.channels(gain, shrunk.before, where.spread),
@@ -172,6 +188,7 @@ class _Writer:
                 floor=1.0,
                 held_out=data.count > 1,
                 channels=self.by_channel(shrunk.before, shrunk.after, where.spread),
+                without_effects=without,
             ),
             utility_prediction=self.utility_prediction(bare),
             whole_run=self.whole_run(bare),
@@ -184,6 +201,14 @@ class _Writer:
             steps=data.steps,
             candidates=len(self.search.candidates),
         )
+
+    def without_effects(self, where: Horizon) -> float:
+        """The gap that the calibrated parameters alone leave; NaN where nothing was calibrated."""
+        h = self.best.hypothesis
+        if not h.effects or h.shift is None or h.spread == 0:
+            return float("nan")
+        alone = Hypothesis(shift=h.shift, spread=h.spread)
+        return normalised(errors(self.predictor, alone, self.best.track, where), where)
 
     def remainder(self, left: Leftover) -> Remainder:
         """A leftover with the region where it acts."""

@@ -159,7 +159,10 @@ class RunChange(Change):
 
 @dataclass(frozen=True, eq=False)
 class Gap(Document):
-    """The prediction error over a horizon, without the effects and with them, and the noise's."""
+    """The prediction error over a horizon, without the effects and with them, and the noise's.
+
+    `without_effects` keeps the parameters that were calibrated beside the effects.
+    """
 
     horizon_s: float = math.nan
     unit: str = ""
@@ -168,6 +171,7 @@ class Gap(Document):
     floor: float = math.nan
     held_out: bool = False
     channels: Mapping[str, Change] = field(default_factory=dict)
+    without_effects: float = field(default=math.nan, metadata=BRIEF)
 
     @property
     def measured(self) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -22,6 +23,7 @@ from grounded.effects import Effect, ParamFamily, places
 from grounded.model import Model
 
 NAMED = 2  # leftovers
+MOST = 0.5  # share of the squared error: calibration that makes more is said to make most of it
 
 
 def verdict(
@@ -32,6 +34,7 @@ def verdict(
     groups: tuple[tuple[str, ...], ...],
     alike: tuple[Likeness, ...],
     remainder: tuple[Remainder, ...],
+    without: float = math.nan,
 ) -> Verdict:
     """One effect, several, none or unknown, and why, in sentences.
 
@@ -43,6 +46,7 @@ def verdict(
         groups: what ties.
         alike: what is nearly the same as a claimed effect.
         remainder: what no effect explains.
+        without: the gap that the calibrated parameters leave without the effects; NaN: none were.
     """
     left = "; ".join(r.sentence() for r in remainder[:NAMED])
     left += f"; and {len(remainder) - NAMED} more" if len(remainder) > NAMED else ""
@@ -56,6 +60,11 @@ def verdict(
         effects = {e.name: e for e in claims.best.hypothesis.effects}
         words = [sentence(meaning(effects[row.effect], row.params) for row in claimed)]
         words.append(improvement(before, after))
+        if before**2 - without**2 > MOST * (before**2 - after**2) > 0:
+            words.append(
+                "Most of that is the calibration of the model's own parameters: without the "
+                f"effect{'s' * (len(claimed) > 1)} they leave {number(without)} times the noise."
+            )
     elif remainder:
         return Verdict("unknown", (), f"A gap remains that no known effect explains: {left}.")
     else:

@@ -1,6 +1,7 @@
 """The diagnosis: its filter against dense algebra, its verdicts on known answers."""
 
 import json
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -18,7 +19,7 @@ from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.excitation import probe
 from grounded.diagnosis.leftover import whiteness
 from grounded.diagnosis.prediction_error import _stump
-from grounded.diagnosis.report import Estimate, Remainder
+from grounded.diagnosis.report import Estimate, Ranked, Remainder
 from grounded.diagnosis.verdict import meaning, sentence, verdict
 from grounded.effects import Library
 from grounded.models.pendulum import model as pendulum
@@ -249,6 +250,18 @@ def test_what_no_effect_explains_is_left_over():
     assert found.leftover or found.gap.after < 1.3
     if found.leftover:
         assert found.leftover[0].channel == "v"
+
+
+@pytest.mark.parametrize(("without", "said"), [(2.4, True), (40.0, False), (math.nan, False)])
+def test_what_calibration_makes_is_not_credited_to_the_effect(without, said):
+    effect = Library().effect("viscous_friction:omega", pendulum)
+    values = {q.name: Estimate(0.1, 0.0, (0.1, 0.1), q.unit) for q in effect.quantities}
+    row = Ranked(effect.name, values, {}, 50.0, claimed=True)
+    best = SimpleNamespace(hypothesis=SimpleNamespace(effects=(effect,)))
+    known = SimpleNamespace(no_cause=False)
+    claims = SimpleNamespace(known=known, blamed=(), names=(effect.name,), best=best)
+    found = verdict(claims, 50.0, 2.0, (row,), (), (), (), without)
+    assert ("calibration" in found.sentence) is said and found.kind == "effect"
 
 
 def test_leftovers_that_are_not_named_are_counted():
