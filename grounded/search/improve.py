@@ -46,6 +46,7 @@ from grounded.search.standing import (
     SearchOptions,
     Standing,
     Tried,
+    losers_of,
     standing,
 )
 from grounded.search.step_size import Step
@@ -216,11 +217,8 @@ def _improvement(make: _Maker, incumbent: Tried, options: SearchOptions) -> Prop
     already = simulate(real, theta).utility
     already = already if np.isfinite(already) else incumbent.utility
     least = options.tolerance * abs(already)
-    losers = {
-        (t.candidate.damping, t.candidate.alpha)
-        for t in make.now.history
-        if t.candidate.base == incumbent.candidate.id and t.candidate.model == make.fingerprint
-    }
+    lost = losers_of(make.now.history, incumbent.candidate.id, make.fingerprint)
+    losers = {(candidate.damping, candidate.alpha) for candidate in lost}
     unsafe: Proposal | None = None
     promised: list[float] = []
     directions: dict[float, Policy] = {}
@@ -253,10 +251,7 @@ def _ended(
     phase: Phase = "stopped"
     ending: Ending
     then: NextCommand | None = NextCommand("diagnose")
-    lost = sum(
-        t.accepted is False and t.candidate.base == own and t.candidate.model == make.fingerprint
-        for t in make.now.history
-    )
+    lost = len(losers_of(make.now.history, own, make.fingerprint))
     if promised and not finite:
         ending = "model diverges"
         sentence = (

@@ -334,6 +334,12 @@ def _awaited(now: Standing, options: SearchOptions, model: str) -> Standing | No
     return replace(now, phase="await-trial", outstanding=made, missing=missing, sentence=sentence)
 
 
+def losers_of(history: Sequence[Tried], base: str, model: str) -> list[Candidate]:
+    """The steps from a candidate, planned in this model, that did not improve on it."""
+    tried = [t for t in history if t.candidate.base == base and t.candidate.model == model]
+    return [t.candidate for t in tried if t.accepted is False]
+
+
 def _next_step(
     history: tuple[Tried, ...], incumbent: Tried, options: SearchOptions, model: str
 ) -> Step | None:
@@ -344,11 +350,7 @@ def _next_step(
     if base is not None and made.model == model and options.damps:
         real = incumbent.utility - base.utility
         step = after_success(Step(made.damping, made.alpha), made.predicted_gain, real)
-    losers = [
-        t.candidate
-        for t in history
-        if t.accepted is False and t.candidate.base == made.id and t.candidate.model == model
-    ]
+    losers = losers_of(history, made.id, model)
     return options.next_step(Step(losers[-1].damping, losers[-1].alpha)) if losers else step
 
 

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from grounded.errors import NextCommand
-    from grounded.search.standing import Tried
 
 WIDTH = 80  # columns of a terminal
 _WORD = re.compile(r"""(?:'[^']*'|"[^"]*"|\S)+""")  # of a command; what is quoted stays whole
@@ -94,8 +93,3 @@ def folded(command: str, lead: str = "next: ") -> str:
             lines.append("    ")
         lines[-1] += word + " "
     return "\n".join(line.rstrip() for line in lines)
-
-
-def verdict(tried: Tried, last: bool = True) -> str:
-    """See `Tried.verdict`."""
-    return tried.verdict(last)

@@ -29,7 +29,6 @@ from grounded_trials.wording import (
     folded,
     per_second,
     rendered,
-    verdict,
     with_unit,
     wrapped,
 )
@@ -142,7 +141,7 @@ def _candidate(tried: Tried, last: bool) -> tuple[str, ...]:
         figure(tried.utility),
         figure(error, 2),
         str(len(tried.trials)),
-        verdict(tried, last),
+        tried.verdict(last),
     )
 
 

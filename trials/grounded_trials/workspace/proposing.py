@@ -14,11 +14,8 @@ from grounded_trials.workspace.handover import Void, checked_candidate, outside_
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
 
-    from grounded.model import Model
     from grounded.search.improve import Proposal
     from grounded.search.standing import Candidate, Standing
-    from grounded.task import Task
-    from grounded.trial import Trial
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -126,7 +123,6 @@ def _proposal(workspace: Folder, without: Collection[str]) -> Proposal:
         workspace.config.search,
         identity=workspace.next_id(),
         planner=workspace.planner,
-        refit=refitted,
     )
 
 
@@ -173,9 +169,7 @@ def standing_in(
     task, options, planner = workspace.task, workspace.config.search, workspace.planner
     now = standing(task, contents.candidates, trials, options, model_fingerprint(planner.plan))
     if ahead and now.phase == "propose" and now.incumbent is not None:
-        return propose(
-            task, contents.candidates, trials, options, planner=planner, refit=refitted
-        ).standing
+        return propose(task, contents.candidates, trials, options, planner=planner).standing
     return now
 
 
@@ -214,11 +208,3 @@ def candidate_named(workspace: Folder, name: str) -> str:
     if best is None:
         raise GroundedError("there is no best candidate yet: no trial was ingested")
     return best.candidate.id
-
-
-def refitted(task: Task, trials: Sequence[Trial]) -> Model:
-    """The task's model with parameters fitted to all trials ([search] refit)."""
-    from grounded.fit import fit
-
-    usable = [t for t in trials if t.finite_steps == t.steps and t.steps > 2]
-    return fit(task, usable).model

@@ -10,7 +10,7 @@ import numpy as np
 from grounded.search.standing import Tried
 from grounded_trials.report.figures.figure import Band, Curve, Dot, Figure, Key, Panel, Rule
 from grounded_trials.report.findings import Findings, standard_error
-from grounded_trials.wording import figure, verdict
+from grounded_trials.wording import figure
 
 STEEP = 8.0  # worst over best utility from which on the axis is logarithmic
 NEAR = 4  # candidates from which on the better half has a panel of its own
@@ -86,7 +86,7 @@ def _near(whole: Panel) -> Panel:
 def _dots(findings: Findings, tried: Tried, at: int) -> list[Dot]:
     candidate = tried.candidate
     real = figure(tried.utility)
-    became = verdict(tried, tried is findings.history[-1])
+    became = tried.verdict(tried is findings.history[-1])
     note = (
         f"{candidate.id}, iteration {candidate.iteration}, α = {candidate.alpha:g}\n"
         f"utility {real}, predicted {figure(candidate.predicted_utility)}\n{became}"

@@ -22,7 +22,7 @@ from grounded_trials.report.findings import (
     tracking_error,
 )
 from grounded_trials.report.forecast import SECONDS, forecast_error
-from grounded_trials.wording import figure, shown, verdict, with_unit
+from grounded_trials.wording import figure, shown, with_unit
 from grounded_trials.workspace.next_step import Since
 
 WIDEST = 1e6  # an interval so many times its value, or so wide, says nothing
@@ -42,7 +42,7 @@ def candidate_table(findings: Findings) -> str:
             "predicted utility": figure(c.predicted_utility),
             "real utility": figure(tried.utility),
             "std. error": figure(standard_error(tried), 2),
-            "verdict ": verdict(tried, tried is findings.history[-1]),
+            "verdict ": tried.verdict(tried is findings.history[-1]),
             "trials ": " ".join(t.id for t in tried.trials) or "none",
         }
         rows.append(cells)
