@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import csv
 import re
+import warnings
 import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -46,12 +47,17 @@ def csv_records(path: Path) -> Iterator[Record]:
                 f"{path} begins with {head[:40].strip()!r}: its first row must name the columns, "
                 "one of them 't' (time in seconds)"
             )
+        _time_of(names, path)
         try:
-            values = np.loadtxt(stream, delimiter=mark, ndmin=2, usecols=range(len(names)))
+            with warnings.catch_warnings():  # a table without rows is found below
+                warnings.simplefilter("ignore")
+                values = np.loadtxt(stream, delimiter=mark, ndmin=2, usecols=range(len(names)))
         except ValueError:
             stream.seek(0)
             stream.readline()
             values = _with_holes(stream, mark, len(names), path)
+    if not values.size:
+        raise GroundedError(f"{path} has no rows below its first line")
     columns = {name: values[:, i] for i, name in enumerate(names) if name}
     yield from table_records({"/csv": columns}, "csv", path)
 
@@ -222,12 +228,7 @@ def _rows(channel: int, stamps: Any, columns: list[Floats]) -> Messages:
 
 def _times(columns: Columns, path: Path) -> tuple[str, Any]:
     """The column of times, and its values [ns]."""
-    name = next((name for name in columns if _is_time(name)), None)
-    if name is None:
-        raise GroundedError(
-            f"{path} has no column of times among {', '.join(list(columns)[:8])}: name one 't' "
-            "(seconds), or 't_us' or 't_ns' in their units"
-        )
+    name = _time_of(list(columns), path)
     unit = next((u for u in ("ns", "us", "ms") if name.lower().endswith("_" + u)), "")
     values = columns[name]
     finite = values[np.isfinite(values)]
@@ -239,6 +240,16 @@ def _times(columns: Columns, path: Path) -> tuple[str, Any]:
             f"{path}: '{name}' holds times that are not finite or not on a calendar"
         )
     return name, np.rint(values * UNITS[unit]).astype(np.int64)
+
+
+def _time_of(names: list[str], path: Path) -> str:
+    for name in names:
+        if _is_time(name):
+            return name
+    raise GroundedError(
+        f"{path} has no column of times among {', '.join(names[:8])}: name one 't' (seconds), or "
+        "'t_us' or 't_ns' in their units"
+    )
 
 
 def _is_time(name: str) -> bool:

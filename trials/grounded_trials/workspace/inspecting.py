@@ -70,7 +70,7 @@ def inspect_in(workspace: Folder, log: str | Path) -> Inspected:
 
     Args:
         workspace: whose model names the states and inputs; without one no table is guessed.
-        log: an MCAP file or a bag's folder.
+        log: a log of any format or a bag's folder.
 
     Raises:
         GroundedError: if the log can't be read at all.
