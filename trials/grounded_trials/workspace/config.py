@@ -205,6 +205,11 @@ def set_latency(file: Path, latency: Mapping[str, float]) -> None:
     _change(file, "task", {"latency": _inline(latency)})
 
 
+def set_horizon(file: Path, steps: int) -> None:
+    """Replaces [task] horizon."""
+    _change(file, "task", {"horizon": steps})
+
+
 def _change(file: Path, where: str, changes: Mapping[str, Any]) -> None:
     import tomlkit
 
