@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from grounded_cli.options import as_json, in_workspace, open_workspace
+from grounded.errors import NextCommand
+from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
 from grounded_cli.terminal import field, number, show, show_json
 from grounded_trials.wording import with_unit
 
@@ -67,7 +68,7 @@ def command(
     for name, (low, high) in ranges.items():
         text = with_unit(f"{number(low)} to {number(high)}", model.states[name])
         show(field(name, text, "  "))
-    show("\nnext: grounded propose")
+    show(f"\n{next_line(NextCommand('propose'))}")
 
 
 def _values(pairs: tuple[str, ...]) -> dict[str, float]:

@@ -275,6 +275,24 @@ def test_a_recorded_run_becomes_the_target(tmp_path):
     assert done["horizon"] == 20 and done["columns"] == {"x": [0.0, 2.0]}
 
 
+def test_logs_are_fitted_and_diagnosed_without_a_task(tmp_path):
+    """A model, a [log] table and a log: no target, no reward."""
+    log, w = car_bag(tmp_path / "bag"), tmp_path / "car"
+    grounded("init", w, "--from", log)
+    mapping = (w / "grounded.toml").read_text().partition("[log]")[2]
+    (w / "grounded.toml").write_text(
+        f'[model]\nfile = "model.py"\n[task]\ndt = 0.05\n[log]{mapping}'
+    )
+    (w / "target.csv").unlink()
+    assert grounded("-C", w, "ingest", "--data", log).code == 0
+    assert grounded("-C", w, "fit", "--json").json["params"]["L"]["value"] < 0.34
+    assert grounded("-C", w, "status").code == 0
+    refused = grounded("-C", w, "propose")
+    assert refused.code == 1 and "grounded -C" in refused.err and "target" in refused.err
+    assert grounded("-C", w, "target", "circle").code == 0
+    assert grounded("-C", w, "propose", "--json").json["candidate"] == "c0001"
+
+
 # the loop at the track
 
 

@@ -213,15 +213,19 @@ class Workspace(Folder):
         Args:
             columns: what each state is to do, (H + 1,) each, a row a control step; see `starting`.
         """
-        from grounded_trials.workspace.config import set_horizon
+        from grounded_trials.workspace.config import set_target
         from grounded_trials.workspace.task_file import write_target
 
         here = self._afresh()
-        path = here.folder / here.config.task.target
-        if path.exists():
+        name = here.config.task.target or "target.csv"
+        path = here.folder / name
+        if path.is_file():
             path.replace(path.with_name(path.name + ".bak"))
         write_target(path, here.config.task.dt, dict(columns))
-        set_horizon(here.config.file, len(next(iter(columns.values()))) - 1)
+        ranges = {state: float(values.max() - values.min()) for state, values in columns.items()}
+        weights = {state: round(max(size, 0.1) ** -2, 6) for state, size in ranges.items()}
+        steps = len(next(iter(columns.values()))) - 1
+        set_target(here.config.file, name, steps, weights)
         self.forget()
         return path
 
