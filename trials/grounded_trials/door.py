@@ -374,16 +374,22 @@ class Workspace(Folder):
     ) -> Exported:
         """Writes a candidate for other languages; refused as in `run`, an earlier task's is not.
 
+        A trial, or the run that a candidate predicts (form "bag"), is written to be looked at.
+
         Args:
-            candidate: c0003, or `best`.
+            candidate: c0003, `best`, or a trial, t0007.
             path: the file; None: named after the candidate, in the current folder.
-            form: csv, json or npz; None: as the file is named, else json.
+            form: csv, json or npz, of a run bag, csv or npz; None: as the file is named.
             runner: npz, and beside it the program that runs it on a robot with numpy alone.
             anyway: write it though it is void.
         """
         from grounded_trials.workspace.exporting import export_candidate
 
         file, here = Path(path) if path else None, self._afresh()
+        if form == "bag" or candidate.startswith("t"):
+            from grounded_trials.report.ros_bag import export_run
+
+            return export_run(here, candidate, form, file)
         return export_candidate(here, candidate, form, file, runner=runner, anyway=anyway)
 
     def verify(self) -> Verified:
