@@ -63,9 +63,8 @@ def test_a_candidates_prediction_and_the_joints_of_a_pendulum(tmp_path):
     folder = tmp_path / "p"
     grounded("init", folder, "--example", "pendulum")
     grounded("-C", folder, "propose")
-    assert (
-        grounded("-C", folder, "export", "c0001", "--format", "bag", "-o", tmp_path / "b").code == 0
-    )
+    words = ("c0001", "--format", "bag", "-o", tmp_path / "b")
+    assert grounded("-C", folder, "export", *words).code == 0
     with AnyReader([tmp_path / "b"]) as bag:
         joints = [
             bag.deserialize(raw, c.msgtype)
