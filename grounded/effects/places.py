@@ -94,12 +94,19 @@ def samples(model: Model, count: int = 3) -> tuple[Array, Array]:
     return x, rng.uniform(0.2, 1.0, (count, model.m))
 
 
+def probe(model: Model, dt: float) -> float:
+    """A step to look at a model with [s]: dt, or the nearest that its simulator can make."""
+    own = float(getattr(model.step, "timestep", 0.0))
+    return max(1, round(dt / own)) * own if own else dt
+
+
 def following(model: Model) -> list[str]:
     """States that follow an input by themselves: a steering angle, a motor's speed, a servo.
 
     Their rate depends on an input, on no state but themselves, and somewhere falls with them.
     """
-    f_x, f_u = model.system.linearise(*samples(model, 8), model.values, 1e-2)
+    dt = probe(model, 1e-2)
+    f_x, f_u = model.system.linearise(*samples(model, 8), model.values, dt)
     found = []
     for i, name in enumerate(model.state_names):
         driven = np.abs(f_u[:, i]).max() > 1e-6

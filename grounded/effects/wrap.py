@@ -3,6 +3,7 @@
 One control step of the wrapped model, for commands held over the step:
 
     u_eff  = effect(u, z, t)                      input and memory families
+    f      = f(s, u_eff - loss(s, f))             losses to a joint's friction, solved (`joint`)
     own    = (f(s, u_eff) - s) / dt               the model's own rate, its mean over the step
     s1     = f(s + dt/2 rate(s), u_eff)           half of an added rate before the step ...
     s+     = s1 + dt/2 rate(s1)                   ... and half after it (Strang): second order in dt
@@ -29,6 +30,7 @@ from grounded.compile.names import Named
 from grounded.effects.family import (
     Effect,
     InputFamily,
+    LossFamily,
     MemoryFamily,
     ParamFamily,
     RateFamily,
@@ -36,6 +38,7 @@ from grounded.effects.family import (
     SensorFamily,
     Values,
 )
+from grounded.effects.joint import inputs_left
 from grounded.effects.registry import partner
 from grounded.errors import GroundedError
 from grounded.frozen import Array
@@ -94,6 +97,7 @@ def wrap(effect: Effect, values: Mapping[str, float], dt: float) -> Model:
     added = {param_name(effect.name, q.name): _param(q, whole[q.name]) for q in effect.quantities}
     make = {
         InputFamily: _input_step,
+        LossFamily: _loss_step,
         MemoryFamily: _memory_step,
         RateFamily: _rate_step,
         SensorFamily: _sensor_step,
@@ -102,6 +106,7 @@ def wrap(effect: Effect, values: Mapping[str, float], dt: float) -> Model:
     for kind, build in make.items():
         if isinstance(family, kind):
             step, memory = build(effect, whole, dt)
+            vars(step)["timestep"] = getattr(model.step, "timestep", 0.0)
             break
     else:
         raise GroundedError(f"effect '{effect.name}': its family can't be adopted")
@@ -177,6 +182,22 @@ def _memory_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[s
         return {**base(_own_state(model, s), _replaced(model, a, u), p, dt), **kept}
 
     return step, {z: model.inputs[n] for n, memory in names.items() for z in memory}
+
+
+def _loss_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str, str]]:
+    """One more loss: solved together with those that the model has already."""
+    model = effect.site.model
+    inner, others = getattr(model.step, "losing", (model, ()))
+    base, effects = plain_step(inner), (*others, effect)
+
+    def step(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
+        start, given = _own_state(inner, s), _replaced(inner, a, {})
+        pairs = [(e, _quantities(e, p)) for e in effects]
+        left = inputs_left(pairs, start, given, dt, lambda u: base(start, u, p, dt))
+        return base(start, left, p, dt)
+
+    vars(step)["losing"] = (inner, effects)
+    return step, {}
 
 
 def _rate_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str, str]]:
