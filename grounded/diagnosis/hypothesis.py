@@ -29,7 +29,7 @@ from grounded.effects import (
     SensorFamily,
     acting_order,
 )
-from grounded.effects.family import coupled
+from grounded.effects.family import braked, coupled
 from grounded.effects.joint import Loads, loads, solved
 from grounded.effects.registry import partner
 from grounded.frozen import Array
@@ -285,6 +285,7 @@ class Predictor:
         total = np.zeros_like(x)
         for effect, values in rates:
             added = effect.family.rate(s, a, own, t, values, effect.site)
+            added = braked(effect, s, added, 0.5 * self.data.dt)
             for name, value in added.items():
                 total[..., names.index(name)] += value
         return total

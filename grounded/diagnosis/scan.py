@@ -253,6 +253,7 @@ class _Context:
                 continue
             scaled = gram / np.outer(size, size)
             value = -np.linalg.lstsq(scaled, score / size, rcond=1e-9)[0] / size
+            value = inside(effect, names, value)
             gain = -float(value @ score) - 0.5 * float(value @ gram @ value)
             looks.append((gain, {**grid, **dict(zip(names, value.tolist(), strict=True))}))
         if not looks:
@@ -262,6 +263,12 @@ class _Context:
 
 
 _EMPTY: Array = np.zeros(0)
+
+
+def inside(effect: Effect, names: Sequence[str], value: Array) -> Array:
+    """Values of linear quantities, kept in their bounds."""
+    bounds = {q.name: (q.low, q.high) for q in effect.free}
+    return np.array([np.clip(v, *bounds[name]) for name, v in zip(names, value, strict=True)])
 
 
 NEAR = 3.0  # nats within which another grid point is tried too

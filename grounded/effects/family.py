@@ -135,6 +135,17 @@ def coupled(site: Site) -> tuple[str, str]:
     return target, source
 
 
+def width(site: Site, speed: str) -> Quantity:
+    """Over which speed a dry friction builds up: a constant, a hundredth of the largest.
+
+    Data may make it up to three tenths: wider, it would be a viscous one under another name.
+    """
+    peak, unit = site.scales.peak(speed), site.unit(speed)
+    return Quantity(
+        "width", unit, (), 1e-3 * peak, 0.3 * peak, fixed=True, start=0.01 * peak, tunable=True
+    )
+
+
 def speed_limit(site: Site, unit: str) -> tuple[Quantity, ...]:
     """A speed r that is not exceeded: scanned from half the fastest that a step could show."""
     spread = site.scales.spread(site.target)
@@ -213,12 +224,14 @@ class RateFamily(Family):
         x+ = x + h (own + rate(x)),   own = (f(x, h) - x) / h,   h = dt / parts
 
     right where it limits a rate whose own time constant may be shorter than the step.
+    `brakes`: it opposes the motion of its target, which half a step of it never turns round.
     """
 
     rate: Callable[[Any, Any, Any, Any, Any, Site], Values] = lambda s, a, own, t, c, site: {}
     timed: bool = False
     needs_own: bool = False
     parts: int = 0
+    brakes: bool = False
 
 
 @dataclass(frozen=True)
@@ -291,6 +304,14 @@ class Effect:
         if missing:
             raise GroundedError(f"effect '{self.name}' needs a value for '{missing[0]}'")
         return MappingProxyType({name: whole[name] for name in names})
+
+
+def braked(effect: Effect, s: Any, added: Values, half: Any) -> Values:
+    """The rates that an effect adds, for a kick of `half` a step that turns no motion round."""
+    if not getattr(effect.family, "brakes", False):
+        return added
+    most = {n: np.abs(s[n]) / half for n in added}
+    return {n: np.minimum(np.maximum(rate, -most[n]), most[n]) for n, rate in added.items()}
 
 
 def scales_of(model: Model, states: Array, inputs: Array, dt: float, duration: float) -> Scales:

@@ -10,11 +10,15 @@ model but its step, be it NumPy, MuJoCo or any black box. Over a step of h
     B = d w / d tau   what a unit of tau, held over the step, adds to it
     w_end = w_free - B T                                                    T: mean over the step
 
-and T(w, w_end) is solved in closed form, as if all else were constant over the step. So a dry
-friction needs no smoothed sign: it slows a joint until it stands, holds it while the rest is less
-than c, and lets it go the other way for what is left of the step. It can't be too stiff for a step,
-and never turns a motion round by itself. Losses of several joints act on each other by B (k, k):
-a few sweeps of Gauss and Seidel.
+and w' = (w_free - w) / h - B T(w) / h is solved for this one speed, in a few implicit parts of the
+step, as if all else were constant over it. A dry friction slows a joint until it stands, holds it
+while the rest is less than c, and lets it go the other way for what is left of the step; it can't
+be too stiff for a step. It builds up over a width of speed, a hundredth of the largest or what data
+show, never so wide that it were a viscous one. Losses of several joints act on each other by B
+(k, k): a few sweeps of Gauss and Seidel.
+
+Where tau drives w alone through a constant inertia, the same friction is a Coulomb and a viscous
+one of w itself, an inertia a gain of its rate, and they go by those names (`renamed`).
 
 Pairs are found from the model: those where tau always pushes w the same way (a torque and its own
 joint's velocity; the inertia matrix is positive there, elsewhere it changes sign or brakes).
@@ -29,12 +33,14 @@ import numpy as np
 
 from grounded.compile.names import Named
 from grounded.effects import places
-from grounded.effects.family import Effect, LossFamily, Quantity, Site, coupled
+from grounded.effects.family import Effect, LossFamily, Quantity, Site, coupled, width
 from grounded.model import Model
 
 SWEEPS = 4
+PARTS = 6  # of a step
 NUDGE = 1e-2  # of the input's unit: the difference that B is taken over
 ALIKE = 0.999  # cosine from which two slopes are one
+ONLY = 2e-3  # of a speed's answer: what an input may do besides
 FORCES = ("N", "V", "A")  # what a unit of an effort begins with: N m, V ...
 
 Pairs = Sequence[tuple[Effect, Mapping[str, Any]]]
@@ -78,27 +84,32 @@ def solved(pairs: Pairs, at: Loads, dt: Any) -> list[Any]:
     return found
 
 
-def dry(w: Any, free: Any, gain: Any, c: Any, b: Any) -> Any:
-    """Mean of c sign(w) + b w over a step that would end at `free`, stuck where it stands."""
-    by = np.maximum(1 + 0.5 * gain * b, 0.1)
-    end = (free - 0.5 * gain * b * w) / by  # with the viscous part alone
-    least, forward = gain * c / by, np.where(w == 0, end >= 0, w > 0)
-    sign = np.where(forward, 1.0, -1.0)
-    pushed, speed = sign * (end - w), np.abs(w)
-    left = speed + pushed - least
-    rest = np.maximum(1 - speed / np.maximum(least - pushed, 1e-300), 0.0)  # of the step, at zero
-    back = rest * np.maximum(-pushed - least, 0.0)
-    last = sign * np.where(left >= 0, left, -back)
-    held = np.minimum(np.maximum((end - last) * by / gain, -c), c)
-    return b * 0.5 * (w + last) + held
+def dry(w: Any, free: Any, gain: Any, c: Any, b: Any, width: Any) -> Any:
+    """Mean of c clip(w / width, -1, 1) + b w over a step that would end at `free`.
+
+    By the implicit Euler method for the one, the trapezoidal rule for the other: in each part the
+    end is known in closed form.
+    """
+    part = gain / PARTS
+    push, by = (free - w) / PARTS, np.maximum(1 + 0.5 * part * b, 0.1)
+    g = part * c / by
+    total: Any = 0.0
+    for _ in range(PARTS):
+        end = (w + push - 0.5 * part * b * w) / by
+        slow, fast = end / (1 + g / width), np.maximum(np.abs(end) - g, 0.0)
+        last = np.where(np.abs(slow) < width, slow, np.where(end > 0, fast, -fast))
+        dry = np.minimum(np.maximum(last / width, -1.0), 1.0)
+        total = total + c * dry + 0.5 * b * (w + last)
+        w = last
+    return total / PARTS
 
 
 def _friction(site: Site) -> tuple[Quantity, ...]:
     tau, w = coupled(site)
     unit, most = site.unit(tau), _strongest(site)
     by = f"{unit} s/{site.unit(w).removesuffix('/s')}"
-    viscous = Quantity("b", by, fixed=has_viscous(site.model, tau, w))
-    return (Quantity("c", unit, low=0.0, high=most), viscous)
+    viscous = Quantity("b", by, low=0.0, fixed=has_viscous(site.model, tau, w))
+    return (Quantity("c", unit, low=0.0, high=most), viscous, width(site, w))
 
 
 def _per_acceleration(site: Site) -> str:
@@ -156,13 +167,34 @@ def _inertia(w: Any, free: Any, gain: Any, u: Any, c: Any, dt: Any) -> Any:
 
 def _load(w: Any, free: Any, gain: Any, u: Any, c: Any, dt: Any) -> Any:
     carried = np.abs(u - 0.5 * (free - w) / gain)  # the mean of what drives and what resists
-    return dry(w, free, gain, c["c"] + c["k"] * carried, c["b"])
+    return dry(w, free, gain, c["c"] + c["k"] * carried, c["b"], c["width"])
 
 
 def _loaded(site: Site) -> tuple[Quantity, ...]:
-    constant, viscous = _friction(site)
+    constant, viscous, constant_width = _friction(site)
     share = tuple(float(k) for k in np.geomspace(0.02, 0.6, 6))
-    return (constant, viscous, Quantity("k", "1", share, 0.02, 0.9, places=4))
+    k = Quantity("k", "1", share, 0.02, 0.9, places=4)
+    return (constant, viscous, k, constant_width)
+
+
+def alone(model: Model, tau: str, w: str) -> bool:
+    """Whether tau moves nothing but w, and always as much: through a constant inertia."""
+    dt, (x, u) = places.probe(model, 1e-5), places.samples(model, 8)
+    _, f_u = model.system.linearise(x, u, model.values, dt)
+    by, i = f_u[:, :, model.input_names.index(tau)], model.state_names.index(w)
+    others = np.abs(np.delete(by, i, axis=1)).max(initial=0.0)
+    return bool(others < ONLY * by[0, i] and np.ptp(by[:, i]) < ONLY * by[0, i])
+
+
+def renamed(model: Model) -> dict[str, str]:
+    """Names that a joint has already where its inertia is constant: {dropped: kept}."""
+    found: dict[str, str] = {}
+    for pair in pairs_of(model):
+        tau, _, w = pair.partition("<-")
+        if alone(model, tau, w):
+            found |= {f"joint_friction:{pair}": f"coulomb_friction:{w}"}
+            found |= {f"added_inertia:{pair}": f"rate_gain:{w}"}
+    return found
 
 
 joint_friction = LossFamily(
@@ -172,8 +204,8 @@ joint_friction = LossFamily(
     targets=pairs_of,
     quantities=_friction,
     lookalikes=("coulomb_friction", "viscous_friction", "dead_zone", "stiction", "parameter"),
-    loss=lambda w, free, gain, u, c, dt: dry(w, free, gain, c["c"], c["b"]),
-    torque=lambda w, rate, u, c: c["c"] * np.tanh(w / 1e-3) + c["b"] * w,
+    loss=lambda w, free, gain, u, c, dt: dry(w, free, gain, c["c"], c["b"], c["width"]),
+    torque=lambda w, rate, u, c: c["c"] * np.tanh(w / c["width"]) + c["b"] * w,
 )
 
 load_friction = LossFamily(
@@ -185,7 +217,9 @@ load_friction = LossFamily(
     quantities=_loaded,
     lookalikes=("joint_friction", "coulomb_friction", "viscous_friction", "input_gain"),
     loss=_load,
-    torque=lambda w, rate, u, c: (c["c"] + c["k"] * np.abs(u)) * np.tanh(w / 1e-3) + c["b"] * w,
+    torque=lambda w, rate, u, c: (
+        (c["c"] + c["k"] * np.abs(u)) * np.tanh(w / c["width"]) + c["b"] * w
+    ),
 )
 
 added_inertia = LossFamily(

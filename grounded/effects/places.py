@@ -56,6 +56,27 @@ def speed(model: Model) -> str | None:
     return next(iter(named), None)
 
 
+def speed_input(model: Model) -> str | None:
+    """The speed where it is commanded: an input that is called one."""
+    return next((n for n in SPEEDS if n in model.input_names and model.inputs[n] == "m/s"), None)
+
+
+def steering(model: Model) -> list[str]:
+    """What turns the heading: a steering angle among the states, or the inputs that do it at once.
+
+    The speed turns it too, but only together with these.
+    """
+    turned = heading(model)
+    if turned is None:
+        return []
+    i, dt = model.state_names.index(turned), probe(model, 1e-5)
+    f_x, f_u = model.system.linearise(*samples(model, 8), model.values, dt)
+    size = {n: float(np.abs(f_x[:, i, j]).max()) for j, n in enumerate(model.state_names)}
+    size |= {n: float(np.abs(f_u[:, i, j]).max()) for j, n in enumerate(model.input_names)}
+    no = {*position(model), turned, speed(model), speed_input(model), *role(model, "heading_rate")}
+    return [n for n, by in size.items() if n not in no and by > 1e-3 * dt]
+
+
 def velocities(model: Model) -> list[str]:
     """States whose unit is per second: velocities, linear or angular."""
     return [n for n, u in model.states.items() if u.endswith("/s") or u.endswith("/ s")]

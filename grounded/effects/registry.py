@@ -117,7 +117,8 @@ class Library:
         """Every effect that can apply to a model, in the library's order."""
         found, offered = [], [family.name for family in self.families]
         idle, outright = derived_states(model), outright_states(model)
-        integrals, same = integrated_states(model), aliases(model, idle | outright)
+        integrals = integrated_states(model)
+        same = aliases(model, idle | outright) | joint.renamed(model)
         for family in self.families:
             for target in family.targets(model):
                 driven = target.partition("<-")

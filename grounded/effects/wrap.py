@@ -37,6 +37,7 @@ from grounded.effects.family import (
     SensorDelayFamily,
     SensorFamily,
     Values,
+    braked,
 )
 from grounded.effects.joint import inputs_left
 from grounded.effects.registry import partner
@@ -226,17 +227,17 @@ def _joint_step(model: Model, effects: tuple[Effect, ...]) -> Step:
         start, now = _own_state(model, s), {z: s[z] for z in clocks}
         then = {z: s[z] + dt for z in clocks}
         own = _mean_rate(start, base(start, a, p, dt), dt) if needs_own else {}
-        state = _kicked(start, _added(rates, start, a, own, now, p), dt)
+        state = _kicked(start, _added(rates, start, a, own, now, p, dt), dt)
         after, own = _through(limits, base, state, a, p, dt, now)  # the mean over the very step
-        final = _kicked(after, _added(rates, after, a, own, then, p), dt)
+        final = _kicked(after, _added(rates, after, a, own, then, p, dt), dt)
         result = dict(final)
         for n, k in tied.items():  # a carried heading rate is the heading's rate, effects and all
             first, last = instant(start, a, p, dt), instant(final, a, p, dt)
             if not rates:
                 result[k] = s[k] + last[n] - first[n]
                 continue
-            before = _added(rates, start, a, first, now, p).get(n, 0.0)
-            later = _added(rates, final, a, last, then, p).get(n, 0.0)
+            before = _added(rates, start, a, first, now, p, dt).get(n, 0.0)
+            later = _added(rates, final, a, last, then, p, dt).get(n, 0.0)
             result[k] = s[k] + (last[n] - first[n]) + later - before
         return {**result, **then}
 
@@ -268,13 +269,14 @@ def _mean_rate(s: Named, ahead: Mapping[str, Any], dt: Any) -> dict[str, Any]:
 
 
 def _added(
-    effects: Sequence[Effect], s: Named, a: Any, own: Any, clock: Mapping[str, Any], p: Any
+    effects: Sequence[Effect], s: Named, a: Any, own: Any, clock: Mapping[str, Any], p: Any, dt: Any
 ) -> dict[str, Any]:
     """Sum of the effects' rates at one moment, by state."""
     total: dict[str, Any] = {}
     for e in effects:
         t = clock.get(_clock(e), 0.0)
-        for n, rate in _family(e).rate(s, a, own, t, _quantities(e, p), e.site).items():
+        added = _family(e).rate(s, a, own, t, _quantities(e, p), e.site)
+        for n, rate in braked(e, s, added, 0.5 * dt).items():
             total[n] = total[n] + rate if n in total else rate
     return total
 
@@ -291,7 +293,7 @@ def _through(
     for part in range(parts):
         ahead = base(final, a, p, h)
         own = _mean_rate(final, ahead, h)
-        added = _added(limits, final, a, own, {z: t + part * h for z, t in now.items()}, p)
+        added = _added(limits, final, a, own, {z: t + part * h for z, t in now.items()}, p, h)
         values = [ahead[n] + h * added[n] if n in added else ahead[n] for n in s]
         final = Named("state", tuple(s), values)
         mean = {n: mean[n] + own[n] / parts for n in s}
