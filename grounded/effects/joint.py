@@ -36,8 +36,8 @@ from grounded.effects import places
 from grounded.effects.family import Effect, LossFamily, Quantity, Site, coupled, width
 from grounded.model import Model
 
-SWEEPS = 4
-PARTS = 6  # of a step
+SWEEPS = 3
+PARTS = 4  # of a step
 NUDGE = 1e-2  # of the input's unit: the difference that B is taken over
 ALIKE = 0.999  # cosine from which two slopes are one
 ONLY = 2e-3  # of a speed's answer: what an input may do besides
