@@ -1,4 +1,4 @@
-"""What a motion takes off the input that drives it: closed forms, wrapping, MuJoCo's own friction."""
+"""What a motion takes off the input that drives it: in small steps, wrapped, and in MuJoCo."""
 
 from dataclasses import replace
 from typing import Any
@@ -61,7 +61,7 @@ def rates(x, u, c, J):
 
 
 def real_trials(count=3, steps=100, c=(0.0, 0.0), J=(0.0, 0.0)):
-    """The arm with friction in its joints, by the midpoint rule in 40 parts of a step, and noise."""
+    """The arm with friction in its joints, by the midpoint rule in 40 parts of a step; noise."""
     rng, found, h = np.random.default_rng(1), [], DT / 40
     for _ in range(count):
         t, w = DT * np.arange(steps), rng.uniform(2, 7, 4)

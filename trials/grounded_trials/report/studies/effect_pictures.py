@@ -3,9 +3,9 @@
 Made by `python -m grounded_trials.report.studies.effect_pictures docs`.
 
 A car (for a joint's effects a pendulum) is driven by the same commands in the model (grey) and in
-the model with one effect (orange); shown is the state that the effect changes most, in units of its own range: one that moves fast
-(speed, steering angle, heading rate) where it changes those, else a position. Strengths are chosen
-so that the change is seen: about a quarter of the range.
+the model with one effect (orange); shown is the state that the effect changes most, in units of its
+own range: one that moves fast (speed, steering angle, heading rate) where it changes those, else a
+position. Strengths are chosen so that the change is seen: about a quarter of the range.
 """
 
 from __future__ import annotations
