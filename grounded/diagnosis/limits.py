@@ -15,6 +15,7 @@ from grounded.diagnosis.data import Data
 from grounded.effects import (
     Effect,
     InputFamily,
+    LossFamily,
     MemoryFamily,
     RateFamily,
     SensorDelayFamily,
@@ -100,7 +101,7 @@ def knowable(data: Data, effects: Sequence[Effect]) -> tuple[Effect, ...]:
             continue
         if isinstance(family, InputFamily | MemoryFamily) and targets & still:
             continue
-        if isinstance(family, RateFamily) and targets & unmoved:
+        if isinstance(family, RateFamily | LossFamily) and targets & unmoved:
             continue
         if isinstance(family, SensorFamily | SensorDelayFamily) and targets & (dead | unmoved):
             continue
