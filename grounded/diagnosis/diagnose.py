@@ -14,7 +14,7 @@ excitation        what to run next, where two explanations tie
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -31,9 +31,9 @@ from grounded.diagnosis.held_out import (
     utility_prediction,
     whole_runs,
 )
-from grounded.diagnosis.hypothesis import Hypothesis
+from grounded.diagnosis.hypothesis import Hypothesis, Predictor, param_scale
 from grounded.diagnosis.leftover import Leftover, leftovers, whiteness
-from grounded.diagnosis.limits import Limits, knowable, limits
+from grounded.diagnosis.limits import Limits, held, identifiable, knowable, limits
 from grounded.diagnosis.prediction_error import (
     Horizon,
     by_region,
@@ -48,6 +48,7 @@ from grounded.diagnosis.report import (
     ChannelShare,
     Diagnosis,
     Gap,
+    Identifiable,
     NoiseLevels,
     Remainder,
     RunChange,
@@ -108,7 +109,12 @@ def diagnose(
     data = prepare(model, trials, latency, past, options.hidden)
     known = limits(data)
     tick("candidates")
-    offered = options.library.candidates(model, data.scales)
+    uncertain = Predictor(data)
+    with np.errstate(all="ignore"):
+        search = HypothesisSearch(data, ())
+        first = search.refined([search.fresh(Hypothesis())], FIRST_LOOK)
+        data = replace(data, model=held(uncertain, first[0])) if first else data
+    offered = options.library.candidates(data.model, data.scales)
     candidates = knowable(data, [e for e in offered if e.name not in options.but])
     search, best = attribute(data, candidates, max_effects=options.max_effects, tick=tick)
     tick("leftover")
@@ -118,7 +124,18 @@ def diagnose(
         left = leftovers(search.predictor, best)
         task = subject if isinstance(subject, Task) else None
         used = [trial for trial in trials if trial.known_steps >= 2]
-        return _Writer(search, best, left, known, options, tick, task, used).diagnosis()
+        found = _Writer(search, best, left, known, options, tick, task, used).diagnosis()
+        return replace(found, identifiable=tuple(_identified(uncertain, best)))
+
+
+FIRST_LOOK = 6  # iterations of the fit by whose noise the parameters are found identifiable
+
+
+def _identified(uncertain: Predictor, best: Fitted) -> list[Identifiable]:
+    """Of all uncertain parameters, those that were held too, beside the best hypothesis."""
+    if not param_scale(uncertain.data.model).any():
+        return []
+    return identifiable(uncertain, best)
 
 
 class _Writer:

@@ -208,6 +208,19 @@ class Remainder(Document):
 
 
 @dataclass(frozen=True, eq=False)
+class Identifiable(Document):
+    """How well the trials tell one uncertain parameter, all others free.
+
+    left: of its prior standard deviation `prior`, 0 to 1.
+    """
+
+    parameter: str
+    verdict: str  # identifiable, weak, not identifiable
+    prior: float = math.nan
+    left: float = math.nan
+
+
+@dataclass(frozen=True, eq=False)
 class NoiseLevels(Document):
     """The noise as it was estimated: a standard deviation for each state."""
 
@@ -253,6 +266,7 @@ class Diagnosis(Document):
     unknowable: tuple[str, ...] = ()  # what the trials are too few or too quiet for
     noise: NoiseLevels = field(default_factory=NoiseLevels)
     parameters: Mapping[str, Estimate] = field(default_factory=dict)  # calibrated beside effects
+    identifiable: tuple[Identifiable, ...] = ()  # each uncertain parameter
     trials: int = 0
     steps: int = 0
     candidates: int = 0
@@ -292,6 +306,12 @@ class Diagnosis(Document):
         """An effect's quantities, fixed ones included; none where it was not weighed."""
         row = self.ranked(effect)
         return {} if row is None else row.values
+
+    @property
+    def known_parameters(self) -> dict[str, Estimate]:
+        """The calibrated parameters that the trials identify: what may be adopted."""
+        lost = {i.parameter for i in self.identifiable if i.verdict == "not identifiable"}
+        return {name: e for name, e in self.parameters.items() if name not in lost}
 
     def open(self, adopted: Iterable[Mapping[str, Any]]) -> tuple[str, ...]:
         """The claimed effects that the model with these adopted ones lacks as it did then."""

@@ -215,7 +215,7 @@ def test_sentences_are_english():
     model = Model(
         states={"x": "m", "v": "m/s", "w": "1"},
         inputs={"steering": "1", "throttle": "1", "u": "N"},
-        params={"k": Param(1.0, "1/s")},
+        params={"k": Param(1.0, "1/s", std=0.3)},
         roles={"position": ("x",), "speed": "v"},
         derivative=lambda s, a, p: {"x": s.v, "v": a.throttle + a.u, "w": p.k * a.steering},
     )

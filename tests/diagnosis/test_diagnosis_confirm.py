@@ -23,7 +23,7 @@ def axis(wave, trials=2, steps=500, seed=0):
     model = Model(
         states={"x": "m", "v": "m/s"},
         inputs={"u": "m/s^2"},
-        params={"k": Param(1.0, "1")},
+        params={"k": Param(1.0, "1", std=0.3)},
         roles={"position": ("x",), "speed": "v"},
         derivative=lambda s, a, p: {"x": s.v, "v": p.k * a.u},
         name="axis",

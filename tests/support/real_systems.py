@@ -92,7 +92,7 @@ model = Model(
     name="emps",
     states={"q": "m", "v": "m/s"},
     inputs={"u": "V"},
-    params={"M": Param(95.109, "kg"), "g": Param(35.1507, "N/V")},
+    params={"M": Param(95.109, "kg", std=5.0), "g": Param(35.1507, "N/V")},
     derivative=lambda s, a, p: {"q": s.v, "v": p.g * a.u / p.M},
     roles={"position": ("q",), "speed": "v"},
 )
@@ -108,7 +108,7 @@ model = Model(
     name="servo",
     states={"position": "1"},
     inputs={"command": "1"},
-    params={"tau": Param(0.02, "s")},
+    params={"tau": Param(0.02, "s", 0.005, 0.2)},
     derivative=lambda s, a, p: {"position": (a.command - s.position) / p.tau},
 )
 """,
@@ -123,7 +123,7 @@ model = Model(
     name="heading rate",
     states={"w": "rad/s"},
     inputs={"steering": "1", "speed": "m/s"},
-    params={"k": Param(2.214, "rad/m")},
+    params={"k": Param(2.214, "rad/m", 1.0, 5.0)},
     step=lambda s, a, p, dt: {"w": p.k * a.speed * a.steering + 0 * s.w},
 )
 """,
@@ -138,7 +138,7 @@ model = Model(
     name="motor",
     states={"v": "m/s"},
     inputs={"throttle": "1"},
-    params={"a": Param(17.0, "m/s^2"), "tau": Param(0.8, "s")},
+    params={"a": Param(17.0, "m/s^2", 5.0, 50.0), "tau": Param(0.8, "s", 0.2, 3.0)},
     derivative=lambda s, a, p: {"v": p.a * a.throttle - s.v / p.tau},
     roles={"speed": "v"},
 )
