@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from grounded.diagnosis import filter as kalman
-from grounded.diagnosis.data import Data
+from grounded.diagnosis.data import PIECES, Data
 from grounded.diagnosis.fitted import Fitted, calibrated
 from grounded.diagnosis.hypothesis import Predictor
 from grounded.diagnosis.leftover import filter_of
@@ -45,8 +45,8 @@ class Limits:
 def limits(data: Data) -> Limits:
     """What the trials are too few or too quiet for."""
     found, no_cause = [], False
-    if data.count < 2:
-        found.append("one trial alone confirms nothing; run a second one")
+    if data.count < 2 and len(data.valid) < PIECES:
+        found.append("one trial alone confirms nothing; run a second one, or a longer one")
         no_cause = True
     if data.steps < FEW_STEPS:
         found.append(

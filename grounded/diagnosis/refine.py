@@ -132,7 +132,7 @@ def _room(data: Data, h: Hypothesis, k: int, size: int) -> tuple[Array, Array]:
         which = calibrated(data)
         shift = np.zeros(data.model.system.k) if h.shift is None else h.shift
         lowest, highest = _bounds(data)
-        at, unit = data.model.values + shift, param_scale(data.model)
+        at, unit = data.model.values + shift, np.maximum(param_scale(data.model), 1e-300)
         low[k:] = np.minimum((lowest - at) / unit, 0.0)[which]
         high[k:] = np.maximum((highest - at) / unit, 0.0)[which]
     return low, high
