@@ -40,8 +40,8 @@ from grounded.model import Model
 class Hypothesis:
     """Effects with their values, and shifts of the model's parameters (k,) with a prior.
 
-    `spread` is the prior standard deviation of every shift in units of `param_scale`; 0: the
-    parameters are taken as they are.
+    `spread` is the prior standard deviation of every shift in units of `param_scale`, the user's
+    own; 0: the parameters are taken as they are.
     """
 
     effects: tuple[Effect, ...] = ()
@@ -95,14 +95,8 @@ class Hypothesis:
 
 
 def param_scale(model: Model) -> Array:
-    """What a relative error of 1 means for each parameter (k,): its size, or its range if zero."""
-    found = []
-    for param in model.params.values():
-        size = abs(param.value)
-        if size == 0 and param.low is not None and param.high is not None:
-            size = 0.5 * (param.high - param.low)
-        found.append(size)
-    return np.array(found, float)
+    """Prior standard deviation of each parameter (k,): 0 of a constant."""
+    return np.array([param.spread for param in model.params.values()], float)
 
 
 @dataclass(frozen=True, eq=False)

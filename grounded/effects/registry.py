@@ -44,7 +44,7 @@ parameter = ParamFamily(
     name="parameter",
     equation="p = nominal + d",
     sentence="the parameter {target} is off by {d}",
-    targets=lambda model: model.param_names,
+    targets=lambda model: model.uncertain,
     quantities=_shift,
     lookalikes=("input_gain", "rate_gain", "viscous_friction", "first_order_lag"),
 )
@@ -248,6 +248,8 @@ def _free(model: Model, name: str) -> bool:
     if family != "parameter":
         return True
     param = model.params[target]
+    if not param.uncertain:
+        return False
     low, high = _bounds(param)
     ends = (0.5 * param.value, 2 * param.value) if param.value else (-0.05, 0.05)
     return bool(low <= min(ends) and high >= max(ends))

@@ -128,12 +128,16 @@ def param_name(effect: str, quantity: str) -> str:
     return f"{family}_{targets.replace('+', '_').replace('<-', '_from_')}_{quantity}"
 
 
+SURE = 0.5  # of its value: prior standard deviation of an adopted effect's quantity
+
+
 def _param(quantity: Any, value: float) -> Param:
     low = None if not np.isfinite(quantity.low) else min(float(quantity.low), value)
     high = None if not np.isfinite(quantity.high) else max(float(quantity.high), value)
     if quantity.fixed:
         low = high = value
-    return Param(value, quantity.unit, low, high)
+    sure = None if quantity.fixed else SURE * abs(value) or None
+    return Param(value, quantity.unit, low, high, sure)
 
 
 def _quantities(effect: Effect, p: Any) -> dict[str, Any]:
