@@ -5,9 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from grounded.diagnosis import filter as kalman
-from grounded.diagnosis import kernels
-from grounded.diagnosis.filter import innovations, smoother, transition
 from grounded.diagnosis.noise import (
     NoiseModel,
     Structure,
@@ -16,6 +13,9 @@ from grounded.diagnosis.noise import (
     likelihood_slopes,
     working,
 )
+from grounded.filter import kalman, kernels
+from grounded.filter.augmented import coloured
+from grounded.filter.kalman import innovations, smoother
 
 L, B = 150, 2
 CASES = [
@@ -36,7 +36,7 @@ class Problem:
         if through:
             self.G = np.tile(np.eye(n), (L, B, 1, 1))
             self.G[:, :, n - 1, : n - 1] = 3 * rng.standard_normal((L, B, n - 1))
-        self.A = transition(F, phi, self.G)
+        self.A = coloured(F, phi, self.G)
         self.N = self.A.shape[-1]
         self.seen = np.ones((L + 1, B, n))
         if missing:
@@ -48,10 +48,9 @@ class Problem:
         self.v = 0.1 * np.exp(rng.standard_normal(n))
 
     def passes(self, q, v):
-        R = np.tile(v, (L + 1, 1, 1))
-        R[0] = self.v  # the start is given
-        start = np.ones((B, self.N - self.n))
-        g = kalman.gains(self.A, q, R, self.seen, start, self.G)
+        start = np.ones((B, self.N))
+        start[:, : self.n] = self.v  # the start is given
+        g = kalman.gains(kalman.LinearSystem(self.A, q, v, self.seen, start, self.G))
         white, track = innovations(g, self.d, self.r, track=True)
         return g, white, track, smoother(g, white[..., 0])
 
@@ -65,7 +64,7 @@ def test_smoother_gives_the_slope_of_the_likelihood_after_many_steps(case, monke
     problem = Problem(*case)
     for compiled in (True, False):
         if not compiled:
-            monkeypatch.setattr(kernels, "available", lambda n: False)
+            monkeypatch.setattr(kernels, "available", lambda n, N: False)
         back = problem.passes(problem.q, problem.v)[3]
         of_q = 0.5 * (problem.q * (back.r**2 - back.N)).sum(axis=(0, 1))
         of_v = 0.5 * (problem.v * (back.u**2 - back.D)).sum(axis=(0, 1))
@@ -83,9 +82,9 @@ def test_smoother_gives_the_slope_of_the_likelihood_after_many_steps(case, monke
 def test_kernels_and_numpy_agree(case, monkeypatch):
     problem = Problem(*case)
     fast = problem.passes(problem.q, problem.v)
-    monkeypatch.setattr(kernels, "available", lambda n: False)
+    monkeypatch.setattr(kernels, "available", lambda n, N: False)
     slow = problem.passes(problem.q, problem.v)
-    for name in ("K", "whiten", "logdet"):
+    for name in ("k", "weight", "logdet"):
         assert np.allclose(getattr(fast[0], name), getattr(slow[0], name), rtol=1e-9, atol=1e-11)
     for one, other in zip(fast[1:3], slow[1:3], strict=True):
         assert np.allclose(one, other, rtol=1e-9, atol=1e-9)
