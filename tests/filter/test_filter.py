@@ -177,3 +177,47 @@ def test_kernels_that_another_version_of_us_wrote_are_not_used(monkeypatch):
     before = version()
     monkeypatch.setattr(Path, "read_bytes", lambda p: read(p) + b"#" * (p.name == "kernels.py"))
     assert version() != before
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_the_covariance_of_an_unstable_plant_stays_symmetric_and_settles(compiled, monkeypatch):
+    from scipy.linalg import solve_discrete_are
+
+    if not compiled:
+        monkeypatch.setattr(kernels, "available", lambda n, N: False)
+    T, A = 400, np.array([[1.34, 0.3, 0.0], [0.02, 0.9, 0.4], [0.1, 0.0, 1.2]])
+    Q, R, H = np.array([1e-6, 1e-4, 1e-5]), np.array([1e-3, 1e-4]), np.eye(2, 3)
+    one = kalman.LinearSystem(
+        np.tile(A, (T, 1, 1, 1)), Q, R, np.ones((T + 1, 1, 2)), np.full((1, 3), 1e4), None,
+        np.tile(H, (T, 1, 1, 1)),
+    )  # fmt: skip
+    for system in (one, one._replace(H=None)):  # the same measurement, told or understood
+        g = kalman.gains(system, covariances=True)
+        assert np.array_equal(g.P, g.P.swapaxes(-1, -2))
+        exact = solve_discrete_are(A.T, H.T, np.diag(Q), np.diag(R))
+        assert np.allclose(g.P[-1, 0], exact, rtol=1e-8)
+        back = smoother(g, np.ones((T, 1, 2)), covariances=True)
+        assert np.isfinite(back.whole).all() and np.abs(back.N).max() < 1e9
+
+
+@pytest.mark.parametrize("width", [1, 5, 11])
+def test_channels_may_measure_any_mixture_of_states(width, monkeypatch):
+    rng, n, N = np.random.default_rng(width), 3, 4
+    A = np.eye(N) + 0.1 * rng.standard_normal((L, width, N, N))
+    seen = (rng.random((L + 1, width, n)) > 0.2).astype(float)
+    H = rng.standard_normal((L, width, n, N))
+    system = kalman.LinearSystem(
+        A, 0.1, np.exp(rng.standard_normal(n)), seen, np.ones((width, N)), H=H
+    )
+    d, r = rng.standard_normal((L, width, N, 2)), rng.standard_normal((L + 1, width, n, 2))
+    found = []
+    for compiled in (True, False):
+        if not compiled:
+            monkeypatch.setattr(kernels, "available", lambda n, N: False)
+        g = kalman.gains(system, covariances=True)
+        white, track = innovations(g, d, r, track=True)
+        found.append(
+            [g.P, g.k, white, track, *vars(smoother(g, white[..., 0], covariances=True)).values()]
+        )
+    for one, other in zip(*found, strict=True):
+        assert np.allclose(one, other, rtol=1e-7, atol=1e-8 * np.abs(other).max())
