@@ -16,6 +16,7 @@ from grounded.diagnosis.noise import (
 from grounded.filter import kalman, kernels
 from grounded.filter.augmented import coloured
 from grounded.filter.kalman import innovations, smoother
+from grounded.filter.tempering import tempering
 
 L, B = 150, 2
 CASES = [
@@ -221,3 +222,16 @@ def test_channels_may_measure_any_mixture_of_states(width, monkeypatch):
         )
     for one, other in zip(*found, strict=True):
         assert np.allclose(one, other, rtol=1e-7, atol=1e-8 * np.abs(other).max())
+
+
+def test_nats_of_correlated_innovations_are_worth_as_many_as_are_news():
+    rng, T = np.random.default_rng(5), 4000
+    white, seen = rng.standard_normal((T, 2, 2)), np.ones((T, 2, 2))
+    assert tempering(white, seen).factor > 0.9
+    coloured_ = white.copy()
+    for t in range(1, T):
+        coloured_[t] = 0.8 * coloured_[t - 1] + 0.6 * white[t]
+    assert tempering(coloured_, seen).factor == pytest.approx(0.2 / 1.8, rel=0.25)
+    assert tempering(3 * white, seen).factor == pytest.approx(1 / 9, rel=0.1)
+    seen[: T // 2, :, 0] = 0.0
+    assert tempering(np.where(seen > 0, coloured_, 99.0), seen).factor < 0.2
