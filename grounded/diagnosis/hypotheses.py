@@ -1,6 +1,8 @@
 """Which hypotheses an attribution has fitted so far, their evidence, the best of them.
 
-    evidence(h) = log p(y | h) - what naming its effects costs - what the noise structure costs
+    evidence(h) = b log p(y | h) - what naming its effects costs - what the noise structure costs
+
+with one b for all, 1 where the likeliest leaves white noise (`grounded.filter.tempering`).
 
 What naming an effect costs, the price of its numbers, of looking for it, of where it might be:
 
@@ -23,6 +25,7 @@ from grounded.diagnosis.fitted import Fitted
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor, rates_of
 from grounded.diagnosis.noise import Structure
 from grounded.effects import Effect, ParamFamily
+from grounded.filter.tempering import Tempering, tempering
 
 CLAIM = 3.0  # nats from which an effect is claimed
 TIE = 3.0  # nats within which two explanations are not told apart
@@ -36,6 +39,7 @@ class FittedHypotheses:
         self.candidates = tuple(candidates)
         self.N = max(data.steps, 2)
         self._cancelling: dict[object, bool] = {}
+        self.tempering = Tempering()
         self._prices: dict[tuple[object, ...], float] = {}
         self.fits: dict[tuple[Structure, float, tuple[str, ...]], Fitted] = {}
         families = [e.family.name for e in candidates]
@@ -57,7 +61,12 @@ class FittedHypotheses:
         paid = sum(self.price(e, v) for e, v in h.pairs)
         extra = fit.noise.structure.numbers(self.data.model.n)
         calibration = 1.0 if h.spread > 0 else 0.0
-        return fit.evidence - paid - 0.5 * extra * math.log(self.N) - calibration
+        return (
+            self.tempering.factor * fit.evidence
+            - paid
+            - 0.5 * extra * math.log(self.N)
+            - calibration
+        )
 
     def cancelling(self, h: Hypothesis) -> bool:
         """Whether two added rates of a hypothesis all but cancel: neither is a finding."""
@@ -68,6 +77,10 @@ class FittedHypotheses:
 
     def keep(self, fits: Sequence[Fitted]) -> None:
         """Remembers the best fit of every hypothesis under every structure."""
+        before = max((fit.evidence for fit in self.fits.values()), default=-math.inf)
+        likeliest = max(fits, key=lambda fit: fit.evidence, default=None)
+        if likeliest is not None and likeliest.evidence > before:
+            self.tempering = tempering(likeliest.white, self.data.seen[1:])
         for fit in fits:
             h = fit.hypothesis
             key = (fit.noise.structure, h.spread, tuple(sorted(h.names)))

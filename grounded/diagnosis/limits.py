@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from grounded.diagnosis import filter as kalman
 from grounded.diagnosis.data import PIECES, Data
 from grounded.diagnosis.fitted import Fitted, calibrated
 from grounded.diagnosis.hypothesis import Predictor
@@ -27,6 +26,7 @@ from grounded.effects import (
     SensorDelayFamily,
     SensorFamily,
 )
+from grounded.filter import kalman
 from grounded.frozen import Array
 from grounded.model import Model, Param
 

@@ -32,15 +32,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from grounded.diagnosis import filter as kalman
 from grounded.diagnosis.data import Data
-from grounded.diagnosis.delayed_measurement import Delayed, FilterSystem
 from grounded.diagnosis.delays import delays_of
-from grounded.diagnosis.filter import UNKNOWN
 from grounded.diagnosis.fitted import Fitted, calibrated
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor, limits_of, param_scale, rates_of
 from grounded.diagnosis.noise import NoiseModel
 from grounded.effects import ParamFamily
+from grounded.filter import kalman
+from grounded.filter.augmented import Delayed, coloured
+from grounded.filter.kalman import LinearSystem
 from grounded.frozen import Array
 from grounded.model import Model
 
@@ -129,7 +129,7 @@ def noise_entry(predictor: Predictor, h: Hypothesis, track: Array) -> Array | No
 
 def filter_system(
     predictor: Predictor, h: Hypothesis, noise: NoiseModel, track: Array, F: Array
-) -> tuple[FilterSystem, Delayed | None]:
+) -> tuple[LinearSystem, Delayed | None]:
     """What the filter of a hypothesis is made of; F (L, B, n, n)."""
     data = predictor.data
     (L, B, n, _), delays = F.shape, delays_of(h, data)
@@ -137,18 +137,24 @@ def filter_system(
     if delays is not None:
         noise, seen, delayed = delays.noise(noise), delays.samples()[1], delays.in_filter()
     G = noise_entry(predictor, h, track)
-    A = kalman.transition(F, noise.structure.phi(data.dt), G)
+    A = coloured(F, noise.structure.phi(data.dt), G)
     Q = np.broadcast_to(noise.process(data.dt), (L, B, A.shape[-1]))
-    R = widened(data, np.broadcast_to(noise.measurement(L), (L + 1, B, n)), seen)
-    return FilterSystem(A, Q, R, seen, noise.start(B), G), delayed
+    R = np.broadcast_to(noise.measurement(L), (L + 1, B, n))
+    first = np.where(seen[0] > 0, R[0], prior(data))
+    return LinearSystem(A, Q, R, seen, np.hstack([first, noise.start(B)]), G), delayed
 
 
 def gains_of(
-    predictor: Predictor, h: Hypothesis, noise: NoiseModel, track: Array, F: Array
+    predictor: Predictor,
+    h: Hypothesis,
+    noise: NoiseModel,
+    track: Array,
+    F: Array,
+    *,
+    covariances: bool = False,
 ) -> kalman.Gains:
     """The gains of a hypothesis' filter; F (L, B, n, n)."""
-    system, delayed = filter_system(predictor, h, noise, track, F)
-    return kalman.gains(*system, delayed)
+    return kalman.gains(*filter_system(predictor, h, noise, track, F), covariances=covariances)
 
 
 def base_columns(predictor: Predictor, fit: Fitted) -> tuple[Array, Array]:
@@ -322,18 +328,6 @@ def prior(data: Data) -> Array:
         known = bool(data.seen[..., i].any())
         found.append(data.scales.spread(name) ** 2 if known else WIDE**2)
     return np.array(found)
-
-
-def widened(data: Data, R: Array, seen: Array) -> Array:
-    """Measurement variances (L + 1, B, n) with the prior of what was not seen at the start.
-
-    In the filter's own convention: at t = 0 what is not seen has UNKNOWN times its R.
-    """
-    if seen[0].all():
-        return R
-    R = R.copy()
-    R[0] = np.where(seen[0] > 0, R[0], prior(data) / UNKNOWN)
-    return R
 
 
 def smoothed(data: Data, g: kalman.Gains, jacobian: Array, white: Array) -> Array | None:

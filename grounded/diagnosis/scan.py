@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 
 from grounded.compile import Named
-from grounded.diagnosis import filter as kalman
 from grounded.diagnosis.delays import delays_of
 from grounded.diagnosis.fitted import Fitted
 from grounded.diagnosis.hypothesis import Predictor, sensor_offset
@@ -38,6 +37,7 @@ from grounded.effects import (
     SensorDelayFamily,
     SensorFamily,
 )
+from grounded.filter import kalman
 from grounded.frozen import Array
 
 BLOCK = 160  # columns filtered at once
@@ -97,7 +97,7 @@ class _Context:
         self.ahead = np.concatenate([fit.track[:1], self.after])
         self.F, self.f_p = sensitivities_of(predictor, h, self.x, self.u)
         system, delayed = filter_system(predictor, h, fit.noise, fit.track, self.F)
-        self.G, self.gains = system.G, kalman.gains(*system, delayed)
+        self.G, self.gains = system.G, kalman.gains(system, delayed)
         self.delays = delays_of(h, data)
         self.white = fit.white
         self.base = fit.covariance if fit.gram.shape[-1] else np.zeros((0, 0))
