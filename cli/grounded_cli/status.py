@@ -29,6 +29,8 @@ def command(json_: bool) -> None:
         show_json(status.to_json())
         return
     show(summary(status))
+    for name, why in status.discarded.items():
+        show(field("discarded", f"{name}{why and ': ' + why}"))
     if status.outdated:
         show(field("diagnosis", status.outdated))
     show(f"\n{next_line(status.then)}")

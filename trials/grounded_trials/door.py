@@ -52,6 +52,22 @@ class Verified(Result):
         return {"checked": self.checked, "damaged": [vars(one) for one in self.damaged]}
 
 
+@dataclass(frozen=True, repr=False)
+class SetAside(Result):
+    """What `discard` and `restore` answer: the trials that were named, and all that are aside."""
+
+    trials: tuple[str, ...]
+    discarded: dict[str, str]  # t0004 -> why
+
+    def summary(self) -> str:
+        """All that are set aside."""
+        return f"set aside: {', '.join(self.discarded) or 'none'}"
+
+    def to_json(self) -> dict[str, Any]:
+        """The document of `discard --json` and of `restore --json`."""
+        return {"trials": list(self.trials), "discarded": self.discarded}
+
+
 class Workspace(Folder):
     """A folder with a task, its trials and its candidates, and what can be done in it.
 
@@ -313,7 +329,8 @@ class Workspace(Folder):
         from grounded_trials.store.own_files import FILE_LIMIT, read_file
         from grounded_trials.workspace.handover import intact
 
-        damaged = [Lost(str(one.path), one.reason) for one in self.store.verify()]
+        broken = [*self.store.verify(), *self.notes.store.verify()]
+        damaged = [Lost(str(one.path), one.reason) for one in broken]
         candidates = sorted((self.folder / "candidates").glob("*.mcap"))
         for path in candidates:
             try:
@@ -321,6 +338,28 @@ class Workspace(Folder):
             except GroundedError as error:
                 damaged.append(Lost(str(path), str(error)))
         return Verified(len(self.store.list()) + len(candidates), tuple(damaged))
+
+    def discard(self, *trials: str, why: str = "") -> SetAside:
+        """Sets trials aside: search, fit, diagnosis and report leave them out; nothing is deleted.
+
+        Args:
+            trials: short names, t0004.
+            why: kept with it, for who asks later.
+        """
+        return self._noted("discard", trials, why)
+
+    def restore(self, *trials: str) -> SetAside:
+        """Takes back what `discard` did."""
+        return self._noted("restore", trials, "")
+
+    def _noted(self, note: str, trials: Sequence[str], why: str) -> SetAside:
+        here = self._afresh()
+        found = [here.store.find(name.lower()) for name in trials]
+        for one in found:
+            if (one.digest in here.set_aside) == (note == "restore"):
+                here.notes.add({"note": note, "trial": one.digest, "why": why})
+        here.forget_trials()
+        return SetAside(tuple(one.id for one in found), here.discarded())
 
     def inspect(self, log: str | Path) -> Inspected:
         """Shows what a log holds, and guesses a [log] table for this workspace's model."""

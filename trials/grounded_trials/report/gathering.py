@@ -64,6 +64,7 @@ def gather(workspace: Folder) -> Findings:
         then=next_command(workspace, now, diagnosis, usable),
         better=better,
         since=since_diagnosis(workspace, diagnosis, usable) if diagnosis else Since(),
+        discarded=tuple(workspace.discarded()),
         folder=workspace.address,
     )
 

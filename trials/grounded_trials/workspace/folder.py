@@ -4,7 +4,7 @@
 
 All state is derived from these files. Trials are the store's (content-addressed, never rewritten).
 Candidates are files c0001.mcap ...; one that got lost is taken from the trial that ran it, which
-carries it as an attachment.
+carries it as an attachment. A trial that was set aside (`set_aside`) is left out everywhere.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from grounded.search.standing import Candidate
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.store.candidate_file import candidate_bytes, read_candidate
-from grounded_trials.store.store import Store, Stored, write_atomically
+from grounded_trials.store.documents import Notes
+from grounded_trials.store.store import Damaged, Store, Stored, write_atomically
 from grounded_trials.store.trial_file import read_trial
 from grounded_trials.workspace.config import Config, read_config
 from grounded_trials.workspace.model_file import check_names, load_module, model_in
@@ -86,6 +87,7 @@ class Folder:
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
         self.store = Store(self.folder / "trials", prefix="t")
+        self.notes = Notes(self.folder / "trials")
         self.reports = self.folder / "reports"
 
     @property
@@ -126,14 +128,33 @@ class Folder:
     def _trials(self) -> tuple[StoredTrial, ...]:
         return tuple(self._read_trials(None))
 
+    @cached_property
+    def set_aside(self) -> dict[str, str]:
+        """Trials that were discarded and not restored: their hash -> why.
+
+        Raises:
+            GroundedError: if a note is damaged.
+        """
+        return self._set_aside(None)
+
+    def _set_aside(self, lost: list[Damaged] | None) -> dict[str, str]:
+        found: dict[str, str] = {}
+        for note in self.notes.read(lost):
+            if note["note"] == "discard":
+                found[note["trial"]] = note["why"]
+            elif note["note"] == "restore":
+                found.pop(note["trial"], None)
+        return found
+
     def forget(self) -> None:
         """Everything is read again when it is asked for next."""
-        for name in ("config", "base_model", "task", "planner", "_trials"):
+        for name in ("config", "base_model", "task", "planner", "_trials", "set_aside"):
             vars(self).pop(name, None)
 
     def forget_trials(self) -> None:
         """Trials are read again when they are asked for next."""
-        vars(self).pop("_trials", None)
+        for name in ("_trials", "set_aside"):
+            vars(self).pop(name, None)
 
     def read(self, *, strict: bool = True) -> Contents:
         """The trials, and the search's candidates for the present task.
@@ -158,6 +179,11 @@ class Folder:
             GroundedError: if one is damaged, naming it.
         """
         return self._trials
+
+    def discarded(self) -> dict[str, str]:
+        """Trials that are set aside, t0004 -> why."""
+        aside = self.set_aside
+        return {one.id: aside[one.digest] for one in self.store.list() if one.digest in aside}
 
     def fits(self, trial: Trial) -> bool:
         """Whether a trial's states and inputs are this model's, and its dt is this task's."""
@@ -234,8 +260,13 @@ class Folder:
 
     def _read_trials(self, lost: list[Lost] | None) -> Iterator[StoredTrial]:
         """The stored trials; those that are damaged or gone are put into `lost` if it is there."""
-        entries = self.store.list()
+        entries, broken = self.store.list(), list[Damaged]()
+        aside = self.set_aside if lost is None else self._set_aside(broken)
+        if lost is not None:
+            lost += [Lost(one.path.name, one.reason) for one in broken]
         for stored in entries:
+            if stored.digest in aside:
+                continue
             try:
                 trial, meta, policy = read_trial(self.store.read(stored), stored.path.name)
             except GroundedError as error:

@@ -21,12 +21,12 @@ from functools import cached_property
 import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
-from grounded.frozen import Array
-from grounded.policy import Policy, z_difference
+from grounded.policy import Policy
 from grounded.search.standing import Candidate
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.workspace.folder import Contents, Folder, candidate_of
+from grounded_trials.workspace.trial_check import commands
 
 AGREES = 1e-6  # of an input's size: how well a policy repeats its own predicted inputs
 
@@ -92,35 +92,23 @@ def intact(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]:
         GroundedError: if it is damaged, rewritten or renamed.
     """
     candidate, meta = candidate_of(data, identity)
-    predicted = candidate.predicted_inputs
+    predicted, policy = candidate.predicted_inputs, candidate.policy
     with np.errstate(all="ignore"):
-        off = np.abs(_sent(candidate) - predicted)
+        sent = commands(
+            candidate.policy, candidate.predicted_states[None, :-1], candidate.policy.past
+        )
+        off = np.abs(sent[0] - predicted)
         wrong = off > AGREES * (1 + np.abs(predicted).max(axis=0))
     if wrong.any():
         t, j = (int(i) for i in np.argwhere(wrong)[0])
         raise GroundedError(
             f"candidates/{identity}.mcap is not the candidate that was proposed: at t = "
-            f"{t * candidate.policy.dt:g} s its policy sends {candidate.policy.input_names[j]} = "
-            f"{predicted[t, j] + off[t, j]:g} or {predicted[t, j] - off[t, j]:g}, its own "
-            f"prediction says {predicted[t, j]:g}. It was rewritten: delete the file and propose "
-            "again",
+            f"{t * policy.dt:g} s its policy sends {policy.input_names[j]} = {sent[0, t, j]:g}, "
+            f"its own prediction says {predicted[t, j]:g}. It was rewritten: delete the file and "
+            "propose again",
             NextCommand("propose"),
         )
     return candidate, meta
-
-
-def _sent(candidate: Candidate) -> Array:
-    """What the policy sends along its predicted run, (H, m)."""
-    policy, x, u = candidate.policy, candidate.predicted_states, candidate.predicted_inputs
-    asked = policy.feedforward
-    if policy.gain is not None and policy.reference is not None:
-        columns = [x[:-1]]
-        for j, depth in enumerate(policy.depths):
-            sent = np.concatenate([np.full(depth, policy.past[j]), u[:, j]])
-            columns += [sent[depth - 1 - i : -1 - i, None] for i in range(depth)]
-        off = z_difference(np.hstack(columns), policy.reference, policy.angles)
-        asked = asked + np.einsum("tij,tj->ti", policy.gain, off)
-    return np.clip(asked, policy.low, policy.high)
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -53,6 +53,7 @@ class Status(Result):
     then: NextCommand
     outdated: str = ""  # why the last diagnosis is not the last word
     notes: tuple[str, ...] = ()  # of the search, where it has ended
+    discarded: dict[str, str] = field(default_factory=dict)  # t0004 -> why it is set aside
 
     def summary(self) -> str:
         """The phase and the best candidate."""
@@ -60,7 +61,7 @@ class Status(Result):
 
     def to_json(self) -> dict[str, Any]:
         """The document of `status --json`, the whole history in it."""
-        return self.standing.to_json()
+        return self.standing.to_json() | {"discarded": self.discarded}
 
 
 def propose_in(workspace: Folder) -> Proposed:
@@ -193,6 +194,7 @@ def status_of(workspace: Folder, standing: Standing, notes: tuple[str, ...] = ()
         next_command(workspace, standing, found, usable),
         since.told(workspace.address) if since else "",
         notes,
+        workspace.discarded(),
     )
 
 
