@@ -4,6 +4,7 @@ Every test here fails on 0.1, which compared nothing and knew no `discard`.
 """
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -85,7 +86,7 @@ def test_a_takeover_is_dated(learnt):
     inputs = np.array(trial.inputs)
     inputs[25:] = -inputs[25:] + 2
     why = what_ran(learnt.task, replace(trial, inputs=inputs), own, candidates)
-    assert "up to 1.2 s" in why
+    assert re.search(r"up to 1\.[0-3] s", why)
 
 
 @pytest.fixture

@@ -58,6 +58,11 @@ def read_document(path: Path) -> dict[str, Any]:
         raise
     except OSError as error:
         raise GroundedError(f"{path} can't be read: {error.strerror}") from None
+    return proven(data, path)
+
+
+def proven(data: bytes, path: Path) -> dict[str, Any]:
+    """The same from the bytes of a file; `path` is for messages."""
     found = _SEALED.fullmatch(data)
     if found is None:
         raise GroundedError(f"{path} has no checksum: it is damaged, or of an older version")

@@ -27,6 +27,7 @@ from grounded_trials.store.store import DIGITS, hash_file
 from grounded_trials.store.trial_file import read_trial, trial_bytes
 from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.identity import sha256
 from grounded_trials.workspace.proposing import standing_in
 from grounded_trials.workspace.trial_check import warnings_about, what_ran
 
@@ -77,6 +78,7 @@ class _Read:
     data: bytes
     warnings: tuple[str, ...] = ()
     signals: tuple[SignalReport, ...] = ()
+    bare: bool = False  # it ran a candidate, and carries no copy of it
 
 
 def ingest_log(
@@ -104,13 +106,17 @@ def ingest_log(
     read = _recognised(workspace, path, read, candidate)
     before = _repeated(workspace, path, read)
     added = workspace.store.add(read.data, again=before != "")
+    if read.bare:  # what it ran is kept beside it
+        ran = sha256(workspace.candidate_bytes(read.trial.candidate))
+        trial_hash = added.sha256[:DIGITS]
+        workspace.notes.add({"note": "run", "trial": trial_hash, "sha256": ran}, again=False)
     workspace.forget_trials()
     trial = replace(read.trial, id=added.id)
     warnings = (*read.warnings, *warnings_about(workspace, trial))
     if before:
         repeat = f"it repeats {before} to the last bit: the system is taken as deterministic"
         warnings = (*warnings, f"{repeat}, and no candidate is run a second time from now on")
-    if added.known and added.sha256[:DIGITS] in workspace.set_aside:
+    if added.known and added.sha256[:DIGITS] in workspace.noted.aside:
         warnings = (*warnings, f"{added.id} is set aside: `restore` takes that back")
     tried = _tried(workspace, trial)
     return Ingested(
@@ -207,7 +213,7 @@ def _own(workspace: Folder, path: Path, candidate: str | None, data: bool) -> _R
         raise GroundedError(f"{path} says that it ran {trial.candidate}, not {candidate}")
     if trial.candidate:
         _check_candidate(workspace, path, trial.candidate, meta.get("task", ""), policy)
-        return _Read(trial, content)
+        return _Read(trial, content, bare=policy is None)
     trial = replace(trial, candidate=candidate or _outstanding(workspace, path))
     _check_candidate(workspace, path, trial.candidate)
     return _Read(trial, _encode(workspace, trial, _about(workspace, trial.candidate)))

@@ -147,11 +147,13 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
     fits = {}
     for late in range(-1, latest + 1):
         a, b = free[:, max(0, -late) : T - max(0, late)], sent[max(0, late) : T - max(0, -late)]
-        for back, error in enumerate((((a - b) / size[:, None]) ** 2).mean(axis=(1, 2)).tolist()):
-            fits[back, late] = (error, a[back], b, size[back])
+        squares = (((a - b) / size[:, None]) ** 2).mean(axis=2)
+        usual, mean = np.median(squares, axis=1), squares.mean(axis=1)
+        for back, score in enumerate(usual + 1e-3 * mean):  # a takeover must not move the rest
+            fits[back, late] = (float(score), float(mean[back]), a[back], b, size[back])
     back, late = min(fits, key=lambda key: fits[key][0])
-    error, asked, sent, size = fits[back, late]
-    unmoved = min(fit[0] for key, fit in fits.items() if key[1] == 0)
+    _, error, asked, sent, size = fits[back, late]
+    unmoved = min(fit[1] for key, fit in fits.items() if key[1] == 0)
     off = (asked - sent) ** 2
     unrelated = asked.var(axis=0) + sent.var(axis=0) + (asked - sent).mean(axis=0) ** 2
     noise = _noise_sent(policy, states[back], free[back])
