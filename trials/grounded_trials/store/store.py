@@ -84,7 +84,7 @@ class Store:
             GroundedError: if the folder can't be read.
         """
         try:
-            names = [path.name for path in self.folder.iterdir()]
+            names = os.listdir(self.folder)  # noqa: PTH208 (many times quicker)
         except FileNotFoundError:
             return ()
         except OSError as error:

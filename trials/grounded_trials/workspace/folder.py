@@ -23,7 +23,7 @@ from grounded.search.standing import Candidate
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.store.documents import Notes
-from grounded_trials.store.store import Damaged, Store, write_atomically
+from grounded_trials.store.store import Damaged, Store, Stored, write_atomically
 from grounded_trials.store.trial_file import read_trial
 from grounded_trials.workspace.config import Config, read_config
 from grounded_trials.workspace.identity import (
@@ -40,7 +40,9 @@ from grounded_trials.workspace.task_file import build_task
 
 if TYPE_CHECKING:
     from grounded.search.planner import Planner
+    from grounded_trials.store.index import TrialIndex
 
+MANY = 200  # trials: fewer are all read, more are indexed
 _ID = re.compile(r"c\d{4,}")
 
 
@@ -176,6 +178,8 @@ class Folder:
     def discarded(self) -> dict[str, str]:
         """Trials that are set aside, t0004 -> why."""
         aside = self.noted.aside
+        if not aside:
+            return {}
         return {one.id: aside[one.digest] for one in self.store.list() if one.digest in aside}
 
     def fits(self, trial: Trial) -> bool:
@@ -279,22 +283,50 @@ class Folder:
         """The stored trials; those that are damaged or gone are put into `lost` if it is there."""
         broken: list[Damaged] = []
         known, found = noted(self.notes.read(None if lost is None else broken)), []
-        for stored in self.store.list():
-            if stored.digest in known.aside:
-                continue
+        entries = [e for e in self.store.list() if e.digest not in known.aside]
+        read = self._indexed if len(entries) >= MANY else self._whole
+        for stored in entries:
             try:
-                trial, meta, policy = read_trial(self.store.read(stored), stored.path.name)
+                found.append(read(stored))
             except GroundedError as error:
                 if lost is None:
                     raise
                 broken.append(Damaged(stored.path, str(error)))
-                continue
-            logged = replace(trial, id=stored.id)
-            bridged = interpolate_gaps(logged).trial
-            found.append(StoredTrial(stored, bridged, meta, logged, policy))
+        if len(entries) >= MANY:
+            self._index.save()
         if lost is not None:
             lost += [Lost(one.path.name, one.reason) for one in (*broken, *self.gone(known))]
         return named_apart(found, known, self.candidate_path)
+
+    def _read_one(self, stored: Stored) -> tuple[Trial, dict[str, str], bytes | None]:
+        """A trial as it was logged, its metadata and the policy that it carries."""
+        trial, meta, policy = read_trial(self.store.read(stored), stored.path.name)
+        return replace(trial, id=stored.id), meta, policy
+
+    def _whole(self, stored: Stored) -> StoredTrial:
+        trial, meta, policy = self._read_one(stored)
+        ran = sha256(policy) if policy else ""
+        bridged = interpolate_gaps(trial).trial
+        return StoredTrial(stored, bridged, meta, trial, ran, lambda: policy)
+
+    @cached_property
+    def _index(self) -> TrialIndex:
+        from grounded_trials.store.index import TrialIndex
+
+        return TrialIndex(self.store.folder, self._read_one)
+
+    def _indexed(self, stored: Stored) -> StoredTrial:
+        about = self._index.about(stored)
+        trial = self._index.trial(stored, about, bridged=True)
+        measured = self._index.trial(stored, about, bridged=False) if about["gaps"] else trial
+        return StoredTrial(
+            stored, trial, about["meta"], measured, about["ran"], lambda: self._read_one(stored)[2]
+        )
+
+    def save_index(self) -> None:
+        """Keeps what was learnt of many trials for the next command."""
+        if "_index" in vars(self):
+            self._index.save()
 
     def gone(self, known: Noted) -> Iterator[Damaged]:
         """Trials that were stored, and are not there any more."""
@@ -312,7 +344,7 @@ class Folder:
         self, trials: tuple[StoredTrial, ...], lost: list[Lost] | None
     ) -> Iterator[Candidate]:
         """The search's candidates; unless strict, a trial's copy stands in for a damaged file."""
-        ran = {t.trial.candidate: (t.stored.id, t.ran) for t in trials if t.policy is not None}
+        ran = {t.trial.candidate: (t.stored.id, t.ran) for t in trials if t.ran}
         for identity in self._ids(trials):
             why = GroundedError("its file is gone and no trial carries it")
             for data in self._sources(identity, trials):
@@ -351,5 +383,5 @@ class Folder:
         if path.is_file():
             yield path.read_bytes()
         for one in self.trials() if trials is None else trials:
-            if one.trial.candidate == identity and one.policy is not None:
-                yield one.policy
+            if one.trial.candidate == identity and (policy := one.policy) is not None:
+                yield policy

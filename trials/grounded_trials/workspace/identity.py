@@ -48,12 +48,13 @@ class StoredTrial:
     trial: Trial  # .id is its short name (t0007); short gaps are bridged
     meta: dict[str, str]
     measured: Trial  # as it was logged, gaps and all
-    policy: bytes | None  # the file of the candidate that it ran
+    ran: str  # SHA-256 of the candidate's file that it carries, "" for none
+    policy_of: Callable[[], bytes | None]
 
     @property
-    def ran(self) -> str:
-        """SHA-256 of the candidate's file that it carries, "" for none."""
-        return sha256(self.policy) if self.policy else ""
+    def policy(self) -> bytes | None:
+        """The file of the candidate that it ran."""
+        return self.policy_of() if self.ran else None
 
 
 @dataclass(frozen=True, eq=False)

@@ -176,6 +176,7 @@ def standing_in(
     trials = [t.trial for t in contents.trials if workspace.fits(t.trial)]
     task, options, planner = workspace.task, workspace.config.search, workspace.planner
     now = standing(task, contents.candidates, trials, options, model_fingerprint(planner.plan))
+    workspace.save_index()
     if ahead and now.phase == "propose" and now.incumbent is not None:
         return propose(task, contents.candidates, trials, options, planner=planner).standing
     return now

@@ -73,7 +73,7 @@ def _candidates(workspace: Folder, known: Noted) -> Iterator[tuple[Path, Callabl
 def _carried(workspace: Folder, handed: set[str]) -> bool:
     """Whether a trial carries a candidate whose file is gone."""
     trials = workspace.read(strict=False).trials
-    return any(one.policy is not None and sha256(one.policy) in handed for one in trials)
+    return any(one.ran in handed for one in trials)
 
 
 def _documents(workspace: Folder) -> Iterator[tuple[Path, Callable[[], Any]]]:
