@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result
-from grounded_trials.workspace.folder import Folder, Lost
+from grounded_trials.workspace.folder import Folder
 
 if TYPE_CHECKING:
     from grounded.diagnosis.report import Diagnosis
@@ -35,22 +35,23 @@ if TYPE_CHECKING:
     from grounded_trials.workspace.inspecting import Inspected
     from grounded_trials.workspace.proposing import Proposed, Status
     from grounded_trials.workspace.running import Ran
+    from grounded_trials.workspace.verifying import Verified
 
 
 @dataclass(frozen=True, repr=False)
-class Verified(Result):
-    """How many files were checked, and those that are not what they were."""
+class SetAside(Result):
+    """What `discard` and `restore` answer: the trials that were named, and all that are aside."""
 
-    checked: int
-    damaged: tuple[Lost, ...]
+    trials: tuple[str, ...]
+    discarded: dict[str, str]  # t0004 -> why
 
     def summary(self) -> str:
-        """How many are good, how many not."""
-        return f"{self.checked} files, {len(self.damaged)} damaged"
+        """All that are set aside."""
+        return f"set aside: {', '.join(self.discarded) or 'none'}"
 
     def to_json(self) -> dict[str, Any]:
-        """The document of `verify --json`."""
-        return {"checked": self.checked, "damaged": [vars(one) for one in self.damaged]}
+        """The document of `discard --json` and of `restore --json`."""
+        return {"trials": list(self.trials), "discarded": self.discarded}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -393,21 +394,37 @@ class Workspace(Folder):
         return export_candidate(here, candidate, form, file, runner=runner, anyway=anyway)
 
     def verify(self) -> Verified:
-        """Checks every stored trial against its hash, every candidate against its checksums.
+        """Checks everything that is kept: what was changed, damaged, deleted or put in its place.
 
-        A candidate must also be the one its file is named after, and do what it predicts.
+        Trials and notes against their hashes, and whether all are there that were stored;
+        candidates against their checksums, what was handed out under their names and what they
+        predict; the last diagnosis and the optimum against their checksums.
         """
-        from grounded_trials.store.own_files import FILE_LIMIT, read_file
-        from grounded_trials.workspace.handover import intact
+        from grounded_trials.workspace.verifying import verify_in
 
-        damaged = [Lost(str(one.path), one.reason) for one in self.store.verify()]
-        candidates = sorted((self.folder / "candidates").glob("*.mcap"))
-        for path in candidates:
-            try:
-                intact(read_file(path, FILE_LIMIT), path.stem)
-            except GroundedError as error:
-                damaged.append(Lost(str(path), str(error)))
-        return Verified(len(self.store.list()) + len(candidates), tuple(damaged))
+        return verify_in(self._afresh())
+
+    def discard(self, *trials: str, why: str = "") -> SetAside:
+        """Sets trials aside: search, fit, diagnosis and report leave them out; nothing is deleted.
+
+        Args:
+            trials: short names, t0004.
+            why: kept with it, for who asks later.
+        """
+        return self._noted("discard", trials, why)
+
+    def restore(self, *trials: str) -> SetAside:
+        """Takes back what `discard` did."""
+        return self._noted("restore", trials, "")
+
+    def _noted(self, note: str, trials: Sequence[str], why: str) -> SetAside:
+        here = self._afresh()
+        found = [here.store.find(name.lower()) for name in trials]
+        for one in found:
+            if (one.digest in here.noted.aside) == (note == "restore"):
+                here.notes.add({"note": note, "trial": one.digest, "why": why})
+        here.forget_trials()
+        return SetAside(tuple(one.id for one in found), here.discarded())
 
     def inspect(self, log: str | Path) -> Inspected:
         """Shows what a log holds, and guesses a [log] table for this workspace's model."""
