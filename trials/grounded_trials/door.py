@@ -310,7 +310,8 @@ class Workspace(Folder):
 
         A candidate must also be the one its file is named after, and do what it predicts.
         """
-        from grounded_trials.store.own_files import FILE_LIMIT, read_file
+        from grounded_trials.plain_file import read_file
+        from grounded_trials.store.own_files import FILE_LIMIT
         from grounded_trials.workspace.handover import intact
 
         damaged = [Lost(str(one.path), one.reason) for one in self.store.verify()]

@@ -6,15 +6,19 @@ What a file says it is, from its first records: one of ours, or somebody else's 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
 from grounded.errors import GroundedError, nearest
+from grounded_trials.formats.budget import budget
 from grounded_trials.formats.mcap_records import Messages, Metadata
 from grounded_trials.formats.mcap_walk import read_records
+from grounded_trials.plain_file import open_file, read_file
 
 _LISTED = re.compile(r"^\s*-\s+(?:path:\s*)?[\"']?([^\"'\s#]+\.mcap)[\"']?\s*$", re.MULTILINE)
+LISTING_LIMIT = 2**24  # [bytes] of a metadata.yaml
 _DIGITS = re.compile(r"(\d+)")
 
 
@@ -43,7 +47,7 @@ def log_files(paths: str | Path | Sequence[str | Path]) -> tuple[Path, ...]:
 def _bag(folder: Path) -> list[Path]:
     listing = folder / "metadata.yaml"
     try:
-        text = listing.read_text("utf-8") if listing.exists() else ""
+        text = read_file(listing, LISTING_LIMIT).decode() if listing.exists() else ""
         inside = [path for path in folder.iterdir() if path.suffix == ".mcap"]
     except (OSError, UnicodeDecodeError) as error:
         raise GroundedError(f"{folder} can't be read as a bag: {error}") from None
@@ -91,10 +95,10 @@ def open_log(path: Path) -> BinaryIO:
     """Opens a log for reading.
 
     Raises:
-        GroundedError: if it can't be.
+        GroundedError: if it can't be, or is no file at all (a pipe, a device).
     """
     try:
-        return path.open("rb")
+        return open_file(path)
     except FileNotFoundError:
         raise GroundedError(f"{path} does not exist{_nearby(path)}") from None
     except IsADirectoryError:
@@ -103,13 +107,25 @@ def open_log(path: Path) -> BinaryIO:
         raise GroundedError(f"{path} can't be read: {error.strerror}") from None
 
 
+@contextmanager
+def reading(paths: str | Path | Sequence[str | Path]) -> Iterator[tuple[Path, ...]]:
+    """The files of a log, and a budget of time and memory for what is decoded of them.
+
+    Raises:
+        GroundedError: as `log_files`, and where the budget is used up.
+    """
+    files = log_files(paths)
+    with budget(str(files[0]), files):
+        yield files
+
+
 def kind_of(path: Path) -> str:
     """The `format` that a file of ours states ahead of its messages, "" for any other file.
 
     Damage is not judged here: whoever reads the file does that.
     """
     try:
-        with open_log(path) as stream:
+        with reading(path), open_log(path) as stream:
             for record in read_records(stream, str(path)):
                 if isinstance(record, Metadata) and record.name == "grounded":
                     return record.data.get("format", "")

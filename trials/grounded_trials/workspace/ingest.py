@@ -22,7 +22,8 @@ from grounded_trials.formats.mcap_walk import read_records
 from grounded_trials.logs.log_files import kind_of, log_files, open_log
 from grounded_trials.logs.log_table import log_mapping, read_log
 from grounded_trials.logs.samples import SignalReport
-from grounded_trials.store.own_files import CANDIDATE, FILE_LIMIT, TRIAL, read_file
+from grounded_trials.plain_file import read_file
+from grounded_trials.store.own_files import CANDIDATE, FILE_LIMIT, TRIAL
 from grounded_trials.store.store import hash_file
 from grounded_trials.store.trial_file import read_trial, trial_bytes
 from grounded_trials.workspace.config import FILE
