@@ -211,7 +211,7 @@ class _Parser:
         for text in reversed(counts):
             count = self.count(text, scope, 0)
             if not 0 <= count <= COUNT_LIMIT:
-                raise BadSchema(f"its IDL definition has an array of {count} items")
+                raise BadSchema(f"its IDL definition has an array of {str(count)[:20]} items")
             kind = Array(kind, count)
         return kind
 

@@ -34,6 +34,8 @@ from grounded_trials.store.own_files import TRIAL
 from grounded_trials.store.store import sync_folder
 from grounded_trials.wording import count
 
+MOST_LOSSES = 50  # that are told one by one
+
 
 @dataclass(frozen=True)
 class Recovery:
@@ -92,7 +94,9 @@ def recover_log(source: str | Path, target: str | Path) -> Recovery:
             f"{source}: there is nothing to save: {why}; expected an MCAP log, whole or damaged: "
             "look for another copy of the recording"
         )
-    losses = list(salvage.losses)
+    losses = salvage.losses[:MOST_LOSSES]
+    if more := len(salvage.losses) - len(losses):
+        losses.append(f"{more} more of these kinds")
     if copy.homeless:
         these = count(copy.homeless, "message")
         losses.append(f"{these} of topics whose name and type are lost")
