@@ -1,4 +1,4 @@
-"""Budgets of time and memory, stamps, ids: what 0.1 read for minutes, into gigabytes, or wrongly."""
+"""Budgets of time and memory, stamps, ids: what 0.1 read for minutes, or wrongly."""
 
 from __future__ import annotations
 
@@ -40,9 +40,8 @@ def test_every_bomb_ends_in_time(name: str, tmp_path: Path) -> None:
 def test_a_trial_in_many_small_chunks_is_read_in_linear_time() -> None:
     """Fails on 0.1: time grew with the square of the steps, 19 s for 400,000 (FACTS 9)."""
     steps = 20_000
-    data = trial_bytes(
-        Trial(np.zeros((steps + 1, 1)), np.zeros((steps, 1)), 1.0, ("x",), ("u",)), {}
-    )
+    trial = Trial(np.zeros((steps + 1, 1)), np.zeros((steps, 1)), 1.0, ("x",), ("u",))
+    data = trial_bytes(trial, {})
     began = time.process_time()
     assert read_trial(data)[0].steps == steps
     assert time.process_time() - began < 2.0  # 0.15 here; 0.1 took 30 s

@@ -283,9 +283,9 @@ def measured(
     with tempfile.TemporaryDirectory() as folder:
         output, peak = Path(folder, "output"), Path(folder, "peak")
         with output.open("wb") as out:
+            limited = ["timeout", "-s", "KILL", str(timeout_s)]
             child = subprocess.Popen(
-                ["timeout", "-s", "KILL", str(timeout_s), sys.executable, "-c", _START + code]
-                + [str(peak), *words],
+                [*limited, sys.executable, "-c", _START + code, str(peak), *words],
                 stdout=out,
                 stderr=subprocess.STDOUT,
                 env={**os.environ, **env},

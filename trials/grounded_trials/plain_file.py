@@ -14,14 +14,21 @@ from typing import BinaryIO
 from grounded.errors import GroundedError
 
 
-def open_file(path: Path) -> BinaryIO:
+def open_file(path: Path, *, follow: bool = True) -> BinaryIO:
     """Opens a regular file for reading, without waiting for it.
 
+    Args:
+        path: the file.
+        follow: it may be a link.
+
     Raises:
-        GroundedError: if it is something else: a pipe, a device, a socket.
+        GroundedError: if it is something else: a pipe, a device, a socket, a link.
         OSError: as `open`.
     """
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    if not follow and path.is_symlink():
+        raise GroundedError(f"{path} is a link, expected a file: it may lead anywhere")
+    links = 0 if follow else os.O_NOFOLLOW
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | links)
     try:
         mode = os.fstat(descriptor).st_mode
         if stat.S_ISDIR(mode):

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import IO
 
 from grounded.errors import GroundedError
-from grounded_trials.formats.budget import OverBudget, keep
+from grounded_trials.formats.budget import OverBudget, budget, keep
 from grounded_trials.formats.mcap_records import (
     Attachment,
     Channel,
@@ -27,7 +27,7 @@ from grounded_trials.formats.mcap_records import (
     Schema,
 )
 from grounded_trials.formats.mcap_writer import LIBRARY, CopyWriter
-from grounded_trials.logs.log_files import open_log, reading
+from grounded_trials.logs.log_files import open_log
 from grounded_trials.logs.salvage import Salvage
 from grounded_trials.store.candidate_file import read_candidate
 from grounded_trials.store.own_files import TRIAL
@@ -73,7 +73,7 @@ def recover_log(source: str | Path, target: str | Path) -> Recovery:
     source, target = Path(source), Path(target)
     if target.exists():
         raise GroundedError(f"{target} exists already; name a file that does not")
-    with reading(source), open_log(source) as stream:
+    with open_log(source) as stream, budget(str(source), [source]):
         salvage = Salvage(stream, str(source))
         try:
             with target.open("xb") as out:
