@@ -13,8 +13,8 @@ import warnings
 from pathlib import Path
 
 import pytest
-from support.bombs import log
 
+from bombs import log
 from cli import COMMAND, grounded, process
 from grounded.compile.run import jit
 from grounded.errors import GroundedError

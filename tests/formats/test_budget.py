@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.writer import CompressionType, Writer
-from support.bombs import BOMBS, explode, idl, log, ros
 
+from bombs import BOMBS, explode, idl, log, ros
 from grounded.errors import GroundedError, nearest
 from grounded.trial import Trial
 from grounded_trials.formats.budget import MEMORY, SECONDS, OverBudget, budget, keep, room, step

@@ -299,9 +299,9 @@ def measured(
 
 def explode(name: str, folder: Path) -> dict[str, Cost]:
     """Reads, inspects and recovers a bomb; it is built in a process of its own."""
-    here = Path(__file__).parents[1]
+    here = Path(__file__).parent
     make = (
-        f"sys.path.insert(0, {str(here)!r})\nfrom support.bombs import bomb\n"
+        f"sys.path.insert(0, {str(here)!r})\nfrom bombs import bomb\n"
         f"bomb({name!r}, pathlib.Path(sys.argv[1]))"
     )
     made = measured([str(folder)], make, 300)
