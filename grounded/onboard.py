@@ -25,8 +25,11 @@ from io import BytesIO
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Optional, Tuple
+from zipfile import ZipFile
 
 import numpy as np
+
+LIMIT = 2**28  # [bytes] of an exported policy when decompressed
 
 FORMAT = "grounded-policy-1"
 NUMBERS = ("feedforward", "low", "high", "past")
@@ -184,10 +187,15 @@ def _check(path: Any, found: dict[str, Any]) -> None:
 
 def _archive(path: Any) -> dict[str, Any]:
     try:
+        if not Path(path).is_file() and Path(path).exists():
+            raise ValueError(f"{path} is a folder, a pipe or a device, not a file")
         content = Path(path).read_bytes()
     except OSError as error:
         raise ValueError(f"{path} can't be read: {error.strerror}") from None
     try:
+        size = sum(part.file_size for part in ZipFile(BytesIO(content)).infolist())
+        if size > LIMIT:
+            raise ValueError(f"it claims {size} bytes when decompressed, the limit is {LIMIT}")
         with np.load(BytesIO(content), allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
     except Exception as error:  # numpy, zipfile and zlib each have errors of their own

@@ -11,7 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from grounded.errors import GroundedError, NextCommand, nearest
+from grounded_trials.plain_file import open_file
 
+SIZE_LIMIT = 2**22  # [bytes] of a file
 _WORDS = {str: "a text", bool: "true or false", float: "a number", int: "a whole number"}
 _REQUIRED = object()
 
@@ -131,7 +133,8 @@ def read_toml(path: Path) -> Table:
     import tomllib
 
     try:
-        text = path.read_text(encoding="utf-8")
+        with open_file(path) as stream:
+            text = stream.read(SIZE_LIMIT + 1).decode("utf-8")
     except FileNotFoundError:
         raise GroundedError(
             f"{path} does not exist: this is not a workspace; name one with -C DIR, or make one",
@@ -144,6 +147,8 @@ def read_toml(path: Path) -> Table:
     except (OSError, UnicodeDecodeError) as error:
         raise GroundedError(f"{path} can't be read: {error}") from None
     try:
+        if len(text) > SIZE_LIMIT:
+            raise ValueError(f"it has more than {SIZE_LIMIT} bytes")
         return Table(tomllib.loads(text), path)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise GroundedError(f"{path.name} is not valid TOML: {error}") from None

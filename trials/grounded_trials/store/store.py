@@ -17,12 +17,14 @@ from __future__ import annotations
 import hashlib
 import os
 import re
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from grounded.errors import GroundedError
+from grounded_trials.plain_file import open_file
 
 try:
     import fcntl
@@ -35,6 +37,8 @@ except ImportError:
 DIGITS = 16  # hex digits of the hash in a name
 _NAME = re.compile(r"^([a-z]+)(\d{4,})-([0-9a-f]{16})(\.\w+)$")
 _BLOCK = 2**20
+_TEMPORARY = re.compile(r"-[0-9a-f]{16}\.tmp$")
+OLD_S = 3600.0  # of a temporary file that nobody writes any more
 
 
 @dataclass(frozen=True)
@@ -126,7 +130,8 @@ class Store:
         """
         entry = key if isinstance(key, Stored) else self.find(key)
         try:
-            data = entry.path.read_bytes()
+            with open_file(entry.path, follow=False) as stream:
+                data = stream.read()
         except OSError as error:
             raise GroundedError(f"{entry.path} can't be read: {error.strerror}") from None
         if hashlib.sha256(data).hexdigest()[:DIGITS] != entry.digest:
@@ -231,8 +236,10 @@ def write_atomically(path: Path, data: bytes) -> None:
     Raises:
         GroundedError: if it can't be written.
     """
-    temporary = path.with_name(f".{path.name}-{os.getpid()}.tmp")
+    # not by the process's number: two containers may each have a process of the same
+    temporary = path.with_name(f".{path.name}-{os.urandom(8).hex()}.tmp")
     try:
+        _sweep_old(path.parent)
         _copy(data, temporary, mode=0o644)
         temporary.replace(path)
         sync_folder(path.parent)
@@ -245,6 +252,16 @@ def write_atomically(path: Path, data: bytes) -> None:
         raise GroundedError(f"{path} can't be written: {error.strerror}") from None
     finally:
         _remove(temporary)
+
+
+def _sweep_old(folder: Path) -> None:
+    """Removes the temporary files of processes that were killed, an hour after their last write."""
+    with os.scandir(folder) as entries:
+        names = [e.name for e in entries if e.name[0] == "." and _TEMPORARY.search(e.name)]
+    for path in (folder / name for name in names):
+        with suppress(OSError):
+            if path.lstat().st_mtime < time.time() - OLD_S:
+                path.unlink()
 
 
 def _remove(path: Path) -> None:
@@ -281,7 +298,7 @@ def _blocks(source: str | Path | bytes) -> Iterator[bytes]:
         yield source
         return
     try:
-        with Path(source).open("rb") as stream:
+        with open_file(Path(source)) as stream:
             while block := stream.read(_BLOCK):
                 yield block
     except OSError as error:

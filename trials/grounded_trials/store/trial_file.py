@@ -35,7 +35,8 @@ class TrialWriter:
         candidate: the candidate that is run, "" for none.
         policy: the bytes of its file.
         start_inputs: (m,) held before t = 0; None: zero.
-        start_ns: absolute time of t = 0 [ns], for display.
+        start_ns: absolute time of t = 0 [ns], for display; where it is negative (simulation time),
+            stamps count from 0, since MCAP's have no sign.
 
     Raises:
         GroundedError: if the file can't be written or an entry of `meta` is reserved.
@@ -80,7 +81,7 @@ class TrialWriter:
             self._log.attachment("policy", "application/octet-stream", policy)
         self._state = self._log.channel("/state", "State", list(states))
         self._input = self._log.channel("/input", "Input", list(inputs))
-        self._flushed = start_ns
+        self._flushed = max(start_ns, 0)
         self._log.flush()
 
     def append(self, t: float, state: Array, input: Array | None) -> None:
@@ -91,7 +92,7 @@ class TrialWriter:
         Raises:
             GroundedError: if the shapes do not fit, or the file can't be written.
         """
-        time = self._start_ns + round(t * 1e9)
+        time = max(self._start_ns, 0) + round(t * 1e9)
         with self._writing():
             self._log.message(self._state, time, self._encode_state(_row(state, self._n)))
             if input is not None:
@@ -204,7 +205,7 @@ def read_trial(
     if len(u) != len(x) - 1:
         raise GroundedError(f"{own.name}: {len(x)} states need {len(x) - 1} inputs, found {len(u)}")
     for topic in ("/state", "/input"):
-        own.check_grid(topic, own.integer("start_ns"), dt)
+        own.check_grid(topic, max(own.integer("start_ns", signed=True), 0), dt)
     held = None
     if own.entry("start_inputs") != "null":
         held = own.floats(own.json("start_inputs", list), "start_inputs", len(inputs))

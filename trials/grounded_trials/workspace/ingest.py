@@ -21,7 +21,8 @@ from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.logs.log_files import kind_of, log_files, log_records
 from grounded_trials.logs.log_table import log_mapping, read_log
 from grounded_trials.logs.samples import SignalReport
-from grounded_trials.store.own_files import CANDIDATE, FILE_LIMIT, TRIAL, read_file
+from grounded_trials.plain_file import read_file
+from grounded_trials.store.own_files import CANDIDATE, FILE_LIMIT, TRIAL
 from grounded_trials.store.store import DIGITS, hash_file
 from grounded_trials.store.trial_file import read_trial, trial_bytes
 from grounded_trials.workspace.config import FILE
