@@ -80,6 +80,7 @@ class Store:
 
     def __init__(self, folder: str | Path, prefix: str = "t") -> None:
         self.folder, self.prefix = Path(folder), prefix
+        self._seen: dict[str, Stored | None] = {}  # what a name says
 
     def list(self) -> tuple[Stored, ...]:
         """The files in the order of their arrival; nothing is read but the folder.
@@ -93,11 +94,12 @@ class Store:
             return ()
         except OSError as error:
             raise GroundedError(f"{self.folder} can't be read: {error.strerror}") from None
-        found = []
         for name in names:
-            match = _NAME.match(name)
-            if match and match[1] == self.prefix:
-                found.append(Stored(self.folder / name, int(match[2]), match[3]))
+            if name not in self._seen:
+                match, self._seen[name] = _NAME.match(name), None
+                if match and match[1] == self.prefix:
+                    self._seen[name] = Stored(self.folder / name, int(match[2]), match[3])
+        found = (entry for name in names if (entry := self._seen[name]) is not None)
         return tuple(sorted(found, key=lambda s: (s.number, s.digest)))
 
     def digests(self) -> set[str]:

@@ -143,7 +143,7 @@ class Folder:
 
     def forget(self) -> None:
         """Everything is read again when it is asked for next."""
-        for name in ("config", "base_model", "task", "planner", "_trials", "noted"):
+        for name in ("config", "base_model", "task", "planner", "_trials", "noted", "_index"):
             vars(self).pop(name, None)
 
     def forget_trials(self) -> None:
@@ -292,8 +292,7 @@ class Folder:
                 if lost is None:
                     raise
                 broken.append(Damaged(stored.path, str(error)))
-        if len(entries) >= MANY:
-            self._index.save()
+        self.save_index()
         if lost is not None:
             lost += [Lost(one.path.name, one.reason) for one in (*broken, *self.gone(known))]
         return named_apart(found, known, self.candidate_path)
@@ -310,23 +309,29 @@ class Folder:
         return StoredTrial(stored, bridged, meta, trial, ran, lambda: policy)
 
     @cached_property
-    def _index(self) -> TrialIndex:
+    def _index(self) -> tuple[TrialIndex, dict[str, StoredTrial]]:
+        """The index, and the trials that were made of it."""
         from grounded_trials.store.index import TrialIndex
 
-        return TrialIndex(self.store.folder, self._read_one)
+        return TrialIndex(self.store.folder, self._read_one), {}
 
     def _indexed(self, stored: Stored) -> StoredTrial:
-        about = self._index.about(stored)
-        trial = self._index.trial(stored, about, bridged=True)
-        measured = self._index.trial(stored, about, bridged=False) if about["gaps"] else trial
-        return StoredTrial(
+        index, made = self._index
+        if (known := made.get(stored.path.name)) is not None:
+            return known
+        about = index.about(stored)
+        trial = index.trial(stored, about, bridged=True)
+        measured = index.trial(stored, about, bridged=False) if about["gaps"] else trial
+        found = StoredTrial(
             stored, trial, about["meta"], measured, about["ran"], lambda: self._read_one(stored)[2]
         )
+        made[stored.path.name] = found
+        return found
 
     def save_index(self) -> None:
         """Keeps what was learnt of many trials for the next command."""
         if "_index" in vars(self):
-            self._index.save()
+            self._index[0].save()
 
     def gone(self, known: Noted) -> Iterator[Damaged]:
         """Trials that were stored, and are not there any more."""
