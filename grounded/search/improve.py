@@ -39,6 +39,7 @@ from grounded.rollout import simulate
 from grounded.search.first_policy import Tick, first_policy
 from grounded.search.planner import Planner
 from grounded.search.safety import objections, spread
+from grounded.search.secants import slope_error, with_slope
 from grounded.search.standing import (
     Candidate,
     Ending,
@@ -46,8 +47,10 @@ from grounded.search.standing import (
     SearchOptions,
     Standing,
     Tried,
+    Way,
     losers_of,
     standing,
+    wild,
 )
 from grounded.search.step_size import Step
 from grounded.solve import ddp
@@ -55,6 +58,8 @@ from grounded.solve.bias import Grounding, ground
 from grounded.task import Task
 from grounded.trial import Trial, mean_trial
 
+GENTLER = 1e3  # factor on the price of inputs from which gentler gains are designed
+GENTLER_TIMES = 2  # they are tried
 PLANNING = DescentOptions(max_iterations=30, tolerance=1e-6)  # a direction needs no more digits
 
 
@@ -108,7 +113,12 @@ def model_fingerprint(task: Task) -> str:
 
 
 def direction(
-    task: Task, policy: Policy, grounding: Grounding, options: SearchOptions, damping: float = 1.0
+    task: Task,
+    policy: Policy,
+    grounding: Grounding,
+    options: SearchOptions,
+    damping: float = 1.0,
+    slope: Array | None = None,
 ) -> Policy:
     """Step 5: theta' such that d = theta' - theta improves the policy in the biased model.
 
@@ -118,6 +128,7 @@ def direction(
         grounding: the trial as the biased model replays it (step 4).
         options: which algorithm A.
         damping: lambda of `step_size`, the share of mu that leaving the trial's inputs costs.
+        slope: what the utility's slope by the inputs is more than the model's, see `secants`.
     """
     if options.method == "policy-gradient":
         from grounded.solve.policy_gradient import ascent
@@ -126,6 +137,8 @@ def direction(
     problem = grounding.on(task.problem())
     if options.step == "damped":
         problem = damped(problem, grounding.inputs, damping)
+    if slope is not None:
+        problem = with_slope(problem, slope)
     gains = ddp.sweep(problem, grounding.z, grounding.inputs).gains
     result = ddp.solve(problem, grounding.inputs, gains.K, grounding.z[:-1], PLANNING)
     return task.policy(result.u, result.K, result.z[:-1])
@@ -199,48 +212,119 @@ def refitted(task: Task, trials: Sequence[Trial]) -> Model:
 
 
 def _improvement(make: _Maker, incumbent: Tried, options: SearchOptions) -> Proposal:
-    """Steps 4 to 6: the first step, from the one that is due on, that the model believes in.
+    """Steps 4 to 6: another plan where there is reason for one, else the first step, from the one
+    that is due on, that the model believes in.
 
     A step whose predicted run loses is passed over in the model, at no trial's cost: d must satisfy
     U^(theta + alpha d) >= U^(theta) for some alpha (step 5).
     """
-    planner, plan = make.planner, make.planner.plan
-    own = planner.lift(mean_trial(incumbent.trials, planner.task.model.angle_mask))
-    plan.model.system.check(own.states[:-1], own.inputs, plan.model.values, plan.dt)
-    matched = options.match_inputs
-    grounding = ground(plan, own, match_inputs=matched)
-    exact = ground(plan, own, exact=True, shift=grounding.shift)
-    real = exact.on(plan.problem(exact=True))
-    theta = planner.widened(incumbent.candidate.policy)
-    # Where a trial started off s_0, its utility is no measure for runs that start there: theta's
-    # own run in the grounded model is. It replays the trial when the start was s_0.
-    already = simulate(real, theta).utility
-    already = already if np.isfinite(already) else incumbent.utility
-    least = options.tolerance * abs(already)
-    lost = losers_of(make.now.history, incumbent.candidate.id, make.fingerprint)
-    losers = {(candidate.damping, candidate.alpha) for candidate in lost}
+    now = make.now
+    if (made := make.gentler(incumbent)) is not None:
+        return make.checked(made)
+    ways, promised = options.ways(incumbent.candidate), list[float]()
     unsafe: Proposal | None = None
-    promised: list[float] = []
-    directions: dict[float, Policy] = {}
-    for step in options.steps_from(make.now.step):
-        if (step.damping, step.alpha) in losers:
+    least = 0.0
+    for way in ways[ways.index(now.way) :]:
+        step = now.step
+        if way != now.way:
+            step = options.due(now.history, incumbent, make.fingerprint, way)
+        if step is None:
             continue
-        if step.damping not in directions:
-            directions[step.damping] = direction(plan, theta, grounding, options, step.damping)
-        policy = theta.toward(directions[step.damping], step.alpha)
-        made = make.candidate(policy, real, step, already)
-        if made.predicted_gain > least:
-            proposal = make.checked(made)
-            if proposal.candidate is not None:
-                return proposal
-            unsafe = proposal
-            continue
-        promised.append(made.predicted_gain)
-        if abs(made.predicted_gain) <= least:
-            break
-    if unsafe is not None:
+        about = _About(make, incumbent, options, way)
+        found = about.step_from(step, promised)
+        least = options.tolerance * abs(about.already)
+        if way == ways[0] and (own := about.own_plan(found)) is not None:
+            found = own
+        if found is not None and found.candidate is not None:
+            return found
+        unsafe = unsafe or found
+    return unsafe or Proposal(
+        _ended(make, incumbent, promised, least, options.tolerance), None, False
+    )
+
+
+class _About:
+    """The model grounded on the incumbent's trial, and what it promises of other policies.
+
+    Where a trial started off s_0, its utility is no measure for runs that start there: theta's own
+    run in the grounded model is (`already`). It replays the trial when the start was s_0.
+    """
+
+    def __init__(
+        self, make: _Maker, incumbent: Tried, options: SearchOptions, way: Way
+    ) -> None:
+        self.make, self.incumbent, self.options, self.way = make, incumbent, options, way
+        planner, plan = make.planner, make.planner.plan
+        own = planner.lift(mean_trial(incumbent.trials, planner.task.model.angle_mask))
+        plan.model.system.check(own.states[:-1], own.inputs, plan.model.values, plan.dt)
+        matched = options.match_inputs and way != "recorded inputs"
+        self.grounding = ground(plan, own, match_inputs=matched)
+        exact = ground(plan, own, exact=True, shift=self.grounding.shift)
+        self.real = exact.on(plan.problem(exact=True))
+        self.theta = planner.widened(incumbent.candidate.policy)
+        already = simulate(self.real, self.theta).utility
+        self.already = already if np.isfinite(already) else incumbent.utility
+        self.least = options.tolerance * abs(self.already)
+        self.slope: Array | None = None
+        if options.damps and np.isfinite(already):
+            self.slope = slope_error(planner, incumbent, make.now.history, self.real)
+
+    def candidate(self, policy: Policy, step: Step, way: Way) -> Candidate:
+        """A candidate with what is promised of it, mispredictions of earlier trials included."""
+        made = self.make.candidate(policy, self.real, step, self.already, way)
+        if self.slope is None:
+            return made
+        moved = made.predicted_inputs - self.grounding.inputs[: len(self.slope)]
+        more = float(np.sum(self.slope * moved))
+        return replace(
+            made,
+            predicted_gain=made.predicted_gain + more,
+            predicted_utility=made.predicted_utility + more,
+        )
+
+    def step_from(self, first: Step, promised: list[float]) -> Proposal | None:
+        """The first step worth a trial; one that is not allowed, or None; adds to the promises."""
+        make, options, plan = self.make, self.options, self.make.planner.plan
+        own = self.incumbent.candidate.id
+        lost = losers_of(make.now.history, own, make.fingerprint, self.way)
+        losers = {(candidate.damping, candidate.alpha) for candidate in lost}
+        unsafe: Proposal | None = None
+        directions: dict[float, Policy] = {}
+        for step in options.steps_from(first):
+            if (step.damping, step.alpha) in losers:
+                continue
+            if step.damping not in directions:
+                directions[step.damping] = direction(
+                    plan, self.theta, self.grounding, options, step.damping, self.slope
+                )
+            policy = self.theta.toward(directions[step.damping], step.alpha)
+            made = self.candidate(policy, step, self.way)
+            if made.predicted_gain > self.least:
+                proposal = make.checked(made)
+                if proposal.candidate is not None:
+                    return proposal
+                unsafe = proposal
+                continue
+            promised.append(made.predicted_gain)
+            if abs(made.predicted_gain) <= self.least:
+                break
         return unsafe
-    return Proposal(_ended(make, incumbent, promised, least, options.tolerance), None, False)
+
+    def own_plan(self, rival: Proposal | None) -> Proposal | None:
+        """A model that was changed since: its own new plan, where more is promised of that.
+
+        The plan of a crude model may sit in another valley than that of the better one: going on
+        from it ends where it began. Both are judged by the grounded prediction.
+        """
+        make, base = self.make, self.incumbent.candidate
+        tried = losers_of(make.now.history, base.id, make.fingerprint, "own plan")
+        if base.model == make.fingerprint or tried:
+            return None
+        policy, _ = first_policy(make.planner.plan)
+        made = self.candidate(policy, Step(), "own plan")
+        promise = rival.candidate.predicted_gain if rival and rival.candidate else self.least
+        proposal = make.checked(made) if made.predicted_gain > promise else None
+        return proposal if proposal is not None and proposal.candidate is not None else None
 
 
 def _ended(
@@ -289,9 +373,21 @@ class _Maker:
     fingerprint: str
 
     def candidate(
-        self, policy: Policy, problem: Problem, step: Step, already: float = float("nan")
+        self,
+        policy: Policy,
+        problem: Problem,
+        step: Step,
+        already: float = float("nan"),
+        way: Way = "",
+        caution: int | None = None,
     ) -> Candidate:
+        """A candidate; its gains are designed as gently as its incumbent's, or by `caution`."""
         base, policy = self.now.incumbent, self.planner.narrowed(policy)
+        if caution is None:
+            follows = base is not None and base.candidate.base and way != "own plan"
+            caution = base.candidate.caution if base and follows else self.now.caution
+        if caution and base is not None:
+            policy = self._gently(policy, problem, caution)
         predicted = simulate(problem, self.planner.widened(policy))
         return Candidate(
             id=self.identity,
@@ -305,8 +401,38 @@ class _Maker:
             predicted_states=predicted.states[:, : self.planner.task.model.n],
             predicted_inputs=predicted.inputs,
             predicted_utility=predicted.utility,
-            caution=self.now.caution,
+            caution=caution,
+            way=way,
         )
+
+    def gentler(self, incumbent: Tried) -> Candidate | None:
+        """The model's own plan with gentler gains, where its loop was unstable on the robot.
+
+        High gains and a delay that the model lacks make a limit cycle, which no step along a
+        direction leaves: the grounded model replays it, and has no delay to blame.
+        """
+        own = incumbent.candidate
+        lost = losers_of(self.now.history, own.id, self.fingerprint, "gentler gains")
+        if not wild(incumbent) or own.policy.gain is None or len(lost) >= GENTLER_TIMES:
+            return None
+        if own.model != self.fingerprint:
+            return None
+        problem, real = self.planner.plan.problem(exact=True), incumbent.utility
+        caution = own.caution + len(lost) + 1
+        return self.candidate(own.policy, problem, Step(), real, "gentler gains", caution)
+
+    def _gently(self, policy: Policy, problem: Problem, caution: int) -> Policy:
+        """The same run with the gains of a regulator whose inputs cost GENTLER ** caution more."""
+        if policy.gain is None:
+            return policy
+        run = simulate(problem, self.planner.widened(policy))
+        factor = GENTLER**caution
+        weight = factor * problem.input_weight + (factor - 1) * problem.change_weight
+        found = ddp.sweep(replace(problem, input_weight=weight), run.z, run.inputs)
+        if not (found.ok and np.isfinite(run.z).all()):
+            return policy
+        plan = self.planner.plan
+        return self.planner.narrowed(plan.policy(run.inputs, found.gains.K, run.z[:-1]))
 
     def checked(self, made: Candidate) -> Proposal:
         """A candidate that is finite, inside the limits and predicted to stay safe; or none."""

@@ -44,8 +44,9 @@ _FIELDS: Mapping[str, Callable[[str], Any]] = {
     "predicted_gain": float,
     "damping": float,
     "caution": int,
+    "way": str,
 }
-_ABSENT = {"predicted_gain": "nan", "damping": "1.0", "caution": "0"}  # in files of 0.1
+_ABSENT = {"predicted_gain": "nan", "damping": "1.0", "caution": "0", "way": ""}  # in files of 0.1
 
 
 @dataclass(frozen=True, eq=False)
