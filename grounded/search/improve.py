@@ -212,10 +212,10 @@ def refitted(task: Task, trials: Sequence[Trial]) -> Model:
 
 
 def _improvement(make: _Maker, incumbent: Tried, options: SearchOptions) -> Proposal:
-    """Steps 4 to 6: another plan where there is reason for one, else the first step, from the one
-    that is due on, that the model believes in.
+    """Steps 4 to 6: the first step, from the one that is due on, that the model believes in.
 
-    A step whose predicted run loses is passed over in the model, at no trial's cost: d must satisfy
+    Another plan goes before it where there is reason for one (`gentler`, `own_plan`). A step
+    whose predicted run loses is passed over in the model, at no trial's cost: d must satisfy
     U^(theta + alpha d) >= U^(theta) for some alpha (step 5).
     """
     now = make.now
@@ -250,9 +250,7 @@ class _About:
     run in the grounded model is (`already`). It replays the trial when the start was s_0.
     """
 
-    def __init__(
-        self, make: _Maker, incumbent: Tried, options: SearchOptions, way: Way
-    ) -> None:
+    def __init__(self, make: _Maker, incumbent: Tried, options: SearchOptions, way: Way) -> None:
         self.make, self.incumbent, self.options, self.way = make, incumbent, options, way
         planner, plan = make.planner, make.planner.plan
         own = planner.lift(mean_trial(incumbent.trials, planner.task.model.angle_mask))

@@ -50,8 +50,8 @@ Way = Literal[
     "own plan",  # of a model that was changed since the incumbent was planned, see `rivals`
 ]
 BOLDER = 3  # factors of 10 below the damping that is due, tried where all from it on lose
-OTHER_WAY = 3  # losses of "recorded inputs", which comes after all others, before it is given up
-PATIENCE = 8  # candidates in a row that may gain less than the tolerance each
+OTHER_WAY = 2  # losses of "recorded inputs", which comes after all others, before it is given up
+PATIENCE = 6  # candidates in a row that may gain less than the tolerance each
 LOST = 2  # steps in a row without improvement that ask for a diagnosis
 WILD = 100.0  # times its promise that a first trial's loss may be before it asks for one
 MAX_CAUTION = 3  # times the first policy is designed again, ever more gently, after a crash
@@ -105,9 +105,7 @@ class SearchOptions:
         recorded = incumbent.way == "recorded inputs"
         return ("recorded inputs", "") if recorded else ("", "recorded inputs")
 
-    def due(
-        self, history: Sequence[Tried], incumbent: Tried, model: str, way: Way
-    ) -> Step | None:
+    def due(self, history: Sequence[Tried], incumbent: Tried, model: str, way: Way) -> Step | None:
         """The step that is due from the incumbent in one way; None where it is exhausted.
 
         A direction belongs to one model: what was learnt with another counts for nothing.
@@ -329,10 +327,10 @@ def standing(
             f"{own} is the result (step 7)"
         )
         return replace(now, phase="converged", sentence=sentence, ending="no step improved")
-    if gained := _hardly(history, options.tolerance):
-        return replace(
-            now, phase="converged", sentence=f"{gained}: {own} is the result", ending="too little gained"
-        )
+    if options.damps and (hardly := _hardly(history, options.tolerance)):
+        ending, why = hardly
+        why = f"{why}: {own} is the result"
+        return replace(now, phase="converged", sentence=why, ending=ending)
     sentence = f"improve on {own} with {step}"
     if why := _suspicion(history, incumbent):
         then = NextCommand("diagnose")
@@ -340,17 +338,19 @@ def standing(
     return replace(now, step=step, way=way, sentence=sentence)
 
 
-def _hardly(history: tuple[Tried, ...], tolerance: float) -> str:
-    """That the last candidates gained too little for what they cost, "" where they did not."""
+def _hardly(history: tuple[Tried, ...], tolerance: float) -> tuple[Ending, str] | None:
+    """The ending where the last candidates gained too little for what they cost."""
     before = [t.utility for t in history[:-PATIENCE] if t.accepted]
     last = history[-PATIENCE:]
     if not before or any(t.candidate.model != last[0].candidate.model for t in last):
-        return ""
+        return None
     best = max(t.utility for t in history if t.accepted)
     gained = best - max(before)
+    if gained == 0.0:
+        return "no step improved", f"the last {PATIENCE} candidates did not improve"
     if gained >= PATIENCE * tolerance * abs(best):
-        return ""
-    return (
+        return None
+    return "too little gained", (
         f"the last {PATIENCE} candidates gained {gained:.3g} in all, less than "
         f"{100 * tolerance:g} % each ([search] tolerance)"
     )
