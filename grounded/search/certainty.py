@@ -12,7 +12,7 @@ import numpy as np
 from grounded.trial import Trial
 
 if TYPE_CHECKING:
-    from grounded.search.standing import Tried
+    from grounded.search.candidate import Tried
 
 
 def repeated_exactly(trials: Sequence[Trial]) -> bool:

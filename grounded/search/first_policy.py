@@ -192,7 +192,7 @@ def _kicked(task: Task, rng: np.random.Generator, inputs: Array) -> Array:
     at, width = rng.uniform(0, task.horizon), rng.uniform(*KICKED)
     height = rng.normal(0.0, KICK, task.model.m) * _range(task)
     shape = np.exp(-0.5 * ((np.arange(task.horizon)[:, None] - at) / width) ** 2)
-    return np.clip(inputs + height * shape, task.low, task.high)
+    return np.asarray(np.clip(inputs + height * shape, task.low, task.high))
 
 
 def _smooth(task: Task, rng: np.random.Generator, count: int, amplitude: float) -> Array:

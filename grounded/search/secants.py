@@ -28,8 +28,8 @@ import numpy as np
 from grounded.compile import Problem
 from grounded.frozen import Array
 from grounded.rollout import simulate
+from grounded.search.candidate import Tried
 from grounded.search.planner import Planner
-from grounded.search.standing import Tried
 from grounded.trial import Trial, mean_trial
 
 SMOOTH = 6.0  # steps: standard deviation of the kernel in time

@@ -7,8 +7,8 @@ import pytest
 from scipy.stats import ttest_ind
 
 from facts import holds
+from grounded.search.candidate import Tried
 from grounded.search.certainty import last_improvement, utility_noise
-from grounded.search.standing import Tried
 
 
 def tried(*utilities, accepted=True):

@@ -25,7 +25,7 @@ from grounded_trials.workspace.folder import Folder, Lost
 if TYPE_CHECKING:
     from grounded.diagnosis.report import Diagnosis
     from grounded.effects import Library
-    from grounded.search.standing import Candidate
+    from grounded.search.candidate import Candidate
     from grounded_trials.report.reporting import Report
     from grounded_trials.workspace.adopting import Adopted
     from grounded_trials.workspace.exporting import Exported

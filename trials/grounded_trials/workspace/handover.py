@@ -23,7 +23,7 @@ import numpy as np
 from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import Array
 from grounded.policy import Policy, z_difference
-from grounded.search.standing import Candidate
+from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.workspace.folder import Contents, Folder, candidate_of

@@ -16,7 +16,7 @@ from typing import Any
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result
-from grounded.search.standing import Tried
+from grounded.search.candidate import Tried
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.formats.mcap_walk import read_records
 from grounded_trials.logs.log_files import kind_of, log_files, open_log

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from grounded.search.standing import Tried
+from grounded.search.candidate import Tried
 from grounded_trials.report.figures.figure import Band, Curve, Dot, Figure, Key, Panel, Rule
 from grounded_trials.report.findings import Findings, standard_error
 from grounded_trials.wording import figure
