@@ -70,19 +70,27 @@ class Workspace(Folder):
         _ = self.config
 
     @classmethod
-    def create(cls, folder: str | Path, *, example: str) -> Self:
-        """Makes a workspace from an example; an existing file is never overwritten.
+    def create(
+        cls, folder: str | Path, *, example: str = "", blank: str | Path | None = None
+    ) -> Self:
+        """Makes a workspace from an example or a model; an existing file is never overwritten.
 
         Args:
             folder: where it is made.
             example: car-turn, car-circle, car-figure8, flight-figure8 or pendulum.
+            blank: a file with a `model` instead; target, weights and drive.py are to be filled in.
 
         Raises:
             GroundedError: if there is no such example, or the folder holds a workspace already.
         """
-        from grounded_trials.workspace.examples import write_example
+        if blank is not None:
+            from grounded_trials.workspace.blank import write_blank
 
-        write_example(Path(folder), example)
+            write_blank(Path(folder), blank)
+        else:
+            from grounded_trials.workspace.examples import write_example
+
+            write_example(Path(folder), example)
         return cls(folder)
 
     def __repr__(self) -> str:

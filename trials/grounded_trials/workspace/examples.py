@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -123,18 +123,7 @@ def write_example(folder: Path, name: str) -> None:
         GroundedError: if the folder already holds a workspace, or can't be written.
     """
     chosen = example(name)
-    files = (FILE, "model.py", "real.py", "target.csv")
-    for file in files:
-        if (folder / file).exists():
-            raise GroundedError(
-                f"{folder / file} exists already: name another folder, or remove it first"
-            )
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / "trials").mkdir(exist_ok=True)
-        (folder / "candidates").mkdir(exist_ok=True)
-    except OSError as error:
-        raise GroundedError(f"{folder} can't be made: {error.strerror}") from None
+    fresh_folder(folder, (FILE, "model.py", "real.py", "target.csv"))
     import importlib
 
     task, module = chosen.task(), importlib.import_module(chosen.model)
@@ -149,12 +138,33 @@ def write_example(folder: Path, name: str) -> None:
     write_atomically(folder / FILE, toml_of(task, name).encode())
 
 
+def fresh_folder(folder: Path, files: Sequence[str]) -> None:
+    """Makes the folders of a workspace in which none of these files exists yet.
+
+    Raises:
+        GroundedError: if one does, or the folder can't be made.
+    """
+    for file in files:
+        if (folder / file).exists():
+            raise GroundedError(
+                f"{folder / file} exists already: name another folder, or remove it first"
+            )
+    try:
+        for made in (folder, folder / "trials", folder / "candidates"):
+            made.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise GroundedError(f"{folder} can't be made: {error.strerror}") from None
+
+
 def _source(module: ModuleType) -> str:
     return f"# From {module.__name__}: yours to change.\n" + inspect.getsource(module)
 
 
-def toml_of(task: Task, name: str) -> str:
-    """The grounded.toml of a task, with a comment on each table."""
+SIMULATED = 'model = "real.py"             # yours: command = "python drive.py {candidate} {trial}"'
+
+
+def toml_of(task: Task, name: str, system: str = SIMULATED) -> str:
+    """The grounded.toml of a task, with a comment on each table; `system`: the line of its own."""
     states, inputs = task.model.state_names, task.model.input_names
     first = np.where(np.isfinite(task.target[0]), task.target[0], 0.0)
     start = {s: v for s, v, f in zip(states, task.start, first, strict=True) if v != f}
@@ -203,8 +213,8 @@ def toml_of(task: Task, name: str) -> str:
         "max_trials = 40",
         "",
         "[system]                      # how `grounded run` reaches the real system",
-        'model = "real.py"             # yours: command = "python drive.py {candidate} {trial}"',
-        "seed = 0",
+        system,
+        *["seed = 0"] * (system == SIMULATED),
         "",
     ]
     return "\n".join(lines)
