@@ -1,18 +1,30 @@
-"""grounded init: a workspace from an example, or from a model alone."""
+"""grounded init: a workspace from a log of your robot, from a model alone, or from an example."""
 
 from __future__ import annotations
 
 import shlex
+import sys
+from typing import TYPE_CHECKING
 
 import click
 
 from grounded_cli import completion as complete
-from grounded_cli.options import as_json
-from grounded_cli.terminal import show, show_json
+from grounded_cli.options import as_json, next_line
+from grounded_cli.terminal import field, progress, remark, show, show_json
+
+if TYPE_CHECKING:
+    from grounded_trials.logs.inspect_guess import Guess
+    from grounded_trials.starting.begin import Begun
 
 
 @click.command("init")
 @click.argument("folder", metavar="DIR", required=False)
+@click.option("--from", "log", metavar="LOG", help="A log of your robot, of any format.")
+@click.option("--model", metavar="FILE", help="Your model.py, beside --from or --blank.")
+@click.option("--blank", is_flag=True, help="No log yet: a workspace of --model, to fill in.")
+@click.option("--kind", help="Of the model skeleton: car, rover, drone, arm, pendulum, generic.")
+@click.option("--dt", type=float, metavar="SECONDS", help="Control interval (the log's).")
+@click.option("--yes", is_flag=True, help="Ask nothing: take the best guesses, marked as such.")
 @click.option(
     "--example",
     "name",
@@ -20,47 +32,118 @@ from grounded_cli.terminal import show, show_json
     shell_complete=complete.examples,
     help="Which example (see --list).",
 )
-@click.option(
-    "--blank",
-    metavar="MODEL.py",
-    type=click.Path(exists=True, dir_okay=False),
-    help="No example: your model, a target and weights to fill in, drive.py for your robot.",
-)
 @click.option("--list", "list_", is_flag=True, help="List the examples.")
 @as_json
 def command(
-    folder: str | None, name: str | None, blank: str | None, list_: bool, json_: bool
+    folder: str | None,
+    log: str | None,
+    model: str | None,
+    blank: bool,
+    kind: str | None,
+    dt: float | None,
+    yes: bool,
+    name: str | None,
+    list_: bool,
+    json_: bool,
 ) -> None:
     """Make a workspace in DIR: grounded.toml, model.py, target.csv, trials/, candidates/.
 
-    real.py stands in for your robot; replace [system] in grounded.toml when you have one.
+    --from LOG finds the model's states and inputs in a log and says why; without --model it writes
+    a model skeleton of the kind of robot that the log shows. --blank --model FILE needs no log and
+    writes drive.py, the robot's program. --example NAME takes an example, whose real.py stands in
+    for your robot.
     """
     if list_:
-        from grounded_trials.workspace.examples import EXAMPLES
-
-        if json_:
-            show_json({"examples": {key: value.text for key, value in EXAMPLES.items()}})
-        else:
-            show("\n".join(f"{key:15} {value.text}" for key, value in EXAMPLES.items()))
-        return
-    if folder is None or (name is None) == (blank is None):
+        _list(json_)
+    elif folder is None or [log is not None, name is not None, blank].count(True) != 1:
         raise click.UsageError(
-            "give a folder and either an example or a model: grounded init DIR --example car-turn "
-            "(`grounded init --list` names them), or grounded init DIR --blank model.py"
+            "give a folder and a log, grounded init DIR --from run1.mcap, or an example, grounded "
+            "init DIR --example car-turn (`grounded init --list` names them), or a model alone, "
+            "grounded init DIR --blank --model model.py"
         )
+    elif blank:
+        _blank(folder, model, json_)
+    elif log is not None:
+        from pathlib import Path
+
+        from grounded_trials.starting.begin import begin
+
+        asked = None if yes or json_ or not sys.stdin.isatty() else _ask
+        with progress(f"reading {log}"):
+            begun = begin(Path(folder), log, model=model, kind=kind, dt=dt, ask=asked)
+        show_json(begun.to_json()) if json_ else _tell(begun)
+    else:
+        _example(folder, str(name), json_)
+
+
+def _ask(guess: Guess) -> str:
+    """Asks which signal a state or input is."""
+    paths = [p for p in (guess.path, *guess.others) if p]
+    show(f"\n{guess.name} {'is unsure' if guess.path else 'was not found'}")
+    for reason in guess.reasons:
+        show(f"  {reason}")
+    for i, path in enumerate(paths, start=1):
+        show(f"  {i}  {path}")
+    first = "1" if guess.path else ""
+    answer = click.prompt("  a number, another message path, or - for none", default=first or "-")
+    if answer == "-":
+        return ""
+    return paths[int(answer) - 1] if answer.isdigit() and 0 < int(answer) <= len(paths) else answer
+
+
+def _tell(begun: Begun) -> None:
+    what = f"skeleton of kind '{begun.kind}': {begun.why}" if begun.kind else begun.why
+    show(f"{begun.workspace} is a workspace for {begun.log}")
+    show(field("model", what, "  "))
+    show(field("grid", f"{begun.dt:g} s, {begun.horizon} steps", "  "))
+    show(field("target", begun.target, "  "))
+    show("")
+    for guess in (*begun.states, *begun.inputs):
+        mark = "" if guess.sure else "UNSURE "
+        show(field(guess.name, f"{mark}{guess.path or 'nothing in the log fits'}", "  "))
+        for reason in guess.reasons:
+            show(field("", reason, "  "))
+        if guess.others and not guess.sure:
+            show(field("", f"or {', '.join(guess.others)}", "  "))
+    for note in begun.notes:
+        remark("note", note)
+    look = "; look at what is UNSURE in its [log]" if begun.unsure else ""
+    show(f"\nread {begun.workspace}/model.py and grounded.toml{look}, then")
+    show(next_line(begun.then, begun.workspace))
+
+
+def _list(json_: bool) -> None:
+    from grounded_trials.workspace.examples import EXAMPLES
+
+    if json_:
+        show_json({"examples": {key: value.text for key, value in EXAMPLES.items()}})
+    else:
+        show("\n".join(f"{key:15} {value.text}" for key, value in EXAMPLES.items()))
+
+
+def _blank(folder: str, model: str | None, json_: bool) -> None:
+    if model is None:
+        raise click.UsageError("--blank needs your model: grounded init DIR --blank --model FILE")
     from grounded_trials import Workspace
 
-    Workspace.create(folder, example=name or "", blank=blank)
+    Workspace.create(folder, model=model)
     if json_:
-        show_json({"workspace": folder, "example": name, "blank": blank})
+        show_json({"workspace": folder, "model": model})
         return
+    show(f"{folder} is a workspace for the model of {model}. Yours to fill in:")
+    show("  grounded.toml  dt, start, weights, limits")
+    show("  target.csv     what the states are to do")
+    show("  drive.py       measure() and send() of your robot")
     where = f"cd {shlex.quote(folder)} && " * (folder != ".")
-    if blank:
-        show(f"{folder} is a workspace for the model of {blank}. Yours to fill in:")
-        show("  grounded.toml  dt, start, weights, limits")
-        show("  target.csv     what the states are to do")
-        show("  drive.py       measure() and send() of your robot")
-        show(f"\nnext: edit these, then {where}grounded propose")
+    show(f"\nnext: edit these, then {where}grounded propose")
+
+
+def _example(folder: str, name: str, json_: bool) -> None:
+    from grounded_trials import Workspace
+
+    Workspace.create(folder, example=name)
+    if json_:
+        show_json({"workspace": folder, "example": name})
         return
     files = [
         ("grounded.toml", "the task: target, reward, limits, search"),
@@ -70,4 +153,4 @@ def command(
     ]
     show(f"{folder} is a workspace for {name}:")
     show("\n".join(f"  {a:14} {b}" for a, b in files))
-    show(f"\nnext: {where}grounded propose")
+    show("\nnext: " + f"cd {shlex.quote(folder)} && " * (folder != ".") + "grounded propose")

@@ -39,7 +39,7 @@ def installed(monkeypatch):
 @pytest.fixture
 def blank(tmp_path):
     (tmp_path / "sled.py").write_text(MODEL)
-    return Workspace.create(tmp_path / "w", blank=tmp_path / "sled.py")
+    return Workspace.create(tmp_path / "w", model=tmp_path / "sled.py")
 
 
 def driver(folder):
@@ -94,5 +94,5 @@ def test_a_candidate_is_not_read_where_nothing_reads_it(blank, monkeypatch):
 def test_nothing_is_overwritten(blank, tmp_path):
     before = (blank.folder / "drive.py").read_bytes()
     with pytest.raises(GroundedError, match="exists already"):
-        Workspace.create(blank.folder, blank=tmp_path / "sled.py")
+        Workspace.create(blank.folder, model=tmp_path / "sled.py")
     assert (blank.folder / "drive.py").read_bytes() == before
