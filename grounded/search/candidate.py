@@ -78,7 +78,7 @@ class Tried(Result):
         return float(np.std(self.utilities, ddof=1) / np.sqrt(len(self.utilities)))
 
     def verdict(self, last: bool = True) -> str:
-        """What became of the candidate: first, better, no better; or why that is not decided.
+        """What became of the candidate: first, better, no better, crashed; or why not decided.
 
         Args:
             last: whether it is the latest one; an earlier one without a trial will get none.
@@ -88,7 +88,7 @@ class Tried(Result):
         if self.accepted is None:
             return "waiting" if last or self.trials else "no trial"
         if not self.accepted:
-            return "no better"
+            return "crashed" if self.utility == -np.inf else "no better"
         return "better" if self.candidate.base else "first"
 
     def summary(self) -> str:

@@ -56,6 +56,13 @@ def test_failed_runs_are_left_out_and_trials_that_agree_say_so():
     assert holds(found, 1, "exactly") and "+-" not in found and "probability" not in found
 
 
+def test_a_crash_is_called_a_crash():
+    """FACTS 7 and issue 12: a run that ended early was "no better" in table, page and text."""
+    candidate = SimpleNamespace(base="c0001")
+    lost = Tried(candidate, (None, None), (-4.0, -np.inf), False)
+    assert lost.verdict() == "crashed"
+
+
 @pytest.mark.parametrize(
     ("accepted", "base", "doubt", "trials", "last", "word"),
     [

@@ -32,7 +32,7 @@ def search_figure(findings: Findings) -> Figure | None:
         Key("best", "best so far"),
     ]
     if any(not math.isfinite(t.utility) for t in tried):
-        key.append(Key("model", "failed", "cross"))
+        key.append(Key("model", "crashed", "cross"))
     if findings.optimum is not None:
         key.append(Key("accepted", "optimum of the real system"))
     if math.isfinite(findings.noise):
