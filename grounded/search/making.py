@@ -98,7 +98,8 @@ class About:
         """A model that was changed since: its own new plan, where more is promised of that.
 
         The plan of a crude model may sit in another valley than that of the better one: going on
-        from it ends where it began. Both are judged by the grounded prediction.
+        from it ends where it began. Both are judged by the grounded prediction, unless the
+        incumbent's trial was wild: a bias measured there says nothing of other runs.
         """
         make, base = self.make, self.incumbent.candidate
         tried = losers_of(make.now.history, base.id, make.fingerprint, "own plan")
@@ -107,7 +108,8 @@ class About:
         policy, _ = first_policy(make.planner.plan)
         made = self.candidate(policy, Step(), "own plan")
         promise = rival.candidate.predicted_gain if rival and rival.candidate else self.least
-        proposal = make.checked(made) if made.predicted_gain > promise else None
+        better = made.predicted_gain > promise or wild(self.incumbent)
+        proposal = make.checked(made) if better else None
         return proposal if proposal is not None and proposal.candidate is not None else None
 
 
