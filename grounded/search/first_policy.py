@@ -8,8 +8,8 @@ until it has converged, and the plan with the lowest cost wins:
     the reference    a closed-loop run of the model near the target (`first_guess`)
     zero inputs      and the inputs held before the start, where they are others
     smooth inputs    random, by fixed seeds: only where a solve takes milliseconds
-    more of them     where those have shown that there are local optima; every other one is the best
-                     plan so far, kicked for a while: it leaves a valley that random inputs lead to
+    more of them     where those have shown local optima that are nearly as good; every other one the
+                     best plan so far, kicked for a while, which leads to other valleys than random inputs
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def first_policy(
         found = _pursued(problem, inputs, best, most, tick)
         elsewhere |= _other_optimum(found, best)
         best = _better(found, best)
-    if elsewhere and task.model.system.how == "compiled":
+    if elsewhere and share >= FEWEST and task.model.system.how == "compiled":
         best = _hopped(task, problem, best, most, tick)
     if best.status == "max iterations" and len(best.trace) < ITERATIONS:
         more = finished(problem, best.u, best.K, best.z[:-1], tick=tick)
@@ -145,7 +145,8 @@ def _pursued(
 ) -> ddp.Solution | None:
     """DDP from a start; None where its own cost is hopeless."""
     cost = float(problem.system.rollout(problem, inputs).cost[0])
-    most_cost = HOPELESS if problem.system.how == "compiled" else HOPELESS_SLOW
+    cheap = problem.system.how == "compiled" and most > FEWEST
+    most_cost = HOPELESS if cheap else HOPELESS_SLOW
     if not np.isfinite(cost) or (best.ok and cost > most_cost * best.cost):
         return None
     return finished(problem, inputs, most=most, tick=tick)
@@ -158,11 +159,11 @@ def _better(found: ddp.Solution | None, best: ddp.Solution) -> ddp.Solution:
 
 
 def _other_optimum(found: ddp.Solution | None, best: ddp.Solution) -> bool:
-    """Whether two plans have converged to different costs."""
+    """Whether two plans have converged to different costs, of which the worse may compete."""
     if found is None or (found.status, best.status) != ("converged", "converged"):
         return False
     low, high = sorted((found.cost, best.cost))
-    return high > WORSE * low
+    return WORSE * low < high < PROMISING * low
 
 
 def _rivals(task: Task) -> Iterator[Array]:
