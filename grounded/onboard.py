@@ -153,14 +153,26 @@ def read(path: Any, states: Names, inputs: Names, task: Optional[str]) -> dict[s
         raise ValueError(f"{path} lacks {error}; export it again") from None
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path} is garbled: {error}; export it again") from None
-    for kind, names in (("states", states), ("inputs", inputs)):
-        own = found["state_names" if kind == "states" else "input_names"]
-        if names is not None and tuple(names) != own:
-            raise ValueError(f"{path} is for {kind} {own}; this robot has {tuple(names)}")
-    if task is not None and str(data.get("task", "")) != task:
-        raise ValueError(f"{path} is for task {data.get('task')}; this robot is set up for {task}")
+    check_robot(path, SimpleNamespace(**found), states, inputs)
+    check_task(path, str(data.get("task", "")), task)
     _check(path, found)
     return found
+
+
+def check_robot(path: Any, policy: Any, states: Names, inputs: Names) -> None:
+    """That a policy is for a robot with these names, in this order."""
+    for kind, names, own in (
+        ("states", states, policy.state_names),
+        ("inputs", inputs, policy.input_names),
+    ):
+        if names is not None and tuple(names) != own:
+            raise ValueError(f"{path} is for {kind} {own}; this robot has {tuple(names)}")
+
+
+def check_task(path: Any, made_for: str, task: Optional[str]) -> None:
+    """That a policy is for the task with this hash."""
+    if task is not None and made_for != task:
+        raise ValueError(f"{path} is for task {made_for}; this robot is set up for {task}")
 
 
 def _check(path: Any, found: dict[str, Any]) -> None:

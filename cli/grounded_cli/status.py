@@ -11,7 +11,8 @@ from grounded_cli.options import as_json, in_workspace, next_line, open_workspac
 from grounded_cli.terminal import field, number, progress, remark, show, show_json, sparkline, table
 
 if TYPE_CHECKING:
-    from grounded.search.standing import Standing, Tried
+    from grounded.search.candidate import Tried
+    from grounded.search.standing import Standing
     from grounded_trials.workspace.proposing import Status
 
 LEGEND = "damp: penalty on leaving the last trial's inputs; +-: standard error"

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from grounded.frozen import Array
-from grounded.search.standing import Candidate, Tried
+from grounded.search.candidate import Candidate, Tried
 from grounded.task import Task
 
 MAX_GAIN = 1e6  # input units per state unit: beyond it a gain is a numerical accident

@@ -15,7 +15,8 @@ from grounded.errors import NextCommand
 from grounded.experiments.figure8 import flight_task
 from grounded.models import aircraft
 from grounded.policy import Policy
-from grounded.search.standing import Candidate, SearchOptions, standing
+from grounded.search.candidate import Candidate
+from grounded.search.standing import SearchOptions, standing
 from grounded.solve.bias import residuals
 from grounded.trial import Trial
 from grounded_trials.report.findings import Findings, Run

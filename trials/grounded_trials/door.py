@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from grounded.diagnosis.report import Diagnosis
     from grounded.effects import Library
     from grounded.frozen import Array
-    from grounded.search.standing import Candidate
+    from grounded.search.candidate import Candidate
     from grounded_trials.report.reporting import Report
     from grounded_trials.workspace.adopting import Adopted
     from grounded_trials.workspace.exporting import Exported
@@ -102,21 +102,26 @@ class Workspace(Folder):
         log: str | Path | None = None,
         model: str | Path | None = None,
     ) -> Self:
-        """Makes a workspace from an example or from a log; nothing is ever overwritten.
+        """Makes a workspace from an example, a log or a model; nothing is ever overwritten.
 
         Args:
             folder: where it is made.
             example: car-turn, car-circle, car-figure8, flight-figure8 or pendulum.
             log: of your robot, any format; `starting.begin.begin` says what it found.
-            model: your model.py, beside `log`; None: a skeleton is written.
+            model: your model.py, beside `log`, where None writes a skeleton; or alone: target,
+                weights and drive.py are to be filled in then.
 
         Raises:
             GroundedError: if there is no such example, the log can't be read, or the folder holds
                 a workspace already.
         """
-        if (example is None) == (log is None):
-            raise GroundedError("give an example or a log to make a workspace from")
-        if log is not None:
+        if (example is None) == (log is None and model is None):
+            raise GroundedError("give an example, a log or a model to make a workspace from")
+        if log is None and model is not None:
+            from grounded_trials.starting.blank import write_blank
+
+            write_blank(Path(folder), model)
+        elif log is not None:
             from grounded_trials.starting.begin import begin
 
             begin(Path(folder), log, model=model)

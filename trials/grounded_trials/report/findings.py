@@ -15,8 +15,9 @@ from grounded.diagnosis.report import Diagnosis
 from grounded.errors import NextCommand
 from grounded.frozen import Array
 from grounded.model import Model
+from grounded.search.candidate import Candidate, Tried
 from grounded.search.planner import Planner
-from grounded.search.standing import Candidate, Standing, Tried
+from grounded.search.standing import Standing
 from grounded.task import Task
 from grounded.trial import Trial, mean_trial
 from grounded_trials.wording import figure, rendered, shown

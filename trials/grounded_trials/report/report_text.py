@@ -9,7 +9,7 @@ import numpy as np
 
 from grounded.diagnosis.report import Estimate
 from grounded.errors import NextCommand
-from grounded.search.standing import Tried
+from grounded.search.candidate import Tried
 from grounded_trials.report.diagnosis_words import error_lines, sentences
 from grounded_trials.report.findings import (
     Findings,

@@ -135,8 +135,8 @@ def _probe(
         return None
     from grounded.diagnosis.excitation import probe
     from grounded.rollout import simulate
+    from grounded.search.candidate import Candidate
     from grounded.search.improve import model_fingerprint
-    from grounded.search.standing import Candidate
     from grounded_trials.workspace.proposing import standing_in
 
     best = standing_in(workspace).incumbent

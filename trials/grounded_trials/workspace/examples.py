@@ -138,11 +138,7 @@ def write_example(folder: Path, name: str) -> None:
     files = {"target.csv": target_text(task.dt, columns), "model.py": _source(module)}
     files |= {"real.py": chosen.real, FILE: toml_of(task, name)}
     _refuse(folder, [file for file, text in files.items() if not _holds(folder / file, text)])
-    try:
-        for part in (folder, folder / "trials", folder / "candidates"):
-            part.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise GroundedError(f"{folder} can't be made: {error.strerror}") from None
+    fresh_folder(folder, ())
     for file, text in files.items():
         write_atomically(folder / file, text.encode())
 
@@ -157,12 +153,29 @@ def _holds(path: Path, text: str) -> bool:
     return path.is_file() and path.stat().st_size < 10**7 and path.read_bytes() == text.encode()
 
 
+def fresh_folder(folder: Path, files: Iterable[str]) -> None:
+    """Makes the folders of a workspace in which none of these files exists yet.
+
+    Raises:
+        GroundedError: if one does, or the folder can't be made.
+    """
+    _refuse(folder, files)
+    try:
+        for made in (folder, folder / "trials", folder / "candidates"):
+            made.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise GroundedError(f"{folder} can't be made: {error.strerror}") from None
+
+
 def _source(module: ModuleType) -> str:
     return f"# From {module.__name__}: yours to change.\n" + inspect.getsource(module)
 
 
-def toml_of(task: Task, name: str) -> str:
-    """The grounded.toml of a task, with a comment on each table."""
+SIMULATED = 'model = "real.py"             # yours: command = "python drive.py {candidate} {trial}"'
+
+
+def toml_of(task: Task, name: str, system: str = SIMULATED) -> str:
+    """The grounded.toml of a task, with a comment on each table; `system`: the line of its own."""
     states, inputs = task.model.state_names, task.model.input_names
     first = np.where(np.isfinite(task.target[0]), task.target[0], 0.0)
     start = {s: v for s, v, f in zip(states, task.start, first, strict=True) if v != f}
@@ -211,8 +224,8 @@ def toml_of(task: Task, name: str) -> str:
         "max_trials = 40",
         "",
         "[system]                      # how `grounded run` reaches the real system",
-        'model = "real.py"             # yours: command = "python drive.py {candidate} {trial}"',
-        "seed = 0",
+        system,
+        *["seed = 0"] * (system == SIMULATED),
         "",
     ]
     return "\n".join(lines)

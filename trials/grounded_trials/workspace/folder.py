@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 from grounded.errors import GroundedError, nearest
 from grounded.model import Model
-from grounded.search.standing import Candidate
+from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.store.documents import Notes

@@ -22,7 +22,7 @@ import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.policy import Policy
-from grounded.search.standing import Candidate
+from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.workspace.folder import Contents, Folder

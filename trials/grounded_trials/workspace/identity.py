@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from grounded.errors import GroundedError
-from grounded.search.standing import Candidate
+from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.store.candidate_file import candidate_bytes, read_candidate
@@ -36,8 +36,9 @@ _FIELDS: Mapping[str, Callable[[str], Any]] = {
     "predicted_gain": float,
     "damping": float,
     "caution": int,
+    "way": str,
 }
-_ABSENT = {"predicted_gain": "nan", "damping": "1.0", "caution": "0"}  # in files of 0.1
+_ABSENT = {"predicted_gain": "nan", "damping": "1.0", "caution": "0", "way": ""}  # in 0.1
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from typing import Any
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result
-from grounded.search.standing import Tried
+from grounded.search.candidate import Tried
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.logs.log_files import kind_of, log_files, log_records
 from grounded_trials.logs.log_table import log_mapping, read_log

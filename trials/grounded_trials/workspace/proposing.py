@@ -14,8 +14,9 @@ from grounded_trials.workspace.handover import Void, checked_candidate, outside_
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
 
-    from grounded.search.improve import Proposal
-    from grounded.search.standing import Candidate, Standing
+    from grounded.search.candidate import Candidate
+    from grounded.search.making import Proposal
+    from grounded.search.standing import Standing
 
 
 @dataclass(frozen=True, eq=False, repr=False)

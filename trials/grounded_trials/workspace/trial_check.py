@@ -14,7 +14,7 @@ import numpy as np
 
 from grounded.frozen import Array
 from grounded.policy import Policy, z_difference
-from grounded.search.standing import Candidate
+from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import HUGE, Trial, interpolate_gaps
 from grounded_trials.workspace.folder import Folder

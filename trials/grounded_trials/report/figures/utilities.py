@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from grounded.search.standing import Tried
+from grounded.search.candidate import Tried
 from grounded_trials.report.figures.figure import Band, Curve, Dot, Figure, Key, Panel, Rule
 from grounded_trials.report.findings import Findings, standard_error
 from grounded_trials.wording import figure
@@ -32,7 +32,7 @@ def search_figure(findings: Findings) -> Figure | None:
         Key("best", "best so far"),
     ]
     if any(not math.isfinite(t.utility) for t in tried):
-        key.append(Key("model", "failed", "cross"))
+        key.append(Key("model", "crashed", "cross"))
     if findings.optimum is not None:
         key.append(Key("accepted", "optimum of the real system"))
     if math.isfinite(findings.noise):

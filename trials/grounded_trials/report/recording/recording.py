@@ -165,6 +165,8 @@ class _Recorder:
     def trial(self, run: Run) -> None:
         """Everything of one trial, under its own name."""
         at, colour = f"trials/{run.trial.id}", "accepted" if run.accepted else "other"
+        if self.task.utility(run.trial) == -np.inf:
+            colour = "limit"  # it crashed
         for role, chosen in self.compared.items():
             if chosen is not None and run.candidate is chosen.candidate:
                 colour = role
