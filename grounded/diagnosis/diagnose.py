@@ -1,5 +1,6 @@
 """START HERE: the sim-to-real gap, diagnosed. Trials and a crude model in, a verdict out.
 
+preflight         the instruments, from their signals alone: corrected first  (instruments)
 limits            what can't be known from these data
 attribution       which effects, by evidence       (search, hypotheses, scan, refine, noise, fitted)
 held_out          no claim that held-out trials contradict; how far the gap shrinks on them
@@ -14,7 +15,7 @@ excitation        what to run next, where two explanations tie
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -59,6 +60,7 @@ from grounded.diagnosis.search import HypothesisSearch
 from grounded.diagnosis.split import repeated, split
 from grounded.diagnosis.verdict import next_trial, verdict
 from grounded.effects import Library
+from grounded.instruments.preflight import preflight
 from grounded.model import Model
 from grounded.task import Task
 from grounded.trial import Trial
@@ -105,11 +107,15 @@ def diagnose(
     model = subject.model if isinstance(subject, Task) else subject
     latency = subject.latency if isinstance(subject, Task) else None
     past = subject.past if isinstance(subject, Task) else None
+    tick("instruments")
+    looked = preflight(subject, trials, options.hidden)
+    trials = looked.trials
     data = prepare(model, trials, latency, past, options.hidden)
     known = limits(data)
     tick("candidates")
     offered = options.library.candidates(model, data.scales)
-    candidates = knowable(data, [e for e in offered if e.name not in options.but])
+    settled = {*options.but, *looked.settled}
+    candidates = knowable(data, [e for e in offered if e.name not in settled])
     search, best = attribute(data, candidates, max_effects=options.max_effects, tick=tick)
     tick("leftover")
     with np.errstate(all="ignore"):
@@ -118,7 +124,8 @@ def diagnose(
         left = leftovers(search.predictor, best)
         task = subject if isinstance(subject, Task) else None
         used = [trial for trial in trials if trial.known_steps >= 2]
-        return _Writer(search, best, left, known, options, tick, task, used).diagnosis()
+        found = _Writer(search, best, left, known, options, tick, task, used).diagnosis()
+        return replace(found, preflight=looked.findings)
 
 
 class _Writer:

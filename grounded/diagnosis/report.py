@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from grounded.instruments.finding import Finding
 from grounded.result import Document
 
 BRIEF: dict[str, Any] = {"brief": True}  # a field whose key is left out where there is nothing
@@ -253,6 +254,7 @@ class Diagnosis(Document):
     unknowable: tuple[str, ...] = ()  # what the trials are too few or too quiet for
     noise: NoiseLevels = field(default_factory=NoiseLevels)
     parameters: Mapping[str, Estimate] = field(default_factory=dict)  # calibrated beside effects
+    preflight: tuple[Finding, ...] = ()  # of the instruments, before any physics
     trials: int = 0
     steps: int = 0
     candidates: int = 0

@@ -25,6 +25,7 @@ from grounded_trials.workspace.folder import Folder, Lost
 if TYPE_CHECKING:
     from grounded.diagnosis.report import Diagnosis
     from grounded.effects import Library
+    from grounded.instruments.finding import Finding
     from grounded.search.standing import Candidate
     from grounded_trials.report.reporting import Report
     from grounded_trials.workspace.adopting import Adopted
@@ -239,6 +240,16 @@ class Workspace(Folder):
             library=library.without(without),
             progress=progress,
         )
+
+    def preflight(self, trials: Sequence[str] = ()) -> tuple[Finding, ...]:
+        """Judges the instruments alone, from their own signals: late, scaled, stuck; quick.
+
+        Args:
+            trials: short names, t0007; none: all that can be used.
+        """
+        from grounded_trials.workspace.diagnosing import instruments_in
+
+        return instruments_in(self._afresh(), trials)
 
     def adopt(self, *effects: str, parameters: bool = True) -> Adopted:
         """Adds effects of the last diagnosis to the model of grounded.toml.

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 from grounded.diagnosis.report import Diagnosis, Gap, Split
+from grounded.instruments.finding import Finding
 from grounded_trials.wording import count, figure, percent, with_unit
 
 MOST = 3  # parameters that are named
@@ -49,6 +50,15 @@ def error_lines(diagnosis: Diagnosis, before: Mapping[str, float]) -> list[tuple
         ]
         found.append(("alike", f"{', '.join(like)} of the signal of {effect}"))
     return found
+
+
+def instrument_lines(findings: Iterable[Finding]) -> list[str]:
+    """Each finding with its signal, whether it was corrected, and the key of [log] that does so."""
+    lines = []
+    for one in findings:
+        done = "; corrected here" * one.corrected
+        lines.append(f"{one.signal}: {one.finding}{done}{f', in [log]: {one.log}' * bool(one.log)}")
+    return lines
 
 
 def gap_sentence(gap: Gap) -> str:

@@ -21,6 +21,7 @@ from grounded_trials.wording import rendered
 
 if TYPE_CHECKING:
     from grounded.effects import Library
+    from grounded.instruments.finding import Finding
     from grounded.trial import Trial
     from grounded_trials.workspace.folder import Folder
 
@@ -78,6 +79,16 @@ def diagnose_in(
         found = replace(found, next_trial=f"{words} ({identity}: {run})", probe=identity)
         _keep(workspace, found)
     return found
+
+
+def instruments_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[Finding, ...]:
+    """What the stored trials say of the instruments, before any physics."""
+    from grounded.instruments.preflight import preflight
+
+    planner = workspace.planner
+    memory = planner.plan.model.state_names[planner.task.model.n :]
+    lifted = [planner.lift(trial) for trial in _chosen(workspace, trials)]
+    return preflight(planner.plan, lifted, memory).findings
 
 
 def _keep(workspace: Folder, found: Diagnosis) -> None:
