@@ -30,11 +30,12 @@ AGREE = 0.9  # length of the mean of unit vectors that point the same way
 
 @dataclass(frozen=True)
 class Integral:
-    """The rate of state i is c times state j."""
+    """The rate of state i is c times state j; `exact`: by the model itself, not by roles."""
 
     i: int
     j: int
     c: float
+    exact: bool = True
 
 
 def integrals(model: Model) -> list[Integral]:
@@ -47,7 +48,7 @@ def integrals(model: Model) -> list[Integral]:
         i, j = names.index(name), names.index(other)
         found.append(Integral(i, j, float(np.mean(rates[:, i] / x[:, j]))))
     carried = [(i, k) for i, n in enumerate(names) if (k := partner(model, n))]
-    return found + [Integral(i, names.index(k), 1.0) for i, k in carried]
+    return found + [Integral(i, names.index(k), 1.0, exact=False) for i, k in carried]
 
 
 def lag_of(model: Model, relation: Integral, trials: Sequence[Trial]) -> Lag | None:

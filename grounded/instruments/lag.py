@@ -86,6 +86,13 @@ class _Pieces:
         return _centred([at_samples(b, np.arange(len(a)) + at) for a, b in self.sides])
 
     @property
+    def groups(self) -> tuple[Any, Any]:
+        """Parts of the samples (N,): stretches of time, and of every trial the same stretch."""
+        lengths = [len(a) for a in self.a]
+        total = np.arange(sum(lengths)) * max(BLOCKS, 2 * len(lengths)) // sum(lengths)
+        return total, np.concatenate([np.arange(n) * BLOCKS // (2 * n) for n in lengths])
+
+    @property
     def sides(self) -> list[tuple[Array, Array]]:
         return list(zip(self.a, self.b, strict=True))
 
@@ -122,8 +129,8 @@ def _measured(pieces: _Pieces, reach: int, dt: float) -> Lag | None:
         step = float((a - s * b) @ slope) / curve if curve else 0.0
         d = float(np.clip(d + np.clip(step, -1, 1), -reach + 1, reach - 1))
     rest, pull = a - s * b, s * slope
-    force = np.array([float(x.sum()) for x in np.array_split(rest * pull, _blocks(pieces))])
-    std = float(np.sqrt((force**2).sum()) / max(float(pull @ pull), 1e-300))
+    force = max(_scatter(rest * pull, group) for group in pieces.groups)
+    std = force / max(float(pull @ pull), 1e-300)
     both = abs(float(a @ b))
     low, high = both / float(a @ a), float(b @ b) / max(both, 1e-300)
     tau = _filter(pieces, a, float(rest @ rest)) if d > 0 else None
@@ -133,8 +140,10 @@ def _measured(pieces: _Pieces, reach: int, dt: float) -> Lag | None:
     )
 
 
-def _blocks(pieces: _Pieces) -> int:
-    return max(BLOCKS, 2 * len(pieces.a))
+def _scatter(force: Array, group: Any) -> float:
+    """Standard deviation of a sum from the scatter of its parts."""
+    parts = np.bincount(group, force)
+    return float(np.sqrt((parts**2).sum()))
 
 
 def _filter(pieces: _Pieces, a: Array, misfit: float) -> float | None:

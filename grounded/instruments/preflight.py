@@ -164,6 +164,9 @@ class _Bench:
         text = f"{d:.3g} s later than {other}"
         if lag.filtered:
             text = f"follows {other} through a filter of {d:.3g} s"
+        if i == relation.i and not relation.exact:  # a disturbed heading looks late as well
+            yield Finding(name, text, "delay", d, lag.std)
+            return
         self.put(i, [_earlier(x, d / self.dt) for x in self.column(i)])
         kind, log = "lag" if lag.filtered else "delay", f"delay_s = {d:.3g}"
         yield _mended(name, text, kind, log, delay_s=d, std_s=lag.std)

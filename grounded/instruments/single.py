@@ -216,7 +216,7 @@ def _clipped(s: Signal) -> Finding | None:
         stays, samples = 0, 0
         for x in s.columns:
             start, length = runs(x)
-            at = (x[start] == limit) & (length >= 3)
+            at = (x[start] == limit) & (length >= 3) & (start > 0)
             stays, samples = stays + int(at.sum()), samples + int(length[at].sum())
         share = samples / values.size
         if stays >= 3 and share > CLIPPED:
