@@ -35,11 +35,23 @@ if TYPE_CHECKING:
     help="Blame at most K effects at once, 1 to 6 (default: 3).",
 )
 @click.option("--without", multiple=True, metavar="F1,F2,...", help="Families not to blame.")
+@click.option(
+    "--compare",
+    nargs=2,
+    metavar="A B",
+    shell_complete=complete.trials,
+    help="Two groups of trials, T1,T2 T3,T4: what changed between them.",
+)
 @click.option("--instruments", is_flag=True, help="Judge the sensors alone; takes a second.")
 @in_workspace
 @as_json
 def command(
-    trials: str | None, max_effects: int, without: tuple[str, ...], instruments: bool, json_: bool
+    trials: str | None,
+    max_effects: int,
+    without: tuple[str, ...],
+    compare: tuple[str, str] | None,
+    instruments: bool,
+    json_: bool,
 ) -> None:
     """Explain the sim-to-real gap from the stored trials; keeps reports/diagnosis.json.
 
@@ -55,6 +67,12 @@ def command(
         raise GroundedError(
             "--trials names no trial: expected some, like t0001,t0002; leave it out to take all"
         )
+    first, second = map(names_in, compare or ("", ""))
+    if compare and (chosen or not (first and second) or {*first} & {*second}):
+        raise GroundedError(
+            "--compare takes two groups of different trials, like --compare t0001,t0002 "
+            "t0003,t0004, instead of --trials"
+        )
     if instruments:
         findings = workspace.preflight(chosen)
         if json_:
@@ -63,7 +81,13 @@ def command(
         return None if findings else show("nothing was found of the sensors")
     families = [name for text in without for name in names_in(text)]
     with stages() as tell:
-        found = workspace.diagnose(chosen, max_effects=max_effects, without=families, progress=tell)
+        found = workspace.diagnose(
+            chosen or first,
+            max_effects=max_effects,
+            without=families,
+            compare=second,
+            progress=tell,
+        )
     if json_:
         show_json(found.to_json())
     else:
@@ -84,7 +108,7 @@ def _follow(workspace: Workspace, found: Diagnosis) -> NextCommand:
 
 
 def _tell(found: Diagnosis, before: dict[str, float]) -> None:
-    from grounded_trials.report.diagnosis_words import error_lines
+    from grounded_trials.report.diagnosis_words import agreement_lines, error_lines
 
     show(_verdict(found.kind, found.sentence))
     _instruments(found.preflight)
@@ -92,6 +116,8 @@ def _tell(found: Diagnosis, before: dict[str, float]) -> None:
         if text not in found.sentence:
             show(field("unknown", text))
     for title, text in error_lines(found, before):
+        show(field(title, text))
+    for title, text in agreement_lines(found):
         show(field(title, text))
     _places(found.where)
     if not found.no_cause:

@@ -6,6 +6,7 @@ attribution       which effects, by evidence       (search, hypotheses, scan, re
 held_out          no claim that held-out trials contradict; how far the gap shrinks on them
 claims            what is claimed, what ties, what is nearly the same    (lookalike)
 leftover          what no effect explains
+agreement         whether the trials agree; what changed between two groups of them
 prediction_error  where the gap lies: channels, times, regions
 split             what the error is made of: explained, unexplained, irreducible
 verdict           all of it in sentences; `report` is the result as data
@@ -20,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from grounded.diagnosis.agreement import by_trial, changed
 from grounded.diagnosis.attribution import attribute
 from grounded.diagnosis.claims import Claims
 from grounded.diagnosis.data import prepare
@@ -90,6 +92,7 @@ def diagnose(
     trials: Sequence[Trial],
     options: DiagnosisOptions | None = None,
     *,
+    compare: Sequence[Trial] = (),
     progress: Callable[[str], None] | None = None,
 ) -> Diagnosis:
     """Where the gap between model and trials lies, which effect makes it, how far it shrinks.
@@ -98,6 +101,7 @@ def diagnose(
         subject: the task (its latency counts as modelled) or the bare model.
         trials: real runs on one time grid, whatever policy they ran.
         options: library, number of effects, horizon.
+        compare: a second group of trials; all are diagnosed, and what changed is `changed`.
         progress: called with a word at every stage, for a display.
 
     Raises:
@@ -108,7 +112,8 @@ def diagnose(
     latency = subject.latency if isinstance(subject, Task) else None
     past = subject.past if isinstance(subject, Task) else None
     tick("instruments")
-    looked = preflight(subject, trials, options.hidden)
+    first = sum(trial.known_steps >= 2 for trial in trials)
+    looked = preflight(subject, [*trials, *compare], options.hidden)
     trials = looked.trials
     data = prepare(model, trials, latency, past, options.hidden)
     known = limits(data)
@@ -125,7 +130,12 @@ def diagnose(
         task = subject if isinstance(subject, Task) else None
         used = [trial for trial in trials if trial.known_steps >= 2]
         found = _Writer(search, best, left, known, options, tick, task, used).diagnosis()
-        return replace(found, preflight=looked.findings)
+        groups = [k < first for k in range(data.count)]
+        return replace(
+            found,
+            preflight=looked.findings,
+            changed=changed(search, best, groups) if compare else None,
+        )
 
 
 class _Writer:
@@ -166,6 +176,8 @@ class _Writer:
         groups = self.claims.groups()
         alike = self.claims.nearly(groups)
         remainder = tuple(self.remainder(left) for left in self.left)
+        named = [row.effect for row in ranking if row.claimed]
+        values, agreement = by_trial(self.best, data, named) if named else ((), ())
         return Diagnosis(
             verdict=verdict(
                 self.claims,
@@ -204,6 +216,8 @@ class _Writer:
             unknowable=self.known.sentences,
             noise=self.noise(),
             parameters=self.claims.parameters(),
+            per_trial=values,
+            agreement=agreement,
             trials=data.count,
             steps=data.steps,
             candidates=len(self.search.candidates),

@@ -219,6 +219,45 @@ class NoiseLevels(Document):
 
 
 @dataclass(frozen=True, eq=False)
+class TrialValue(Document):
+    """What one trial alone says of a claimed value, all others as they are."""
+
+    trial: str
+    effect: str
+    quantity: str = ""
+    value: float = math.nan
+    std: float = math.nan
+    agrees: bool = True  # with the others
+
+
+@dataclass(frozen=True, eq=False)
+class Agreement(Document):
+    """Whether the trials share a value: the chance of such differences if they do.
+
+    `estimate` is the shared value; its `std` is what trials differ by beyond their own uncertainty.
+    """
+
+    effect: str
+    quantity: str = ""
+    agrees: bool = True
+    chance: float = math.nan
+    estimate: Estimate = field(default_factory=lambda: Estimate(math.nan))
+    goes_with: str = ""  # "rises with the mean throttle"
+
+
+@dataclass(frozen=True, eq=False)
+class Changed(Document):
+    """A value that differs between two groups of trials, and the evidence [nats] that it does."""
+
+    effect: str
+    quantity: str = ""
+    first: Estimate = field(default_factory=lambda: Estimate(math.nan))
+    second: Estimate = field(default_factory=lambda: Estimate(math.nan))
+    evidence: float = math.nan
+    chance: float = math.nan  # of such a difference where there is none
+
+
+@dataclass(frozen=True, eq=False)
 class Made(Document):
     """What a diagnosis was made from: stored trials, and the model of that day."""
 
@@ -255,6 +294,9 @@ class Diagnosis(Document):
     noise: NoiseLevels = field(default_factory=NoiseLevels)
     parameters: Mapping[str, Estimate] = field(default_factory=dict)  # calibrated beside effects
     preflight: tuple[Finding, ...] = ()  # of the instruments, before any physics
+    per_trial: tuple[TrialValue, ...] = ()
+    agreement: tuple[Agreement, ...] = ()  # of the trials in each of these values
+    changed: tuple[Changed, ...] | None = field(metadata=BRIEF, default=None)  # of two groups
     trials: int = 0
     steps: int = 0
     candidates: int = 0

@@ -218,6 +218,7 @@ class Workspace(Folder):
         max_effects: int = 3,
         without: Sequence[str] = (),
         library: Library | None = None,
+        compare: Sequence[str] = (),
         progress: Callable[[str], None] | None = None,
     ) -> Diagnosis:
         """Explains the gap between model and trials; keeps reports/diagnosis.json.
@@ -226,6 +227,7 @@ class Workspace(Folder):
             trials: short names, t0007; none: all that can be used.
             max_effects: blame at most so many effects at once.
             without: families not to blame.
+            compare: a second group of trials; what changed from the first is `changed`.
             library: the effects that may be blamed; None: those that are installed.
             progress: told of each stage.
         """
@@ -238,6 +240,7 @@ class Workspace(Folder):
             trials=trials,
             max_effects=max_effects,
             library=library.without(without),
+            compare=compare,
             progress=progress,
         )
 

@@ -35,6 +35,7 @@ def diagnose_in(
     trials: Sequence[str] = (),
     max_effects: int = 3,
     library: Library | None = None,
+    compare: Sequence[str] = (),
     progress: Callable[[str], None] | None = None,
 ) -> Diagnosis:
     """Diagnoses the gap between the model and the stored trials; keeps reports/diagnosis.json.
@@ -46,6 +47,7 @@ def diagnose_in(
         trials: short names; all usable ones by default.
         max_effects: at most so many effects at once.
         library: the effects that may be blamed.
+        compare: short names of a second group, whose differences from `trials` are told.
         progress: told of each stage.
 
     Raises:
@@ -59,20 +61,22 @@ def diagnose_in(
     adopted = {name for name in names if not name.startswith("delay:")}  # whose d is no parameter
     library = library or Library()
     planner, used = workspace.planner, _chosen(workspace, trials)
+    others = _chosen(workspace, compare) if compare else []
     memory = planner.plan.model.state_names[planner.task.model.n :]
     options = DiagnosisOptions(
         library=library, max_effects=max_effects, hidden=tuple(memory), but=adopted
     )
-    lifted = [planner.lift(trial) for trial in used]
+    lifted, second = ([planner.lift(trial) for trial in some] for some in (used, others))
     made = Made(
-        trials=tuple(trial.id for trial in used),
+        trials=tuple(trial.id for trial in used + others),
         adopted=tuple(effects),
         params=dict(workspace.config.model.params),
         nominal={name: p.value for name, p in planner.plan.model.params.items()},
     )
-    found = replace(diagnose(planner.plan, lifted, options, progress=progress), made=made)
+    found = diagnose(planner.plan, lifted, options, compare=second, progress=progress)
+    found = replace(found, made=made)
     _keep(workspace, found)
-    probe = _probe(workspace, found, lifted, library)
+    probe = _probe(workspace, found, lifted + second, library)
     if probe is not None:
         identity, words = probe
         run = rendered(NextCommand("run", (identity,)))
