@@ -108,7 +108,7 @@ def _follow(workspace: Workspace, found: Diagnosis) -> NextCommand:
 
 
 def _tell(found: Diagnosis, before: dict[str, float]) -> None:
-    from grounded_trials.report.diagnosis_words import agreement_lines, error_lines
+    from grounded_trials.report.diagnosis_words import agreement_lines, correction_line, error_lines
 
     show(_verdict(found.kind, found.sentence))
     _instruments(found.preflight)
@@ -117,6 +117,8 @@ def _tell(found: Diagnosis, before: dict[str, float]) -> None:
             show(field("unknown", text))
     for title, text in error_lines(found, before):
         show(field(title, text))
+    if found.correction is not None:
+        show(field("correction", correction_line(found.correction)))
     for title, text in agreement_lines(found):
         show(field(title, text))
     _places(found.where)

@@ -5,6 +5,7 @@ limits            what can't be known from these data
 attribution       which effects, by evidence       (search, hypotheses, scan, refine, noise, fitted)
 held_out          no claim that held-out trials contradict; how far the gap shrinks on them
 claims            what is claimed, what ties, what is nearly the same    (lookalike)
+correction        a curve that predicts what is left, where it passes a test of its own
 leftover          what no effect explains
 agreement         whether the trials agree; what changed between two groups of them
 prediction_error  where the gap lies: channels, times, regions
@@ -24,6 +25,7 @@ import numpy as np
 from grounded.diagnosis.agreement import by_trial, changed
 from grounded.diagnosis.attribution import attribute
 from grounded.diagnosis.claims import Claims
+from grounded.diagnosis.correction import correction
 from grounded.diagnosis.data import prepare
 from grounded.diagnosis.delays import delays_of
 from grounded.diagnosis.fitted import Fitted
@@ -212,6 +214,7 @@ class _Writer:
             utility_prediction=self.utility_prediction(bare),
             whole_run=self.whole_run(bare),
             leftover=remainder,
+            correction=correction(predictor, self.best, self.left, where),
             next_trial=next_trial(self.claims, self.left, groups),
             unknowable=self.known.sentences,
             noise=self.noise(),

@@ -118,6 +118,18 @@ def _channel(
     predictor: Predictor, fit: Fitted, features: Array, i: int
 ) -> tuple[float, Array, Array]:
     """Held-out gain of correcting one channel's rate: total, by step (L, B); the weights."""
+    gain, by_step, weights = held_out_columns(predictor, fit, features, i)
+    return gain, by_step, weights[-1]
+
+
+def held_out_columns(
+    predictor: Predictor, fit: Fitted, features: Array, i: int
+) -> tuple[float, Array, Array]:
+    """What features (L, B, K) of state i's rate gain on each trial, fitted to the others.
+
+    Returns:
+        The gain [nats]; the same by step (L, B); weights (S + 1, K) without each trial, and of all.
+    """
     data = predictor.data
     gains = filter_of(predictor, fit)
     L, B, K = features.shape
@@ -134,12 +146,13 @@ def _channel(
         scores.append(W.T @ fit.white[:, own].reshape(-1))
     G, s = np.sum(grams, axis=0), np.sum(scores, axis=0)
     scale = np.sqrt(np.maximum(np.diag(G), 1e-300))
-    best: tuple[float, Array, Array] = (-np.inf, np.zeros((L, B)), np.zeros(K))
+    best: tuple[float, Array, Array] = (-np.inf, np.zeros((L, B)), np.zeros((1, K)))
     for spread in PENALTIES:
         prior = np.diag(scale**2) / spread  # the columns' own size: a weight explains `spread` nats
-        total, by_step = 0.0, np.zeros((L, B))
+        total, by_step, each = 0.0, np.zeros((L, B)), []
         for trial, Gt, st in zip(trials, grams, scores, strict=True):
             weights = -np.linalg.solve(G - Gt + prior + 1e-12 * np.eye(K), s - st)
+            each.append(weights)
             own = data.trial_of == trial
             change = white[:, own] @ weights
             residual = fit.white[:, own]
@@ -147,7 +160,8 @@ def _channel(
             by_step[:, own] = gained
             total += float(gained.sum())
         if total > best[0]:
-            best = (total, by_step, -np.linalg.solve(G + prior + 1e-12 * np.eye(K), s))
+            whole = -np.linalg.solve(G + prior + 1e-12 * np.eye(K), s)
+            best = (total, by_step, np.array([*each, whole]))
     return best
 
 

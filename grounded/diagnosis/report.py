@@ -258,6 +258,34 @@ class Changed(Document):
 
 
 @dataclass(frozen=True, eq=False)
+class Curve(Document):
+    """The shape of a leftover: a rate `value` with its `std` at places `at` of one variable."""
+
+    effect: str  # its name for `adopt`
+    over: str
+    at: tuple[float, ...] = ()
+    value: tuple[float, ...] = ()
+    std: tuple[float, ...] = ()
+    quantities: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Correction(Document):
+    """A curve that predicts what no effect explains. It is no cause.
+
+    `held_out_gain` is the share of the squared error that goes on held-out trials; `adoptable`:
+    that is more than its scatter from trial to trial.
+    """
+
+    channel: str
+    over: tuple[str, ...] = ()
+    held_out_gain: float = math.nan
+    adoptable: bool = False
+    unit: str = ""
+    curves: tuple[Curve, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
 class Made(Document):
     """What a diagnosis was made from: stored trials, and the model of that day."""
 
@@ -289,6 +317,7 @@ class Diagnosis(Document):
     utility_prediction: UtilityPrediction | None = None  # where the subject was a task
     whole_run: Mapping[str, RunChange] = field(default_factory=dict)
     leftover: tuple[Remainder, ...] = ()
+    correction: Correction | None = None  # where something is left
     next_trial: str = ""
     unknowable: tuple[str, ...] = ()  # what the trials are too few or too quiet for
     noise: NoiseLevels = field(default_factory=NoiseLevels)
@@ -334,6 +363,9 @@ class Diagnosis(Document):
 
     def values(self, effect: str) -> dict[str, float]:
         """An effect's quantities, fixed ones included; none where it was not weighed."""
+        for curve in self.correction.curves if self.correction is not None else ():
+            if effect == curve.effect:
+                return dict(curve.quantities)
         row = self.ranked(effect)
         return {} if row is None else row.values
 

@@ -4,12 +4,12 @@ import json
 
 import numpy as np
 import pytest
+from test_diagnosis import cart
 
 from cli import grounded
 from grounded.diagnosis.diagnose import diagnose
 from grounded.diagnosis.report import Diagnosis
 from grounded_trials.report.diagnosis_words import agreement_lines
-from test_diagnosis import cart
 
 
 def test_trials_of_one_system_agree():

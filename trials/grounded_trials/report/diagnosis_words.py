@@ -11,7 +11,7 @@ import math
 import re
 from collections.abc import Iterable, Mapping
 
-from grounded.diagnosis.report import Diagnosis, Estimate, Gap, Split
+from grounded.diagnosis.report import Correction, Diagnosis, Estimate, Gap, Split
 from grounded.instruments.finding import Finding
 from grounded_trials.wording import count, figure, percent, with_unit
 
@@ -50,6 +50,15 @@ def error_lines(diagnosis: Diagnosis, before: Mapping[str, float]) -> list[tuple
         ]
         found.append(("alike", f"{', '.join(like)} of the signal of {effect}"))
     return found
+
+
+def correction_line(correction: Correction) -> str:
+    """What a correction does, and that it is none of the causes."""
+    over = " and ".join(correction.over)
+    gain = f"takes away {percent(correction.held_out_gain)} of the held-out squared error"
+    if not correction.adoptable:
+        return f"a curve of {correction.channel} over {over} predicts held-out trials no better"
+    return f"correction:{correction.channel}, a curve over {over}, {gain}; it is no cause"
 
 
 def agreement_lines(diagnosis: Diagnosis) -> list[tuple[str, str]]:
