@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     shell_complete=complete.trials,
     help="Two groups of trials, T1,T2 T3,T4: what changed between them.",
 )
+@click.option("--probe", is_flag=True, help="Write the most instructive next trial, tie or not.")
 @click.option("--instruments", is_flag=True, help="Judge the sensors alone; takes a second.")
 @in_workspace
 @as_json
@@ -50,6 +51,7 @@ def command(
     max_effects: int,
     without: tuple[str, ...],
     compare: tuple[str, str] | None,
+    probe: bool,
     instruments: bool,
     json_: bool,
 ) -> None:
@@ -86,6 +88,7 @@ def command(
             max_effects=max_effects,
             without=families,
             compare=second,
+            probe=probe,
             progress=tell,
         )
     if json_:

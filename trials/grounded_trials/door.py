@@ -219,6 +219,7 @@ class Workspace(Folder):
         without: Sequence[str] = (),
         library: Library | None = None,
         compare: Sequence[str] = (),
+        probe: bool = False,
         progress: Callable[[str], None] | None = None,
     ) -> Diagnosis:
         """Explains the gap between model and trials; keeps reports/diagnosis.json.
@@ -228,6 +229,7 @@ class Workspace(Folder):
             max_effects: blame at most so many effects at once.
             without: families not to blame.
             compare: a second group of trials; what changed from the first is `changed`.
+            probe: write the most instructive candidate also where nothing ties.
             library: the effects that may be blamed; None: those that are installed.
             progress: told of each stage.
         """
@@ -241,6 +243,7 @@ class Workspace(Folder):
             max_effects=max_effects,
             library=library.without(without),
             compare=compare,
+            probe=probe,
             progress=progress,
         )
 

@@ -36,11 +36,13 @@ def diagnose_in(
     max_effects: int = 3,
     library: Library | None = None,
     compare: Sequence[str] = (),
+    probe: bool = False,
     progress: Callable[[str], None] | None = None,
 ) -> Diagnosis:
     """Diagnoses the gap between the model and the stored trials; keeps reports/diagnosis.json.
 
-    Where two effects tie, it writes the candidate that would tell them apart, `.probe`.
+    Where two effects tie, it writes the candidate that would tell them apart, `.probe`; asked to,
+    else the one that teaches most. `.next_trial` says what to expect of it.
 
     Args:
         workspace: the model is diagnosed with the effects that were adopted.
@@ -48,6 +50,7 @@ def diagnose_in(
         max_effects: at most so many effects at once.
         library: the effects that may be blamed.
         compare: short names of a second group, whose differences from `trials` are told.
+        probe: write a candidate also where nothing ties.
         progress: told of each stage.
 
     Raises:
@@ -76,11 +79,10 @@ def diagnose_in(
     found = diagnose(planner.plan, lifted, options, compare=second, progress=progress)
     found = replace(found, made=made)
     _keep(workspace, found)
-    probe = _probe(workspace, found, lifted + second, library)
-    if probe is not None:
-        identity, words = probe
-        run = rendered(NextCommand("run", (identity,)))
-        found = replace(found, next_trial=f"{words} ({identity}: {run})", probe=identity)
+    identity, words = _probe(workspace, found, lifted + second, library, write=probe)
+    if words:
+        run = f" ({identity}: {rendered(NextCommand('run', (identity,)))})" * bool(identity)
+        found = replace(found, next_trial=f"{words}{run}", probe=identity)
         _keep(workspace, found)
     return found
 
@@ -145,11 +147,11 @@ def _measured(trial: Trial, guessed: Sequence[str]) -> Trial:
 
 
 def _probe(
-    workspace: Folder, found: Diagnosis, trials: Sequence[Trial], library: Library
-) -> tuple[str, str] | None:
-    """Writes the candidate that would tell two tied effects apart: (id, sentence)."""
-    if not found.indistinguishable:
-        return None
+    workspace: Folder, found: Diagnosis, trials: Sequence[Trial], library: Library, *, write: bool
+) -> tuple[str, str]:
+    """Writes the candidate that would tell two tied effects apart, or if asked: (id, sentence)."""
+    if found.no_cause:
+        return "", ""
     from grounded.diagnosis.excitation import probe
     from grounded.rollout import simulate
     from grounded.search.improve import model_fingerprint
@@ -158,13 +160,13 @@ def _probe(
 
     best = standing_in(workspace).incumbent
     if best is None:
-        return None
+        return "", ""
     planner = workspace.planner
     task = planner.plan
     base = planner.widened(best.candidate.policy)
     made = probe(task, base, found, trials, library)
-    if made is None:
-        return None
+    if made is None or not (write or found.indistinguishable):
+        return "", made.sentence if made is not None else ""
     policy = planner.narrowed(made.policy)
     predicted = simulate(task.problem(exact=True), planner.widened(policy))
     candidate = Candidate(
