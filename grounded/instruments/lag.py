@@ -74,15 +74,18 @@ def lag_between(pairs: Pairs, dt: float) -> Lag | None:
 
 @dataclass(frozen=True)
 class _Pieces:
-    """Smoothed pieces: a where b can be moved by `reach` either way, and all of b."""
+    """Pieces smoothed over `half`: a where b can be moved by `reach` either way, and all of b."""
 
     a: list[Array]
     b: list[Array]
     reach: int
+    half: int
 
     def moved(self, by: float) -> Array:
         """B by so many samples later, at the samples of a (N,), without its means."""
         at = self.reach + by
+        if at == int(at):
+            return _centred([b[int(at) : int(at) + len(a)] for a, b in self.sides])
         return _centred([at_samples(b, np.arange(len(a)) + at) for a, b in self.sides])
 
     @property
@@ -105,7 +108,7 @@ def _smoothed(pairs: Pairs, h: int, reach: int) -> _Pieces:
         if len(a) >= max(SHORTEST, 2 * (h + reach) + 4):
             found[0].append(np.convolve(a, window, "valid")[reach:-reach])
             found[1].append(np.convolve(b, window, "valid"))
-    return _Pieces(*found, reach)
+    return _Pieces(*found, reach, h)
 
 
 def _centred(columns: Sequence[Array]) -> Array:
@@ -116,28 +119,38 @@ def _measured(pieces: _Pieces, reach: int, dt: float) -> Lag | None:
     if not pieces.a:
         return None
     a = _centred(pieces.a)
-    grid = np.arange(-reach + 1.0, reach)
-    moved = [pieces.moved(by) for by in grid]
-    shared = np.array([(a @ b) ** 2 / max(float(b @ b), 1e-300) for b in moved])
+    h = pieces.half
+    grid = np.arange(0.0, reach, h)
+    grid = np.concatenate([-grid[:0:-1], grid])
+    shared = np.zeros(len(grid))
+    for k, by in enumerate(grid):
+        b = pieces.moved(by)
+        shared[k] = _dot(a, b) ** 2 / max(_dot(b, b), 1e-300)
     if not shared.max() > 0:
         return None
     d = float(grid[int(np.argmax(shared - 1e-6 * shared.max() * np.abs(grid) / reach))])
     for _ in range(8):
         b, slope = pieces.moved(d), 0.5 * (pieces.moved(d + 1) - pieces.moved(d - 1))
-        s = float(a @ b) / max(float(b @ b), 1e-300)
-        curve = s * float(slope @ slope)
-        step = float((a - s * b) @ slope) / curve if curve else 0.0
-        d = float(np.clip(d + np.clip(step, -1, 1), -reach + 1, reach - 1))
+        s = _dot(a, b) / max(_dot(b, b), 1e-300)
+        curve = s * _dot(slope, slope)
+        step = float(np.clip(_dot(a - s * b, slope) / curve if curve else 0.0, -h, h))
+        d = float(np.clip(d + step, -reach + 1, reach - 1))
+        if abs(step) < 1e-4:
+            break
     rest, pull = a - s * b, s * slope
     force = max(_scatter(rest * pull, group) for group in pieces.groups)
-    std = force / max(float(pull @ pull), 1e-300)
-    both = abs(float(a @ b))
-    low, high = both / float(a @ a), float(b @ b) / max(both, 1e-300)
-    tau = _filter(pieces, a, float(rest @ rest)) if d > 0 else None
+    std = force / max(_dot(pull, pull), 1e-300)
+    both = abs(_dot(a, b))
+    low, high = both / _dot(a, a), _dot(b, b) / max(both, 1e-300)
+    tau = _filter(pieces, a, _dot(rest, rest)) if d > 0 else None
     late = d if tau is None else tau
     return Lag(
         late * dt, std * dt, tau is not None, 1 if s > 0 else -1, low, high, min(low / high, 1.0)
     )
+
+
+def _dot(a: Array, b: Array) -> float:
+    return float((a * b).sum())  # on one thread
 
 
 def _scatter(force: Array, group: Any) -> float:

@@ -13,7 +13,7 @@ from grounded.instruments.preflight import preflight
 from grounded.models.car import model as car
 from grounded.models.pendulum import model as pendulum
 from real_systems import DART_STEERING, EMPS, SERVO
-from shared_data import needs_data
+from shared_data import data, needs_data
 
 DT = 0.02
 ARM = Model(
@@ -205,6 +205,25 @@ def test_a_late_sensor_is_not_counted_against_the_effects():
     assert not any(row.effect == "sensor_delay:w" for row in found.ranking)
     again = type(found).from_json(found.to_json())
     assert again.preflight == found.preflight
+
+
+@needs_data
+def test_the_late_velocity_registers_of_real_joints():
+    """Published beside the data: about 20 ms (BAM) and 15 ms (the double pendulum)."""
+    for parts, columns, step, late in (
+        (("bam_xl330_servo", "bam_xl330_pendulum"), (0, 1), 0.005, 0.020),
+        (("dfki_double_pendulum", "acrobot_mcpilco"), (1, 3), 0.03, 0.015),
+    ):
+        log, trials = np.load(data(parts[0], f"{parts[1]}.npz"), allow_pickle=True), []
+        for name in (n for n in log.files if n.startswith("run") and not n.endswith("_t")):
+            t = log[f"{name}_t"]
+            grid = np.arange(t[0], t[-1], step)
+            states = np.stack([np.interp(grid, t, log[name][:, c]) for c in columns], axis=1)
+            none = np.zeros((len(grid) - 1, 1))
+            trials.append(Trial(states, none, step, ("q", "w"), ("u",)))
+        found = preflight(ARM, trials).findings
+        assert [(one.signal, one.kind) for one in found] == [("w", "delay")]
+        assert found[0].delay_s == pytest.approx(late, abs=0.001)
 
 
 @needs_data
