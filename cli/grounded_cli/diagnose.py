@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import click
@@ -15,6 +16,7 @@ from grounded_trials.wording import rendered, with_unit
 
 if TYPE_CHECKING:
     from grounded.diagnosis.report import Diagnosis, Ranked, Where
+    from grounded.instruments.finding import Finding
     from grounded_trials import Workspace
 
 
@@ -33,9 +35,26 @@ if TYPE_CHECKING:
     help="Blame at most K effects at once, 1 to 6 (default: 3).",
 )
 @click.option("--without", multiple=True, metavar="F1,F2,...", help="Families not to blame.")
+@click.option(
+    "--compare",
+    nargs=2,
+    metavar="A B",
+    shell_complete=complete.trials,
+    help="Two groups of trials, T1,T2 T3,T4: what changed between them.",
+)
+@click.option("--probe", is_flag=True, help="Write the most instructive next trial, tie or not.")
+@click.option("--instruments", is_flag=True, help="Judge the sensors alone; takes a second.")
 @in_workspace
 @as_json
-def command(trials: str | None, max_effects: int, without: tuple[str, ...], json_: bool) -> None:
+def command(
+    trials: str | None,
+    max_effects: int,
+    without: tuple[str, ...],
+    compare: tuple[str, str] | None,
+    probe: bool,
+    instruments: bool,
+    json_: bool,
+) -> None:
     """Explain the sim-to-real gap from the stored trials; keeps reports/diagnosis.json.
 
     The verdict is one effect, several, none (the model explains the data down to the noise) or
@@ -50,9 +69,28 @@ def command(trials: str | None, max_effects: int, without: tuple[str, ...], json
         raise GroundedError(
             "--trials names no trial: expected some, like t0001,t0002; leave it out to take all"
         )
+    first, second = map(names_in, compare or ("", ""))
+    if compare and (chosen or not (first and second) or {*first} & {*second}):
+        raise GroundedError(
+            "--compare takes two groups of different trials, like --compare t0001,t0002 "
+            "t0003,t0004, instead of --trials"
+        )
+    if instruments:
+        findings = workspace.preflight(chosen)
+        if json_:
+            return show_json({"preflight": [one.to_json() for one in findings]})
+        _instruments(findings)
+        return None if findings else show("nothing was found of the sensors")
     families = [name for text in without for name in names_in(text)]
     with stages() as tell:
-        found = workspace.diagnose(chosen, max_effects=max_effects, without=families, progress=tell)
+        found = workspace.diagnose(
+            chosen or first,
+            max_effects=max_effects,
+            without=families,
+            compare=second,
+            probe=probe,
+            progress=tell,
+        )
     if json_:
         show_json(found.to_json())
     else:
@@ -73,13 +111,18 @@ def _follow(workspace: Workspace, found: Diagnosis) -> NextCommand:
 
 
 def _tell(found: Diagnosis, before: dict[str, float]) -> None:
-    from grounded_trials.report.diagnosis_words import error_lines
+    from grounded_trials.report.diagnosis_words import agreement_lines, correction_line, error_lines
 
     show(_verdict(found.kind, found.sentence))
+    _instruments(found.preflight)
     for text in found.unknowable:
         if text not in found.sentence:
             show(field("unknown", text))
     for title, text in error_lines(found, before):
+        show(field(title, text))
+    if found.correction is not None:
+        show(field("correction", correction_line(found.correction)))
+    for title, text in agreement_lines(found):
         show(field(title, text))
     _places(found.where)
     if not found.no_cause:
@@ -87,6 +130,13 @@ def _tell(found: Diagnosis, before: dict[str, float]) -> None:
     run = NextCommand("run", (found.probe,))
     text = found.next_trial.replace(rendered(run), typed(run))
     show("\n" + field("next trial", text))
+
+
+def _instruments(findings: Sequence[Finding]) -> None:
+    from grounded_trials.report.diagnosis_words import instrument_lines
+
+    for k, line in enumerate(instrument_lines(findings)):
+        show(field("sensors" if k == 0 else "", line))
 
 
 def _verdict(kind: str, text: str) -> str:

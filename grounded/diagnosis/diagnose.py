@@ -1,11 +1,14 @@
 """START HERE: the sim-to-real gap, diagnosed. Trials and a crude model in, a verdict out.
 
+preflight         the instruments, from their signals alone: corrected first  (instruments)
 limits            what can't be known from these data; which parameters they identify
 attribution       which effects, by evidence       (search, hypotheses, scan, refine, noise, fitted)
 ruler             held-out prediction errors in the channels' units, and the noise floor
 decide            evidence proposes, the ruler decides; what each cause is worth
 claims            what is claimed, what ties, what is nearly the same    (lookalike)
+correction        a curve that predicts what is left, where it passes a test of its own
 leftover          what no effect explains
+agreement         whether the trials agree; what changed between two groups of them
 prediction_error  where the gap lies: channels, times, regions
 split             what the error is made of: explained, unexplained, irreducible
 verdict           all of it in sentences; `report` is the result as data
@@ -20,8 +23,10 @@ from typing import Any
 
 import numpy as np
 
+from grounded.diagnosis.agreement import by_trial, changed
 from grounded.diagnosis.attribution import attribute
 from grounded.diagnosis.claims import Claims
+from grounded.diagnosis.correction import correction
 from grounded.diagnosis.data import prepare
 from grounded.diagnosis.decide import Decision, decide, ordered, plain, shares
 from grounded.diagnosis.delays import delays_of
@@ -52,6 +57,7 @@ from grounded.diagnosis.split import split
 from grounded.diagnosis.verdict import next_trial, verdict
 from grounded.effects import Library
 from grounded.frozen import Array
+from grounded.instruments.preflight import preflight
 from grounded.model import Model
 from grounded.task import Task
 from grounded.trial import Trial
@@ -81,6 +87,7 @@ def diagnose(
     trials: Sequence[Trial],
     options: DiagnosisOptions | None = None,
     *,
+    compare: Sequence[Trial] = (),
     progress: Callable[[str], None] | None = None,
 ) -> Diagnosis:
     """Where the gap between model and trials lies, which effect makes it, how far it shrinks.
@@ -89,6 +96,7 @@ def diagnose(
         subject: the task (its latency counts as modelled) or the bare model.
         trials: real runs on one time grid, whatever policy they ran.
         options: library, number of effects, horizon.
+        compare: a second group of trials; all are diagnosed, and what changed is `changed`.
         progress: called with a word at every stage, for a display.
 
     Raises:
@@ -98,16 +106,21 @@ def diagnose(
     model = subject.model if isinstance(subject, Task) else subject
     latency = subject.latency if isinstance(subject, Task) else None
     past = subject.past if isinstance(subject, Task) else None
+    tick("instruments")
+    first = sum(trial.known_steps >= 2 for trial in trials)
+    looked = preflight(subject, [*trials, *compare], options.hidden)
+    trials = looked.trials
     data = prepare(model, trials, latency, past, options.hidden)
     known = limits(data)
     tick("candidates")
     uncertain = Predictor(data)
     with np.errstate(all="ignore"):
         search = HypothesisSearch(data, ())
-        first = search.refined([search.fresh(Hypothesis())], FIRST_LOOK)
-        data = replace(data, model=held(uncertain, first[0])) if first else data
+        null = search.refined([search.fresh(Hypothesis())], FIRST_LOOK)
+        data = replace(data, model=held(uncertain, null[0])) if null else data
     offered = options.library.candidates(data.model, data.scales)
-    candidates = knowable(data, [e for e in offered if e.name not in options.but])
+    settled = {*options.but, *looked.settled}
+    candidates = knowable(data, [e for e in offered if e.name not in settled])
     search, best = attribute(data, candidates, max_effects=options.max_effects, tick=tick)
     tick("predict")
     used = [trial for trial in trials if trial.known_steps >= 2]
@@ -116,7 +129,13 @@ def diagnose(
         tick("leftover")
         task = subject if isinstance(subject, Task) else None
         found = _Writer(decision, ruler, known, options, tick, task, used).diagnosis()
-        return replace(found, identifiable=tuple(_identified(uncertain, decision.fit)))
+        groups = [k < first for k in range(data.count)]
+        return replace(
+            found,
+            identifiable=tuple(_identified(uncertain, decision.fit)),
+            preflight=looked.findings,
+            changed=changed(search, decision.fit, groups) if compare else None,
+        )
 
 
 FIRST_LOOK = 6  # iterations of the fit by whose noise the parameters are found identifiable
@@ -171,6 +190,8 @@ class _Writer:
         alike = self.claims.nearly(groups)
         remainder = self.remainders()
         rows, credit = self.prediction_error(), self.credits()
+        named = [row.effect for row in ranking if row.claimed]
+        values, agreement = by_trial(self.best, data, named) if named else ((), ())
         return Diagnosis(
             verdict=verdict(self.claims, ranking, groups, remainder, rows, credit),
             where=Where(
@@ -196,12 +217,15 @@ class _Writer:
             utility_prediction=self.utility_prediction(bare),
             whole_run=self.whole_run(),
             leftover=remainder,
+            correction=correction(predictor, self.best, self.left, where),
             next_trial=next_trial(self.claims, self.left, groups),
             unknowable=self.known.sentences,
             noise=self.noise(),
             parameters=self.claims.parameters(),
             prediction_error=rows,
             credit=credit,
+            per_trial=values,
+            agreement=agreement,
             trials=data.count,
             steps=data.steps,
             candidates=len(self.search.candidates),

@@ -118,6 +118,23 @@ def _channel(
     predictor: Predictor, fit: Fitted, features: Array, i: int
 ) -> tuple[float, Array, Array]:
     """Held-out gain of correcting one channel's rate: total, by step (L, B); the correction."""
+    gain, by_step, weights = held_out_columns(predictor, fit, features, i)
+    left_out, rate = folds(predictor.data), np.zeros_like(by_step)
+    for k, trial in enumerate(np.unique(left_out)):
+        own = left_out == trial
+        rate[:, own] = features[:, own] @ weights[k]
+    return gain, by_step, rate
+
+
+def held_out_columns(
+    predictor: Predictor, fit: Fitted, features: Array, i: int
+) -> tuple[float, Array, Array]:
+    """What features (L, B, K) of state i's rate gain on each trial, fitted to the others.
+
+    Returns:
+        The gain [nats]; the same by step (L, B); weights (S + 1, K) without each of the S folds,
+        and of all.
+    """
     data = predictor.data
     gains = filter_of(predictor, fit)
     L, B, K = features.shape
@@ -135,20 +152,22 @@ def _channel(
         scores.append(W.T @ fit.white[:, own].reshape(-1))
     G, s = np.sum(grams, axis=0), np.sum(scores, axis=0)
     scale = np.sqrt(np.maximum(np.diag(G), 1e-300))
-    best: tuple[float, Array, Array] = (-np.inf, np.zeros((L, B)), np.zeros((L, B)))
+    best: tuple[float, Array, Array] = (-np.inf, np.zeros((L, B)), np.zeros((len(trials) + 1, K)))
     for spread in PENALTIES:
         prior = np.diag(scale**2) / spread  # the columns' own size: a weight explains `spread` nats
-        total, by_step, rate = 0.0, np.zeros((L, B)), np.zeros((L, B))
+        total, by_step, each = 0.0, np.zeros((L, B)), []
         for trial, Gt, st in zip(trials, grams, scores, strict=True):
             weights = -np.linalg.solve(G - Gt + prior + 1e-12 * np.eye(K), s - st)
+            each.append(weights)
             own = left_out == trial
             change = white[:, own] @ weights
             residual = fit.white[:, own]
             gained = 0.5 * (residual**2 - (residual + change) ** 2).sum(axis=-1)
-            by_step[:, own], rate[:, own] = gained, features[:, own] @ weights
+            by_step[:, own] = gained
             total += float(gained.sum())
         if total > best[0]:
-            best = (total, by_step, rate)
+            whole = -np.linalg.solve(G + prior + 1e-12 * np.eye(K), s)
+            best = (total, by_step, np.array([*each, whole]))
     return best
 
 

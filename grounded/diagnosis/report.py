@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from grounded.instruments.finding import Finding
 from grounded.result import Document
 
 BRIEF: dict[str, Any] = {"brief": True}  # a field whose key is left out where there is nothing
@@ -278,6 +279,73 @@ class NoiseLevels(Document):
 
 
 @dataclass(frozen=True, eq=False)
+class TrialValue(Document):
+    """What one trial alone says of a claimed value, all others as they are."""
+
+    trial: str
+    effect: str
+    quantity: str = ""
+    value: float = math.nan
+    std: float = math.nan
+    agrees: bool = True  # with the others
+
+
+@dataclass(frozen=True, eq=False)
+class Agreement(Document):
+    """Whether the trials share a value: the chance of such differences if they do.
+
+    `estimate` is the shared value; its `std` is what trials differ by beyond their own uncertainty.
+    """
+
+    effect: str
+    quantity: str = ""
+    agrees: bool = True
+    chance: float = math.nan
+    estimate: Estimate = field(default_factory=lambda: Estimate(math.nan))
+    goes_with: str = ""  # "rises with the mean throttle"
+
+
+@dataclass(frozen=True, eq=False)
+class Changed(Document):
+    """A value that differs between two groups of trials, and the evidence [nats] that it does."""
+
+    effect: str
+    quantity: str = ""
+    first: Estimate = field(default_factory=lambda: Estimate(math.nan))
+    second: Estimate = field(default_factory=lambda: Estimate(math.nan))
+    evidence: float = math.nan
+    chance: float = math.nan  # of such a difference where there is none
+
+
+@dataclass(frozen=True, eq=False)
+class Curve(Document):
+    """The shape of a leftover: a rate `value` with its `std` at places `at` of one variable."""
+
+    effect: str  # its name for `adopt`
+    over: str
+    at: tuple[float, ...] = ()
+    value: tuple[float, ...] = ()
+    std: tuple[float, ...] = ()
+    quantities: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Correction(Document):
+    """A curve that predicts what no effect explains. It is no cause.
+
+    `held_out_gain` is the share of the squared error that goes on held-out trials; `adoptable`:
+    that is more than its scatter from trial to trial.
+    """
+
+    channel: str
+    over: tuple[str, ...] = ()
+    held_out_gain: float = math.nan
+    adoptable: bool = False
+    unit: str = ""
+    curves: tuple[Curve, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
 class Made(Document):
     """What a diagnosis was made from: stored trials, and the model of that day."""
 
@@ -309,6 +377,7 @@ class Diagnosis(Document):
     utility_prediction: UtilityPrediction | None = None  # where the subject was a task
     whole_run: Mapping[str, RunChange] = field(default_factory=dict)
     leftover: tuple[Remainder, ...] = ()
+    correction: Correction | None = None  # where something is left
     next_trial: str = ""
     unknowable: tuple[str, ...] = ()  # what the trials are too few or too quiet for
     noise: NoiseLevels = field(default_factory=NoiseLevels)
@@ -316,6 +385,10 @@ class Diagnosis(Document):
     identifiable: tuple[Identifiable, ...] = ()  # each uncertain parameter
     prediction_error: tuple[RulerRow, ...] = ()  # by horizon, the whole trial last
     credit: tuple[Credit, ...] = ()  # largest first
+    preflight: tuple[Finding, ...] = ()  # of the instruments, before any physics
+    per_trial: tuple[TrialValue, ...] = ()
+    agreement: tuple[Agreement, ...] = ()  # of the trials in each of these values
+    changed: tuple[Changed, ...] | None = field(metadata=BRIEF, default=None)  # of two groups
     trials: int = 0
     steps: int = 0
     candidates: int = 0
@@ -353,6 +426,9 @@ class Diagnosis(Document):
 
     def values(self, effect: str) -> dict[str, float]:
         """An effect's quantities, fixed ones included; none where it was not weighed."""
+        for curve in self.correction.curves if self.correction is not None else ():
+            if effect == curve.effect:
+                return dict(curve.quantities)
         row = self.ranked(effect)
         return {} if row is None else row.values
 

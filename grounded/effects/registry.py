@@ -23,6 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from grounded.effects import actuator, friction, geometry, joint, places, rate, sensor
+from grounded.effects.correction import correction
 from grounded.effects.family import Effect, Family, ParamFamily, Quantity, RateFamily, Scales, Site
 from grounded.errors import GroundedError, nearest
 from grounded.frozen import Array
@@ -91,7 +92,7 @@ class Library:
         Raises:
             GroundedError: if there is none.
         """
-        for family in self.families:
+        for family in (*self.families, correction):  # which is adopted, never blamed
             if family.name == name:
                 return family
         known = [family.name for family in self.families]

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from grounded.diagnosis.report import Diagnosis
     from grounded.effects import Library
     from grounded.frozen import Array
+    from grounded.instruments.finding import Finding
     from grounded.search.candidate import Candidate
     from grounded_trials.report.reporting import Report
     from grounded_trials.workspace.adopting import Adopted
@@ -304,6 +305,8 @@ class Workspace(Folder):
         max_effects: int = 3,
         without: Sequence[str] = (),
         library: Library | None = None,
+        compare: Sequence[str] = (),
+        probe: bool = False,
         progress: Callable[[str], None] | None = None,
     ) -> Diagnosis:
         """Explains the gap between model and trials; keeps reports/diagnosis.json.
@@ -312,6 +315,8 @@ class Workspace(Folder):
             trials: short names, t0007; none: all that can be used.
             max_effects: blame at most so many effects at once.
             without: families not to blame.
+            compare: a second group of trials; what changed from the first is `changed`.
+            probe: write the most instructive candidate also where nothing ties.
             library: the effects that may be blamed; None: those that are installed.
             progress: told of each stage.
         """
@@ -324,8 +329,20 @@ class Workspace(Folder):
             trials=trials,
             max_effects=max_effects,
             library=library.without(without),
+            compare=compare,
+            probe=probe,
             progress=progress,
         )
+
+    def preflight(self, trials: Sequence[str] = ()) -> tuple[Finding, ...]:
+        """Judges the instruments alone, from their own signals: late, scaled, stuck; quick.
+
+        Args:
+            trials: short names, t0007; none: all that can be used.
+        """
+        from grounded_trials.workspace.diagnosing import instruments_in
+
+        return instruments_in(self._afresh(), trials)
 
     def adopt(self, *effects: str, parameters: bool = True) -> Adopted:
         """Adds effects of the last diagnosis to the model of grounded.toml.

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
-from grounded.diagnosis.report import Diagnosis, Gap, Split
+from grounded.diagnosis.report import Correction, Diagnosis, Estimate, Gap, Split
+from grounded.instruments.finding import Finding
 from grounded_trials.wording import count, figure, percent, with_unit
 
 MOST = 3  # parameters that are named
@@ -49,6 +50,55 @@ def error_lines(diagnosis: Diagnosis, before: Mapping[str, float]) -> list[tuple
         ]
         found.append(("alike", f"{', '.join(like)} of the signal of {effect}"))
     return found
+
+
+def correction_line(correction: Correction) -> str:
+    """What a correction does, and that it is none of the causes."""
+    over = " and ".join(correction.over)
+    gain = f"takes away {percent(correction.held_out_gain)} of the held-out squared error"
+    if not correction.adoptable:
+        return f"a curve of {correction.channel} over {over} predicts held-out trials no better"
+    return f"correction:{correction.channel}, a curve over {over}, {gain}; it is no cause"
+
+
+def agreement_lines(diagnosis: Diagnosis) -> list[tuple[str, str]]:
+    """What changed between two groups of trials, or the values that trials do not share."""
+    if diagnosis.changed is not None:
+        rows = [
+            (
+                "changed",
+                f"{one.effect}: {one.quantity} = {_with_spread(one.first)} in the first trials, "
+                f"{_with_spread(one.second)} in the second ({figure(one.evidence, 3)} nats)",
+            )
+            for one in diagnosis.changed
+        ]
+        return rows or [("changed", "nothing that these trials show")]
+    found = []
+    for one in diagnosis.agreement:
+        if not one.agrees:
+            values = [v for v in diagnosis.per_trial if v.effect == one.effect]
+            values = [v for v in values if v.quantity == one.quantity]
+            low, high = (f(values, key=lambda v: v.value) for f in (min, max))
+            text = (
+                f"not in {one.quantity} of {one.effect}: {figure(low.value, 3)} in {low.trial}, "
+                f"{with_unit(figure(high.value, 3), one.estimate.unit)} in {high.trial}"
+            )
+            found.append(("agreement", text + f"; it {one.goes_with}" * bool(one.goes_with)))
+    return found
+
+
+def _with_spread(estimate: Estimate) -> str:
+    text = f"{figure(estimate.value, 3)} +- {figure(estimate.std, 2)}"
+    return with_unit(text, estimate.unit)
+
+
+def instrument_lines(findings: Iterable[Finding]) -> list[str]:
+    """Each finding with its signal, whether it was corrected, and the key of [log] that does so."""
+    lines = []
+    for one in findings:
+        done = "; corrected here" * one.corrected
+        lines.append(f"{one.signal}: {one.finding}{done}{f', in [log]: {one.log}' * bool(one.log)}")
+    return lines
 
 
 def gap_sentence(gap: Gap) -> str:
