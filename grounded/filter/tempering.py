@@ -51,6 +51,6 @@ def tempering(eps: Array, seen: Array) -> Tempering:
             if pairs == 0 or rho < 2 / np.sqrt(pairs):
                 break
             worth += 2 * rho
-        news += count / worth
+        news += float(count) / worth
     total = max(float(counts.sum()), 1.0)
     return Tempering(news / total if news else 1.0, float(np.sum((eps * seen) ** 2)) / total)
