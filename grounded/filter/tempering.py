@@ -41,16 +41,16 @@ class Tempering:
 
 def tempering(eps: Array, seen: Array) -> Tempering:
     """Of whitened innovations eps (T, B, n), zero where `seen` (T, B, n) is 0."""
-    counts, news = seen.sum(axis=(0, 1)), 0.0
+    counts, news = seen.sum(axis=(0, 1)).tolist(), 0.0
     for i, count in enumerate(counts):
         e, there = eps[..., i] * seen[..., i], seen[..., i]
         power, worth = float(np.sum(e**2)) / max(count, 1.0), 1.0
         for k in range(1, min(LAGS, len(e) // 4) + 1):
             pairs = float(np.sum(there[k:] * there[:-k]))
             rho = float(np.sum(e[k:] * e[:-k])) / max(pairs * power, 1e-300)
-            if pairs == 0 or rho < 2 / np.sqrt(pairs):
+            if pairs == 0 or rho < 2 / pairs**0.5:
                 break
             worth += 2 * rho
         news += count / worth
-    total = max(float(counts.sum()), 1.0)
+    total = max(sum(counts), 1.0)
     return Tempering(news / total if news else 1.0, float(np.sum((eps * seen) ** 2)) / total)

@@ -11,13 +11,19 @@ adds the log-determinants; W'W is the information that the data hold about theta
 of a trial starts from what the filter knows, noise of the measurements does not bias the fit, as it
 does in one-step least squares (errors in variables).
 
+The filter's gains depend on theta too, through A = f_x. Gauss and Newton leave that out, and where
+the model stiffens with theta the step then leads down and theta would stay where it began. So a
+climb that rises no further goes on with the exact slope (`exact`), and ends where that has none:
+
+    d loglik / d theta = -W' eps + sum_t <(q q' - N) A P, dA / d theta>    q, N: the smoother's
+
 A step counts if the log-likelihood rises; else lambda grows. Unknowns at a bound that would leave
 it are held; directions of which the data say nothing are not moved.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -30,6 +36,7 @@ from grounded.estimate import Measurement, NoiseStd, Record
 from grounded.estimate.extended import Filtered, filter_batch, sensitivity
 from grounded.estimate.record import RecordBatch, batch_of
 from grounded.estimate.steps import ModelSteps
+from grounded.filter.kalman import smoother
 from grounded.frozen import Array
 from grounded.model import Model
 
@@ -175,12 +182,18 @@ def climb(
         free: which unknowns may move, (k,).
         max_steps: steps that count, at most.
     """
-    at, damping, status = start, 1e-3, "out of steps"
+    at, damping, last = start, 1e-3, max_steps
+    slopes_at: Callable[[FitData, Point], Linear] = linear
     slopes = linear(data, at)
     for step in range(max_steps):
-        at, slopes, damping, status = _step(data, noise, at, slopes, free, damping)
-        if status != "rising":
+        at, slopes, damping, status = _step(data, noise, at, slopes, free, damping, slopes_at)
+        if status != "rising" and slopes_at is exact:
             return Climb(at, slopes, step, status)
+        if status != "rising":
+            damping, slopes_at, slopes = 1e-3, exact, exact(data, at)
+            last = min(last, step + 1 + max_steps // 2)
+        if step + 1 == last:
+            break
     return Climb(at, slopes, max_steps, "out of steps")
 
 
@@ -191,6 +204,7 @@ def _step(
     slopes: Linear,
     free: NDArray[np.bool_],
     damping: float,
+    slopes_at: Callable[[FitData, Point], Linear],
 ) -> tuple[Point, Linear, float, str]:
     for _ in range(12):
         delta, promise = marquardt_step(data, at.theta, slopes, free, damping)
@@ -199,7 +213,7 @@ def _step(
         there = point(data, noise, data.unknowns.clipped(at.theta + delta), at)
         if there.loglik > at.loglik:
             gain = there.loglik - at.loglik
-            later = linear(data, there)
+            later = slopes_at(data, there)
             if not np.isfinite(later.W).all():
                 return at, slopes, damping, "slopes are not finite"
             status = "rising" if gain > ENOUGH else "converged"
@@ -213,7 +227,7 @@ def marquardt_step(
 ) -> tuple[Array, float]:
     """The damped step (k,) and the gain in nats that the linear problem promises of it."""
     unknowns = data.unknowns
-    N, g = slopes.W.T @ slopes.W, -slopes.W.T @ slopes.eps
+    N, g = slopes.W.T @ slopes.W, slopes.g
     stuck = ((theta <= unknowns.low) & (g < 0)) | ((theta >= unknowns.high) & (g > 0))
     use = np.flatnonzero(free & ~stuck & (np.diag(N) > 0))
     delta = np.zeros(unknowns.k)
@@ -265,6 +279,12 @@ class Linear:
     W: Array  # (rows, k)
     eps: Array  # (rows,)
     block: NDArray[np.int64]  # (rows,) the piece of time that a row belongs to
+    more: Array | float = 0.0  # (k,) what the gains add to the slope
+
+    @property
+    def g(self) -> Array:
+        """Slope of the log-likelihood, (k,)."""
+        return np.asarray(-self.W.T @ self.eps + self.more)
 
 
 def point(data: FitData, noise: NoiseStd, theta: Array, near: Point | None = None) -> Point:
@@ -288,6 +308,30 @@ def linear(data: FitData, at: Point, blocks: int = 60) -> Linear:
     W = sensitivity(at.filtered, f_theta)
     seen = at.batch.seen
     return Linear(W[seen], at.filtered.eps[seen], _blocks(at.batch, blocks)[seen])
+
+
+def exact(data: FitData, at: Point) -> Linear:
+    """Slopes with what a change of the parameters does to the filter's gains."""
+    unknowns, filtered, batch, more = (
+        data.unknowns,
+        at.filtered,
+        at.batch,
+        np.zeros(data.unknowns.k),
+    )
+    p, back = unknowns.unpack(at.theta)[0], smoother(filtered.gains, filtered.eps, covariances=True)
+    assert back.whole is not None
+    q = back.r[1:, ..., None]
+    said = (q * q.swapaxes(-1, -2) - back.whole[1:]) @ filtered.A @ filtered.gains.posterior[:-1]
+    for h, mask in batch.steps_of:
+        rows = batch.valid if mask is None else mask & batch.valid
+        x, u = filtered.x[:-1][rows], batch.u[rows]
+        A = data.system.linearise(x, u, p, h)[0]
+        for i, column in enumerate(unknowns.columns):
+            moved, size = p.copy(), 1e-5 * max(abs(p[column]), 1e-3)
+            moved[column] += size
+            change = (data.system.linearise(x, u, moved, h)[0] - A) / size
+            more[i] += float(np.sum(said[rows] * change))
+    return replace(linear(data, at), more=more)
 
 
 def _change_of_the_next_state(data: FitData, at: Point) -> Array:
