@@ -1,5 +1,6 @@
 """Causes that robots have, simulated in small steps by other code, are found with their size."""
 
+import itertools
 from dataclasses import dataclass
 from typing import Any
 
@@ -118,7 +119,7 @@ def test_an_adopted_sensor_lag_is_a_filter():
         z.append(model.system.step(z[-1][None], u[None], model.values, DT)[0])
     true, logged = np.array(z)[:, 4], np.array(z)[:, 3]
     filtered, fine = [true[0]], true[0]
-    for before, after in zip(true[:-1], true[1:], strict=True):
+    for before, after in itertools.pairwise(true):
         for k in range(200):
             now = before + (after - before) * (k + 0.5) / 200
             fine += (now - fine) * DT / 200 / 0.2
