@@ -93,7 +93,7 @@ def _value(
         return float(float(scales.spread(target)) * np.exp(rng.uniform(np.log(0.3), np.log(3.0))))
     if family in ("delay", "sensor_delay"):
         return 0.6 * size
-    if family == "first_order_lag":
+    if family in ("first_order_lag", "sensor_lag"):
         return float(size)
     if family in ("input_bias", "sensor_bias"):
         return sign * 0.5 * size * scales.spread(target)

@@ -23,6 +23,7 @@ from grounded.effects import (
     RateFamily,
     SensorDelayFamily,
     SensorFamily,
+    SensorLagFamily,
 )
 from grounded.effects.family import coupled
 from grounded.effects.registry import partner
@@ -200,6 +201,8 @@ class _Run:
                 y[i] = effect.family.measure(y[i], values)
             elif isinstance(effect.family, SensorDelayFamily):
                 y[i] += self._old(i, values["d"]) - self.x[i]
+            elif isinstance(effect.family, SensorLagFamily):
+                y[i] += self._filtered(i, values["tau"]) - self.x[i]
         scale = np.array([noise.measurement.get(n, 0.0) for n in self.names])
         v = self._draw(len(scale))
         if noise.kind == "heavy":
@@ -214,3 +217,10 @@ class _Run:
         last = len(self.past) - 1
         new, old = self.past[max(last - k, 0)][i], self.past[max(last - k - 1, 0)][i]
         return float((1 - part) * new + part * old)
+
+    def _filtered(self, i: int, tau: float) -> float:
+        """State i through a first-order filter at the fine rate, settled at the start."""
+        part, found = 1 - np.exp(-self.fine / tau), self.past[0][i]
+        for x in self.past[1:]:
+            found = found + part * (x[i] - found)
+        return float(found)

@@ -27,11 +27,13 @@ from grounded.effects import (
     RateFamily,
     SensorDelayFamily,
     SensorFamily,
+    SensorLagFamily,
     acting_order,
 )
 from grounded.effects.family import braked, coupled
 from grounded.effects.joint import Loads, loads, solved
 from grounded.effects.registry import partner
+from grounded.effects.sensor import lagging
 from grounded.frozen import Array
 from grounded.model import Model
 
@@ -296,7 +298,8 @@ class Predictor:
 
     def standing(self, h: Hypothesis, shown: Array) -> Array | float:
         """What sensors add to what they are shown (..., n), however old it is; 0.0 if nothing."""
-        sensors = [(e, v) for e, v in h.pairs if isinstance(e.family, SensorFamily)]
+        kinds = SensorFamily | SensorLagFamily
+        sensors = [(e, v) for e, v in h.pairs if isinstance(e.family, kinds)]
         if not sensors:
             return 0.0
         names, total = self.data.model.state_names, np.zeros_like(shown)
@@ -325,6 +328,8 @@ def sensor_offset(effect: Effect, values: Mapping[str, float], track: Array, dt:
     """What a sensor effect adds to the log of its state along a track (L + 1, B)."""
     if isinstance(effect.family, SensorFamily):
         return np.asarray(effect.family.measure(track, values) - track)
+    if isinstance(effect.family, SensorLagFamily):
+        return _behind(track, values["tau"], dt)
     steps = values["d"] / dt
     slope = np.vstack([track[1:2] - track[:1], np.diff(track, axis=0)])
     whole, part = int(np.floor(steps)), steps - np.floor(steps)
@@ -333,6 +338,15 @@ def sensor_offset(effect: Effect, values: Mapping[str, float], track: Array, dt:
     count = len(track)
     old = (1 - part) * line[1 : count + 1] + part * line[:count]
     return np.asarray(old - track)
+
+
+def _behind(track: Array, tau: float, dt: float) -> Array:
+    """How far a filtered sensor is off along a track (L + 1, B) that moved before as it begins."""
+    moved = np.diff(track, axis=0)
+    off = [-moved[0] * tau / dt]
+    for step in moved:
+        off.append(lagging(off[-1], step, tau, dt))
+    return np.array(off)
 
 
 def transformed(effect: Effect, values: Mapping[str, float], u: Array, data: Data) -> Array:

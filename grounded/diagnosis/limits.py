@@ -25,6 +25,7 @@ from grounded.effects import (
     RateFamily,
     SensorDelayFamily,
     SensorFamily,
+    SensorLagFamily,
 )
 from grounded.filter import kalman
 from grounded.frozen import Array
@@ -113,7 +114,8 @@ def knowable(data: Data, effects: Sequence[Effect]) -> tuple[Effect, ...]:
             continue
         if isinstance(family, RateFamily | LossFamily) and targets & unmoved:
             continue
-        if isinstance(family, SensorFamily | SensorDelayFamily) and targets & (dead | unmoved):
+        sensors = SensorFamily | SensorDelayFamily | SensorLagFamily
+        if isinstance(family, sensors) and targets & (dead | unmoved):
             continue
         kept.append(effect)
     return tuple(kept)

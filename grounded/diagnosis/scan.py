@@ -36,6 +36,7 @@ from grounded.effects import (
     RateFamily,
     SensorDelayFamily,
     SensorFamily,
+    SensorLagFamily,
 )
 from grounded.filter import kalman
 from grounded.frozen import Array
@@ -108,7 +109,7 @@ class _Context:
             return self._rate(i, point, effect, grid)
         if isinstance(family, InputFamily | LossFamily | MemoryFamily | RateFamily):
             return self._step(i, point, effect, grid)
-        if isinstance(family, SensorFamily | SensorDelayFamily):
+        if isinstance(family, SensorFamily | SensorDelayFamily | SensorLagFamily):
             return self._sensor(i, point, effect, grid)
         if isinstance(family, ParamFamily):
             k = self.predictor.data.model.param_names.index(effect.site.target)

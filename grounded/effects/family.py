@@ -248,6 +248,11 @@ class SensorDelayFamily(Family):
 
 
 @dataclass(frozen=True)
+class SensorLagFamily(Family):
+    """The logged value of the target state follows it with the time constant `tau` (a filter)."""
+
+
+@dataclass(frozen=True)
 class ParamFamily(Family):
     """The model's own parameter differs from its nominal value."""
 

@@ -36,11 +36,13 @@ from grounded.effects.family import (
     RateFamily,
     SensorDelayFamily,
     SensorFamily,
+    SensorLagFamily,
     Values,
     braked,
 )
 from grounded.effects.joint import inputs_left
 from grounded.effects.registry import partner
+from grounded.effects.sensor import lagging
 from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.model import Model, Param
@@ -103,6 +105,7 @@ def wrap(effect: Effect, values: Mapping[str, float], dt: float) -> Model:
         RateFamily: _rate_step,
         SensorFamily: _sensor_step,
         SensorDelayFamily: _sensor_delay_step,
+        SensorLagFamily: _sensor_lag_step,
     }
     for kind, build in make.items():
         if isinstance(family, kind):
@@ -350,6 +353,21 @@ def _sensor_delay_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, 
         return {**after, target: logged, **dict(zip(memory, line, strict=False))}
 
     return step, dict.fromkeys(memory, model.states[target])
+
+
+def _sensor_lag_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str, str]]:
+    """The true value becomes memory; the state itself is the logged, filtered one."""
+    model, target = effect.site.model, effect.site.target
+    base, memory = plain_step(model), f"{target}_true"
+
+    def step(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
+        true = [s[memory] if n == target else s[n] for n in model.state_names]
+        after = base(Named("state", model.state_names, true), a, p, dt)
+        behind, moved = s[target] - s[memory], after[target] - s[memory]
+        off = lagging(behind, moved, _quantities(effect, p)["tau"], dt)
+        return {**after, target: after[target] + off, memory: after[target]}
+
+    return step, {memory: model.states[target]}
 
 
 def memory_of(wrapped: Model, base: Model, trial: Trial) -> Array:
