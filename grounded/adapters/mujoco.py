@@ -210,6 +210,11 @@ class MujocoStepper(Stepper):
         self.__dict__.update(state)
         self._prepare()
 
+    @property
+    def timestep(self) -> float:
+        """The simulation's own step [s]; a control step is a whole multiple of it."""
+        return float(self._model.opt.timestep)
+
     def advance(self, x: Array, u: Array, p: Array, dt: float) -> Array:
         """The next states (N, n); NaN where a sample is unstable."""
         steps = self._substeps(dt)
@@ -234,7 +239,7 @@ class MujocoStepper(Stepper):
         return np.ascontiguousarray(J[:, :, :n]), np.ascontiguousarray(J[:, :, n:])
 
     def _substeps(self, dt: float) -> int:
-        h = float(self._model.opt.timestep)
+        h = self.timestep
         steps = round(dt / h)
         if steps < 1 or abs(steps * h - dt) > 1e-6 * dt:
             raise GroundedError(

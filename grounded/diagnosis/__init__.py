@@ -1,12 +1,12 @@
 """The sim-to-real gap: where it lies, which effect makes it, how far it shrinks.
 
-Read `diagnose` first; its docstring lists the stages. `report` is what comes out, `attribution` the
-question "which effect?". Below them lie, from the data upwards:
+Read `diagnose` first; its docstring lists the stages. `report` is what comes out, `attribution`
+the question "which effect?". Below them lie, from the data upwards
+(the Kalman filter is `grounded.filter`):
 
     data                  trials as one record, cut into runs of equal length
     hypothesis            effects with their values, and what they predict
-    filter, kernels       the Kalman filter along all runs (NumPy; compiled), and its smoother
-    delays, delayed_measurement     a sensor that shows an earlier state
+    delays                a sensor that shows an earlier state
     noise                 the noise, estimated beside everything else
     linearise             a hypothesis to first order: the columns that are filtered
     refine, fitted        many hypotheses up their likelihood at once; where each ends

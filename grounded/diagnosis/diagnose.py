@@ -171,6 +171,7 @@ class _Writer:
                 regions=tuple(by_region(gain.sum(axis=-1), predictor, self.best)),
                 split=measured.split(),
                 whiteness=self.whiteness(),
+                tempering=self.search.tempering.factor,
             ),
             ranking=ranking,
             indistinguishable=groups,

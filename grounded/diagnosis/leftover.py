@@ -19,13 +19,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from grounded.diagnosis import filter as kalman
 from grounded.diagnosis.fitted import Fitted
 from grounded.diagnosis.hypothesis import Predictor
 from grounded.diagnosis.linearise import gains_of, step_jacobian
 from grounded.diagnosis.ruler import folds
 from grounded.effects import places
 from grounded.effects.family import per
+from grounded.filter import kalman
 from grounded.frozen import Array
 
 CLAIM = 5.0  # nats gained on held-out trials from which a leftover is stated
@@ -152,10 +152,10 @@ def _channel(
     return best
 
 
-def filter_of(predictor: Predictor, fit: Fitted) -> kalman.Gains:
+def filter_of(predictor: Predictor, fit: Fitted, *, covariances: bool = False) -> kalman.Gains:
     """The gains of a fit's filter."""
-    F = step_jacobian(predictor, fit.hypothesis, fit.track)
-    return gains_of(predictor, fit.hypothesis, fit.noise, fit.track, F)
+    h, F = fit.hypothesis, step_jacobian(predictor, fit.hypothesis, fit.track)
+    return gains_of(predictor, h, fit.noise, fit.track, F, covariances=covariances)
 
 
 def whiteness(fit: Fitted, seen: Array) -> dict[str, float]:

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from grounded.diagnosis import filter as kalman
 from grounded.diagnosis.data import PIECES, Data
 from grounded.diagnosis.fitted import Fitted, calibrated
 from grounded.diagnosis.hypothesis import Predictor
@@ -21,11 +20,13 @@ from grounded.diagnosis.report import Identifiable
 from grounded.effects import (
     Effect,
     InputFamily,
+    LossFamily,
     MemoryFamily,
     RateFamily,
     SensorDelayFamily,
     SensorFamily,
 )
+from grounded.filter import kalman
 from grounded.frozen import Array
 from grounded.model import Model, Param
 
@@ -110,7 +111,7 @@ def knowable(data: Data, effects: Sequence[Effect]) -> tuple[Effect, ...]:
             continue
         if isinstance(family, InputFamily | MemoryFamily) and targets & still:
             continue
-        if isinstance(family, RateFamily) and targets & unmoved:
+        if isinstance(family, RateFamily | LossFamily) and targets & unmoved:
             continue
         if isinstance(family, SensorFamily | SensorDelayFamily) and targets & (dead | unmoved):
             continue

@@ -21,9 +21,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from grounded.diagnosis import filter as kalman
 from grounded.diagnosis.data import Data
-from grounded.diagnosis.delayed_measurement import Delayed, FilterSystem, joined
 from grounded.diagnosis.delays import Delays, delays_of
 from grounded.diagnosis.fitted import Fitted, calibrated, moved, shift_precision
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor, param_scale
@@ -37,6 +35,9 @@ from grounded.diagnosis.noise import (
     working,
 )
 from grounded.effects import SensorDelayFamily
+from grounded.filter import kalman
+from grounded.filter.augmented import Delayed, joined
+from grounded.filter.kalman import LinearSystem
 from grounded.frozen import Array
 
 MOST_NUMBERS = 2e6  # of one (L, B, N, N) array: what fits in the cache goes fastest
@@ -222,7 +223,7 @@ def _iterate(predictor: Predictor, works: list[Work], fixed_noise: bool) -> None
     ]
     system, delayed = joined(systems)
     try:
-        g = kalman.gains(*system, delayed)
+        g = kalman.gains(system, delayed)
     except np.linalg.LinAlgError:
         if len(works) == 1:
             works[0].still = True
@@ -243,7 +244,7 @@ def _iterate(predictor: Predictor, works: list[Work], fixed_noise: bool) -> None
         columns, before, delays = parts[i][1].shape[-1], 0.0, each[i]
         if delays is not None:
             entry, residual = systems[i][0].G, white[:, own, :, 0]
-            before = delays.before(work.noise, entry, work.track, residual, g.whiten[:, own])
+            before = delays.before(work.noise, entry, work.track, residual, g.weight[:, own])
         _update(
             predictor,
             work,
@@ -259,7 +260,7 @@ def _climbed(
     data: Data,
     works: list[Work],
     delays_each: list[Delays | None],
-    systems: list[tuple[FilterSystem, Delayed | None]],
+    systems: list[tuple[LinearSystem, Delayed | None]],
     g: kalman.Gains,
     white: Array,
 ) -> list[NoiseModel]:

@@ -96,6 +96,7 @@ class Where(Document):
 
     split: by horizon (one_step, horizon, whole_run).
     whiteness: by state, the chance that white noise leaves what is left of it (a p-value).
+    tempering: what a nat of evidence is worth, by the correlation and the size of what is left.
     """
 
     channels: tuple[ChannelShare, ...] = ()
@@ -103,6 +104,7 @@ class Where(Document):
     regions: tuple[Region, ...] = ()
     split: Mapping[str, Split] = field(default_factory=dict)
     whiteness: Mapping[str, float] = field(default_factory=dict)
+    tempering: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)

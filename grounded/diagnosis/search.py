@@ -301,5 +301,7 @@ def _walked(search: HypothesisSearch, fit: Fitted, index: int, name: str) -> Fit
 def _tried(
     search: HypothesisSearch, fit: Fitted, index: int, name: str, values: tuple[float, ...]
 ) -> list[Fitted]:
-    starts = [(fit.hypothesis.tuned(index, name, v), fit.noise, fit.track) for v in values]
+    (q,) = (q for q in fit.hypothesis.effects[index].quantities if q.name == name)
+    inside = dict.fromkeys(float(np.clip(v, q.low, q.high)) for v in values)
+    starts = [(fit.hypothesis.tuned(index, name, v), fit.noise, fit.track) for v in inside]
     return search.refined(starts, TO_THE_TOP)

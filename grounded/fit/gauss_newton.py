@@ -3,7 +3,7 @@
 What is fitted, parameters of the model and delays of its inputs, is one vector theta (`Unknowns`).
 The least-squares problem are the whitened innovations of the filter and their slopes,
 
-    eps(theta): the filter's, with f(.; theta);      W = d eps / d theta  (`filter.sensitivity`)
+    eps(theta): the filter's, with f(.; theta);      W = d eps / d theta  (`extended.sensitivity`)
     delta = -(W'W + lambda diag(W'W))^-1 W' eps,     theta <- clip(theta + delta)
 
 The sum of squares of eps is what is left unexplained, measured in the noise; the log-likelihood
@@ -27,9 +27,8 @@ from numpy.typing import NDArray
 from grounded.compile import System
 from grounded.errors import GroundedError, nearest
 from grounded.estimate import Measurement, NoiseStd, Record
-from grounded.estimate.filter import filter_batch, sensitivity
+from grounded.estimate.extended import Filtered, filter_batch, sensitivity
 from grounded.estimate.record import RecordBatch, batch_of
-from grounded.estimate.recursion import Filtered
 from grounded.estimate.steps import ModelSteps
 from grounded.frozen import Array
 from grounded.model import Model
@@ -293,7 +292,7 @@ def linear(data: FitData, at: Point, blocks: int = 60) -> Linear:
 
 def _change_of_the_next_state(data: FitData, at: Point) -> Array:
     """f_theta along the filtered track, (T, B, n, k)."""
-    unknowns, batch, (T, B, n) = data.unknowns, at.batch, at.filtered.f.shape
+    unknowns, batch, (T, B, n) = data.unknowns, at.batch, at.filtered.more.shape
     p = unknowns.unpack(at.theta)[0]
     out = np.zeros((T, B, n, unknowns.k))
     params = len(unknowns.columns)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 def repeated_exactly(trials: Sequence[Trial]) -> bool:
     """Whether two trials of a candidate have the very same states."""
-    return any(np.array_equal(a.states, b.states) for a, b in pairwise(trials))
+    return any(a.repeats(b) for a, b in pairwise(trials))
 
 
 def in_doubt(incumbent: Tried, loser: Tried, most: int) -> bool:

@@ -368,8 +368,11 @@ def _judge(
     exact = False  # whether the system has repeated itself to the last bit
     ids = {c.id for c in candidates}
     spent = sum(t.candidate in ids for t in trials) >= options.max_trials
+    by_name: dict[str, list[Trial]] = {}
+    for trial in trials:
+        by_name.setdefault(trial.candidate, []).append(trial.until(task.horizon))
     for candidate in candidates:
-        own = tuple(t.until(task.horizon) for t in trials if t.candidate == candidate.id)
+        own = tuple(by_name.get(candidate.id, ()))
         utilities = tuple(task.utility(t) for t in own)
         failed = any(u == -np.inf for u in utilities)
         exact = exact or repeated_exactly(own)

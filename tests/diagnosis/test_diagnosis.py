@@ -9,7 +9,6 @@ import pytest
 
 from grounded import GroundedError, Model, Param, Trial
 from grounded.challenge import judge, make, oracle, sealed, summary
-from grounded.diagnosis import filter as kalman
 from grounded.diagnosis.claims import loss
 from grounded.diagnosis.data import prepare, shifted
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
@@ -19,6 +18,7 @@ from grounded.diagnosis.prediction_error import _stump
 from grounded.diagnosis.report import Credit, Estimate, Ranked, Remainder, RulerRow
 from grounded.diagnosis.verdict import meaning, sentence, verdict
 from grounded.effects import Library
+from grounded.filter import kalman
 from grounded.models.pendulum import model as pendulum
 from grounded.policy import Policy
 from grounded.task import Task
@@ -91,7 +91,7 @@ def dense_loglik(A, Q, R, d, r, b):
 
 def filter_loglik(A, Q, R, d, r):
     L, B, n, _ = A.shape
-    g = kalman.gains(A, Q, R, np.ones((L + 1, B, n)), np.zeros((B, 0)))
+    g = kalman.gains(kalman.LinearSystem(A, Q, R, np.ones((L + 1, B, n)), R[0]))
     white, _ = kalman.innovations(g, d, r)
     return -0.5 * ((white**2).sum() + g.logdet.sum()), g, white
 
@@ -128,7 +128,7 @@ def test_a_missing_measurement_says_nothing():
     ends = []
     for value in (0.0, 100.0):
         r[2, 0, 1] = value
-        g = kalman.gains(A, Q, R, seen, np.zeros((B, 0)))
+        g = kalman.gains(kalman.LinearSystem(A, Q, R, seen, R[0]))
         white, _ = kalman.innovations(g, d, r)
         ends.append((white**2).sum() + g.logdet.sum())
     assert ends[0] == pytest.approx(ends[1])
@@ -243,7 +243,7 @@ def test_sentences_are_english():
 
 def test_what_no_effect_explains_is_left_over():
     model, trials = cart(asymmetric=0.6, trials=6)
-    found = diagnose(model, trials)
+    found = diagnose(model, trials, DiagnosisOptions(library=Library().without(["input_curve"])))
     assert found.leftover or found.gap.after < 1.3
     if found.leftover:
         assert "v" in [left.channel for left in found.leftover]

@@ -200,7 +200,7 @@ def test_slopes_of_the_problem_are_what_differences_say():
         up, down = (point(data, NOISE, unknowns.start + s * np.eye(3)[i]) for s in (h, -h))
         # S depends on k and d, eps = C e through C as well: compare the innovations themselves
         e = (up.filtered.e - down.filtered.e) / (2 * h)
-        moved = (at.filtered.C @ e[..., None])[..., 0][at.batch.seen]
+        moved = (at.filtered.gains.whitener @ e[..., None])[..., 0][at.batch.seen]
         assert np.corrcoef(moved, W[:, i])[0, 1] > 0.97
 
 

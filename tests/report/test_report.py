@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 from pathlib import Path
@@ -16,6 +15,7 @@ from grounded_trials.report.diagnosis_words import calibrated_sentence
 from grounded_trials.report.findings import prediction_error, rms, tracking_error
 from grounded_trials.report.gathering import gather
 from grounded_trials.report.reporting import save_optimum
+from grounded_trials.store.documents import write_document
 from grounded_trials.workspace.folder import Folder
 from reported import DIAGNOSIS, car, cart, copied, damage
 from workspaces import make
@@ -82,7 +82,7 @@ def test_half_a_number_is_never_shown(cart, tmp_path):
     params = {f"k{i}": {"value": 0.123456, "std": 0.01, "unit": "m/s"} for i in range(4)}
     entry = {"effect": "patch:v", "params": params, "evidence": 9.0, "gap_after": 1.0}
     document = DIAGNOSIS | {"ranking": [entry]}
-    (folder / "reports" / "diagnosis.json").write_text(json.dumps(document))
+    write_document(folder / "reports" / "diagnosis.json", document)
     (line,) = [x for x in grounded("-C", folder, "report").out.splitlines() if "patch:v" in x]
     assert line.endswith("k0 = 0.123 +- 0.01 m/s, ...")
 
@@ -292,7 +292,7 @@ def test_text_says_what_was_calibrated(cart, tmp_path):
     assert "scatter" not in out and "crude model misses" not in out
     one = DIAGNOSIS["utility_prediction"] | {"trials": 1, "spread": 0.0}
     document = DIAGNOSIS | {"utility_prediction": one}
-    (folder / "reports" / "diagnosis.json").write_text(json.dumps(document))
+    write_document(folder / "reports" / "diagnosis.json", document)
     assert "from policy to policy" not in " ".join(grounded("-C", folder, "report").out.split())
 
 

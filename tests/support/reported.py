@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +19,7 @@ from grounded.search.standing import Candidate, SearchOptions, standing
 from grounded.solve.bias import residuals
 from grounded.trial import Trial
 from grounded_trials.report.findings import Findings, Run
+from grounded_trials.store.documents import write_document
 from workspaces import make
 
 DIAGNOSIS: dict[str, Any] = {
@@ -90,7 +90,7 @@ def cart(tmp_path_factory: pytest.TempPathFactory) -> Path:
     make(folder)
     assert grounded("-C", folder, "learn").code == 0
     (folder / "reports").mkdir(exist_ok=True)
-    (folder / "reports" / "diagnosis.json").write_text(json.dumps(DIAGNOSIS))
+    write_document(folder / "reports" / "diagnosis.json", DIAGNOSIS)
     return folder
 
 

@@ -13,18 +13,19 @@ frozen result whose `to_json()` is the document that the command prints with --j
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result
-from grounded_trials.workspace.folder import Folder, Lost
+from grounded_trials.workspace.folder import Folder
 
 if TYPE_CHECKING:
     from grounded.diagnosis.report import Diagnosis
     from grounded.effects import Library
+    from grounded.frozen import Array
     from grounded.search.standing import Candidate
     from grounded_trials.report.reporting import Report
     from grounded_trials.workspace.adopting import Adopted
@@ -34,22 +35,45 @@ if TYPE_CHECKING:
     from grounded_trials.workspace.inspecting import Inspected
     from grounded_trials.workspace.proposing import Proposed, Status
     from grounded_trials.workspace.running import Ran
+    from grounded_trials.workspace.verifying import Verified
 
 
 @dataclass(frozen=True, repr=False)
-class Verified(Result):
-    """How many files were checked, and those that are not what they were."""
+class SetAside(Result):
+    """What `discard` and `restore` answer: the trials that were named, and all that are aside."""
 
-    checked: int
-    damaged: tuple[Lost, ...]
+    trials: tuple[str, ...]
+    discarded: dict[str, str]  # t0004 -> why
 
     def summary(self) -> str:
-        """How many are good, how many not."""
-        return f"{self.checked} files, {len(self.damaged)} damaged"
+        """All that are set aside."""
+        return f"set aside: {', '.join(self.discarded) or 'none'}"
 
     def to_json(self) -> dict[str, Any]:
-        """The document of `verify --json`."""
-        return {"checked": self.checked, "damaged": [vars(one) for one in self.damaged]}
+        """The document of `discard --json` and of `restore --json`."""
+        return {"trials": list(self.trials), "discarded": self.discarded}
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class NextRun(Result):
+    """What a log gave, what to run next, and the file for the robot (None: the search ended)."""
+
+    taken: Ingested
+    proposed: Proposed
+    exported: Exported | None
+
+    def summary(self) -> str:
+        """What was taken in, and what comes next."""
+        name = None if self.proposed.candidate is None else self.proposed.candidate.id
+        return f"{self.taken.trial} is in; next {name or 'nothing: the search has ended'}"
+
+    def to_json(self) -> dict[str, Any]:
+        """The document of `next --json`: those of ingest, propose and export."""
+        return {
+            "trials": [self.taken.to_json()],
+            "propose": self.proposed.to_json(),
+            "export": None if self.exported is None else self.exported.to_json(),
+        }
 
 
 class Workspace(Folder):
@@ -70,19 +94,36 @@ class Workspace(Folder):
         _ = self.config
 
     @classmethod
-    def create(cls, folder: str | Path, *, example: str) -> Self:
-        """Makes a workspace from an example; an existing file is never overwritten.
+    def create(
+        cls,
+        folder: str | Path,
+        *,
+        example: str | None = None,
+        log: str | Path | None = None,
+        model: str | Path | None = None,
+    ) -> Self:
+        """Makes a workspace from an example or from a log; nothing is ever overwritten.
 
         Args:
             folder: where it is made.
             example: car-turn, car-circle, car-figure8, flight-figure8 or pendulum.
+            log: of your robot, any format; `starting.begin.begin` says what it found.
+            model: your model.py, beside `log`; None: a skeleton is written.
 
         Raises:
-            GroundedError: if there is no such example, or the folder holds a workspace already.
+            GroundedError: if there is no such example, the log can't be read, or the folder holds
+                a workspace already.
         """
-        from grounded_trials.workspace.examples import write_example
+        if (example is None) == (log is None):
+            raise GroundedError("give an example or a log to make a workspace from")
+        if log is not None:
+            from grounded_trials.starting.begin import begin
 
-        write_example(Path(folder), example)
+            begin(Path(folder), log, model=model)
+        elif example is not None:
+            from grounded_trials.workspace.examples import write_example
+
+            write_example(Path(folder), example)
         return cls(folder)
 
     def __repr__(self) -> str:
@@ -147,6 +188,47 @@ class Workspace(Folder):
         here = self._afresh()
         ran = candidate and candidate_named(here, candidate)
         return ingest_log(here, Path(path), ran, data=data)
+
+    def next(self, log: str | Path, *, runner: bool = True) -> NextRun:
+        """The loop at the track in one call: takes a log in, proposes, exports for the robot.
+
+        Args:
+            log: what came back of the outstanding candidate.
+            runner: write the program that runs the candidate beside it, see `export`.
+        """
+        from grounded_trials.workspace.exporting import export_candidate
+        from grounded_trials.workspace.proposing import propose_in
+
+        taken = self.ingest(log)
+        proposed, exported = propose_in(self._afresh()), None
+        if proposed.candidate is not None:
+            name = proposed.candidate.id
+            form = "npz" if runner else "json"
+            file = self.folder / f"{name}.{form}"
+            exported = export_candidate(self, name, form, file, runner=runner)
+        return NextRun(taken, proposed, exported)
+
+    def target(self, columns: Mapping[str, Array]) -> Path:
+        """Writes target.csv and its length to grounded.toml; the old one is kept as target.csv.bak.
+
+        Args:
+            columns: what each state is to do, (H + 1,) each, a row a control step; see `starting`.
+        """
+        from grounded_trials.workspace.config import set_target
+        from grounded_trials.workspace.task_file import write_target
+
+        here = self._afresh()
+        name = here.config.task.target or "target.csv"
+        path = here.folder / name
+        if path.is_file():
+            path.replace(path.with_name(path.name + ".bak"))
+        write_target(path, here.config.task.dt, dict(columns))
+        ranges = {state: float(values.max() - values.min()) for state, values in columns.items()}
+        weights = {state: round(max(size, 0.1) ** -2, 6) for state, size in ranges.items()}
+        steps = len(next(iter(columns.values()))) - 1
+        set_target(here.config.file, name, steps, weights)
+        self.forget()
+        return path
 
     def learn(
         self,
@@ -293,34 +375,56 @@ class Workspace(Folder):
     ) -> Exported:
         """Writes a candidate for other languages; refused as in `run`, an earlier task's is not.
 
+        A trial, or the run that a candidate predicts (form "bag"), is written to be looked at.
+
         Args:
-            candidate: c0003, or `best`.
+            candidate: c0003, `best`, or a trial, t0007.
             path: the file; None: named after the candidate, in the current folder.
-            form: csv, json or npz; None: as the file is named, else json.
+            form: csv, json or npz, of a run bag, csv or npz; None: as the file is named.
             runner: npz, and beside it the program that runs it on a robot with numpy alone.
             anyway: write it though it is void.
         """
         from grounded_trials.workspace.exporting import export_candidate
 
         file, here = Path(path) if path else None, self._afresh()
+        if form == "bag" or candidate.startswith("t"):
+            from grounded_trials.report.ros_bag import export_run
+
+            return export_run(here, candidate, form, file)
         return export_candidate(here, candidate, form, file, runner=runner, anyway=anyway)
 
     def verify(self) -> Verified:
-        """Checks every stored trial against its hash, every candidate against its checksums.
+        """Checks everything that is kept: what was changed, damaged, deleted or put in its place.
 
-        A candidate must also be the one its file is named after, and do what it predicts.
+        Trials and notes against their hashes, and whether all are there that were stored;
+        candidates against their checksums, what was handed out under their names and what they
+        predict; the last diagnosis and the optimum against their checksums.
         """
-        from grounded_trials.store.own_files import FILE_LIMIT, read_file
-        from grounded_trials.workspace.handover import intact
+        from grounded_trials.workspace.verifying import verify_in
 
-        damaged = [Lost(str(one.path), one.reason) for one in self.store.verify()]
-        candidates = sorted((self.folder / "candidates").glob("*.mcap"))
-        for path in candidates:
-            try:
-                intact(read_file(path, FILE_LIMIT), path.stem)
-            except GroundedError as error:
-                damaged.append(Lost(str(path), str(error)))
-        return Verified(len(self.store.list()) + len(candidates), tuple(damaged))
+        return verify_in(self._afresh())
+
+    def discard(self, *trials: str, why: str = "") -> SetAside:
+        """Sets trials aside: search, fit, diagnosis and report leave them out; nothing is deleted.
+
+        Args:
+            trials: short names, t0004.
+            why: kept with it, for who asks later.
+        """
+        return self._noted("discard", trials, why)
+
+    def restore(self, *trials: str) -> SetAside:
+        """Takes back what `discard` did."""
+        return self._noted("restore", trials, "")
+
+    def _noted(self, note: str, trials: Sequence[str], why: str) -> SetAside:
+        here = self._afresh()
+        found = [here.store.find(name.lower()) for name in trials]
+        for one in found:
+            if (one.digest in here.noted.aside) == (note == "restore"):
+                here.notes.add({"note": note, "trial": one.digest, "why": why})
+        here.forget_trials()
+        return SetAside(tuple(one.id for one in found), here.discarded())
 
     def inspect(self, log: str | Path) -> Inspected:
         """Shows what a log holds, and guesses a [log] table for this workspace's model."""

@@ -70,6 +70,7 @@ class Findings:
     then: NextCommand
     better: Better | None = None  # the model as diagnosed, or with adopted effects
     since: Since = field(default_factory=Since)  # the diagnosis
+    discarded: tuple[str, ...] = ()  # trials that were set aside
     folder: str | None = None  # as the user named it, None where it is the current one
 
     @property

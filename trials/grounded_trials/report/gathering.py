@@ -6,7 +6,6 @@ itself (grounded.toml, model.py, target.csv) must be whole, for without it nothi
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -23,6 +22,7 @@ from grounded.solve.bias import residuals
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.report.findings import Findings, Log, Run
+from grounded_trials.store.documents import read_document
 from grounded_trials.workspace.adopting import Better, better_model
 from grounded_trials.workspace.diagnosing import LEAST_STEPS, read_diagnosis
 from grounded_trials.workspace.folder import Contents, Folder, Lost
@@ -64,6 +64,7 @@ def gather(workspace: Folder) -> Findings:
         then=next_command(workspace, now, diagnosis, usable),
         better=better,
         since=since_diagnosis(workspace, diagnosis, usable) if diagnosis else Since(),
+        discarded=tuple(workspace.discarded()),
         folder=workspace.address,
     )
 
@@ -134,8 +135,8 @@ def _diagnosis(workspace: Folder, lost: list[Lost]) -> Diagnosis | None:
 def _optimum(reports: Path) -> float | None:
     """reports/optimum.json, {"utility": U}: written by studies that know the real system."""
     try:
-        value = float(json.loads((reports / "optimum.json").read_text())["utility"])
-    except (OSError, ValueError, KeyError, TypeError):
+        value = float(read_document(reports / "optimum.json")["utility"])
+    except (OSError, GroundedError, ValueError, KeyError, TypeError):
         return None
     return value if math.isfinite(value) else None
 

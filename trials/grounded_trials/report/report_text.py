@@ -81,6 +81,8 @@ def _head(findings: Findings) -> str:
     )
     if findings.logs:
         text += f", {count(len(findings.logs), 'log')} of data"
+    if findings.discarded:
+        text += f", set aside: {', '.join(findings.discarded)}"
     if findings.effects:
         text += "; adopted: " + ", ".join(findings.effects)
     return "\n".join(wrapped(text, "", ""))

@@ -5,7 +5,6 @@ All of reports/ may be deleted and made again.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from grounded.result import Result
 from grounded.task import Task
 from grounded_trials.report.findings import Findings, Run, prediction_error, rms, tracking_error
 from grounded_trials.report.gathering import gather
+from grounded_trials.store.documents import write_document
 from grounded_trials.store.store import write_atomically
 from grounded_trials.wording import rendered
 from grounded_trials.workspace.folder import Folder
@@ -106,8 +106,7 @@ def save_pictures(workspace: Folder, findings: Findings) -> list[Path]:
 def save_optimum(workspace: Folder, utility: float | None) -> None:
     """Leaves the optimum of the real system, where a study knows it, for the report to show."""
     if utility is not None:
-        document = json.dumps({"utility": utility}, allow_nan=False)
-        write_atomically(_place(workspace) / OPTIMUM, document.encode())
+        write_document(_place(workspace) / OPTIMUM, {"utility": utility})
 
 
 def _place(workspace: Folder) -> Path:

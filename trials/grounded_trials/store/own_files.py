@@ -11,6 +11,7 @@ import hashlib
 import io
 import json
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -205,6 +206,7 @@ def read_own(source: str | Path | bytes, name: str, kind: str) -> OwnFile:
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
     messages: dict[str, list[Messages]] = {}
+    counts: Counter[str] = Counter()
     for record in read_records(io.BytesIO(source), name, limit=FILE_LIMIT):
         if isinstance(record, Metadata) and record.name == "grounded":
             meta = record.data
@@ -215,7 +217,7 @@ def read_own(source: str | Path | bytes, name: str, kind: str) -> OwnFile:
         elif isinstance(record, Channel):
             channels[record.id] = record
         elif isinstance(record, Messages):
-            _sort(record, channels, messages, name)
+            _sort(record, channels, messages, counts, name)
         elif isinstance(record, End) and not record.data_crc and meta is not None:
             raise DamagedFile(name, len(source), "its checksum is missing")
     if meta is None or meta.get("format") != kind:
@@ -244,16 +246,22 @@ def read_file(path: Path, limit: int) -> bytes:
 
 
 def _sort(
-    batch: Messages, channels: dict[int, Channel], messages: dict[str, list[Messages]], name: str
+    batch: Messages,
+    channels: dict[int, Channel],
+    messages: dict[str, list[Messages]],
+    counts: Counter[str],
+    name: str,
 ) -> None:
+    """Puts messages under their topics, which must not have more than the limit."""
     for identity in batch.channel_ids():
         if identity not in channels:
             raise DamagedFile(
                 name, 0, f"a message belongs to channel {identity}, which is not defined"
             )
-        own = messages.setdefault(channels[identity].topic, [])
-        own.append(batch.of(identity))
-        if sum(len(part) for part in own) > STEP_LIMIT:
+        topic, part = channels[identity].topic, batch.of(identity)
+        messages.setdefault(topic, []).append(part)
+        counts[topic] += len(part)
+        if counts[topic] > STEP_LIMIT:
             raise GroundedError(f"{name}: more than {STEP_LIMIT} messages on one channel")
 
 

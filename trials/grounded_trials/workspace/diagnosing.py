@@ -7,7 +7,6 @@ a stranger, so no text in it is trusted.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -16,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from grounded.diagnosis.report import Diagnosis, Made
 from grounded.errors import GroundedError, NextCommand, nearest
-from grounded_trials.store.store import write_atomically
+from grounded_trials.store.documents import read_document, write_document
 from grounded_trials.wording import rendered
 
 if TYPE_CHECKING:
@@ -82,8 +81,7 @@ def diagnose_in(
 
 def _keep(workspace: Folder, found: Diagnosis) -> None:
     workspace.reports.mkdir(exist_ok=True)
-    text = json.dumps(found.to_json(), indent=1, ensure_ascii=False, allow_nan=False)
-    write_atomically(workspace.reports / FILE, (text + "\n").encode())
+    write_document(workspace.reports / FILE, found.to_json())
 
 
 def read_diagnosis(folder: Path) -> Diagnosis | None:
@@ -94,10 +92,10 @@ def read_diagnosis(folder: Path) -> Diagnosis | None:
     """
     path = folder / FILE
     try:
-        return Diagnosis.from_json(json.loads(path.read_text(encoding="utf-8")))
+        return Diagnosis.from_json(read_document(path))
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, RecursionError, GroundedError) as error:
+    except (ValueError, RecursionError, GroundedError) as error:
         raise GroundedError(
             f"{path} can't be read ({error}): diagnose again", then=NextCommand("diagnose")
         ) from None
@@ -163,8 +161,10 @@ def _probe(
         predicted_inputs=predicted.inputs,
         predicted_utility=predicted.utility,
     )
-    workspace.save_candidate(candidate, workspace.task, kind="probe")
-    return candidate.id, made.sentence
+    while (saved := workspace.save_candidate(candidate, kind="probe")) is None:
+        workspace.forget_trials()  # somebody took the name
+        candidate = replace(candidate, id=workspace.next_id())
+    return saved.id, made.sentence
 
 
 def diagnosable(workspace: Folder) -> list[Trial]:
