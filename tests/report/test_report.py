@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 from pathlib import Path
@@ -65,7 +64,7 @@ def test_text_shows_the_ruler(cart, tmp_path):
     }
     credit = [{"of": "viscous_friction:v", "share": 0.62}]
     document = DIAGNOSIS | {"prediction_error": [row], "credit": credit}
-    (folder / "reports" / "diagnosis.json").write_text(json.dumps(document))
+    write_document(folder / "reports" / "diagnosis.json", document)
     lines = grounded("-C", folder, "report").out.splitlines()
     (line,) = [x for x in lines if x.startswith("v, 1 s ahead")]
     assert line.split()[4:] == ["0.310", "0.120", "0.0800", "-", "m/s"]
