@@ -111,25 +111,44 @@ def _follow(workspace: Workspace, found: Diagnosis) -> NextCommand:
 
 
 def _tell(found: Diagnosis, before: dict[str, float]) -> None:
-    from grounded_trials.report.diagnosis_words import agreement_lines, correction_line, error_lines
+    from grounded_trials.report.diagnosis_words import (
+        agreement_lines,
+        correction_line,
+        error_lines,
+        error_table,
+    )
 
     show(_verdict(found.kind, found.sentence))
     _instruments(found.preflight)
     for text in found.unknowable:
         if text not in found.sentence:
             show(field("unknown", text))
+    if not found.no_cause:
+        if found.prediction_error:
+            show("\n" + table(*error_table(found)))
+            show(f"  open loop, {_held_out(found)}")
+        _effects(found)
+    _places(found.where)
     for title, text in error_lines(found, before):
         show(field(title, text))
     if found.correction is not None:
         show(field("correction", correction_line(found.correction)))
     for title, text in agreement_lines(found):
         show(field(title, text))
-    _places(found.where)
-    if not found.no_cause:
-        _effects(found)
     run = NextCommand("run", (found.probe,))
     text = found.next_trial.replace(rendered(run), typed(run))
     show("\n" + field("next trial", text))
+
+
+def _held_out(found: Diagnosis) -> str:
+    """How the errors were measured."""
+    row = found.prediction_error[0]
+    by = {
+        "trials": "each trial predicted with values from the others",
+        "pieces": "each piece of the log predicted with values from the others",
+    }
+    noise = {"repeats": "the scatter of repeats", "short horizon": "one step's noise, carried on"}
+    return f"{by.get(row.held_out, 'not held out')}; noise: {noise.get(row.floor_from, 'unknown')}"
 
 
 def _instruments(findings: Sequence[Finding]) -> None:
@@ -162,18 +181,23 @@ def _places(where: Where) -> None:
 
 
 def _effects(found: Diagnosis) -> None:
+    from grounded_trials.report.diagnosis_words import credit_of
+
     ranking = found.ranking[:8]
     if ranking:
         rows = [
-            (("* " if r.claimed else "  ") + r.effect, f"{r.evidence:.1f}", number(r.gap_after, 3))
+            (
+                ("* " if r.claimed else "  ") + r.effect,
+                credit_of(found, r.effect),
+                f"{r.evidence:.1f}",
+                _values(r),
+            )
             for r in ranking
         ]
-        show("\n" + table(rows, ("effect (*: claimed)", "evidence [nats]", "gap after")))
-        show("  evidence of a claimed effect: what is lost without it; of others: what each")
-        show("  gains by itself; +-: standard deviation")
-    for row in ranking:
-        if row.claimed:
-            show(field(f"  {row.effect}:", _values(row)))
+        if share := credit_of(found, "calibration"):
+            rows.insert(0, ("  (calibration)", share, "", "the model's own parameters, below"))
+        show("\n" + table(rows, ("effect (*: claimed)", "credit", "evidence [nats]", "value")))
+        show("  credit: what predictions lose without it, of what they gain in all")
     for group in found.indistinguishable:
         show(field("tied", f"the data can't tell apart: {', '.join(group)}"))
 

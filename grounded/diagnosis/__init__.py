@@ -12,8 +12,9 @@ the question "which effect?". Below them lie, from the data upwards
     refine, fitted        many hypotheses up their likelihood at once; where each ends
     scan                  a first look at every candidate effect
     hypotheses, search    what was fitted, what it is worth, what to try next
-    held_out, claims      what other trials confirm; what is claimed, with intervals
+    held_out, claims      the gap and utilities on other trials; what is claimed, with intervals
     lookalike, leftover   what acts nearly the same; what no effect explains
+    ruler, decide, measured     held-out errors in units; they decide; what they say of the decision
     prediction_error, split     where the gap lies, and what the error is made of
     limits, excitation    what the data can't tell; the trial that would
     verdict               the same in words

@@ -32,7 +32,7 @@ PAYS = (1.0, 0.01)  # scatters that a cause must gain, and the least gain in one
 FURTHER = (2.0, 0.01)  # the same where there are several causes
 BETTER = (2.0, 0.05)  # the same for a rival to take the place of a likelier hypothesis
 OVERRULES = (3.0, 0.1)  # and for a claim that is likely under another noise only
-SLIGHT = 0.01  # of what all causes gain: one that makes less is not named
+SLIGHT = 0.02  # of what all causes gain: one that makes less is not named
 REFIT = 12  # iterations after a cause was taken out
 
 

@@ -3,8 +3,9 @@
 preflight         the instruments, from their signals alone: corrected first  (instruments)
 limits            what can't be known from these data; which parameters they identify
 attribution       which effects, by evidence       (search, hypotheses, scan, refine, noise, fitted)
-ruler             held-out prediction errors in the channels' units, and the noise floor
+ruler             held-out prediction errors in the channels' units
 decide            evidence proposes, the ruler decides; what each cause is worth
+measured          what the ruler says of the decision: table, noise floor, credit, what is left
 claims            what is claimed, what ties, what is nearly the same    (lookalike)
 correction        a curve that predicts what is left, where it passes a test of its own
 leftover          what no effect explains
@@ -28,35 +29,29 @@ from grounded.diagnosis.attribution import attribute
 from grounded.diagnosis.claims import Claims
 from grounded.diagnosis.correction import correction
 from grounded.diagnosis.data import prepare
-from grounded.diagnosis.decide import Decision, decide, ordered, plain, shares
+from grounded.diagnosis.decide import Decision, decide
 from grounded.diagnosis.delays import delays_of
 from grounded.diagnosis.fitted import Fitted
 from grounded.diagnosis.held_out import shrinkage, utility_prediction
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor, param_scale
-from grounded.diagnosis.leftover import Leftover, leftovers, whiteness
+from grounded.diagnosis.leftover import whiteness
 from grounded.diagnosis.limits import Limits, held, identifiable, knowable, limits
+from grounded.diagnosis.measured import Measured, root_mean_square
 from grounded.diagnosis.prediction_error import by_region, by_time, explained, horizon
 from grounded.diagnosis.report import (
     Change,
     ChannelShare,
-    Credit,
     Diagnosis,
     Gap,
     Identifiable,
     NoiseLevels,
-    Remainder,
-    RulerRow,
-    RunChange,
-    Split,
     UtilityPrediction,
     Where,
 )
-from grounded.diagnosis.ruler import Ruler, repeated
+from grounded.diagnosis.ruler import Ruler
 from grounded.diagnosis.search import HypothesisSearch
-from grounded.diagnosis.split import split
 from grounded.diagnosis.verdict import next_trial, verdict
 from grounded.effects import Library
-from grounded.frozen import Array
 from grounded.instruments.preflight import preflight
 from grounded.model import Model
 from grounded.task import Task
@@ -139,8 +134,6 @@ def diagnose(
 
 
 FIRST_LOOK = 6  # iterations of the fit by whose noise the parameters are found identifiable
-ABOVE = 1.3  # times the noise floor: what is left is stated
-COUNTS = (2.0, 0.03)  # scatters, and least gain, of a flexible correction that is stated
 
 
 def _identified(uncertain: Predictor, best: Fitted) -> list[Identifiable]:
@@ -168,11 +161,9 @@ class _Writer:
         self.search, self.best = decision.search, decision.fit
         self.predictor, self.data = self.search.predictor, self.search.data
         self.shown = list(zip(ruler.shown, ruler.names, strict=True))
-        self.units = {n: self.data.model.states[n] for n in ruler.names}
-        self.credit = shares(ruler, decision)
-        self.claims = Claims(decision, self.credit, known)
-        self.left = leftovers(self.predictor, self.best)
-        self.floor, self.source = self.noise_floor()
+        self.measured = Measured(decision, ruler, trials)
+        self.claims = Claims(decision, self.measured.credit, known)
+        self.left = self.measured.left
 
     def diagnosis(self) -> Diagnosis:
         data, predictor = self.data, self.predictor
@@ -188,8 +179,9 @@ class _Writer:
         ranking = self.claims.ranking(where, shrunk.gap_before)
         groups = self.claims.groups()
         alike = self.claims.nearly(groups)
-        remainder = self.remainders()
-        rows, credit = self.prediction_error(), self.credits()
+        measured = self.measured
+        remainder = measured.remainders()
+        rows, credit = measured.prediction_error(), measured.credits()
         named = [row.effect for row in ranking if row.claimed]
         values, agreement = by_trial(self.best, data, named) if named else ((), ())
         return Diagnosis(
@@ -198,7 +190,7 @@ class _Writer:
                 channels=self.channels(gain, shrunk.before, where.spread),
                 times=tuple(by_time(gain.sum(axis=-1), data)),
                 regions=tuple(by_region(gain.sum(axis=-1), predictor, self.best)),
-                split=self.split(),
+                split=measured.split(),
                 whiteness=self.whiteness(),
                 tempering=self.search.tempering.factor,
             ),
@@ -215,7 +207,7 @@ class _Writer:
                 channels=self.by_channel(shrunk.before, shrunk.after, where.spread),
             ),
             utility_prediction=self.utility_prediction(bare),
-            whole_run=self.whole_run(),
+            whole_run=measured.whole_run(),
             leftover=remainder,
             correction=correction(predictor, self.best, self.left, where),
             next_trial=next_trial(self.claims, self.left, groups),
@@ -231,157 +223,12 @@ class _Writer:
             candidates=len(self.search.candidates),
         )
 
-    def rms(self, fit: Fitted) -> Array:
-        """By horizon and shown state, (K, n')."""
-        return np.asarray(self.ruler.errors(fit).rms[:, self.ruler.shown])
-
-    def calibrated(self) -> Fitted | None:
-        """The model with its parameters fitted; as it is where that predicts no better."""
-        fits = [f for (_, spread, names), f in self.search.fits.items() if spread and not names]
-        if not fits:
-            return None
-        best, crude = max(fits, key=self.search.score), self.decision.crude
-        return best if self.ruler.gain(crude, best).mean > 0 else crude
-
-    def noise_floor(self) -> tuple[Array, str]:
-        """Rms error that no model undercuts, by horizon and shown state, and where it is from.
-
-        Noise that seems coloured counts as such where no flexible model finds anything in it.
-        """
-        repeats = repeated(self.trials, self.data)
-        found, source = self.ruler.scatter(self.best, repeats), "repeats"
-        if found is None:
-            source = "short horizon"
-            fit = self.best if not self.left else plain(self.search, self.best)
-            starts = (horizon(self.predictor, fit, k * self.data.dt) for k in self.ruler.steps)
-            rows = [
-                _rms(np.where(self.data.seen[w.at + w.steps, w.run] > 0, w.spread, np.nan))
-                for w in starts
-            ]
-            found = np.array([*rows, np.full_like(rows[0], np.nan)])
-        reached = [e.rms for _, e in self.ruler.measured]
-        return np.fmin(found, np.fmin.reduce(reached))[:, self.ruler.shown], source
-
-    def prediction_error(self) -> tuple[RulerRow, ...]:
-        """The ruler's table: 0.1, 0.5, 1 s and the whole trial."""
-        calibrated = self.calibrated()
-        columns = {
-            "crude": self.rms(self.decision.crude),
-            "calibrated": None if calibrated is None else self.rms(calibrated),
-            "with_effects": self.rms(self.best),
-            "noise_floor": self.floor,
-        }
-        by = "trials" if self.data.count > 1 else "pieces"
-        rows = []
-        for k, seconds in self.horizons():
-            found = {
-                key: {} if rms is None else dict(zip(self.units, map(float, rms[k]), strict=True))
-                for key, rms in columns.items()
-            }
-            rows.append(
-                RulerRow(
-                    seconds,
-                    k == len(self.ruler.steps),
-                    self.units,
-                    by if self.ruler.held_out else "no",
-                    floor_from=self.source,
-                    **found,
-                )
-            )
-        return tuple(rows)
-
-    def horizons(self) -> list[tuple[int, float]]:
-        """(index, seconds) of the ruler's rows; a single step is no row unless it is 0.1 s."""
-        dt, steps = self.data.dt, self.ruler.steps
-        first = 0 if len(steps) < 2 or dt > 0.05 else 1
-        rows = [(k, steps[k] * dt) for k in range(first, len(steps))]
-        return [*rows, (len(steps), float(np.median(self.data.lengths)) * dt)]
-
-    def credits(self) -> tuple[Credit, ...]:
-        """What each cause is worth, largest first."""
-        k = len(self.ruler.steps) - 1
-        return tuple(
-            Credit(
-                name,
-                self.credit[name],
-                dict(
-                    zip(
-                        self.units,
-                        map(float, self.rms(self.decision.without[name])[k]),
-                        strict=True,
-                    )
-                ),
-            )
-            for name in ordered(self.credit, list(self.credit))
-        )
-
-    def remainders(self) -> tuple[Remainder, ...]:
-        """What is left above the floor, and what a flexible model finds that would show there."""
-        k, data, ruler = len(self.ruler.steps) - 1, self.data, self.ruler
-        now, fine = self.rms(self.best), ruler.fine[ruler.shown]
-        short = slice(0, len(ruler.steps))
-        least = np.maximum(np.log(ABOVE), 2 * ruler.doubt(self.best))
-        above = (np.log(now / self.floor) > least) & (now > 2 * fine)
-        flexible, found = {left.channel: left for left in self.left}, []
-        for i, name in enumerate(ruler.names):
-            left = flexible.get(name)
-            error, floor = float(now[k, i]), float(self.floor[k, i])
-            if left is not None and not self.counts(left):
-                left = None
-            if left is None and not above[short, i].any():
-                continue
-            at = k
-            if left is None and not above[k, i]:
-                at = int(np.flatnonzero(above[short, i])[-1])
-                error, floor = float(now[at, i]), float(self.floor[at, i])
-            row = Remainder(
-                name,
-                error=error,
-                floor=floor,
-                horizon_s=ruler.steps[at] * data.dt,
-                error_unit=self.units[name],
-            )
-            found.append((left is None, -error / max(floor, float(fine[i])), i, left, row))
-        return tuple(self.with_region(row, left) for *_, left, row in sorted(found, key=_first))
-
-    def counts(self, left: Leftover) -> bool:
-        """Whether predictions would gain by a flexible model's correction."""
-        rate = np.zeros((*left.correction.shape, self.data.model.n))
-        rate[..., self.data.model.state_names.index(left.channel)] = left.correction
-        return self.ruler.corrected(self.best, rate).beyond(*COUNTS)
-
-    def with_region(self, row: Remainder, left: Leftover | None) -> Remainder:
-        """A remainder with what a flexible model says of it: the missing rate, and where."""
-        if left is None:
-            return row
-        size = left.correction**2 * self.data.valid.T
-        regions = by_region(size, self.predictor, self.best, 1)
-        region = regions[0] if regions else None
-        return replace(row, size=left.size, unit=left.unit, evidence=left.gain, region=region)
-
-    def split(self) -> dict[str, Split]:
-        """Explained, unexplained, irreducible: one step, the horizon, a whole trial."""
-        steps, dt = self.ruler.steps, self.data.dt
-        rows = {"one_step": 0, "horizon": len(steps) - 1, "whole_run": len(steps)}
-        seconds = [*(k * dt for k in steps), float(np.median(self.data.lengths)) * dt]
-        before, after = self.rms(self.decision.crude), self.rms(self.best)
-        return {
-            key: split(seconds[k], self.units, before[k], after[k], self.floor[k], self.source)
-            for key, k in rows.items()
-        }
-
-    def whole_run(self) -> dict[str, RunChange]:
-        """Errors of predictions from the beginning of each trial to its end."""
-        before, after = self.rms(self.decision.crude)[-1], self.rms(self.best)[-1]
-        rows = zip(self.units.items(), before, after, strict=True)
-        return {n: RunChange(float(b), float(a), unit) for (n, unit), b, a in rows}
-
     def channels(self, gain: Any, error: Any, spread: Any) -> tuple[ChannelShare, ...]:
         """Each state's part of the gap."""
         data = self.data
         excess = np.maximum(gain.sum(axis=(0, 1)), 0.0)
         share = excess / max(float(excess.sum()), 1e-12)
-        rms = _rms(error)
+        rms = root_mean_square(error)
         rows = [
             ChannelShare(
                 name,
@@ -398,7 +245,9 @@ class _Writer:
         """The gap of each state, noise-normalised."""
         found = {}
         for i, name in self.shown:
-            found[name] = Change(*(float(_rms(e[:, i] / spread[:, i])) for e in (before, after)))
+            found[name] = Change(
+                *(float(root_mean_square(e[:, i] / spread[:, i])) for e in (before, after))
+            )
         return found
 
     def noise(self) -> NoiseLevels:
@@ -427,15 +276,3 @@ class _Writer:
         self.tick("utility")
         found = utility_prediction(self.predictor, self.best, bare, self.task, self.trials)
         return found.summary()
-
-
-def _first(each: tuple[Any, ...]) -> tuple[Any, ...]:
-    """Sorts remainders: where a flexible model finds a rate first, then by size."""
-    return each[:3]
-
-
-def _rms(error: Any) -> Any:
-    """Root mean square along the first axis; nan for a state that was never measured."""
-    count = np.isfinite(error).sum(axis=0)
-    total = np.nansum(error**2, axis=0)
-    return np.where(count > 0, np.sqrt(total / np.maximum(count, 1)), np.nan)

@@ -208,13 +208,13 @@ class Ruler:
         """What `after` predicts better than `before`."""
         return self.compared(self.errors(before), self.errors(after))
 
-    def corrected(self, fit: Fitted, rate: Array) -> Gain:
-        """What a fit would predict better with a rate (L, B, n) [unit/s] added along its log."""
+    def corrected(self, fit: Fitted, rate: Array) -> tuple[Gain, Errors]:
+        """What a fit would gain by a rate (L, B, n) [unit/s] added along its log; its errors."""
         B, n, K = len(self.data.valid), self.data.model.n, len(self.steps) + 1
         plain, other = (Errors(np.zeros((K, B, n)), np.zeros((K, B, n))) for _ in range(2))
         for found, added in ((plain, None), (other, rate * self.data.dt)):
             self._add(found, fit.hypothesis, fit.track, np.arange(B), added, whole=False)
-        return self.compared(plain, other)
+        return self.compared(plain, other), other
 
     def compared(self, before: Errors, after: Errors) -> Gain:
         """The same of errors."""

@@ -207,7 +207,9 @@ def _new(diagnosis: Diagnosis | None, adopted: set[str]) -> list[Effect]:
     return [
         {"name": name, **diagnosis.values(name)}
         for name in diagnosis.effects
-        if name not in adopted and diagnosis.ranked(name) is not None
+        if name not in adopted
+        and diagnosis.ranked(name) is not None
+        and name.removeprefix("parameter:") not in diagnosis.known_parameters
     ]
 
 
