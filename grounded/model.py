@@ -110,7 +110,8 @@ class Model:
         for name in names:
             if not name.isidentifier():
                 raise GroundedError(f"model '{self.name}': '{name}' is not a valid Python name")
-        for name, unit in (self.states | self.inputs).items():
+        units: dict[str, object] = {**self.states, **self.inputs}
+        for name, unit in units.items():
             if not isinstance(unit, str):
                 found = type(unit).__name__
                 raise GroundedError(f"model '{self.name}': the unit of '{name}' is a {found}")
