@@ -141,6 +141,11 @@ class Model:
         for name in names:
             if not name.isidentifier():
                 raise GroundedError(f"model '{self.name}': '{name}' is not a valid Python name")
+        units: dict[str, object] = {**self.states, **self.inputs}
+        for name, unit in units.items():
+            if not isinstance(unit, str):
+                found = type(unit).__name__
+                raise GroundedError(f"model '{self.name}': the unit of '{name}' is a {found}")
         for name in self.angles:
             if name not in self.states:
                 raise GroundedError(f"angle '{name}' is not a state: {nearest(name, self.states)}")

@@ -330,15 +330,16 @@ def fuzzed_target(rng: random.Random) -> str:
     return "\n".join(lines)
 
 
+FUZZES = (("config", fuzzed_toml), ("model", fuzzed_model), ("target", fuzzed_target))
+
+
 def configurations(rng: random.Random, seconds: float) -> Tally:
     """Mutated grounded.toml, model.py and target.csv: `propose`, `status` and `run`."""
     tally = Tally()
     with tempfile.TemporaryDirectory(dir=MEMORY) as folder:
         for k in during(seconds):
-            kind = ("config", "model", "target")[k % 3]
-            text = {"config": fuzzed_toml, "model": fuzzed_model, "target": fuzzed_target}[kind](
-                rng
-            )
+            kind, fuzz = FUZZES[k % 3]
+            text = fuzz(rng)
             where = Path(folder, "w")
             shutil.rmtree(where, ignore_errors=True)
             with trying(tally, f"{kind} {k}"):
@@ -504,7 +505,7 @@ def crowds(rng: random.Random, seconds: float) -> Tally:
 
 # --- flipped bits ---------------------------------------------------------------------------------
 
-READING = (("status",), ("propose",), ("verify",), ("report",), ("fit",), ("diagnose",))
+READING = (("status",), ("propose",))
 
 
 def flips(rng: random.Random, seconds: float) -> Tally:
