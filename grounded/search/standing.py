@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -30,6 +30,9 @@ from grounded.search.certainty import in_doubt, last_improvement, repeated_exact
 from grounded.search.step_size import Step, after_failure, after_success
 from grounded.task import Task
 from grounded.trial import Trial
+
+if TYPE_CHECKING:
+    from grounded.figures.figure import Figure
 
 Phase = Literal["propose", "await-trial", "converged", "stopped"]
 Ending = Literal[
@@ -132,6 +135,12 @@ class Candidate(Result):
             predicted_utility=self.predicted_utility,
         )
 
+    def figures(self) -> Sequence[Figure]:
+        """What the model predicts."""
+        from grounded.search.pictures import candidate_figure
+
+        return (candidate_figure(self),)
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Tried(Result):
@@ -229,6 +238,13 @@ class Standing(Result):
             certainty=last_improvement(self.history),
             history=[t.to_json() | {"verdict": t.verdict(t is last)} for t in self.history],
         )
+
+    def figures(self) -> Sequence[Figure]:
+        """Utility by candidate, and the step sizes."""
+        from grounded.search.pictures import search_figure
+
+        found = search_figure(self)
+        return () if found is None else (found,)
 
 
 def standing(

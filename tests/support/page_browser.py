@@ -15,6 +15,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 FLAGS = [
     "--headless=new",
     "--no-sandbox",
@@ -26,6 +28,14 @@ FLAGS = [
     "--disable-sync",
     "--hide-scrollbars",
 ]
+
+
+def unpacked(value: dict[str, Any]) -> np.ndarray:
+    """The numbers of a packed array."""
+    raw = np.frombuffer(base64.b64decode(value["bdata"]), "<" + value["dtype"]).astype(float)
+    if value["dtype"] != "u2":
+        return raw
+    return np.where(raw == 65535, np.nan, value["from"] + value["step"] * raw)
 
 
 def missing() -> str:

@@ -270,7 +270,9 @@ class Workspace(Folder):
         from grounded_trials.report import reporting
         from grounded_trials.report.gathering import gather
 
-        for asked, module, extra in ((png, "PIL", "png"), (rrd, "rerun", "view")):
+        known = {"jinja2": (html, "report"), "plotly": (html, "report")}
+        known |= {"matplotlib": (png, "png"), "rerun": (rrd, "view")}
+        for module, (asked, extra) in known.items():
             if asked:
                 needs(module, extra)
         findings, paths = gather(self._afresh()), []
