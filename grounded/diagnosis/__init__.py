@@ -16,5 +16,5 @@ question "which effect?". Below them lie, from the data upwards:
     lookalike, leftover   what acts nearly the same; what no effect explains
     prediction_error, split     where the gap lies, and what the error is made of
     limits, excitation    what the data can't tell; the trial that would
-    verdict               the same in words
+    verdict, pictures     the same in words; in figures
 """

@@ -4,5 +4,5 @@ Read `improve.py` first: the paper's loop, one proposal at a time; `ask_tell.py`
 it. `standing.py` says where the search stands and why it ended, `certainty.py` how sure an
 improvement is, `step_size.py` how far to go (damping, alpha), `first_policy.py` where it starts
 (DDP from several runs, the first of them by `first_guess.py`), `planner.py` by which model it
-plans, `safety.py` what may be handed out.
+plans, `safety.py` what may be handed out; `pictures.py` draws it.
 """

@@ -14,6 +14,7 @@ from grounded_trials.workspace.handover import Void, checked_candidate, outside_
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
 
+    from grounded.figures.figure import Figure
     from grounded.search.improve import Proposal
     from grounded.search.standing import Candidate, Standing
 
@@ -57,6 +58,10 @@ class Status(Result):
     def summary(self) -> str:
         """The phase and the best candidate."""
         return self.standing.summary()
+
+    def figures(self) -> Sequence[Figure]:
+        """Utility by candidate."""
+        return self.standing.figures()
 
     def to_json(self) -> dict[str, Any]:
         """The document of `status --json`, the whole history in it."""
