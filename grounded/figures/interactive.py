@@ -39,6 +39,7 @@ PAPER = {
 }
 SYMBOLS = {"disc": "circle", "ring": "circle-open", "cross": "x-thin", "dash": "line-ew"}
 FONT = 12
+LETTER = 0.035  # of a bar's text, as a share of the longest bar
 EXTRA = "report"  # that brings Plotly
 
 
@@ -208,7 +209,8 @@ def _bars(panel: Bars, axis: str) -> dict[str, Any]:
     }  # fmt: skip
     most = max([abs(v) for v in values], default=0.0) or 1.0
     low = min([*values, 0.0])
-    across = {"range": [1.3 * low, 1.35 * most], "visible": False, "fixedrange": True}
+    room = 1.05 + max([LETTER * len(bar.text) for bar in bars], default=0.0)
+    across = {"range": [room * low, room * most], "visible": False, "fixedrange": True}
     up = {
         "tickvals": list(range(len(bars))), "ticktext": [bar.label for bar in bars],
         "automargin": True, "fixedrange": True, "showgrid": False, "zeroline": False,

@@ -75,7 +75,8 @@
   const draw = (plot) => {
     const first = !plot.drawn;
     plot.drawn = true;
-    Plotly.react(plot, ...looks(plot), config);
+    const bars = known(plot).kind === "bars";
+    Plotly.react(plot, ...looks(plot), bars ? { ...config, displayModeBar: false, staticPlot: true } : config);
     if (!first) return;
     const { kind } = panels[plot.dataset.panel];
     plot.on("plotly_afterplot", () => marks(plot));

@@ -47,7 +47,7 @@ from grounded_trials.report.page.tables import (
 )
 from grounded_trials.wording import count, figure
 
-LINES = 2  # of the verdict, at the top
+LINES = 3  # of the verdict, at the top
 OPEN = 12  # candidates whose table is open
 
 
