@@ -27,8 +27,8 @@ from grounded.figures.figure import (
 )
 from grounded.frozen import Array
 
-MOST = 1600  # points of a curve, 600 of one that is only context
-CONTEXT = 500
+MOST = 1600  # points of a curve, fewer of one that is only context
+CONTEXT = 300
 STEPS = 65535  # of a packed number's range
 COARSE = 50.0  # times the range of nearly all values from which on two bytes are too few
 FAINT = 0.15  # opacity of a band
@@ -89,7 +89,8 @@ def _ruled(axis: dict[str, Any]) -> dict[str, Any]:
 
 
 def _curve(panel: Panel, curve: Curve) -> dict[str, Any]:
-    most = MOST if curve.name and curve.style == "line" else CONTEXT
+    near = curve.name and curve.role != "other" and curve.style != "ghost"
+    most = MOST if near else CONTEXT
     index = thinned(curve.x, curve.y, most)
     trace: dict[str, Any] = {
         "type": "scatter",

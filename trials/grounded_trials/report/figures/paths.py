@@ -11,6 +11,7 @@ from grounded_trials.report.scene import Scene, scene_of
 from grounded_trials.wording import labelled
 
 OTHERS = 60  # runs that are drawn behind the compared ones
+SEEN = 5.0  # the least factor that shows more than the paths themselves
 FAR = 4.0  # times the size of the picture: what lies further off is not drawn
 
 
@@ -104,7 +105,7 @@ def _enlarged(findings: Findings, scene: Scene) -> list[Panel]:
     desired = findings.task.target[:, axes]
     best = compared(findings)[-1][1].trial.states[:, axes]
     factor = enlarging(best, desired)
-    if factor == 1.0:
+    if factor < SEEN:
         return []
     curves = []
     for role, name, states in named_paths(findings):

@@ -89,10 +89,16 @@
     plot.addEventListener("keydown", (event) => keyed(plot, event));
     marks(plot);
   };
+  const waiting = []; // one panel a frame, so that the page can be scrolled meanwhile
+  const next = () => {
+    const plot = waiting.shift();
+    if (plot && !plot.drawn) draw(plot);
+    if (waiting.length) requestAnimationFrame(next);
+  };
   const seen = new IntersectionObserver((entries) => {
-    for (const { isIntersecting, target } of entries) {
-      if (isIntersecting && !target.drawn) draw(target);
-    }
+    const idle = !waiting.length;
+    waiting.push(...entries.filter((e) => e.isIntersecting && !e.target.drawn).map((e) => e.target));
+    if (idle && waiting.length) requestAnimationFrame(next);
   }, { rootMargin: "300px" });
 
   // Zoom: the panels over a run's time share it; keys do what the mouse does.

@@ -23,7 +23,7 @@ from grounded.figures.figure import Bars, Panel
 from grounded.figures.interactive import EXTRA, packed, palette, plotted
 from grounded.search.pictures import search_figure
 from grounded_trials.report.diagnosis_words import error_lines
-from grounded_trials.report.figures.paths import path_figure
+from grounded_trials.report.figures.paths import crash, path_figure
 from grounded_trials.report.figures.runs import (
     bias_figure,
     error_figure,
@@ -187,7 +187,8 @@ def _tiles(findings: Findings) -> list[str]:
         found.append(f"{count(logs, 'log')} of data")
     if findings.optimum is not None:
         found.append(f"optimum of the real system {figure(findings.optimum)}")
-    return [*found, f"phase of the search: {now.phase}"]
+    early = [run.trial.id for run in findings.runs if crash(run) is not None]
+    return [*found, f"ended early: {', '.join(early)}"] if early else found
 
 
 def _why(findings: Findings) -> dict[str, Any]:
