@@ -14,6 +14,7 @@ from grounded_cli.terminal import remark, show, show_json
 USES = {
     "csv": "a row a control step; the control law is in its head",
     "npz": "on the robot: grounded.policy.load; --runner adds a file for numpy alone",
+    "bag": "a ROS 2 bag of the run: `ros2 bag play`, RViz, Foxglove, PlotJuggler",
     "json": "the control law, names and units are in it (docs/robot.md)",
 }
 
@@ -45,10 +46,14 @@ def command(
 ) -> None:
     """Write a candidate as csv, npz or json, with units and the time base in the file.
 
+    --format bag writes the run that it predicts as a ROS 2 bag of standard messages; a trial
+    (t0007) is written as a bag, csv or npz.
+
     `best` names the best candidate so far. One that must not be run any more (see `grounded run`)
     is refused; one of an earlier task is not, if it keeps today's [limits] and [safety].
     """
     named = Path(output or "").suffix.lstrip(".").lower()
+    run = candidate.startswith("t") or form == "bag"
     if form is not None and named in USES and named != form:
         raise click.UsageError(f"-o {output} is named as {named}, --format says {form}")
     done = open_workspace().export(candidate, output, form=form, runner=runner, anyway=anyway)
@@ -60,7 +65,9 @@ def command(
         show_json(done.to_json())
     else:
         show(f"{done.candidate} is written to {done.file}")
-        if done.runner is None:
+        if run and done.format != "bag":
+            show("  a column a state and input, a row a control step, t in seconds")
+        elif done.runner is None:
             show(f"  {USES[done.format]}")
         else:
             show(f"  on the robot, with Python 3.8 and numpy alone: {done.runner}")

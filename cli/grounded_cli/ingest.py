@@ -46,14 +46,15 @@ def command(files: tuple[str, ...], candidate: str | None, data: bool, json_: bo
         with progress(f"reading {name}"):
             done.append(workspace.ingest(name, candidate=candidate, data=data))
         if not json_:
-            _tell(name, done[-1])
+            tell(name, done[-1])
     if json_:
         show_json({"trials": [one.to_json() for one in done]})
     else:
         show(f"\n{next_line(done[-1].then)}")
 
 
-def _tell(name: str, one: Ingested) -> None:
+def tell(name: str, one: Ingested) -> None:
+    """Says what became of a log."""
     for warning in one.warnings:
         remark("warning", f"{name}: {warning}")
     known = "was stored before as" if one.known else "is stored as"

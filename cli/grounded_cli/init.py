@@ -1,18 +1,29 @@
-"""grounded init: a workspace from an example."""
+"""grounded init: a workspace from a log of your robot, or from an example."""
 
 from __future__ import annotations
 
 import shlex
+import sys
+from typing import TYPE_CHECKING
 
 import click
 
 from grounded_cli import completion as complete
-from grounded_cli.options import as_json
-from grounded_cli.terminal import show, show_json
+from grounded_cli.options import as_json, next_line
+from grounded_cli.terminal import field, progress, remark, show, show_json
+
+if TYPE_CHECKING:
+    from grounded_trials.logs.inspect_guess import Guess
+    from grounded_trials.starting.begin import Begun
 
 
 @click.command("init")
 @click.argument("folder", metavar="DIR", required=False)
+@click.option("--from", "log", metavar="LOG", help="A log of your robot, of any format.")
+@click.option("--model", metavar="FILE", help="Your model.py, beside --from.")
+@click.option("--kind", help="Of the model skeleton: car, rover, drone, arm, pendulum, generic.")
+@click.option("--dt", type=float, metavar="SECONDS", help="Control interval (the log's).")
+@click.option("--yes", is_flag=True, help="Ask nothing: take the best guesses, marked as such.")
 @click.option(
     "--example",
     "name",
@@ -22,24 +33,89 @@ from grounded_cli.terminal import show, show_json
 )
 @click.option("--list", "list_", is_flag=True, help="List the examples.")
 @as_json
-def command(folder: str | None, name: str | None, list_: bool, json_: bool) -> None:
+def command(
+    folder: str | None,
+    log: str | None,
+    model: str | None,
+    kind: str | None,
+    dt: float | None,
+    yes: bool,
+    name: str | None,
+    list_: bool,
+    json_: bool,
+) -> None:
     """Make a workspace in DIR: grounded.toml, model.py, target.csv, trials/, candidates/.
 
-    real.py stands in for your robot; replace [system] in grounded.toml when you have one.
+    --from LOG finds the model's states and inputs in a log and says why; without --model it writes
+    a model skeleton of the kind of robot that the log shows. --example NAME takes an example, whose
+    real.py stands in for your robot.
     """
     if list_:
-        from grounded_trials.workspace.examples import EXAMPLES
-
-        if json_:
-            show_json({"examples": {key: value.text for key, value in EXAMPLES.items()}})
-        else:
-            show("\n".join(f"{key:15} {value.text}" for key, value in EXAMPLES.items()))
-        return
-    if folder is None or name is None:
+        _list(json_)
+    elif folder is None or (log is None) == (name is None):
         raise click.UsageError(
-            "give a folder and an example: grounded init DIR --example car-turn; "
-            "`grounded init --list` names them"
+            "give a folder and a log, grounded init DIR --from run1.mcap, or an example, grounded "
+            "init DIR --example car-turn; `grounded init --list` names them"
         )
+    elif log is not None:
+        from pathlib import Path
+
+        from grounded_trials.starting.begin import begin
+
+        asked = None if yes or json_ or not sys.stdin.isatty() else _ask
+        with progress(f"reading {log}"):
+            begun = begin(Path(folder), log, model=model, kind=kind, dt=dt, ask=asked)
+        show_json(begun.to_json()) if json_ else _tell(begun)
+    else:
+        _example(folder, str(name), json_)
+
+
+def _ask(guess: Guess) -> str:
+    """Asks which signal a state or input is."""
+    paths = [p for p in (guess.path, *guess.others) if p]
+    show(f"\n{guess.name} {'is unsure' if guess.path else 'was not found'}")
+    for reason in guess.reasons:
+        show(f"  {reason}")
+    for i, path in enumerate(paths, start=1):
+        show(f"  {i}  {path}")
+    first = "1" if guess.path else ""
+    answer = click.prompt("  a number, another message path, or - for none", default=first or "-")
+    if answer == "-":
+        return ""
+    return paths[int(answer) - 1] if answer.isdigit() and 0 < int(answer) <= len(paths) else answer
+
+
+def _tell(begun: Begun) -> None:
+    what = f"skeleton of kind '{begun.kind}': {begun.why}" if begun.kind else begun.why
+    show(f"{begun.workspace} is a workspace for {begun.log}")
+    show(field("model", what, "  "))
+    show(field("grid", f"{begun.dt:g} s, {begun.horizon} steps", "  "))
+    show(field("target", begun.target, "  "))
+    show("")
+    for guess in (*begun.states, *begun.inputs):
+        mark = "" if guess.sure else "UNSURE "
+        show(field(guess.name, f"{mark}{guess.path or 'nothing in the log fits'}", "  "))
+        for reason in guess.reasons:
+            show(field("", reason, "  "))
+        if guess.others and not guess.sure:
+            show(field("", f"or {', '.join(guess.others)}", "  "))
+    for note in begun.notes:
+        remark("note", note)
+    look = "; look at what is UNSURE in its [log]" if begun.unsure else ""
+    show(f"\nread {begun.workspace}/model.py and grounded.toml{look}, then")
+    show(next_line(begun.then, begun.workspace))
+
+
+def _list(json_: bool) -> None:
+    from grounded_trials.workspace.examples import EXAMPLES
+
+    if json_:
+        show_json({"examples": {key: value.text for key, value in EXAMPLES.items()}})
+    else:
+        show("\n".join(f"{key:15} {value.text}" for key, value in EXAMPLES.items()))
+
+
+def _example(folder: str, name: str, json_: bool) -> None:
     from grounded_trials import Workspace
 
     Workspace.create(folder, example=name)

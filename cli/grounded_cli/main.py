@@ -27,10 +27,12 @@ if TYPE_CHECKING:
 
 # name -> (module, one line); in the order in which they are used
 COMMANDS = {
-    "init": ("init", "Make a workspace from an example."),
+    "init": ("init", "Make a workspace from a log or an example."),
+    "target": ("target", "Draw the manoeuvre: line, circle, figure-8, step, swing-up, a run."),
     "propose": ("propose", "Say what to run next and write its candidate file."),
     "run": ("run", "Run the candidate on the system of grounded.toml."),
     "ingest": ("ingest", "Take in what came back: check, resample, store."),
+    "next": ("next", "Ingest a log, propose, and export for the robot, in one go."),
     "learn": ("learn", "Propose, run and ingest until the search ends."),
     "status": ("status", "Show where the search stands."),
     "report": ("report", "Show what all trials say: text, page, pictures, recording."),

@@ -34,10 +34,11 @@ def command(json_: bool) -> None:
     if json_:
         show_json(proposed.to_json())
     else:
-        _tell(workspace, proposed)
+        tell_proposed(workspace, proposed)
 
 
-def _tell(workspace: Workspace, proposed: Proposed) -> None:
+def tell_proposed(workspace: Workspace, proposed: Proposed, *, last: bool = True) -> None:
+    """Says what to run next; `last`: and the command after that."""
     standing, candidate = proposed.standing, proposed.candidate
     for note in proposed.proposal.notes:
         remark("note", note)
@@ -61,7 +62,8 @@ def _tell(workspace: Workspace, proposed: Proposed) -> None:
     show(field("trust", _trust(standing, adopted), "  "))
     for name, text in _extent(candidate, workspace.task):
         show(field(name, text, "  "))
-    show(f"\n{next_line(proposed.then)}")
+    if last:
+        show(f"\n{next_line(proposed.then)}")
 
 
 def _what(candidate: Candidate, task: Task) -> str:

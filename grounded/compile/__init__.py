@@ -27,7 +27,6 @@ from grounded.compile.problem import (
     System,
     history_depths,
 )
-from grounded.compile.run.differenced import DifferencedSystem
 from grounded.compile.run.jit import parallel
 from grounded.compile.run.traced import TracedSystem
 from grounded.compile.trace.graph import TooLong
@@ -83,10 +82,10 @@ def system_of(
         signature = replace(signature, kind="step", within=(integrator, substeps))
     if jacobian is not None:
         note = "not compiled: it is run as it is, with the derivatives that come with it"
-        return DifferencedSystem(replace(signature, jacobian=jacobian), integrator, note)
+        return _differenced(replace(signature, jacobian=jacobian), integrator, note)
     found = trace(signature, None, 1.0)
     if isinstance(found, str):
-        return DifferencedSystem(signature, integrator, f"not compiled, {found}")
+        return _differenced(signature, integrator, f"not compiled, {found}")
     trouble = jit.trouble()
     if trouble:
         return TracedSystem(signature, found, integrator, f"not compiled: {trouble}")
@@ -95,9 +94,15 @@ def system_of(
         operations = system.operations
     except TooLong as error:
         note = f"not compiled, {where(function)}: its derivatives take {error}"
-        return DifferencedSystem(signature, integrator, note)
+        return _differenced(signature, integrator, note)
     if operations > MAX_COMPILED or system.n * (system.n + system.m) > MAX_PLACES:
         size = f"{system.n} states and {operations:,} operations"
         note = f"not compiled, {where(function)}: {size} would take too long"
         return TracedSystem(signature, found, integrator, note)
     return system
+
+
+def _differenced(signature: Signature, integrator: Integrator, note: str) -> System:
+    from grounded.compile.run.differenced import DifferencedSystem
+
+    return DifferencedSystem(signature, integrator, note)

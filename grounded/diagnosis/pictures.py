@@ -36,7 +36,7 @@ def accuracy_figure(diagnosis: Diagnosis) -> Figure | None:
         held = diagnosis.gap.held_out
     else:
         panels = _over_horizons(errors) if len(errors) > 1 else _by_channel(errors[0])
-        held = bool(errors[0].held_out)
+        held = errors[0].held_out != "no"
     if not panels:
         return None
     where = "on data that was held out" if held else "on the data that it was made from"

@@ -135,7 +135,7 @@ def test_repeats_say_what_is_waited_for(tmp_path):
     [
         (["status", "-C", "grounded.toml"], "is a file: -C takes the folder"),
         (["ingest", "."], "is a workspace: name the log"),
-        (["ingest", "model.py"], "this is not an MCAP file"),
+        (["ingest", "model.py"], "model.py is no log"),
         (["adopt", "x:y"], "nothing was diagnosed yet"),
         (["diagnose", "--trials", "t9,"], "there is no trial to learn from"),
         (["diagnose", "--without", "delay,delai"], "did you mean 'delay'"),
@@ -144,7 +144,7 @@ def test_repeats_say_what_is_waited_for(tmp_path):
         (["diagnose", "--trials", " , "], "leave it out to take all"),
         (["recover", "trials"], "is a folder"),
         (["recover", "model.py"], "look for another copy of the recording"),
-        (["ingest", "nofile.mcap"], "name an MCAP file or a bag's folder"),
+        (["ingest", "nofile.mcap"], "nofile.mcap does not exist"),
         (["ingest", "no/nofile.mcap"], "nor does its folder no: name a log"),
         (["inspect", "nowhere.mcap"], "does not exist"),
     ],

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from grounded.compile import Problem, parallel, system_of
-from grounded.compile.emit.llvm_box import MAX_INPUTS
+from grounded.compile.kernel_words import MAX_INPUTS
 from grounded.compile.run import jit
 from grounded.compile.run.traced import TracedSystem
 from grounded.compile.trace.graph import TooLong

@@ -13,7 +13,7 @@ frozen result whose `to_json()` is the document that the command prints with --j
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -25,6 +25,7 @@ from grounded_trials.workspace.folder import Folder, Lost
 if TYPE_CHECKING:
     from grounded.diagnosis.report import Diagnosis
     from grounded.effects import Library
+    from grounded.frozen import Array
     from grounded.search.standing import Candidate
     from grounded_trials.report.reporting import Report
     from grounded_trials.workspace.adopting import Adopted
@@ -52,6 +53,28 @@ class Verified(Result):
         return {"checked": self.checked, "damaged": [vars(one) for one in self.damaged]}
 
 
+@dataclass(frozen=True, eq=False, repr=False)
+class NextRun(Result):
+    """What a log gave, what to run next, and the file for the robot (None: the search ended)."""
+
+    taken: Ingested
+    proposed: Proposed
+    exported: Exported | None
+
+    def summary(self) -> str:
+        """What was taken in, and what comes next."""
+        name = None if self.proposed.candidate is None else self.proposed.candidate.id
+        return f"{self.taken.trial} is in; next {name or 'nothing: the search has ended'}"
+
+    def to_json(self) -> dict[str, Any]:
+        """The document of `next --json`: those of ingest, propose and export."""
+        return {
+            "trials": [self.taken.to_json()],
+            "propose": self.proposed.to_json(),
+            "export": None if self.exported is None else self.exported.to_json(),
+        }
+
+
 class Workspace(Folder):
     """A folder with a task, its trials and its candidates, and what can be done in it.
 
@@ -70,19 +93,36 @@ class Workspace(Folder):
         _ = self.config
 
     @classmethod
-    def create(cls, folder: str | Path, *, example: str) -> Self:
-        """Makes a workspace from an example; an existing file is never overwritten.
+    def create(
+        cls,
+        folder: str | Path,
+        *,
+        example: str | None = None,
+        log: str | Path | None = None,
+        model: str | Path | None = None,
+    ) -> Self:
+        """Makes a workspace from an example or from a log; nothing is ever overwritten.
 
         Args:
             folder: where it is made.
             example: car-turn, car-circle, car-figure8, flight-figure8 or pendulum.
+            log: of your robot, any format; `starting.begin.begin` says what it found.
+            model: your model.py, beside `log`; None: a skeleton is written.
 
         Raises:
-            GroundedError: if there is no such example, or the folder holds a workspace already.
+            GroundedError: if there is no such example, the log can't be read, or the folder holds
+                a workspace already.
         """
-        from grounded_trials.workspace.examples import write_example
+        if (example is None) == (log is None):
+            raise GroundedError("give an example or a log to make a workspace from")
+        if log is not None:
+            from grounded_trials.starting.begin import begin
 
-        write_example(Path(folder), example)
+            begin(Path(folder), log, model=model)
+        elif example is not None:
+            from grounded_trials.workspace.examples import write_example
+
+            write_example(Path(folder), example)
         return cls(folder)
 
     def __repr__(self) -> str:
@@ -147,6 +187,47 @@ class Workspace(Folder):
         here = self._afresh()
         ran = candidate and candidate_named(here, candidate)
         return ingest_log(here, Path(path), ran, data=data)
+
+    def next(self, log: str | Path, *, runner: bool = True) -> NextRun:
+        """The loop at the track in one call: takes a log in, proposes, exports for the robot.
+
+        Args:
+            log: what came back of the outstanding candidate.
+            runner: write the program that runs the candidate beside it, see `export`.
+        """
+        from grounded_trials.workspace.exporting import export_candidate
+        from grounded_trials.workspace.proposing import propose_in
+
+        taken = self.ingest(log)
+        proposed, exported = propose_in(self._afresh()), None
+        if proposed.candidate is not None:
+            name = proposed.candidate.id
+            form = "npz" if runner else "json"
+            file = self.folder / f"{name}.{form}"
+            exported = export_candidate(self, name, form, file, runner=runner)
+        return NextRun(taken, proposed, exported)
+
+    def target(self, columns: Mapping[str, Array]) -> Path:
+        """Writes target.csv and its length to grounded.toml; the old one is kept as target.csv.bak.
+
+        Args:
+            columns: what each state is to do, (H + 1,) each, a row a control step; see `starting`.
+        """
+        from grounded_trials.workspace.config import set_target
+        from grounded_trials.workspace.task_file import write_target
+
+        here = self._afresh()
+        name = here.config.task.target or "target.csv"
+        path = here.folder / name
+        if path.is_file():
+            path.replace(path.with_name(path.name + ".bak"))
+        write_target(path, here.config.task.dt, dict(columns))
+        ranges = {state: float(values.max() - values.min()) for state, values in columns.items()}
+        weights = {state: round(max(size, 0.1) ** -2, 6) for state, size in ranges.items()}
+        steps = len(next(iter(columns.values()))) - 1
+        set_target(here.config.file, name, steps, weights)
+        self.forget()
+        return path
 
     def learn(
         self,
@@ -317,16 +398,22 @@ class Workspace(Folder):
     ) -> Exported:
         """Writes a candidate for other languages; refused as in `run`, an earlier task's is not.
 
+        A trial, or the run that a candidate predicts (form "bag"), is written to be looked at.
+
         Args:
-            candidate: c0003, or `best`.
+            candidate: c0003, `best`, or a trial, t0007.
             path: the file; None: named after the candidate, in the current folder.
-            form: csv, json or npz; None: as the file is named, else json.
+            form: csv, json or npz, of a run bag, csv or npz; None: as the file is named.
             runner: npz, and beside it the program that runs it on a robot with numpy alone.
             anyway: write it though it is void.
         """
         from grounded_trials.workspace.exporting import export_candidate
 
         file, here = Path(path) if path else None, self._afresh()
+        if form == "bag" or candidate.startswith("t"):
+            from grounded_trials.report.ros_bag import export_run
+
+            return export_run(here, candidate, form, file)
         return export_candidate(here, candidate, form, file, runner=runner, anyway=anyway)
 
     def verify(self) -> Verified:

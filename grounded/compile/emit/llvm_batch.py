@@ -10,8 +10,7 @@ from collections.abc import Callable, Sequence
 
 from grounded.compile.emit.llvm_step import Dynamics, StepWriter
 from grounded.compile.emit.llvm_text import Writer
-
-BATCH = ("x", "u", "p", "dt", "eps", "N", "out", "f_x", "f_u", "f_p")  # a kernel's words
+from grounded.compile.kernel_words import BATCH
 
 
 class Words:

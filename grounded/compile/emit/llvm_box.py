@@ -10,7 +10,6 @@ from __future__ import annotations
 from grounded.compile.emit.llvm_text import Writer, number
 from grounded.compile.problem import ARMIJO, MAX_ITERATIONS, ROUNDING, STOP
 
-MAX_INPUTS = 8
 ZERO, ONE = number(0.0), number(1.0)
 
 

@@ -9,9 +9,17 @@ Sums that decide are rounded as NumPy rounds them: the twins take the same decis
 from __future__ import annotations
 
 from grounded.compile.emit.llvm_batch import Words
-from grounded.compile.emit.llvm_riccati import SWEEP
-from grounded.compile.emit.llvm_rollout import LANES, ROLLOUT
 from grounded.compile.emit.llvm_text import Writer, number
+from grounded.compile.kernel_words import (
+    COST,
+    COUNT,
+    DESCENT,
+    FAILED_AT,
+    LANES,
+    ROLLOUT,
+    SWEEP,
+    TURN,
+)
 from grounded.compile.problem import (
     CEILING,
     FLOOR,
@@ -23,11 +31,6 @@ from grounded.compile.problem import (
     Status,
 )
 
-DESCENT = (
-    *("rollout", "sweep", "z0", "u0", "z1", "u1", "k", "K", "scale", "damping", "alphas", "costs"),
-    *("expected", "halvings", "max_iterations", "tolerance", "accept", "lines", "result"),
-)
-COST, COUNT, FAILED_AT, TURN = range(4)  # of the result; TURN: 0 when z0, u0 are the last
 ZERO, ONE, INFINITY = number(0.0), number(1.0), number(float("inf"))
 ENDLESS = 2**62
 

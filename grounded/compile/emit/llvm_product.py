@@ -11,9 +11,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from grounded.compile.emit.llvm_batch import Words, gather_rows, start_table
-from grounded.compile.emit.llvm_rollout import Layout, received
+from grounded.compile.emit.llvm_rollout import received
 from grounded.compile.emit.llvm_step import Dynamics
 from grounded.compile.emit.llvm_text import Writer, integers, number, splat, vector
+from grounded.compile.kernel_words import Layout
 
 Row = Callable[[int | str], str]  # loads (a piece of) row r of a matrix
 UNROLLED = 400  # entries of the Jacobian whose products are written out; more are a loop

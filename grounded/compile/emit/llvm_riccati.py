@@ -23,14 +23,10 @@ from grounded.compile.emit.llvm_product import (
     symmetric,
     transpose,
 )
-from grounded.compile.emit.llvm_rollout import Layout, wrap
+from grounded.compile.emit.llvm_rollout import wrap
 from grounded.compile.emit.llvm_step import Dynamics
 from grounded.compile.emit.llvm_text import Writer, number, splat
-
-SWEEP = (
-    *("z_run", "u_run", "shift", "p", "dt", "eps", "target", "weight", "input_target", "R", "S"),
-    *("low", "high", "now", "past", "damping", "H", "k", "K", "expected", "jacobian"),
-)
+from grounded.compile.kernel_words import SWEEP, Layout
 
 
 def sweep_kernel(d: Dynamics, layout: Layout, width: int) -> str:

@@ -11,54 +11,11 @@ the cost is all that is wanted.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 from grounded.compile.emit.llvm_batch import Words, start_table
 from grounded.compile.emit.llvm_step import Dynamics, StepWriter
 from grounded.compile.emit.llvm_text import Writer, splat
-
-ROLLOUT = (
-    *("start", "ubar", "K", "zbar", "k", "alphas", "p", "dt", "eps", "bias", "target", "weight"),
-    *(
-        "shift",
-        "input_target",
-        "R",
-        "S",
-        "low",
-        "high",
-        "now",
-        "past",
-        "H",
-        "runs",
-        "z",
-        "u",
-        "cost",
-    ),
-)
-LANES = 4
-
-
-@dataclass(frozen=True)
-class Layout:
-    """z = [x, past inputs]: sizes, angles, and where each input's past begins."""
-
-    n: int
-    depths: tuple[int, ...]  # (m,)
-    angles: tuple[bool, ...]  # (n,)
-
-    @property
-    def m(self) -> int:
-        """Number of inputs."""
-        return len(self.depths)
-
-    @property
-    def nz(self) -> int:
-        """Size of z."""
-        return self.n + sum(self.depths)
-
-    def slot(self, j: int, i: int = 0) -> int:
-        """Index in z of u_j[t - 1 - i]."""
-        return self.n + sum(self.depths[:j]) + i
+from grounded.compile.kernel_words import LANES, ROLLOUT, Layout
 
 
 def wrap(f: Writer, d: str, width: int) -> str:

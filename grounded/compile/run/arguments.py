@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from grounded.compile.emit.llvm_rollout import Layout
+from grounded.compile.kernel_words import Layout
 from grounded.compile.problem import Problem
 from grounded.frozen import Array
 

@@ -11,27 +11,24 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import threading
-from collections.abc import Callable, Sequence
-from functools import cached_property
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from grounded.compile.emit.llvm_batch import BATCH, linearise_kernel, step_kernel
-from grounded.compile.emit.llvm_box import MAX_INPUTS, box_functions
-from grounded.compile.emit.llvm_descent import (
+from grounded.compile.kernel_words import (
+    BATCH,
     COST,
     COUNT,
     DESCENT,
     FAILED_AT,
+    LANES,
+    MAX_INPUTS,
+    ROLLOUT,
+    SWEEP,
     TURN,
-    descent_kernel,
+    Layout,
 )
-from grounded.compile.emit.llvm_product import sweep_tables
-from grounded.compile.emit.llvm_riccati import SWEEP, sweep_kernel
-from grounded.compile.emit.llvm_rollout import LANES, ROLLOUT, Layout, rollout_kernel
-from grounded.compile.emit.llvm_step import Dynamics, dynamics_of, jacobian_function, stage_tables
-from grounded.compile.emit.llvm_text import declarations
 from grounded.compile.problem import (
     STATUSES,
     Backward,
@@ -76,62 +73,35 @@ class Kernels:
         self._libraries: dict[Any, jit.Library] = {}
         self._lock = threading.RLock()
 
-    @cached_property
-    def dynamics(self) -> Dynamics:
-        """Values and derivatives by state and input."""
-        return self._dynamics(self.sizes[0] + self.sizes[1])
-
-    def _dynamics(self, width: int) -> Dynamics:
-        n, m, _ = self.sizes
-        return dynamics_of(self._variant, n, m, width, self._kind, self._integrator)
-
     def batch(self) -> jit.Library:
         """Step and linearise, of many samples."""
-        return self._library("batch", ("step", "linearise", "jacobian"), self._batch_text)
+        return self._library("batch", ("step", "linearise", "jacobian"))
 
     def search(self, layout: Layout) -> jit.Library:
         """Rollout and, for few enough inputs, sweep and descent; about a layout of z."""
         small = layout.m <= MAX_INPUTS
         names = ("rollout", "sweep", "descent") if small else ("rollout",)
-        return self._library(layout, names, lambda: self._search_text(layout))
+        return self._library(layout, names)
 
     def full(self) -> jit.Library:
         """Linearise with respect to the parameters as well."""
-        return self._library("full", ("linearise",), self._full_text)
+        return self._library("full", ("linearise",))
 
-    def _library(self, key: Any, names: Sequence[str], write: Callable[[], str]) -> jit.Library:
+    def _library(self, key: Layout | str, names: Sequence[str]) -> jit.Library:
         known = self._libraries.get(key)
         if known is not None:
             return known
         with self._lock:
             if key not in self._libraries:
                 digest = hashlib.sha256(f"{self._key} {key}".encode()).hexdigest()
-                self._libraries[key] = jit.library(digest, write, names)
+                self._libraries[key] = jit.library(digest, lambda: self._text(key), names)
             return self._libraries[key]
 
-    def _batch_text(self) -> str:
-        d, width = self.dynamics, jit.lanes()
-        return _linearise_text(d, width, 0) + step_kernel(d, width)
+    def _text(self, which: Layout | str) -> str:
+        from grounded.compile.emit import modules  # only what no cache holds is written
 
-    def _full_text(self) -> str:
-        return _linearise_text(self._dynamics(sum(self.sizes)), jit.lanes(), self.sizes[2])
-
-    def _search_text(self, layout: Layout) -> str:
-        d, width = self.dynamics, jit.lanes()
-        text = _start_of_module(d, width) + rollout_kernel(d, layout)
-        if layout.m > MAX_INPUTS:
-            return text
-        text += sweep_tables(d, width) + box_functions(layout.m) + sweep_kernel(d, layout, width)
-        return text + descent_kernel(layout.m, layout.nz)
-
-
-def _start_of_module(d: Dynamics, width: int) -> str:
-    return declarations({width, LANES}) + stage_tables(d) + d.uniforms.function()
-
-
-def _linearise_text(d: Dynamics, width: int, k: int) -> str:
-    kernels = jacobian_function(d, width) + linearise_kernel(d, width, k)
-    return _start_of_module(d, width) + kernels
+        source = modules.Source(self._variant, self.sizes, self._kind, self._integrator)
+        return source.text(which, jit.lanes())
 
 
 class CompiledSystem(TracedSystem):

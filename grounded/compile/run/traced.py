@@ -10,10 +10,11 @@ the stages of Runge-Kutta: with k_i = f(x_i), x_i = x + c_i dt k_{i-1}, T_i = d 
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 
 from grounded.compile.problem import STAGES, Integrator
-from grounded.compile.run.differenced import DifferencedSystem
 from grounded.compile.run.interpreted import Interpreted
 from grounded.compile.trace.tracing import Signature, Trace, Variant, trace
 from grounded.errors import GroundedError
@@ -32,8 +33,14 @@ class TracedSystem(Interpreted):
         self, signature: Signature, first: Trace, integrator: Integrator, note: str
     ) -> None:
         super().__init__(signature, integrator, note)
-        self.original = DifferencedSystem(signature, integrator)
         self._variants = [Variant(first, self.sizes)] if not first.guards else []
+
+    @cached_property
+    def original(self) -> Interpreted:
+        """The function as it is."""
+        from grounded.compile.run.differenced import DifferencedSystem
+
+        return DifferencedSystem(self.signature, self.integrator)
 
     def variant(self, p: Array, dt: float) -> Variant:
         """The trace that holds for these parameters.

@@ -16,7 +16,6 @@ import numpy as np
 
 from grounded.compile.names import Named, check_names, raised_at, wrong_value
 from grounded.compile.problem import STAGES, Integrator, Kind
-from grounded.compile.trace.derivative import jacobian
 from grounded.compile.trace.expression import Expression, NotTraceable, node_of
 from grounded.compile.trace.functions import rebound
 from grounded.compile.trace.graph import MAX_NODES, Graph, Program, TooLong
@@ -168,6 +167,8 @@ class Variant:
 
     def entries(self, width: int) -> list[tuple[int, int, int]]:
         """(row, column, node) of the non-zero derivatives by the first `width` of x, u, p."""
+        from grounded.compile.trace.derivative import jacobian
+
         graph = self.trace.graph
         letters = [
             (letter, i) for letter, size in zip("xup", self.sizes, strict=True) for i in range(size)

@@ -65,6 +65,8 @@ class Guess:
     sure: bool
     others: tuple[str, ...]  # what else it might be, best first
     field: FieldReport | None = None
+    reasons: tuple[str, ...] = ()  # what speaks for it
+    scale: float = 1.0  # of its values: degrees, or a sign
 
     @property
     def is_angle(self) -> bool:
@@ -198,6 +200,10 @@ def _table(kind: str, guess: Guess, clock: str) -> list[str]:
     lines.append(f"path = {_quote(guess.path)}")
     if guess.field is not None and guess.field.low is not None:
         lines[-1] += f"  # {guess.field.low:.4g} to {guess.field.high:.4g} in this log"
+    if guess.reasons:
+        lines.insert(1, f"# {'; '.join(guess.reasons)}")
+    if guess.scale != 1.0:
+        lines.append(f"scale = {guess.scale:.10g}")
     if guess.clock != clock:
         lines.append(f'clock = "{guess.clock}"')
     if guess.is_angle and guess.path.endswith("yaw"):

@@ -18,7 +18,7 @@ import numpy as np
 
 from grounded.errors import GroundedError
 from grounded_trials.formats.mcap_records import Channel, Header, Messages, Metadata, Schema
-from grounded_trials.formats.mcap_walk import DamagedFile, read_records
+from grounded_trials.formats.mcap_walk import DamagedFile
 from grounded_trials.formats.message_path import is_topic, parse_path
 from grounded_trials.formats.messages import (
     BadMessage,
@@ -29,7 +29,7 @@ from grounded_trials.formats.messages import (
     Ints,
 )
 from grounded_trials.formats.path_walk import Bound, bind, evaluate, number_paths
-from grounded_trials.logs.log_files import log_files, open_log
+from grounded_trials.logs.log_files import log_files, log_records
 from grounded_trials.logs.signals import Decoder, decoder_of
 
 NOISE_SAMPLES = 10  # in a batch, to tell a signal's noise
@@ -188,21 +188,20 @@ def inspect_log(paths: str | Path | Sequence[str | Path]) -> LogReport:
         paths: an MCAP file, several that follow each other, or the folder of a bag.
 
     Raises:
-        GroundedError: if a file can't be read, or is not MCAP at all.
+        GroundedError: if a file can't be read, or is no log at all.
     """
     files = log_files(paths)
     look = _Look()
     for path in files:
-        with open_log(path) as stream:
-            look.new_file()
-            try:
-                for record in read_records(stream, str(path)):
-                    look.add(record)
-            except DamagedFile as error:
-                if not look.headers:
-                    raise
-                look.damage = str(error)
-                break
+        look.new_file()
+        try:
+            for record in log_records(path):
+                look.add(record)
+        except DamagedFile as error:
+            if not look.headers:
+                raise
+            look.damage = str(error)
+            break
     return look.report(files)
 
 

@@ -1,29 +1,39 @@
-"""Which files a log consists of: one, several in order, or a bag's folder with split files.
+"""Which files a log consists of, and the records of each, whatever its format.
 
-What a file says it is, from its first records: one of ours, or somebody else's log.
+A log is a file, several in order, or a bag's folder with split files. A file's format is told by
+how it begins, not by its name: MCAP, ROS 2 SQLite, ROS 1, NumPy, PX4, any of them as a zstd file,
+else a text table. All give the records of MCAP, so that nobody above needs to know which it was.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+import shutil
+import tempfile
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
 from grounded.errors import GroundedError, nearest
-from grounded_trials.formats.mcap_records import Messages, Metadata
-from grounded_trials.formats.mcap_walk import read_records
+from grounded_trials.formats.mcap_records import Messages, Metadata, Record
+from grounded_trials.formats.mcap_walk import MAGIC, read_records
 
-_LISTED = re.compile(r"^\s*-\s+(?:path:\s*)?[\"']?([^\"'\s#]+\.mcap)[\"']?\s*$", re.MULTILINE)
+BAGS = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")  # files of a bag's folder
+KINDS = (*BAGS, ".bag", ".csv", ".npz", ".ulg")
+EXPANDED = 4 * 2**30  # bytes of a compressed file, at most
+_ZSTD = b"\x28\xb5\x2f\xfd"
+_LISTED = re.compile(
+    r"^\s*-\s+(?:path:\s*)?[\"']?([^\"'\s#]+\.(?:mcap|db3)(?:\.zstd)?)[\"']?\s*$", re.MULTILINE
+)
 _DIGITS = re.compile(r"(\d+)")
 
 
 def log_files(paths: str | Path | Sequence[str | Path]) -> tuple[Path, ...]:
-    """The MCAP files of a log in order.
+    """The files of a log in order.
 
     Args:
         paths: a file, files in order, or the folder of a bag. A folder's metadata.yaml says which
-            files it has and in which order; without it, all *.mcap in the order of their numbers.
+            files it has and in which order; without it, all *.mcap, else *.db3, by their numbers.
 
     Raises:
         GroundedError: if one of them is missing, or a folder has none.
@@ -44,7 +54,7 @@ def _bag(folder: Path) -> list[Path]:
     listing = folder / "metadata.yaml"
     try:
         text = listing.read_text("utf-8") if listing.exists() else ""
-        inside = [path for path in folder.iterdir() if path.suffix == ".mcap"]
+        found = [[p for p in folder.iterdir() if p.name.endswith(kind)] for kind in BAGS]
     except (OSError, UnicodeDecodeError) as error:
         raise GroundedError(f"{folder} can't be read as a bag: {error}") from None
     names = list(dict.fromkeys(Path(name).name for name in _LISTED.findall(text)))
@@ -56,8 +66,9 @@ def _bag(folder: Path) -> list[Path]:
                 "give the files that are there one by one"
             )
         return [folder / name for name in names]
+    inside = next((paths for paths in found if paths), [])
     if not inside:
-        raise GroundedError(f"{folder} holds no *.mcap file{_advice(folder)}")
+        raise GroundedError(f"{folder} holds no *.mcap or *.db3 file{_advice(folder)}")
     return sorted(inside, key=lambda path: _natural(path.name))
 
 
@@ -65,21 +76,16 @@ def _nearby(path: Path) -> str:
     """What to do about a file that is not there."""
     if not path.parent.is_dir():
         return f", nor does its folder {path.parent}: name a log, seen from the folder you are in"
-    names = sorted(p.name for p in path.parent.glob("*.mcap"))
+    names = sorted(p.name for p in path.parent.iterdir() if p.name.endswith(KINDS))
     if names:
         return f": {nearest(path.name, names[:5])}"
-    return ": name an MCAP file or a bag's folder, seen from the folder you are in"
+    return ": name a log or a bag's folder, seen from the folder you are in"
 
 
 def _advice(folder: Path) -> str:
     if (folder / "grounded.toml").is_file():
         return "; it is a workspace: name the log, or its folder, inside"
-    kinds = {path.suffix for path in folder.iterdir()}
-    if ".db3" in kinds:
-        return "; turn its .db3 into MCAP with `ros2 bag convert` or `mcap convert`"
-    if ".zstd" in kinds:
-        return "; decompress its files first, with `zstd -d`"
-    return ""
+    return ": name the log itself"
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
@@ -103,18 +109,88 @@ def open_log(path: Path) -> BinaryIO:
         raise GroundedError(f"{path} can't be read: {error.strerror}") from None
 
 
+def log_records(path: Path) -> Iterator[Record]:
+    """The records of one file, MCAP or not.
+
+    Raises:
+        GroundedError: if it can't be read, is damaged, or is no log.
+    """
+    with open_log(path) as stream:
+        head = stream.read(16)
+        if not head.startswith(_ZSTD):
+            yield from _by_format(path, head, stream)
+            return
+        with tempfile.TemporaryDirectory(prefix="grounded-") as room:
+            inner = Path(room) / path.stem
+            _expand(path, stream, inner)
+            with inner.open("rb") as expanded:
+                yield from _by_format(inner, expanded.read(16), expanded)
+
+
+def _by_format(path: Path, head: bytes, stream: BinaryIO) -> Iterator[Record]:
+    if head.startswith(MAGIC[:5]) or path.name.endswith(".mcap") or not head:
+        yield from map(_plain, read_records(stream, str(path)))
+        return
+    from grounded_trials.formats import bags, tables
+
+    begins = {
+        bags.SQLITE: bags.sqlite_records,
+        bags.ROS1: bags.ros1_records,
+        tables.ULOG: tables.ulog_records,
+        tables.ZIP: tables.npz_records,
+    }
+    reader = next((read for magic, read in begins.items() if head.startswith(magic)), None)
+    if reader is None and path.suffix not in (".csv", ".tsv", ".txt"):
+        raise GroundedError(
+            f"{path} is no log: it begins with {head[:8]!r}; MCAP, ROS 2 .db3, ROS 1 .bag, .csv, "
+            ".npz and PX4 .ulg can be read"
+        )
+    yield from map(_plain, (reader or tables.csv_records)(path))
+
+
+def _plain(record: Record) -> Record:
+    """A record whose messages, if compressed one by one (rosbag2's mode "message"), no longer are.
+
+    No CDR message begins like a zstd frame.
+    """
+    if isinstance(record, Messages) and len(record):
+        start = int(record.starts[0])
+        if record.buffer[start : start + 4] == _ZSTD:
+            from grounded_trials.formats.bags import expanded
+
+            return expanded(record)
+    return record
+
+
+def _expand(path: Path, stream: BinaryIO, target: Path) -> None:
+    import zstandard
+
+    stream.seek(0)
+    free = shutil.disk_usage(target.parent).free
+    limit, size = min(EXPANDED, free // 2), 0
+    try:
+        decoder = zstandard.ZstdDecompressor(max_window_size=2**27)
+        with decoder.stream_reader(stream) as reader, target.open("wb") as out:
+            while piece := reader.read(2**20):
+                size += len(piece)
+                if size > limit:
+                    raise GroundedError(f"{path} expands to more than {limit} bytes")
+                out.write(piece)
+    except (zstandard.ZstdError, OSError) as error:
+        raise GroundedError(f"{path} can't be decompressed: {error}") from None
+
+
 def kind_of(path: Path) -> str:
     """The `format` that a file of ours states ahead of its messages, "" for any other file.
 
     Damage is not judged here: whoever reads the file does that.
     """
     try:
-        with open_log(path) as stream:
-            for record in read_records(stream, str(path)):
-                if isinstance(record, Metadata) and record.name == "grounded":
-                    return record.data.get("format", "")
-                if isinstance(record, Messages):
-                    return ""
+        for record in log_records(path):
+            if isinstance(record, Metadata) and record.name == "grounded":
+                return record.data.get("format", "")
+            if isinstance(record, Messages):
+                return ""
     except GroundedError:
         return ""
     return ""

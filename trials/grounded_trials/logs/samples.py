@@ -130,6 +130,8 @@ def tidy(name: str, series: Series, *, unwrap: bool) -> Samples:
     spec, t = series.spec, series.t
     finite = np.isfinite(series.values)
     stamped = t != 0 if (t != 0).any() else np.ones(len(t), dtype=np.bool_)
+    if len(t) > 1 and t[0] == 0 and 0 < t[1] < JUMP_S * 1e9:
+        stamped[0] = True  # a clock that begins with the log: simulation time, or a table's
     if not (t != 0).any() and len(t) > 1:
         raise _unusable(name, spec, f"all its {spec.clock} stamps are 0; use another clock")
     good = finite & stamped

@@ -17,7 +17,6 @@ import numpy as np
 from grounded.errors import GroundedError, NextCommand, nearest
 from grounded_trials.formats.cdr import cdr_messages, ros1_messages
 from grounded_trials.formats.mcap_records import Channel, Messages, Schema
-from grounded_trials.formats.mcap_walk import read_records
 from grounded_trials.formats.message_path import MessagePath, parse_path
 from grounded_trials.formats.messages import (
     BadMessage,
@@ -34,7 +33,7 @@ from grounded_trials.formats.messages import (
 from grounded_trials.formats.path_walk import Bound, Values, bind, evaluate
 from grounded_trials.formats.protobuf import protobuf_messages
 from grounded_trials.formats.schemas import struct_of
-from grounded_trials.logs.log_files import log_files, open_log
+from grounded_trials.logs.log_files import log_files, log_records
 
 Clock = Literal["header", "log", "publish"]
 SAMPLE_LIMIT = 100_000_000  # of one signal
@@ -78,7 +77,7 @@ def read_signals(
     """Reads signals from a log: a file, files in order, or the folder of a bag.
 
     Args:
-        paths: an MCAP file, several that follow each other, or a folder with them.
+        paths: a log of any format, several that follow each other, or a folder with them.
         specs: what to read, by name.
 
     Raises:
@@ -87,17 +86,16 @@ def read_signals(
     """
     collectors = {name: _Collector(name, spec) for name, spec in specs.items()}
     for path in log_files(paths):
-        with open_log(path) as stream:
-            log = _Log(str(path), list(collectors.values()))
-            for record in read_records(stream, str(path)):
-                if isinstance(record, Schema):
-                    log.schemas[record.id] = record
-                elif isinstance(record, Channel):
-                    log.channel(record)
-                elif isinstance(record, Messages):
-                    log.messages(record)
-            for collector in collectors.values():
-                collector.topics |= set(log.topics)
+        log = _Log(str(path), list(collectors.values()))
+        for record in log_records(path):
+            if isinstance(record, Schema):
+                log.schemas[record.id] = record
+            elif isinstance(record, Channel):
+                log.channel(record)
+            elif isinstance(record, Messages):
+                log.messages(record)
+        for collector in collectors.values():
+            collector.topics |= set(log.topics)
     return {name: collector.series() for name, collector in collectors.items()}
 
 

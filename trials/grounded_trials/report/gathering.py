@@ -76,8 +76,9 @@ def _standing(workspace: Folder, contents: Contents) -> Standing:
 
 
 def _better(workspace: Folder, diagnosis: Diagnosis | None, lost: list[Lost]) -> Better | None:
+    named = diagnosis is not None and not diagnosis.no_cause
     try:
-        return better_model(workspace, diagnosis)
+        return better_model(workspace, diagnosis if named else None)
     except GroundedError as error:
         lost.append(Lost("the model as diagnosed", str(error)))
         return None

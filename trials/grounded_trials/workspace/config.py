@@ -36,10 +36,10 @@ class TaskTable:
     """[task]: the time grid, the target and the start."""
 
     dt: float
-    horizon: int
-    target: str
     start: Mapping[str, float]
     latency: Mapping[str, float]
+    horizon: int = 1
+    target: str = ""  # none: logs are fitted and diagnosed, nothing can be proposed
     feedback: bool = True
 
 
@@ -205,11 +205,21 @@ def set_latency(file: Path, latency: Mapping[str, float]) -> None:
     _change(file, "task", {"latency": _inline(latency)})
 
 
+def set_target(file: Path, name: str, steps: int, weights: Mapping[str, float]) -> None:
+    """Replaces [task] target and horizon; `weights` go to a [reward] that weighs no state yet."""
+    import tomlkit
+
+    _change(file, "task", {"target": name, "horizon": steps})
+    reward = tomlkit.parse(file.read_text(encoding="utf-8")).get("reward", {})
+    if not reward.get("state") and not reward.get("terminal"):
+        _change(file, "reward", {"state": _inline(weights)})
+
+
 def _change(file: Path, where: str, changes: Mapping[str, Any]) -> None:
     import tomlkit
 
     document = tomlkit.parse(file.read_text(encoding="utf-8"))
-    table: Any = document[where]
+    table: Any = document.setdefault(where, tomlkit.table())
     table.update(changes)
     write_atomically(file, tomlkit.dumps(document).encode())
 

@@ -18,8 +18,7 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result
 from grounded.search.standing import Tried
 from grounded.trial import Trial, interpolate_gaps
-from grounded_trials.formats.mcap_walk import read_records
-from grounded_trials.logs.log_files import kind_of, log_files, open_log
+from grounded_trials.logs.log_files import kind_of, log_files, log_records
 from grounded_trials.logs.log_table import log_mapping, read_log
 from grounded_trials.logs.samples import SignalReport
 from grounded_trials.store.own_files import CANDIDATE, FILE_LIMIT, TRIAL, read_file
@@ -281,8 +280,7 @@ def _check_is_log(path: Path, files: Sequence[Path]) -> None:
     if (path / FILE).is_file():
         raise GroundedError(f"{path} is a workspace: name the log, or its folder, inside")
     for file in files:
-        with open_log(file) as stream:
-            next(iter(read_records(stream, str(file))), None)
+        next(iter(log_records(file)), None)
 
 
 def _hashed(files: Sequence[Path]) -> str:

@@ -70,11 +70,12 @@ def inspect_in(workspace: Folder, log: str | Path) -> Inspected:
 
     Args:
         workspace: whose model names the states and inputs; without one no table is guessed.
-        log: an MCAP file or a bag's folder.
+        log: a log of any format or a bag's folder.
 
     Raises:
         GroundedError: if the log can't be read at all.
     """
+    from grounded_trials.logs.inspect_evidence import weigh
     from grounded_trials.logs.inspect_guess import guess_mapping, is_simulated, mapping_toml
 
     report = inspect_log(log)
@@ -87,5 +88,6 @@ def inspect_in(workspace: Folder, log: str | Path) -> Inspected:
         why = f": {error}" if here else " outside a workspace (-C DIR names one)"
         return Inspected(str(log), report, "", why)
     states, inputs = guess_mapping(report, model.state_names, model.input_names)
+    states, inputs = weigh(report, model, states, inputs)
     table = mapping_toml(states, inputs, simulated=is_simulated(report))
     return Inspected(str(log), report, table)

@@ -77,6 +77,12 @@ def propose_in(workspace: Folder) -> Proposed:
         GroundedError: if the candidate must not be handed over (see `handover`), a stored file is
             damaged, or the task can't be planned.
     """
+    if not workspace.config.task.target:
+        raise GroundedError(
+            "there is no manoeuvre to learn: [task] names no target. `grounded target` draws one; "
+            "`fit` and `diagnose` need none",
+            NextCommand("target", ("SHAPE",)),
+        )
     before = workspace.candidate_ids()
     proposal, void = _handed_over(workspace)
     candidate = proposal.candidate

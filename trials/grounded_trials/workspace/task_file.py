@@ -40,7 +40,10 @@ def _build(config: Config, model: Model, folder: Path) -> Task:
     path = (folder / table.target).resolve()
     if not path.is_relative_to(folder.resolve()):
         raise GroundedError(f"[task] target = '{table.target}' lies outside the workspace")
-    target, input_target = target_arrays(path, states, inputs, table.dt, table.horizon)
+    if table.target:
+        target, input_target = target_arrays(path, states, inputs, table.dt, table.horizon)
+    else:
+        target, input_target = np.full((table.horizon + 1, len(states)), np.nan), None
     first = np.where(np.isfinite(target[0]), target[0], 0.0)
     start = np.array([table.start.get(s, first[i]) for i, s in enumerate(states)])
     low, high = _limits(config, inputs)
@@ -80,7 +83,8 @@ def _reward(config: Config, states: list[str], inputs: list[str]) -> Reward:
         given = table.numbers(kind, names)
         weights[kind] = np.array([given.get(name, 0.0) for name in names])
     table.finish()
-    if not any(w.any() for w in (weights["state"], weights["terminal"])):
+    tracked = any(w.any() for w in (weights["state"], weights["terminal"]))
+    if config.task.target and not tracked:
         raise GroundedError(
             "[reward] weighs no state: there is nothing to follow; add for example "
             f"state = {{ {states[0]} = 1.0 }}"

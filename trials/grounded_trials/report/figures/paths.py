@@ -11,6 +11,8 @@ from grounded_trials.report.scene import Scene, scene_of
 from grounded_trials.wording import labelled
 
 OTHERS = 60  # runs that are drawn behind the compared ones
+LOGS = 4  # that are drawn where there is no run
+LOG_ROLES = ("best", "model", "accepted", "limit")
 SEEN = 5.0  # the least factor that shows more than the paths themselves
 FAR = 4.0  # times the size of the picture: what lies further off is not drawn
 
@@ -18,6 +20,8 @@ FAR = 4.0  # times the size of the picture: what lies further off is not drawn
 def path_figure(findings: Findings) -> Figure | None:
     """The paths in the plane, the error along the best one, and the deviations enlarged."""
     scene = scene_of(findings.task.model)
+    if len(scene.axes) == 2 and not findings.runs and findings.logs:
+        return _of_logs(findings, scene)
     if len(scene.axes) < 2 or len(named_paths(findings)) < 2:
         return None
     panels = [_plane(findings, scene, scene.axes[0], scene.axes[1], plan=True)]
@@ -28,6 +32,19 @@ def path_figure(findings: Findings) -> Figure | None:
     if any(crash(run) for run in findings.runs):
         caption += " A cross marks where a run ended early."
     return Figure("paths", "Paths", caption.strip(), tuple(panels), legend(panels[:1]))
+
+
+def _of_logs(findings: Findings, scene: Scene) -> Figure:
+    """Where the robot went in the logs, while no candidate has been run."""
+    x_name, y_name = (labelled(*one) for one in zip(scene.names, scene.units, strict=True))
+    curves = []
+    for k, log in enumerate(findings.logs[-LOGS:]):
+        x, y = (log.trial.states[:, i] for i in scene.axes)
+        times = np.arange(len(x), dtype=np.float64) * log.trial.dt
+        curves.append(Curve(x, y, LOG_ROLES[k], log.trial.id, 1.5, times, trial=log.trial.id))
+    equal = scene.spatial and len(set(scene.units)) == 1
+    panel = Panel(f"{y_name} over {x_name}", x_name, y_name, tuple(curves), equal=equal, kind="path")
+    return Figure("paths", "Paths", "Data that ran no candidate.", (panel,), legend([panel]))
 
 
 def name_of(role: str, run: Run) -> str:

@@ -42,7 +42,7 @@ def gap_section(findings: Findings) -> list[Block]:
         return [Block("text", words), command, *ahead, *forecast_table(findings), *lacking]
     verdict = Block("verdict", lines=verdict_lines(diagnosis, findings.since))
     if diagnosis.no_cause:  # with too little data, what was fitted is no finding
-        return [verdict, *ahead, *forecast_table(findings)]
+        return [verdict, *ahead, *forecast_table(findings), *lacking]
     proof = [*drawn(accuracy_figure(diagnosis), title=True), *ahead, *forecast_table(findings)]
     return [verdict, *proof, *lacking, *_details(diagnosis, findings.since)]
 

@@ -105,10 +105,10 @@
   const zoomedTo = (plot, kind, change) => {
     if (!Object.keys(change).some((key) => /^[xy]axis/.test(key))) return;
     plot.zoomed = true;
-    if (kind !== "time") return;
-    const range = plot.layout.xaxis.range;
-    for (const other of plots) {
-      if (other === plot || panels[other.dataset.panel].kind !== "time") continue;
+    if (kind !== "time" && kind !== "forecast") return;
+    const range = plot.layout.xaxis.range, figure = plot.closest(".figure");
+    for (const other of kind === "time" ? plots : all(".plot", figure)) {
+      if (other === plot || panels[other.dataset.panel].kind !== kind) continue;
       const { xaxis } = other.drawn ? other.layout : known(other).layout;
       if (xaxis.range[0] === range[0] && xaxis.range[1] === range[1]) continue;
       if (other.drawn) Plotly.relayout(other, { "xaxis.range": [...range] });

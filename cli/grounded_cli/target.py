@@ -1,0 +1,89 @@
+"""grounded target: draw the manoeuvre that the states are to follow."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import click
+
+from grounded.errors import NextCommand
+from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
+from grounded_cli.terminal import field, number, show, show_json
+from grounded_trials.wording import with_unit
+
+if TYPE_CHECKING:
+    from grounded.frozen import Array
+    from grounded_trials import Workspace
+
+SHAPES = ("line", "circle", "figure-8", "step", "swing-up")
+
+
+@click.command("target")
+@click.argument("shape", metavar="SHAPE|FILE")
+@click.option("--size", type=float, default=2.0, help="Length, or radius [m] (2).")
+@click.option("--speed", type=float, default=1.0, help="At most [m/s] (1).")
+@click.option("--accel", type=float, default=1.0, help="Along the path, at most [m/s^2] (1).")
+@click.option("--lateral", type=float, default=4.0, help="Across it, at most [m/s^2] (4).")
+@click.option("--laps", type=float, default=1.0, help="Of a circle or figure-8 (1).")
+@click.option("--to", multiple=True, metavar="STATE=VALUE", help="Where a step goes.")
+@click.option("--seconds", type=float, default=5.0, help="Of a step or swing-up (5).")
+@in_workspace
+@as_json
+def command(
+    shape: str,
+    size: float,
+    speed: float,
+    accel: float,
+    lateral: float,
+    laps: float,
+    to: tuple[str, ...],
+    seconds: float,
+    json_: bool,
+) -> None:
+    """Write target.csv: a line, circle, figure-8, step or swing-up, or a recorded run.
+
+    FILE is a log, read through [log], or a CSV with columns `t` and states. Paths start from rest
+    and keep to the speeds and accelerations given. The target there was is kept as target.csv.bak,
+    and [task] horizon follows. Earlier trials stay, for fit and diagnose; the search begins anew.
+    """
+    from grounded_trials.starting.shapes import PATHS, Drive, path_target, step_target, swing_up
+
+    workspace = open_workspace()
+    model, dt = workspace.base_model, workspace.config.task.dt
+    if shape in PATHS:
+        columns = path_target(shape, Drive(size, speed, accel, lateral, laps), model, dt)
+    elif shape == "step":
+        columns = step_target(_values(to), model, dt, seconds)
+    elif shape == "swing-up":
+        columns = swing_up(model, dt, seconds)
+    else:
+        columns = _recorded(workspace, shape)
+    path = workspace.target(columns)
+    rows = len(next(iter(columns.values())))
+    ranges = {name: (float(v.min()), float(v.max())) for name, v in columns.items()}
+    if json_:
+        show_json({"target": str(path), "horizon": rows - 1, "columns": ranges})
+        return
+    show(f"{path}: {shape}, {(rows - 1) * dt:g} s, {rows - 1} steps")
+    for name, (low, high) in ranges.items():
+        text = with_unit(f"{number(low)} to {number(high)}", model.states[name])
+        show(field(name, text, "  "))
+    show(f"\n{next_line(NextCommand('propose'))}")
+
+
+def _values(pairs: tuple[str, ...]) -> dict[str, float]:
+    found = {}
+    for pair in pairs:
+        name, _, value = pair.partition("=")
+        try:
+            found[name.strip()] = float(value)
+        except ValueError:
+            raise click.UsageError(f"--to {pair}: expected STATE=VALUE, such as x=1.0") from None
+    return found
+
+
+def _recorded(workspace: Workspace, file: str) -> dict[str, Array]:
+    """A run of a log, or the columns of a CSV of states."""
+    from grounded_trials.starting.begin import recorded_run
+
+    return recorded_run(workspace, file, SHAPES)

@@ -1,0 +1,306 @@
+"""A workspace from somebody else's log: what is found, what is asked, and that it then works."""
+
+import json
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from cli import grounded
+from grounded.errors import GroundedError
+from grounded_trials import Workspace
+from grounded_trials.logs.inspect_evidence import rates_of
+from grounded_trials.starting.begin import begin
+from grounded_trials.starting.kinds import KINDS
+from grounded_trials.starting.shapes import Drive, path_target
+from shared_data import data
+
+STORE = get_typestore(Stores.ROS2_HUMBLE)
+STORE.register(
+    get_types_from_msg(
+        "float32 steering_angle\nfloat32 steering_angle_velocity\nfloat32 speed\n"
+        "float32 acceleration\nfloat32 jerk",
+        "ackermann_msgs/msg/AckermannDrive",
+    )
+)
+STORE.register(
+    get_types_from_msg(
+        "std_msgs/Header header\nackermann_msgs/AckermannDrive drive",
+        "ackermann_msgs/msg/AckermannDriveStamped",
+    )
+)
+T = STORE.types
+DT, START = 0.01, 1_760_000_000_000_000_000
+
+
+def header(t):
+    stamp = T["builtin_interfaces/msg/Time"](sec=t // 10**9, nanosec=t % 10**9)
+    return T["std_msgs/msg/Header"](stamp=stamp, frame_id="")
+
+
+def vector(kind, x, y, z):
+    return T[f"geometry_msgs/msg/{kind}"](x=x, y=y, z=z)
+
+
+def odometry(t, x, y, psi, v, rate):
+    turn = T["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=np.sin(psi / 2), w=np.cos(psi / 2))
+    pose = T["geometry_msgs/msg/Pose"](position=vector("Point", x, y, 0.0), orientation=turn)
+    linear, angular = vector("Vector3", v, 0.0, 0.0), vector("Vector3", 0.0, 0.0, rate)
+    twist = T["geometry_msgs/msg/Twist"](linear=linear, angular=angular)
+    return T["nav_msgs/msg/Odometry"](
+        header=header(t),
+        child_frame_id="base",
+        pose=T["geometry_msgs/msg/PoseWithCovariance"](pose=pose, covariance=np.zeros(36)),
+        twist=T["geometry_msgs/msg/TwistWithCovariance"](twist=twist, covariance=np.zeros(36)),
+    )
+
+
+def drive(t, steering, speed):
+    small = {n: np.float32(0) for n in ("steering_angle_velocity", "acceleration", "jerk")}
+    command = T["ackermann_msgs/msg/AckermannDrive"](
+        steering_angle=np.float32(steering), speed=np.float32(speed), **small
+    )
+    return T["ackermann_msgs/msg/AckermannDriveStamped"](header=header(t), drive=command)
+
+
+def joints(t, names, q, w, tau):
+    return T["sensor_msgs/msg/JointState"](
+        header=header(t), name=names, position=q.copy(), velocity=w.copy(), effort=tau.copy()
+    )
+
+
+def bag(folder, topics, messages, storage=StoragePlugin.SQLITE3):
+    with Writer(folder, version=9, storage_plugin=storage) as writer:
+        open_ = {t: writer.add_connection(t, kind, typestore=STORE) for t, kind in topics.items()}
+        for topic, t, message in messages:
+            writer.write(open_[topic], t, STORE.serialize_cdr(message, topics[topic]))
+    return folder
+
+
+def car_bag(folder, storage=StoragePlugin.SQLITE3):
+    """A car with a wheelbase of 0.32 m, driven in curves for 8 s."""
+    topics = {
+        "/odom": "nav_msgs/msg/Odometry",
+        "/drive": "ackermann_msgs/msg/AckermannDriveStamped",
+        "/joint_states": "sensor_msgs/msg/JointState",
+    }
+    messages, v, x, y, psi = [], 0.0, 0.0, 0.0, 0.0
+    for k in range(800):
+        t, steering, speed = START + k * 10**7, 0.3 * np.sin(0.01 * k), 1 + 0.5 * np.sin(0.02 * k)
+        rate = v * np.tan(steering) / 0.32
+        if k % 5 == 0:
+            messages.append(("/drive", t, drive(t, steering, speed)))
+        messages.append(("/odom", t, odometry(t, x, y, psi, v, rate)))
+        wheels = np.array([20 * x, 20 * x])
+        messages.append(("/joint_states", t, joints(t, ["left", "right"], wheels, wheels, wheels)))
+        v, psi = v + DT * (0.9 * speed - v) / 0.35, psi + DT * rate
+        x, y = x + DT * v * np.cos(psi), y + DT * v * np.sin(psi)
+    return bag(folder, topics, messages, storage)
+
+
+def arm_bag(folder, scale=1.0):
+    topics = {"/joint_states": "sensor_msgs/msg/JointState"}
+    messages, q, w = [], np.zeros(2), np.zeros(2)
+    for k in range(600):
+        t, tau = START + k * 10**7, np.array([0.5 * np.sin(0.02 * k), 0.3 * np.cos(0.03 * k)])
+        names = ["shoulder_joint", "elbow_joint"]
+        messages.append(("/joint_states", t, joints(t, names, scale * q, w, tau)))
+        w = w + DT * (tau - 0.2 * w) / np.array([0.3, 0.1])
+        q = q + DT * w
+    return bag(folder, topics, messages)
+
+
+@pytest.mark.parametrize("storage", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
+def test_from_a_bag_to_the_first_candidate_in_four_commands(tmp_path, storage):
+    log, w = car_bag(tmp_path / "bag", storage), tmp_path / "car"
+    made = grounded("init", w, "--from", log, "--json").json
+    assert made["kind"] == "car" and made["dt"] == 0.05
+    paths = {one["name"]: one["path"] for one in made["signals"]}
+    assert paths == {
+        "v": "/odom.twist.twist.linear.x",
+        "x": "/odom.pose.pose.position.x",
+        "y": "/odom.pose.pose.position.y",
+        "psi": "/odom.pose.pose.orientation.@rpy.yaw",
+        "steering": "/drive.drive.steering_angle",
+        "speed": "/drive.drive.speed",
+    }
+    assert all(one["sure"] and one["reasons"] for one in made["signals"])
+    assert grounded("-C", w, "ingest", "--data", log).code == 0
+    fitted = grounded("-C", w, "fit", "--apply", "--json").json["params"]
+    assert fitted["L"]["value"] == pytest.approx(0.32, abs=0.01)
+    proposed = grounded("-C", w, "propose", "--json").json
+    assert proposed["candidate"] == "c0001"
+
+
+def test_the_joints_of_an_arm_by_name(tmp_path):
+    found = begin(tmp_path / "arm", arm_bag(tmp_path / "bag"))
+    paths = {guess.name: guess.path for guess in (*found.states, *found.inputs)}
+    assert found.kind == "arm" and not found.unsure
+    assert paths["elbow_velocity"] == "/joint_states.velocity[1]"
+    assert paths["shoulder_effort"] == "/joint_states.effort[0]"
+    assert any("1.000" in r for g in found.states for r in g.reasons)
+
+
+MODEL = """from grounded import Model, Param
+def f(s, a, p):
+    return {"q1": s.w1, "q2": s.w2, "w1": a.tau1 / p.J, "w2": a.tau2 / p.J}
+model = Model(
+    states={"q1": "rad", "q2": "rad", "w1": "rad/s", "w2": "rad/s"},
+    inputs={"tau1": "N m", "tau2": "N m"}, params={"J": Param(0.2, "kg m^2", 0.01, 1)},
+    derivative=f)
+"""
+
+
+@pytest.fixture
+def mine(tmp_path):
+    path = tmp_path / "mine.py"
+    path.write_text(MODEL)
+    return path
+
+
+def test_joints_that_a_model_does_not_name_are_taken_in_order_and_unsure(tmp_path, mine):
+    found = begin(tmp_path / "arm", arm_bag(tmp_path / "bag"), model=mine)
+    assert [g.path[-11:] for g in found.states] == [
+        *("position[0]", "position[1]", "velocity[0]", "velocity[1]")
+    ]
+    assert {g.name for g in found.unsure} >= {"q1", "q2", "tau1", "tau2"}
+    assert (tmp_path / "arm" / "model.py").read_text() == MODEL
+
+
+@pytest.mark.parametrize(("scale", "expected"), [(180 / np.pi, np.pi / 180), (-1.0, -1.0)])
+def test_degrees_and_signs_are_noticed(tmp_path, mine, scale, expected):
+    found = begin(tmp_path / "arm", arm_bag(tmp_path / "bag", scale), model=mine)
+    by = {g.name: g for g in found.states}
+    scales = [by["q1"].scale, by["w1"].scale]
+    assert any(s == pytest.approx(expected) for s in scales), scales
+
+
+def test_a_person_is_asked_for_what_is_unsure(tmp_path, mine):
+    asked = []
+
+    def ask(guess):
+        asked.append(guess.name)
+        return "/joint_states.effort[1]" if guess.name == "tau1" else guess.path
+
+    found = begin(tmp_path / "arm", arm_bag(tmp_path / "bag"), model=mine, ask=ask)
+    assert found.inputs[0].path == "/joint_states.effort[1]" and "tau1" in asked
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_skeleton_is_a_model(tmp_path, kind):
+    found = begin(tmp_path / "w", arm_bag(tmp_path / "bag"), kind=kind)
+    model = Workspace(tmp_path / "w").base_model
+    assert found.kind == kind and model.system.how == "compiled"
+    assert np.isfinite(
+        model.system.step(np.zeros((1, model.n)), np.zeros((1, model.m)), model.values, 0.01)
+    ).all()
+
+
+def test_nothing_is_overwritten_and_nothing_half_made_is_left(tmp_path, mine):
+    log = arm_bag(tmp_path / "bag")
+    begin(tmp_path / "w", log)
+    with pytest.raises(GroundedError, match=r"grounded\.toml"):
+        begin(tmp_path / "w", log)
+    mine.write_text("model = 3\n")
+    with pytest.raises(GroundedError, match=r"model\.py"):
+        begin(tmp_path / "new", log, model=mine)
+    assert not (tmp_path / "new").exists()
+    for words in (["--kind", "boat"], ["--model", "nowhere.py"]):
+        done = grounded("init", tmp_path / "new", "--from", log, *words)
+        assert done.code == 1 and words[1] in done.err
+    assert not (tmp_path / "new").exists()
+    own = grounded("init", tmp_path / "p", "--example", "pendulum").code
+    grounded("-C", tmp_path / "p", "propose")
+    refused = grounded("init", tmp_path / "x", "--from", tmp_path / "p/candidates/c0001.mcap")
+    assert own == 0 and refused.code == 1 and "c0001.mcap" in refused.err
+
+
+def test_rates_are_found_in_any_model(mine, tmp_path):
+    begin(tmp_path / "w", arm_bag(tmp_path / "bag"), model=mine)
+    assert rates_of(Workspace(tmp_path / "w").base_model) == {"q1": "w1", "q2": "w2"}
+
+
+def test_the_real_car_of_a_laboratory(tmp_path):
+    """DART: what fits is found, what no topic shows is asked for, nothing is guessed silently."""
+    folder = data("dart_small_car")
+    found = begin(tmp_path / "w", folder / "dart_4_sept_random_driving_slow_ros2.mcap")
+    by = {g.name: g for g in (*found.states, *found.inputs)}
+    assert by["x"].path == "/vicon/jetracer1.pose.pose.position.x" and by["x"].sure
+    assert by["throttle"].path == "/throttle_1.data"
+    assert not by["v"].path and not by["v"].sure
+    assert not by["steering"].sure and len(by["steering"].others) == 1
+
+
+# targets
+
+
+def test_a_path_keeps_to_its_speeds_and_starts_from_rest(tmp_path):
+    grounded("init", tmp_path / "w", "--example", "car-circle")
+    w = Workspace(tmp_path / "w")
+    limits = Drive(size=1.5, speed=2.0, accel=1.0, lateral=1.5)
+    for shape in ("line", "circle", "figure-8"):
+        columns = path_target(shape, limits, w.base_model, 0.05)
+        step = np.hypot(np.diff(columns["x"]), np.diff(columns["y"])) / 0.05
+        assert columns["v"][0] == 0 and step.max() < 2.01
+        assert np.abs(np.diff(columns["v"])).max() / 0.05 < 1.1
+        across = np.abs(np.diff(np.unwrap(columns["psi"]))) / 0.05 * step
+        assert across.max() < 1.6
+        turned = np.arctan2(np.diff(columns["y"]), np.diff(columns["x"]))
+        error = np.angle(np.exp(1j * (turned - columns["psi"][:-1])))[step > 0.1]
+        assert np.abs(error).max() < 0.2
+
+
+def test_the_target_of_a_workspace_is_drawn_and_the_old_one_kept(tmp_path):
+    grounded("init", tmp_path / "w", "--example", "pendulum")
+    old = (tmp_path / "w/target.csv").read_text()
+    done = grounded("-C", tmp_path / "w", "target", "swing-up", "--seconds", 2, "--json").json
+    w = Workspace(tmp_path / "w")
+    assert w.task.horizon == done["horizon"] and w.task.target[0, 0] == pytest.approx(np.pi)
+    assert (tmp_path / "w/target.csv.bak").read_text() == old
+    done = grounded("-C", tmp_path / "w", "target", "step", "--to", "theta=0.5", "--json").json
+    assert done["columns"]["theta"] == [0.0, 0.5]
+    for words in (["circle"], ["step", "--to", "x=1"], ["nowhere.mcap"]):
+        done = grounded("-C", tmp_path / "w", "target", *words)
+        assert done.code == 1 and done.err.startswith("error: ")
+
+
+def test_a_recorded_run_becomes_the_target(tmp_path):
+    log, w = car_bag(tmp_path / "bag"), tmp_path / "car"
+    grounded("init", w, "--from", log)
+    done = grounded("-C", w, "target", log, "--json").json
+    assert done["horizon"] > 150 and set(done["columns"]) == {"v", "x", "y", "psi"}
+    (tmp_path / "run.csv").write_text("t,x\n0,0\n1,2\n")
+    done = grounded("-C", w, "target", tmp_path / "run.csv", "--json").json
+    assert done["horizon"] == 20 and done["columns"] == {"x": [0.0, 2.0]}
+
+
+def test_logs_are_fitted_and_diagnosed_without_a_task(tmp_path):
+    """A model, a [log] table and a log: no target, no reward."""
+    log, w = car_bag(tmp_path / "bag"), tmp_path / "car"
+    grounded("init", w, "--from", log)
+    mapping = (w / "grounded.toml").read_text().partition("[log]")[2]
+    (w / "grounded.toml").write_text(
+        f'[model]\nfile = "model.py"\n[task]\ndt = 0.05\n[log]{mapping}'
+    )
+    (w / "target.csv").unlink()
+    assert grounded("-C", w, "ingest", "--data", log).code == 0
+    assert grounded("-C", w, "fit", "--json").json["params"]["L"]["value"] < 0.34
+    assert grounded("-C", w, "status").code == 0
+    refused = grounded("-C", w, "propose")
+    assert refused.code == 1 and "grounded -C" in refused.err and "target" in refused.err
+    assert grounded("-C", w, "target", "circle").code == 0
+    assert grounded("-C", w, "propose", "--json").json["candidate"] == "c0001"
+
+
+# the loop at the track
+
+
+def test_next_ingests_proposes_and_exports(tmp_path):
+    grounded("init", tmp_path / "w", "--example", "pendulum")
+    grounded("-C", tmp_path / "w", "propose")
+    trial = grounded("-C", tmp_path / "w", "run", "--json").json["trial_file"]
+    done = grounded("-C", tmp_path / "w", "next", trial, "--json")
+    found = json.loads(done.out)
+    assert found["trials"][0]["candidate"] == "c0001" and found["propose"]["candidate"] == "c0002"
+    assert (tmp_path / "w/c0002.npz").exists() and (tmp_path / "w/grounded_runner.py").exists()

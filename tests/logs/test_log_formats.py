@@ -1,0 +1,211 @@
+"""Logs in every format: one run, written by other people's libraries, gives the same signals."""
+
+import struct
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zstandard
+from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from grounded.errors import GroundedError
+from grounded_trials.logs.inspect_log import inspect_log
+from grounded_trials.logs.signals import SignalSpec, read_signals
+
+N, DT, EPOCH = 300, 0.02, 1_700_000_000_000_000_000
+TIME = np.arange(N) * DT
+X = np.sin(TIME)
+STAMPS = EPOCH + np.round(TIME * 1e9).astype(np.int64)
+
+
+def imu(store, t, x, **header):
+    """An Imu message whose angular velocity about z is x."""
+    kinds = store.types
+    stamp = kinds["builtin_interfaces/msg/Time"](sec=t // 10**9, nanosec=t % 10**9)
+    zero = kinds["geometry_msgs/msg/Vector3"](x=0.0, y=0.0, z=0.0)
+    rate = kinds["geometry_msgs/msg/Vector3"](x=0.0, y=0.0, z=x)
+    return kinds["sensor_msgs/msg/Imu"](
+        header=kinds["std_msgs/msg/Header"](stamp=stamp, frame_id="imu", **header),
+        orientation=kinds["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0),
+        orientation_covariance=np.zeros(9),
+        angular_velocity=rate,
+        angular_velocity_covariance=np.zeros(9),
+        linear_acceleration=zero,
+        linear_acceleration_covariance=np.zeros(9),
+    )
+
+
+def fill(writer, store, serialize, ros1=False):
+    with writer:
+        topic = writer.add_connection("/imu", "sensor_msgs/msg/Imu", typestore=store)
+        for i, (t, x) in enumerate(zip(STAMPS.tolist(), X.tolist(), strict=True)):
+            message = imu(store, t, x, **({"seq": i} if ros1 else {}))
+            writer.write(topic, t, serialize(message, "sensor_msgs/msg/Imu"))
+
+
+def ros2(folder, storage=StoragePlugin.SQLITE3, mode=None, version=9):
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    writer = Writer(folder, version=version, storage_plugin=storage)
+    if mode is not None:
+        writer.set_compression(mode, CompressionFormat.ZSTD)
+    fill(writer, store, store.serialize_cdr)
+    return folder
+
+
+def ros1(folder):
+    store = get_typestore(Stores.ROS1_NOETIC)
+    path = folder.with_suffix(".bag")
+    fill(Ros1Writer(path), store, store.serialize_ros1, ros1=True)
+    return path
+
+
+def table(folder, mark=","):
+    path = folder.with_suffix(".csv")
+    rows = [f"{t!r}{mark}{x!r}" for t, x in zip((TIME + 1.7e9).tolist(), X.tolist(), strict=True)]
+    path.write_text("\n".join([f"time [s]{mark}rate (rad/s)", *rows]) + "\n")
+    return path
+
+
+def npz(folder):
+    path = folder.with_suffix(".npz")
+    np.savez(path, t_ns=STAMPS, rate=X, gain=np.ones(1))
+    return path
+
+
+def ulog(folder):
+    def message(kind, body):
+        return struct.pack("<HB", len(body), ord(kind)) + body
+
+    path = folder.with_suffix(".ulg")
+    head = b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0)
+    flags, layout = message("B", bytes(40)), b"gyro:uint64_t timestamp;float[3] rate;"
+    parts = [head, flags, message("F", layout), message("A", struct.pack("<BH", 0, 7) + b"gyro")]
+    for t, x in zip((STAMPS // 1000).tolist(), X.tolist(), strict=True):
+        parts.append(message("D", struct.pack("<HQfff", 7, t, 0.0, 0.0, x)))
+    path.write_bytes(b"".join(parts))
+    return path
+
+
+FILE, MESSAGE, MCAP = CompressionMode.FILE, CompressionMode.MESSAGE, StoragePlugin.MCAP
+IMU = "/imu.angular_velocity.z"
+LOGS = {
+    "db3": (ros2, IMU),
+    "db3 without definitions": (lambda f: ros2(f, version=8), IMU),
+    "db3, files compressed": (lambda f: ros2(f, mode=FILE), IMU),
+    "db3, messages compressed": (lambda f: ros2(f, mode=MESSAGE), IMU),
+    "mcap": (lambda f: ros2(f, MCAP), IMU),
+    "mcap, files compressed": (lambda f: ros2(f, MCAP, FILE), IMU),
+    "mcap, messages compressed": (lambda f: ros2(f, MCAP, MESSAGE), IMU),
+    "ros 1": (ros1, IMU),
+    "csv": (table, "/csv.rate"),
+    "csv with semicolons": (lambda f: table(f, ";"), "/csv.rate"),
+    "npz": (npz, "/npz.rate"),
+    "px4": (ulog, "/gyro.rate[2]"),
+}
+
+
+def file_of(path):
+    return path if path.is_file() else next(p for p in path.iterdir() if p.suffix != ".yaml")
+
+
+@pytest.mark.parametrize("kind", LOGS)
+def test_every_format_gives_the_same_signal(tmp_path, kind):
+    make, path = LOGS[kind]
+    log = make(tmp_path / "log")
+    for given in {log, file_of(log)}:
+        found = read_signals(given, {"r": SignalSpec(path)})["r"]
+        np.testing.assert_allclose(found.values, X, atol=1e-7)
+        np.testing.assert_allclose(found.t, STAMPS, atol=500)
+        assert found.stamped
+    report = inspect_log(log)
+    assert report.messages == N and report.duration_s == pytest.approx((N - 1) * DT, abs=1e-3)
+    assert path in [field.path for topic in report.topics for field in topic.fields]
+
+
+@pytest.mark.parametrize("kind", LOGS)
+def test_a_damaged_log_is_refused_or_ends_early(tmp_path, kind):
+    """Cut in the middle, or with its middle overwritten: a clear error or fewer samples."""
+    make, path = LOGS[kind]
+    source = file_of(make(tmp_path / "log"))
+    content = source.read_bytes()
+    middle = len(content) // 2
+    for i, bad in enumerate([content[:middle], content[:40], content[:middle] + bytes(400)]):
+        copy = tmp_path / f"bad{i}{''.join(source.suffixes)}"
+        copy.write_bytes(bad)
+        try:
+            found = read_signals(copy, {"r": SignalSpec(path)})["r"]
+        except GroundedError as error:
+            assert copy.name.removesuffix(".zstd") in str(error) or "'r'" in str(error)
+        else:
+            assert (len(found.values) < N and np.isin(found.t, STAMPS).all()) or "csv" in kind
+
+
+def test_tables_with_holes_and_texts(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("t,mode,x\n0,auto,1.5\n0.1,manual,\n\n0.2,auto,2.5\n")
+    found = read_signals(path, {"x": SignalSpec("/csv.x")})["x"]
+    assert found.values[[0, 2]].tolist() == [1.5, 2.5] and np.isnan(found.values[1])
+
+
+@pytest.mark.parametrize(
+    "text, holds",
+    [
+        ("1,2\n3,4\n", ("1,2", "'t'")),
+        ("a,b\n3,4\n", ("a, b", "'t'")),
+        ("t,b\n0,4\n1\n", ("line 3", "1", "2")),
+        ("t,b\n1e30,4\n", ("'t'",)),
+        ("", ("log.csv",)),
+    ],
+)
+def test_tables_that_are_none(tmp_path, text, holds):
+    path = tmp_path / "log.csv"
+    path.write_text(text)
+    with pytest.raises(GroundedError) as error:
+        read_signals(path, {"x": SignalSpec("/csv.b")})
+    assert all(part in str(error.value) for part in holds), error.value
+
+
+def test_a_million_zeros_in_a_small_file_are_refused(tmp_path):
+    """Compressed files are bounded by what they expand to."""
+    path = tmp_path / "bomb.npz"
+
+    with (
+        zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive,
+        archive.open("x.npy", "w") as f,
+    ):
+        for _ in range(1700):
+            f.write(bytes(2**20))
+    with pytest.raises(GroundedError, match="limit"):
+        read_signals(path, {"x": SignalSpec("/npz.x")})
+
+
+def test_several_runs_in_one_archive(tmp_path):
+    path = tmp_path / "runs.npz"
+    runs = {
+        "a": np.ones((5, 2)),
+        "a_t": np.arange(5.0),
+        "b": np.zeros((7, 2)),
+        "b_t": np.arange(7.0),
+    }
+    np.savez(path, columns=np.array(["x", "v [m/s]"]), **runs)
+    topics = {t.topic: [f.path for f in t.fields] for t in inspect_log(path).topics}
+    assert topics == {"/a": ["/a.x", "/a.v"], "/b": ["/b.x", "/b.v"]}
+
+
+def test_a_file_is_told_by_its_content(tmp_path):
+    log = file_of(ros2(tmp_path / "log"))
+    renamed = log.rename(Path(tmp_path / "log.dat"))
+    assert inspect_log(renamed).messages == N
+    (tmp_path / "photo.jpg").write_bytes(b"\xff\xd8\xff\xe0" + bytes(100))
+    with pytest.raises(GroundedError, match=r"photo\.jpg"):
+        inspect_log(tmp_path / "photo.jpg")
+
+
+def test_zstd_files_of_any_log(tmp_path):
+    plain = table(tmp_path / "log")
+    packed = tmp_path / "log.csv.zst"
+    packed.write_bytes(zstandard.compress(plain.read_bytes()))
+    assert inspect_log(packed).messages == N

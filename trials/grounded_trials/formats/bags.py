@@ -1,0 +1,176 @@
+"""ROS bags that are not MCAP, as the same records: ROS 2 `.db3` (SQLite) and ROS 1 `.bag`.
+
+A `.db3` is a table of topics and one of messages, read by Python's own sqlite3, read-only. Since
+ROS 2 Iron it carries the definitions of its messages; for an older one they are taken from the
+standard types of ROS 2 Humble that come with rosbags. A `.bag` is read by rosbags (0.10 and later;
+pure Python but for its decompressors, kept up with each ROS release).
+
+A batch holds at most `BATCH` messages or `ROOM` bytes: memory is bounded whatever the bag's size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from grounded.errors import GroundedError
+from grounded_trials.formats.mcap_records import Channel, End, Header, Messages, Record, Schema
+
+SQLITE, ROS1 = b"SQLite format 3\0", b"#ROSBAG V2.0\n"  # how the files begin
+BATCH, ROOM = 20_000, 64 * 2**20  # messages, bytes
+MESSAGE_LIMIT = 256 * 2**20  # bytes
+
+Piece = tuple[int, int, bytes]  # channel, time [ns], message
+
+
+def batches(pieces: Iterable[Piece]) -> Iterator[Messages]:
+    """Messages one by one as batches."""
+    held: list[Piece] = []
+    room = 0
+    for piece in pieces:
+        held.append(piece)
+        room += len(piece[2])
+        if len(held) == BATCH or room > ROOM:
+            yield _batch(held)
+            held, room = [], 0
+    if held:
+        yield _batch(held)
+
+
+def _batch(pieces: list[Piece]) -> Messages:
+    channels, times, parts = zip(*pieces, strict=True)
+    ends = np.cumsum(np.array([len(part) for part in parts], dtype=np.int64))
+    t = np.array(times, dtype=np.int64)
+    return Messages(
+        b"".join(parts),
+        np.concatenate([[0], ends[:-1]]),
+        ends,
+        np.array(channels, dtype=np.uint16),
+        np.arange(len(t), dtype=np.uint32),
+        t,
+        t,
+    )
+
+
+def sqlite_records(path: Path) -> Iterator[Record]:
+    """The records of a ROS 2 `.db3` file.
+
+    Raises:
+        GroundedError: if it is damaged, or no bag.
+    """
+    import sqlite3
+
+    waiting = path.with_name(path.name + "-wal").exists()  # written by a recorder that was killed
+    name = f"{path.absolute().as_uri()}?mode=ro{'' if waiting else '&immutable=1'}"
+    try:
+        with closing(sqlite3.connect(name, uri=True)) as bag:
+            yield from _tables(bag, path)
+    except (sqlite3.Error, UnicodeDecodeError, OverflowError, TypeError) as error:
+        raise GroundedError(
+            f"{path} can't be read as a ROS 2 bag: {error}; `sqlite3 {path.name} .recover` saves "
+            "what can be saved of a damaged one"
+        ) from None
+
+
+def _tables(bag: Any, path: Path) -> Iterator[Record]:
+    tables = {name for (name,) in bag.execute("SELECT name FROM sqlite_master WHERE type='table'")}
+    if not {"topics", "messages"} <= tables:
+        raise GroundedError(
+            f"{path} is an SQLite file without the tables 'topics' and 'messages' of a ROS 2 bag"
+        )
+    yield Header("ros2", "rosbag2 sqlite3")
+    known = _definitions(bag) if "message_definitions" in tables else {}
+    topics = bag.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
+    kinds = list(dict.fromkeys(kind for _, _, kind, _ in topics))
+    numbers = {kind: i for i, kind in enumerate(kinds, start=1)}
+    for kind, number in numbers.items():
+        encoding, text = known.get(kind) or ("ros2msg", _standard(kind))
+        if text:
+            yield Schema(number, kind, encoding, text.encode())
+    channels: dict[int, int] = {}
+    for i, (identity, topic, kind, encoding) in enumerate(topics):
+        channels[identity] = i
+        missing = not known.get(kind) and not _standard(kind)
+        yield Channel(i, topic, encoding, 0 if missing else numbers[kind], {})
+    yield from batches(_messages(bag, channels, path))
+    yield End(data_crc=False)
+
+
+def _definitions(bag: Any) -> dict[str, tuple[str, str]]:
+    query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+    return {kind: (encoding, text) for kind, encoding, text in bag.execute(query) if text}
+
+
+def _messages(bag: Any, channels: dict[int, int], path: Path) -> Iterator[Piece]:
+    query = "SELECT topic_id, timestamp, length(data), data FROM messages"
+    for topic, stamp, size, data in bag.execute(query):
+        if topic not in channels:
+            raise GroundedError(f"{path}: a message belongs to topic {topic}, which is not listed")
+        if size > MESSAGE_LIMIT:
+            raise GroundedError(f"{path}: a message has {size} bytes, the limit is {MESSAGE_LIMIT}")
+        yield channels[topic], stamp, data
+
+
+def _standard(kind: str) -> str:
+    """The definition of a standard ROS 2 type, "" for one that Humble doesn't have."""
+    store = _standard_types()
+    return str(store.generate_msgdef(kind, 2)[0]) if kind in store.fielddefs else ""
+
+
+def _standard_types() -> Any:
+    from rosbags.typesys import Stores, get_typestore
+
+    if not hasattr(_standard_types, "kept"):
+        _standard_types.kept = get_typestore(Stores.ROS2_HUMBLE)  # type: ignore[attr-defined]
+    return _standard_types.kept  # type: ignore[attr-defined]
+
+
+def ros1_records(path: Path) -> Iterator[Record]:
+    """The records of a ROS 1 `.bag` file.
+
+    Raises:
+        GroundedError: if it is damaged, or was not closed.
+    """
+    from rosbags.rosbag1 import Reader, ReaderError
+
+    try:
+        with Reader(path) as bag:
+            yield Header("ros1", "rosbag")
+            numbers: dict[int, int] = {}
+            for i, one in enumerate(bag.connections):
+                numbers[one.id] = i
+                yield Schema(i + 1, one.msgtype, "ros1msg", one.msgdef.data.encode())
+                yield Channel(i, one.topic, "ros1", i + 1, {})
+            yield from batches((numbers[c.id], t, bytes(data)) for c, t, data in bag.messages())
+            yield End(data_crc=False)
+    except (ReaderError, AssertionError, KeyError, ValueError, OSError, MemoryError) as error:
+        raise GroundedError(
+            f"{path} can't be read as a ROS 1 bag: {error or type(error).__name__}; "
+            "`rosbag reindex` mends one that was not closed"
+        ) from None
+
+
+def expanded(batch: Messages, limit: int = ROOM) -> Messages:
+    """A batch whose messages are compressed one by one (rosbag2's zstd mode "message").
+
+    Raises:
+        GroundedError: if a message expands beyond `limit` bytes.
+    """
+    import zstandard
+
+    decoder = zstandard.ZstdDecompressor(max_window_size=2**27)
+    pieces: list[Piece] = []
+    columns = (batch.starts, batch.ends, batch.channels, batch.log_times)
+    for start, end, channel, time in zip(*(c.tolist() for c in columns), strict=True):
+        data = batch.buffer[start:end]
+        if data.startswith(b"\x28\xb5\x2f\xfd"):
+            with decoder.stream_reader(data) as reader:
+                data = reader.read(limit + 1)
+            if len(data) > limit:
+                raise GroundedError(f"a compressed message expands to more than {limit} bytes")
+        pieces.append((channel, time, data))
+    return _batch(pieces)

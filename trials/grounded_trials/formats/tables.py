@@ -1,0 +1,263 @@
+"""Tables of numbers as the same records: `.csv`, `.npz`, and PX4's `.ulg`.
+
+A table is a topic whose messages hold a stamp and one double a column, so that everything that
+reads a bag reads a table: `/csv.speed`, `/run03.q[1]`, `/vehicle_attitude.q[0]`. Every table needs
+a column of times, which its type's name states ("csv, time in 't' [s]"). Names keep letters,
+digits and underscores; a unit in brackets or after the last comma is left out.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+import warnings
+import zipfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from grounded.errors import GroundedError, needs
+from grounded_trials.formats.mcap_records import Channel, End, Header, Messages, Record, Schema
+from grounded_trials.formats.messages import Floats
+
+ULOG, ZIP = b"ULog\x01\x12\x35", b"PK\x03\x04"  # how the files begin
+VALUES = 200_000_000  # numbers in one file
+ROWS = 50_000  # of a batch
+TIMES = ("t", "time", "timestamp", "stamp", "times", "timestamps", "seconds", "secs", "clock")
+UNITS = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
+LATEST = 4e18  # [ns], the year 2096
+
+Columns = Mapping[str, Floats]
+
+
+def csv_records(path: Path) -> Iterator[Record]:
+    """The records of a text table: a row of names, then rows of numbers.
+
+    Raises:
+        GroundedError: without names or times, or where a row doesn't fit.
+    """
+    with path.open(encoding="utf-8-sig", errors="replace", newline="") as stream:
+        head = stream.readline(65536)
+        mark = next((m for m in "\t;," if m in head), ",")
+        names = [_name(cell) for cell in next(csv.reader([head], delimiter=mark), [])]
+        if not head.strip() or not any(names) or _are_numbers(head, mark):
+            raise GroundedError(
+                f"{path} begins with {head[:40].strip()!r}: its first row must name the columns, "
+                "one of them 't' (time in seconds)"
+            )
+        _time_of(names, path)
+        try:
+            with warnings.catch_warnings():  # a table without rows is found below
+                warnings.simplefilter("ignore")
+                values = np.loadtxt(stream, delimiter=mark, ndmin=2, usecols=range(len(names)))
+        except ValueError:
+            stream.seek(0)
+            stream.readline()
+            values = _with_holes(stream, mark, len(names), path)
+    if not values.size:
+        raise GroundedError(f"{path} has no rows below its first line")
+    columns = {name: values[:, i] for i, name in enumerate(names) if name}
+    yield from table_records({"/csv": columns}, "csv", path)
+
+
+def _with_holes(stream: Any, mark: str, width: int, path: Path) -> Floats:
+    """Rows with texts or empty cells, which are no number."""
+    rows: list[list[float]] = []
+    for number, row in enumerate(csv.reader(stream, delimiter=mark), start=2):
+        if not any(cell.strip() for cell in row):
+            continue
+        if len(row) != width:
+            raise GroundedError(
+                f"{path}, line {number}: it has {len(row)} cells, its first line names {width}"
+            )
+        rows.append([_number(cell) for cell in row])
+    return np.array(rows, dtype=float).reshape(-1, width)
+
+
+def _number(cell: str) -> float:
+    try:
+        return float(cell)
+    except ValueError:
+        return float({"true": 1, "false": 0}.get(cell.strip().lower(), "nan"))
+
+
+def _are_numbers(head: str, mark: str) -> bool:
+    return all(not np.isnan(_number(cell)) for cell in head.split(mark) if cell.strip())
+
+
+def npz_records(path: Path) -> Iterator[Record]:
+    """The records of a NumPy archive: arrays of one length and their times.
+
+    `NAME` (N, k) beside `NAME_t` (N,) is the table /NAME, its columns named by an array of k texts
+    where there is one; arrays (N,) beside a time of that length are the table /npz.
+
+    Raises:
+        GroundedError: if it is damaged, holds Python objects, or has no times.
+    """
+    try:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
+            _check_size(path)
+            arrays = {name: archive[name] for name in archive.files}
+    except (ValueError, OSError, zipfile.BadZipFile, EOFError, KeyError, MemoryError) as error:
+        raise GroundedError(f"{path} can't be read as a NumPy archive: {error}") from None
+    yield from table_records(_npz_tables(arrays), "npz", path)
+
+
+def _check_size(path: Path) -> None:
+    with zipfile.ZipFile(path) as archive:
+        size = sum(entry.file_size for entry in archive.infolist())
+    if size > 8 * VALUES:
+        raise GroundedError(f"{path} expands to {size} bytes, the limit is {8 * VALUES}")
+
+
+def _npz_tables(arrays: Mapping[str, Any]) -> dict[str, Columns]:
+    labels = [list(map(_name, a)) for a in arrays.values() if a.ndim == 1 and a.dtype.kind == "U"]
+    numbers = {k: np.asarray(a, float) for k, a in arrays.items() if a.dtype.kind in "fiub"}
+    tables: dict[str, Columns] = {}
+    for name, t in numbers.items():
+        own = numbers.get(name.removesuffix("_t"), np.zeros(0))
+        if not name.endswith("_t") or t.ndim != 1 or len(own) != len(t) or own.ndim > 2:
+            continue
+        texts = [label for label in labels if own.ndim == 2 and len(label) == own.shape[1]]
+        table = _name(name.removesuffix("_t"))
+        tables["/" + table] = {"t": t} | _columns(own, texts[0] if texts else [], table)
+    used = {name for name in numbers if "/" + _name(name.removesuffix("_t")) in tables}
+    rest = {k: a for k, a in numbers.items() if k not in used and a.ndim in (1, 2)}
+    times = [k for k, a in rest.items() if a.ndim == 1 and len(a) > 1 and _is_time(k)]
+    for k in times[:1]:
+        flat: dict[str, Floats] = {_name(k): rest.pop(k)}
+        length = len(next(iter(flat.values())))
+        for name, a in rest.items():
+            if len(a) == length:
+                flat |= _columns(a, [], _name(name))
+        tables["/npz"] = flat
+    return tables
+
+
+def _columns(array: Floats, names: list[str], table: str) -> dict[str, Floats]:
+    if array.ndim == 1:
+        return {table: array}
+    names = names or [f"{table}_{i}" for i in range(array.shape[1])]
+    return {name: array[:, i] for i, name in enumerate(names) if not _is_time(name)}
+
+
+def ulog_records(path: Path) -> Iterator[Record]:
+    """The records of a PX4 log, by pyulog.
+
+    Raises:
+        GroundedError: if it is damaged, or pyulog is not installed.
+    """
+    needs("pyulog", "px4")
+    from pyulog import ULog
+
+    try:
+        log = ULog(str(path))
+    except Exception as error:  # pyulog raises whatever a damaged file leads to
+        raise GroundedError(f"{path} can't be read as a PX4 log: {error}") from None
+    tables: dict[str, Columns] = {}
+    for data in log.data_list:
+        topic = f"/{data.name}" + (f"_{data.multi_id}" if data.multi_id else "")
+        fields = {k: np.asarray(v, float) for k, v in data.data.items() if "padding" not in k}
+        tables[topic] = {"timestamp_us": fields.pop("timestamp")} | fields
+    yield from table_records(tables, "ulog", path)
+
+
+def table_records(tables: Mapping[str, Columns], kind: str, path: Path) -> Iterator[Record]:
+    """Tables as records, one topic a table.
+
+    Args:
+        tables: columns by topic, equally long, one of them the times.
+        kind: what the file is.
+        path: of the file, for messages.
+
+    Raises:
+        GroundedError: if there is no table, no column of times, or more than `VALUES` numbers.
+    """
+    if sum(len(column) for columns in tables.values() for column in columns.values()) > VALUES:
+        raise GroundedError(f"{path} holds more than {VALUES} numbers: cut it into several files")
+    if not tables:
+        raise GroundedError(
+            f"{path} has no column of times: name one 't' (seconds), of the other arrays' length"
+        )
+    yield Header("", kind)
+    packed = []
+    for i, (topic, columns) in enumerate(tables.items()):
+        name, stamps = _times(columns, path)
+        fields = {k: column for k, column in columns.items() if k != name}
+        yield Schema(i + 1, f"{kind}, time in '{name}'", "ros2msg", _definition(list(fields)))
+        yield Channel(i, topic, "cdr", i + 1, {})
+        packed.append((i, stamps, fields))
+    for i, stamps, fields in packed:
+        for start in range(0, len(stamps), ROWS):
+            some = slice(start, start + ROWS)
+            yield _rows(i, stamps[some], [column[some] for column in fields.values()])
+    yield End(data_crc=False)
+
+
+def _definition(fields: list[str]) -> bytes:
+    """A message of a header and doubles; `q[0]`, `q[1]` ... are an array."""
+    lines, seen = ["std_msgs/Header header"], dict[str, int]()
+    for field in fields:
+        name = field.partition("[")[0]
+        seen[name] = seen.get(name, 0) + 1
+    for name, count in seen.items():
+        alone = name in fields
+        lines.append(f"float64 {name}" if alone else f"float64[{count}] {name}")
+    inner = "builtin_interfaces/Time stamp\nstring frame_id\n"
+    parts = {"std_msgs/Header": inner, "builtin_interfaces/Time": "int32 sec\nuint32 nanosec\n"}
+    text = "\n".join(lines) + "\n"
+    return (text + "".join(f"{'=' * 80}\nMSG: {k}\n{v}" for k, v in parts.items())).encode()
+
+
+def _rows(channel: int, stamps: Any, columns: list[Floats]) -> Messages:
+    kind = np.dtype([("cdr", "<u4"), ("sec", "<i4"), ("ns", "<u4"), ("id", "<u4"), ("end", "<u4")])
+    width, N = kind.itemsize + 8 * len(columns), len(stamps)
+    rows = np.zeros((N, width), np.uint8)
+    head = np.zeros(N, kind)
+    head["cdr"], head["id"] = 0x0100, 1  # little-endian; frame_id is empty
+    head["sec"], head["ns"] = np.divmod(stamps, 10**9)
+    rows[:, : kind.itemsize] = head.view(np.uint8).reshape(N, -1)
+    values = np.ascontiguousarray(np.array(columns, "<f8").reshape(len(columns), N).T)
+    rows[:, kind.itemsize :] = values.view(np.uint8).reshape(N, 8 * len(columns))
+    starts = np.arange(N, dtype=np.int64) * width
+    numbers = np.full(N, channel, np.uint16), np.arange(N, dtype=np.uint32)
+    return Messages(rows.tobytes(), starts, starts + width, *numbers, stamps, stamps)
+
+
+def _times(columns: Columns, path: Path) -> tuple[str, Any]:
+    """The column of times, and its values [ns]."""
+    name = _time_of(list(columns), path)
+    unit = next((u for u in ("ns", "us", "ms") if name.lower().endswith("_" + u)), "")
+    values = columns[name]
+    finite = values[np.isfinite(values)]
+    top = float(np.abs(finite).max(initial=0.0))
+    if not unit:
+        unit = "ns" if top > 1e17 else "us" if top > 1e14 else "ms" if top > 1e11 else "s"
+    if len(finite) < len(values) or top * UNITS[unit] > LATEST:
+        raise GroundedError(
+            f"{path}: '{name}' holds times that are not finite or not on a calendar"
+        )
+    return name, np.rint(values * UNITS[unit]).astype(np.int64)
+
+
+def _time_of(names: list[str], path: Path) -> str:
+    for name in names:
+        if _is_time(name):
+            return name
+    raise GroundedError(
+        f"{path} has no column of times among {', '.join(names[:8])}: name one 't' (seconds), or "
+        "'t_us' or 't_ns' in their units"
+    )
+
+
+def _is_time(name: str) -> bool:
+    stem = re.sub(r"_?(s|ns|us|ms|sec)$", "", name.lower()) or name.lower()
+    return name.lower() in TIMES or stem in TIMES
+
+
+def _name(cell: str) -> str:
+    """A column's name as a message path can say it."""
+    bare = re.sub(r"[\[(].*?[\])]", "", cell.strip()) if not re.search(r"\[\d+\]", cell) else cell
+    return re.sub(r"[^\w\[\]]+", "_", bare.strip()).strip("_")

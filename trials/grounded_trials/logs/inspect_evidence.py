@@ -1,0 +1,383 @@
+"""What the numbers of a log say about a guessed [log] table: units, derivatives, the model's steps.
+
+Names mislead; a rate is the derivative of its position in every log. So each guess is tried against
+its rivals with the log's own samples:
+
+- joints: a JointState says which of its numbers is which joint;
+- units: what a ROS type measures, against the unit that the model states;
+- derivatives: where the model says dq/dt = w, the samples of w must follow those of q. Their slope
+  tells degrees (57.3) and signs (-1);
+- steps: of the rivals for an input, the one with which the model's steps fit the log best.
+
+Every guess that is changed or confirmed says by what; where the numbers can't decide it stays
+unsure.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import islice, product
+from pathlib import Path
+
+import numpy as np
+
+from grounded.errors import GroundedError
+from grounded.model import Model
+from grounded_trials.formats.mcap_records import Channel, Messages, Schema
+from grounded_trials.formats.messages import Floats
+from grounded_trials.logs.inspect_guess import SIMULATED_S, Guess
+from grounded_trials.logs.inspect_log import LogReport
+from grounded_trials.logs.log_files import log_records
+from grounded_trials.logs.samples import Samples, tidy
+from grounded_trials.logs.signals import Series, SignalSpec, read_signals
+
+UNITS = (  # what the end of a path measures, in ROS's conventions (REP 103)
+    (r"(position|translation)\.[xyz]$", "m"),
+    (r"@rpy\.\w+$|steering_angle$", "rad"),
+    (r"angular_velocity\.[xyz]$|angular\.[xyz]$|steering_angle_velocity$", "rad/s"),
+    (r"linear_acceleration\.[xyz]$|accel\.linear\.[xyz]$", "m/s^2"),
+    (r"linear\.[xyz]$|drive\.speed$", "m/s"),
+)
+JOINT_UNITS = {"position": "rad", "velocity": "rad/s", "effort": "N m"}
+SAME, DEGREE = 0.15, 180 / np.pi
+FOLLOWS = 0.8  # correlation of a rate with the derivative of its position
+BETTER = 0.9  # of the rival's error: less decides
+COMBINATIONS, SPAN, LONGEST = 64, 5, 20_000  # tried at most; samples a slope is taken over; grid
+
+
+def weigh(
+    log: LogReport, model: Model, states: Sequence[Guess], inputs: Sequence[Guess]
+) -> tuple[tuple[Guess, ...], tuple[Guess, ...]]:
+    """The guesses, with what the log's numbers say for and against them.
+
+    Args:
+        log: that was looked through.
+        model: whose states and inputs are sought.
+        states: one guess for each state, in order; `inputs` likewise.
+        inputs: see `states`.
+    """
+    units = {**model.states, **model.inputs}
+    joints = joint_names(log)
+    guesses = {guess.name: guess for guess in (*states, *inputs)}
+    guesses = {name: _joint(guess, units[name], joints) for name, guess in guesses.items()}
+    guesses |= _in_order(guesses, units, joints, log)
+    guesses = {name: _unit(guess, units[name]) for name, guess in guesses.items()}
+    signals = _Signals(log, guesses.values())
+    for position, rate in rates_of(model).items():
+        if position in guesses and rate in guesses:
+            guesses |= _derivative(guesses[position], guesses[rate], signals, units[rate])
+    guesses |= _steps(model, guesses, signals)
+    guesses = {name: _as_logged(guess, log) for name, guess in guesses.items()}
+    return tuple(guesses[g.name] for g in states), tuple(guesses[g.name] for g in inputs)
+
+
+def joint_names(log: LogReport) -> dict[str, tuple[str, ...]]:
+    """The joints of each JointState topic, in the order of its numbers.
+
+    A topic whose messages name different joints is left out: an index then means several things.
+    """
+    wanted = {t.topic for t in log.topics if t.type.endswith("/JointState") and t.messages}
+    found: dict[str, set[tuple[str, ...]]] = {topic: set() for topic in wanted}
+    for file in log.files if wanted else ():
+        schemas, channels = dict[int, Schema](), dict[int, Channel]()
+        for record in log_records(file):
+            if isinstance(record, Schema):
+                schemas[record.id] = record
+            elif isinstance(record, Channel):
+                channels[record.id] = record
+            elif isinstance(record, Messages):
+                for identity in record.channel_ids():
+                    channel = channels.get(identity)
+                    if channel is not None and channel.topic in wanted:
+                        found[channel.topic] |= _names_in(record.of(identity), channel.encoding)
+    return {topic: names.pop() for topic, names in found.items() if len(names) == 1}
+
+
+def _names_in(batch: Messages, encoding: str) -> set[tuple[str, ...]]:
+    """The lists of names in the first and last message of a batch."""
+    from rosbags.typesys import Stores, get_typestore
+
+    ros1 = encoding == "ros1"
+    store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+    read = store.deserialize_ros1 if ros1 else store.deserialize_cdr
+    found = set()
+    for i in {0, len(batch) - 1}:
+        data = batch.buffer[int(batch.starts[i]) : int(batch.ends[i])]
+        try:
+            found.add(tuple(read(data, "sensor_msgs/msg/JointState").name))  # type: ignore[attr-defined]
+        except (AttributeError, KeyError, ValueError, IndexError, AssertionError):
+            continue  # another encoding than ROS's: joints go unnamed
+    return found
+
+
+def _joint(guess: Guess, unit: str, joints: Mapping[str, tuple[str, ...]]) -> Guess:
+    """A state whose name holds a joint's is that joint's number of its unit."""
+    for topic, names in joints.items():
+        for i, joint in enumerate(names):
+            if not _holds(guess.name, joint):
+                continue
+            kind = next((k for k, u in JOINT_UNITS.items() if u == unit), None)
+            kind = kind or ("position" if unit in ("m", "1") else None)
+            if kind is not None:
+                path = f"{topic}.{kind}[{i}]"
+                others = tuple(p for p in (guess.path, *guess.others) if p and p != path)
+                why = f"{topic} names its joint {i} '{joint}'"
+                return replace(guess, path=path, sure=True, others=others[:3], reasons=(why,))
+    return guess
+
+
+def _in_order(
+    guesses: Mapping[str, Guess],
+    units: Mapping[str, str],
+    joints: Mapping[str, tuple[str, ...]],
+    log: LogReport,
+) -> dict[str, Guess]:
+    """As many names of a unit as there are joints, none of them found: taken in their order."""
+    found: dict[str, Guess] = {}
+    if len(joints) != 1:
+        return found
+    topic, names = next(iter(joints.items()))
+    for kind, unit in JOINT_UNITS.items():
+        those = [name for name, guess in guesses.items() if units[name] == unit]
+        if len(those) != len(names) or any(guesses[name].path for name in those):
+            continue
+        commanded = _commands(log, len(names)) if kind == "effort" else []
+        for i, name in enumerate(those):
+            paths = [*(f"{command}[{i}]" for command in commanded), f"{topic}.{kind}[{i}]"]
+            why = (f"in the order of the joints: {i} is '{names[i]}'",)
+            others = tuple(paths[1:])
+            found[name] = replace(guesses[name], path=paths[0], others=others, reasons=why)
+    return found
+
+
+def _commands(log: LogReport, count: int) -> list[str]:
+    """Topics of arrays with a command for each of `count` joints."""
+    words = ("cmd", "command", "effort", "torque", "desired", "ref")
+    return [
+        f"{topic.topic}.data"
+        for topic in log.topics
+        if "MultiArray" in topic.type
+        and any(word in topic.topic.lower() for word in words)
+        and sum(".data[" in field.path for field in topic.fields) == count
+    ]
+
+
+def _holds(name: str, joint: str) -> bool:
+    """Whether a state's name is a joint's with a letter or word for what is measured."""
+    plain = re.sub(r"(_?joint_?)", "", joint.lower()) or joint.lower()
+    parts = name.lower().split("_")
+    return (
+        name.lower() in (joint.lower(), plain)
+        or any(part in (joint.lower(), plain) for part in parts)
+        or plain == "_".join(parts[1:])
+        or plain == "_".join(parts[:-1])
+    )
+
+
+def unit_of(path: str, joint: bool = True) -> str:
+    """The unit that a path's number has by ROS's conventions, "" where there is none."""
+    for pattern, unit in UNITS:
+        if re.search(pattern, path):
+            return unit
+    found = re.search(r"\.(position|velocity|effort)\[\d+\]$", path)
+    return JOINT_UNITS[found[1]] if found and joint else ""
+
+
+def _as_logged(guess: Guess, log: LogReport) -> Guess:
+    """The guess with the clock and the range of the signal that it ended at."""
+    for topic in log.topics:
+        for field in topic.fields:
+            if field.path == guess.path:
+                simulated = topic.skew_s is not None and abs(topic.skew_s) > SIMULATED_S
+                clock = "header" if topic.stamped and not simulated else "log"
+                return replace(guess, field=field, clock=clock)
+    return replace(guess, clock=guess.clock or "log")
+
+
+def _unit(guess: Guess, unit: str) -> Guess:
+    known = unit_of(guess.path)
+    if not known or unit in ("", "1"):
+        return guess
+    others = tuple(path for path in guess.others if unit_of(path) in ("", unit))
+    if known == unit and others != guess.others:  # rivals of another unit are none
+        guess = replace(guess, others=others, sure=not others)
+    if known == unit:
+        return replace(guess, reasons=(*guess.reasons, f"its unit is {unit}"))
+    fits = [path for path in guess.others if unit_of(path) == unit]
+    if fits:
+        rest = tuple(p for p in guess.others if p != fits[0])
+        why = f"its unit is {unit}, that of {guess.path} {known}"
+        return replace(guess, path=fits[0], others=(guess.path, *rest), reasons=(why,), field=None)
+    why = f"its unit should be {unit}, the log's is {known}"
+    return replace(guess, sure=False, reasons=(*guess.reasons, why))
+
+
+class _Signals:
+    """The samples of everything that was guessed, read once, and put on one grid when asked."""
+
+    def __init__(self, log: LogReport, guesses: Iterable[Guess]) -> None:
+        clocks = {t.topic: "header" if t.stamped else "log" for t in log.topics}
+        if any(t.skew_s is not None and abs(t.skew_s) > SIMULATED_S for t in log.topics):
+            clocks = dict.fromkeys(clocks, "log")
+        paths = [p for g in guesses for p in (g.path, *g.others) if p]
+        specs = {p: SignalSpec(p, clock=_clock(p, clocks)) for p in paths}  # type: ignore[arg-type]
+        self.found: dict[str, Samples] = {}
+        try:
+            series = read_signals(log.files, specs) if specs else {}
+        except GroundedError:
+            series = _one_by_one(log.files, specs)
+        for path, one in series.items():
+            try:
+                self.found[path] = tidy(path, one, unwrap="@rpy" in path)
+            except GroundedError:
+                continue
+
+    def grid(self, paths: Sequence[str]) -> tuple[float, list[Floats]] | None:
+        """These signals on a common grid: its step [s] and the columns; None if they don't meet."""
+        if not all(path in self.found and len(self.found[path].t) > 20 for path in paths):
+            return None
+        samples = [self.found[path] for path in paths]
+        start, stop = max(s.t[0] for s in samples), min(s.t[-1] for s in samples)
+        step = max(s.interval for s in samples)
+        step = max(step, (stop - start) * 1e-9 / LONGEST)
+        t = np.arange(start, stop, round(step * 1e9), dtype=np.int64)
+        if len(t) < 20:
+            return None
+        at = (t - start) * 1e-9
+        return step, [np.interp(at, (s.t - start) * 1e-9, s.y) for s in samples]
+
+
+def _clock(path: str, clocks: Mapping[str, str]) -> str:
+    topic = max((t for t in clocks if path.strip('"').startswith(t)), key=len, default="")
+    return clocks.get(topic, "log")
+
+
+def _one_by_one(files: Sequence[Path], specs: Mapping[str, SignalSpec]) -> dict[str, Series]:
+    found: dict[str, Series] = {}
+    for path, spec in specs.items():
+        try:
+            found |= read_signals(files, {path: spec})
+        except GroundedError:
+            continue
+    return found
+
+
+def rates_of(model: Model) -> dict[str, str]:
+    """Which state's derivative is another state, whatever the inputs and parameters: {q: w}."""
+    rng, dt = np.random.default_rng(0), 1e-4
+    x, u = rng.normal(size=(4, model.n)), rng.normal(size=(4, model.m))
+    with np.errstate(all="ignore"):
+        change = (model.system.step(x, u, model.values, dt) - x) / dt
+    found = {}
+    for i, q in enumerate(model.state_names):
+        for j, w in enumerate(model.state_names):
+            if i != j and np.allclose(change[:, i], x[:, j], rtol=0.01, atol=0.05):
+                found[q] = w
+    return found
+
+
+@dataclass(frozen=True)
+class _Follows:
+    correlation: float
+    slope: float
+
+
+def _follows(q: Floats, w: Floats, step: float) -> _Follows:
+    """How w goes with the derivative of q, both averaged over a few samples."""
+    slope = (q[SPAN:] - q[:-SPAN]) / (SPAN * step)
+    mean = np.convolve(0.5 * (w[1:] + w[:-1]), np.ones(SPAN) / SPAN, "valid")
+    good = np.isfinite(slope) & np.isfinite(mean)
+    a, b = slope[good], mean[good]
+    if len(a) < 20 or a.std() < 1e-9 or b.std() < 1e-9:
+        return _Follows(0.0, 1.0)
+    a, b = a - a.mean(), b - b.mean()
+    return _Follows(float(a @ b / np.sqrt((a @ a) * (b @ b))), float(a @ b / (a @ a)))
+
+
+def _derivative(q: Guess, w: Guess, signals: _Signals, unit: str) -> dict[str, Guess]:
+    """Both guesses, after trying which pair of candidates are a position and its rate."""
+    tried = []
+    pairs = product([p for p in (q.path, *q.others) if p], [p for p in (w.path, *w.others) if p])
+    for rank, (a, b) in enumerate(islice(pairs, COMBINATIONS)):
+        gridded = signals.grid((a, b)) if a != b else None
+        if gridded is not None:
+            step, (position, rate) = gridded
+            found = _follows(position, rate, step)
+            tried.append((abs(found.correlation) - 0.02 * rank, found, a, b))
+    if not tried:
+        return {}
+    _, best, a, b = max(tried, key=lambda one: one[0])
+    if abs(best.correlation) < FOLLOWS:
+        why = f"it does not follow the derivative of {q.path} (correlation {best.correlation:.2f})"
+        return {w.name: replace(w, sure=False, reasons=(*w.reasons, why))}
+    scale, what = _scale(best.slope)
+    why = f"follows the derivative of {a}, correlation {best.correlation:.3f}{what}"
+    fits = abs(best.slope * scale - 1) < SAME
+    found_q, found_w = _moved(q, a), _moved(w, b)
+    if fits or scale != 1.0:
+        if scale in (DEGREE, -DEGREE):  # the position is in degrees
+            found_q = replace(found_q, scale=1 / DEGREE, sure=False)
+            scale /= DEGREE
+        found_w = replace(found_w, scale=scale, sure=found_w.sure or fits)
+    else:
+        why += f", but {best.slope:.3g} times as large"
+        found_w = replace(found_w, sure=False)
+    return {q.name: found_q, w.name: replace(found_w, reasons=(*found_w.reasons, why))}
+
+
+def _scale(slope: float) -> tuple[float, str]:
+    """What a rate must be multiplied by, and how to say it."""
+    sign, size = np.sign(slope), abs(slope)
+    opposite = " with the OPPOSITE SIGN" if sign < 0 else ""
+    if abs(size / DEGREE - 1) < SAME:
+        return float(sign / DEGREE), f"{opposite}, in DEGREES per second"
+    if abs(size * DEGREE - 1) < SAME:
+        return float(sign * DEGREE), f"{opposite}, whose values are in DEGREES"
+    return float(sign), opposite
+
+
+def _moved(guess: Guess, path: str) -> Guess:
+    """The guess at another of its candidates."""
+    if path == guess.path:
+        return guess
+    rest = tuple(p for p in (guess.path, *guess.others) if p != path)
+    return replace(guess, path=path, others=rest[:3], field=None, reasons=())
+
+
+def _steps(model: Model, guesses: Mapping[str, Guess], signals: _Signals) -> dict[str, Guess]:
+    """Inputs that are unsure, decided by the model's one-step predictions where they can."""
+    unsure = [n for n in model.input_names if guesses[n].path and guesses[n].others]
+    known = [*model.state_names, *model.input_names]
+    if not unsure or not all(guesses[name].path for name in known):
+        return {}
+    choices = [(guesses[n].path, *guesses[n].others) for n in unsure]
+    errors: dict[tuple[str, ...], float] = {}
+    for chosen in islice(product(*choices), COMBINATIONS):
+        paths = {n: guesses[n].path for n in known} | dict(zip(unsure, chosen, strict=True))
+        gridded = signals.grid(list(paths.values()))
+        if gridded is not None and len(set(paths.values())) == len(paths):
+            scales = [guesses[name].scale for name in known]
+            errors[chosen] = _one_step(model, gridded[0], gridded[1], scales)
+    ranked = sorted(errors, key=errors.__getitem__)
+    if len(ranked) < 2 or not errors[ranked[0]] < BETTER * errors[ranked[1]]:
+        return {}
+    gain = 100 * (1 - errors[ranked[0]] / errors[ranked[1]])
+    found = {}
+    for name, path in zip(unsure, ranked[0], strict=True):
+        why = f"with it the model's steps fit {gain:.0f} % better than with the next best"
+        moved = _moved(guesses[name], path)
+        found[name] = replace(moved, sure=True, reasons=(*moved.reasons, why))
+    return found
+
+
+def _one_step(model: Model, step: float, columns: list[Floats], scales: list[float]) -> float:
+    """Root mean square of the model's steps against the log's, each state in its own deviation."""
+    values = np.column_stack(columns) * scales
+    x, u = values[:, : model.n], values[:-1, model.n :]
+    with np.errstate(all="ignore"):
+        predicted = model.system.step(x[:-1], u, model.values, step)
+    change = np.maximum(model.difference(x[1:], x[:-1]).std(axis=0), 1e-12)
+    error = model.difference(x[1:], predicted) / change
+    return float(np.sqrt(np.nanmean(np.minimum(error**2, 1e4))))

@@ -1,0 +1,260 @@
+"""A trial or a candidate as a ROS 2 bag of standard messages, for `ros2 bag play`, RViz and others.
+
+Every state and input is a number of its own topic; where the model's roles say what moves, the
+robot is seen as well:
+
+    /state/NAME, /input/NAME      std_msgs/Float64
+    /pose, /odom, /tf             PoseStamped, Odometry, TFMessage of the body: roles position,
+                                  heading or attitude, altitude, speed
+    /joint_states                 JointState: states in rad and the states that are their rates
+    /target                       nav_msgs/Path, once
+
+rosbags writes them; a bag is a folder, of a `.db3` or `.mcap` file and its metadata.yaml.
+"""
+
+from __future__ import annotations
+
+import io
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from grounded.errors import GroundedError, nearest
+from grounded.frozen import Array
+from grounded.model import Model
+from grounded_trials.logs.inspect_evidence import rates_of
+from grounded_trials.report.scene import Scene, scene_of
+from grounded_trials.store.store import write_atomically
+from grounded_trials.workspace.exporting import Exported
+from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.proposing import candidate_named
+
+FRAME, BODY = "map", "robot"
+Message = tuple[str, str, int, Any]  # topic, type, time [ns], message
+
+
+def write_bag(
+    path: Path,
+    model: Model,
+    dt: float,
+    states: Array,
+    inputs: Array,
+    *,
+    target: Array | None = None,
+    start_ns: int = 0,
+) -> Path:
+    """Writes a run as a ROS 2 bag.
+
+    Args:
+        path: the bag's folder, which must not exist; with "mcap" in its name it holds MCAP, else
+            `.db3`.
+        model: whose names and roles say what is what.
+        dt: control interval [s].
+        states: (T + 1, n); inputs: (T, m), sent at the beginning of each step.
+        inputs: see `states`.
+        target: (H + 1, n), NaN where free.
+        start_ns: the stamp of the first state.
+
+    Returns:
+        The folder.
+
+    Raises:
+        GroundedError: if it exists, or can't be written.
+    """
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
+    if path.exists():
+        raise GroundedError(f"{path} exists already: name another folder, or remove it first")
+    storage = StoragePlugin.MCAP if "mcap" in path.name else StoragePlugin.SQLITE3
+    store = _types()
+    with tempfile.TemporaryDirectory(prefix=".bag-", dir=_parent(path)) as room:
+        made = Path(room) / path.name
+        with Writer(made, version=9, storage_plugin=storage) as writer:
+            topics: dict[str, Any] = {}
+            for topic, kind, time, message in _Run(model, dt, start_ns).messages(
+                states, inputs, target
+            ):
+                if topic not in topics:
+                    topics[topic] = writer.add_connection(topic, kind, typestore=store)
+                writer.write(topics[topic], time, store.serialize_cdr(message, kind))
+        shutil.move(made, path)
+    return path
+
+
+def _parent(path: Path) -> Path:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise GroundedError(f"{path.parent} can't be made: {error.strerror}") from None
+    return path.parent
+
+
+def _types() -> Any:
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_HUMBLE)
+
+
+class _Run:
+    """The messages of one run, in the order of time."""
+
+    def __init__(self, model: Model, dt: float, start_ns: int) -> None:
+        self.model, self.dt, self.start = model, dt, start_ns
+        self.kinds = _types().types
+        scene = scene_of(model)
+        self.scene: Scene | None = scene if scene.spatial else None
+        self.joints = {q: w for q, w in rates_of(model).items() if model.states[q] == "rad"}
+
+    def messages(self, states: Array, inputs: Array, target: Array | None) -> Iterator[Message]:
+        """All of them; a state that is not finite is left out."""
+        if target is not None and self.scene is not None:
+            path = self._path(target)
+            if path is not None:
+                yield "/target", "nav_msgs/msg/Path", self.start, path
+        turns = self.scene.rotations(states) if self.scene is not None else None
+        for step, x in enumerate(states):
+            time = self.start + round(step * self.dt * 1e9)
+            for name, value in zip(self.model.state_names, x, strict=True):
+                if np.isfinite(value):
+                    yield f"/state/{name}", "std_msgs/msg/Float64", time, self._number(value)
+            if step < len(inputs):
+                for name, value in zip(self.model.input_names, inputs[step], strict=True):
+                    yield f"/input/{name}", "std_msgs/msg/Float64", time, self._number(value)
+            if self.scene is not None and turns is not None and np.isfinite(x).all():
+                yield from self._body(time, x, turns[step])
+            if self.joints and np.isfinite(x).all():
+                yield "/joint_states", "sensor_msgs/msg/JointState", time, self._joints(time, x)
+
+    def _number(self, value: float) -> Any:
+        return self.kinds["std_msgs/msg/Float64"](data=float(value))
+
+    def _of(self, kind: str, **parts: Any) -> Any:
+        return self.kinds[f"geometry_msgs/msg/{kind}"](**parts)
+
+    def _header(self, time: int) -> Any:
+        stamp = self.kinds["builtin_interfaces/msg/Time"](sec=time // 10**9, nanosec=time % 10**9)
+        return self.kinds["std_msgs/msg/Header"](stamp=stamp, frame_id=FRAME)
+
+    def _pose(self, point: Array, turn: Array) -> Any:
+        x, y, z = map(float, point)
+        qx, qy, qz, qw = quaternion(turn)
+        return self._of(
+            "Pose",
+            position=self._of("Point", x=x, y=y, z=z),
+            orientation=self._of("Quaternion", x=qx, y=qy, z=qz, w=qw),
+        )
+
+    def _body(self, time: int, state: Array, turn: Array) -> Iterator[Message]:
+        assert self.scene is not None
+        point = self.scene.points(state[None])[0]
+        pose, header = self._pose(point, turn), self._header(time)
+        stamped = self._of("PoseStamped", header=header, pose=pose)
+        yield "/pose", "geometry_msgs/msg/PoseStamped", time, stamped
+        linear, angular = self._twist(state)
+        twist = self._of("Twist", linear=linear, angular=angular)
+        odometry = self.kinds["nav_msgs/msg/Odometry"](
+            header=header,
+            child_frame_id=BODY,
+            pose=self._of("PoseWithCovariance", pose=pose, covariance=np.zeros(36)),
+            twist=self._of("TwistWithCovariance", twist=twist, covariance=np.zeros(36)),
+        )
+        yield "/odom", "nav_msgs/msg/Odometry", time, odometry
+        x, y, z = map(float, point)
+        moved = self._of(
+            "Transform",
+            translation=self._of("Vector3", x=x, y=y, z=z),
+            rotation=pose.orientation,
+        )
+        frame = self._of("TransformStamped", header=header, child_frame_id=BODY, transform=moved)
+        frames = self.kinds["tf2_msgs/msg/TFMessage"](transforms=[frame])
+        yield "/tf", "tf2_msgs/msg/TFMessage", time, frames
+
+    def _twist(self, state: Array) -> tuple[Any, Any]:
+        names, roles = self.model.state_names, self.model.roles
+        speed, rate = (
+            float(state[names.index(role)]) if isinstance(role, str) and role in names else 0.0
+            for role in (roles.get("speed"), roles.get("heading_rate"))
+        )
+        linear = self._of("Vector3", x=speed, y=0.0, z=0.0)
+        return linear, self._of("Vector3", x=0.0, y=0.0, z=rate)
+
+    def _joints(self, time: int, state: Array) -> Any:
+        index = self.model.state_names.index
+        return self.kinds["sensor_msgs/msg/JointState"](
+            header=self._header(time),
+            name=list(self.joints),
+            position=np.array([state[index(q)] for q in self.joints]),
+            velocity=np.array([state[index(w)] for w in self.joints.values()]),
+            effort=np.zeros(0),
+        )
+
+    def _path(self, target: Array) -> Any:
+        assert self.scene is not None
+        points = self.scene.finite(target)
+        if not len(points):
+            return None
+        still, header = np.eye(3), self._header(self.start)
+        poses = [
+            self._of("PoseStamped", header=header, pose=self._pose(point, still))
+            for point in points
+        ]
+        return self.kinds["nav_msgs/msg/Path"](header=header, poses=poses)
+
+
+def quaternion(turn: Array) -> tuple[float, float, float, float]:
+    """x, y, z, w of a rotation matrix (3, 3)."""
+    from scipy.spatial.transform import Rotation
+
+    x, y, z, w = Rotation.from_matrix(turn).as_quat()
+    return float(x), float(y), float(z), float(w)
+
+
+def export_run(workspace: Folder, identity: str, form: str | None, path: Path | None) -> Exported:
+    """Writes a trial, or the run that a candidate predicts: as a bag, csv or npz.
+
+    Args:
+        workspace: its own.
+        identity: t0007, c0003 or `best`.
+        form: bag, csv or npz; None: as `path` is named, else bag.
+        path: file or folder; None: named after the run, in the current folder.
+
+    Raises:
+        GroundedError: for an unknown run or form, or a place that can't be written.
+    """
+    named = path.suffix.lstrip(".").lower() if path else ""
+    form = form or (named if named in ("csv", "npz") else "bag")
+    if form not in ("bag", "csv", "npz"):
+        raise GroundedError(f"a run is written as bag, csv or npz, not {form}")
+    states, inputs, dt = _run_of(workspace, identity)
+    path = path or Path(f"{identity}.{form}" if form != "bag" else f"{identity}_bag")
+    model = workspace.base_model
+    if form == "bag":
+        target = workspace.task.target
+        write_bag(path, model, dt, states, inputs, target=target)
+        return Exported(identity, path, form)
+    names = ("t", *model.state_names, *model.input_names)
+    last = np.full((1, model.m), np.nan)  # the last state has no input
+    rows = np.hstack([dt * np.arange(len(states))[:, None], states, np.vstack([inputs, last])])
+    stream = io.BytesIO()
+    if form == "npz":
+        np.savez(stream, **dict(zip(names, rows.T, strict=True)))
+    else:
+        np.savetxt(stream, rows, fmt="%.10g", delimiter=",", header=",".join(names), comments="")
+    write_atomically(path, stream.getvalue())
+    return Exported(identity, path, form)
+
+
+def _run_of(workspace: Folder, identity: str) -> tuple[Array, Array, float]:
+    """States, inputs and control interval of a stored trial, or of a candidate's prediction."""
+    for stored in workspace.trials():
+        if stored.trial.id == identity:
+            return stored.trial.states, stored.trial.inputs, stored.trial.dt
+    if identity.startswith("t"):
+        known = [stored.trial.id for stored in workspace.trials()]
+        raise GroundedError(f"there is no trial '{identity}': {nearest(identity, known)}")
+    found, _ = workspace.candidate(candidate_named(workspace, identity))
+    return found.predicted_states, found.predicted_inputs, found.policy.dt

@@ -1,0 +1,359 @@
+"""A workspace from a log: what it found, what it guessed and why, and what a person must decide.
+
+Nothing is decided silently: every signal is listed with its reasons and its rivals, every number in
+grounded.toml that was read off the log says so, and what is unsure is asked for (in a terminal) or
+marked.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from grounded.errors import GroundedError, NextCommand, nearest
+from grounded.frozen import Array
+from grounded.model import Model
+from grounded.result import Result
+from grounded_trials.logs.inspect_evidence import weigh
+from grounded_trials.logs.inspect_guess import Guess, guess_mapping, is_simulated, mapping_toml
+from grounded_trials.logs.inspect_log import LogReport, inspect_log
+from grounded_trials.logs.log_files import kind_of, log_files
+from grounded_trials.logs.log_table import LogMapping, log_mapping, read_log
+from grounded_trials.starting.kinds import KINDS, kind_in, skeleton
+from grounded_trials.store.store import write_atomically
+from grounded_trials.workspace.config import FILE
+from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.model_file import load_module
+from grounded_trials.workspace.task_file import write_target
+
+STEPS = (0.001, 0.002, 0.0025, 0.004, 0.005, 0.008, 0.01, 0.02, 0.025, 0.04, 0.05, 0.1, 0.2, 0.5)
+HORIZON = 200  # steps of a target that is a recorded run, at most
+Ask = Callable[[Guess], str]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Begun(Result):
+    """A workspace made from a log."""
+
+    workspace: str
+    log: str
+    kind: str  # of the model skeleton; "" for the user's own model
+    why: str  # what says so
+    dt: float  # [s]
+    horizon: int
+    states: tuple[Guess, ...]
+    inputs: tuple[Guess, ...]
+    target: str  # what target.csv holds
+    notes: tuple[str, ...] = ()
+
+    @property
+    def unsure(self) -> tuple[Guess, ...]:
+        """The signals that a person must look at."""
+        return tuple(g for g in (*self.states, *self.inputs) if not g.sure)
+
+    @property
+    def then(self) -> NextCommand:
+        """Take the log in, to fit and diagnose the model on it."""
+        return NextCommand("ingest", ("--data", self.log))
+
+    def summary(self) -> str:
+        """How much was matched."""
+        both = (*self.states, *self.inputs)
+        return f"{self.workspace}: {sum(bool(g.path) for g in both)} of {len(both)} signals found"
+
+    def to_json(self) -> dict[str, Any]:
+        """The document of `init --from --json`."""
+        signals = [
+            {
+                "name": guess.name,
+                "path": guess.path or None,
+                "sure": guess.sure,
+                "reasons": list(guess.reasons),
+                "rivals": list(guess.others),
+                "scale": guess.scale,
+            }
+            for guess in (*self.states, *self.inputs)
+        ]
+        return {
+            "workspace": self.workspace,
+            "log": self.log,
+            "kind": self.kind or None,
+            "why": self.why,
+            "dt": self.dt,
+            "horizon": self.horizon,
+            "signals": signals,
+            "target": self.target,
+            "notes": list(self.notes),
+        }
+
+
+def begin(
+    folder: Path,
+    log: str | Path,
+    *,
+    model: str | Path | None = None,
+    kind: str | None = None,
+    dt: float | None = None,
+    ask: Ask | None = None,
+) -> Begun:
+    """Makes a workspace from a log; an existing file is never overwritten.
+
+    Args:
+        folder: where it is made.
+        log: of any format.
+        model: the user's model.py, which is copied; None: a skeleton is written.
+        kind: of the skeleton, see `KINDS`; None: as the log looks.
+        dt: control interval [s]; None: that of the commands in the log.
+        ask: given each unsure signal, returns the path to take; None: the best guess is taken.
+
+    Raises:
+        GroundedError: if the log can't be read or is ours, the folder holds a workspace, or a
+            name is unknown.
+    """
+    _check(folder, model, kind)
+    new = not folder.exists()
+    try:
+        return _begin(folder, log, model, kind, dt, ask)
+    except BaseException:
+        written = [folder] if new else [folder / name for name in (FILE, "model.py", "target.csv")]
+        for path in written:
+            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+        raise
+
+
+def _begin(
+    folder: Path,
+    log: str | Path,
+    model: str | Path | None,
+    kind: str | None,
+    dt: float | None,
+    ask: Ask | None,
+) -> Begun:
+    files = log_files(log)
+    if kind_of(files[0]):
+        raise GroundedError(f"{log} was written by grounded itself: init needs a foreign log")
+    report = inspect_log(log)
+    if report.damage:
+        raise GroundedError(report.damage, NextCommand("recover", (str(log),)))
+    report, notes = _one_run(report)
+    chosen, why = (kind, "as you said") if kind else kind_in(report)
+    text = Path(model).read_text("utf-8") if model else skeleton(chosen, report).source()
+    found = _model_in(folder, text)
+    states, inputs = guess_mapping(report, found.state_names, found.input_names)
+    states, inputs = weigh(report, found, states, inputs)
+    if ask is not None:
+        states, inputs = (tuple(_asked(g, ask) for g in some) for some in (states, inputs))
+    step = dt or _interval(report, inputs, states)
+    ranges = {g.name: _range(report, g) for g in (*states, *inputs)}
+    table = mapping_toml(states, inputs, simulated=is_simulated(report))
+
+    def write(columns: Mapping[str, Array], rows: int) -> None:
+        _write(folder, found, step, columns, rows, ranges, table, why)
+
+    write({found.state_names[0]: np.zeros(2)}, 1)
+    target, horizon, more = _recorded(folder, files, found, states, step, write)
+    return Begun(
+        workspace=str(folder),
+        log=str(log),
+        kind="" if model else chosen,
+        why="your model" if model else why,
+        dt=step,
+        horizon=horizon,
+        states=states,
+        inputs=inputs,
+        target=target,
+        notes=(*notes, *more),
+    )
+
+
+def _one_run(report: LogReport) -> tuple[LogReport, tuple[str, ...]]:
+    """An archive of many runs with the same columns is looked at by its first one."""
+    runs = [t for t in report.topics if t.type.startswith("npz")]
+    columns = {tuple(f.path.removeprefix(t.topic) for f in t.fields) for t in runs}
+    same = [t for t in runs if len(t.fields) == max(len(c) for c in columns)] if columns else []
+    if len(same) < 2:
+        return report, ()
+    note = f"{same[0].topic} of {len(same)} runs is taken; [log] may name another"
+    return replace(report, topics=(same[0],)), (note,)
+
+
+def _check(folder: Path, model: str | Path | None, kind: str | None) -> None:
+    for file in (FILE, "model.py", "target.csv"):
+        if (folder / file).exists():
+            raise GroundedError(
+                f"{folder / file} exists already: name another folder, or remove it first"
+            )
+    if kind is not None and kind not in KINDS:
+        raise GroundedError(f"there is no kind '{kind}': {nearest(kind, KINDS)}")
+    if model is not None and not Path(model).is_file():
+        raise GroundedError(f"{model} does not exist: --model names a Python file with `model`")
+
+
+def _model_in(folder: Path, text: str) -> Model:
+    """Writes model.py and loads it."""
+    try:
+        for part in ("trials", "candidates"):
+            (folder / part).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise GroundedError(f"{folder} can't be made: {error.strerror}") from None
+    write_atomically(folder / "model.py", text.encode())
+    found = getattr(load_module(folder, "model.py"), "model", None)
+    if not isinstance(found, Model):
+        raise GroundedError("model.py has no `model = grounded.Model(...)`")
+    return found
+
+
+def _asked(guess: Guess, ask: Ask) -> Guess:
+    if guess.sure:
+        return guess
+    path = ask(guess)
+    if path == guess.path:
+        return replace(guess, sure=bool(path))
+    return replace(
+        guess, path=path, sure=bool(path), reasons=("as you said",), field=None, scale=1.0
+    )
+
+
+def _interval(report: LogReport, inputs: Sequence[Guess], states: Sequence[Guess]) -> float:
+    """The control interval: the slowest command or state, as a round number."""
+    for guesses in (inputs, states):
+        rates = [
+            t.rate_hz for g in guesses if (t := _topic(report, g)) is not None and t.rate_hz > 0
+        ]
+        if rates:
+            return min(STEPS, key=lambda step: abs(np.log(step * min(rates))))
+    return 0.05
+
+
+def _topic(report: LogReport, guess: Guess) -> Any:
+    known = {t.topic: t for t in report.topics if guess.path.strip('"').startswith(t.topic)}
+    return known[max(known, key=len)] if known and guess.path else None
+
+
+def _range(report: LogReport, guess: Guess) -> tuple[float, float] | None:
+    """Lowest and highest value in the log, in the model's unit."""
+    for topic in report.topics:
+        for one in topic.fields:
+            if one.path == guess.path and one.low is not None and one.high is not None:
+                low, high = sorted((one.low * guess.scale, one.high * guess.scale))
+                return low, high
+    return None
+
+
+def _recorded(
+    folder: Path,
+    files: Sequence[Path],
+    model: Model,
+    states: Sequence[Guess],
+    dt: float,
+    write: Callable[[Mapping[str, Array], int], None],
+) -> tuple[str, int, tuple[str, ...]]:
+    """target.csv from the run in the log; where that can't be sampled, a target to be replaced."""
+    here = Folder(folder)
+    measured = [guess.name for guess in states if guess.path]
+    mapping = log_mapping(here.config.log, model.state_names, model.input_names)
+    try:
+        if mapping is None or not measured:
+            raise GroundedError("no signal of the log fits a state")
+        found = read_log(files, mapping, dt, states=measured, angles=model.angles, steps=HORIZON)
+    except GroundedError as error:
+        write({model.state_names[0]: np.zeros(HORIZON + 1)}, HORIZON)
+        return "zeros, to be replaced", HORIZON, (f"the run can't be sampled yet: {error}",)
+    columns = dict(zip(measured, found.states.T, strict=True))
+    horizon = len(found.states) - 1
+    write(columns, horizon)
+    return f"the run in the log, its first {horizon * dt:g} s", horizon, found.warnings
+
+
+def recorded_run(workspace: Folder, file: str, shapes: Sequence[str]) -> dict[str, Array]:
+    """The states of a recorded run as a target: a log through [log], or a CSV of states.
+
+    Args:
+        workspace: whose model and [log] it is read by.
+        file: a log of any format; a CSV may have columns `t` and states instead.
+        shapes: what else could have been meant, for the message.
+
+    Raises:
+        GroundedError: if there is no such file, or it can't be sampled.
+    """
+    model, dt = workspace.base_model, workspace.config.task.dt
+    if not Path(file).exists():
+        raise GroundedError(f"'{file}' is neither a file nor a shape: {nearest(file, shapes)}")
+    mapping = log_mapping(workspace.config.log, model.state_names, model.input_names)
+    if Path(file).suffix == ".csv" and (mapping is None or not _maps(mapping, "/csv")):
+        from grounded_trials.workspace.task_file import read_target
+
+        names, values = read_target(Path(file))
+        known = [name for name in names[1:] if name in model.states]
+        if not known:
+            raise GroundedError(f"{file} has no column named after a state: {', '.join(names)}")
+        t = np.arange(0.0, values[-1, 0] - values[0, 0] + 1e-9, dt)
+        at = values[:, 0] - values[0, 0]
+        return {name: np.interp(t, at, values[:, names.index(name)]) for name in known}
+    if mapping is None:
+        raise GroundedError(
+            f"grounded.toml has no [log] table to read {file} by: `inspect` prints one",
+            NextCommand("inspect", (file,)),
+        )
+    found = read_log(log_files(file), mapping, dt, angles=model.angles)
+    return dict(zip(mapping.states, found.states.T, strict=True))
+
+
+def _maps(mapping: LogMapping, topic: str) -> bool:
+    return any(s.path.startswith(topic) for s in mapping.states.values())
+
+
+def _write(
+    folder: Path,
+    model: Model,
+    dt: float,
+    columns: Mapping[str, Array],
+    horizon: int,
+    ranges: Mapping[str, tuple[float, float] | None],
+    table: str,
+    why: str,
+) -> None:
+    write_target(folder / "target.csv", dt, dict(columns))
+    weights = {name: 1.0 / max(float(np.ptp(values)), 0.1) ** 2 for name, values in columns.items()}
+    limits = [
+        f"{name} = [{found[0]:.6g}, {found[1]:.6g}]"
+        for name in model.input_names
+        if (found := ranges[name]) is not None and found[0] < found[1]
+    ]
+    lines = [
+        f"# made from a log by `grounded init --from` ({why})",
+        "",
+        "[model]",
+        'file = "model.py"             # the crude model, plain NumPy',
+        "",
+        "[task]",
+        f"dt = {dt:g}                     # [s] control interval: that of the log's commands",
+        f"horizon = {horizon}                 # steps",
+        'target = "target.csv"         # `grounded target` draws another; no column: free',
+        "start = { }",
+        "feedback = true               # false: open loop",
+        "latency = { }                 # [s] transport delay of inputs: `fit --latency` finds it",
+        "",
+        "[reward]                      # quadratic weights: 1 / (range in the target)^2",
+        f"state = {_inline(weights)}",
+        f"input_change = {_inline(dict.fromkeys(model.input_names, 0.01))}",
+        "",
+        "[limits]                      # SEEN in the log: put in what your robot may be given",
+        *limits,
+        "",
+        "[search]",
+        "max_trials = 40",
+        "",
+        table.rstrip(),
+        "",
+    ]
+    write_atomically(folder / FILE, "\n".join(lines).encode())
+
+
+def _inline(values: Mapping[str, float]) -> str:
+    return "{ " + ", ".join(f"{name} = {value:.4g}" for name, value in values.items()) + " }"

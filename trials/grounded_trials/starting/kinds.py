@@ -1,0 +1,263 @@
+"""A model skeleton for each kind of robot, and which kind a log was recorded on.
+
+A skeleton is a model.py that runs as it is: the simplest equations of its kind, with parameters
+whose bounds say how little is known of them. It is meant to be changed.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+from grounded_trials.logs.inspect_evidence import joint_names
+from grounded_trials.logs.inspect_log import LogReport, TopicReport
+
+MOST = 6  # states of a generic model
+COMMANDED = re.compile(
+    "cmd|command|desired|setpoint|target|input|throttle|torque|tau|effort|volt|pwm|duty|motor|steer"
+    r"|goal|control|_con|_ref"
+)
+
+
+@dataclass(frozen=True)
+class Skeleton:
+    """A model as text: names with units, parameters, lines of equations."""
+
+    kind: str
+    text: str  # what it is, one line
+    states: Mapping[str, str]
+    inputs: Mapping[str, str]
+    params: Mapping[str, str]  # name -> the arguments of Param
+    lines: Sequence[str]  # name: expression, of ds/dt
+    angles: tuple[str, ...] = ()
+    roles: Mapping[str, object] = field(default_factory=dict)
+
+    def source(self) -> str:
+        """The text of model.py."""
+        params = [f'        "{name}": Param({given}),' for name, given in self.params.items()]
+        return "\n".join(
+            [
+                f'"""{self.text}.',
+                "",
+                "A skeleton by `grounded init --from`: make it yours.",
+                '"""',
+                "",
+                "import numpy as np",
+                "",
+                "from grounded import Model, Param",
+                "",
+                "",
+                "def dynamics(s, a, p):",
+                '    """ds/dt."""',
+                "    return {",
+                *(f"        {line}," for line in self.lines),
+                "    }",
+                "",
+                "",
+                "# Param(value, unit) is a constant; with bounds, `fit` may move it between them.",
+                "model = Model(",
+                f'    name="{self.kind}",',
+                f"    states={_dict(self.states)},",
+                f"    inputs={_dict(self.inputs)},",
+                "    params={",
+                *params,
+                "    },",
+                f"    angles={self.angles!r},",
+                f"    roles={dict(self.roles)!r},",
+                "    derivative=dynamics,",
+                ")",
+                "",
+            ]
+        ).replace("import numpy as np\n\n", "import numpy as np\n\n" if self._numpy() else "")
+
+    def _numpy(self) -> bool:
+        return any("np." in line for line in self.lines)
+
+
+def _dict(units: Mapping[str, str]) -> str:
+    inside = [f'"{name}": "{unit}"' for name, unit in units.items()]
+    if len(inside) < 5:
+        return "{" + ", ".join(inside) + "}"
+    return "{\n" + "".join(f"        {one},\n" for one in inside) + "    }"
+
+
+PLANE = {"position": ("x", "y"), "heading": "psi", "speed": "v"}
+CAR = Skeleton(
+    "car",
+    "A kinematic car: rear axle at (x, y), speed v, steering without lag",
+    {"v": "m/s", "x": "m", "y": "m", "psi": "rad"},
+    {"steering": "rad", "speed": "m/s"},
+    {
+        "L": '0.3, "m", 0.1, 3.0',
+        "tau": '0.3, "s", 0.02, 3.0',
+        "gain": '1.0, "1", 0.2, 5.0',
+        "trim": '0.0, "rad", -0.2, 0.2',
+    },
+    (
+        '"v": (p.gain * a.speed - s.v) / p.tau',
+        '"x": s.v * np.cos(s.psi)',
+        '"y": s.v * np.sin(s.psi)',
+        '"psi": s.v * np.tan(a.steering + p.trim) / p.L',
+    ),
+    ("psi",),
+    PLANE,
+)
+ROVER = Skeleton(
+    "rover",
+    "A robot on two driven wheels: speed and turn rate follow their commands with a lag",
+    {"v": "m/s", "omega": "rad/s", "x": "m", "y": "m", "psi": "rad"},
+    {"speed": "m/s", "turn": "rad/s"},
+    {"tau_v": '0.2, "s", 0.01, 2.0', "tau_w": '0.2, "s", 0.01, 2.0', "gain": '1.0, "1", 0.3, 2.0'},
+    (
+        '"v": (p.gain * a.speed - s.v) / p.tau_v',
+        '"omega": (a.turn - s.omega) / p.tau_w',
+        '"x": s.v * np.cos(s.psi)',
+        '"y": s.v * np.sin(s.psi)',
+        '"psi": s.omega',
+    ),
+    ("psi",),
+    PLANE | {"heading_rate": "omega"},
+)
+DRONE = Skeleton(
+    "drone",
+    "A hovering drone: attitude follows its commands with a lag, thrust lifts along its axis",
+    {
+        **dict.fromkeys("xyz", "m"),
+        **{f"v{axis}": "m/s" for axis in "xyz"},
+        **{"roll": "rad", "pitch": "rad"},
+    },
+    {"roll_command": "rad", "pitch_command": "rad", "thrust": "1"},
+    {
+        "g": '9.81, "m/s^2"',
+        "hover": '0.5, "1", 0.1, 1.0',
+        "tau": '0.15, "s", 0.02, 1.0',
+        "drag": '0.2, "1/s", 0.0, 2.0',
+    },
+    (
+        '"x": s.vx',
+        '"y": s.vy',
+        '"z": s.vz',
+        '"vx": p.g * a.thrust / p.hover * np.sin(s.pitch) - p.drag * s.vx',
+        '"vy": -p.g * a.thrust / p.hover * np.sin(s.roll) - p.drag * s.vy',
+        '"vz": p.g * (a.thrust / p.hover * np.cos(s.roll) * np.cos(s.pitch) - 1) - p.drag * s.vz',
+        '"roll": (a.roll_command - s.roll) / p.tau',
+        '"pitch": (a.pitch_command - s.pitch) / p.tau',
+    ),
+    (),
+    {"position": ("x", "y", "z")},
+)
+PENDULUM = Skeleton(
+    "pendulum",
+    "One joint under gravity, theta = 0 hanging down",
+    {"theta": "rad", "omega": "rad/s"},
+    {"torque": "N m"},
+    {
+        "inertia": '0.1, "kg m^2", 0.0001, 10.0',
+        "damping": '0.01, "N m s", 0.0, 5.0',
+        "weight": '0.5, "N m", 0.0, 50.0',
+    },
+    (
+        '"theta": s.omega',
+        '"omega": (a.torque - p.damping * s.omega - p.weight * np.sin(s.theta)) / p.inertia',
+    ),
+)
+
+
+def arm(joints: Sequence[str]) -> Skeleton:
+    """An arm whose joints don't feel each other, named after them."""
+    short = [re.sub(r"_?joint_?", "", joint) or joint for joint in joints]
+    distinct = len(set(short)) == len(joints)
+    bare = [re.sub(r"\W+", "_", joint).strip("_") for joint in (short if distinct else joints)]
+    names = [name if name.isidentifier() else f"joint{i}" for i, name in enumerate(bare, start=1)]
+    return Skeleton(
+        "arm",
+        f"An arm of {len(names)} joints that don't feel each other: write its inertia matrix",
+        {f"{n}_position": "rad" for n in names} | {f"{n}_velocity": "rad/s" for n in names},
+        {f"{n}_effort": "N m" for n in names},
+        {f"inertia_{n}": '0.1, "kg m^2", 0.0001, 10.0' for n in names}
+        | {f"b_{n}": '0.1, "N m s", 0.0, 10.0' for n in names},
+        [
+            *(f'"{n}_position": s.{n}_velocity' for n in names),
+            *(
+                f'"{n}_velocity": (a.{n}_effort - p.b_{n} * s.{n}_velocity) / p.inertia_{n}'
+                for n in names
+            ),
+        ],
+    )
+
+
+def generic(log: LogReport) -> Skeleton:
+    """Every number that moves is a state that follows the inputs with a lag."""
+    fields = [(topic, one) for topic in log.topics for one in topic.fields if one.low != one.high]
+    names = {one.path: _word(one.path) for _, one in fields}
+    commands = [p for p, name in names.items() if COMMANDED.search(p.lower())]
+    others = [p for p in names if p not in commands and not re.search(r"covariance|layout", p)]
+    inputs = [names[p] for p in commands[:2]] or ["u"]
+    states = list(dict.fromkeys(names[p] for p in others if names[p] not in inputs))[:MOST]
+    states = states or ["x"]
+    gains = {f"gain_{s}_{i}": '0.0, "1", -100.0, 100.0' for s in states for i in inputs}
+    return Skeleton(
+        "generic",
+        "Numbers that follow the inputs with a lag: write down what moves your robot",
+        dict.fromkeys(states, "1"),
+        dict.fromkeys(inputs, "1"),
+        {f"tau_{s}": '1.0, "s", 0.01, 100.0' for s in states} | gains,
+        [
+            f'"{s}": ({" + ".join(f"p.gain_{s}_{i} * a.{i}" for i in inputs)} - s.{s}) / p.tau_{s}'
+            for s in states
+        ],
+    )
+
+
+def _word(path: str) -> str:
+    """The end of a message path as a Python name."""
+    last = path.replace("@", "").rsplit(".", 1)[-1].strip('"')
+    name = last if last not in ("data", "value") else path.rsplit(".", 1)[0].rsplit("/", 1)[-1]
+    name = re.sub(r"\W+", "_", name).strip("_")
+    return name if name.isidentifier() else f"s_{name}"
+
+
+KINDS = ("car", "rover", "drone", "arm", "pendulum", "generic")
+
+
+def kind_in(log: LogReport) -> tuple[str, str]:
+    """The kind of robot that a log was probably recorded on, and what says so."""
+    joints = joint_names(log)
+    steered = next((t.topic for t in log.topics if "Ackermann" in t.type), None)
+    if steered is not None:
+        return "car", f"{steered} holds Ackermann commands"
+    if joints:
+        where, names = next(iter(joints.items()))
+        kind = "arm" if len(names) > 1 else "pendulum"
+        return kind, f"{where} has {len(names)} joints: {', '.join(names[:6])}"
+    for wanted, kind, what in (
+        (("steer",), "car", "names a steering"),
+        (("thrust", "attitude_setpoint", "actuator_outputs"), "drone", "names a thrust"),
+        (("cmd_vel",), "rover", "holds velocity commands"),
+    ):
+        for topic in log.topics:
+            if _says(topic, wanted):
+                return kind, f"{topic.topic} {what}"
+    words = {_word(one.path).lower() for topic in log.topics for one in topic.fields}
+    if words & {"theta", "angle", "q", "q_rad", "position"} and words & {"torque", "tau", "u"}:
+        return "pendulum", "an angle and a torque"
+    return "generic", "nothing tells what kind of robot it is"
+
+
+def _says(topic: TopicReport, words: Sequence[str]) -> bool:
+    everything = " ".join([topic.topic, *(one.path for one in topic.fields)]).lower()
+    return any(word in everything for word in words)
+
+
+def skeleton(kind: str, log: LogReport) -> Skeleton:
+    """The skeleton of a kind, named after what is in the log."""
+    if kind == "arm":
+        joints = joint_names(log)
+        return arm(next(iter(joints.values())) if joints else ("joint1", "joint2"))
+    ackermann = any("Ackermann" in topic.type for topic in log.topics)
+    if kind == "car" and not ackermann and any(_says(t, ("throttle",)) for t in log.topics):
+        lines = [line.replace("a.speed", "a.throttle") for line in CAR.lines]
+        return replace(CAR, inputs={"steering": "1", "throttle": "1"}, lines=lines)
+    fixed = {"car": CAR, "rover": ROVER, "drone": DRONE, "pendulum": PENDULUM}
+    return fixed[kind] if kind in fixed else generic(log)

@@ -1,0 +1,127 @@
+"""Targets: a path driven with limited speed and acceleration, a step, a swing-up, a recorded run.
+
+A path is given over its length; the speed starts from rest, rises with `accel` and keeps to `speed`
+and, in curves, to sqrt(lateral / curvature). Every state that the model's roles name gets its
+column: position, heading, speed, heading_rate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from grounded.errors import GroundedError, nearest
+from grounded.frozen import Array
+from grounded.model import Model
+
+PATHS = ("line", "circle", "figure-8")
+SHAPES = (*PATHS, "step", "swing-up")
+FINE = 2000  # points of a path
+
+
+@dataclass(frozen=True)
+class Drive:
+    """How a path is driven, SI units."""
+
+    size: float = 2.0  # [m] length of a line, radius of a circle and of an 8's loops
+    speed: float = 1.0  # [m/s] at most
+    accel: float = 1.0  # [m/s^2] along the path
+    lateral: float = 4.0  # [m/s^2] across it
+    laps: float = 1.0
+
+
+def path_target(shape: str, drive: Drive, model: Model, dt: float) -> dict[str, Array]:
+    """Columns of a target that follows a path from rest.
+
+    Args:
+        shape: line, circle or figure-8.
+        drive: its size and speeds.
+        model: whose roles name the states.
+        dt: control interval [s].
+
+    Raises:
+        GroundedError: if the model has no position, or a number is not positive.
+    """
+    position = model.roles.get("position", ())
+    if len(position) < 2:
+        raise GroundedError(
+            f"model '{model.name}' has no role 'position' of two states, which a {shape} needs: "
+            'add roles={"position": ("x", "y"), "heading": "psi", "speed": "v"} to model.py'
+        )
+    for name, value in vars(drive).items():
+        if not 0 < value < np.inf:
+            raise GroundedError(f"--{name} must be positive, found {value:g}")
+    along, x, y, heading = _path(shape, drive)
+    curvature = np.abs(np.gradient(heading, along))
+    limit = np.minimum(drive.speed, np.sqrt(drive.lateral / np.maximum(curvature, 1e-9)))
+    speed = _reachable(along, limit, drive.accel)
+    middle = 0.5 * (speed[1:] + speed[:-1])
+    when = np.concatenate([[0.0], np.cumsum(np.diff(along) / np.maximum(middle, 1e-6))])
+    t = np.arange(0.0, when[-1] + 1e-9, dt)
+    columns = {position[0]: np.interp(t, when, x), position[1]: np.interp(t, when, y)}
+    rate = np.gradient(heading, along) * speed
+    for role, values in {"heading": heading, "speed": speed, "heading_rate": rate}.items():
+        played = model.roles.get(role)
+        if isinstance(played, str) and played in model.states:
+            columns[played] = np.interp(t, when, values)
+    return columns
+
+
+def _path(shape: str, drive: Drive) -> tuple[Array, Array, Array, Array]:
+    """Length, x, y and heading along a path from the origin, heading along x."""
+    a, turn = drive.size, 2 * np.pi * drive.laps * np.linspace(0, 1, FINE)
+    if shape == "line":
+        s = np.linspace(0, a, FINE)
+        return s, s, np.zeros(FINE), np.zeros(FINE)
+    if shape == "circle":
+        return a * turn, a * np.sin(turn), a * (1 - np.cos(turn)), turn
+    x, y = 2 * a * np.sin(turn), a * np.sin(2 * turn)  # a lemniscate of Gerono
+    dx, dy = np.gradient(x, turn), np.gradient(y, turn)
+    heading = np.unwrap(np.arctan2(dy, dx))
+    cos, sin = np.cos(-heading[0]), np.sin(-heading[0])
+    along = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
+    return along, cos * x - sin * y, sin * x + cos * y, heading - heading[0]
+
+
+def _reachable(along: Array, limit: Array, accel: float) -> Array:
+    """The fastest speed within a limit that starts at rest and needs no more than `accel`."""
+    v = limit.copy()
+    v[0] = 0.0
+    for i in range(len(v) - 1):
+        v[i + 1] = min(v[i + 1], np.sqrt(v[i] ** 2 + 2 * accel * (along[i + 1] - along[i])))
+    for i in range(len(v) - 1, 0, -1):
+        v[i - 1] = min(v[i - 1], np.sqrt(v[i] ** 2 + 2 * accel * (along[i] - along[i - 1])))
+    return v
+
+
+def step_target(
+    to: Mapping[str, float], model: Model, dt: float, seconds: float
+) -> dict[str, Array]:
+    """Columns that ask for given values from the second row on.
+
+    Raises:
+        GroundedError: for a name that is no state.
+    """
+    rows = round(seconds / dt) + 1
+    if not to or rows < 2:
+        raise GroundedError("name a state and its value, such as --to x=1.0, and some --seconds")
+    for name in to:
+        if name not in model.states:
+            raise GroundedError(f"'{name}' is not a state: {nearest(name, model.states)}")
+    return {name: np.where(np.arange(rows) < 1, 0.0, value) for name, value in to.items()}
+
+
+def swing_up(model: Model, dt: float, seconds: float) -> dict[str, Array]:
+    """The first angle to pi, everything of it at rest there; the way up is free.
+
+    Raises:
+        GroundedError: if the model has no state in radians.
+    """
+    angle = next((name for name, unit in model.states.items() if unit == "rad"), None)
+    if angle is None:
+        raise GroundedError(f"model '{model.name}' has no state in rad to swing up")
+    rates = [name for name, unit in model.states.items() if unit == "rad/s"][:1]
+    rows = round(seconds / dt) + 1
+    return {angle: np.full(rows, np.pi)} | {rate: np.zeros(rows) for rate in rates}
