@@ -43,7 +43,9 @@ def _of_logs(findings: Findings, scene: Scene) -> Figure:
         times = np.arange(len(x), dtype=np.float64) * log.trial.dt
         curves.append(Curve(x, y, LOG_ROLES[k], log.trial.id, 1.5, times, trial=log.trial.id))
     equal = scene.spatial and len(set(scene.units)) == 1
-    panel = Panel(f"{y_name} over {x_name}", x_name, y_name, tuple(curves), equal=equal, kind="path")
+    panel = Panel(
+        f"{y_name} over {x_name}", x_name, y_name, tuple(curves), equal=equal, kind="path"
+    )
     return Figure("paths", "Paths", "Data that ran no candidate.", (panel,), legend([panel]))
 
 
