@@ -12,6 +12,7 @@ from grounded.diagnosis.report import Diagnosis, number
 from grounded.figures.figure import Bar, Bars, Curve, Figure, Panel, legend
 
 MOST = 12
+CREDIT_S = 1.0  # how far ahead an effect's worth is measured
 MODELS = {  # keys of a prediction error: role, name
     "crude": ("model", "model"),
     "calibrated": ("step2", "calibrated"),
@@ -24,7 +25,7 @@ def gap_figures(diagnosis: Diagnosis) -> list[Figure]:
     """The diagnosis in figures, what matters first; nothing where no cause is known."""
     if diagnosis.no_cause:
         return []
-    found = (accuracy_figure(diagnosis), credit_figure(diagnosis), where_figure(diagnosis))
+    found = (accuracy_figure(diagnosis), credit_figure(diagnosis, 6), where_figure(diagnosis))
     return [figure for figure in found if figure is not None]
 
 
@@ -75,13 +76,41 @@ def _by_channel(error: Any) -> list[Panel | Bars]:
     return panels
 
 
-def credit_figure(diagnosis: Diagnosis) -> Figure | None:
-    """How much of the improvement each effect, and calibration, deserves."""
+def credit_figure(diagnosis: Diagnosis, channels: int = 1) -> Figure | None:
+    """How much of the improvement each effect, and calibration, deserves.
+
+    Args:
+        diagnosis: what was found.
+        channels: so many states show by how much predictions are off without each, in their unit;
+            first those that predictions improved most.
+    """
     credit: Sequence[Any] = getattr(diagnosis, "credit", ())
     if not credit:
         return None
     bars = tuple(Bar(c.of, c.share, f"{100 * c.share:.0f} %") for c in credit[:MOST])
-    return Figure("credit", "Credit", "", (Bars("Share of what predictions gain", bars),))
+    panels = [Bars("Share of what predictions gain", bars)]
+    errors: Sequence[Any] = getattr(diagnosis, "prediction_error", ())
+    known = [e for e in errors if math.isclose(e.horizon_s, CREDIT_S, rel_tol=0.1)]
+    for name in _improved(known[0])[:channels] if known else ():
+        error, unit = known[0], known[0].unit_by_channel.get(name, "")
+        rows = [(MODELS["crude"], error.crude)]
+        rows += [(("limit", f"without {c.of}"), c.without_it) for c in credit[:MOST]]
+        rows += [(MODELS["with_effects"], error.with_effects)]
+        rows += [(MODELS["noise_floor"], error.noise_floor)]
+        found = [(look, values[name]) for look, values in rows if name in values]
+        bars = tuple(Bar(n, v, _with_unit(v, unit), role) for (role, n), v in found)
+        panels.append(Bars(f"{name}: error {error.horizon_s:g} s ahead", bars))
+    return Figure("credit", "What each is worth", "", tuple(panels))
+
+
+def _improved(error: Any) -> list[str]:
+    """The states by how much better they are predicted, most first."""
+    gain = {
+        name: error.crude[name] / max(after, 1e-300)
+        for name, after in error.with_effects.items()
+        if error.crude.get(name)
+    }
+    return sorted(gain, key=lambda name: -gain[name])
 
 
 def where_figure(diagnosis: Diagnosis) -> Figure | None:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import io
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from grounded.diagnosis.pictures import accuracy_figure, credit_figure
+from grounded.errors import GroundedError
 from grounded.experiments.pendulum import pendulum_task
 from grounded.figures.figure import (
     Band,
@@ -27,6 +30,8 @@ from grounded.rollout import simulate
 from grounded.search.first_policy import first_policy
 from grounded.search.planner import Planner
 from grounded.trial import Trial
+from grounded_trials.report.figures.gap import residual_figures
+from grounded_trials.report.figures.paths import path_figure
 from grounded_trials.report.figures.png import png
 from grounded_trials.report.figures.runs import all_figures, error_figure
 from grounded_trials.report.forecast import forecast, forecast_error
@@ -219,3 +224,78 @@ def test_what_is_cut_off_is_marked(cart):
     assert panel.note == "model’s policy is cut off: it reaches −490"
     assert panel.y_range[0] > -490
     assert plotted(panel)["layout"]["annotations"][0]["text"] == panel.note
+
+
+@pytest.mark.extra("report")
+def test_results_plot_what_the_page_shows(cart):
+    findings = gather(Folder(cart))
+    assert findings.diagnosis is not None and findings.best is not None
+    for result, titles in (
+        (findings.diagnosis, ("Prediction error 1 s ahead", "Share of the gap by channel")),
+        (findings.standing, ("Utility of each candidate", "Step size")),
+        (findings.best.candidate, ("x", "v", "force")),
+    ):
+        drawn = result.plot()
+        said = [note.text for note in drawn.layout.annotations]
+        for title in titles:
+            assert any(text.startswith(title) for text in said), (title, said)
+        assert len(drawn.data) >= len(titles)
+    traces = findings.best.candidate.plot().data
+    np.testing.assert_allclose(traces[0].y, findings.best.candidate.predicted_states[:, 0])
+
+
+def test_a_result_without_a_figure_says_so(cart):
+    nothing = replace(gather(Folder(cart)).standing, history=())
+    with pytest.raises(GroundedError, match="nothing to draw"):
+        nothing.plot()
+
+
+def test_the_worth_of_each_effect_is_drawn_in_the_unit_of_the_state():
+    channels = {"x": "m", "v": "m/s"}
+    row = SimpleNamespace(
+        horizon_s=1.0,
+        held_out="trials",
+        unit_by_channel=channels,
+        crude={"x": 0.2, "v": 0.5},
+        calibrated={"x": 0.1, "v": 0.4},
+        with_effects={"x": 0.1, "v": 0.05},
+        noise_floor={"x": 0.05, "v": 0.04},
+    )
+    credit = [SimpleNamespace(of="delay:u", share=0.9, without_it={"x": 0.15, "v": 0.4})]
+    found = SimpleNamespace(credit=credit, prediction_error=[row], gap=None)
+    figure = credit_figure(found)
+    assert figure is not None
+    share, worth = figure.panels
+    assert [bar.label for bar in share.bars] == ["delay:u"] and share.bars[0].value == 0.9
+    assert worth.title == "v: error 1 s ahead"  # what predictions improved most
+    assert [bar.value for bar in worth.bars] == [0.5, 0.4, 0.05, 0.04]
+    assert worth.bars[1].label == "without delay:u" and worth.bars[1].text == "0.4 m/s"
+    (x, v) = accuracy_figure(found).panels
+    assert [bar.value for bar in x.bars] == [0.2, 0.1, 0.1, 0.05] and "v" in v.title
+
+
+def test_the_residual_is_drawn_over_what_tells_most_of_it(cart):
+    findings = gather(Folder(cart))
+    over, rest = residual_figures(findings)
+    velocity = next(panel for panel in over.panels if panel.title.startswith("v:"))
+    points, line = velocity.curves
+    assert points.style == "points" and line.name.startswith("added by the model")
+    run = findings.best
+    assert run is not None and run.explained is not None
+    added = (run.residual - run.explained)[:, 1] / findings.task.dt
+    assert added.min() <= line.y.min() <= line.y.max() <= added.max()
+    assert all(len(panel.bands) == 1 for panel in rest.panels)
+    assert all(np.abs(c.y).max() <= 1.0 for panel in rest.panels for c in panel.curves)
+
+
+def test_a_crash_is_marked_where_it_happened(car):
+    findings = gather(Folder(car))
+    run = findings.runs[0]
+    states = run.trial.states.copy()
+    states[20:] = np.nan
+    short = replace(run, trial=replace(run.trial, states=states), utility=-np.inf)
+    figure = path_figure(replace(findings, runs=(short, *findings.runs[1:])))
+    assert figure is not None and "cross" in figure.caption
+    (cross,) = figure.panels[0].dots
+    x = findings.task.model.state_names.index("x")
+    assert cross.shape == "cross" and cross.x == states[19, x] and "0.95 s" in cross.note

@@ -102,7 +102,9 @@ def _panel(axes: Any, panel: Panel) -> None:
         _curve(axes, panel, curve)
     for dot in panel.dots:
         _dot(axes, panel, dot, up)
-    axes.set(xlabel=panel.x_name, ylabel=panel.y_name, xlim=across, ylim=up)
+    axes.set(xlabel=panel.x_name, ylabel=panel.y_name)
+    axes.set_xlim(across, auto=panel.equal)
+    axes.set_ylim(up, auto=panel.equal)
     if panel.equal:
         axes.set_aspect("equal", adjustable="datalim")
     if panel.whole:

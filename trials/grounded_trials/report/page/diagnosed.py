@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from grounded.diagnosis.pictures import accuracy_figure, where_figure
+from grounded.diagnosis.pictures import accuracy_figure, credit_figure, where_figure
 from grounded.diagnosis.report import ChannelParts, Diagnosis, Parts, Split
 from grounded_trials.report.diagnosis_words import (
     WHITE,
@@ -27,8 +27,10 @@ from grounded_trials.report.page.tables import (
     leftover_table,
     table,
 )
-from grounded_trials.wording import figure, percent, rendered, with_unit
+from grounded_trials.wording import figure, percent, rendered
 from grounded_trials.workspace.next_step import DIAGNOSE, Since
+
+MOST = 6  # states whose error without each effect is drawn
 
 
 def gap_section(findings: Findings) -> list[Block]:
@@ -43,7 +45,9 @@ def gap_section(findings: Findings) -> list[Block]:
     verdict = Block("verdict", lines=verdict_lines(diagnosis, findings.since))
     if diagnosis.no_cause:  # with too little data, what was fitted is no finding
         return [verdict, *ahead, *forecast_table(findings), *lacking]
-    proof = [*drawn(accuracy_figure(diagnosis), title=True), *ahead, *forecast_table(findings)]
+    proof = drawn(accuracy_figure(diagnosis), title=True)
+    proof += drawn(credit_figure(diagnosis, MOST), title=True)
+    proof += [*ahead, *forecast_table(findings)]
     return [verdict, *proof, *lacking, *_details(diagnosis, findings.since)]
 
 
@@ -157,20 +161,6 @@ def _rest(diagnosis: Diagnosis) -> list[Block]:
         Block("text", f"{_begun(whiteness_sentence(whiteness))}."),
         table("whiteness", ("state", "p (white noise)", "what is left "), rows),
     ]
-
-
-def credit_lines(diagnosis: Diagnosis) -> list[str]:
-    """What predictions would lose without each effect, in the states' units."""
-    found: Sequence[Any] = getattr(diagnosis, "credit", ())
-    errors: Sequence[Any] = getattr(diagnosis, "prediction_error", ())
-    units = errors[0].unit_by_channel if errors else {}
-    lines = []
-    for one in found:
-        without = getattr(one, "without_it", None) or {}
-        parts = [f"{n} {with_unit(figure(v, 2), units.get(n, ''))}" for n, v in without.items()]
-        if parts:
-            lines.append(f"Without {one.of} predictions are off by {', '.join(parts)}.")
-    return lines
 
 
 def _begun(sentence: str) -> str:

@@ -32,7 +32,6 @@ from grounded_trials.report.figures.runs import (
 )
 from grounded_trials.report.findings import Findings, improvements_in
 from grounded_trials.report.page.diagnosed import (
-    credit_lines,
     gap_section,
     preflight,
     verdict_lines,
@@ -47,7 +46,7 @@ from grounded_trials.report.page.tables import (
 )
 from grounded_trials.wording import count, figure
 
-LINES = 3  # of the verdict, at the top
+LINES = 2  # of the verdict, at the top
 OPEN = 12  # candidates whose table is open
 
 
@@ -197,14 +196,14 @@ def _why(findings: Findings) -> dict[str, Any]:
     if diagnosis is None:
         return {}
     before = {} if findings.since.changed else findings.values
-    named = ("parameters", "error", "rest")
+    credit = credit_figure(diagnosis)
+    named = ("rest",) if credit else ("parameters", "error", "rest")
     lines = [(title, text) for title, text in error_lines(diagnosis, before) if title in named]
     return {
         "verdict": verdict_lines(diagnosis, findings.since, LINES),
         "preflight": preflight(diagnosis),
         "lines": lines,
-        "credit": credit_figure(diagnosis),
-        "without": credit_lines(diagnosis),
+        "credit": credit,
     }
 
 
