@@ -18,11 +18,13 @@ from grounded.compile import Named
 from grounded.effects import (
     Effect,
     InputFamily,
+    LossFamily,
     MemoryFamily,
     RateFamily,
     SensorDelayFamily,
     SensorFamily,
 )
+from grounded.effects.family import coupled
 from grounded.effects.registry import partner
 from grounded.frozen import Array
 from grounded.model import Model
@@ -139,6 +141,13 @@ class _Run:
         s, a = Named("state", self.names, list(x)), Named("input", model.input_names, list(u))
         assert model.derivative is not None
         own = dict(model.derivative(s, a, self.p))
+        for effect, values in self.truth.effects:
+            if isinstance(effect.family, LossFamily):
+                tau, w = coupled(effect.site)
+                lost = effect.family.torque(s[w], own[w], a[tau], values)
+                left = [a[n] - lost if n == tau else a[n] for n in model.input_names]
+                a = Named("input", model.input_names, left)
+                own = dict(model.derivative(s, a, self.p))
         total = {n: float(own[n]) for n in self.names}
         for effect, values in self.truth.effects:
             if isinstance(effect.family, RateFamily):

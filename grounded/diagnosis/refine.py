@@ -132,7 +132,7 @@ def _room(data: Data, h: Hypothesis, k: int, size: int) -> tuple[Array, Array]:
         which = calibrated(data)
         shift = np.zeros(data.model.system.k) if h.shift is None else h.shift
         lowest, highest = _bounds(data)
-        at, unit = data.model.values + shift, param_scale(data.model)
+        at, unit = data.model.values + shift, np.maximum(param_scale(data.model), 1e-300)
         low[k:] = np.minimum((lowest - at) / unit, 0.0)[which]
         high[k:] = np.maximum((highest - at) / unit, 0.0)[which]
     return low, high
@@ -154,12 +154,14 @@ def _inside(data: Data, shift: Array) -> Array:
 
 
 def _bounds(data: Data) -> tuple[Array, Array]:
-    """Bounds of the model's parameters, (k,) each; positive ones stay positive."""
-    values = data.model.values
-    low = [-np.inf if p.low is None else p.low for p in data.model.params.values()]
-    high = [np.inf if p.high is None else p.high for p in data.model.params.values()]
-    low = [max(b, 0.2 * v) if v > 0 else b for b, v in zip(low, values, strict=True)]
-    high = [min(b, 0.2 * v) if v < 0 else b for b, v in zip(high, values, strict=True)]
+    """Bounds of the model's parameters, (k,) each; where none is given the sign stays."""
+    params = data.model.params.values()
+    low = [
+        p.low if p.low is not None else 0.2 * p.value if p.value > 0 else -np.inf for p in params
+    ]
+    high = [
+        p.high if p.high is not None else 0.2 * p.value if p.value < 0 else np.inf for p in params
+    ]
     return np.array(low), np.array(high)
 
 

@@ -162,9 +162,9 @@ class RunChange(Change):
 
 @dataclass(frozen=True, eq=False)
 class Gap(Document):
-    """The prediction error over a horizon, without the effects and with them, and the noise's.
+    """The prediction error in units of the noise that one diagnosis estimates, before and after.
 
-    `without_effects` keeps the parameters that were calibrated beside the effects.
+    Figures of two diagnoses don't compare; verdicts rest on `prediction_error`, not on these.
     """
 
     horizon_s: float = math.nan
@@ -174,7 +174,6 @@ class Gap(Document):
     floor: float = math.nan
     held_out: bool = False
     channels: Mapping[str, Change] = field(default_factory=dict)
-    without_effects: float = field(default=math.nan, metadata=BRIEF)
 
     @property
     def measured(self) -> bool:
@@ -195,19 +194,78 @@ class UtilityPrediction(Document):
 
 
 @dataclass(frozen=True, eq=False)
+class RulerRow(Document):
+    """Rms errors of held-out open-loop predictions over one horizon, by channel in its unit.
+
+    held_out: by "trials", by "pieces" of one long log, or "no" where there is too little.
+    calibrated: with the model's own parameters fitted; empty where none may move.
+    floor_from: "repeats" of a manoeuvre, or the "short horizon", whose noise is carried on.
+    """
+
+    horizon_s: float
+    whole_trial: bool = False
+    unit_by_channel: Mapping[str, str] = field(default_factory=dict)
+    held_out: str = "trials"
+    crude: Mapping[str, float] = field(default_factory=dict)
+    calibrated: Mapping[str, float] = field(default_factory=dict)
+    with_effects: Mapping[str, float] = field(default_factory=dict)
+    noise_floor: Mapping[str, float] = field(default_factory=dict)
+    floor_from: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Credit(Document):
+    """What an effect, or the "calibration", is worth: what predictions lose without it.
+
+    share: of what predictions gain in all, by the logarithm of their errors, over channels and
+    horizons; without_it: rms by channel, 1 s ahead, all the rest fitted again.
+    """
+
+    of: str
+    share: float = math.nan
+    without_it: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
 class Remainder(Document):
-    """A leftover that no known effect explains: a state's missing rate, rms."""
+    """A leftover that no known effect explains.
+
+    size: rms of the rate that a state lacks, where a flexible model finds one [unit of the state
+    per second]; error: rms of predictions `horizon_s` ahead, which noise alone leaves at `floor`.
+    """
 
     channel: str
     size: float = math.nan
     unit: str = ""
     evidence: float = math.nan  # [nats]
     region: Region | None = None  # that holds most of it
+    error: float = math.nan
+    floor: float = math.nan
+    horizon_s: float = math.nan
+    error_unit: str = ""
 
     def sentence(self) -> str:
         """One clause."""
         where = "" if self.region is None else f", mostly where {self.region.when}"
-        return f"{self.channel} is off by {number(self.size)} {self.unit} rms{where}"
+        if not math.isfinite(self.error):
+            return f"{self.channel} is off by {number(self.size)} {self.unit} rms{where}"
+        noise = f" ({number(self.floor)} is noise)" if math.isfinite(self.floor) else ""
+        unit = "" if self.error_unit == "1" else f" {self.error_unit}"
+        ahead = f"{number(self.horizon_s)} s ahead"
+        return f"{self.channel} is still off by {number(self.error)}{unit} {ahead}{noise}{where}"
+
+
+@dataclass(frozen=True, eq=False)
+class Identifiable(Document):
+    """How well the trials tell one uncertain parameter, all others free.
+
+    left: of its prior standard deviation `prior`, 0 to 1.
+    """
+
+    parameter: str
+    verdict: str  # identifiable, weak, not identifiable
+    prior: float = math.nan
+    left: float = math.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,6 +314,9 @@ class Diagnosis(Document):
     unknowable: tuple[str, ...] = ()  # what the trials are too few or too quiet for
     noise: NoiseLevels = field(default_factory=NoiseLevels)
     parameters: Mapping[str, Estimate] = field(default_factory=dict)  # calibrated beside effects
+    identifiable: tuple[Identifiable, ...] = ()  # each uncertain parameter
+    prediction_error: tuple[RulerRow, ...] = ()  # by horizon, the whole trial last
+    credit: tuple[Credit, ...] = ()  # largest first
     trials: int = 0
     steps: int = 0
     candidates: int = 0
@@ -301,6 +362,12 @@ class Diagnosis(Document):
         """An effect's quantities, fixed ones included; none where it was not weighed."""
         row = self.ranked(effect)
         return {} if row is None else row.values
+
+    @property
+    def known_parameters(self) -> dict[str, Estimate]:
+        """The calibrated parameters that the trials identify: what may be adopted."""
+        lost = {i.parameter for i in self.identifiable if i.verdict == "not identifiable"}
+        return {name: e for name, e in self.parameters.items() if name not in lost}
 
     def open(self, adopted: Iterable[Mapping[str, Any]]) -> tuple[str, ...]:
         """The claimed effects that the model with these adopted ones lacks as it did then."""

@@ -18,7 +18,7 @@ it are held; directions of which the data say nothing are not moved.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -36,6 +36,10 @@ from grounded.model import Model
 
 Latency = Literal["known", "common", "each"]
 LONGEST = 0.5  # [s] no latency is sought beyond
+STDS = 3.0  # prior standard deviations that a parameter without bounds may move
+BOUNDS = (
+    "what may move has bounds, Param(value, unit, low, high), or a prior, Param(value, unit, std=s)"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +73,16 @@ class Unknowns:
             latency[list(inputs)] = value
         return p, latency
 
+    def less(self, index: int) -> Unknowns:
+        """The same without one unknown, which stays at its start."""
+        kept = np.delete(np.arange(self.k), index)
+        names, units = (tuple(each[i] for i in kept) for each in (self.names, self.units))
+        columns = tuple(c for i, c in enumerate(self.columns) if i != index)
+        first = len(self.columns)
+        delayed = tuple(d for i, d in enumerate(self.delayed, first) if i != index)
+        arrays = {key: getattr(self, key)[kept] for key in ("start", "low", "high", "scale")}
+        return replace(self, names=names, units=units, columns=columns, delayed=delayed, **arrays)
+
     def clipped(self, theta: Array) -> Array:
         """Theta within the bounds."""
         return np.asarray(np.clip(theta, self.low, self.high))
@@ -81,20 +95,22 @@ def unknowns_of(
 
     Args:
         model: gives values and bounds.
-        names: parameters to fit; None: all.
+        names: parameters to fit; None: all uncertain ones.
         latency: of each input [s], known or where to begin, (m,).
         fit_latency: "known" (not fitted), "common" (one for all inputs), or "each".
 
     Raises:
-        GroundedError: for a name that is not a parameter, or nothing to fit.
+        GroundedError: for a name that is not an uncertain parameter, or nothing to fit.
     """
-    names = model.param_names if names is None else tuple(names)
+    names = model.uncertain if names is None else tuple(names)
     for name in names:
         if name not in model.params:
             raise GroundedError(
                 f"'{name}' is not a parameter of model '{model.name}': "
                 + nearest(name, model.params)
             )
+        if not model.params[name].uncertain:
+            raise GroundedError(f"'{name}' is a constant of model '{model.name}': {BOUNDS}")
     if fit_latency not in ("known", "common", "each"):
         raise GroundedError(f"fit_latency must be known, common or each, got '{fit_latency}'")
     params = [model.params[name] for name in names]
@@ -108,9 +124,11 @@ def unknowns_of(
     if fit_latency == "each":
         labels = [f"latency:{name}" for name in model.input_names]
     if not names and not labels:
-        raise GroundedError(f"model '{model.name}' has no parameter to fit")
-    low = [-np.inf if p.low is None else p.low for p in params] + [0.0] * len(delayed)
-    high = [np.inf if p.high is None else p.high for p in params] + [LONGEST] * len(delayed)
+        raise GroundedError(f"model '{model.name}' has no uncertain parameter to fit: {BOUNDS}")
+    far = [np.inf if p.std is None else STDS * p.std for p in params]  # where no bound is given
+    low = [p.value - f if p.low is None else p.low for p, f in zip(params, far, strict=True)]
+    high = [p.value + f if p.high is None else p.high for p, f in zip(params, far, strict=True)]
+    low, high = low + [0.0] * len(delayed), high + [LONGEST] * len(delayed)
     start = [p.value for p in params] + [float(latency[inputs[0]]) for inputs in delayed]
     width = np.array(high) - np.array(low)
     size = np.maximum(np.abs(start), 1e-3)

@@ -63,7 +63,7 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
     _check(names, [row.effect for row in found.ranking], workspace, before)
     claimed = _claimed(found, names)
     adopted: list[Effect] = [dict(effect) for effect in workspace.config.model.effects]
-    calibrated = found.parameters if parameters and claimed else {}
+    calibrated = found.known_parameters if parameters and claimed else {}
     params = {key: _rounded(estimate.value) for key, estimate in calibrated.items()}
     for name in names:
         values = {key: _rounded(value) for key, value in found.values(name).items()}
@@ -187,5 +187,5 @@ def _new(diagnosis: Diagnosis | None, adopted: set[str]) -> list[Effect]:
 def _parameters(workspace: Folder, diagnosis: Diagnosis | None) -> dict[str, float]:
     """The model's parameters as the diagnosis estimated them; its own names only."""
     known = workspace.task.model.params
-    found = diagnosis.parameters if diagnosis is not None else {}
+    found = diagnosis.known_parameters if diagnosis is not None else {}
     return {n: e.value for n, e in found.items() if n in known and e.value == e.value}
