@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
-from grounded.diagnosis.report import Diagnosis, number
+from grounded.diagnosis.report import Diagnosis, RulerRow, number
 from grounded.figures.figure import Bar, Bars, Curve, Figure, Panel, legend
 
 MOST = 12
@@ -31,7 +30,7 @@ def gap_figures(diagnosis: Diagnosis) -> list[Figure]:
 
 def accuracy_figure(diagnosis: Diagnosis) -> Figure | None:
     """How far predictions are off without the diagnosis and with it, in each state's unit."""
-    errors: Sequence[Any] = getattr(diagnosis, "prediction_error", ())
+    errors = diagnosis.prediction_error
     if not errors:
         panels: list[Panel | Bars] = [_shrinkage(diagnosis)] if diagnosis.gap.measured else []
         held = diagnosis.gap.held_out
@@ -46,15 +45,15 @@ def accuracy_figure(diagnosis: Diagnosis) -> Figure | None:
     return Figure("accuracy", "Predictions before and after", caption, tuple(panels), key)
 
 
-def _over_horizons(errors: Sequence[Any]) -> list[Panel | Bars]:
+def _over_horizons(errors: Sequence[RulerRow]) -> list[Panel | Bars]:
     """A panel a state: its error by how far ahead is predicted."""
-    units: Mapping[str, str] = errors[0].unit_by_channel
+    units = errors[0].unit_by_channel
     panels: list[Panel | Bars] = []
     ahead = np.array([error.horizon_s for error in errors])
     for channel, unit in units.items():
         curves = []
         for key, (role, name) in MODELS.items():
-            values = [(getattr(e, key, None) or {}).get(channel, math.nan) for e in errors]
+            values = [getattr(e, key).get(channel, math.nan) for e in errors]
             if np.isfinite(values).any():
                 curves.append(Curve(ahead, np.array(values, float), role, name, 2.0))
         if curves:
@@ -63,12 +62,12 @@ def _over_horizons(errors: Sequence[Any]) -> list[Panel | Bars]:
     return panels
 
 
-def _by_channel(error: Any) -> list[Panel | Bars]:
+def _by_channel(error: RulerRow) -> list[Panel | Bars]:
     panels: list[Panel | Bars] = []
     for channel, unit in error.unit_by_channel.items():
         bars = []
         for key, (role, name) in MODELS.items():
-            value = (getattr(error, key, None) or {}).get(channel, math.nan)
+            value = getattr(error, key).get(channel, math.nan)
             if math.isfinite(value):
                 bars.append(Bar(name, value, _with_unit(value, unit), role))
         if bars:
@@ -84,13 +83,14 @@ def credit_figure(diagnosis: Diagnosis, channels: int = 1) -> Figure | None:
         channels: so many states show by how much predictions are off without each, in their unit;
             first those that predictions improved most.
     """
-    credit: Sequence[Any] = getattr(diagnosis, "credit", ())
+    credit = diagnosis.credit
     if not credit:
         return None
     bars = tuple(Bar(c.of, c.share, f"{100 * c.share:.0f} %") for c in credit[:MOST])
     panels = [Bars("Share of what predictions gain", bars)]
-    errors: Sequence[Any] = getattr(diagnosis, "prediction_error", ())
-    known = [e for e in errors if math.isclose(e.horizon_s, CREDIT_S, rel_tol=0.1)]
+    known = [
+        e for e in diagnosis.prediction_error if math.isclose(e.horizon_s, CREDIT_S, rel_tol=0.1)
+    ]
     for name in _improved(known[0])[:channels] if known else ():
         error, unit = known[0], known[0].unit_by_channel.get(name, "")
         rows = [(MODELS["crude"], error.crude)]
@@ -103,7 +103,7 @@ def credit_figure(diagnosis: Diagnosis, channels: int = 1) -> Figure | None:
     return Figure("credit", "What each is worth", "", tuple(panels))
 
 
-def _improved(error: Any) -> list[str]:
+def _improved(error: RulerRow) -> list[str]:
     """The states by how much better they are predicted, most first."""
     gain = {
         name: error.crude[name] / max(after, 1e-300)

@@ -53,9 +53,10 @@ def plotted(panel: Panel | Bars, axis: str = "") -> dict[str, Any]:
     if isinstance(panel, Bars):
         return _bars(panel, axis)
     data = [_curve(panel, curve) for curve in panel.curves]
-    for role, shape, error in dict.fromkeys((d.role, d.shape, d.error > 0) for d in panel.dots):
-        same = [d for d in panel.dots if (d.role, d.shape, d.error > 0) == (role, shape, error)]
-        data.append(_dots(panel, same))
+    looks: dict[tuple[Any, ...], list[Dot]] = {}
+    for dot in panel.dots:
+        looks.setdefault((dot.role, dot.shape, dot.error > 0, dot.trial), []).append(dot)
+    data += [_dots(panel, same) for same in looks.values()]
     for trace in data:
         trace |= {"xaxis": f"x{axis}", "yaxis": f"y{axis}"}
     (left, right), (low, high) = panel.ranges()
@@ -93,15 +94,11 @@ def _curve(panel: Panel, curve: Curve) -> dict[str, Any]:
     most = MOST if near else CONTEXT
     index = thinned(curve.x, curve.y, most)
     trace: dict[str, Any] = {
-        "type": "scatter",
-        "x": curve.x[index],
-        "y": panel.height(curve.y[index]),
-        "mode": "lines",
-        "name": curve.name,
-        "line": {"color": f"@{curve.role}", "width": curve.width},
+        "type": "scatter", "mode": "lines", "x": curve.x[index], "y": panel.height(curve.y[index]),
+        "name": curve.name, "line": {"color": f"@{curve.role}", "width": curve.width},
         "meta": {"role": curve.role, "trial": curve.trial, "style": curve.style},
         "hovertemplate": "%{y:.5g}",
-    }
+    }  # fmt: skip
     if curve.role in DASHES:
         trace["line"]["dash"] = " ".join(f"{v:g}px" for v in DASHES[curve.role]).replace(" ", ",")
     if curve.times is not None:
@@ -131,51 +128,32 @@ def _dots(panel: Panel, dots: Sequence[Dot]) -> dict[str, Any]:
     low, high = panel.ranges()[1]
     y = np.where(np.isfinite(heights), heights, low + 0.04 * (high - low))
     one = dots[0]
+    size, width = (9, 1.5) if one.shape in ("disc", "ring") else (11, 2.5)
+    colour = f"@{one.role}"
+    line = {"color": colour, "width": width}
     trace = {
-        "type": "scatter",
-        "mode": "markers",
-        "x": np.array([d.x for d in dots]),
-        "y": y,
-        "text": [d.note.replace("\n", "<br>") for d in dots],
-        "hovertemplate": "%{text}",
-        "name": "",
-        "marker": {
-            "symbol": SYMBOLS[one.shape],
-            "color": f"@{one.role}",
-            "size": 9 if one.shape in ("disc", "ring") else 11,
-            "line": {"color": f"@{one.role}", "width": 1.5 if one.shape == "ring" else 2.5},
-        },
-        "meta": {"role": one.role, "trial": one.trial, "style": one.shape},
+        "type": "scatter", "mode": "markers", "x": np.array([d.x for d in dots]), "y": y,
+        "text": [d.note.replace("\n", "<br>") for d in dots], "hovertemplate": "%{text}",
+        "name": "", "meta": {"role": one.role, "trial": one.trial, "style": one.shape},
+        "marker": {"symbol": SYMBOLS[one.shape], "color": colour, "size": size, "line": line},
         "cliponaxis": False,
-    }
+    }  # fmt: skip
     if one.error > 0:
         ends = [(panel.height(d.y + d.error), panel.height(d.y - d.error)) for d in dots]
         up, down = np.array(ends, float).T
         trace["error_y"] = {
-            "type": "data",
-            "symmetric": False,
-            "array": np.abs(up - y),
-            "arrayminus": np.abs(y - down),
-            "color": f"@{one.role}",
-            "thickness": 1.2,
-            "width": 0,
-        }
+            "type": "data", "symmetric": False, "array": np.abs(up - y),
+            "arrayminus": np.abs(y - down), "color": colour, "thickness": 1.2, "width": 0,
+        }  # fmt: skip
     return trace
 
 
 def _flat(panel: Panel, low: float, high: float, axis: str) -> dict[str, Any]:
     bottom, top = (float(panel.height(v)) for v in (low, high))
     return {
-        "type": "rect",
-        "xref": f"x{axis} domain",
-        "yref": f"y{axis}",
-        "x0": 0,
-        "x1": 1,
-        "y0": bottom,
-        "y1": top,
-        "line": {"width": 0},
-        "layer": "below",
-    }
+        "type": "rect", "xref": f"x{axis} domain", "yref": f"y{axis}", "x0": 0, "x1": 1,
+        "y0": bottom, "y1": top, "line": {"width": 0}, "layer": "below",
+    }  # fmt: skip
 
 
 def _line(panel: Panel, y: float, role: str, axis: str) -> dict[str, Any]:
@@ -186,16 +164,9 @@ def _line(panel: Panel, y: float, role: str, axis: str) -> dict[str, Any]:
 
 def _note(text: str, axis: str) -> dict[str, Any]:
     return {
-        "text": text,
-        "xref": f"x{axis} domain",
-        "yref": f"y{axis} domain",
-        "x": 1,
-        "y": 1,
-        "xanchor": "right",
-        "yanchor": "top",
-        "showarrow": False,
-        "font": {"size": FONT - 1},
-    }
+        "text": text, "xref": f"x{axis} domain", "yref": f"y{axis} domain", "x": 1, "y": 1,
+        "xanchor": "right", "yanchor": "top", "showarrow": False, "font": {"size": FONT - 1},
+    }  # fmt: skip
 
 
 def _bars(panel: Bars, axis: str) -> dict[str, Any]:

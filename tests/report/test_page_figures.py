@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from grounded.diagnosis.pictures import accuracy_figure, credit_figure
+from grounded.diagnosis.report import Credit, Diagnosis, RulerRow, Verdict
 from grounded.errors import GroundedError
 from grounded.experiments.pendulum import pendulum_task
 from grounded.figures.figure import (
@@ -252,7 +252,7 @@ def test_a_result_without_a_figure_says_so(cart):
 
 def test_the_worth_of_each_effect_is_drawn_in_the_unit_of_the_state():
     channels = {"x": "m", "v": "m/s"}
-    row = SimpleNamespace(
+    row = RulerRow(
         horizon_s=1.0,
         held_out="trials",
         unit_by_channel=channels,
@@ -261,8 +261,8 @@ def test_the_worth_of_each_effect_is_drawn_in_the_unit_of_the_state():
         with_effects={"x": 0.1, "v": 0.05},
         noise_floor={"x": 0.05, "v": 0.04},
     )
-    credit = [SimpleNamespace(of="delay:u", share=0.9, without_it={"x": 0.15, "v": 0.4})]
-    found = SimpleNamespace(credit=credit, prediction_error=[row], gap=None)
+    credit = (Credit("delay:u", share=0.9, without_it={"x": 0.15, "v": 0.4}),)
+    found = Diagnosis(Verdict("effect"), credit=credit, prediction_error=(row,))
     figure = credit_figure(found)
     assert figure is not None
     share, worth = figure.panels

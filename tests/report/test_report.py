@@ -252,7 +252,7 @@ def test_a_workspace_of_data_only_shows_the_model_against_the_data(cart, tmp_pat
         assert grounded("-C", folder, "ingest", path, "--data").code == 0
     done = grounded("-C", folder, "report", "--html", "--png", "--rrd", "--json")
     assert done.code == 0, done.err
-    names = ["data-t0001", "data-t0002", "residual", "autocorrelation"]
+    names = ["paths", "data-t0001", "data-t0002", "residual", "autocorrelation"]
     assert [Path(p).stem for p in done.json["paths"]["png"]] == names
     assert "t0001, crude" in Path(done.json["paths"]["html"]).read_text()
     out = grounded("-C", folder, "report").out

@@ -89,6 +89,7 @@ def _bars(axes: Any, panel: Bars) -> None:
     axes.xaxis.set_visible(False)
     axes.grid(False)
     axes.tick_params(left=False)
+    axes.spines["bottom"].set_visible(False)
 
 
 def _panel(axes: Any, panel: Panel) -> None:
