@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from grounded.figures.figure import WIDTHS, Curve, Dot, Figure, Panel, enlarging, fitted, legend
+from grounded.figures.figure import WIDTHS, Curve, Dot, Figure, Panel, enlarging, legend
 from grounded.frozen import Array
 from grounded_trials.report.findings import Findings, Log, Run, compared, tracked, tracking_error
 from grounded_trials.report.scene import Scene, scene_of
@@ -14,7 +14,7 @@ OTHERS = 60  # runs that are drawn behind the compared ones
 LOGS = 4  # that are drawn where there is no run
 LOG_ROLES = ("best", "model", "accepted", "limit")
 SEEN = 5.0  # the least factor that shows more than the paths themselves
-FAR = 4.0  # times the size of the picture: what lies further off is not drawn
+FAR = 0.4  # of the desired path's size: enlarged deviations beyond it are not drawn
 
 
 def path_figure(findings: Findings) -> Figure | None:
@@ -136,9 +136,7 @@ def _enlarged(findings: Findings, scene: Scene) -> list[Panel]:
         curves.append(Curve(path[:, 0], path[:, 1], role, name, width))
     x_name, y_name, *_ = (labelled(*one) for one in zip(scene.names, scene.units, strict=True))
     title = f"Deviations {factor:g} times as large"
-    room = 0.2 * np.ptp(desired[:, 1])
-    bounds = fitted([desired[:, 1], desired[:, 1] + room, desired[:, 1] - room])
-    return [Panel(title, x_name, y_name, tuple(curves), equal=True, kind="path", y_range=bounds)]
+    return [Panel(title, x_name, y_name, tuple(curves), equal=True, kind="path")]
 
 
 def _shaded(findings: Findings, scene: Scene) -> list[Panel]:
