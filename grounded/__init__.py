@@ -13,7 +13,7 @@ ICML 2006; start reading in `grounded.search.improve`. The files of this folder 
 model, task, utility    the crude model, the manoeuvre, its quadratic reward
 trial, rollout, plant   a real run, a simulated one, a simulated real system
 policy, onboard         what a robot runs, and the one file that runs it with numpy alone
-result, errors, frozen  what results, mistakes and arrays have in common
+result, errors, frozen  what results, mistakes and arrays have in common; `figures`, what they show
 
 Its rooms, from the paper's loop down:
 

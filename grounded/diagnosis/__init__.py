@@ -17,5 +17,5 @@ the question "which effect?". Below them lie, from the data upwards
     ruler, decide, measured     held-out errors in units; they decide; what they say of the decision
     prediction_error, split     where the gap lies, and what the error is made of
     limits, excitation    what the data can't tell; the trial that would
-    verdict               the same in words
+    verdict, pictures     the same in words; in figures
 """

@@ -7,12 +7,15 @@ of `diagnose --json` and `from_json` reads it back, an older one too.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from grounded.instruments.finding import Finding
 from grounded.result import Document
+
+if TYPE_CHECKING:
+    from grounded.figures.figure import Figure
 
 BRIEF: dict[str, Any] = {"brief": True}  # a field whose key is left out where there is nothing
 
@@ -399,6 +402,12 @@ class Diagnosis(Document):
         named = ", ".join(self.effects) or "no effect"
         gap = f"{number(self.gap.before)} -> {number(self.gap.after)}"
         return f"Diagnosis({self.kind}: {named}; gap {gap}; {self.trials} trials)"
+
+    def figures(self) -> Sequence[Figure]:
+        """Predictions before and after, the credit, where the gap lies."""
+        from grounded.diagnosis.pictures import gap_figures
+
+        return gap_figures(self)
 
     @property
     def kind(self) -> str:

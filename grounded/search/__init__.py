@@ -5,5 +5,5 @@ it. `making.py` makes a `candidate.py`, by slopes that earlier trials have corre
 `standing.py` says where the search stands and why it ended, `certainty.py` how sure an improvement
 is, `step_size.py` how far to go (damping, alpha), `first_policy.py` where it starts (DDP from many
 runs, the first of them by `first_guess.py`), `planner.py` by which model it plans, `safety.py` what
-may be handed out.
+may be handed out; `pictures.py` draws it.
 """

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -18,6 +19,9 @@ Way = Literal[
     "gentler gains",  # the model's own plan with gains designed more gently, see `rivals`
     "own plan",  # of a model that was changed since the incumbent was planned, see `rivals`
 ]
+
+if TYPE_CHECKING:
+    from grounded.figures.figure import Figure
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -53,6 +57,12 @@ class Candidate(Result):
             base=self.base or None,
             predicted_utility=self.predicted_utility,
         )
+
+    def figures(self) -> Sequence[Figure]:
+        """What the model predicts."""
+        from grounded.search.pictures import candidate_figure
+
+        return (candidate_figure(self),)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

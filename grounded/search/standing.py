@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -29,6 +29,9 @@ from grounded.search.certainty import in_doubt, last_improvement, repeated_exact
 from grounded.search.step_size import Step, after_failure, after_success
 from grounded.task import Task
 from grounded.trial import Trial
+
+if TYPE_CHECKING:
+    from grounded.figures.figure import Figure
 
 Phase = Literal["propose", "await-trial", "converged", "stopped"]
 Ending = Literal[
@@ -170,6 +173,13 @@ class Standing(Result):
             certainty=last_improvement(self.history),
             history=[t.to_json() | {"verdict": t.verdict(t is last)} for t in self.history],
         )
+
+    def figures(self) -> Sequence[Figure]:
+        """Utility by candidate, and the step sizes."""
+        from grounded.search.pictures import search_figure
+
+        found = search_figure(self)
+        return () if found is None else (found,)
 
 
 def standing(

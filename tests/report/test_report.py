@@ -253,7 +253,7 @@ def test_nothing_heavy_is_imported_for_text(cart):
         "from grounded_cli.main import main\n"
         "try: main()\n"
         "except SystemExit: pass\n"
-        "heavy = {'rerun', 'PIL', 'matplotlib', 'scipy.optimize'} & set(sys.modules)\n"
+        "heavy = {'rerun', 'plotly', 'jinja2', 'matplotlib', 'scipy.optimize'} & set(sys.modules)\n"
         "print(heavy, file=sys.stderr); sys.exit(bool(heavy))"
     )
     done = subprocess.run([sys.executable, "-c", script, str(cart)], capture_output=True, text=True)
@@ -268,7 +268,8 @@ def test_a_workspace_of_data_only_shows_the_model_against_the_data(cart, tmp_pat
         assert grounded("-C", folder, "ingest", path, "--data").code == 0
     done = grounded("-C", folder, "report", "--html", "--png", "--rrd", "--json")
     assert done.code == 0, done.err
-    assert [Path(p).name for p in done.json["paths"]["png"]] == ["data-t0001.png", "data-t0002.png"]
+    names = ["paths", "data-t0001", "data-t0002", "residual", "autocorrelation"]
+    assert [Path(p).stem for p in done.json["paths"]["png"]] == names
     assert "t0001, crude" in Path(done.json["paths"]["html"]).read_text()
     out = grounded("-C", folder, "report").out
     assert "2 logs of data" in out and "error of the crude model 1 s ahead" in out

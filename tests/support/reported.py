@@ -162,6 +162,5 @@ def many_flights(trials: int = 50) -> Findings:
         lost=(),
         diagnosis=None,
         optimum=None,
-        noise=float("nan"),
         then=NextCommand("propose"),
     )

@@ -13,7 +13,7 @@ frozen result whose `to_json()` is the document that the command prints with --j
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -374,7 +374,9 @@ class Workspace(Folder):
         from grounded_trials.report import reporting
         from grounded_trials.report.gathering import gather
 
-        for asked, module, extra in ((png, "PIL", "png"), (rrd, "rerun", "view")):
+        known = {"jinja2": (html, "report"), "plotly": (html, "report")}
+        known |= {"matplotlib": (png, "png"), "rerun": (rrd, "view")}
+        for module, (asked, extra) in known.items():
             if asked:
                 needs(module, extra)
         findings, paths = gather(self._afresh()), []
@@ -385,6 +387,28 @@ class Workspace(Folder):
         if rrd:
             paths.append(reporting.save_recording(self, findings))
         return reporting.Report(findings, tuple(paths))
+
+    def watch(
+        self, *, every: float = 1.0, trouble: Callable[[GroundedError], None] = lambda error: None
+    ) -> Iterator[Report]:
+        """Keeps reports/report.html current while trials come in; open in a browser, it reloads.
+
+        Args:
+            every: how often the files are looked at [s].
+            trouble: told what keeps the page from being written for now.
+
+        Yields:
+            A report each time that the page was written; it ends when it is no longer asked.
+
+        Raises:
+            GroundedError: if the extra `report` is missing.
+        """
+        from grounded.errors import needs
+        from grounded_trials.report.reporting import watched
+
+        for module in ("jinja2", "plotly"):
+            needs(module, "report")
+        return watched(self, every, trouble)
 
     def export(
         self,

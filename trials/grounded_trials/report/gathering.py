@@ -15,7 +15,6 @@ import numpy as np
 from grounded.diagnosis.report import Diagnosis
 from grounded.errors import GroundedError
 from grounded.frozen import Array
-from grounded.search.certainty import utility_noise
 from grounded.search.planner import Planner
 from grounded.search.standing import Standing
 from grounded.solve.bias import residuals
@@ -60,7 +59,6 @@ def gather(workspace: Folder) -> Findings:
         lost=tuple(lost),
         diagnosis=diagnosis,
         optimum=_optimum(workspace.reports),
-        noise=utility_noise(now.history)[0],
         then=next_command(workspace, now, diagnosis, usable),
         better=better,
         since=since_diagnosis(workspace, diagnosis, usable) if diagnosis else Since(),
@@ -79,8 +77,9 @@ def _standing(workspace: Folder, contents: Contents) -> Standing:
 
 
 def _better(workspace: Folder, diagnosis: Diagnosis | None, lost: list[Lost]) -> Better | None:
+    named = diagnosis is not None and not diagnosis.no_cause
     try:
-        return better_model(workspace, diagnosis)
+        return better_model(workspace, diagnosis if named else None)
     except GroundedError as error:
         lost.append(Lost("the model as diagnosed", str(error)))
         return None

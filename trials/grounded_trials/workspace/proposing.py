@@ -14,6 +14,7 @@ from grounded_trials.workspace.handover import Void, checked_candidate, outside_
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
 
+    from grounded.figures.figure import Figure
     from grounded.search.candidate import Candidate
     from grounded.search.making import Proposal
     from grounded.search.standing import Standing
@@ -59,6 +60,10 @@ class Status(Result):
     def summary(self) -> str:
         """The phase and the best candidate."""
         return self.standing.summary()
+
+    def figures(self) -> Sequence[Figure]:
+        """Utility by candidate."""
+        return self.standing.figures()
 
     def to_json(self) -> dict[str, Any]:
         """The document of `status --json`, the whole history in it."""
