@@ -14,6 +14,8 @@ question "which effect?". Below them lie, from the data upwards:
     hypotheses, search    what was fitted, what it is worth, what to try next
     held_out, claims      what other trials confirm; what is claimed, with intervals
     lookalike, leftover   what acts nearly the same; what no effect explains
+    correction            a curve that predicts what no effect explains
+    agreement             whether the trials agree; what changed between two groups
     prediction_error, split     where the gap lies, and what the error is made of
     limits, excitation    what the data can't tell; the trial that would
     verdict               the same in words
