@@ -21,6 +21,7 @@ search       what to run next, from stored trials
 solve        optimal control in the model, and the bias that makes it replay a trial
 compile      a model in NumPy, differentiated and compiled
 diagnosis    what the model lacks; `effects` it may be; `challenge`, blind cases for it
+instruments  sensors, judged from their own signals before any physics
 estimate     states and noise from measurements; `fit`, parameters from trials
 models       systems that come with grounded; `adapters`, models that other software computes
 experiments  the paper's studies

@@ -15,6 +15,8 @@ the question "which effect?". Below them lie, from the data upwards
     held_out, claims      the gap and utilities on other trials; what is claimed, with intervals
     lookalike, leftover   what acts nearly the same; what no effect explains
     ruler, decide, measured     held-out errors in units; they decide; what they say of the decision
+    correction            a curve that predicts what no effect explains
+    agreement             whether the trials agree; what changed between two groups
     prediction_error, split     where the gap lies, and what the error is made of
     limits, excitation    what the data can't tell; the trial that would
     verdict, pictures     the same in words; in figures
