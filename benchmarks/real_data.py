@@ -83,6 +83,8 @@ def told(name, found, seconds):
     by_hand = {(s, channel): value for s, channel, value in best}
     for row in found.prediction_error:
         for channel, unit in row.unit_by_channel.items():
+            if not row.crude[channel] >= 0:
+                continue  # never measured
             columns = (row.crude, row.calibrated, row.with_effects, row.noise_floor)
             figures = "  ".join(f"{c.get(channel, float('nan')):9.4g}" for c in columns)
             key = (0 if row.whole_trial else round(row.horizon_s, 2), channel)

@@ -56,6 +56,8 @@ def error_table(diagnosis: Diagnosis) -> tuple[list[Cells], Cells]:
     for row in (*ahead, *whole):
         when = "whole trial" if row.whole_trial else f"{row.horizon_s:.3g} s ahead"
         for name, unit in row.unit_by_channel.items():
+            if math.isnan(row.crude.get(name, math.nan)):
+                continue  # never measured
             columns = (row.crude, row.calibrated, row.with_effects, row.noise_floor)
             figures = (_cell(column.get(name, math.nan)) for column in columns)
             rows.append((f"{name}, {when}", *figures, shown(unit)))
