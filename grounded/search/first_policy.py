@@ -8,8 +8,8 @@ until it has converged, and the plan with the lowest cost wins:
     the reference    a closed-loop run of the model near the target (`first_guess`)
     zero inputs      and the inputs held before the start, where they are others
     smooth inputs    random, by fixed seeds: only where a solve takes milliseconds
-    more of them     where those have shown local optima that are nearly as good; every other one the
-                     best plan so far, kicked for a while, which leads to other valleys than random inputs
+    more of them     where those have shown local optima that are nearly as good; every other one
+                     the best plan so far, kicked for a while: it leads to other valleys
 """
 
 from __future__ import annotations
