@@ -47,7 +47,7 @@ Ending = Literal[
 ]
 BOLDER = 3  # factors of 10 below the damping that is due, tried where all from it on lose
 OTHER_WAY = 2  # losses of "recorded inputs", which comes after all others, before it is given up
-PATIENCE = 6  # candidates in a row that may gain less than the tolerance each
+PATIENCE = 4  # candidates in a row that may gain less than the tolerance each
 LOST = 2  # steps in a row without improvement that ask for a diagnosis
 WILD = 100.0  # times its promise that a first trial's loss may be before it asks for one
 MAX_CAUTION = 3  # times the first policy is designed again, ever more gently, after a crash
@@ -108,8 +108,8 @@ class SearchOptions:
         """
         made = incumbent.candidate
         losers = losers_of(history, made.id, model, way)
-        if way != self.ways(made)[0] and len(losers) >= OTHER_WAY:
-            return None
+        if way != self.ways(made)[0] and (incumbent.standard_error > 0 or len(losers) >= OTHER_WAY):
+            return None  # where trials scatter, one way is enough to be told from luck
         if losers:
             return self.next_step(Step(losers[-1].damping, losers[-1].alpha))
         base = next((t for t in history if t.candidate.id == made.base), None)
