@@ -13,7 +13,7 @@ ICML 2006; start reading in `grounded.search.improve`. The files of this folder 
 model, task, utility    the crude model, the manoeuvre, its quadratic reward
 trial, rollout, plant   a real run, a simulated one, a simulated real system
 policy, onboard         what a robot runs, and the one file that runs it with numpy alone
-result, errors, frozen  what results, mistakes and arrays have in common
+result, errors, frozen  what results, mistakes and arrays have in common; `figures`, what they show
 
 Its rooms, from the paper's loop down:
 
@@ -21,6 +21,7 @@ search       what to run next, from stored trials
 solve        optimal control in the model, and the bias that makes it replay a trial
 compile      a model in NumPy, differentiated and compiled
 diagnosis    what the model lacks; `effects` it may be; `challenge`, blind cases for it
+instruments  sensors, judged from their own signals before any physics
 estimate     states and noise from measurements; `fit`, parameters from trials
 models       systems that come with grounded; `adapters`, models that other software computes
 experiments  the paper's studies

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
+MOST, COMPARED = 40, 2000  # names that a message lists, and that are compared with a wrong one
+
 
 @dataclass(frozen=True)
 class NextCommand:
@@ -48,13 +50,14 @@ def nearest(name: str, valid: Iterable[str]) -> str:
     from difflib import get_close_matches
 
     names = list(valid)
-    lower = {known.lower(): known for known in reversed(names)}
+    lower = {known.lower(): known for known in reversed(names[:COMPARED])}
     close = get_close_matches(name.lower(), lower, n=1, cutoff=0.6)
     if close:
         return f"did you mean '{lower[close[0]]}'?"
     if not names:
         return "none is defined"
-    return "valid names: " + ", ".join(names)
+    more = f" and {len(names) - MOST} more" if len(names) > MOST else ""
+    return "valid names: " + ", ".join(names[:MOST]) + more
 
 
 def needs(module: str, extra: str) -> Any:

@@ -30,12 +30,24 @@ MAX_SUBSTEPS = 1000
 
 @dataclass(frozen=True)
 class Param:
-    """A model parameter: value, unit, and the bounds that a fit keeps (None: free)."""
+    """A model parameter: a constant by its value alone; uncertain with bounds or a `std`.
+
+    A constant (a mass on a scale, g) is never fitted, never blamed, never adopted. An uncertain
+    parameter may move inside its bounds (None: none), about as far as its prior allows.
+
+    Args:
+        value: nominal value.
+        unit: as printed.
+        low: lower bound.
+        high: upper bound.
+        std: prior standard deviation, in the unit; None: that of an even chance between the bounds.
+    """
 
     value: float
     unit: str = "1"
     low: float | None = None
     high: float | None = None
+    std: float | None = None
 
     def __post_init__(self) -> None:
         if not np.isfinite(self.value):
@@ -44,6 +56,25 @@ class Param:
         high = np.inf if self.high is None else self.high
         if not low <= self.value <= high:
             raise GroundedError(f"a parameter's value {self.value} lies outside [{low}, {high}]")
+        if self.std is not None and not (np.isfinite(self.std) and self.std > 0):
+            raise GroundedError(f"a parameter's std must be positive and finite, got {self.std}")
+
+    @property
+    def uncertain(self) -> bool:
+        """Whether it may move at all."""
+        given = self.low is not None or self.high is not None or self.std is not None
+        return given and self.low != (np.nan if self.high is None else self.high)
+
+    @property
+    def spread(self) -> float:
+        """Prior standard deviation [unit]: 0 of a constant; half its value beside one bound."""
+        if not self.uncertain:
+            return 0.0
+        if self.std is not None:
+            return self.std
+        if self.low is None or self.high is None:
+            return 0.5 * abs(self.value)
+        return (self.high - self.low) / 12**0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +141,11 @@ class Model:
         for name in names:
             if not name.isidentifier():
                 raise GroundedError(f"model '{self.name}': '{name}' is not a valid Python name")
+        units: dict[str, object] = {**self.states, **self.inputs}
+        for name, unit in units.items():
+            if not isinstance(unit, str):
+                found = type(unit).__name__
+                raise GroundedError(f"model '{self.name}': the unit of '{name}' is a {found}")
         for name in self.angles:
             if name not in self.states:
                 raise GroundedError(f"angle '{name}' is not a state: {nearest(name, self.states)}")
@@ -145,6 +181,11 @@ class Model:
     def param_names(self) -> tuple[str, ...]:
         """Parameters in array order."""
         return tuple(self.params)
+
+    @cached_property
+    def uncertain(self) -> tuple[str, ...]:
+        """The parameters that may move, in array order."""
+        return tuple(name for name, param in self.params.items() if param.uncertain)
 
     @cached_property
     def values(self) -> Array:
@@ -195,5 +236,6 @@ class Model:
                 old.unit,
                 None if old.low is None else min(old.low, value),
                 None if old.high is None else max(old.high, value),
+                old.std,
             )
         return dataclasses.replace(self, params=params)

@@ -25,8 +25,11 @@ from io import BytesIO
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Optional, Tuple
+from zipfile import ZipFile
 
 import numpy as np
+
+LIMIT = 2**28  # [bytes] of an exported policy when decompressed
 
 FORMAT = "grounded-policy-1"
 NUMBERS = ("feedforward", "low", "high", "past")
@@ -150,14 +153,26 @@ def read(path: Any, states: Names, inputs: Names, task: Optional[str]) -> dict[s
         raise ValueError(f"{path} lacks {error}; export it again") from None
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path} is garbled: {error}; export it again") from None
-    for kind, names in (("states", states), ("inputs", inputs)):
-        own = found["state_names" if kind == "states" else "input_names"]
-        if names is not None and tuple(names) != own:
-            raise ValueError(f"{path} is for {kind} {own}; this robot has {tuple(names)}")
-    if task is not None and str(data.get("task", "")) != task:
-        raise ValueError(f"{path} is for task {data.get('task')}; this robot is set up for {task}")
+    check_robot(path, SimpleNamespace(**found), states, inputs)
+    check_task(path, str(data.get("task", "")), task)
     _check(path, found)
     return found
+
+
+def check_robot(path: Any, policy: Any, states: Names, inputs: Names) -> None:
+    """That a policy is for a robot with these names, in this order."""
+    for kind, names, own in (
+        ("states", states, policy.state_names),
+        ("inputs", inputs, policy.input_names),
+    ):
+        if names is not None and tuple(names) != own:
+            raise ValueError(f"{path} is for {kind} {own}; this robot has {tuple(names)}")
+
+
+def check_task(path: Any, made_for: str, task: Optional[str]) -> None:
+    """That a policy is for the task with this hash."""
+    if task is not None and made_for != task:
+        raise ValueError(f"{path} is for task {made_for}; this robot is set up for {task}")
 
 
 def _check(path: Any, found: dict[str, Any]) -> None:
@@ -184,10 +199,15 @@ def _check(path: Any, found: dict[str, Any]) -> None:
 
 def _archive(path: Any) -> dict[str, Any]:
     try:
+        if not Path(path).is_file() and Path(path).exists():
+            raise ValueError(f"{path} is a folder, a pipe or a device, not a file")
         content = Path(path).read_bytes()
     except OSError as error:
         raise ValueError(f"{path} can't be read: {error.strerror}") from None
     try:
+        size = sum(part.file_size for part in ZipFile(BytesIO(content)).infolist())
+        if size > LIMIT:
+            raise ValueError(f"it claims {size} bytes when decompressed, the limit is {LIMIT}")
         with np.load(BytesIO(content), allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
     except Exception as error:  # numpy, zipfile and zlib each have errors of their own

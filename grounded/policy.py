@@ -164,10 +164,11 @@ def load(
     inputs: tuple[str, ...] | None = None,
     task: str | None = None,
 ) -> Runner:
-    """A runner from an exported candidate (`grounded export ID --format npz`).
+    """A runner from a candidate: exported (`grounded export ID --format npz`), or as proposed.
 
     Args:
-        path: the .npz file; it is data, nothing in it is executed.
+        path: the .npz or .mcap file; it is data, nothing in it is executed. The .mcap needs
+            `grounded_trials`, found by its entry point in the group `grounded.policies`.
         states: the robot's state names in the order in which it will pass them.
         inputs: the robot's input names in the order in which it will send them.
         task: the task hash that the robot is set up for.
@@ -175,7 +176,31 @@ def load(
     Raises:
         GroundedError: if the file is no exported candidate, or one for another robot or task.
     """
+    if Path(path).suffix == ".mcap":
+        return Runner(_proposed(Path(path), states, inputs, task))
     try:
         return Runner(Policy(**onboard.read(path, states, inputs, task)))
     except ValueError as error:
         raise GroundedError(str(error)) from None
+
+
+def _proposed(
+    path: Path, states: tuple[str, ...] | None, inputs: tuple[str, ...] | None, task: str | None
+) -> Policy:
+    """A policy from a file whose format is registered by its suffix, checked as an .npz is."""
+    from importlib.metadata import entry_points
+
+    readers = [p for p in entry_points(group="grounded.policies") if p.name == path.suffix[1:]]
+    if not readers:
+        raise GroundedError(
+            f"{path}: nothing here reads {path.suffix}; install grounded with its trials, or "
+            "export the candidate with --format npz"
+        )
+    policy, made_for = readers[0].load()(path)
+    assert isinstance(policy, Policy)
+    try:
+        onboard.check_robot(path, policy, states, inputs)
+        onboard.check_task(path, made_for, task)
+    except ValueError as error:
+        raise GroundedError(str(error)) from None
+    return policy

@@ -1,4 +1,4 @@
-"""What every result offers: one JSON document, and a table of it for a notebook.
+"""What every result offers: one JSON document, and a table and a plot of it for a notebook.
 
 `Result` is the base of all of them. A `Document` is a result whose fields are the keys of its
 document, so that it can be read back from it.
@@ -7,13 +7,16 @@ document, so that it can be read back from it.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields
 from functools import cache
 from types import UnionType
-from typing import Any, Self, Union, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, Self, Union, get_args, get_origin, get_type_hints
 
 from grounded.errors import GroundedError
+
+if TYPE_CHECKING:
+    from grounded.figures.figure import Figure
 
 # what reading a document of another shape may raise
 MALFORMED = (ValueError, TypeError, AttributeError, KeyError, OverflowError, RecursionError)
@@ -32,6 +35,23 @@ class Result:
     def to_json(self) -> dict[str, Any]:
         """What the command's --json prints: finite numbers, None where there is none."""
         raise NotImplementedError
+
+    def figures(self) -> Sequence[Figure]:
+        """What there is to draw of it."""
+        return ()
+
+    def plot(self) -> Any:
+        """A Plotly figure of it, for a notebook (extra `report`).
+
+        Raises:
+            GroundedError: if it has nothing to draw, or Plotly is not installed.
+        """
+        from grounded.figures.interactive import notebook_figure
+
+        figures = self.figures()
+        if not figures:
+            raise GroundedError(f"there is nothing to draw of this {type(self).__name__} yet")
+        return notebook_figure(figures)
 
     def _repr_html_(self) -> str:
         """The document as a table, for Jupyter."""

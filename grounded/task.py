@@ -22,6 +22,7 @@ from grounded.trial import Trial
 from grounded.utility import Reward, step_rewards
 
 MAX_HORIZON = 200_000  # a control step is a few kB of gains: a bound against nonsense
+MAX_SIZE = 200  # states and inputs: a step costs their cube, and minutes from here on
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +70,12 @@ class Task:
         H = len(self.target) - 1
         if not 1 <= H <= MAX_HORIZON:
             raise GroundedError(f"task: the horizon must be 1 to {MAX_HORIZON} steps, got {H}")
+        if n + m > MAX_SIZE:
+            raise GroundedError(
+                f"the model has {n} states and {m} inputs; planning takes at most {MAX_SIZE} of "
+                "both together: model those that the reward and the inputs act on, and leave the "
+                "rest to the trials"
+            )
         defaults = {
             "latency": np.zeros(m),
             "input_target": np.zeros((H, m)),
@@ -205,6 +212,9 @@ class Task:
 
     def utility(self, trial: Trial) -> float:
         """U of a real trial (section 2); -inf for one that ended early or is not finite."""
+        return trial.worth(f"{self.hash}{self.model.angles}", lambda: self._utility(trial))
+
+    def _utility(self, trial: Trial) -> float:
         if trial.steps < self.horizon or trial.finite_steps < self.horizon:
             return -np.inf
         total = float(self.rewards(trial).sum())

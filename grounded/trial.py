@@ -8,7 +8,7 @@ input.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -82,6 +82,19 @@ class Trial:
         last = int(known[-1]) if len(known) else 0
         last = min(last, int(np.argmax(wild)) - 1) if wild.any() else last
         return max(0, min(last, int(np.argmax(bad))) if bad.any() else last)
+
+    def worth(self, task: str, compute: Callable[[], float]) -> float:
+        """The utility in a task; a trial that remembers it computes it once.
+
+        Args:
+            task: stands for all that the utility depends on.
+            compute: gives it.
+        """
+        return compute()
+
+    def repeats(self, other: Trial) -> bool:
+        """Whether the other has the very same states."""
+        return np.array_equal(self.states, other.states)
 
     def until(self, steps: int) -> Trial:
         """The trial up to so many steps; a log may go on after the horizon."""

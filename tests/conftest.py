@@ -12,7 +12,13 @@ import pytest
 from grounded_trials.workspace.folder import Folder
 from shared_data import DATA
 
-EXTRAS = {"view": "rerun", "png": "PIL", "studies": "joblib", "cluster": "distributed"}
+EXTRAS = {
+    "view": "rerun",
+    "report": "plotly",
+    "png": "matplotlib",
+    "studies": "joblib",
+    "cluster": "distributed",
+}
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -9,7 +9,7 @@ from benchmarks.foreign import aircraft, cars
 from benchmarks.foreign import mechanisms as mech
 from benchmarks.foreign.robots import Robot
 from grounded.policy import Policy
-from grounded.search.standing import Candidate
+from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial
 

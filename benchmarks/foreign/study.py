@@ -21,7 +21,8 @@ from grounded.experiments.baselines import learning_control, refit_alone
 from grounded.experiments.bench import Kept
 from grounded.policy import Policy
 from grounded.search.ask_tell import learn
-from grounded.search.standing import Candidate, SearchOptions
+from grounded.search.candidate import Candidate
+from grounded.search.standing import SearchOptions
 from grounded.trial import Trial
 
 SHARES = (0.9, 0.97, 0.99)

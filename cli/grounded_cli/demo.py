@@ -44,10 +44,11 @@ def command(name: str, folder: str | None, json_: bool) -> None:
     with progress("diagnosing the gap"):
         diagnosed = workspace.diagnose()
     with progress("writing the report"):
-        rrd = find_spec("rerun") is not None
-        report = workspace.report(html=True, rrd=rrd)
-    if not rrd:
-        remark("note", "no recording was written: the viewer comes with the extra `view`")
+        html, rrd = (find_spec(name) is not None for name in ("plotly", "rerun"))
+        report = workspace.report(html=html, rrd=rrd)
+    for made, what, extra in ((html, "page", "report"), (rrd, "recording", "view")):
+        if not made:
+            remark("note", f"no {what} was written: it needs the extra `{extra}`")
     document = {
         "workspace": str(target),
         "utilities": status.standing.utilities,

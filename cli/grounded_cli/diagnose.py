@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import click
@@ -15,6 +16,7 @@ from grounded_trials.wording import rendered, with_unit
 
 if TYPE_CHECKING:
     from grounded.diagnosis.report import Diagnosis, Ranked, Where
+    from grounded.instruments.finding import Finding
     from grounded_trials import Workspace
 
 
@@ -33,9 +35,26 @@ if TYPE_CHECKING:
     help="Blame at most K effects at once, 1 to 6 (default: 3).",
 )
 @click.option("--without", multiple=True, metavar="F1,F2,...", help="Families not to blame.")
+@click.option(
+    "--compare",
+    nargs=2,
+    metavar="A B",
+    shell_complete=complete.trials,
+    help="Two groups of trials, T1,T2 T3,T4: what changed between them.",
+)
+@click.option("--probe", is_flag=True, help="Write the most instructive next trial, tie or not.")
+@click.option("--instruments", is_flag=True, help="Judge the sensors alone; takes a second.")
 @in_workspace
 @as_json
-def command(trials: str | None, max_effects: int, without: tuple[str, ...], json_: bool) -> None:
+def command(
+    trials: str | None,
+    max_effects: int,
+    without: tuple[str, ...],
+    compare: tuple[str, str] | None,
+    probe: bool,
+    instruments: bool,
+    json_: bool,
+) -> None:
     """Explain the sim-to-real gap from the stored trials; keeps reports/diagnosis.json.
 
     The verdict is one effect, several, none (the model explains the data down to the noise) or
@@ -50,9 +69,28 @@ def command(trials: str | None, max_effects: int, without: tuple[str, ...], json
         raise GroundedError(
             "--trials names no trial: expected some, like t0001,t0002; leave it out to take all"
         )
+    first, second = map(names_in, compare or ("", ""))
+    if compare and (chosen or not (first and second) or {*first} & {*second}):
+        raise GroundedError(
+            "--compare takes two groups of different trials, like --compare t0001,t0002 "
+            "t0003,t0004, instead of --trials"
+        )
+    if instruments:
+        findings = workspace.preflight(chosen)
+        if json_:
+            return show_json({"preflight": [one.to_json() for one in findings]})
+        _instruments(findings)
+        return None if findings else show("nothing was found of the sensors")
     families = [name for text in without for name in names_in(text)]
     with stages() as tell:
-        found = workspace.diagnose(chosen, max_effects=max_effects, without=families, progress=tell)
+        found = workspace.diagnose(
+            chosen or first,
+            max_effects=max_effects,
+            without=families,
+            compare=second,
+            probe=probe,
+            progress=tell,
+        )
     if json_:
         show_json(found.to_json())
     else:
@@ -73,20 +111,51 @@ def _follow(workspace: Workspace, found: Diagnosis) -> NextCommand:
 
 
 def _tell(found: Diagnosis, before: dict[str, float]) -> None:
-    from grounded_trials.report.diagnosis_words import error_lines
+    from grounded_trials.report.diagnosis_words import (
+        agreement_lines,
+        correction_line,
+        error_lines,
+        error_table,
+    )
 
     show(_verdict(found.kind, found.sentence))
+    _instruments(found.preflight)
     for text in found.unknowable:
         if text not in found.sentence:
             show(field("unknown", text))
+    if not found.no_cause:
+        if found.prediction_error:
+            show("\n" + table(*error_table(found)))
+            show(f"  open loop, {_held_out(found)}")
+        _effects(found)
+    _places(found.where)
     for title, text in error_lines(found, before):
         show(field(title, text))
-    _places(found.where)
-    if not found.no_cause:
-        _effects(found)
+    if found.correction is not None:
+        show(field("correction", correction_line(found.correction)))
+    for title, text in agreement_lines(found):
+        show(field(title, text))
     run = NextCommand("run", (found.probe,))
     text = found.next_trial.replace(rendered(run), typed(run))
     show("\n" + field("next trial", text))
+
+
+def _held_out(found: Diagnosis) -> str:
+    """How the errors were measured."""
+    row = found.prediction_error[0]
+    by = {
+        "trials": "each trial predicted with values from the others",
+        "pieces": "each piece of the log predicted with values from the others",
+    }
+    noise = {"repeats": "the scatter of repeats", "short horizon": "one step's noise, carried on"}
+    return f"{by.get(row.held_out, 'not held out')}; noise: {noise.get(row.floor_from, 'unknown')}"
+
+
+def _instruments(findings: Sequence[Finding]) -> None:
+    from grounded_trials.report.diagnosis_words import instrument_lines
+
+    for k, line in enumerate(instrument_lines(findings)):
+        show(field("sensors" if k == 0 else "", line))
 
 
 def _verdict(kind: str, text: str) -> str:
@@ -112,18 +181,23 @@ def _places(where: Where) -> None:
 
 
 def _effects(found: Diagnosis) -> None:
+    from grounded_trials.report.diagnosis_words import credit_of
+
     ranking = found.ranking[:8]
     if ranking:
         rows = [
-            (("* " if r.claimed else "  ") + r.effect, f"{r.evidence:.1f}", number(r.gap_after, 3))
+            (
+                ("* " if r.claimed else "  ") + r.effect,
+                credit_of(found, r.effect),
+                f"{r.evidence:.1f}",
+                _values(r),
+            )
             for r in ranking
         ]
-        show("\n" + table(rows, ("effect (*: claimed)", "evidence [nats]", "gap after")))
-        show("  evidence of a claimed effect: what is lost without it; of others: what each")
-        show("  gains by itself; +-: standard deviation")
-    for row in ranking:
-        if row.claimed:
-            show(field(f"  {row.effect}:", _values(row)))
+        if share := credit_of(found, "calibration"):
+            rows.insert(0, ("  (calibration)", share, "", "the model's own parameters, below"))
+        show("\n" + table(rows, ("effect (*: claimed)", "credit", "evidence [nats]", "value")))
+        show("  credit: what predictions lose without it, of what they gain in all")
     for group in found.indistinguishable:
         show(field("tied", f"the data can't tell apart: {', '.join(group)}"))
 

@@ -53,7 +53,7 @@ def command(
     if name is None:
         show("\n".join(f"{key:15} {text}" for key, (_, _, _, text) in STUDIES.items()))
         return
-    from grounded_trials.store.store import StudyStore
+    from grounded_trials.store.documents import StudyStore
 
     module, function, kind, _ = STUDIES[name]
     study = getattr(importlib.import_module(f"grounded.experiments.{module}"), function)

@@ -18,6 +18,7 @@ VERDICTS = {
     "first": ": what the search improves on",
     "better": ": the best so far",
     "no better": " than the best so far",
+    "crashed": ": it did not run to the end",
     "waiting": ": more trials of it are needed ([search] repeats)",
     "in doubt": ": it may be bad luck, the best so far is run once more",
     "probe": ", for the diagnosis: the search leaves it out",
@@ -63,8 +64,6 @@ def tell(name: str, one: Ingested) -> None:
         show(field("data", "for fit and diagnose: it ran no candidate", "  "))
     else:
         meaning = VERDICTS.get(one.verdict, "")
-        if one.utility == float("-inf"):
-            meaning = ": it did not run to the end" * (one.verdict == "no better")
         text = f"utility {number(one.utility)}, {one.verdict}{meaning}"
         show(field(one.candidate, text, "  "))
     if one.signals:

@@ -1,4 +1,4 @@
-"""grounded init: a workspace from a log of your robot, or from an example."""
+"""grounded init: a workspace from a log of your robot, from a model alone, or from an example."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 @click.command("init")
 @click.argument("folder", metavar="DIR", required=False)
 @click.option("--from", "log", metavar="LOG", help="A log of your robot, of any format.")
-@click.option("--model", metavar="FILE", help="Your model.py, beside --from.")
+@click.option("--model", metavar="FILE", help="Your model.py, beside --from or --blank.")
+@click.option("--blank", is_flag=True, help="No log yet: a workspace of --model, to fill in.")
 @click.option("--kind", help="Of the model skeleton: car, rover, drone, arm, pendulum, generic.")
 @click.option("--dt", type=float, metavar="SECONDS", help="Control interval (the log's).")
 @click.option("--yes", is_flag=True, help="Ask nothing: take the best guesses, marked as such.")
@@ -37,6 +38,7 @@ def command(
     folder: str | None,
     log: str | None,
     model: str | None,
+    blank: bool,
     kind: str | None,
     dt: float | None,
     yes: bool,
@@ -47,16 +49,20 @@ def command(
     """Make a workspace in DIR: grounded.toml, model.py, target.csv, trials/, candidates/.
 
     --from LOG finds the model's states and inputs in a log and says why; without --model it writes
-    a model skeleton of the kind of robot that the log shows. --example NAME takes an example, whose
-    real.py stands in for your robot.
+    a model skeleton of the kind of robot that the log shows. --blank --model FILE needs no log and
+    writes drive.py, the robot's program. --example NAME takes an example, whose real.py stands in
+    for your robot.
     """
     if list_:
         _list(json_)
-    elif folder is None or (log is None) == (name is None):
+    elif folder is None or [log is not None, name is not None, blank].count(True) != 1:
         raise click.UsageError(
             "give a folder and a log, grounded init DIR --from run1.mcap, or an example, grounded "
-            "init DIR --example car-turn; `grounded init --list` names them"
+            "init DIR --example car-turn (`grounded init --list` names them), or a model alone, "
+            "grounded init DIR --blank --model model.py"
         )
+    elif blank:
+        _blank(folder, model, json_)
     elif log is not None:
         from pathlib import Path
 
@@ -113,6 +119,23 @@ def _list(json_: bool) -> None:
         show_json({"examples": {key: value.text for key, value in EXAMPLES.items()}})
     else:
         show("\n".join(f"{key:15} {value.text}" for key, value in EXAMPLES.items()))
+
+
+def _blank(folder: str, model: str | None, json_: bool) -> None:
+    if model is None:
+        raise click.UsageError("--blank needs your model: grounded init DIR --blank --model FILE")
+    from grounded_trials import Workspace
+
+    Workspace.create(folder, model=model)
+    if json_:
+        show_json({"workspace": folder, "model": model})
+        return
+    show(f"{folder} is a workspace for the model of {model}. Yours to fill in:")
+    show("  grounded.toml  dt, start, weights, limits")
+    show("  target.csv     what the states are to do")
+    show("  drive.py       measure() and send() of your robot")
+    where = f"cd {shlex.quote(folder)} && " * (folder != ".")
+    show(f"\nnext: edit these, then {where}grounded propose")
 
 
 def _example(folder: str, name: str, json_: bool) -> None:

@@ -11,7 +11,7 @@ from grounded_cli.status import summary
 from grounded_cli.terminal import number, remark, say, show, show_json, stages
 
 if TYPE_CHECKING:
-    from grounded.search.standing import Candidate
+    from grounded.search.candidate import Candidate
     from grounded_trials import Workspace
     from grounded_trials.workspace.ingest import Ingested
     from grounded_trials.workspace.proposing import Status

@@ -13,6 +13,8 @@ import gc
 import importlib
 import os
 import sys
+from contextlib import suppress
+from io import StringIO, TextIOWrapper
 from typing import TYPE_CHECKING, Any, NoReturn
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small; threads only cost start-up
@@ -33,6 +35,8 @@ COMMANDS = {
     "run": ("run", "Run the candidate on the system of grounded.toml."),
     "ingest": ("ingest", "Take in what came back: check, resample, store."),
     "next": ("next", "Ingest a log, propose, and export for the robot, in one go."),
+    "discard": ("discard", "Set a trial aside; nothing is deleted."),
+    "restore": ("discard", "Take back what discard did."),
     "learn": ("learn", "Propose, run and ingest until the search ends."),
     "status": ("status", "Show where the search stands."),
     "report": ("report", "Show what all trials say: text, page, pictures, recording."),
@@ -63,7 +67,7 @@ class LazyGroup(click.Group):
         if name not in COMMANDS:
             return None
         module = importlib.import_module(f"grounded_cli.{COMMANDS[name][0]}")
-        command: click.Command = module.command
+        command: click.Command = getattr(module, name, module.command)
         return command
 
     def resolve_command(
@@ -117,33 +121,64 @@ def cli() -> None:
 def main() -> NoReturn:
     """Runs the command line and exits with its code."""
     atexit.register(gc.freeze)  # a process that is over needs no search for cycles, 30 ms long
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):  # a terminal that lacks a character shows "?"
+            stream.reconfigure(errors="replace")
+    try:
+        code, words = _run()
+        if words:
+            from grounded_cli.terminal import say
+
+            say(words)
+        if sys.stdout is not None:
+            sys.stdout.flush()
+    except BrokenPipeError:  # nobody reads any more, as after `| head`
+        code = 0
+        _silence()
+    except OSError as error:
+        code = 1
+        with suppress(OSError):
+            sys.stderr.write(f"error: the output can't be written: {error.strerror}\n")
+        _silence()
+    sys.exit(code)
+
+
+def _run() -> tuple[int, str]:
+    """The exit code of the command, and what to say at its end."""
+    stdout = sys.stdout
     try:
         code = cli.main(standalone_mode=False, prog_name="grounded")
-        sys.stdout.flush()
     except click.exceptions.Exit as stop:
-        code = stop.exit_code
-    except click.UsageError as error:
-        error.show()
-        code = 2
+        return stop.exit_code, ""
     except click.ClickException as error:
-        error.show()
-        code = error.exit_code
+        text = StringIO()
+        error.show(text)
+        return error.exit_code, text.getvalue().rstrip()
     except (click.Abort, KeyboardInterrupt):
-        click.echo("interrupted; what was stored is safe, run the same command again", err=True)
-        code = 130
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        code = 0
+        return 130, "interrupted; what was stored is safe, run the same command again"
+    except SystemExit:
+        if sys.stdout is not stdout:  # click has seen a closed pipe, and would end with 1
+            raise BrokenPipeError from None
+        raise
     except Exception as error:
         from grounded.errors import GroundedError
+        from grounded_cli.terminal import ALARM, style
 
+        if isinstance(error, OSError) and error.strerror:
+            named = f"{error.filename}: " if error.filename else ""
+            return 1, f"{style('error:', ALARM)} {named}{error.strerror}"
         if not isinstance(error, GroundedError):
             raise
-        from grounded_cli.terminal import style
+        return 1, f"{style('error:', ALARM)} {error}"
+    return code if isinstance(code, int) else 0, ""
 
-        click.echo(f"{style('error:', fg='red', bold=True)} {error}", err=True)
-        code = 1
-    sys.exit(code if isinstance(code, int) else 0)
+
+def _silence() -> None:
+    """What is still to be written goes nowhere: Python would complain of it at its end."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError, AttributeError):  # closed, or none of the system's
+            os.dup2(nowhere, stream.fileno())
 
 
 if __name__ == "__main__":

@@ -13,7 +13,8 @@ from grounded_cli.terminal import field, number, progress, remark, show, show_js
 from grounded_trials.wording import count, with_unit
 
 if TYPE_CHECKING:
-    from grounded.search.standing import Candidate, Standing
+    from grounded.search.candidate import Candidate
+    from grounded.search.standing import Standing
     from grounded.task import Task
     from grounded_trials import Workspace
     from grounded_trials.workspace.proposing import Proposed

@@ -2,24 +2,36 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import click
 
+from grounded.errors import GroundedError
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
-from grounded_cli.terminal import progress, remark, show, show_json, sparkline, table
+from grounded_cli.terminal import number, progress, remark, say, show, show_json, sparkline, table
+from grounded_trials.wording import count
+
+if TYPE_CHECKING:
+    from grounded_trials import Workspace
 
 
 @click.command("report")
 @click.option("--html", is_flag=True, help="Write reports/report.html, one page with everything.")
 @click.option("--png", is_flag=True, help="Write the page's figures as pictures, reports/*.png.")
 @click.option("--rrd", is_flag=True, help="Write reports/recording.rrd for the Rerun viewer.")
+@click.option("--watch", is_flag=True, help="Write the page again whenever a trial comes in.")
 @in_workspace
 @as_json
-def command(html: bool, png: bool, rrd: bool, json_: bool) -> None:
+def command(html: bool, png: bool, rrd: bool, watch: bool, json_: bool) -> None:
     """Show utilities, trajectories, bias and gap of all stored trials.
 
-    A damaged or missing trial is left out and named (exit code 3).
+    A damaged or missing trial is left out and named (exit code 3). With --watch the page stays
+    current beside `learn` or a session at the track, until Ctrl-C; in a browser it reloads itself.
     """
     workspace = open_workspace()
+    if watch:
+        _watch(workspace)
+        return
     with progress("reading trials"):
         report = workspace.report(html=html, png=png, rrd=rrd)
     if json_:
@@ -36,3 +48,19 @@ def command(html: bool, png: bool, rrd: bool, json_: bool) -> None:
         for one in report.findings.lost if report.paths or json_ else ():
             remark("left out", f"{one.file}: {one.reason}")
         click.get_current_context().exit(3)
+
+
+def _watch(workspace: Workspace) -> None:
+    """Says each time that the page was written, or why it could not be; Ctrl-C ends it."""
+
+    def trouble(error: GroundedError) -> None:
+        remark("waiting", str(error))
+
+    try:
+        for report in workspace.watch(trouble=trouble):
+            (path,), findings = report.paths, report.findings
+            best = findings.best
+            known = "" if best is None else f", best {best.candidate.id} {number(best.utility)}"
+            show(f"{path}: {count(len(findings.runs), 'trial')}{known}")
+    except KeyboardInterrupt:
+        say("the page is as it was written last")

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 import click
 
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
-from grounded_cli.terminal import field, number, progress, show, show_json, sparkline, table
+from grounded_cli.terminal import field, number, progress, remark, show, show_json, sparkline, table
 
 if TYPE_CHECKING:
-    from grounded.search.standing import Standing, Tried
+    from grounded.search.candidate import Tried
+    from grounded.search.standing import Standing
     from grounded_trials.workspace.proposing import Status
 
 LEGEND = "damp: penalty on leaving the last trial's inputs; +-: standard error"
@@ -29,6 +30,10 @@ def command(json_: bool) -> None:
         show_json(status.to_json())
         return
     show(summary(status))
+    for note in status.notes:
+        remark("note", note)
+    for name, why in status.discarded.items():
+        show(field("discarded", f"{name}{why and ': ' + why}"))
     if status.outdated:
         show(field("diagnosis", status.outdated))
     show(f"\n{next_line(status.then)}")

@@ -10,9 +10,7 @@ import sys
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
-
-import click
+from typing import Any, TextIO
 
 from grounded.result import plain
 from grounded_trials.wording import WIDTH, figure, wrapped
@@ -20,35 +18,54 @@ from grounded_trials.wording import WIDTH, figure, wrapped
 number = figure
 
 
-def style(text: str, **how: Any) -> str:
-    """Coloured text, unless NO_COLOR is set or the output is not a terminal."""
-    plain = os.environ.get("NO_COLOR") or not (sys.stdout.isatty() and sys.stderr.isatty())
-    return text if plain else click.style(text, **how)
+# Our own marks in a text, which are no characters: what strangers' files say can't be anything else
+_MARKS = {"\ufdd0": "\033[1m", "\ufdd1": "\033[1;31m", "\ufdd2": "\033[0m"}
+BOLD, ALARM, _END = _MARKS
+
+
+def style(text: str, mark: str = BOLD) -> str:
+    """Text in bold, or in another of the styles here, where it is shown in colour."""
+    return f"{mark}{text}{_END}"
 
 
 def say(text: str) -> None:
     """Narration, on stderr."""
-    click.echo(harmless(text), err=True)
+    _write(text, sys.stderr)
 
 
 def show(text: str = "") -> None:
     """Data, on stdout."""
-    click.echo(harmless(text))
+    _write(text, sys.stdout)
 
 
-def harmless(text: str) -> str:
-    """Text that can colour a terminal and nothing else: names come from strangers' files."""
-    parts = re.split(r"(\x1b\[[0-9;]*m)", text)
-    shown = [
-        part if i % 2 else "".join(c if c.isprintable() or c in "\n\t" else "?" for c in part)
-        for i, part in enumerate(parts)
-    ]
-    return "".join(shown)
+def _write(text: str, stream: TextIO | None, end: str = "\n") -> None:
+    """The one place that writes to a terminal; a stream that the caller closed gets nothing."""
+    if stream is not None:
+        stream.write(harmless(text, coloured=is_live(stream) and not os.environ.get("NO_COLOR")))
+        stream.write(end)
+        stream.flush()
+
+
+def is_live(stream: TextIO | None) -> bool:
+    """Whether a stream is a terminal."""
+    return stream is not None and stream.isatty()
+
+
+def harmless(text: str, *, coloured: bool = False) -> str:
+    """Text without control characters, since names come from strangers' files; "?" for each."""
+    marks = _MARKS if coloured else dict.fromkeys(_MARKS, "")
+    return "".join(c if c.isprintable() or c in "\n\t" else marks.get(c, "?") for c in text)
 
 
 def show_json(document: dict[str, Any]) -> None:
     """One JSON document on stdout; a number that JSON doesn't have becomes null."""
-    click.echo(json.dumps(plain(document), indent=1, ensure_ascii=False, allow_nan=False))
+    text = json.dumps(plain(document), indent=1, ensure_ascii=False, allow_nan=False)
+    _write(re.sub(r"[^\n -~]", _escaped, text), sys.stdout)
+
+
+def _escaped(found: re.Match[str]) -> str:
+    """A character as it is, or as JSON escapes it where a terminal might obey it."""
+    return found[0] if found[0].isprintable() else json.dumps(found[0])[1:-1]
 
 
 def field(label: str, text: str, indent: str = "") -> str:
@@ -70,11 +87,12 @@ def names_in(text: str | None) -> list[str]:
 @contextmanager
 def stages() -> Iterator[Callable[[str], None]]:
     """A function that shows which stage a long command is in, "" for none; only on a terminal."""
-    live = sys.stderr.isatty()
+    live = is_live(sys.stderr)
 
     def tell(stage: str) -> None:
         if live:
-            click.echo(f"\r\033[K{stage and stage + ' ...'}", err=True, nl=False)
+            sys.stderr.write("\r\033[K")
+            _write(f"{stage and stage + ' ...'}", sys.stderr, end="")
 
     try:
         yield tell
@@ -108,6 +126,7 @@ def table(rows: Sequence[Sequence[str]], header: Sequence[str]) -> str:
 
     Where it is wider than a terminal, names of columns are broken at their blanks.
     """
+    rows = [[cell.replace("\n", "?") for cell in row] for row in rows]
     heads = [[name] for name in header]
     if sum(_widths(rows, heads)) + 2 * (len(header) - 1) > WIDTH:
         widths = [
@@ -125,7 +144,7 @@ def table(rows: Sequence[Sequence[str]], header: Sequence[str]) -> str:
             for i, (cell, width) in enumerate(zip(line, widths, strict=True))
         ]
         text = "  ".join(cells).rstrip()
-        out.append(style(text, bold=True) if k < tall else text)
+        out.append(style(text) if k < tall else text)
     return "\n".join(out)
 
 

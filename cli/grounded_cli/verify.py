@@ -1,4 +1,4 @@
-"""grounded verify: every stored file against its hash and checksums."""
+"""grounded verify: is everything that is kept what it was?"""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from grounded_cli.terminal import progress, remark, show, show_json
 @in_workspace
 @as_json
 def command(json_: bool) -> None:
-    """Check every stored trial against the hash in its name, and every candidate's checksum."""
+    """Check everything that is kept: changed, damaged, deleted, or put in its place."""
     workspace = open_workspace()
     with progress("checking"):
         found = workspace.verify()

@@ -53,7 +53,7 @@ HUGE = 1e9  # MuJoCo calls 1e10 unstable, warns and stops there
 def model(
     xml: str | Path,
     *,
-    params: Sequence[str] | Mapping[str, tuple[float, float]] = (),
+    params: Sequence[str] | Mapping[str, float | tuple[float, ...]] = (),
     inputs: str | Sequence[str] = "auto",
     timestep: float | None = None,
     reference: str | Sequence[float] | None = None,
@@ -64,10 +64,12 @@ def model(
 
     Args:
         xml: path of the file, or MJCF text.
-        params: what may be fitted or diagnosed, "element.field": `mass` of a body (its inertia
+        params: what may be set, fitted or diagnosed, "element.field": `mass` of a body (its inertia
             scales with it); `damping`, `frictionloss`, `armature`, `stiffness` of a joint; `gear`,
-            `kp`, `kv`, `gain`, `tau` of an actuator; `friction` of a geom. With a mapping, the
-            bounds (low, high) of each. Nominal values are the file's.
+            `kp`, `kv`, `gain`, `tau` of an actuator; `friction` of a geom. A
+            sequence of names: all uncertain, not below zero. A mapping: a number is a constant of
+            that value, (low, high) bounds what is uncertain, (value, low, high) says both. Nominal
+            values are else the file's.
         inputs: "actuators", "torques" (generalised forces on all hinges and slides), the names of
             the joints that get a torque, or "auto": actuators where there are any.
         timestep: of the simulation [s], instead of the file's; dt must be a whole multiple.
@@ -86,12 +88,9 @@ def model(
     coordinates = _coordinates(compiled, _reference(compiled, reference))
     states = states_of(compiled)
     controls = controls_of(compiled, inputs, states)
-    bounds = params if isinstance(params, Mapping) else dict.fromkeys(params, (0.0, None))
-    settings = [setting_of(mj, compiled, spec) for spec in bounds]
-    values = {
-        setting.name: Param(setting.nominal, setting.unit, *limits)
-        for setting, limits in zip(settings, bounds.values(), strict=True)
-    }
+    named = params if isinstance(params, Mapping) else dict.fromkeys(params, None)
+    settings = [setting_of(mj, compiled, spec) for spec in named]
+    values = {s.name: _param(s, given) for s, given in zip(settings, named.values(), strict=True)}
     stepper = MujocoStepper(compiled, coordinates, list(states), controls, settings, threads)
     angles = [
         joint_name(compiled, j)
@@ -106,6 +105,21 @@ def model(
         angles=tuple(angles),
         name=name or compiled.names.split(b"\0", 1)[0].decode() or "mujoco",
     )
+
+
+def _param(setting: Setting, given: float | tuple[float, ...] | None) -> Param:
+    """A number: a constant; (low, high) or (value, low, high): uncertain; None: not below zero."""
+    if given is None:
+        return Param(setting.nominal, setting.unit, 0.0)
+    if isinstance(given, int | float):
+        return Param(float(given), setting.unit)
+    if len(given) not in (2, 3):
+        raise GroundedError(
+            f"parameter '{setting.name}': expected a value, (low, high) or (value, low, high), "
+            f"found {given!r}"
+        )
+    value, low, high = (setting.nominal, *given) if len(given) == 2 else given
+    return Param(value, setting.unit, low, high)
 
 
 def limits(xml: str | Path, inputs: str | Sequence[str] = "auto") -> dict[str, tuple[float, float]]:
@@ -196,6 +210,11 @@ class MujocoStepper(Stepper):
         self.__dict__.update(state)
         self._prepare()
 
+    @property
+    def timestep(self) -> float:
+        """The simulation's own step [s]; a control step is a whole multiple of it."""
+        return float(self._model.opt.timestep)
+
     def advance(self, x: Array, u: Array, p: Array, dt: float) -> Array:
         """The next states (N, n); NaN where a sample is unstable."""
         steps = self._substeps(dt)
@@ -220,7 +239,7 @@ class MujocoStepper(Stepper):
         return np.ascontiguousarray(J[:, :, :n]), np.ascontiguousarray(J[:, :, n:])
 
     def _substeps(self, dt: float) -> int:
-        h = float(self._model.opt.timestep)
+        h = self.timestep
         steps = round(dt / h)
         if steps < 1 or abs(steps * h - dt) > 1e-6 * dt:
             raise GroundedError(

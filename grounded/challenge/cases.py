@@ -153,7 +153,7 @@ def _with_errors(model: Model, error: float, rng: np.random.Generator) -> Model:
         return model
     factors = 1 + error * rng.uniform(-1, 1, len(model.params))
     names = zip(model.params.items(), factors, strict=True)
-    return model.with_values({n: p.value * float(f) for (n, p), f in names})
+    return model.with_values({n: p.value * float(f) for (n, p), f in names if p.uncertain})
 
 
 Plan = tuple[Array, Array, Array, Array]  # inputs (T, m), start (n,), target (T + 1, n), gains

@@ -4,10 +4,8 @@
 diagnosis must meet without a name for it:
 
 resonance     the actuator rings: u_eff'' = w^2 (u - u_eff) - 2 zeta w u_eff'
-asymmetric    a different gain for positive and negative commands
 dropouts      commands get lost for 0.1 to 0.4 s; the last one is held
 fault         from half of the trial on an actuator gives less
-expo          an exponential stick curve: u_eff = (1 - e) u + e u^3 / peak^2
 crosstalk     one input leaks, squared, into another
 quantised     commands arrive in coarse steps
 gusts         pushes of half a second at random times
@@ -95,13 +93,13 @@ def _value(
         return float(float(scales.spread(target)) * np.exp(rng.uniform(np.log(0.3), np.log(3.0))))
     if family in ("delay", "sensor_delay"):
         return 0.6 * size
-    if family == "first_order_lag":
+    if family in ("first_order_lag", "sensor_lag"):
         return float(size)
     if family in ("input_bias", "sensor_bias"):
         return sign * 0.5 * size * scales.spread(target)
     if family == "input_fade":
         return size / scales.duration
-    if family in ("input_gain", "rate_gain", "odometry_scale", "sensor_scale"):
+    if family in ("input_gain", "input_curve", "rate_gain", "odometry_scale", "sensor_scale"):
         return sign * size
     if family == "parameter":
         value = effect.site.model.params[target].value
@@ -118,6 +116,14 @@ def _value(
     if family == "coupling":
         driven, _, source = target.partition("<-")
         return sign * size * _rate_scale(scales, driven) / scales.peak(source)
+    if family == "cornering_drag":
+        return 2 * size / scales.peak(target.partition("<-")[2])
+    if family in ("joint_friction", "load_friction", "added_inertia"):
+        return _joint(quantity, size, scales, *target.split("<-"))
+    if family == "grip_limit":
+        return (1 - size) * max(effect.free[0].grid) / 2
+    if family == "lever_arm":
+        return sign * 0.5 * size
     if family == "trend":
         return sign * size * _rate_scale(scales, target) / scales.duration
     if family == "periodic" and quantity == "omega":
@@ -127,6 +133,14 @@ def _value(
     if family == "patch":
         return 0.12 * max(effect.free[-1].grid) / 0.16  # of the radius; the place is drawn apart
     return sign * size * _rate_scale(scales, target)
+
+
+def _joint(quantity: str, size: float, scales: Scales, tau: str, w: str) -> float:
+    """Parts of the largest input: dry friction, viscous friction, what accelerates in 0.2 s."""
+    if quantity == "k":
+        return size
+    over = {"b": scales.peak(w), "J": scales.peak(w) / 0.2}.get(quantity, 1.0)
+    return size * scales.peak(tau) / over
 
 
 Rate = Callable[[Any, Any, float, Mapping[str, Any]], Mapping[str, float]]
@@ -156,7 +170,7 @@ def draw_withheld(
         rate: typical size of that state's rate.
         duration: of a trial [s].
     """
-    makers = [_resonance, _asymmetric, _dropouts, _fault, _expo, _quantised, _crosstalk]
+    makers = [_resonance, _dropouts, _fault, _quantised, _crosstalk]
     kind = int(rng.integers(0, len(makers) + 2))
     j = int(rng.integers(0, model.m))
     if kind == len(makers) or (model.m == 1 and kind == len(makers) - 1):
@@ -195,11 +209,6 @@ def _resonance(rng: np.random.Generator, j: int, m: int, peak: float, T: float) 
     return {"omega": w, "zeta": zeta}, _on(j, ring)
 
 
-def _asymmetric(rng: np.random.Generator, j: int, m: int, peak: float, T: float) -> _Made:
-    gain = float(rng.choice([-1, 1]) * rng.uniform(0.1, 0.4))
-    return {"gain": gain}, _on(j, lambda u, own, t, dt: u[j] * (1 + gain) if u[j] > 0 else u[j])
-
-
 def _dropouts(rng: np.random.Generator, j: int, m: int, peak: float, T: float) -> _Made:
     rate = rng.uniform(0.3, 1.0)
 
@@ -219,11 +228,6 @@ def _fault(rng: np.random.Generator, j: int, m: int, peak: float, T: float) -> _
     begin, loss = T * rng.uniform(0.4, 0.6), rng.uniform(0.15, 0.5)
     act = _on(j, lambda u, own, t, dt: u[j] * (1 - loss) if t > begin else u[j])
     return {"begin": begin, "loss": loss}, act
-
-
-def _expo(rng: np.random.Generator, j: int, m: int, peak: float, T: float) -> _Made:
-    e = rng.uniform(0.2, 0.7)
-    return {"e": e}, _on(j, lambda u, own, t, dt: (1 - e) * u[j] + e * u[j] ** 3 / peak**2)
 
 
 def _quantised(rng: np.random.Generator, j: int, m: int, peak: float, T: float) -> _Made:

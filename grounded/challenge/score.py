@@ -99,8 +99,10 @@ def judge(
 ) -> dict[str, Any]:
     """One case's marks."""
     truth = [e["effect"] for e in label["effects"]]
-    named = list(diagnosis["verdict"]["effects"])
-    order = [r["effect"] for r in diagnosis["ranking"]]
+    late = [f for f in diagnosis.get("preflight", ()) if f["kind"] == "delay" and f["corrected"]]
+    sensors = [f"sensor_delay:{f['signal']}" for f in late]  # found before any physics
+    named = sensors + list(diagnosis["verdict"]["effects"])
+    order = sensors + [r["effect"] for r in diagnosis["ranking"]]
     group = set(order[:1])
     for g in diagnosis["indistinguishable"]:
         if order and order[0] in g:

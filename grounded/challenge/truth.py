@@ -18,11 +18,14 @@ from grounded.compile import Named
 from grounded.effects import (
     Effect,
     InputFamily,
+    LossFamily,
     MemoryFamily,
     RateFamily,
     SensorDelayFamily,
     SensorFamily,
+    SensorLagFamily,
 )
+from grounded.effects.family import coupled
 from grounded.effects.registry import partner
 from grounded.frozen import Array
 from grounded.model import Model
@@ -139,6 +142,13 @@ class _Run:
         s, a = Named("state", self.names, list(x)), Named("input", model.input_names, list(u))
         assert model.derivative is not None
         own = dict(model.derivative(s, a, self.p))
+        for effect, values in self.truth.effects:
+            if isinstance(effect.family, LossFamily):
+                tau, w = coupled(effect.site)
+                lost = effect.family.torque(s[w], own[w], a[tau], values)
+                left = [a[n] - lost if n == tau else a[n] for n in model.input_names]
+                a = Named("input", model.input_names, left)
+                own = dict(model.derivative(s, a, self.p))
         total = {n: float(own[n]) for n in self.names}
         for effect, values in self.truth.effects:
             if isinstance(effect.family, RateFamily):
@@ -191,6 +201,8 @@ class _Run:
                 y[i] = effect.family.measure(y[i], values)
             elif isinstance(effect.family, SensorDelayFamily):
                 y[i] += self._old(i, values["d"]) - self.x[i]
+            elif isinstance(effect.family, SensorLagFamily):
+                y[i] += self._filtered(i, values["tau"]) - self.x[i]
         scale = np.array([noise.measurement.get(n, 0.0) for n in self.names])
         v = self._draw(len(scale))
         if noise.kind == "heavy":
@@ -205,3 +217,10 @@ class _Run:
         last = len(self.past) - 1
         new, old = self.past[max(last - k, 0)][i], self.past[max(last - k - 1, 0)][i]
         return float((1 - part) * new + part * old)
+
+    def _filtered(self, i: int, tau: float) -> float:
+        """State i through a first-order filter at the fine rate, settled at the start."""
+        part, found = 1 - np.exp(-self.fine / tau), self.past[0][i]
+        for x in self.past[1:]:
+            found = found + part * (x[i] - found)
+        return float(found)

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis.data import Data
+from grounded.diagnosis.decide import Decision, ordered
 from grounded.diagnosis.fitted import Fitted, calibrated, standard_deviations
 from grounded.diagnosis.held_out import gaps_of, held_out_errors
 from grounded.diagnosis.hypotheses import TIE, parametric
@@ -28,7 +29,7 @@ from grounded.diagnosis.limits import Limits
 from grounded.diagnosis.lookalike import lookalikes, of_parameters
 from grounded.diagnosis.prediction_error import normalised
 from grounded.diagnosis.report import Estimate, Likeness, Ranked
-from grounded.diagnosis.search import HypothesisSearch
+from grounded.diagnosis.ruler import folds
 from grounded.frozen import Array
 
 ENOUGH = 3.0  # nats that the parameters that are not named may still hold
@@ -79,15 +80,14 @@ SAME = 0.95  # share of a parameter's signal from which an effect is the same th
 class Claims:
     """What the best hypothesis blames: effects, or parameters where calibrating them is enough."""
 
-    def __init__(
-        self, search: HypothesisSearch, best: Fitted, known: Limits, *, left: bool
-    ) -> None:
-        self.search, self.best, self.known = search, best, known
+    def __init__(self, decision: Decision, credit: dict[str, float], known: Limits) -> None:
+        self.search, self.best, self.known = decision.search, decision.fit, known
+        search, best, self.credit = decision.search, decision.fit, credit
         self.predictor, self.data = search.predictor, search.data
-        self.null = search.best_null()
         self.names = best.hypothesis.names
-        self.base = search.score(search.exact_null() if parametric(best) else self.null)
-        calibrating = not self.names and not left and search.calibrates()
+        calibrating = not self.names and best.hypothesis.spread > 0
+        self.null = best if calibrating else search.best_null()
+        self.base = search.score(decision.crude if parametric(best) else self.null)
         self.blamed = blamed(self.data, self.null) if calibrating else ()
         off = [blame.index for blame in self.blamed[:2]]
         candidates = search.candidates
@@ -96,13 +96,13 @@ class Claims:
         )
 
     def ranking(self, where: Any, before: float) -> tuple[Ranked, ...]:
-        """The claimed effects first (by what would be lost without each), then what lost."""
+        """The claimed effects first (those that make most of the error), then what lost."""
         search, rows = self.search, []
         parts = self.parts()
         after = normalised(
             held_out_errors(self.predictor, self.best, self.best.track, where), where
         )
-        for name in sorted(self.names, key=lambda n: -parts[n]):
+        for name in ordered(self.credit, self.names):
             claimed = not self.known.no_cause
             rows.append(self._row(self.best, name, parts[name], after, before, claimed=claimed))
         rows += self.off(after, before)
@@ -171,7 +171,7 @@ class Claims:
 
     def estimates(self, fit: Fitted) -> list[dict[str, Estimate]]:
         """Values with intervals, effect by effect."""
-        stds, halves = standard_deviations(fit, self.data.trial_of)
+        stds, halves = standard_deviations(fit, folds(self.data))
         found, at = [], 0
         for effect, values in zip(fit.hypothesis.effects, fit.hypothesis.values, strict=True):
             some = {}
@@ -220,7 +220,7 @@ class Claims:
         h, model = self.best.hypothesis, self.data.model
         if h.spread == 0 or h.shift is None:
             return {}
-        stds, halves = standard_deviations(self.best, self.data.trial_of)
+        stds, halves = standard_deviations(self.best, folds(self.data))
         scale, k = param_scale(model), len(h.theta)
         found = {}
         for at, index in enumerate(calibrated(self.data)):

@@ -25,6 +25,7 @@ from grounded.model import Model
 from grounded.trial import Trial
 
 LONGEST_RUN = 200  # steps
+PIECES, SHORTEST_PIECE = 5, 50  # one log alone is held out by pieces; steps of a piece at least
 MOST_NUMBERS = 6e6  # of one (L, B, N, N) array: above it, evenly spaced runs are used
 
 
@@ -194,6 +195,8 @@ def _cut(lengths: Any) -> tuple[Any, Any, Array, Any]:
     step0 = state0 = 0
     for i, T in enumerate(lengths):
         parts = int(np.ceil(T / LONGEST_RUN))
+        if len(lengths) == 1 and T >= PIECES * SHORTEST_PIECE:
+            parts = max(parts, PIECES)
         edges = np.linspace(0, T, parts + 1).astype(int)
         pieces += [(i, step0 + a, state0 + a, b - a) for a, b in itertools.pairwise(edges)]
         step0, state0 = step0 + T, state0 + T + 1

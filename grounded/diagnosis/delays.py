@@ -4,10 +4,10 @@
     y_i(s + k) = (1 - p) x_i(s) + p x_i(s - 1)
 
 So under a hypothesis with a delay the log of its channel is moved by k steps, and the filter takes
-care of p (`delayed_measurement`). The first k samples of a trial show what was before it, which no
-model predicts. All hypotheses are judged by the same data, so they count too (`before`): as samples
-of a state that drifted into the trial at rest, or at the pace of its beginning, whichever is
-likelier.
+care of p (`grounded.filter.augmented`). The first k samples of a trial show what was before it,
+which no model predicts. All hypotheses are judged by the same data, so they count too (`before`):
+as samples of a state that drifted into the trial at rest, or at the pace of its beginning,
+whichever is likelier.
 
 Noise (its weights) and adjoints belong to samples: outside the filter they stay in the log's order.
 """
@@ -21,13 +21,14 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis.data import Data
-from grounded.diagnosis.delayed_measurement import Delayed
-from grounded.diagnosis.filter import UNKNOWN, Adjoint
 from grounded.diagnosis.hypothesis import Hypothesis
 from grounded.diagnosis.noise import NoiseModel
 from grounded.effects import SensorDelayFamily
+from grounded.filter.augmented import Delayed
+from grounded.filter.kalman import Adjoint
 from grounded.frozen import Array
 
+UNKNOWN = 1e6  # variances: how little is known of a state that was not measured at first
 UNLIKE = 1.0  # nats that a sample of what was before a trial costs at most more than others
 
 
@@ -95,7 +96,7 @@ class Delays:
         return replace(noise, weight_v=self.aligned(noise.weight_v, 1.0))
 
     def before(
-        self, noise: NoiseModel, entry: Array | None, track: Array, white: Array, whiten: Array
+        self, noise: NoiseModel, entry: Array | None, track: Array, white: Array, weight: Array
     ) -> float:
         """Log density of the samples that show what was before the trials; without log 2 pi [nats].
 
@@ -106,7 +107,7 @@ class Delays:
             entry: how noise enters (L, B, n, n); None: as it is.
             track: (L + 1, B, n).
             white: whitened innovations (L, B, n) of all other samples.
-            whiten: what whitened them, (L, B, n or more, n or more).
+            weight: 1 / their standard deviation, (L, B, n or more).
         """
         L, B, n = white.shape
         seen, colour = self.samples()[1][1:], noise.structure.tau is not None
@@ -117,7 +118,7 @@ class Delays:
             through = np.eye(n)[i] if entry is None else entry[:k, :, i]
             drift = (through**2 * power[:k]).sum(axis=-1)
             pace = (track[k] - track[0])[:, i] / max(k, 1)
-            log = np.log(whiten[..., i, i]) - 0.5 * white[..., i] ** 2
+            log = np.log(np.where(seen[..., i] > 0, weight[..., i], 1.0)) - 0.5 * white[..., i] ** 2
             mean = float((log * seen[..., i]).sum()) / max(float(seen[..., i].sum()), 1.0)
             least = (mean - UNLIKE) * float(self.data.seen[1 : k + 1, self.first, i].sum())
             total += max(least, *(self._drifted(noise, i, drift, p * pace) for p in (0.0, 1.0)))

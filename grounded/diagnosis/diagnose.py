@@ -1,10 +1,15 @@
 """START HERE: the sim-to-real gap, diagnosed. Trials and a crude model in, a verdict out.
 
-limits            what can't be known from these data
+preflight         the instruments, from their signals alone: corrected first  (instruments)
+limits            what can't be known from these data; which parameters they identify
 attribution       which effects, by evidence       (search, hypotheses, scan, refine, noise, fitted)
-held_out          no claim that held-out trials contradict; how far the gap shrinks on them
+ruler             held-out prediction errors in the channels' units
+decide            evidence proposes, the ruler decides; what each cause is worth
+measured          what the ruler says of the decision: table, noise floor, credit, what is left
 claims            what is claimed, what ties, what is nearly the same    (lookalike)
+correction        a curve that predicts what is left, where it passes a test of its own
 leftover          what no effect explains
+agreement         whether the trials agree; what changed between two groups of them
 prediction_error  where the gap lies: channels, times, regions
 split             what the error is made of: explained, unexplained, irreducible
 verdict           all of it in sentences; `report` is the result as data
@@ -14,51 +19,40 @@ excitation        what to run next, where two explanations tie
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
+from grounded.diagnosis.agreement import by_trial, changed
 from grounded.diagnosis.attribution import attribute
 from grounded.diagnosis.claims import Claims
+from grounded.diagnosis.correction import correction
 from grounded.diagnosis.data import prepare
+from grounded.diagnosis.decide import Decision, decide
 from grounded.diagnosis.delays import delays_of
 from grounded.diagnosis.fitted import Fitted
-from grounded.diagnosis.held_out import (
-    confirmed,
-    noise_confirmed,
-    shrinkage,
-    utility_prediction,
-    whole_runs,
-)
-from grounded.diagnosis.hypothesis import Hypothesis
-from grounded.diagnosis.leftover import Leftover, leftovers, whiteness
-from grounded.diagnosis.limits import Limits, knowable, limits
-from grounded.diagnosis.prediction_error import (
-    Horizon,
-    by_region,
-    by_time,
-    errors,
-    explained,
-    horizon,
-    normalised,
-)
+from grounded.diagnosis.held_out import shrinkage, utility_prediction
+from grounded.diagnosis.hypothesis import Hypothesis, Predictor, param_scale
+from grounded.diagnosis.leftover import whiteness
+from grounded.diagnosis.limits import Limits, held, identifiable, knowable, limits
+from grounded.diagnosis.measured import Measured, root_mean_square
+from grounded.diagnosis.prediction_error import by_region, by_time, explained, horizon
 from grounded.diagnosis.report import (
     Change,
     ChannelShare,
     Diagnosis,
     Gap,
+    Identifiable,
     NoiseLevels,
-    Remainder,
-    RunChange,
-    Split,
     UtilityPrediction,
     Where,
 )
+from grounded.diagnosis.ruler import Ruler
 from grounded.diagnosis.search import HypothesisSearch
-from grounded.diagnosis.split import repeated, split
 from grounded.diagnosis.verdict import next_trial, verdict
 from grounded.effects import Library
+from grounded.instruments.preflight import preflight
 from grounded.model import Model
 from grounded.task import Task
 from grounded.trial import Trial
@@ -88,6 +82,7 @@ def diagnose(
     trials: Sequence[Trial],
     options: DiagnosisOptions | None = None,
     *,
+    compare: Sequence[Trial] = (),
     progress: Callable[[str], None] | None = None,
 ) -> Diagnosis:
     """Where the gap between model and trials lies, which effect makes it, how far it shrinks.
@@ -96,6 +91,7 @@ def diagnose(
         subject: the task (its latency counts as modelled) or the bare model.
         trials: real runs on one time grid, whatever policy they ran.
         options: library, number of effects, horizon.
+        compare: a second group of trials; all are diagnosed, and what changed is `changed`.
         progress: called with a word at every stage, for a display.
 
     Raises:
@@ -105,49 +101,75 @@ def diagnose(
     model = subject.model if isinstance(subject, Task) else subject
     latency = subject.latency if isinstance(subject, Task) else None
     past = subject.past if isinstance(subject, Task) else None
+    tick("instruments")
+    first = sum(trial.known_steps >= 2 for trial in trials)
+    looked = preflight(subject, [*trials, *compare], options.hidden)
+    trials = looked.trials
     data = prepare(model, trials, latency, past, options.hidden)
     known = limits(data)
     tick("candidates")
-    offered = options.library.candidates(model, data.scales)
-    candidates = knowable(data, [e for e in offered if e.name not in options.but])
-    search, best = attribute(data, candidates, max_effects=options.max_effects, tick=tick)
-    tick("leftover")
+    uncertain = Predictor(data)
     with np.errstate(all="ignore"):
-        search, best = noise_confirmed(search, best, options.max_effects, options.horizon)
-        best = confirmed(search, best, options.horizon)
-        left = leftovers(search.predictor, best)
+        search = HypothesisSearch(data, ())
+        null = search.refined([search.fresh(Hypothesis())], FIRST_LOOK)
+        data = replace(data, model=held(uncertain, null[0])) if null else data
+    offered = options.library.candidates(data.model, data.scales)
+    settled = {*options.but, *looked.settled}
+    candidates = knowable(data, [e for e in offered if e.name not in settled])
+    search, best = attribute(data, candidates, max_effects=options.max_effects, tick=tick)
+    tick("predict")
+    used = [trial for trial in trials if trial.known_steps >= 2]
+    with np.errstate(all="ignore"):
+        decision = decide(search, best, ruler := Ruler(search.predictor), options.max_effects)
+        tick("leftover")
         task = subject if isinstance(subject, Task) else None
-        used = [trial for trial in trials if trial.known_steps >= 2]
-        return _Writer(search, best, left, known, options, tick, task, used).diagnosis()
+        found = _Writer(decision, ruler, known, options, tick, task, used).diagnosis()
+        groups = [k < first for k in range(data.count)]
+        return replace(
+            found,
+            identifiable=tuple(_identified(uncertain, decision.fit)),
+            preflight=looked.findings,
+            changed=changed(search, decision.fit, groups) if compare else None,
+        )
+
+
+FIRST_LOOK = 6  # iterations of the fit by whose noise the parameters are found identifiable
+
+
+def _identified(uncertain: Predictor, best: Fitted) -> list[Identifiable]:
+    """Of all uncertain parameters, those that were held too, beside the best hypothesis."""
+    if not param_scale(uncertain.data.model).any():
+        return []
+    return identifiable(uncertain, best)
 
 
 class _Writer:
-    """Turns a search into a Diagnosis."""
+    """Turns a decision into a Diagnosis."""
 
     def __init__(
         self,
-        search: HypothesisSearch,
-        best: Fitted,
-        left: list[Leftover],
+        decision: Decision,
+        ruler: Ruler,
         known: Limits,
         options: DiagnosisOptions,
         tick: Callable[[str], None],
         task: Task | None,
         trials: Sequence[Trial],
     ) -> None:
-        self.task, self.trials = task, trials
-        self.search, self.best, self.left, self.known = search, best, left, known
-        self.options, self.tick = options, tick
-        self.predictor, self.data = search.predictor, search.data
-        names = search.data.model.state_names
-        self.shown = [(i, n) for i, n in enumerate(names) if i not in search.data.hidden]
-        self.claims = Claims(search, best, known, left=bool(left))
+        self.decision, self.ruler, self.known, self.options = decision, ruler, known, options
+        self.tick, self.task, self.trials = tick, task, trials
+        self.search, self.best = decision.search, decision.fit
+        self.predictor, self.data = self.search.predictor, self.search.data
+        self.shown = list(zip(ruler.shown, ruler.names, strict=True))
+        self.measured = Measured(decision, ruler, trials)
+        self.claims = Claims(decision, self.measured.credit, known)
+        self.left = self.measured.left
 
     def diagnosis(self) -> Diagnosis:
         data, predictor = self.data, self.predictor
         self.tick("gap")
         where = horizon(predictor, self.best, self.options.horizon)
-        bare = self.claims.null.track  # a prediction starts from its own hypothesis' states
+        bare = self.decision.crude.track  # a prediction starts from its own hypothesis' states
         shrunk = shrinkage(predictor, self.best, bare, where)
         gain = explained(predictor, Hypothesis(), self.best)
         if self.left:
@@ -155,27 +177,22 @@ class _Writer:
             gain = gain.copy()
             gain[..., i] += self.left[0].improvement
         ranking = self.claims.ranking(where, shrunk.gap_before)
-        without = self.without_effects(where)
         groups = self.claims.groups()
         alike = self.claims.nearly(groups)
-        remainder = tuple(self.remainder(left) for left in self.left)
+        measured = self.measured
+        remainder = measured.remainders()
+        rows, credit = measured.prediction_error(), measured.credits()
+        named = [row.effect for row in ranking if row.claimed]
+        values, agreement = by_trial(self.best, data, named) if named else ((), ())
         return Diagnosis(
-            verdict=verdict(
-                self.claims,
-                shrunk.gap_before,
-                shrunk.gap_after,
-                ranking,
-                groups,
-                alike,
-                remainder,
-                without,
-            ),
+            verdict=verdict(self.claims, ranking, groups, remainder, rows, credit),
             where=Where(
                 channels=self.channels(gain, shrunk.before, where.spread),
                 times=tuple(by_time(gain.sum(axis=-1), data)),
                 regions=tuple(by_region(gain.sum(axis=-1), predictor, self.best)),
-                split=self.split(bare, where),
+                split=measured.split(),
                 whiteness=self.whiteness(),
+                tempering=self.search.tempering.factor,
             ),
             ranking=ranking,
             indistinguishable=groups,
@@ -186,36 +203,24 @@ class _Writer:
                 before=shrunk.gap_before,
                 after=shrunk.gap_after,
                 floor=1.0,
-                held_out=data.count > 1,
+                held_out=self.ruler.held_out,
                 channels=self.by_channel(shrunk.before, shrunk.after, where.spread),
-                without_effects=without,
             ),
             utility_prediction=self.utility_prediction(bare),
-            whole_run=self.whole_run(bare),
+            whole_run=measured.whole_run(),
             leftover=remainder,
+            correction=correction(predictor, self.best, self.left, where),
             next_trial=next_trial(self.claims, self.left, groups),
             unknowable=self.known.sentences,
             noise=self.noise(),
             parameters=self.claims.parameters(),
+            prediction_error=rows,
+            credit=credit,
+            per_trial=values,
+            agreement=agreement,
             trials=data.count,
             steps=data.steps,
             candidates=len(self.search.candidates),
-        )
-
-    def without_effects(self, where: Horizon) -> float:
-        """The gap that the calibrated parameters alone leave; NaN where nothing was calibrated."""
-        h = self.best.hypothesis
-        if not h.effects or h.shift is None or h.spread == 0:
-            return float("nan")
-        alone = Hypothesis(shift=h.shift, spread=h.spread)
-        return normalised(errors(self.predictor, alone, self.best.track, where), where)
-
-    def remainder(self, left: Leftover) -> Remainder:
-        """A leftover with the region where it acts."""
-        size = left.correction**2 * self.data.valid.T
-        regions = by_region(size, self.predictor, self.best, 1)
-        return Remainder(
-            left.channel, left.size, left.unit, left.gain, regions[0] if regions else None
         )
 
     def channels(self, gain: Any, error: Any, spread: Any) -> tuple[ChannelShare, ...]:
@@ -223,7 +228,7 @@ class _Writer:
         data = self.data
         excess = np.maximum(gain.sum(axis=(0, 1)), 0.0)
         share = excess / max(float(excess.sum()), 1e-12)
-        rms = _rms(error)
+        rms = root_mean_square(error)
         rows = [
             ChannelShare(
                 name,
@@ -240,7 +245,9 @@ class _Writer:
         """The gap of each state, noise-normalised."""
         found = {}
         for i, name in self.shown:
-            found[name] = Change(*(float(_rms(e[:, i] / spread[:, i])) for e in (before, after)))
+            found[name] = Change(
+                *(float(root_mean_square(e[:, i] / spread[:, i])) for e in (before, after))
+            )
         return found
 
     def noise(self) -> NoiseLevels:
@@ -254,26 +261,6 @@ class _Writer:
             correlation_s=np.nan if tau is None else tau,
             outliers=not isinstance(noise.weight_v, float),
         )
-
-    def whole_run(self, bare: Any) -> dict[str, RunChange]:
-        """Errors of predictions from the first state to the end of each run."""
-        before = whole_runs(self.predictor, Hypothesis(), bare)
-        after = whole_runs(self.predictor, self.best.hypothesis, self.best.track)
-        units = self.data.model.states
-        return {n: RunChange(float(before[i]), float(after[i]), units[n]) for i, n in self.shown}
-
-    def split(self, bare: Any, where: Horizon) -> dict[str, Split]:
-        """Explained, unexplained, irreducible: one step, the horizon, a whole run."""
-        repeats = repeated([trial.candidate for trial in self.trials])
-        horizons = {
-            "one_step": horizon(self.predictor, self.best, self.data.dt),
-            "horizon": where,
-            "whole_run": horizon(self.predictor, self.best, np.inf),
-        }
-        return {
-            name: split(self.predictor, self.best, bare, one, repeats)
-            for name, one in horizons.items()
-        }
 
     def whiteness(self) -> dict[str, float]:
         """The chance that white noise leaves innovations as correlated as these, by channel."""
@@ -289,10 +276,3 @@ class _Writer:
         self.tick("utility")
         found = utility_prediction(self.predictor, self.best, bare, self.task, self.trials)
         return found.summary()
-
-
-def _rms(error: Any) -> Any:
-    """Root mean square along the first axis; nan for a state that was never measured."""
-    count = np.isfinite(error).sum(axis=0)
-    total = np.nansum(error**2, axis=0)
-    return np.where(count > 0, np.sqrt(total / np.maximum(count, 1)), np.nan)

@@ -7,6 +7,11 @@ and noise. What it fails to explain is the evidence that the probe is expected t
 
     E[log p(y | A) - log p(y | B)] = 1/2 |whitened innovations of B on A's run|^2
 
+Where nothing ties, the probe teaches most about the values that are claimed or calibrated: from
+the information F of the trials so far and J of its run, filtered alike, the expected gain is
+
+    1/2 log det(F + J) / det F        and variances shrink as diag (F + J)^-1 to diag F^-1
+
 The probe stays inside the inputs' limits, and both hypotheses' runs inside the task's safety.
 """
 
@@ -19,11 +24,12 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis.data import prepare, shifted
-from grounded.diagnosis.hypothesis import Hypothesis, Predictor
+from grounded.diagnosis.fitted import calibrated
+from grounded.diagnosis.hypothesis import Hypothesis, Predictor, param_scale
 from grounded.diagnosis.noise import NoiseModel, Structure
 from grounded.diagnosis.refine import refine
 from grounded.diagnosis.report import Diagnosis
-from grounded.effects import Library, memory_start, scales_of, wrap, wrapping_order
+from grounded.effects import Library, Scales, memory_start, scales_of, wrap, wrapping_order
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.onboard import Runner
@@ -32,15 +38,19 @@ from grounded.task import Task
 from grounded.trial import Trial
 
 SIZES = (0.15, 0.35)  # of the input's range
+LITTLE = 1e-6  # of a value's own information, and of its size
 
 
 @dataclass(frozen=True, eq=False)
 class Probe:
-    """A runnable policy, the evidence it is expected to bring [nats], and what it does."""
+    """A runnable policy, the evidence it is expected to bring [nats], and what it does.
+
+    `about`: the two effects that it tells apart, or the value that it teaches most of.
+    """
 
     policy: Policy
     expected: float
-    pair: tuple[str, str]
+    about: tuple[str, ...]
     sentence: str
 
 
@@ -51,7 +61,9 @@ def probe(
     trials: Sequence[Trial],
     library: Library | None = None,
 ) -> Probe | None:
-    """The best probe for the first group that the data can't tell apart; None where nothing ties.
+    """The best probe for the first group that the data can't tell apart, or else for all values.
+
+    None where neither ties nor values are, or none is safe.
 
     Args:
         task: limits, start, safety, latency.
@@ -62,7 +74,7 @@ def probe(
     """
     ties = [g for g in diagnosis.indistinguishable if all(diagnosis.values(n) for n in g[:2])]
     if not ties:
-        return None
+        return _teaching(task, policy, diagnosis, trials, library or Library())
     group = ties[0]
     first, second = _hypotheses(task, diagnosis, trials, library or Library(), group[0], group[1])
     noise = _noise(task.model, diagnosis)
@@ -85,6 +97,71 @@ def probe(
         " (too little: try larger inputs or another manoeuvre)" if expected < 3 else ""
     )
     return Probe(chosen, expected, (group[0], group[1]), sentence)
+
+
+def _teaching(
+    task: Task, policy: Policy, diagnosis: Diagnosis, trials: Sequence[Trial], library: Library
+) -> Probe | None:
+    """The probe from which most is learnt about claimed and calibrated values."""
+    known = {n: e for n, e in diagnosis.parameters.items() if n in task.model.params}
+    values = {n: e.value for n, e in known.items() if np.isfinite(e.value)}
+    task = task.with_model(task.model.with_values(values))
+    scales, h = _scales(task, trials), Hypothesis()
+    spreads: dict[str, tuple[float, str]] = {}  # by column: standard deviation, unit
+    for name in (n for n in diagnosis.effects if not n.startswith("parameter:")):
+        row, effect = diagnosis.ranked(name), library.effect(name, task.model, scales)
+        if row is None:
+            return None
+        h = h.plus(effect, row.values)
+        spreads |= {f"{q.name} of {name}": (row.params[q.name].std, q.unit) for q in effect.free}
+    data = prepare(task.model, trials, task.latency, task.past)
+    sizes = {data.model.param_names[i]: float(param_scale(data.model)[i]) for i in calibrated(data)}
+    if known:
+        h = replace(h, shift=np.zeros(data.model.system.k), spread=1.0)
+        stds = {n: known[n].std / s if n in known else 0.0 for n, s in sizes.items()}
+        spreads |= {n: (stds[n], data.model.params[n].unit) for n in sizes}
+    std = np.array([s if np.isfinite(s) else 0.0 for s, _ in spreads.values()])
+    if not std.any():
+        return None
+    noise, best = _noise(task.model, diagnosis), None
+    F = _information(task, trials, h, noise)
+    if F.shape != (len(std), len(std)) or not np.isfinite(F).all():
+        return None
+    own = np.maximum(np.diag(F), 1 / np.maximum(std, LITTLE) ** 2)  # or what is known beforehand
+    unit_of = 1 / np.sqrt(own)
+    F = (F + np.diag(own - np.diag(F))) * np.outer(unit_of, unit_of) + LITTLE * np.eye(len(std))
+    for words, candidate in probes(policy, range(task.model.m)):
+        run = _run(task, h, candidate)
+        if not _safe(task, run):
+            continue
+        assert run is not None
+        J = _information(task, [run], h, noise)
+        if J.shape != F.shape or not np.isfinite(J).all():
+            continue
+        after = F + J * np.outer(unit_of, unit_of)
+        gain = 0.5 * float(np.linalg.slogdet(after)[1] - np.linalg.slogdet(F)[1])
+        if best is None or gain > best[0]:
+            left = np.diag(np.linalg.inv(after)) / np.diag(np.linalg.inv(F))
+            best = (gain, candidate, words, np.sqrt(left))
+    if best is None:
+        return None
+    gain, chosen, words, shrunk = best
+    k = int(np.argmin(np.where(std > 0, shrunk, np.inf)))
+    name = list(spreads)[k]
+    unit = f" {spreads[name][1]}" * (spreads[name][1] != "1")
+    now = float(std[k]) * sizes.get(name, 1.0)
+    sentence = (
+        f"{words}: expected to take the standard deviation of {name} from {now:.2g} to "
+        f"{now * float(shrunk[k]):.2g}{unit}, and to teach {gain:.1f} nats in all"
+    )
+    return Probe(chosen, gain, (name,), sentence)
+
+
+def _information(task: Task, runs: Sequence[Trial], h: Hypothesis, noise: NoiseModel) -> Array:
+    """Fisher information (C, C) on a hypothesis' values that runs hold, or would."""
+    data = prepare(task.model, runs, task.latency, task.past)
+    fits = refine(Predictor(data), [(h, noise, data.y.copy())], iterations=1, fixed_noise=True)
+    return np.asarray(fits[0].gram.sum(axis=0)) if fits else np.zeros((0, 0))
 
 
 def probes(policy: Policy, inputs: Sequence[int]) -> Iterator[tuple[str, Policy]]:
@@ -137,17 +214,20 @@ def _hypotheses(
     first: str,
     second: str,
 ) -> tuple[Hypothesis, Hypothesis]:
-    states = np.concatenate([trial.states for trial in trials])
-    inputs = np.concatenate([trial.inputs for trial in trials])
-    duration = max(trial.steps for trial in trials) * task.dt
-    scales = scales_of(task.model, states, inputs, task.dt, duration)
-    h = Hypothesis()
+    scales, h = _scales(task, trials), Hypothesis()
     for name in diagnosis.effects:
         if name not in (first, second):
             h = h.plus(library.effect(name, task.model, scales), diagnosis.values(name))
     built = (library.effect(name, task.model, scales) for name in (first, second))
     one, other = (h.plus(effect, diagnosis.values(effect.name)) for effect in built)
     return one, other
+
+
+def _scales(task: Task, trials: Sequence[Trial]) -> Scales:
+    states = np.concatenate([trial.states for trial in trials])
+    inputs = np.concatenate([trial.inputs for trial in trials])
+    duration = max(trial.steps for trial in trials) * task.dt
+    return scales_of(task.model, states, inputs, task.dt, duration)
 
 
 def _noise(model: Model, diagnosis: Diagnosis) -> NoiseModel:

@@ -1,6 +1,8 @@
 """Which hypotheses an attribution has fitted so far, their evidence, the best of them.
 
-    evidence(h) = log p(y | h) - what naming its effects costs - what the noise structure costs
+    evidence(h) = b log p(y | h) - what naming its effects costs - what the noise structure costs
+
+with one b for all, 1 where the likeliest leaves white noise (`grounded.filter.tempering`).
 
 What naming an effect costs, the price of its numbers, of looking for it, of where it might be:
 
@@ -8,7 +10,7 @@ What naming an effect costs, the price of its numbers, of looking for it, of whe
 
 k free values, N time steps. Thresholds, frequencies and places that were scanned pay for the
 looking, and families that could have been blamed at many targets for the choice. A parameter of the
-model pays by its prior (a fifth of its size) instead.
+model pays by its prior (a fifth of its size) instead. Two added rates that cancel are no finding.
 """
 
 from __future__ import annotations
@@ -20,9 +22,10 @@ import numpy as np
 
 from grounded.diagnosis.data import Data
 from grounded.diagnosis.fitted import Fitted
-from grounded.diagnosis.hypothesis import Hypothesis, Predictor
+from grounded.diagnosis.hypothesis import Hypothesis, Predictor, rates_of
 from grounded.diagnosis.noise import Structure
 from grounded.effects import Effect, ParamFamily
+from grounded.filter.tempering import Tempering, tempering
 
 CLAIM = 3.0  # nats from which an effect is claimed
 TIE = 3.0  # nats within which two explanations are not told apart
@@ -35,6 +38,8 @@ class FittedHypotheses:
         self.data, self.predictor = data, Predictor(data)
         self.candidates = tuple(candidates)
         self.N = max(data.steps, 2)
+        self._cancelling: dict[object, bool] = {}
+        self.tempering = Tempering()
         self._prices: dict[tuple[object, ...], float] = {}
         self.fits: dict[tuple[Structure, float, tuple[str, ...]], Fitted] = {}
         families = [e.family.name for e in candidates]
@@ -51,13 +56,31 @@ class FittedHypotheses:
     def score(self, fit: Fitted) -> float:
         """Evidence of a fit in nats, up to a constant of the data."""
         h = fit.hypothesis
+        if self.cancelling(h):
+            return -math.inf
         paid = sum(self.price(e, v) for e, v in h.pairs)
         extra = fit.noise.structure.numbers(self.data.model.n)
         calibration = 1.0 if h.spread > 0 else 0.0
-        return fit.evidence - paid - 0.5 * extra * math.log(self.N) - calibration
+        return (
+            self.tempering.factor * fit.evidence
+            - paid
+            - 0.5 * extra * math.log(self.N)
+            - calibration
+        )
+
+    def cancelling(self, h: Hypothesis) -> bool:
+        """Whether two added rates of a hypothesis all but cancel: neither is a finding."""
+        key = tuple(zip(h.names, (tuple(v.values()) for v in h.values), strict=True))
+        if key not in self._cancelling:
+            self._cancelling[key] = cancelling(self.predictor, h)
+        return self._cancelling[key]
 
     def keep(self, fits: Sequence[Fitted]) -> None:
         """Remembers the best fit of every hypothesis under every structure."""
+        before = max((fit.evidence for fit in self.fits.values()), default=-math.inf)
+        likeliest = max(fits, key=lambda fit: fit.evidence, default=None)
+        if likeliest is not None and likeliest.evidence > before:
+            self.tempering = tempering(likeliest.white, self.data.seen[1:])
         for fit in fits:
             h = fit.hypothesis
             key = (fit.noise.structure, h.spread, tuple(sorted(h.names)))
@@ -112,6 +135,7 @@ def parametric(fit: Fitted) -> bool:
 PARAM_PRIOR = 0.2  # prior relative error of one parameter that is blamed
 BRIEF = 0.1  # of a control step: shorter delays and lags are a matter of time stamps
 TIMES = {"delay": "d", "sensor_delay": "d", "first_order_lag": "tau"}
+LEFT = 0.25  # of the larger of two rates, from which one is more than the other's counterpart
 SAME = 0.05  # part of a dead zone's power that a mere offset may lack and still be the same
 
 
@@ -136,6 +160,27 @@ def price(
     if not _mere_offset(predictor, effect, values):
         cost += math.log(effect.places)
     return cost + math.log(targets)
+
+
+def cancelling(predictor: Predictor, h: Hypothesis) -> bool:
+    """Whether two rates that are added to the same states leave little of each other."""
+    rates, data = rates_of(h), predictor.data
+    if len(rates) < 2:
+        return False
+    x, u = data.y[:-1], predictor.inputs(h)
+    needed = any(effect.family.needs_own for effect, _ in rates)
+    own = predictor.named((predictor.moved(h, x, u) - x) / data.dt) if needed else {}
+    units = data.model.states  # states of one unit, a position's two, share a scale
+    size = np.array(
+        [max(data.scales.spread(n) for n in units if units[n] == unit) for unit in units.values()]
+    )
+    by = [predictor.added_rate([one], x, u, data.time, own) / size for one in rates]
+    lengths = [float(np.sqrt(np.sum(one**2))) for one in by]
+    return any(
+        np.sqrt(np.sum((by[i] + by[j]) ** 2)) < LEFT * max(lengths[i], lengths[j])
+        for i in range(len(by))
+        for j in range(i)
+    )
 
 
 def _of_parameter(effect: Effect, values: Mapping[str, float], steps: int) -> float:

@@ -2,9 +2,9 @@
 
     x_{t+1} = f_h(x_t, commands)        y_t = x_t + offset_h(x)
 
-Effects on inputs act on the command sequence of the whole trial; rates act by Strang splitting,
-half before and half after the model's step, or, limits, on its mean rate; sensor effects act on
-what is compared with the log.
+Effects on inputs act on the command sequence of the whole trial, a joint's losses on what arrives
+of it at a step; rates act by Strang splitting, half before and half after the model's step, or,
+limits, on its mean rate; sensor effects act on what is compared with the log.
 The very equations that `grounded.effects.wrap` adopts, evaluated on arrays.
 """
 
@@ -21,14 +21,19 @@ from grounded.diagnosis.data import Data, shifted
 from grounded.effects import (
     Effect,
     InputFamily,
+    LossFamily,
     MemoryFamily,
     ParamFamily,
     RateFamily,
     SensorDelayFamily,
     SensorFamily,
+    SensorLagFamily,
     acting_order,
 )
+from grounded.effects.family import braked, coupled
+from grounded.effects.joint import Loads, loads, solved
 from grounded.effects.registry import partner
+from grounded.effects.sensor import lagging
 from grounded.frozen import Array
 from grounded.model import Model
 
@@ -37,8 +42,8 @@ from grounded.model import Model
 class Hypothesis:
     """Effects with their values, and shifts of the model's parameters (k,) with a prior.
 
-    `spread` is the prior standard deviation of every shift in units of `param_scale`; 0: the
-    parameters are taken as they are.
+    `spread` is the prior standard deviation of every shift in units of `param_scale`, the user's
+    own; 0: the parameters are taken as they are.
     """
 
     effects: tuple[Effect, ...] = ()
@@ -92,14 +97,8 @@ class Hypothesis:
 
 
 def param_scale(model: Model) -> Array:
-    """What a relative error of 1 means for each parameter (k,): its size, or its range if zero."""
-    found = []
-    for param in model.params.values():
-        size = abs(param.value)
-        if size == 0 and param.low is not None and param.high is not None:
-            size = 0.5 * (param.high - param.low)
-        found.append(size)
-    return np.array(found, float)
+    """Prior standard deviation of each parameter (k,): 0 of a constant."""
+    return np.array([param.spread for param in model.params.values()], float)
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,10 +146,11 @@ class Predictor:
         moved = self.data.model.system.step(*self.flat(x, u), p, dt or self.data.dt)
         return moved.reshape(x.shape)
 
-    def slope(self, x: Array, u: Array, p: Array, dt: float | None = None) -> Array:
-        """Slope f_x of the model's own step at any leading shape, (..., n, n)."""
-        f_x, _ = self.data.model.system.linearise(*self.flat(x, u), p, dt or self.data.dt)
-        return f_x.reshape(*x.shape, x.shape[-1])
+    def slopes(self, x: Array, u: Array, p: Array, dt: float | None = None) -> tuple[Array, Array]:
+        """Slopes of the model's own step at any leading shape: f_x (..., n, n), f_u (..., n, m)."""
+        found = self.data.model.system.linearise(*self.flat(x, u), p, dt or self.data.dt)
+        f_x, f_u = (f.reshape(*x.shape, f.shape[-1]) for f in found)
+        return f_x, f_u
 
     def flat(self, x: Array, u: Array) -> tuple[Array, Array]:
         """States (..., n) and inputs (..., m) as rows."""
@@ -163,29 +163,83 @@ class Predictor:
 
     def advance(self, h: Hypothesis, x: Array, u: Array, t: Array) -> Array:
         """One step of a hypothesis from x (..., n) with received inputs u (..., m) at times t."""
-        p, dt = self.params(h), self.data.dt
-        rates, limits = rates_of(h), limits_of(h)
-        if not rates and not limits:
-            return self.step(x, u, p)
+        dt, rates = self.data.dt, rates_of(h)
+        if not rates and not limits_of(h):
+            return self.moved(h, x, u)
         needs_own = any(e.family.needs_own for e, _ in rates)
-        own = self.named((self.step(x, u, p) - x) / dt) if needs_own else {}
+        own = self.named((self.moved(h, x, u) - x) / dt) if needs_own else {}
         start = x + 0.5 * dt * self.added_rate(rates, x, u, t, own)
-        after, mean = self.limited(limits, start, u, p, t)
+        after, mean = self.limited(h, start, u, t)
         if needs_own:  # the mean over the very step: second order, steady where the model is stiff
             own = self.named(mean)
         result = after + 0.5 * dt * self.added_rate(rates, after, u, t + dt, own)
         for i, j in self.tied():  # a carried heading rate is the heading's rate, effects and all
             found = []
             for s, when in ((x, t), (result, t + dt)):
-                rate = self.instant(s, u, p)
+                rate = self.instant(h, s, u)
                 own = self.named(rate) if needs_own else {}
                 found.append(rate[..., i] + self.added_rate(rates, s, u, when, own)[..., i])
             result[..., j] = x[..., j] + found[1] - found[0]
         return result
 
-    def limited(self, limits: Any, x: Array, u: Array, p: Array, t: Array) -> tuple[Array, Array]:
-        """The model's step through (effect, values) that limit its rates, and its mean rate."""
-        after = self.step(x, u, p)
+    def moved(self, h: Hypothesis, x: Array, u: Array, dt: float | None = None) -> Array:
+        """The model's step with what its motion takes off the inputs, without further rates."""
+        return self.step(x, self.left(h, x, u, dt), self.params(h), dt)
+
+    def left(self, h: Hypothesis, x: Array, u: Array, dt: float | None = None) -> Array:
+        """What losses leave of the inputs u (..., m) that reach the model at x (..., n)."""
+        pairs, names = losses_of(h), self.data.model.input_names
+        if not pairs:
+            return u
+        found = u.copy()
+        taken = solved(pairs, self.loads(h, x, u, dt), dt or self.data.dt)
+        for (effect, _), loss in zip(pairs, taken, strict=True):
+            found[..., names.index(coupled(effect.site)[0])] -= loss
+        return found
+
+    def loads(self, h: Hypothesis, x: Array, u: Array, dt: float | None = None) -> Loads:
+        """Of each loss: speed at the start, at the end without it, gains, the input (`joint`)."""
+        names, p = self.data.model.input_names, self.params(h)
+
+        def step(a: Named) -> Named:
+            return self.named(self.step(x, np.stack([a[n] for n in names], axis=-1), p, dt))
+
+        given = Named("input", names, list(np.moveaxis(u, -1, 0)))
+        return loads(losses_of(h), self.named(x), given, step)
+
+    def loss_slopes(
+        self, h: Hypothesis, x: Array, u: Array, f_x: Array, f_p: Array | None = None
+    ) -> tuple[Array, Array]:
+        """Slopes of what losses take off the inputs: by state (..., m, n), parameter (..., m, k).
+
+        f_x, f_p: slopes of the model's own step (..., n, n), (..., n, k).
+        """
+        names, pairs = self.data.model.input_names, losses_of(h)
+        f_p = f_x[..., :0] if f_p is None else f_p
+        m = len(names)
+        by_x, by_p = (np.zeros((*x.shape[:-1], m, f.shape[-1])) for f in (f_x, f_p))
+        if not pairs:
+            return by_x, by_p
+        at = w, free, gain, given = self.loads(h, x, u)
+        base = solved(pairs, at, self.data.dt)
+        drives = [coupled(effect.site) for effect, _ in pairs]
+        for i, (_, source) in enumerate(drives):
+            k = self.data.model.state_names.index(source)
+            size = 1e-6 * self.data.scales.peak(source)
+            more = [value + size if j == i else value for j, value in enumerate(w)]
+            ends = [value + size if j == i else value for j, value in enumerate(free)]
+            started = solved(pairs, (more, free, gain, given), self.data.dt)
+            ended = solved(pairs, (w, ends, gain, given), self.data.dt)
+            for (tau, _), was, by_w, by_end in zip(drives, base, started, ended, strict=True):
+                row, slope = names.index(tau), (by_end - was)[..., None] / size
+                by_x[..., row, :] += slope * f_x[..., k, :]
+                by_x[..., row, k] += (by_w - was) / size
+                by_p[..., row, :] += slope * f_p[..., k, :]
+        return by_x, by_p
+
+    def limited(self, h: Hypothesis, x: Array, u: Array, t: Array) -> tuple[Array, Array]:
+        """The model's step through the effects that limit its rates, and its mean rate."""
+        after, limits = self.moved(h, x, u), limits_of(h)
         free = (after - x) / self.data.dt
         if not limits:
             return after, free
@@ -193,7 +247,7 @@ class Predictor:
         dt, mean = self.data.dt / parts, np.zeros_like(x)
         touched = np.zeros((*x.shape[:-1], 1), bool)
         for k in range(parts):
-            own = (self.step(x, u, p, dt) - x) / dt
+            own = (self.moved(h, x, u, dt) - x) / dt
             added = self.added_rate(limits, x, u, t + k * dt, self.named(own))
             x, mean = x + dt * (own + added), mean + own / parts
             touched |= (added != 0).any(axis=-1, keepdims=True)
@@ -203,10 +257,10 @@ class Predictor:
         """States, or their rates (..., n), by name."""
         return Named("state", self.data.model.state_names, list(np.moveaxis(x, -1, 0)))
 
-    def instant(self, x: Array, u: Array, p: Array) -> Array:
+    def instant(self, h: Hypothesis, x: Array, u: Array) -> Array:
         """The model's own rates at x (..., n), by a very short step."""
         short = 1e-3 * self.data.dt
-        return np.asarray((self.step(x, u, p, short) - x) / short)
+        return np.asarray((self.moved(h, x, u, short) - x) / short)
 
     def tied(self) -> list[tuple[int, int]]:
         """(heading, heading rate) where the rate is only carried along."""
@@ -227,6 +281,7 @@ class Predictor:
         total = np.zeros_like(x)
         for effect, values in rates:
             added = effect.family.rate(s, a, own, t, values, effect.site)
+            added = braked(effect, s, added, 0.5 * self.data.dt)
             for name, value in added.items():
                 total[..., names.index(name)] += value
         return total
@@ -243,7 +298,8 @@ class Predictor:
 
     def standing(self, h: Hypothesis, shown: Array) -> Array | float:
         """What sensors add to what they are shown (..., n), however old it is; 0.0 if nothing."""
-        sensors = [(e, v) for e, v in h.pairs if isinstance(e.family, SensorFamily)]
+        kinds = SensorFamily | SensorLagFamily
+        sensors = [(e, v) for e, v in h.pairs if isinstance(e.family, kinds)]
         if not sensors:
             return 0.0
         names, total = self.data.model.state_names, np.zeros_like(shown)
@@ -263,10 +319,17 @@ def limits_of(h: Hypothesis) -> list[tuple[Any, Mapping[str, float]]]:
     return [(e, v) for e, v in h.pairs if isinstance(e.family, RateFamily) and e.family.parts]
 
 
+def losses_of(h: Hypothesis) -> list[tuple[Any, Mapping[str, float]]]:
+    """What the motion takes off the inputs that drive it."""
+    return [(e, v) for e, v in h.pairs if isinstance(e.family, LossFamily)]
+
+
 def sensor_offset(effect: Effect, values: Mapping[str, float], track: Array, dt: float) -> Array:
     """What a sensor effect adds to the log of its state along a track (L + 1, B)."""
     if isinstance(effect.family, SensorFamily):
         return np.asarray(effect.family.measure(track, values) - track)
+    if isinstance(effect.family, SensorLagFamily):
+        return _behind(track, values["tau"], dt)
     steps = values["d"] / dt
     slope = np.vstack([track[1:2] - track[:1], np.diff(track, axis=0)])
     whole, part = int(np.floor(steps)), steps - np.floor(steps)
@@ -275,6 +338,15 @@ def sensor_offset(effect: Effect, values: Mapping[str, float], track: Array, dt:
     count = len(track)
     old = (1 - part) * line[1 : count + 1] + part * line[:count]
     return np.asarray(old - track)
+
+
+def _behind(track: Array, tau: float, dt: float) -> Array:
+    """How far a filtered sensor is off along a track (L + 1, B) that moved before as it begins."""
+    moved = np.diff(track, axis=0)
+    off = [-moved[0] * tau / dt]
+    for step in moved:
+        off.append(lagging(off[-1], step, tau, dt))
+    return np.array(off)
 
 
 def transformed(effect: Effect, values: Mapping[str, float], u: Array, data: Data) -> Array:

@@ -19,12 +19,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from grounded.diagnosis import filter as kalman
 from grounded.diagnosis.fitted import Fitted
 from grounded.diagnosis.hypothesis import Predictor
 from grounded.diagnosis.linearise import gains_of, step_jacobian
+from grounded.diagnosis.ruler import folds
 from grounded.effects import places
 from grounded.effects.family import per
+from grounded.filter import kalman
 from grounded.frozen import Array
 
 CLAIM = 5.0  # nats gained on held-out trials from which a leftover is stated
@@ -41,23 +42,22 @@ class Leftover:
     gain: float
     size: float
     unit: str
-    correction: Array  # (L, B) the rate that the flexible model adds
+    correction: Array  # (L, B) the rate that the flexible model adds, its weights from other trials
     improvement: Array  # (L, B) held-out gain of each step [nats]
 
 
 def leftovers(predictor: Predictor, fit: Fitted) -> list[Leftover]:
     """The channels in which a flexible model predicts held-out trials better, most first."""
     data = predictor.data
-    if data.count < 2:
+    if len(np.unique(folds(data))) < 2:
         return []
     features = flexible(predictor, fit)
     found = []
     for i, name in enumerate(data.model.state_names):
         if i in data.hidden:
             continue
-        gain, step_gain, weights = _channel(predictor, fit, features, i)
+        gain, step_gain, correction = _channel(predictor, fit, features, i)
         if gain > CLAIM:
-            correction = features @ weights
             size = float(np.sqrt((correction**2 * data.valid.T).sum() / data.valid.sum()))
             unit = data.model.states[name]
             found.append(Leftover(name, gain, size, per(unit), correction, step_gain))
@@ -117,7 +117,24 @@ def _bins(value: Array, count: int) -> list[Array]:
 def _channel(
     predictor: Predictor, fit: Fitted, features: Array, i: int
 ) -> tuple[float, Array, Array]:
-    """Held-out gain of correcting one channel's rate: total, by step (L, B); the weights."""
+    """Held-out gain of correcting one channel's rate: total, by step (L, B); the correction."""
+    gain, by_step, weights = held_out_columns(predictor, fit, features, i)
+    left_out, rate = folds(predictor.data), np.zeros_like(by_step)
+    for k, trial in enumerate(np.unique(left_out)):
+        own = left_out == trial
+        rate[:, own] = features[:, own] @ weights[k]
+    return gain, by_step, rate
+
+
+def held_out_columns(
+    predictor: Predictor, fit: Fitted, features: Array, i: int
+) -> tuple[float, Array, Array]:
+    """What features (L, B, K) of state i's rate gain on each trial, fitted to the others.
+
+    Returns:
+        The gain [nats]; the same by step (L, B); weights (S + 1, K) without each of the S folds,
+        and of all.
+    """
     data = predictor.data
     gains = filter_of(predictor, fit)
     L, B, K = features.shape
@@ -125,36 +142,39 @@ def _channel(
     d = np.zeros((L, B, n, K))
     d[:, :, i, :] = features * data.dt
     white, _ = kalman.innovations(gains, d, np.zeros((L + 1, 1, 1, 1)))
-    trials = np.unique(data.trial_of)
+    left_out = folds(data)
+    trials = np.unique(left_out)
     grams, scores = [], []
     for trial in trials:
-        own = data.trial_of == trial
+        own = left_out == trial
         W = white[:, own].reshape(-1, K)
         grams.append(W.T @ W)
         scores.append(W.T @ fit.white[:, own].reshape(-1))
     G, s = np.sum(grams, axis=0), np.sum(scores, axis=0)
     scale = np.sqrt(np.maximum(np.diag(G), 1e-300))
-    best: tuple[float, Array, Array] = (-np.inf, np.zeros((L, B)), np.zeros(K))
+    best: tuple[float, Array, Array] = (-np.inf, np.zeros((L, B)), np.zeros((len(trials) + 1, K)))
     for spread in PENALTIES:
         prior = np.diag(scale**2) / spread  # the columns' own size: a weight explains `spread` nats
-        total, by_step = 0.0, np.zeros((L, B))
+        total, by_step, each = 0.0, np.zeros((L, B)), []
         for trial, Gt, st in zip(trials, grams, scores, strict=True):
             weights = -np.linalg.solve(G - Gt + prior + 1e-12 * np.eye(K), s - st)
-            own = data.trial_of == trial
+            each.append(weights)
+            own = left_out == trial
             change = white[:, own] @ weights
             residual = fit.white[:, own]
             gained = 0.5 * (residual**2 - (residual + change) ** 2).sum(axis=-1)
             by_step[:, own] = gained
             total += float(gained.sum())
         if total > best[0]:
-            best = (total, by_step, -np.linalg.solve(G + prior + 1e-12 * np.eye(K), s))
+            whole = -np.linalg.solve(G + prior + 1e-12 * np.eye(K), s)
+            best = (total, by_step, np.array([*each, whole]))
     return best
 
 
-def filter_of(predictor: Predictor, fit: Fitted) -> kalman.Gains:
+def filter_of(predictor: Predictor, fit: Fitted, *, covariances: bool = False) -> kalman.Gains:
     """The gains of a fit's filter."""
-    F = step_jacobian(predictor, fit.hypothesis, fit.track)
-    return gains_of(predictor, fit.hypothesis, fit.noise, fit.track, F)
+    h, F = fit.hypothesis, step_jacobian(predictor, fit.hypothesis, fit.track)
+    return gains_of(predictor, h, fit.noise, fit.track, F, covariances=covariances)
 
 
 def whiteness(fit: Fitted, seen: Array) -> dict[str, float]:

@@ -7,21 +7,33 @@ there may exist and can't be known, so it is not offered and the reader is told.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from grounded.diagnosis.data import Data
+from grounded.diagnosis.data import PIECES, Data
+from grounded.diagnosis.fitted import Fitted, calibrated
+from grounded.diagnosis.hypothesis import Predictor
+from grounded.diagnosis.leftover import filter_of
+from grounded.diagnosis.linearise import base_columns
+from grounded.diagnosis.report import Identifiable
 from grounded.effects import (
     Effect,
     InputFamily,
+    LossFamily,
     MemoryFamily,
     RateFamily,
     SensorDelayFamily,
     SensorFamily,
+    SensorLagFamily,
 )
+from grounded.filter import kalman
+from grounded.frozen import Array
+from grounded.model import Model, Param
 
 FEW_STEPS = 30
+WEAK, UNKNOWN = 0.2, 0.6  # of its prior standard deviation: what the trials leave of it
+QUIETER = 100.0  # times less noise variance: what effects may yet take out of the noise
 
 
 @dataclass(frozen=True)
@@ -35,8 +47,8 @@ class Limits:
 def limits(data: Data) -> Limits:
     """What the trials are too few or too quiet for."""
     found, no_cause = [], False
-    if data.count < 2:
-        found.append("one trial alone confirms nothing; run a second one")
+    if data.count < 2 and len(data.valid) < PIECES:
+        found.append("one trial alone confirms nothing; run a second one, or a longer one")
         no_cause = True
     if data.steps < FEW_STEPS:
         found.append(
@@ -100,9 +112,70 @@ def knowable(data: Data, effects: Sequence[Effect]) -> tuple[Effect, ...]:
             continue
         if isinstance(family, InputFamily | MemoryFamily) and targets & still:
             continue
-        if isinstance(family, RateFamily) and targets & unmoved:
+        if isinstance(family, RateFamily | LossFamily) and targets & unmoved:
             continue
-        if isinstance(family, SensorFamily | SensorDelayFamily) and targets & (dead | unmoved):
+        sensors = SensorFamily | SensorDelayFamily | SensorLagFamily
+        if isinstance(family, sensors) and targets & (dead | unmoved):
             continue
         kept.append(effect)
     return tuple(kept)
+
+
+def identifiable(predictor: Predictor, fit: Fitted, quieter: float = 1.0) -> list[Identifiable]:
+    """How well the trials tell each uncertain parameter, all others free, under a fit's noise.
+
+    The sensitivities of the predictions, whitened, are the information that the data add to the
+    priors; what is left of each prior's standard deviation is the verdict.
+    """
+    left = _left(_information(predictor, fit) * quieter)
+    model, found = predictor.data.model, []
+    for i, share in zip(calibrated(predictor.data), left, strict=True):
+        name = model.param_names[i]
+        found.append(Identifiable(name, _verdict(share), model.params[name].spread, float(share)))
+    return found
+
+
+def held(predictor: Predictor, fit: Fitted) -> Model:
+    """The model with those parameters as constants that even little noise would leave unknown.
+
+    Of several of which only a combination is known (a mass and a gain) the one stays free that its
+    user is least sure of.
+    """
+    model = predictor.data.model
+    H = _information(predictor, fit) * QUIETER
+    names = [model.param_names[i] for i in calibrated(predictor.data)]
+    sure = np.array([model.params[n].spread / max(abs(model.params[n].value), 1e-9) for n in names])
+    free = list(range(len(names)))
+    while free:
+        left = _left(H[np.ix_(free, free)])
+        lost = [i for i, share in zip(free, left, strict=True) if share > UNKNOWN]
+        if not lost:
+            break
+        free.remove(min(lost, key=lambda i: sure[i]))
+    fixed = {names[i] for i in range(len(names)) if i not in free}
+    params = {n: Param(p.value, p.unit) if n in fixed else p for n, p in model.params.items()}
+    return replace(model, params=params) if fixed else model
+
+
+def _information(predictor: Predictor, fit: Fitted) -> Array:
+    """Of the uncertain parameters in units of their priors, the effects' values known, (K, K)."""
+    h, k = fit.hypothesis, len(fit.hypothesis.theta)
+    columns, of_log = base_columns(predictor, replace(fit, hypothesis=replace(h, spread=1.0)))
+    if columns.shape[-1] == k:
+        return np.zeros((0, 0))
+    white = kalman.innovations(filter_of(predictor, fit), columns, of_log)[0]
+    W = white.reshape(-1, columns.shape[-1])
+    G = np.nan_to_num(W.T @ W)
+    across = G[k:, :k]
+    return np.asarray(G[k:, k:] - across @ np.linalg.pinv(G[:k, :k], hermitian=True) @ across.T)
+
+
+def _left(information: Array) -> Array:
+    """Standard deviations with unit priors, (K,)."""
+    return np.sqrt(np.diag(np.linalg.inv(information + np.eye(len(information)))))
+
+
+def _verdict(left: float) -> str:
+    if left > UNKNOWN:
+        return "not identifiable"
+    return "weak" if left > WEAK else "identifiable"

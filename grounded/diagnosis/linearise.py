@@ -32,15 +32,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from grounded.diagnosis import filter as kalman
 from grounded.diagnosis.data import Data
-from grounded.diagnosis.delayed_measurement import Delayed, FilterSystem
 from grounded.diagnosis.delays import delays_of
-from grounded.diagnosis.filter import UNKNOWN
 from grounded.diagnosis.fitted import Fitted, calibrated
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor, limits_of, param_scale, rates_of
 from grounded.diagnosis.noise import NoiseModel
 from grounded.effects import ParamFamily
+from grounded.filter import kalman
+from grounded.filter.augmented import Delayed, coloured
+from grounded.filter.kalman import LinearSystem
 from grounded.frozen import Array
 from grounded.model import Model
 
@@ -95,18 +95,22 @@ def sensitivities_of(
     predictor: Predictor, h: Hypothesis, x: Array, u: Array
 ) -> tuple[Array, Array]:
     """Of a hypothesis' steps from x (L, B, n): F (L, B, n, n), slope in all parameters (..., k)."""
-    data, n = predictor.data, x.shape[-1]
-    flat = predictor.flat(x, u)
-    f_x, f_p = sensitivities(data.model, *flat, predictor.params(h), data.dt)
-    F = with_effects(predictor, h, x, u, f_x.reshape(*x.shape, n))
-    return F, passed(predictor, h, x, u, f_p.reshape(*x.shape, -1))
+    data = predictor.data
+    flat = predictor.flat(x, predictor.left(h, x, u))
+    slopes = sensitivities(data.model, *flat, predictor.params(h), data.dt)
+    f_x, f_u, f_p = (f.reshape(*x.shape, f.shape[-1]) for f in slopes)
+    by_x, by_p = predictor.loss_slopes(h, x, u, f_x, f_p)
+    F = with_effects(predictor, h, x, u, f_x - f_u @ by_x)
+    return F, passed(predictor, h, x, u, f_p - f_u @ by_p)
 
 
 def step_jacobian(predictor: Predictor, h: Hypothesis, track: Array) -> Array:
     """F of every step along a track (L or more, B, n), (L, B, n, n)."""
     data, u = predictor.data, predictor.inputs(h)
     x = track[: len(data.time)]
-    return with_effects(predictor, h, x, u, predictor.slope(x, u, predictor.params(h)))
+    f_x, f_u = predictor.slopes(x, predictor.left(h, x, u), predictor.params(h))
+    by_x, _ = predictor.loss_slopes(h, x, u, f_x)
+    return with_effects(predictor, h, x, u, f_x - f_u @ by_x)
 
 
 def noise_entry(predictor: Predictor, h: Hypothesis, track: Array) -> Array | None:
@@ -125,7 +129,7 @@ def noise_entry(predictor: Predictor, h: Hypothesis, track: Array) -> Array | No
 
 def filter_system(
     predictor: Predictor, h: Hypothesis, noise: NoiseModel, track: Array, F: Array
-) -> tuple[FilterSystem, Delayed | None]:
+) -> tuple[LinearSystem, Delayed | None]:
     """What the filter of a hypothesis is made of; F (L, B, n, n)."""
     data = predictor.data
     (L, B, n, _), delays = F.shape, delays_of(h, data)
@@ -133,18 +137,24 @@ def filter_system(
     if delays is not None:
         noise, seen, delayed = delays.noise(noise), delays.samples()[1], delays.in_filter()
     G = noise_entry(predictor, h, track)
-    A = kalman.transition(F, noise.structure.phi(data.dt), G)
+    A = coloured(F, noise.structure.phi(data.dt), G)
     Q = np.broadcast_to(noise.process(data.dt), (L, B, A.shape[-1]))
-    R = widened(data, np.broadcast_to(noise.measurement(L), (L + 1, B, n)), seen)
-    return FilterSystem(A, Q, R, seen, noise.start(B), G), delayed
+    R = np.broadcast_to(noise.measurement(L), (L + 1, B, n))
+    first = np.where(seen[0] > 0, R[0], prior(data))
+    return LinearSystem(A, Q, R, seen, np.hstack([first, noise.start(B)]), G), delayed
 
 
 def gains_of(
-    predictor: Predictor, h: Hypothesis, noise: NoiseModel, track: Array, F: Array
+    predictor: Predictor,
+    h: Hypothesis,
+    noise: NoiseModel,
+    track: Array,
+    F: Array,
+    *,
+    covariances: bool = False,
 ) -> kalman.Gains:
     """The gains of a hypothesis' filter; F (L, B, n, n)."""
-    system, delayed = filter_system(predictor, h, noise, track, F)
-    return kalman.gains(*system, delayed)
+    return kalman.gains(*filter_system(predictor, h, noise, track, F), covariances=covariances)
 
 
 def base_columns(predictor: Predictor, fit: Fitted) -> tuple[Array, Array]:
@@ -232,11 +242,11 @@ def passed(
     limits = limits_of(h)
     if not limits:
         return slopes
-    data, p = predictor.data, predictor.params(h)
+    data = predictor.data
     parts = max(e.family.parts for e, _ in limits)
     dt, held = data.dt / parts, np.zeros_like(x)
     for k in range(parts):
-        t, own = data.time + k * dt, (predictor.step(x, u, p, dt) - x) / dt
+        t, own = data.time + k * dt, (predictor.moved(h, x, u, dt) - x) / dt
         tiny = 1e-6 * np.abs(own).max(axis=(0, 1)) + 1e-12
         added, more = (
             predictor.added_rate(limits, x, u, t, predictor.named(rate))
@@ -259,7 +269,7 @@ def rate_slopes(
     if not rates:
         return np.zeros((*x.shape, n))
     needs = any(e.family.needs_own for e, _ in rates)
-    own = (predictor.step(x, u, predictor.params(h)) - x) / data.dt if needs else x
+    own = (predictor.moved(h, x, u) - x) / data.dt if needs else x
     base = predictor.added_rate(rates, x, u, t, predictor.named(own))
     found = np.empty((*x.shape, n))
     for j, name in enumerate(names):
@@ -279,7 +289,7 @@ def heading_slope(
 ) -> Array:
     """Slope of the heading's rate of this very moment, effects and all, (L, B, n) [1/s]."""
     data, short = predictor.data, 1e-3 * predictor.data.dt
-    f_x = predictor.slope(x, u, predictor.params(h), short)
+    f_x, _ = predictor.slopes(x, u, predictor.params(h), short)
     own = (f_x - np.eye(x.shape[-1])) / short
     slope, name = own[..., heading, :].copy(), data.model.state_names[heading]
     if any(name in e.site.targets or f"{name}<-" in e.name for e, _ in rates_of(h)):
@@ -291,9 +301,11 @@ def heading_slope(
 PART = 0.05  # of a parameter's size, to each side
 
 
-def sensitivities(model: Model, x: Array, u: Array, p: Array, dt: float) -> tuple[Array, Array]:
-    """f_x (N, n, n) and f_p (N, n, k) of one step from x (N, n) with received inputs u (N, m)."""
-    f_x, _, f_p = model.system.sensitivities(x, u, p, dt)
+def sensitivities(
+    model: Model, x: Array, u: Array, p: Array, dt: float
+) -> tuple[Array, Array, Array]:
+    """f_x (N, n, n), f_u (N, n, m), f_p (N, n, k) of a step from x (N, n) with inputs u (N, m)."""
+    f_x, f_u, f_p = model.system.sensitivities(x, u, p, dt)
     flat = np.flatnonzero(~f_p.any(axis=(0, 1)) & (param_scale(model) > 0))
     for i in flat:
         size = PART * param_scale(model)[i]
@@ -303,7 +315,7 @@ def sensitivities(model: Model, x: Array, u: Array, p: Array, dt: float) -> tupl
             moved[i] += sign * size
             ends.append(model.system.step(x, u, moved, dt))
         f_p[:, :, i] = model.difference(ends[1], ends[0]) / (2 * size)
-    return f_x, f_p
+    return f_x, f_u, f_p
 
 
 WIDE = 10.0  # [SI unit] standard deviation of a state that is never measured
@@ -316,18 +328,6 @@ def prior(data: Data) -> Array:
         known = bool(data.seen[..., i].any())
         found.append(data.scales.spread(name) ** 2 if known else WIDE**2)
     return np.array(found)
-
-
-def widened(data: Data, R: Array, seen: Array) -> Array:
-    """Measurement variances (L + 1, B, n) with the prior of what was not seen at the start.
-
-    In the filter's own convention: at t = 0 what is not seen has UNKNOWN times its R.
-    """
-    if seen[0].all():
-        return R
-    R = R.copy()
-    R[0] = np.where(seen[0] > 0, R[0], prior(data) / UNKNOWN)
-    return R
 
 
 def smoothed(data: Data, g: kalman.Gains, jacobian: Array, white: Array) -> Array | None:

@@ -18,7 +18,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from grounded.diagnosis import filter as kalman
 from grounded.diagnosis.delays import delays_of
 from grounded.diagnosis.fitted import Fitted
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor
@@ -27,6 +26,7 @@ from grounded.diagnosis.linearise import base_columns
 from grounded.diagnosis.report import Likeness
 from grounded.diagnosis.scan import scan_candidates
 from grounded.effects import Effect, ParamFamily
+from grounded.filter import kalman
 
 NEARLY = 0.75  # share of an effect's signal from which a look-alike is named
 MOST = 3  # that are named for one effect

@@ -30,8 +30,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from grounded.diagnosis import filter as kalman
-from grounded.diagnosis.filter import Adjoint
+from grounded.filter import kalman
+from grounded.filter.kalman import Adjoint
 from grounded.frozen import Array
 
 DOF = 4.0

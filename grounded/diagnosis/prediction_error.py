@@ -16,14 +16,13 @@ from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis import filter as kalman
 from grounded.diagnosis.data import Data
 from grounded.diagnosis.delays import delays_of
 from grounded.diagnosis.fitted import Fitted
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor
 from grounded.diagnosis.leftover import filter_of
-from grounded.diagnosis.linearise import widened
 from grounded.diagnosis.report import Region, TimeShare
+from grounded.filter import kalman
 from grounded.frozen import Array
 
 MOST_STARTS = 400
@@ -68,17 +67,11 @@ def _spread(predictor: Predictor, fit: Fitted, at: Any, run: Any, steps: int) ->
     """Standard deviation that noise alone gives the log `steps` after the moments (M,), (M, n)."""
     data, noise = predictor.data, fit.noise
     (L, B), n = data.time.shape, data.model.n
-    g, delays = filter_of(predictor, fit), delays_of(fit.hypothesis, data)
-    R = np.broadcast_to(noise.measurement(L), (L + 1, B, n))
-    Q = noise.process(data.dt)
-    Q, wide, N = Q if g.delayed is None else g.delayed.noises(Q, n), g.seen.shape[-1], g.A.shape[-1]
-    Q = np.broadcast_to(Q, (L, B, N))
-    P = np.zeros((len(at), N, N))
-    if g.delayed is None and bool(data.seen.all()):
-        P[:, :n, :n] = g.K[np.maximum(at - 1, 0), run][:, :n] * R[at, run][:, None, :]
-    else:
-        given = widened(data, R, g.seen[..., :n])
-        P[:, :wide, :wide] = _covariances(g, Q, given)[np.maximum(at - 1, 0), run]
+    g, delays = filter_of(predictor, fit, covariances=True), delays_of(fit.hypothesis, data)
+    R, Q = np.broadcast_to(noise.measurement(L), (L + 1, B, n)), g.system.Q
+    wide, N = g.k.shape[2:]
+    P = g.posterior[np.maximum(at - 1, 0), run]
+    P[:, wide:], P[:, :, wide:] = 0.0, 0.0  # of the noise's colour nothing is known by then
     k = np.arange(wide, wide + n if wide < N else wide)
     P[:, k, k] = noise.start(1)[0] if wide < N else 0.0
     delayed = {} if delays is None else dict(zip(delays.channel, delays.whole, strict=True))
@@ -86,42 +79,14 @@ def _spread(predictor: Predictor, fit: Fitted, at: Any, run: Any, steps: int) ->
     # has been filtered already, and this is more than its error
     found = {i: P[:, i, i] for i, whole in delayed.items() if whole >= steps}
     for j in range(steps):
-        A, q = g.A[at + j, run], Q[at + j, run]
-        P = A @ P @ A.swapaxes(1, 2)
-        entry = np.zeros((len(at), N, N))
-        entry[:, np.arange(N), np.arange(N)] = q
-        if g.G is not None:
-            Gt = g.G[at + j, run]
-            entry[:, :wide, :wide] = (Gt * q[:, None, :wide]) @ Gt.swapaxes(1, 2)
-        P = P + entry
+        A, q = g.system.A[at + j, run], Q[at + j, run]
+        G = None if g.system.G is None else g.system.G[at + j, run]
+        P = kalman.predicted(P, A, q, G)
         found |= {i: P[:, i, i] for i, whole in delayed.items() if whole == steps - 1 - j}
     variance = np.einsum("bii->bi", P[:, :n, :n]).copy()
     for i, of_late in found.items():
         variance[:, i] = of_late
     return np.asarray(np.sqrt(variance + R[at + steps, run]))
-
-
-def _covariances(g: kalman.Gains, Q: Array, R: Array) -> Array:
-    """Covariance of a state after each step, its noise's colour aside, (L, B, n', n')."""
-    (L, B, N, _), wide = g.A.shape, g.seen.shape[-1]
-    found, P = np.empty((L, B, wide, wide)), np.zeros((B, N, N))
-    first = R[0] * np.where(g.seen[0, :, : R.shape[-1]] > 0, 1.0, kalman.UNKNOWN)
-    if g.delayed is not None:
-        first = np.concatenate(
-            [first, np.take_along_axis(first, g.delayed.channel, axis=1)], axis=1
-        )
-    P[:, np.arange(wide), np.arange(wide)] = first
-    for t in range(L):
-        P = g.A[t] @ P @ g.A[t].swapaxes(1, 2)
-        if g.G is None:
-            P[:, np.arange(wide), np.arange(wide)] += Q[t][:, :wide]
-        else:
-            P[:, :wide, :wide] += (g.G[t] * Q[t][:, None, :wide]) @ g.G[t].swapaxes(1, 2)
-        P[:, np.arange(wide, N), np.arange(wide, N)] += Q[t][:, wide:]
-        P = P - g.K[t] @ P[:, :wide]
-        P = 0.5 * (P + P.swapaxes(1, 2))
-        found[t] = P[:, :wide, :wide]
-    return found
 
 
 def errors(predictor: Predictor, h: Hypothesis, track: Array, where: Horizon) -> Array:

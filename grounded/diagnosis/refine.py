@@ -21,9 +21,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from grounded.diagnosis import filter as kalman
 from grounded.diagnosis.data import Data
-from grounded.diagnosis.delayed_measurement import Delayed, FilterSystem, joined
 from grounded.diagnosis.delays import Delays, delays_of
 from grounded.diagnosis.fitted import Fitted, calibrated, moved, shift_precision
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor, param_scale
@@ -37,6 +35,9 @@ from grounded.diagnosis.noise import (
     working,
 )
 from grounded.effects import SensorDelayFamily
+from grounded.filter import kalman
+from grounded.filter.augmented import Delayed, joined
+from grounded.filter.kalman import LinearSystem
 from grounded.frozen import Array
 
 MOST_NUMBERS = 2e6  # of one (L, B, N, N) array: what fits in the cache goes fastest
@@ -132,7 +133,7 @@ def _room(data: Data, h: Hypothesis, k: int, size: int) -> tuple[Array, Array]:
         which = calibrated(data)
         shift = np.zeros(data.model.system.k) if h.shift is None else h.shift
         lowest, highest = _bounds(data)
-        at, unit = data.model.values + shift, param_scale(data.model)
+        at, unit = data.model.values + shift, np.maximum(param_scale(data.model), 1e-300)
         low[k:] = np.minimum((lowest - at) / unit, 0.0)[which]
         high[k:] = np.maximum((highest - at) / unit, 0.0)[which]
     return low, high
@@ -154,12 +155,14 @@ def _inside(data: Data, shift: Array) -> Array:
 
 
 def _bounds(data: Data) -> tuple[Array, Array]:
-    """Bounds of the model's parameters, (k,) each; positive ones stay positive."""
-    values = data.model.values
-    low = [-np.inf if p.low is None else p.low for p in data.model.params.values()]
-    high = [np.inf if p.high is None else p.high for p in data.model.params.values()]
-    low = [max(b, 0.2 * v) if v > 0 else b for b, v in zip(low, values, strict=True)]
-    high = [min(b, 0.2 * v) if v < 0 else b for b, v in zip(high, values, strict=True)]
+    """Bounds of the model's parameters, (k,) each; where none is given the sign stays."""
+    params = data.model.params.values()
+    low = [
+        p.low if p.low is not None else 0.2 * p.value if p.value > 0 else -np.inf for p in params
+    ]
+    high = [
+        p.high if p.high is not None else 0.2 * p.value if p.value < 0 else np.inf for p in params
+    ]
     return np.array(low), np.array(high)
 
 
@@ -220,7 +223,7 @@ def _iterate(predictor: Predictor, works: list[Work], fixed_noise: bool) -> None
     ]
     system, delayed = joined(systems)
     try:
-        g = kalman.gains(*system, delayed)
+        g = kalman.gains(system, delayed)
     except np.linalg.LinAlgError:
         if len(works) == 1:
             works[0].still = True
@@ -241,7 +244,7 @@ def _iterate(predictor: Predictor, works: list[Work], fixed_noise: bool) -> None
         columns, before, delays = parts[i][1].shape[-1], 0.0, each[i]
         if delays is not None:
             entry, residual = systems[i][0].G, white[:, own, :, 0]
-            before = delays.before(work.noise, entry, work.track, residual, g.whiten[:, own])
+            before = delays.before(work.noise, entry, work.track, residual, g.weight[:, own])
         _update(
             predictor,
             work,
@@ -257,7 +260,7 @@ def _climbed(
     data: Data,
     works: list[Work],
     delays_each: list[Delays | None],
-    systems: list[tuple[FilterSystem, Delayed | None]],
+    systems: list[tuple[LinearSystem, Delayed | None]],
     g: kalman.Gains,
     white: Array,
 ) -> list[NoiseModel]:

@@ -7,11 +7,15 @@ of `diagnose --json` and `from_json` reads it back, an older one too.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
+from grounded.instruments.finding import Finding
 from grounded.result import Document
+
+if TYPE_CHECKING:
+    from grounded.figures.figure import Figure
 
 BRIEF: dict[str, Any] = {"brief": True}  # a field whose key is left out where there is nothing
 
@@ -96,6 +100,7 @@ class Where(Document):
 
     split: by horizon (one_step, horizon, whole_run).
     whiteness: by state, the chance that white noise leaves what is left of it (a p-value).
+    tempering: what a nat of evidence is worth, by the correlation and the size of what is left.
     """
 
     channels: tuple[ChannelShare, ...] = ()
@@ -103,6 +108,7 @@ class Where(Document):
     regions: tuple[Region, ...] = ()
     split: Mapping[str, Split] = field(default_factory=dict)
     whiteness: Mapping[str, float] = field(default_factory=dict)
+    tempering: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,9 +165,9 @@ class RunChange(Change):
 
 @dataclass(frozen=True, eq=False)
 class Gap(Document):
-    """The prediction error over a horizon, without the effects and with them, and the noise's.
+    """The prediction error in units of the noise that one diagnosis estimates, before and after.
 
-    `without_effects` keeps the parameters that were calibrated beside the effects.
+    Figures of two diagnoses don't compare; verdicts rest on `prediction_error`, not on these.
     """
 
     horizon_s: float = math.nan
@@ -171,7 +177,6 @@ class Gap(Document):
     floor: float = math.nan
     held_out: bool = False
     channels: Mapping[str, Change] = field(default_factory=dict)
-    without_effects: float = field(default=math.nan, metadata=BRIEF)
 
     @property
     def measured(self) -> bool:
@@ -192,19 +197,78 @@ class UtilityPrediction(Document):
 
 
 @dataclass(frozen=True, eq=False)
+class RulerRow(Document):
+    """Rms errors of held-out open-loop predictions over one horizon, by channel in its unit.
+
+    held_out: by "trials", by "pieces" of one long log, or "no" where there is too little.
+    calibrated: with the model's own parameters fitted; empty where none may move.
+    floor_from: "repeats" of a manoeuvre, or the "short horizon", whose noise is carried on.
+    """
+
+    horizon_s: float
+    whole_trial: bool = False
+    unit_by_channel: Mapping[str, str] = field(default_factory=dict)
+    held_out: str = "trials"
+    crude: Mapping[str, float] = field(default_factory=dict)
+    calibrated: Mapping[str, float] = field(default_factory=dict)
+    with_effects: Mapping[str, float] = field(default_factory=dict)
+    noise_floor: Mapping[str, float] = field(default_factory=dict)
+    floor_from: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Credit(Document):
+    """What an effect, or the "calibration", is worth: what predictions lose without it.
+
+    share: of what predictions gain in all, by the logarithm of their errors, over channels and
+    horizons; without_it: rms by channel, 1 s ahead, all the rest fitted again.
+    """
+
+    of: str
+    share: float = math.nan
+    without_it: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
 class Remainder(Document):
-    """A leftover that no known effect explains: a state's missing rate, rms."""
+    """A leftover that no known effect explains.
+
+    size: rms of the rate that a state lacks, where a flexible model finds one [unit of the state
+    per second]; error: rms of predictions `horizon_s` ahead, which noise alone leaves at `floor`.
+    """
 
     channel: str
     size: float = math.nan
     unit: str = ""
     evidence: float = math.nan  # [nats]
     region: Region | None = None  # that holds most of it
+    error: float = math.nan
+    floor: float = math.nan
+    horizon_s: float = math.nan
+    error_unit: str = ""
 
     def sentence(self) -> str:
         """One clause."""
         where = "" if self.region is None else f", mostly where {self.region.when}"
-        return f"{self.channel} is off by {number(self.size)} {self.unit} rms{where}"
+        if not math.isfinite(self.error):
+            return f"{self.channel} is off by {number(self.size)} {self.unit} rms{where}"
+        noise = f" ({number(self.floor)} is noise)" if math.isfinite(self.floor) else ""
+        unit = "" if self.error_unit == "1" else f" {self.error_unit}"
+        ahead = f"{number(self.horizon_s)} s ahead"
+        return f"{self.channel} is still off by {number(self.error)}{unit} {ahead}{noise}{where}"
+
+
+@dataclass(frozen=True, eq=False)
+class Identifiable(Document):
+    """How well the trials tell one uncertain parameter, all others free.
+
+    left: of its prior standard deviation `prior`, 0 to 1.
+    """
+
+    parameter: str
+    verdict: str  # identifiable, weak, not identifiable
+    prior: float = math.nan
+    left: float = math.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,6 +279,73 @@ class NoiseLevels(Document):
     measurement: Mapping[str, float] = field(default_factory=dict)
     correlation_s: float = math.nan  # of process noise; NaN where it is white
     outliers: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class TrialValue(Document):
+    """What one trial alone says of a claimed value, all others as they are."""
+
+    trial: str
+    effect: str
+    quantity: str = ""
+    value: float = math.nan
+    std: float = math.nan
+    agrees: bool = True  # with the others
+
+
+@dataclass(frozen=True, eq=False)
+class Agreement(Document):
+    """Whether the trials share a value: the chance of such differences if they do.
+
+    `estimate` is the shared value; its `std` is what trials differ by beyond their own uncertainty.
+    """
+
+    effect: str
+    quantity: str = ""
+    agrees: bool = True
+    chance: float = math.nan
+    estimate: Estimate = field(default_factory=lambda: Estimate(math.nan))
+    goes_with: str = ""  # "rises with the mean throttle"
+
+
+@dataclass(frozen=True, eq=False)
+class Changed(Document):
+    """A value that differs between two groups of trials, and the evidence [nats] that it does."""
+
+    effect: str
+    quantity: str = ""
+    first: Estimate = field(default_factory=lambda: Estimate(math.nan))
+    second: Estimate = field(default_factory=lambda: Estimate(math.nan))
+    evidence: float = math.nan
+    chance: float = math.nan  # of such a difference where there is none
+
+
+@dataclass(frozen=True, eq=False)
+class Curve(Document):
+    """The shape of a leftover: a rate `value` with its `std` at places `at` of one variable."""
+
+    effect: str  # its name for `adopt`
+    over: str
+    at: tuple[float, ...] = ()
+    value: tuple[float, ...] = ()
+    std: tuple[float, ...] = ()
+    quantities: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Correction(Document):
+    """A curve that predicts what no effect explains. It is no cause.
+
+    `held_out_gain` is the share of the squared error that goes on held-out trials; `adoptable`:
+    that is more than its scatter from trial to trial.
+    """
+
+    channel: str
+    over: tuple[str, ...] = ()
+    held_out_gain: float = math.nan
+    adoptable: bool = False
+    unit: str = ""
+    curves: tuple[Curve, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,10 +380,18 @@ class Diagnosis(Document):
     utility_prediction: UtilityPrediction | None = None  # where the subject was a task
     whole_run: Mapping[str, RunChange] = field(default_factory=dict)
     leftover: tuple[Remainder, ...] = ()
+    correction: Correction | None = None  # where something is left
     next_trial: str = ""
     unknowable: tuple[str, ...] = ()  # what the trials are too few or too quiet for
     noise: NoiseLevels = field(default_factory=NoiseLevels)
     parameters: Mapping[str, Estimate] = field(default_factory=dict)  # calibrated beside effects
+    identifiable: tuple[Identifiable, ...] = ()  # each uncertain parameter
+    prediction_error: tuple[RulerRow, ...] = ()  # by horizon, the whole trial last
+    credit: tuple[Credit, ...] = ()  # largest first
+    preflight: tuple[Finding, ...] = ()  # of the instruments, before any physics
+    per_trial: tuple[TrialValue, ...] = ()
+    agreement: tuple[Agreement, ...] = ()  # of the trials in each of these values
+    changed: tuple[Changed, ...] | None = field(metadata=BRIEF, default=None)  # of two groups
     trials: int = 0
     steps: int = 0
     candidates: int = 0
@@ -263,6 +402,12 @@ class Diagnosis(Document):
         named = ", ".join(self.effects) or "no effect"
         gap = f"{number(self.gap.before)} -> {number(self.gap.after)}"
         return f"Diagnosis({self.kind}: {named}; gap {gap}; {self.trials} trials)"
+
+    def figures(self) -> Sequence[Figure]:
+        """Predictions before and after, the credit, where the gap lies."""
+        from grounded.diagnosis.pictures import gap_figures
+
+        return gap_figures(self)
 
     @property
     def kind(self) -> str:
@@ -290,8 +435,17 @@ class Diagnosis(Document):
 
     def values(self, effect: str) -> dict[str, float]:
         """An effect's quantities, fixed ones included; none where it was not weighed."""
+        for curve in self.correction.curves if self.correction is not None else ():
+            if effect == curve.effect:
+                return dict(curve.quantities)
         row = self.ranked(effect)
         return {} if row is None else row.values
+
+    @property
+    def known_parameters(self) -> dict[str, Estimate]:
+        """The calibrated parameters that the trials identify: what may be adopted."""
+        lost = {i.parameter for i in self.identifiable if i.verdict == "not identifiable"}
+        return {name: e for name, e in self.parameters.items() if name not in lost}
 
     def open(self, adopted: Iterable[Mapping[str, Any]]) -> tuple[str, ...]:
         """The claimed effects that the model with these adopted ones lacks as it did then."""

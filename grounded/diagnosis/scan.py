@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 
 from grounded.compile import Named
-from grounded.diagnosis import filter as kalman
 from grounded.diagnosis.delays import delays_of
 from grounded.diagnosis.fitted import Fitted
 from grounded.diagnosis.hypothesis import Predictor, sensor_offset
@@ -31,12 +30,15 @@ from grounded.diagnosis.linearise import base_columns, filter_system, sensitivit
 from grounded.effects import (
     Effect,
     InputFamily,
+    LossFamily,
     MemoryFamily,
     ParamFamily,
     RateFamily,
     SensorDelayFamily,
     SensorFamily,
+    SensorLagFamily,
 )
+from grounded.filter import kalman
 from grounded.frozen import Array
 
 BLOCK = 160  # columns filtered at once
@@ -92,12 +94,11 @@ class _Context:
         data, h = predictor.data, fit.hypothesis
         self.x = fit.track[:-1]
         self.u = predictor.inputs(h)
-        self.p = predictor.params(h)
         self.after = predictor.advance(h, self.x, self.u, data.time)
         self.ahead = np.concatenate([fit.track[:1], self.after])
         self.F, self.f_p = sensitivities_of(predictor, h, self.x, self.u)
         system, delayed = filter_system(predictor, h, fit.noise, fit.track, self.F)
-        self.G, self.gains = system.G, kalman.gains(*system, delayed)
+        self.G, self.gains = system.G, kalman.gains(system, delayed)
         self.delays = delays_of(h, data)
         self.white = fit.white
         self.base = fit.covariance if fit.gram.shape[-1] else np.zeros((0, 0))
@@ -106,9 +107,9 @@ class _Context:
         family = effect.family
         if isinstance(family, RateFamily) and not family.parts:
             return self._rate(i, point, effect, grid)
-        if isinstance(family, InputFamily | MemoryFamily | RateFamily):
+        if isinstance(family, InputFamily | LossFamily | MemoryFamily | RateFamily):
             return self._step(i, point, effect, grid)
-        if isinstance(family, SensorFamily | SensorDelayFamily):
+        if isinstance(family, SensorFamily | SensorDelayFamily | SensorLagFamily):
             return self._sensor(i, point, effect, grid)
         if isinstance(family, ParamFamily):
             k = self.predictor.data.model.param_names.index(effect.site.target)
@@ -159,13 +160,14 @@ class _Context:
     @cached_property
     def mean(self) -> Named:
         """The model's own rates, mean over every step."""
-        ahead = self.predictor.step(self.x, self.u, self.p)
+        ahead = self.predictor.moved(self.fit.hypothesis, self.x, self.u)
         return self.predictor.named((ahead - self.x) / self.predictor.data.dt)
 
     @cached_property
     def instants(self) -> tuple[Named, Named]:
         """The same at the start and at the end of every step."""
-        start, end = (self.predictor.instant(x, self.u, self.p) for x in (self.x, self.after))
+        h = self.fit.hypothesis
+        start, end = (self.predictor.instant(h, x, self.u) for x in (self.x, self.after))
         return self.predictor.named(start), self.predictor.named(end)
 
     def _step(self, i: int, point: int, effect: Effect, grid: dict[str, float]) -> list[_Column]:
@@ -174,7 +176,7 @@ class _Context:
         found = []
         for name, amount, values in self._tried(effect, grid):
             h = self.fit.hypothesis.plus(effect, values)
-            acts = not isinstance(effect.family, RateFamily)
+            acts = isinstance(effect.family, InputFamily | MemoryFamily)
             received = data.runs(predictor.received(h)) if acts else self.u
             after = predictor.advance(h, self.x, received, data.time)
             d = data.model.difference(after, self.after) / amount
@@ -252,6 +254,7 @@ class _Context:
                 continue
             scaled = gram / np.outer(size, size)
             value = -np.linalg.lstsq(scaled, score / size, rcond=1e-9)[0] / size
+            value = inside(effect, names, value)
             gain = -float(value @ score) - 0.5 * float(value @ gram @ value)
             looks.append((gain, {**grid, **dict(zip(names, value.tolist(), strict=True))}))
         if not looks:
@@ -261,6 +264,12 @@ class _Context:
 
 
 _EMPTY: Array = np.zeros(0)
+
+
+def inside(effect: Effect, names: Sequence[str], value: Array) -> Array:
+    """Values of linear quantities, kept in their bounds."""
+    bounds = {q.name: (q.low, q.high) for q in effect.free}
+    return np.array([np.clip(v, *bounds[name]) for name, v in zip(names, value, strict=True)])
 
 
 NEAR = 3.0  # nats within which another grid point is tried too

@@ -22,8 +22,8 @@ from grounded.effects import Effect, ParamFamily
 from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import Array
 
-SPREADS = (0.03, 0.1)  # prior relative errors of the model's parameters when they are calibrated
-CRUDE = 0.3  # the same of a model that is crude; tried without effects
+SPREADS = (0.1, 0.3)  # of the parameters' priors, by which they are calibrated
+CRUDE = 1.0  # the same where one has moved beyond: all that its prior allows
 SHORTLIST = 14  # effects that are refined of a scan, and half as many parameters
 TAUS = (0.05, 0.1, 0.3)  # [s] of coloured noise
 SLOW = (1.0, 2.0, 6.0)  # the same in steps, where a step is longer than all of them
@@ -133,23 +133,22 @@ class HypothesisSearch(FittedHypotheses):
     def calibrated(self, fit: Fitted) -> list[Fitted]:
         """The same hypothesis with the model's parameters free to move a little, or more.
 
-        Without effects, where they already moved by more than that: much.
+        Where one already moved by more than that: as far as its prior allows.
         """
         shift = np.zeros(self.data.model.system.k)
-        if fit.hypothesis.spread > 0 or not len(shift):
+        if fit.hypothesis.spread > 0 or not param_scale(self.data.model).any():
             return []
         starts = [
             (replace(fit.hypothesis, spread=w, shift=shift), fit.noise, fit.track) for w in SPREADS
         ]
         found = self.refined(starts, iterations=14)
-        far = found and not fit.hypothesis.effects and self._far(found[-1])
-        if far:
+        if found and self._far(found[-1]):
             crude = replace(found[-1].hypothesis, spread=CRUDE)
             found += self.refined([(crude, found[-1].noise, found[-1].track)], iterations=10)
         return found
 
     def _far(self, fit: Fitted) -> bool:
-        """Whether a parameter has moved beyond its prior."""
+        """Whether a parameter has moved beyond what it was given."""
         h, unit = fit.hypothesis, param_scale(self.data.model)
         assert h.shift is not None
         return bool((np.abs(h.shift) > h.spread * unit).any())
@@ -302,5 +301,7 @@ def _walked(search: HypothesisSearch, fit: Fitted, index: int, name: str) -> Fit
 def _tried(
     search: HypothesisSearch, fit: Fitted, index: int, name: str, values: tuple[float, ...]
 ) -> list[Fitted]:
-    starts = [(fit.hypothesis.tuned(index, name, v), fit.noise, fit.track) for v in values]
+    (q,) = (q for q in fit.hypothesis.effects[index].quantities if q.name == name)
+    inside = dict.fromkeys(float(np.clip(v, q.low, q.high)) for v in values)
+    starts = [(fit.hypothesis.tuned(index, name, v), fit.noise, fit.track) for v in inside]
     return search.refined(starts, TO_THE_TOP)

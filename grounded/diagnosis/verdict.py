@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 
 from grounded.diagnosis.claims import Claims
 from grounded.diagnosis.leftover import Leftover
 from grounded.diagnosis.report import (
+    Credit,
     Estimate,
     Kind,
-    Likeness,
     Ranked,
     Remainder,
+    RulerRow,
     Verdict,
     number,
     quantity,
@@ -22,73 +22,116 @@ from grounded.diagnosis.report import (
 from grounded.effects import Effect, ParamFamily, places
 from grounded.model import Model
 
-NAMED = 2  # leftovers
-MOST = 0.5  # share of the squared error: calibration that makes more is said to make most of it
+NAMED = 3  # parameters, channels and leftovers that a sentence names at most
+SHOWS = 0.1  # of the error: a channel that improves by less is not named
 
 
 def verdict(
     claims: Claims,
-    before: float,
-    after: float,
     ranking: tuple[Ranked, ...],
     groups: tuple[tuple[str, ...], ...],
-    alike: tuple[Likeness, ...],
     remainder: tuple[Remainder, ...],
-    without: float = math.nan,
+    rows: tuple[RulerRow, ...],
+    credit: tuple[Credit, ...],
 ) -> Verdict:
-    """One effect, several, none or unknown, and why, in sentences.
+    """One effect, several, none or unknown, and why: what, by how much, what is left.
 
     Args:
         claims: what is blamed.
-        before: held-out gap without effects, in units of the noise.
-        after: the same with them.
         ranking: the claimed effects first.
         groups: what ties.
-        alike: what is nearly the same as a claimed effect.
         remainder: what no effect explains.
-        without: the gap that the calibrated parameters leave without the effects; NaN: none were.
+        rows: the ruler's.
+        credit: what each cause is worth, largest first.
     """
-    left = "; ".join(r.sentence() for r in remainder[:NAMED])
-    left += f"; and {len(remainder) - NAMED} more" if len(remainder) > NAMED else ""
+    left = remainder[0].sentence() if remainder else ""
+    left += f"; {len(remainder) - 1} more" if len(remainder) > 1 else ""
+    claimed = [row for row in ranking if row.claimed]
+    row = next((r for r in reversed(rows) if not r.whole_trial), None)
     if claims.known.no_cause:
         return Verdict("unknown", (), f"No cause is named: {claims.known.sentences[0]}.")
-    claimed = [row for row in ranking if row.claimed]
-    if claims.blamed:
-        words = [_calibration(claims, ranking), improvement(before, after)]
-        words.append("Fit them all at once.")
-    elif claims.names:
-        effects = {e.name: e for e in claims.best.hypothesis.effects}
-        words = [sentence(meaning(effects[row.effect], row.params) for row in claimed)]
-        words.append(improvement(before, after))
-        if before**2 - without**2 > MOST * (before**2 - after**2) > 0:
-            words.append(
-                "Most of that is the calibration of the model's own parameters: without the "
-                f"effect{'s' * (len(claimed) > 1)} they leave {number(without)} times the noise."
-            )
-    elif remainder:
-        return Verdict("unknown", (), f"A gap remains that no known effect explains: {left}.")
-    else:
-        level = f"predictions {number(before)} times what noise alone makes"
-        return Verdict("none", (), f"The model explains the data down to the noise ({level}).")
-    words += [f"The data can't tell {tied(group)}." for group in groups]
-    if alike:
-        words.append(nearly(alike))
-    if claims.names and remainder:
+    if not claimed:
+        if remainder:
+            return Verdict("unknown", (), f"A gap remains that no known effect explains: {left}.")
+        return Verdict("none", (), f"The model explains the data down to the noise{floor(row)}.")
+    words = [sentence(_causes(claims, ranking, credit)), improvement(row)]
+    words += [f"The data can't tell {tied(group)}." for group in groups[:1]]
+    if remainder:
         words.append(f"Something is left that no known effect explains: {left}.")
     kind: Kind = "effect" if len(claimed) == 1 else "several"
-    return Verdict(kind, tuple(row.effect for row in claimed), " ".join(words))
+    return Verdict(kind, tuple(row.effect for row in claimed), " ".join(w for w in words if w))
 
 
-def _calibration(claims: Claims, ranking: Sequence[Ranked]) -> str:
-    """The model's form is right, its numbers are not."""
-    model, listed = claims.data.model, []
-    for row in ranking[: len(claims.blamed)]:
-        name = row.effect.partition(":")[2]
-        nominal, d = model.params[name].value, row.params["d"]
-        new = quantity(replace(d, value=nominal + d.value))
-        part = f" ({d.value / abs(nominal):+.1%})" if nominal else ""
-        listed.append(f"{name} should be {new}{part}")
-    return sentence(["the model's form explains the data, its numbers don't", *listed])
+def _causes(claims: Claims, ranking: Sequence[Ranked], credit: Sequence[Credit]) -> list[str]:
+    """A clause a cause, largest first, each with its share where there are several."""
+    effects = {e.name: e for e in claims.best.hypothesis.effects}
+    values = {row.effect: row.params for row in ranking}
+    found = []
+    for one in credit:
+        if one.of in effects:
+            text = meaning(effects[one.of], values[one.of])
+        else:
+            text = f"the model's own parameters are off: {_moved(claims)}"
+        share = f" ({_percent(one.share)} of the gain)" if len(credit) > 1 else ""
+        found.append(text + share)
+    return found
+
+
+def _percent(share: float) -> str:
+    return "under 1 %" if share < 0.01 else f"{100 * share:.0f} %"
+
+
+def _moved(claims: Claims) -> str:
+    """`L should be 0.166 m (+11 %)` of the parameters that moved most, in units of their std."""
+    params, known = claims.data.model.params, claims.parameters()
+    named = [claims.data.model.param_names[blame.index] for blame in claims.blamed] or sorted(
+        known, key=lambda n: -abs(known[n].value - params[n].value) / max(known[n].std, 1e-300)
+    )
+    texts = []
+    for name in named[:NAMED]:
+        old = params[name].value
+        part = f" ({(known[name].value - old) / abs(old):+.0%})" if old else ""
+        texts.append(f"{name} should be {quantity(known[name])}{part}")
+    more = len(named) - NAMED
+    return ", ".join(texts) + (f" and {more} more" if more > 0 else "")
+
+
+def improvement(row: RulerRow | None) -> str:
+    """What predictions gain: `1 s ahead predictions miss v by 0.08 m/s instead of 0.31`."""
+    if row is None:
+        return ""
+    gains = {n: 1 - row.with_effects[n] / e for n, e in row.crude.items() if e > 0}
+    best = sorted((n for n in gains if gains[n] > SHOWS), key=lambda n: -gains[n])[: NAMED - 1]
+    parts = [
+        f"{name} by {_measured(row, name, row.with_effects[name])} instead of "
+        f"{number(row.crude[name])}{_noise(row, name)}"
+        for name in best
+    ]
+    held = "" if row.held_out != "no" else ", not held out"
+    ahead = f"{number(row.horizon_s)} s ahead{held} predictions"
+    return f"{ahead} miss {' and '.join(parts)}." if parts else f"{ahead} hardly change."
+
+
+def floor(row: RulerRow | None) -> str:
+    """What predictions miss by, and noise alone, of the channel that misses most."""
+    if row is None:
+        return ""
+    known = {n: e for n, e in row.with_effects.items() if e == e}
+    if not known:
+        return ""
+    name = max(known, key=lambda n: known[n] / max(row.noise_floor.get(n, math.nan), 1e-300))
+    ahead = f"{number(row.horizon_s)} s ahead"
+    return f": {ahead} it misses {name} by {_measured(row, name, known[name])}{_noise(row, name)}"
+
+
+def _measured(row: RulerRow, name: str, value: float) -> str:
+    unit = row.unit_by_channel[name]
+    return number(value) if unit == "1" else f"{number(value)} {unit}"
+
+
+def _noise(row: RulerRow, name: str) -> str:
+    value = row.noise_floor.get(name, math.nan)
+    return f" (noise: {number(value)})" if math.isfinite(value) else ""
 
 
 def next_trial(
@@ -176,7 +219,11 @@ def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
             return f"{number(value)} %"
         return f"{number(abs(value))} % {more if value >= 0 else less}"
 
-    return re.sub(r"\{(\w+)(%)?(?:([^{}|]+)\|([^{}|]+))?\}", filled, effect.family.sentence)
+    def kept(found: re.Match[str]) -> str:  # of a quantity that is estimated, or [left out]
+        return found[1] if set(re.findall(r"\{(\w)\}", found[1])) <= set(params) else ""
+
+    text = re.sub(r"\[([^]]*)\]", kept, effect.family.sentence)
+    return re.sub(r"\{(\w+)(%)?(?:([^{}|]+)\|([^{}|]+))?\}", filled, text)
 
 
 def sentence(clauses: Iterable[str]) -> str:
@@ -185,26 +232,9 @@ def sentence(clauses: Iterable[str]) -> str:
     return f"{text[:1].upper()}{text[1:]}."
 
 
-def improvement(before: float, after: float) -> str:
-    """What held-out predictions gained."""
-    verb = "improve" if after < before else "go"
-    return f"Held-out predictions {verb} from {number(before)} to {number(after)} times the noise."
-
-
 def tied(group: Sequence[str]) -> str:
     """`A from B or C`."""
     return f"{group[0]} from {' or '.join(group[1:])}"
-
-
-def nearly(alike: Sequence[Likeness]) -> str:
-    """Which other effects would do nearly the same."""
-    parts = []
-    for name in dict.fromkeys(one.effect for one in alike):
-        others = [
-            f"{a.like} ({100 * a.share:.0f} % of its signal)" for a in alike if a.effect == name
-        ]
-        parts.append(f"{name} is nearly inseparable from {', '.join(others)}")
-    return f"In these trials {'; '.join(parts)}."
 
 
 def distinguishing(group: Sequence[str]) -> list[str]:

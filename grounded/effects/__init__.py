@@ -1,10 +1,10 @@
 """Unmodelled effects: what a model may lack, one family of physics a file.
 
-Read `family` first (what an effect is), then any of the families: `actuator`, `friction`, `rate`,
-`geometry`, `sensor`. `places` says where in a model they can act. `registry` has the `Library` of
-all families: what of it applies to a model, and the way from a name to its effect. `wrap` adds an
-effect to a model, which is then a plain model again. A new family is a value in one of these files,
-or comes from a package of your own by the entry point group `grounded.effects`.
+Read `family` first (what an effect is), then any of the families: `actuator`, `joint`, `friction`,
+`rate`, `geometry`, `sensor`. `places` says where in a model they can act. `registry` has the
+`Library` of all families: what of it applies to a model, and the way from a name to its effect.
+`wrap` adds an effect to a model, which is then a plain model again. A new family is a value in one
+of these files, or comes from a package of your own by the entry point group `grounded.effects`.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from grounded.effects.family import (
     Effect,
     Family,
     InputFamily,
+    LossFamily,
     MemoryFamily,
     ParamFamily,
     Quantity,
@@ -20,6 +21,7 @@ from grounded.effects.family import (
     Scales,
     SensorDelayFamily,
     SensorFamily,
+    SensorLagFamily,
     Site,
     acting_order,
     scales_of,
@@ -33,6 +35,7 @@ __all__ = [
     "Family",
     "InputFamily",
     "Library",
+    "LossFamily",
     "MemoryFamily",
     "ParamFamily",
     "Quantity",
@@ -40,6 +43,7 @@ __all__ = [
     "Scales",
     "SensorDelayFamily",
     "SensorFamily",
+    "SensorLagFamily",
     "Site",
     "acting_order",
     "memory_of",

@@ -15,6 +15,7 @@ the MEAN of what the actuator delivers over the step, and fractions of a step ma
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,7 @@ LONGEST_LAG = 2.0  # [s] the same
 
 def _threshold(site: Site) -> tuple[Quantity, ...]:
     """A threshold below which something differs: scanned, the small ones closely."""
-    peak = site.scales.peak(site.target)
+    peak = max(site.scales.peak(name) for name in site.targets)
     grid = tuple(float(v) for v in np.linspace(0.15, 0.87, 20) ** 2 * peak)
     return (Quantity("c", site.unit(site.target), grid, 0.0, peak, places=8),)
 
@@ -39,6 +40,28 @@ def _limit(site: Site) -> tuple[Quantity, ...]:
     peak = site.scales.peak(site.target)
     grid = tuple(float(v) for v in np.linspace(0.95, 0.3, 12) * peak)
     return (Quantity("c", site.unit(site.target), grid, 0.0, 1.5 * peak, start=2 * peak, places=6),)
+
+
+def _one_or_all(model: Model) -> list[str]:
+    """Each input, and all at once: a delay in the radio or the camera shifts every command."""
+    names = model.input_names
+    return [*names, "+".join(names)] if len(names) > 1 else list(names)
+
+
+def _one_or_alike(model: Model) -> list[str]:
+    """Each input, those of one unit together, and each two of them: drives of one make."""
+    found = list(model.input_names)
+    for unit in dict.fromkeys(model.inputs.values()):
+        alike = [n for n in model.input_names if model.inputs[n] == unit]
+        groups = [alike, *(itertools.combinations(alike, 2) if 2 < len(alike) <= 4 else ())]
+        found += ["+".join(group) for group in groups if len(group) > 1]
+    return found
+
+
+def _curve(site: Site) -> tuple[Quantity, ...]:
+    peak = site.scales.peak(site.target)
+    whole = Quantity("U", site.unit(site.target), fixed=True, start=peak)
+    return (Quantity("a", low=-0.9, high=0.9), Quantity("b", low=-1.8, high=1.8), whole)
 
 
 input_bias = InputFamily(
@@ -55,8 +78,8 @@ input_bias = InputFamily(
 input_gain = InputFamily(
     name="input_gain",
     equation="u_eff = (1 + g) u",
-    sentence="{target} acts {g%stronger|weaker} than modelled",
-    targets=places.inputs,
+    sentence="{target} act{s} {g%stronger|weaker} than modelled",
+    targets=_one_or_alike,
     quantities=lambda site: (Quantity("g", "1", low=-1.5, high=5.0),),
     lookalikes=("viscous_friction", "rate_gain", "parameter", "input_fade"),
     effect=lambda u, t, c: (1 + c["g"]) * u,
@@ -65,8 +88,8 @@ input_gain = InputFamily(
 dead_zone = InputFamily(
     name="dead_zone",
     equation="u_eff = sign(u) max(|u| - c, 0)",
-    sentence="{target} has a dead zone of {c}, which every command loses",
-    targets=places.inputs,
+    sentence="every command of {target} loses a dead zone of {c}",
+    targets=_one_or_alike,
     quantities=_threshold,
     lookalikes=("stall", "stiction", "coulomb_friction", "backlash", "input_bias"),
     effect=lambda u, t, c: np.maximum(u - c["c"], 0.0) - np.maximum(-u - c["c"], 0.0),
@@ -90,6 +113,18 @@ saturation = InputFamily(
     quantities=_limit,
     lookalikes=("rate_limit", "slew_limit", "input_gain", "quadratic_drag"),
     effect=lambda u, t, c: np.minimum(np.maximum(u, -c["c"]), c["c"]),
+)
+
+input_curve = InputFamily(
+    name="input_curve",
+    equation="u_eff = (1 + a sign(u) + b (|u| / U - 1/2)) u",
+    sentence="{target} acts {a%more|less} to its positive side, and {b%more|less} at its end than "
+    "about zero",
+    targets=places.inputs,
+    quantities=_curve,
+    lookalikes=("input_gain", "input_bias", "saturation", "dead_zone"),
+    vague=0.5,
+    effect=lambda u, t, c: (1 + c["b"] * (np.abs(u) / c["U"] - 0.5)) * u + c["a"] * np.abs(u),
 )
 
 input_fade = InputFamily(
@@ -125,12 +160,6 @@ def _backlash(site: Site) -> tuple[Quantity, ...]:
     spread = site.scales.spread(site.target)
     grid = tuple(float(v) for v in np.linspace(0.02, 0.6, 10) * spread)
     return (Quantity("b", site.unit(site.target), grid, 0.0, spread, places=6),)
-
-
-def _one_or_all(model: Model) -> list[str]:
-    """Each input, and all at once: a delay in the radio or the camera shifts every command."""
-    names = model.input_names
-    return [*names, "+".join(names)] if len(names) > 1 else list(names)
 
 
 def _advance_delay(u: Any, z: tuple[Any, ...], c: Any, dt: Any) -> tuple[Any, tuple[Any, ...]]:
@@ -178,8 +207,8 @@ delay = MemoryFamily(
 first_order_lag = MemoryFamily(
     name="first_order_lag",
     equation="tau u_eff' = u - u_eff",
-    sentence="{target} lags with a time constant of {tau}",
-    targets=places.inputs,
+    sentence="{target} lag{s} with a time constant of {tau}",
+    targets=_one_or_alike,
     quantities=_lag,
     lookalikes=("delay", "rate_limit", "slew_limit", "parameter"),
     advance=_advance_lag,
@@ -206,6 +235,6 @@ backlash = MemoryFamily(
 )
 
 FAMILIES = (
-    *(input_bias, input_gain, dead_zone, stall, saturation, input_fade),
+    *(input_bias, input_gain, input_curve, dead_zone, stall, saturation, input_fade),
     *(delay, first_order_lag, rate_limit, backlash),
 )

@@ -6,6 +6,7 @@ diagnosis, and listed in docs/effects.md.
 
     InputFamily     u_eff = effect(u, t, c)                 what the actuator makes of a command
     MemoryFamily    u_eff, z+ = advance(u, z, c, dt)        the same, with a memory z
+    LossFamily      u_eff = u - loss(w, u, c)               what a driven motion takes off an input
     RateFamily      ds/dt = model + rate(s, a, own, t, c)   added to the rates of states
     SensorFamily    y = measure(s, c),  s = recover(y, c)   what is logged of a state
     ParamFamily     p + c                                   the model's own parameter is wrong
@@ -17,12 +18,12 @@ is large, the data may set it themselves.
 
 Several effects act in one order, for prediction, probes and adopted models alike:
 
-    command -> input effects as they were claimed -> transport delays -> model -> sensor effects
+    command -> input effects as claimed -> transport delays -> losses -> model -> sensor effects
 
 A transport delay commutes with all that does not depend on time, so it may as well act last; there
 a fraction of a step blends two samples of what is delivered, not two commands that a nonlinear
 effect has yet to see. Of two effects the one that is wrapped LAST acts FIRST on a command, so
-wrapping goes from the model outwards: parameters, limits of rates, rates, sensors, inputs.
+wrapping goes from the model outwards: parameters, losses, limits of rates, rates, sensors, inputs.
 """
 
 from __future__ import annotations
@@ -93,6 +94,10 @@ class Scales:
         value = max(abs(self.low.get(name, -1.0)), abs(self.high.get(name, 1.0)))
         return value if value > 0 else 1.0
 
+    def moves(self, name: str) -> bool:
+        """Whether its size is known, and not zero."""
+        return max(abs(self.low.get(name, 0.0)), abs(self.high.get(name, 0.0))) > 0
+
     def spread(self, name: str) -> float:
         """High minus low, never zero."""
         value = self.high.get(name, 1.0) - self.low.get(name, -1.0)
@@ -124,6 +129,23 @@ def per(unit: str, by: str = "s") -> str:
     return f"{unit}^2" if unit.endswith(f"/{by}") else f"{unit}/{by}"
 
 
+def coupled(site: Site) -> tuple[str, str]:
+    """The two sides of `v<-delta`: what is driven, and what drives it."""
+    target, _, source = site.target.partition("<-")
+    return target, source
+
+
+def width(site: Site, speed: str) -> Quantity:
+    """Over which speed a dry friction builds up: a constant, a hundredth of the largest.
+
+    Data may make it up to three tenths: wider, it would be a viscous one under another name.
+    """
+    peak, unit = site.scales.peak(speed), site.unit(speed)
+    return Quantity(
+        "width", unit, (), 1e-3 * peak, 0.3 * peak, fixed=True, start=0.01 * peak, tunable=True
+    )
+
+
 def speed_limit(site: Site, unit: str) -> tuple[Quantity, ...]:
     """A speed r that is not exceeded: scanned from half the fastest that a step could show."""
     spread = site.scales.spread(site.target)
@@ -140,7 +162,8 @@ class Family:
         name: `dead_zone`.
         equation: one line of maths for docs and messages.
         sentence: what it means in the workshop. {target} and quantities are filled in; {s} is a
-            verb's ending, {g%} a percentage, {g%stronger|weaker} one with its direction.
+            verb's ending, {g%} a percentage, {g%stronger|weaker} one with its direction; what
+            stands in [] is left out where a quantity {b} in it is a constant.
         targets: all targets of a model to which it can apply, joined by "+".
         quantities: the numbers to estimate at a site.
         lookalikes: families that the same data may explain.
@@ -180,6 +203,19 @@ class MemoryFamily(Family):
 
 
 @dataclass(frozen=True)
+class LossFamily(Family):
+    """What the motion w takes off the input u that drives it, at a target `u<-w` (`joint`).
+
+    loss(w, free, gain, u, c, dt): its mean over a step that begins at the speed w and would end at
+    `free`; a unit of u adds `gain` to that. torque(w, rate, u, c): the same at one moment, where
+    the speed's own rate is `rate`.
+    """
+
+    loss: Callable[[Any, Any, Any, Any, Any, Any], Any] = lambda w, free, gain, u, c, dt: 0.0
+    torque: Callable[[Any, Any, Any, Any], Any] = lambda w, rate, u, c: 0.0
+
+
+@dataclass(frozen=True)
 class RateFamily(Family):
     """rate(s, a, own, t, c, site) -> {state: added rate}; `own` are the model's own rates.
 
@@ -188,12 +224,14 @@ class RateFamily(Family):
         x+ = x + h (own + rate(x)),   own = (f(x, h) - x) / h,   h = dt / parts
 
     right where it limits a rate whose own time constant may be shorter than the step.
+    `brakes`: it opposes the motion of its target, which half a step of it never turns round.
     """
 
     rate: Callable[[Any, Any, Any, Any, Any, Site], Values] = lambda s, a, own, t, c, site: {}
     timed: bool = False
     needs_own: bool = False
     parts: int = 0
+    brakes: bool = False
 
 
 @dataclass(frozen=True)
@@ -207,6 +245,11 @@ class SensorFamily(Family):
 @dataclass(frozen=True)
 class SensorDelayFamily(Family):
     """The logged value of the target state is `delay` seconds old."""
+
+
+@dataclass(frozen=True)
+class SensorLagFamily(Family):
+    """The logged value of the target state follows it with the time constant `tau` (a filter)."""
 
 
 @dataclass(frozen=True)
@@ -268,6 +311,14 @@ class Effect:
         return MappingProxyType({name: whole[name] for name in names})
 
 
+def braked(effect: Effect, s: Any, added: Values, half: Any) -> Values:
+    """The rates that an effect adds, for a kick of `half` a step that turns no motion round."""
+    if not getattr(effect.family, "brakes", False):
+        return added
+    most = {n: np.abs(s[n]) / half for n in added}
+    return {n: np.minimum(np.maximum(rate, -most[n]), most[n]) for n, rate in added.items()}
+
+
 def scales_of(model: Model, states: Array, inputs: Array, dt: float, duration: float) -> Scales:
     """Sizes of the signals in recorded data: states (N, n), inputs (N, m)."""
     low, high, quantiles = {}, {}, {}
@@ -296,8 +347,8 @@ def wrapping_order(families: Sequence[Family]) -> list[int]:
 
 
 def _depth(family: Family) -> int:
-    if isinstance(family, ParamFamily):
-        return 0
+    if isinstance(family, ParamFamily | LossFamily):
+        return 0 if isinstance(family, ParamFamily) else 1
     if isinstance(family, RateFamily):
-        return 1 if family.parts else 2
-    return 3
+        return 2 if family.parts else 3
+    return 4

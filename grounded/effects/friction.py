@@ -3,8 +3,10 @@
     v' = model + rate(v)
 
 Viscous and quadratic drag act on any velocity. Coulomb friction's sign is smoothed over a small
-width w (a hundredth of the largest speed, or what data show): with noise around zero a sharp sign
-would chatter, and real friction needs some way to build up.
+width w (a hundredth of the largest speed, or what data show, up to three tenths): with noise around
+zero a sharp sign would chatter, and real friction needs some way to build up. None of the three
+turns a motion round within a step, however strong it is, or takes off more than the model damps.
+Where the friction is a joint's, and an input drives it, `joint` has it as a torque.
 Stiction holds what is slower than v_s: the model's own rate is cancelled up to c,
 
     v' = own - exp(-(v / v_s)^2) clip(own + 2 v, -c, c)               (the 2 is 2 per second)
@@ -17,18 +19,41 @@ from typing import Any
 import numpy as np
 
 from grounded.effects import places
-from grounded.effects.family import Quantity, RateFamily, Site, Values, per
+from grounded.effects.family import Quantity, RateFamily, Site, Values, per, width
+
+
+def _least(site: Site, power: int) -> float:
+    """How far below zero: less friction than modelled, as far as the model damps the motion.
+
+    In units of speed^(1 - power) per second; power 1 is a viscous one.
+    """
+    model, name = site.model, site.target
+    if not site.scales.moves(name):
+        return -np.inf
+    i, dt = model.state_names.index(name), places.probe(model, 1e-5)
+    f_x, _ = model.system.linearise(*places.samples(model, 8), model.values, dt)
+    damping = float(np.median(1 - f_x[:, i, i])) / dt
+    return -max(damping, 0.0) * site.scales.peak(name) ** (1 - power)
+
+
+def _viscous(site: Site) -> tuple[Quantity, ...]:
+    return (Quantity("k", "1/s", low=_least(site, 1)),)
 
 
 def _coulomb(site: Site) -> tuple[Quantity, ...]:
-    unit, width = site.unit(site.target), 0.01 * site.scales.peak(site.target)
-    constant = Quantity("width", unit, fixed=True, start=width, tunable=True)
-    return (Quantity("c", per(unit)), constant)
+    return (
+        Quantity("c", per(site.unit(site.target)), low=_least(site, 0)),
+        width(site, site.target),
+    )
 
 
 def _quadratic(site: Site) -> tuple[Quantity, ...]:
     unit = site.unit(site.target)
-    return (Quantity("k", {"m/s": "1/m", "rad/s": "1/rad"}.get(unit, f"1/({unit} s)")),)
+    return (
+        Quantity(
+            "k", {"m/s": "1/m", "rad/s": "1/rad"}.get(unit, f"1/({unit} s)"), low=_least(site, 2)
+        ),
+    )
 
 
 def _stiction(site: Site) -> tuple[Quantity, ...]:
@@ -53,9 +78,10 @@ viscous_friction = RateFamily(
     equation="v' = model - k v",
     sentence="{target} is damped by {k}",
     targets=places.velocities,
-    quantities=lambda site: (Quantity("k", "1/s"),),
+    quantities=_viscous,
     lookalikes=("quadratic_drag", "coulomb_friction", "input_gain", "parameter"),
     rate=lambda s, a, own, t, c, site: {site.target: -c["k"] * s[site.target]},
+    brakes=True,
 )
 
 coulomb_friction = RateFamily(
@@ -68,6 +94,7 @@ coulomb_friction = RateFamily(
     rate=lambda s, a, own, t, c, site: {
         site.target: -c["c"] * np.tanh(s[site.target] / c["width"])
     },
+    brakes=True,
 )
 
 quadratic_drag = RateFamily(
@@ -80,6 +107,7 @@ quadratic_drag = RateFamily(
     rate=lambda s, a, own, t, c, site: {
         site.target: -c["k"] * s[site.target] * np.abs(s[site.target])
     },
+    brakes=True,
 )
 
 stiction = RateFamily(

@@ -6,6 +6,10 @@ With the position (x, y), the heading psi and the speed v of the model's roles:
     drift_body    x' += a cos psi - b sin psi, y' += a sin psi + b cos psi carpet, misaligned wheels
     side_slip     the velocity sideways is -k v^2 psi'  (k times the lateral acceleration, times v)
     understeer    psi' = model / (1 + k v^2)
+    grip_limit    |v psi'| <= a                                            tyres that let go
+    cornering_drag   v' = model - k |delta| v                              turned wheels brake
+    lever_arm     the point whose position is logged lies a ahead, b to the left of the model's:
+                  its velocity has b psi' less ahead, a psi' more to the left
     slope         v' += a cos psi + b sin psi                              a floor that tilts
     patch         s' += c exp(-|q - q0|^2 / (2 radius^2)) at a place q0    a doormat, a puddle
 """
@@ -17,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from grounded.effects import places
-from grounded.effects.family import Quantity, RateFamily, Site, Values, per
+from grounded.effects.family import Quantity, RateFamily, Site, Values, coupled, per
 from grounded.model import Model
 
 
@@ -33,9 +37,15 @@ def _heading(site: Site) -> str:
 
 
 def _speed(site: Site) -> str:
-    name = places.speed(site.model)
+    name = places.speed(site.model) or places.speed_input(site.model)
     assert name is not None
     return name
+
+
+def _velocity(s: Any, a: Any, site: Site) -> Any:
+    """The speed, be it a state or commanded."""
+    name = _speed(site)
+    return s[name] if name in site.model.state_names else a[name]
 
 
 def _understeer(site: Site) -> tuple[Quantity, ...]:
@@ -83,8 +93,42 @@ def _slip_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
 
 
 def _understeer_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
-    v = s[_speed(site)]
+    v = _velocity(s, a, site)
     return {site.target: own[site.target] * (1 / (1 + c["k"] * v * v) - 1)}
+
+
+def _grip(site: Site) -> tuple[Quantity, ...]:
+    """From twice the largest lateral acceleration that the speeds and headings allow, downwards."""
+    model, scales = site.model, site.scales
+    turning = scales.spread(site.target) / max(scales.duration, scales.dt)
+    rate = places.role(model, "heading_rate")
+    turning = scales.peak(rate[0]) if rate else 4 * turning
+    most = max(scales.peak(_speed(site)) * turning, 1e-3)
+    grid = tuple(float(v) for v in np.geomspace(2.0, 0.2, 10) * most)
+    return (Quantity("a", "m/s^2", grid, 0.0, np.inf, start=4 * most, places=6),)
+
+
+def _grip_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
+    rate = own[site.target]
+    most = c["a"] / np.maximum(np.abs(_velocity(s, a, site)), 1e-3)
+    return {site.target: np.minimum(np.maximum(rate, -most), most) - rate}
+
+
+def _drag_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
+    driven, source = coupled(site)
+    turned = s[source] if source in site.model.state_names else a[source]
+    return {driven: -c["k"] * np.abs(turned) * s[driven]}
+
+
+def _corners(model: Model) -> list[str]:
+    v = places.speed(model)
+    return [f"{v}<-{name}" for name in places.steering(model)] if v else []
+
+
+def _lever_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
+    x, y = site.targets
+    cos, sin, turn = np.cos(s[_heading(site)]), np.sin(s[_heading(site)]), own[_heading(site)]
+    return {x: -turn * (c["a"] * sin + c["b"] * cos), y: turn * (c["a"] * cos - c["b"] * sin)}
 
 
 def _slope_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
@@ -101,7 +145,13 @@ def _patch_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
 
 
 def _moving(model: Model) -> bool:
-    return bool(places.heading(model) and places.speed(model) and places.plane(model))
+    return bool(_turning(model) and places.speed(model) and places.plane(model))
+
+
+def _turning(model: Model) -> list[str]:
+    """The heading of something whose speed is known: a state, or commanded."""
+    name = places.heading(model)
+    return [name] if name and (places.speed(model) or places.speed_input(model)) else []
 
 
 drift_world = RateFamily(
@@ -141,10 +191,44 @@ understeer = RateFamily(
     name="understeer",
     equation="psi' = model / (1 + k v^2)",
     sentence="it understeers by {k}, turning less the faster it drives",
-    targets=lambda model: [h] if _moving(model) and (h := places.heading(model)) else [],
+    targets=_turning,
     quantities=_understeer,
     lookalikes=("rate_gain", "coupling", "parameter"),
     rate=_understeer_rate,
+    needs_own=True,
+)
+
+grip_limit = RateFamily(
+    name="grip_limit",
+    equation="psi' = clip(model, -a / |v|, a / |v|)",
+    sentence="its tyres let go at a lateral acceleration of {a}",
+    targets=_turning,
+    quantities=_grip,
+    lookalikes=("understeer", "saturation", "slew_limit", "side_slip"),
+    rate=_grip_rate,
+    needs_own=True,
+    parts=4,
+)
+
+cornering_drag = RateFamily(
+    name="cornering_drag",
+    equation="v' = model - k |delta| v   (v<-delta)",
+    sentence="{driven} is braked by {k} times itself and the size of {source}",
+    targets=_corners,
+    quantities=lambda site: (Quantity("k", per("1", "s") + "/" + site.unit(coupled(site)[1])),),
+    lookalikes=("viscous_friction", "quadratic_drag", "coupling", "coulomb_friction"),
+    rate=_drag_rate,
+    brakes=True,
+)
+
+lever_arm = RateFamily(
+    name="lever_arm",
+    equation="x' = model - psi' (a sin psi + b cos psi), y' = model + psi' (a cos psi - b sin psi)",
+    sentence="the tracked point lies {a} ahead and {b} to the left of the model's",
+    targets=places.plane,
+    quantities=lambda site: tuple(Quantity(q, site.unit(site.target)) for q in "ab"),
+    lookalikes=("side_slip", "drift_body", "sensor_delay", "parameter"),
+    rate=_lever_rate,
     needs_own=True,
 )
 
@@ -168,4 +252,7 @@ patch = RateFamily(
     rate=_patch_rate,
 )
 
-FAMILIES = (drift_world, drift_body, side_slip, understeer, slope, patch)
+FAMILIES = (
+    *(drift_world, drift_body, side_slip, lever_arm, understeer, grip_limit, cornering_drag),
+    *(slope, patch),
+)

@@ -56,6 +56,27 @@ def speed(model: Model) -> str | None:
     return next(iter(named), None)
 
 
+def speed_input(model: Model) -> str | None:
+    """The speed where it is commanded: an input that is called one."""
+    return next((n for n in SPEEDS if n in model.input_names and model.inputs[n] == "m/s"), None)
+
+
+def steering(model: Model) -> list[str]:
+    """What turns the heading: a steering angle among the states, or the inputs that do it at once.
+
+    The speed turns it too, but only together with these.
+    """
+    turned = heading(model)
+    if turned is None:
+        return []
+    i, dt = model.state_names.index(turned), probe(model, 1e-5)
+    f_x, f_u = model.system.linearise(*samples(model, 8), model.values, dt)
+    size = {n: float(np.abs(f_x[:, i, j]).max()) for j, n in enumerate(model.state_names)}
+    size |= {n: float(np.abs(f_u[:, i, j]).max()) for j, n in enumerate(model.input_names)}
+    no = {*position(model), turned, speed(model), speed_input(model), *role(model, "heading_rate")}
+    return [n for n, by in size.items() if n not in no and by > 1e-3 * dt]
+
+
 def velocities(model: Model) -> list[str]:
     """States whose unit is per second: velocities, linear or angular."""
     return [n for n, u in model.states.items() if u.endswith("/s") or u.endswith("/ s")]
@@ -94,12 +115,19 @@ def samples(model: Model, count: int = 3) -> tuple[Array, Array]:
     return x, rng.uniform(0.2, 1.0, (count, model.m))
 
 
+def probe(model: Model, dt: float) -> float:
+    """A step to look at a model with [s]: dt, or the nearest that its simulator can make."""
+    own = float(getattr(model.step, "timestep", 0.0))
+    return max(1, round(dt / own)) * own if own else dt
+
+
 def following(model: Model) -> list[str]:
     """States that follow an input by themselves: a steering angle, a motor's speed, a servo.
 
     Their rate depends on an input, on no state but themselves, and somewhere falls with them.
     """
-    f_x, f_u = model.system.linearise(*samples(model, 8), model.values, 1e-2)
+    dt = probe(model, 1e-2)
+    f_x, f_u = model.system.linearise(*samples(model, 8), model.values, dt)
     found = []
     for i, name in enumerate(model.state_names):
         driven = np.abs(f_u[:, i]).max() > 1e-6

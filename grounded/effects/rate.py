@@ -18,13 +18,7 @@ from typing import Any
 import numpy as np
 
 from grounded.effects import places
-from grounded.effects.family import Quantity, RateFamily, Site, Values, per, speed_limit
-
-
-def coupled(site: Site) -> tuple[str, str]:
-    """The two sides of `v<-delta`: what is driven, and what drives it."""
-    target, _, source = site.target.partition("<-")
-    return target, source
+from grounded.effects.family import Quantity, RateFamily, Site, Values, coupled, per, speed_limit
 
 
 def _coupling(site: Site) -> tuple[Quantity, ...]:

@@ -22,7 +22,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from grounded.effects import actuator, friction, geometry, places, rate, sensor
+from grounded.effects import actuator, friction, geometry, joint, places, rate, sensor
+from grounded.effects.correction import correction
 from grounded.effects.family import Effect, Family, ParamFamily, Quantity, RateFamily, Scales, Site
 from grounded.errors import GroundedError, nearest
 from grounded.frozen import Array
@@ -44,13 +45,14 @@ parameter = ParamFamily(
     name="parameter",
     equation="p = nominal + d",
     sentence="the parameter {target} is off by {d}",
-    targets=lambda model: model.param_names,
+    targets=lambda model: model.uncertain,
     quantities=_shift,
     lookalikes=("input_gain", "rate_gain", "viscous_friction", "first_order_lag"),
 )
 
 BUILT_IN: tuple[Family, ...] = (
     *actuator.FAMILIES,
+    *joint.FAMILIES,
     *rate.FAMILIES,
     *friction.FAMILIES,
     *geometry.FAMILIES,
@@ -90,7 +92,7 @@ class Library:
         Raises:
             GroundedError: if there is none.
         """
-        for family in self.families:
+        for family in (*self.families, correction):  # which is adopted, never blamed
             if family.name == name:
                 return family
         known = [family.name for family in self.families]
@@ -116,7 +118,8 @@ class Library:
         """Every effect that can apply to a model, in the library's order."""
         found, offered = [], [family.name for family in self.families]
         idle, outright = derived_states(model), outright_states(model)
-        integrals, same = integrated_states(model), aliases(model, idle | outright)
+        integrals = integrated_states(model)
+        same = aliases(model, idle | outright) | joint.renamed(model)
         for family in self.families:
             for target in family.targets(model):
                 driven = target.partition("<-")
@@ -145,7 +148,7 @@ def derived_states(model: Model) -> set[str]:
     named = places.role(model, "heading_rate")
     if not named:
         return set()
-    f_x, _ = model.system.linearise(*places.samples(model), model.values, 0.01)
+    f_x, _ = model.system.linearise(*places.samples(model), model.values, places.probe(model, 0.01))
     i = model.state_names.index(named[0])
     others = np.delete(f_x[:, :, i], i, axis=1)
     return {named[0]} if float(np.abs(others).max()) < 1e-12 else set()
@@ -153,7 +156,7 @@ def derived_states(model: Model) -> set[str]:
 
 def integrated_states(model: Model) -> dict[str, str]:
     """States whose rate is another state, times a constant: an angle and its angular velocity."""
-    (x, u), dt = places.samples(model), 1e-6
+    (x, u), dt = places.samples(model), places.probe(model, 1e-6)
     f_x, f_u = model.system.linearise(x, u, model.values, dt)
     rates = (f_x - np.eye(model.n)) / dt
     moved = (model.system.step(x, u, model.values, dt) - x) / dt
@@ -172,7 +175,7 @@ def integrated_states(model: Model) -> dict[str, str]:
 
 def outright_states(model: Model) -> set[str]:
     """States that the model sets outright, whatever they were: they have no rate of their own."""
-    f_x, _ = model.system.linearise(*places.samples(model), model.values, 0.01)
+    f_x, _ = model.system.linearise(*places.samples(model), model.values, places.probe(model, 0.01))
     own = np.abs(f_x[:, np.arange(model.n), np.arange(model.n)]).max(axis=0)
     return {name for name, size in zip(model.state_names, own, strict=True) if size < 1e-9}
 
@@ -216,8 +219,9 @@ class _Rates:
     """Rates (SAMPLES, n) that named rate effects add, slopes of the model's rates by name."""
 
     def __init__(self, model: Model, x: Array, u: Array, p: Array, kept: list[int]) -> None:
-        own = (model.system.step(x, u, p, SHORT) - x) / SHORT
-        _, f_u, f_p = model.system.sensitivities(x, u, p, SHORT)
+        dt = places.probe(model, SHORT)
+        own = (model.system.step(x, u, p, dt) - x) / dt
+        _, f_u, f_p = model.system.sensitivities(x, u, p, dt)
         self.named: dict[str, Array] = {}
         for i in kept:
             one = np.zeros_like(own)
@@ -245,6 +249,8 @@ def _free(model: Model, name: str) -> bool:
     if family != "parameter":
         return True
     param = model.params[target]
+    if not param.uncertain:
+        return False
     low, high = _bounds(param)
     ends = (0.5 * param.value, 2 * param.value) if param.value else (-0.05, 0.05)
     return bool(low <= min(ends) and high >= max(ends))

@@ -1,4 +1,4 @@
-"""What is logged is not what is: scale of the odometry, bias, scale and delay of a sensor.
+"""What is logged is not what is: scale of the odometry; bias, scale, delay, lag of a sensor.
 
     y = measure(s),   so that a model of logged states is   y+ = measure( f( recover(y), u ) )
 
@@ -8,10 +8,19 @@ changes nothing.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from grounded.effects import places
-from grounded.effects.family import Quantity, RateFamily, SensorDelayFamily, SensorFamily, Site
+from grounded.effects.family import (
+    Quantity,
+    RateFamily,
+    SensorDelayFamily,
+    SensorFamily,
+    SensorLagFamily,
+    Site,
+)
 
 
 def _delay(site: Site) -> tuple[Quantity, ...]:
@@ -19,6 +28,27 @@ def _delay(site: Site) -> tuple[Quantity, ...]:
     longest = min(max(0.3, 3 * dt), site.scales.duration / 4)
     grid = tuple(float(v) for v in longest * (np.arange(1, 7) / 6) ** 1.5)
     return (Quantity("d", "s", grid, 0.0, longest, places=4),)
+
+
+def _lag(site: Site) -> tuple[Quantity, ...]:
+    dt = site.scales.dt
+    longest = min(max(0.3, 3 * dt), site.scales.duration / 4)
+    grid = tuple(float(v) for v in np.geomspace(min(0.3 * dt, 0.5 * longest), longest, 6))
+    return (Quantity("tau", "s", grid, 0.0, 2 * longest, places=4),)
+
+
+def lagging(behind: Any, moved: Any, tau: Any, dt: Any) -> Any:
+    """How far a filtered sensor is off after a step in which its state moved evenly.
+
+    Args:
+        behind: how far it was off before, y - s.
+        moved: what the state moved by.
+        tau: time constant [s].
+        dt: step [s].
+    """
+    tau = np.maximum(tau, 1e-6)
+    follows = moved * tau / dt
+    return (behind + follows) * np.exp(-dt / tau) - follows
 
 
 odometry_scale = RateFamily(
@@ -63,4 +93,13 @@ sensor_delay = SensorDelayFamily(
     lookalikes=("delay", "first_order_lag", "side_slip"),
 )
 
-FAMILIES = (odometry_scale, sensor_bias, sensor_scale, sensor_delay)
+sensor_lag = SensorLagFamily(
+    name="sensor_lag",
+    equation="tau y' = s - y",
+    sentence="the log of {target} is filtered, with a time constant of {tau}",
+    targets=places.velocities,
+    quantities=_lag,
+    lookalikes=("sensor_delay", "first_order_lag", "sensor_scale"),
+)
+
+FAMILIES = (odometry_scale, sensor_bias, sensor_scale, sensor_delay, sensor_lag)

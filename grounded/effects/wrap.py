@@ -3,6 +3,7 @@
 One control step of the wrapped model, for commands held over the step:
 
     u_eff  = effect(u, z, t)                      input and memory families
+    f      = f(s, u_eff - loss(s, f))             losses to a joint's friction, solved (`joint`)
     own    = (f(s, u_eff) - s) / dt               the model's own rate, its mean over the step
     s1     = f(s + dt/2 rate(s), u_eff)           half of an added rate before the step ...
     s+     = s1 + dt/2 rate(s1)                   ... and half after it (Strang): second order in dt
@@ -29,14 +30,19 @@ from grounded.compile.names import Named
 from grounded.effects.family import (
     Effect,
     InputFamily,
+    LossFamily,
     MemoryFamily,
     ParamFamily,
     RateFamily,
     SensorDelayFamily,
     SensorFamily,
+    SensorLagFamily,
     Values,
+    braked,
 )
+from grounded.effects.joint import inputs_left
 from grounded.effects.registry import partner
+from grounded.effects.sensor import lagging
 from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.model import Model, Param
@@ -94,14 +100,17 @@ def wrap(effect: Effect, values: Mapping[str, float], dt: float) -> Model:
     added = {param_name(effect.name, q.name): _param(q, whole[q.name]) for q in effect.quantities}
     make = {
         InputFamily: _input_step,
+        LossFamily: _loss_step,
         MemoryFamily: _memory_step,
         RateFamily: _rate_step,
         SensorFamily: _sensor_step,
         SensorDelayFamily: _sensor_delay_step,
+        SensorLagFamily: _sensor_lag_step,
     }
     for kind, build in make.items():
         if isinstance(family, kind):
             step, memory = build(effect, whole, dt)
+            vars(step)["timestep"] = getattr(model.step, "timestep", 0.0)
             break
     else:
         raise GroundedError(f"effect '{effect.name}': its family can't be adopted")
@@ -122,12 +131,16 @@ def param_name(effect: str, quantity: str) -> str:
     return f"{family}_{targets.replace('+', '_').replace('<-', '_from_')}_{quantity}"
 
 
+SURE = 0.5  # of its value: prior standard deviation of an adopted effect's quantity
+
+
 def _param(quantity: Any, value: float) -> Param:
     low = None if not np.isfinite(quantity.low) else min(float(quantity.low), value)
     high = None if not np.isfinite(quantity.high) else max(float(quantity.high), value)
     if quantity.fixed:
         low = high = value
-    return Param(value, quantity.unit, low, high)
+    sure = None if quantity.fixed else SURE * abs(value) or None
+    return Param(value, quantity.unit, low, high, sure)
 
 
 def _quantities(effect: Effect, p: Any) -> dict[str, Any]:
@@ -179,6 +192,22 @@ def _memory_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[s
     return step, {z: model.inputs[n] for n, memory in names.items() for z in memory}
 
 
+def _loss_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str, str]]:
+    """One more loss: solved together with those that the model has already."""
+    model = effect.site.model
+    inner, others = getattr(model.step, "losing", (model, ()))
+    base, effects = plain_step(inner), (*others, effect)
+
+    def step(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
+        start, given = _own_state(inner, s), _replaced(inner, a, {})
+        pairs = [(e, _quantities(e, p)) for e in effects]
+        left = inputs_left(pairs, start, given, dt, lambda u: base(start, u, p, dt))
+        return base(start, left, p, dt)
+
+    vars(step)["losing"] = (inner, effects)
+    return step, {}
+
+
 def _rate_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str, str]]:
     """One more added or limited rate: it joins those that the model has already."""
     model = effect.site.model
@@ -205,17 +234,17 @@ def _joint_step(model: Model, effects: tuple[Effect, ...]) -> Step:
         start, now = _own_state(model, s), {z: s[z] for z in clocks}
         then = {z: s[z] + dt for z in clocks}
         own = _mean_rate(start, base(start, a, p, dt), dt) if needs_own else {}
-        state = _kicked(start, _added(rates, start, a, own, now, p), dt)
+        state = _kicked(start, _added(rates, start, a, own, now, p, dt), dt)
         after, own = _through(limits, base, state, a, p, dt, now)  # the mean over the very step
-        final = _kicked(after, _added(rates, after, a, own, then, p), dt)
+        final = _kicked(after, _added(rates, after, a, own, then, p, dt), dt)
         result = dict(final)
         for n, k in tied.items():  # a carried heading rate is the heading's rate, effects and all
             first, last = instant(start, a, p, dt), instant(final, a, p, dt)
             if not rates:
                 result[k] = s[k] + last[n] - first[n]
                 continue
-            before = _added(rates, start, a, first, now, p).get(n, 0.0)
-            later = _added(rates, final, a, last, then, p).get(n, 0.0)
+            before = _added(rates, start, a, first, now, p, dt).get(n, 0.0)
+            later = _added(rates, final, a, last, then, p, dt).get(n, 0.0)
             result[k] = s[k] + (last[n] - first[n]) + later - before
         return {**result, **then}
 
@@ -247,13 +276,14 @@ def _mean_rate(s: Named, ahead: Mapping[str, Any], dt: Any) -> dict[str, Any]:
 
 
 def _added(
-    effects: Sequence[Effect], s: Named, a: Any, own: Any, clock: Mapping[str, Any], p: Any
+    effects: Sequence[Effect], s: Named, a: Any, own: Any, clock: Mapping[str, Any], p: Any, dt: Any
 ) -> dict[str, Any]:
     """Sum of the effects' rates at one moment, by state."""
     total: dict[str, Any] = {}
     for e in effects:
         t = clock.get(_clock(e), 0.0)
-        for n, rate in _family(e).rate(s, a, own, t, _quantities(e, p), e.site).items():
+        added = _family(e).rate(s, a, own, t, _quantities(e, p), e.site)
+        for n, rate in braked(e, s, added, 0.5 * dt).items():
             total[n] = total[n] + rate if n in total else rate
     return total
 
@@ -270,7 +300,7 @@ def _through(
     for part in range(parts):
         ahead = base(final, a, p, h)
         own = _mean_rate(final, ahead, h)
-        added = _added(limits, final, a, own, {z: t + part * h for z, t in now.items()}, p)
+        added = _added(limits, final, a, own, {z: t + part * h for z, t in now.items()}, p, h)
         values = [ahead[n] + h * added[n] if n in added else ahead[n] for n in s]
         final = Named("state", tuple(s), values)
         mean = {n: mean[n] + own[n] / parts for n in s}
@@ -323,6 +353,21 @@ def _sensor_delay_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, 
         return {**after, target: logged, **dict(zip(memory, line, strict=False))}
 
     return step, dict.fromkeys(memory, model.states[target])
+
+
+def _sensor_lag_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str, str]]:
+    """The true value becomes memory; the state itself is the logged, filtered one."""
+    model, target = effect.site.model, effect.site.target
+    base, memory = plain_step(model), f"{target}_true"
+
+    def step(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
+        true = [s[memory] if n == target else s[n] for n in model.state_names]
+        after = base(Named("state", model.state_names, true), a, p, dt)
+        behind, moved = s[target] - s[memory], after[target] - s[memory]
+        off = lagging(behind, moved, _quantities(effect, p)["tau"], dt)
+        return {**after, target: after[target] + off, memory: after[target]}
+
+    return step, {memory: model.states[target]}
 
 
 def memory_of(wrapped: Model, base: Model, trial: Trial) -> Array:

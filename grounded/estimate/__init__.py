@@ -9,9 +9,9 @@
 Everything works for any model (also a black-box simulator), any measurement function, lost samples,
 sensors and controllers of different rates, transport delays of any fraction of a step.
 
-Read `trials` first (the front door), then `measurement` and `record` (what goes in), `filter` (the
-equations) with `steps` (the model in it), `recursion` (NumPy, forwards and back) and `kernel` (the
-same as machine code), `likelihood` (the noise). `tracker` stands by itself.
+Read `trials` first (the front door), then `measurement` and `record` (what goes in), `extended`
+(the Kalman filter about a track) with `steps` (the model in it), `likelihood` (the noise). The
+linear filter below is `grounded.filter`. `tracker` stands by itself.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Process and measurement noise by maximum likelihood of the innovations.
 
-The likelihood is that of `grounded.estimate.filter`; its slopes by the variances come from one pass
-of the smoother; L-BFGS climbs in the logarithms of the variances, in which they cannot turn
+The likelihood is that of `grounded.estimate.extended`; its slopes by the variances come from one
+pass of the smoother; L-BFGS climbs in the logarithms of the variances, in which they cannot turn
 negative. The linearisation is held fixed while the noise moves and renewed between climbs: a track
 filtered with the wrong noise is not where to linearise.
 
@@ -17,11 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from grounded.compile import System
-from grounded.estimate import kernel
-from grounded.estimate.filter import filter_batch
+from grounded.estimate.extended import Filtered, filter_batch, relinked, variance_slopes
 from grounded.estimate.measurement import Measurement, NoiseStd
 from grounded.estimate.record import Record, RecordBatch
-from grounded.estimate.recursion import Filtered, fixed_steps, recursion, smooth
 from grounded.estimate.steps import ModelSteps
 from grounded.frozen import Array
 
@@ -72,7 +70,7 @@ def maximum_likelihood(
         if not np.isfinite(best.loglik):
             status = best.status
             break
-        trial, seen = _climb(batch, measurement, noise, best, start)
+        trial, seen = _climb(batch, noise, best, start)
         after = filter_batch(batch, measurement, trial, steps, best)
         gain = after.loglik - best.loglik
         if gain > 0:
@@ -102,7 +100,7 @@ def _expectation(
             break
         n = len(noise.process)
         variance = np.concatenate([noise.process, noise.measurement]) ** 2
-        slope = _slope(best, batch, noise)
+        slope = variance_slopes(best.gains, best.eps, batch, noise)
         # E[w^2] = q + 2 q (slope by log q) / count
         share = np.concatenate([np.full(n, steps_seen), samples])
         factor = np.clip(1 + 2 * slope / share, 1e-2, 1e2)
@@ -151,11 +149,7 @@ def enough(records: Sequence[Record], rng: np.random.Generator | None = None) ->
 
 
 def _climb(
-    batch: RecordBatch,
-    measurement: Measurement,
-    noise: NoiseStd,
-    about: Filtered,
-    start: NoiseStd,
+    batch: RecordBatch, noise: NoiseStd, about: Filtered, start: NoiseStd
 ) -> tuple[NoiseStd, Array]:
     """The best noise for a fixed linearisation, and which variances the data see."""
     from scipy.optimize import minimize
@@ -165,16 +159,13 @@ def _climb(
     def cost(theta: Array) -> tuple[float, Array]:
         std = np.exp(0.5 * theta)
         there = NoiseStd(std[:n], std[n:], dt)
-        if about.done is not None:
-            done = kernel.forward(about.done.linearised, there)
-            loglik = done.loglik
-            slope = kernel.variance_slopes(done, there) if np.isfinite(loglik) else None
-        else:
-            filtered = recursion(batch, measurement, there, fixed_steps(about))
-            loglik = filtered.loglik
-            slope = _slope(filtered, batch, there) if np.isfinite(loglik) else None
-        if slope is None:
+        try:
+            g, eps, loglik = relinked(about, batch, there)
+        except np.linalg.LinAlgError:
             return 1e12, np.zeros_like(theta)
+        if not np.isfinite(loglik):
+            return 1e12, np.zeros_like(theta)
+        slope = variance_slopes(g, eps, batch, there)
         return -loglik / batch.count, -slope / batch.count
 
     visible = np.concatenate([start.process, start.measurement])
@@ -185,18 +176,6 @@ def _climb(
     found = minimize(cost, theta, jac=True, method="L-BFGS-B", bounds=bounds, options=options).x
     std = np.exp(0.5 * found)
     return NoiseStd(std[:n], std[n:], dt), found > low + 2.0
-
-
-def _slope(filtered: Filtered, batch: RecordBatch, noise: NoiseStd) -> Array:
-    """Slope of the log-likelihood by the log variances, (n + ny,)."""
-    if filtered.done is not None:
-        return kernel.variance_slopes(filtered.done, noise)
-    back = smooth(filtered, batch)
-    by_q = np.sum(back.process_slope * batch.dt[..., None] / noise.dt, axis=(0, 1))
-    by_r = np.sum(back.measurement_slope, axis=(0, 1))
-    for c in range(len(by_r)):
-        by_r[c] += back.start_slope[batch.start_channel == c].sum()
-    return np.concatenate([by_q * noise.process**2, by_r * noise.measurement**2])
 
 
 def _spread(values: Array) -> float:

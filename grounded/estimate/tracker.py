@@ -17,6 +17,7 @@ import numpy as np
 from grounded.errors import GroundedError
 from grounded.estimate.measurement import Measurement, NoiseStd, of_states
 from grounded.estimate.record import Record
+from grounded.filter.kalman import predicted
 from grounded.frozen import Array
 from grounded.model import Model
 
@@ -139,11 +140,11 @@ class Tracker:
         count = int(np.ceil((t - self.time) / LONGEST_STEP - 1e-9))
         times = np.linspace(self.time, t, count + 1)
         h = float(times[1] - times[0])
-        Q = np.diag(self.noise.process**2) * h / self.noise.dt
+        Q = self.noise.process[None] ** 2 * h / self.noise.dt
         for u in self._received(times):
             A = system.linearise(x[None], u[None], p, h)[0][0]
             x = system.step(x[None], u[None], p, h)[0]
-            P = A @ P @ A.T + Q
+            P = predicted(P[None], A[None], Q)[0]
         return x, P
 
     def _received(self, times: Array) -> Array:

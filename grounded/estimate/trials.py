@@ -18,11 +18,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from grounded.errors import GroundedError
-from grounded.estimate.filter import filter_batch
+from grounded.estimate.extended import Filtered, filter_batch, smooth
 from grounded.estimate.likelihood import NoiseEstimate, enough, first_noise, maximum_likelihood
 from grounded.estimate.measurement import Measurement, NoiseStd, of_states
 from grounded.estimate.record import Record, RecordBatch, batch_of, records_of
-from grounded.estimate.recursion import Filtered, smooth
 from grounded.estimate.steps import ModelSteps
 from grounded.frozen import Array
 from grounded.model import Model
@@ -72,7 +71,7 @@ def filter_trials(
         GroundedError: if a trial does not fit the model or the measurement.
     """
     records, batch, filtered, measurement = _passed(model, trials, noise, latency, measurement)
-    return _estimates(records, batch, filtered, filtered.x, filtered.P)
+    return _estimates(records, batch, filtered, filtered.x, filtered.gains.posterior)
 
 
 def smooth_trials(
@@ -86,8 +85,8 @@ def smooth_trials(
     """The smoother along each trial: what is known afterwards. Arguments as `filter_trials`."""
     records, batch, filtered, measurement = _passed(model, trials, noise, latency, measurement)
     if not np.isfinite(filtered.loglik):
-        return _estimates(records, batch, filtered, filtered.x, filtered.P)
-    back = smooth(filtered, batch)
+        return _estimates(records, batch, filtered, filtered.x, filtered.gains.posterior)
+    back = smooth(filtered)
     return _estimates(records, batch, filtered, back.x, back.P)
 
 
@@ -141,25 +140,22 @@ def _passed(
 def _estimates(
     records: list[Record], batch: RecordBatch, filtered: Filtered, x: Array, P: Array
 ) -> list[Estimated]:
-    found = []
+    found, g = [], filtered.gains
+    assert g.P is not None
+    S = g.measured @ g.P @ g.measured.swapaxes(-1, -2)
+    np.einsum("...ii->...i", S)[:] += g.system.R[1:]
     for b, record in enumerate(records):
         rows = slice(0, record.steps + 1)
-        seen, C = batch.seen[rows, b], filtered.C[rows, b]
-        log_det = np.log(np.maximum(np.diagonal(C, axis1=-2, axis2=-1), 1e-300))
-        loglik = -0.5 * float(np.sum(filtered.eps[rows, b] ** 2)) + float(log_det[seen].sum())
+        seen, weight = batch.seen[rows, b], np.maximum(g.weight[rows, b], 1e-300)
+        loglik = -0.5 * float(np.sum(filtered.eps[rows, b] ** 2)) + float(
+            np.log(weight[seen]).sum()
+        )
         loglik -= 0.5 * np.log(2 * np.pi) * int(seen.sum())
-        with np.errstate(all="ignore"):
-            try:
-                S = np.linalg.inv(C.transpose(0, 2, 1) @ C)
-            except np.linalg.LinAlgError:
-                S = np.full_like(C, np.nan)
         e = np.where(seen, filtered.e[rows, b], np.nan)
         status = filtered.status
         if not np.isfinite(filtered.loglik):
             loglik = -np.inf
-        found.append(
-            Estimated(record.times, x[rows, b], P[rows, b], e, np.asarray(S), loglik, status)
-        )
+        found.append(Estimated(record.times, x[rows, b], P[rows, b], e, S[rows, b], loglik, status))
     return found
 
 

@@ -27,8 +27,9 @@ from grounded.models.car import model as car
 from grounded.plant import Noise, Plant
 from grounded.policy import Policy, z_difference
 from grounded.search.ask_tell import learn
+from grounded.search.candidate import Candidate
 from grounded.search.improve import propose
-from grounded.search.standing import Candidate, SearchOptions
+from grounded.search.standing import SearchOptions
 from grounded.task import Task
 from grounded.trial import Trial
 

@@ -38,7 +38,8 @@ from grounded.onboard import Runner
 from grounded.plant import Plant
 from grounded.policy import Policy
 from grounded.search.ask_tell import learn
-from grounded.search.standing import Candidate, SearchOptions
+from grounded.search.candidate import Candidate
+from grounded.search.standing import SearchOptions
 from grounded.task import Task
 from grounded.trial import Trial
 

@@ -25,9 +25,10 @@ from grounded.models.aircraft import model as aircraft
 from grounded.result import plain
 from grounded.rollout import simulate
 from grounded.search.ask_tell import learn
+from grounded.search.candidate import Candidate
 from grounded.search.first_policy import first_policy
 from grounded.search.improve import propose
-from grounded.search.standing import Candidate, SearchOptions
+from grounded.search.standing import SearchOptions
 from grounded.task import Task
 from grounded.trial import Trial
 

@@ -3,7 +3,7 @@
 What is fitted, parameters of the model and delays of its inputs, is one vector theta (`Unknowns`).
 The least-squares problem are the whitened innovations of the filter and their slopes,
 
-    eps(theta): the filter's, with f(.; theta);      W = d eps / d theta  (`filter.sensitivity`)
+    eps(theta): the filter's, with f(.; theta);      W = d eps / d theta  (`extended.sensitivity`)
     delta = -(W'W + lambda diag(W'W))^-1 W' eps,     theta <- clip(theta + delta)
 
 The sum of squares of eps is what is left unexplained, measured in the noise; the log-likelihood
@@ -11,14 +11,20 @@ adds the log-determinants; W'W is the information that the data hold about theta
 of a trial starts from what the filter knows, noise of the measurements does not bias the fit, as it
 does in one-step least squares (errors in variables).
 
+The filter's gains depend on theta too, through A = f_x. Gauss and Newton leave that out, and where
+the model stiffens with theta the step then leads down and theta would stay where it began. So a
+climb that rises no further goes on with the exact slope (`exact`), and ends where that has none:
+
+    d loglik / d theta = -W' eps + sum_t <(q q' - N) A P, dA / d theta>    q, N: the smoother's
+
 A step counts if the log-likelihood rises; else lambda grows. Unknowns at a bound that would leave
 it are held; directions of which the data say nothing are not moved.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -27,15 +33,19 @@ from numpy.typing import NDArray
 from grounded.compile import System
 from grounded.errors import GroundedError, nearest
 from grounded.estimate import Measurement, NoiseStd, Record
-from grounded.estimate.filter import filter_batch, sensitivity
+from grounded.estimate.extended import Filtered, filter_batch, sensitivity
 from grounded.estimate.record import RecordBatch, batch_of
-from grounded.estimate.recursion import Filtered
 from grounded.estimate.steps import ModelSteps
+from grounded.filter.kalman import smoother
 from grounded.frozen import Array
 from grounded.model import Model
 
 Latency = Literal["known", "common", "each"]
 LONGEST = 0.5  # [s] no latency is sought beyond
+STDS = 3.0  # prior standard deviations that a parameter without bounds may move
+BOUNDS = (
+    "what may move has bounds, Param(value, unit, low, high), or a prior, Param(value, unit, std=s)"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +79,16 @@ class Unknowns:
             latency[list(inputs)] = value
         return p, latency
 
+    def less(self, index: int) -> Unknowns:
+        """The same without one unknown, which stays at its start."""
+        kept = np.delete(np.arange(self.k), index)
+        names, units = (tuple(each[i] for i in kept) for each in (self.names, self.units))
+        columns = tuple(c for i, c in enumerate(self.columns) if i != index)
+        first = len(self.columns)
+        delayed = tuple(d for i, d in enumerate(self.delayed, first) if i != index)
+        arrays = {key: getattr(self, key)[kept] for key in ("start", "low", "high", "scale")}
+        return replace(self, names=names, units=units, columns=columns, delayed=delayed, **arrays)
+
     def clipped(self, theta: Array) -> Array:
         """Theta within the bounds."""
         return np.asarray(np.clip(theta, self.low, self.high))
@@ -81,20 +101,22 @@ def unknowns_of(
 
     Args:
         model: gives values and bounds.
-        names: parameters to fit; None: all.
+        names: parameters to fit; None: all uncertain ones.
         latency: of each input [s], known or where to begin, (m,).
         fit_latency: "known" (not fitted), "common" (one for all inputs), or "each".
 
     Raises:
-        GroundedError: for a name that is not a parameter, or nothing to fit.
+        GroundedError: for a name that is not an uncertain parameter, or nothing to fit.
     """
-    names = model.param_names if names is None else tuple(names)
+    names = model.uncertain if names is None else tuple(names)
     for name in names:
         if name not in model.params:
             raise GroundedError(
                 f"'{name}' is not a parameter of model '{model.name}': "
                 + nearest(name, model.params)
             )
+        if not model.params[name].uncertain:
+            raise GroundedError(f"'{name}' is a constant of model '{model.name}': {BOUNDS}")
     if fit_latency not in ("known", "common", "each"):
         raise GroundedError(f"fit_latency must be known, common or each, got '{fit_latency}'")
     params = [model.params[name] for name in names]
@@ -108,9 +130,11 @@ def unknowns_of(
     if fit_latency == "each":
         labels = [f"latency:{name}" for name in model.input_names]
     if not names and not labels:
-        raise GroundedError(f"model '{model.name}' has no parameter to fit")
-    low = [-np.inf if p.low is None else p.low for p in params] + [0.0] * len(delayed)
-    high = [np.inf if p.high is None else p.high for p in params] + [LONGEST] * len(delayed)
+        raise GroundedError(f"model '{model.name}' has no uncertain parameter to fit: {BOUNDS}")
+    far = [np.inf if p.std is None else STDS * p.std for p in params]  # where no bound is given
+    low = [p.value - f if p.low is None else p.low for p, f in zip(params, far, strict=True)]
+    high = [p.value + f if p.high is None else p.high for p, f in zip(params, far, strict=True)]
+    low, high = low + [0.0] * len(delayed), high + [LONGEST] * len(delayed)
     start = [p.value for p in params] + [float(latency[inputs[0]]) for inputs in delayed]
     width = np.array(high) - np.array(low)
     size = np.maximum(np.abs(start), 1e-3)
@@ -158,12 +182,18 @@ def climb(
         free: which unknowns may move, (k,).
         max_steps: steps that count, at most.
     """
-    at, damping, status = start, 1e-3, "out of steps"
+    at, damping, last = start, 1e-3, max_steps
+    slopes_at: Callable[[FitData, Point], Linear] = linear
     slopes = linear(data, at)
     for step in range(max_steps):
-        at, slopes, damping, status = _step(data, noise, at, slopes, free, damping)
-        if status != "rising":
+        at, slopes, damping, status = _step(data, noise, at, slopes, free, damping, slopes_at)
+        if status != "rising" and slopes_at is exact:
             return Climb(at, slopes, step, status)
+        if status != "rising":
+            damping, slopes_at, slopes = 1e-3, exact, exact(data, at)
+            last = min(last, step + 1 + max_steps // 2)
+        if step + 1 == last:
+            break
     return Climb(at, slopes, max_steps, "out of steps")
 
 
@@ -174,6 +204,7 @@ def _step(
     slopes: Linear,
     free: NDArray[np.bool_],
     damping: float,
+    slopes_at: Callable[[FitData, Point], Linear],
 ) -> tuple[Point, Linear, float, str]:
     for _ in range(12):
         delta, promise = marquardt_step(data, at.theta, slopes, free, damping)
@@ -182,7 +213,7 @@ def _step(
         there = point(data, noise, data.unknowns.clipped(at.theta + delta), at)
         if there.loglik > at.loglik:
             gain = there.loglik - at.loglik
-            later = linear(data, there)
+            later = slopes_at(data, there)
             if not np.isfinite(later.W).all():
                 return at, slopes, damping, "slopes are not finite"
             status = "rising" if gain > ENOUGH else "converged"
@@ -196,7 +227,7 @@ def marquardt_step(
 ) -> tuple[Array, float]:
     """The damped step (k,) and the gain in nats that the linear problem promises of it."""
     unknowns = data.unknowns
-    N, g = slopes.W.T @ slopes.W, -slopes.W.T @ slopes.eps
+    N, g = slopes.W.T @ slopes.W, slopes.g
     stuck = ((theta <= unknowns.low) & (g < 0)) | ((theta >= unknowns.high) & (g > 0))
     use = np.flatnonzero(free & ~stuck & (np.diag(N) > 0))
     delta = np.zeros(unknowns.k)
@@ -248,6 +279,12 @@ class Linear:
     W: Array  # (rows, k)
     eps: Array  # (rows,)
     block: NDArray[np.int64]  # (rows,) the piece of time that a row belongs to
+    more: Array | float = 0.0  # (k,) what the gains add to the slope
+
+    @property
+    def g(self) -> Array:
+        """Slope of the log-likelihood, (k,)."""
+        return np.asarray(-self.W.T @ self.eps + self.more)
 
 
 def point(data: FitData, noise: NoiseStd, theta: Array, near: Point | None = None) -> Point:
@@ -273,9 +310,33 @@ def linear(data: FitData, at: Point, blocks: int = 60) -> Linear:
     return Linear(W[seen], at.filtered.eps[seen], _blocks(at.batch, blocks)[seen])
 
 
+def exact(data: FitData, at: Point) -> Linear:
+    """Slopes with what a change of the parameters does to the filter's gains."""
+    unknowns, filtered, batch, more = (
+        data.unknowns,
+        at.filtered,
+        at.batch,
+        np.zeros(data.unknowns.k),
+    )
+    p, back = unknowns.unpack(at.theta)[0], smoother(filtered.gains, filtered.eps, covariances=True)
+    assert back.whole is not None
+    q = back.r[1:, ..., None]
+    said = (q * q.swapaxes(-1, -2) - back.whole[1:]) @ filtered.A @ filtered.gains.posterior[:-1]
+    for h, mask in batch.steps_of:
+        rows = batch.valid if mask is None else mask & batch.valid
+        x, u = filtered.x[:-1][rows], batch.u[rows]
+        A = data.system.linearise(x, u, p, h)[0]
+        for i, column in enumerate(unknowns.columns):
+            moved, size = p.copy(), 1e-5 * max(abs(p[column]), 1e-3)
+            moved[column] += size
+            change = (data.system.linearise(x, u, moved, h)[0] - A) / size
+            more[i] += float(np.sum(said[rows] * change))
+    return replace(linear(data, at), more=more)
+
+
 def _change_of_the_next_state(data: FitData, at: Point) -> Array:
     """f_theta along the filtered track, (T, B, n, k)."""
-    unknowns, batch, (T, B, n) = data.unknowns, at.batch, at.filtered.f.shape
+    unknowns, batch, (T, B, n) = data.unknowns, at.batch, at.filtered.more.shape
     p = unknowns.unpack(at.theta)[0]
     out = np.zeros((T, B, n, unknowns.k))
     params = len(unknowns.columns)

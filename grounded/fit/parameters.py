@@ -15,7 +15,7 @@ from grounded.estimate import Measurement, NoiseStd, Record, of_states
 from grounded.estimate.record import part, records_of
 from grounded.fit.gauss_newton import Latency, Unknowns, unknowns_of
 from grounded.fit.prediction import PredictionError, prediction_error
-from grounded.fit.result import Fit, report
+from grounded.fit.result import Fit, least_known, report
 from grounded.fit.search import SearchEnd, data_of, first_search, search_parameters
 from grounded.frozen import Array
 from grounded.model import Model
@@ -40,7 +40,7 @@ def fit(
     Args:
         model: where to begin, with bounds; a task also says the latency.
         trials: real trials, or records with clocks of their own.
-        names: parameters to fit; None: all.
+        names: parameters to fit; None: all uncertain ones.
         latency: of each input [s], known, or where to begin, (m,); None: zero (or the task's).
         fit_latency: "known", "common" (fit one for all inputs) or "each".
         measurement: what the records measure; None: the states as they are.
@@ -61,6 +61,25 @@ def fit(
     if max(r.steps for r in records) < 3:
         raise GroundedError("a fit needs a trial of at least 3 steps")
     rng = np.random.default_rng(0) if rng is None else rng
+    held = unknowns
+    while True:
+        found = _fitted(model, records, measurement, unknowns, hold_out, horizon_s, rng)
+        least = least_known(model, found)
+        if least is None or unknowns.k == 1:
+            return found.beside(held)
+        unknowns = unknowns.less(unknowns.names.index(least))
+
+
+def _fitted(
+    model: Model,
+    records: Sequence[Record],
+    measurement: Measurement,
+    unknowns: Unknowns,
+    hold_out: float,
+    horizon_s: float,
+    rng: np.random.Generator,
+) -> Fit:
+    """One search on a part of the time, judged on the rest; the values from all of it."""
     train, test = split_in_time(records, hold_out, horizon_s, measurement)
     first = first_search(data_of(model, train, measurement, unknowns), rng)
     before, after, last = None, None, first

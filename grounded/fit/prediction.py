@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from grounded.estimate import Measurement, NoiseStd, Record, noise_of, of_states
-from grounded.estimate.filter import filter_batch
+from grounded.estimate.extended import filter_batch, smooth
 from grounded.estimate.record import RecordBatch, batch_of, records_of
-from grounded.estimate.recursion import smooth
 from grounded.estimate.steps import ModelSteps
 from grounded.frozen import Array
 from grounded.model import Model
@@ -68,7 +67,7 @@ def prediction_error(
     filtered = filter_batch(
         batch, measurement, noise, ModelSteps(model.system, model.values, batch)
     )
-    x = smooth(filtered, batch).x if np.isfinite(filtered.loglik) else filtered.x
+    x = smooth(filtered).x if np.isfinite(filtered.loglik) else filtered.x
     steps = max(1, round(horizon_s / noise.dt))
     one, ahead, windows = _windows(model, batch, measurement, x, steps)
     return PredictionError(measurement.names, one, ahead, horizon_s, windows)

@@ -14,7 +14,7 @@ Source: White, Estimation, Inference and Specification Analysis (1994); Newey & 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
 
@@ -65,6 +65,27 @@ class Fit(Result):
     def __post_init__(self) -> None:
         object.__setattr__(self, "params", MappingProxyType(dict(self.params)))
 
+    def beside(self, asked: Unknowns) -> Fit:
+        """The same with the unknowns that were held since the data don't identify them."""
+        lost = [i for i, name in enumerate(asked.names) if name not in self.params]
+        if not lost:
+            return self
+        params, covariance = dict(self.params), np.zeros((asked.k, asked.k))
+        kept = np.delete(np.arange(asked.k), lost)
+        covariance[np.ix_(kept, kept)] = self.covariance
+        for i in lost:
+            start, low, high = (float(a[i]) for a in (asked.start, asked.low, asked.high))
+            params[asked.names[i]] = FittedValue(
+                start, np.inf, low, high, asked.units[i], False, start
+            )
+        names = ", ".join(asked.names[i] for i in lost)
+        return replace(
+            self,
+            params={name: params[name] for name in asked.names},
+            covariance=covariance,
+            sentence=f"{self.sentence}; the data do not identify {names}, held as before",
+        )
+
     def summary(self) -> str:
         """The values with their standard deviations."""
         found = ", ".join(f"{name} {e.value:.4g} +- {e.std:.2g}" for name, e in self.params.items())
@@ -87,6 +108,19 @@ class Fit(Result):
                     ahead=dict(zip(error.names, error.ahead, strict=True)),
                 )
         return found
+
+
+def least_known(model: Model, found: Fit) -> str | None:
+    """Of what the data don't identify, the one that its user is surest of; None: all are known."""
+    if not np.isfinite(found.loglik):
+        return None
+
+    def sure(name: str) -> float:
+        param = model.params.get(name)
+        return 0.0 if param is None else param.spread / max(abs(param.value), 1e-9)
+
+    lost = [name for name, e in found.params.items() if not e.identified]
+    return min(lost, key=sure) if lost else None
 
 
 def report(

@@ -42,6 +42,7 @@ from grounded.model import Model
 
 ROUNDS = 8  # of parameters, thresholds, noise
 STIRRED = 0.5  # [nats] a climb that gains less leaves thresholds and noise where they are
+STUCK = 1.0  # [nats] a climb that ends though its slopes promise more has not converged
 REVIVE = 0.2  # of the rough noise: where each search for the noise begins at least
 LONG = 400  # steps; longer records are cut, so that the filter runs over the pieces at once
 
@@ -100,7 +101,8 @@ def search_parameters(
         before = at.loglik
         slopes = linear(data, at)
         still = quiet(data, slopes) | thresholds
-        at = climb(data, noise, at, ~still).at
+        end = climb(data, noise, at, ~still)
+        at = end.at
         if round_ == 0 or at.loglik - before > STIRRED:
             for i in np.flatnonzero(still & np.isfinite(data.unknowns.scale)):
                 width = None if new and round_ == 0 else 0.05 * data.unknowns.scale[i]
@@ -108,7 +110,10 @@ def search_parameters(
                 thresholds[i] |= moved is not at
                 at = moved
         if at.loglik - before < STIRRED and round_ > 0:
+            promise = marquardt_step(data, at.theta, end.slopes, ~still, 1e-3)[1]
             status = "converged"
+            if at is end.at and promise > STUCK:
+                status = f"no step rises, though slopes promise {promise:.1f} nats"
             break
         later = _noise(data, at.theta, noise, rng)
         there = point(data, later, at.theta, at)

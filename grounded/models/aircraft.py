@@ -31,53 +31,59 @@ from grounded.model import Model, Param
 
 GRAVITY = 9.81  # [m/s2]
 
+
+def about(value: float, unit: str) -> Param:
+    """A number of a textbook or a scaled one: 30 % is what it may be off."""
+    return Param(value, unit, std=0.3 * abs(value))
+
+
 # "Zagi" is the flying wing of Beard & McLain, Table E.1, whose moments of inertia scale here with
 # the mass (1 / 1.56) and the span squared ((1.5 / 1.4224)^2). It has no rudder and is unstable in
 # yaw, so a fin and its derivatives are added: those values are marked "chosen".
 PARAMS: dict[str, Param] = {
     "mass": Param(1.0, "kg"),  # paper, footnote 13
-    "Jx": Param(0.0818, "kg m2"),  # Zagi 0.1147, scaled
-    "Jy": Param(0.0411, "kg m2"),  # Zagi 0.0576, scaled
-    "Jz": Param(0.1221, "kg m2"),  # Zagi 0.1712, scaled
-    "Jxz": Param(0.00107, "kg m2"),  # Zagi 0.0015, scaled
+    "Jx": about(0.0818, "kg m2"),  # Zagi 0.1147, scaled
+    "Jy": about(0.0411, "kg m2"),  # Zagi 0.0576, scaled
+    "Jz": about(0.1221, "kg m2"),  # Zagi 0.1712, scaled
+    "Jxz": about(0.00107, "kg m2"),  # Zagi 0.0015, scaled
     "S": Param(0.2879, "m2"),  # wing area: Zagi 0.2589 (1.5 / 1.4224)^2
     "b": Param(1.5, "m"),  # span: paper, footnote 13
     "c": Param(0.3482, "m"),  # mean chord: Zagi 0.3302 (1.5 / 1.4224)
     "rho": Param(1.2682, "kg/m3"),  # air density: Beard & McLain, Table E.1
     "S_prop": Param(0.0314, "m2"),  # Zagi
-    "C_prop": Param(1.0, "1"),  # Zagi
-    "k_motor": Param(20.0, "m/s"),  # Zagi
-    "z_T": Param(0.01, "m"),  # chosen: thrust line below the centre of mass
-    "k_Q": Param(0.01, "m"),  # chosen: propeller torque per thrust
-    "CL0": Param(0.09167, "1"),  # Zagi
-    "CLa": Param(3.5016, "1/rad"),  # Zagi
-    "CLq": Param(2.8932, "1/rad"),  # Zagi
-    "CLde": Param(0.2724, "1/rad"),  # Zagi
-    "alpha_s": Param(0.4712, "rad"),  # stall angle: Zagi alpha_0
-    "M_s": Param(50.0, "1"),  # sharpness of the stall: Zagi M
-    "CD0": Param(0.04171, "1"),  # Zagi: C_D0 0.01631 + C_Dp 0.0254
-    "e_osw": Param(0.9, "1"),  # Oswald's efficiency: Zagi
-    "CDde": Param(0.3045, "1/rad2"),  # Zagi's C_Dde, used with the square (smooth)
-    "CDb": Param(0.1, "1/rad2"),  # chosen: drag of sideslip
-    "Cm0": Param(-0.02338, "1"),  # Zagi
-    "Cma": Param(-0.5675, "1/rad"),  # Zagi
-    "Cmq": Param(-1.399, "1/rad"),  # Zagi
-    "Cmde": Param(-0.3254, "1/rad"),  # Zagi
-    "CYb": Param(-0.2, "1/rad"),  # chosen, fin added: Zagi -0.07359, Aerosonde -0.98
-    "CYp": Param(-0.01, "1/rad"),  # chosen: Zagi 0
-    "CYr": Param(0.05, "1/rad"),  # chosen: Zagi 0
-    "CYda": Param(0.01, "1/rad"),  # chosen: Zagi 0, Aerosonde 0.075
-    "CYdr": Param(0.1, "1/rad"),  # chosen, fin rudder: Aerosonde 0.19
-    "Clb": Param(-0.02854, "1/rad"),  # Zagi
-    "Clp": Param(-0.3209, "1/rad"),  # Zagi
-    "Clr": Param(0.03066, "1/rad"),  # Zagi
-    "Clda": Param(0.1682, "1/rad"),  # Zagi
-    "Cldr": Param(0.0024, "1/rad"),  # Aerosonde, 2nd edition
-    "Cnb": Param(0.03, "1/rad"),  # chosen, fin added: Zagi -0.0004, Aerosonde 0.073
-    "Cnp": Param(-0.01297, "1/rad"),  # Zagi
-    "Cnr": Param(-0.03, "1/rad"),  # chosen, fin added: Zagi -0.00434, Aerosonde -0.095
-    "Cnda": Param(-0.00328, "1/rad"),  # Zagi
-    "Cndr": Param(-0.03, "1/rad"),  # chosen: Aerosonde -0.069
+    "C_prop": about(1.0, "1"),  # Zagi
+    "k_motor": about(20.0, "m/s"),  # Zagi
+    "z_T": about(0.01, "m"),  # chosen: thrust line below the centre of mass
+    "k_Q": about(0.01, "m"),  # chosen: propeller torque per thrust
+    "CL0": about(0.09167, "1"),  # Zagi
+    "CLa": about(3.5016, "1/rad"),  # Zagi
+    "CLq": about(2.8932, "1/rad"),  # Zagi
+    "CLde": about(0.2724, "1/rad"),  # Zagi
+    "alpha_s": about(0.4712, "rad"),  # stall angle: Zagi alpha_0
+    "M_s": about(50.0, "1"),  # sharpness of the stall: Zagi M
+    "CD0": about(0.04171, "1"),  # Zagi: C_D0 0.01631 + C_Dp 0.0254
+    "e_osw": about(0.9, "1"),  # Oswald's efficiency: Zagi
+    "CDde": about(0.3045, "1/rad2"),  # Zagi's C_Dde, used with the square (smooth)
+    "CDb": about(0.1, "1/rad2"),  # chosen: drag of sideslip
+    "Cm0": about(-0.02338, "1"),  # Zagi
+    "Cma": about(-0.5675, "1/rad"),  # Zagi
+    "Cmq": about(-1.399, "1/rad"),  # Zagi
+    "Cmde": about(-0.3254, "1/rad"),  # Zagi
+    "CYb": about(-0.2, "1/rad"),  # chosen, fin added: Zagi -0.07359, Aerosonde -0.98
+    "CYp": about(-0.01, "1/rad"),  # chosen: Zagi 0
+    "CYr": about(0.05, "1/rad"),  # chosen: Zagi 0
+    "CYda": about(0.01, "1/rad"),  # chosen: Zagi 0, Aerosonde 0.075
+    "CYdr": about(0.1, "1/rad"),  # chosen, fin rudder: Aerosonde 0.19
+    "Clb": about(-0.02854, "1/rad"),  # Zagi
+    "Clp": about(-0.3209, "1/rad"),  # Zagi
+    "Clr": about(0.03066, "1/rad"),  # Zagi
+    "Clda": about(0.1682, "1/rad"),  # Zagi
+    "Cldr": about(0.0024, "1/rad"),  # Aerosonde, 2nd edition
+    "Cnb": about(0.03, "1/rad"),  # chosen, fin added: Zagi -0.0004, Aerosonde 0.073
+    "Cnp": about(-0.01297, "1/rad"),  # Zagi
+    "Cnr": about(-0.03, "1/rad"),  # chosen, fin added: Zagi -0.00434, Aerosonde -0.095
+    "Cnda": about(-0.00328, "1/rad"),  # Zagi
+    "Cndr": about(-0.03, "1/rad"),  # chosen: Aerosonde -0.069
 }
 
 

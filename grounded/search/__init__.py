@@ -1,8 +1,9 @@
 """The search on the REAL system, derived from stored trials: what to run next.
 
 Read `improve.py` first: the paper's loop, one proposal at a time; `ask_tell.py` is the loop around
-it. `standing.py` says where the search stands and why it ended, `certainty.py` how sure an
-improvement is, `step_size.py` how far to go (damping, alpha), `first_policy.py` where it starts
-(DDP from several runs, the first of them by `first_guess.py`), `planner.py` by which model it
-plans, `safety.py` what may be handed out.
+it. `making.py` makes a `candidate.py`, by slopes that earlier trials have corrected (`secants.py`).
+`standing.py` says where the search stands and why it ended, `certainty.py` how sure an improvement
+is, `step_size.py` how far to go (damping, alpha), `first_policy.py` where it starts (DDP from many
+runs, the first of them by `first_guess.py`), `planner.py` by which model it plans, `safety.py` what
+may be handed out; `pictures.py` draws it.
 """

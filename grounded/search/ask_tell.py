@@ -16,8 +16,10 @@ from dataclasses import replace
 
 from grounded.errors import GroundedError, nearest
 from grounded.policy import Policy
-from grounded.search.improve import Proposal, propose
-from grounded.search.standing import Candidate, SearchOptions, Standing, Tried
+from grounded.search.candidate import Candidate, Tried
+from grounded.search.improve import propose
+from grounded.search.making import Proposal
+from grounded.search.standing import SearchOptions, Standing
 from grounded.task import Task
 from grounded.trial import Trial
 

@@ -12,12 +12,12 @@ import numpy as np
 from grounded.trial import Trial
 
 if TYPE_CHECKING:
-    from grounded.search.standing import Tried
+    from grounded.search.candidate import Tried
 
 
 def repeated_exactly(trials: Sequence[Trial]) -> bool:
     """Whether two trials of a candidate have the very same states."""
-    return any(np.array_equal(a.states, b.states) for a, b in pairwise(trials))
+    return any(a.repeats(b) for a, b in pairwise(trials))
 
 
 def in_doubt(incumbent: Tried, loser: Tried, most: int) -> bool:
@@ -48,28 +48,40 @@ def utility_noise(history: Sequence[Tried]) -> tuple[float, int]:
 def last_improvement(history: Sequence[Tried]) -> str:
     """How sure the last accepted improvement is, as a sentence; "" before there is one.
 
-    Two candidates differ for certain where the difference of their means exceeds its standard
-    error; Welch's t-test gives the probability. Single trials say nothing about noise: then the
-    scatter of any candidate that was repeated stands in for it.
+    Welch's t-test of the two candidates' own trials, whose standard errors stand beside them in the
+    table. Where one was run once, the other's scatter stands in for its own; where both were, that
+    of the other candidates, but not of the model's own policy: how wildly that one scatters says
+    nothing of those that came after it.
     """
     accepted = [t for t in history if t.accepted]
     if len(accepted) < 2:
         return ""
     before, after = accepted[-2], accepted[-1]
     gain = after.utility - before.utility
-    noise, freedom = utility_noise(history)
+    error, freedom = _error_between(before, after, history)
     if not freedom:
         return (
-            f"the last gain is {gain:.3g}; every candidate was run once, so the noise of a "
+            f"the last gain is {gain:.3g}; both candidates were run once, so the noise of a "
             "trial is unknown: run the best one again"
         )
-    error = noise * math.sqrt(1 / len(before.utilities) + 1 / len(after.utilities))
     if error == 0:
         return f"the last gain is {gain:.3g}; repeated trials agree exactly"
-    from scipy.stats import t as student
+    from scipy.special import stdtr  # Student's t; scipy.stats takes half a second to import
 
-    probability = float(student.cdf(gain / error, freedom))
+    probability = float(stdtr(freedom, gain / error))
     return (
-        f"the last gain is {gain:.3g} +- {error:.2g} (noise of one trial {noise:.2g}): "
-        f"an improvement with probability {probability:.2f}"
+        f"the last gain is {gain:.3g} +- {error:.2g}: an improvement with probability "
+        f"{probability:.2f}"
     )
+
+
+def _error_between(before: Tried, after: Tried, history: Sequence[Tried]) -> tuple[float, float]:
+    """Standard error of the difference of two means, and its degrees of freedom; 0 for unknown."""
+    each = [(t.standard_error**2, len(t.utilities)) for t in (before, after)]
+    if all(count > 1 and math.isfinite(square) for square, count in each):
+        total = sum(square for square, _ in each)
+        parts = sum(square**2 / (count - 1) for square, count in each)
+        return math.sqrt(total), total**2 / parts if parts else 1.0
+    own = [t for t in (before, after) if math.isfinite(t.standard_error)]
+    noise, freedom = utility_noise(own or history[1:])
+    return noise * math.sqrt(sum(1 / count for _, count in each)), float(freedom)

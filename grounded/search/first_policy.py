@@ -8,6 +8,8 @@ until it has converged, and the plan with the lowest cost wins:
     the reference    a closed-loop run of the model near the target (`first_guess`)
     zero inputs      and the inputs held before the start, where they are others
     smooth inputs    random, by fixed seeds: only where a solve takes milliseconds
+    more of them     where those have shown local optima that are nearly as good; every other one
+                     the best plan so far, kicked for a while, which leads to other valleys
 """
 
 from __future__ import annotations
@@ -28,11 +30,16 @@ CAUTION = 100.0  # factor on the input penalties each time the first policy cras
 ITERATIONS = 1000  # of DDP at the most, from one start
 AT_ONCE = 2e5  # control steps times iterations between two chances to interrupt: under a second
 STARTS = 24  # random ones
+MANY = 300  # more, where there are local optima
 KNOTS = (5, 8, 14)  # of a random start's inputs, in turn
 AMPLITUDES = (0.05, 0.15, 0.4)  # of its knots, standard deviation as a share of an input's range
+KICK, KICKED = 0.3, (5.0, 40.0)  # a kick: its height as AMPLITUDES, its width in steps
+WORSE = 1.01  # times the best cost: a plan above it has converged somewhere else
 WORK = 4e7  # iterations x H x (n + m)^2 that all rivals of the reference may take
+SKETCH, PROMISING = 40, 1.3  # iterations after which a plan of so many times the cost is dropped
+MORE_WORK = 2e8  # the same for MANY
 FEWEST = 10  # iterations: a rival that gets no more is not started
-HOPELESS = 1e3  # times the best plan's cost: a start above it is not pursued
+HOPELESS, HOPELESS_SLOW = 1e6, 1e3  # times the best cost: a start above it is not pursued
 
 Tick = Callable[[str], None]
 
@@ -61,19 +68,41 @@ def first_policy(
     problem, guess = task.problem(), first_guess(task)
     best = finished(problem, guess.inputs, guess.gain, guess.z[:-1], tick=tick)
     rivals = list(_rivals(task))
-    share = WORK / (max(len(rivals), 1) * problem.horizon * (problem.nz + task.model.m) ** 2)
+    size = problem.horizon * (problem.nz + task.model.m) ** 2
+    share = WORK / (len(rivals) * size)
     most = int(np.clip(share, FEWEST, ITERATIONS))
+    elsewhere = False
     for inputs in rivals if share >= FEWEST else rivals[:2]:
-        cost = float(problem.system.rollout(problem, inputs).cost[0])
-        if not np.isfinite(cost) or (best.ok and cost > HOPELESS * best.cost):
-            continue
-        found = finished(problem, inputs, most=most, tick=tick)
-        if found.ok and (not best.ok or found.cost < best.cost * (1 - 1e-6)):
-            best = found
+        found = _pursued(problem, inputs, best, most, tick)
+        elsewhere |= _other_optimum(found, best)
+        best = _better(found, best)
+    if elsewhere and share >= FEWEST and task.model.system.how == "compiled":
+        best = _hopped(task, problem, best, most, tick)
     if best.status == "max iterations" and len(best.trace) < ITERATIONS:
         more = finished(problem, best.u, best.K, best.z[:-1], tick=tick)
         best = replace(more, trace=(*best.trace, *more.trace))
     return task.policy(best.u, best.K, best.z[:-1]), best
+
+
+def _hopped(
+    task: Task, problem: Problem, best: ddp.Solution, most: int, tick: Tick | None
+) -> ddp.Solution:
+    """The best plan of many more starts, most of which are dropped before they have converged."""
+    rng, size = np.random.default_rng(STARTS), problem.horizon * (problem.nz + task.model.m) ** 2
+    work = MORE_WORK
+    for i in range(MANY):
+        inputs = _random(task, rng, i // 2) if i % 2 else _kicked(task, rng, best.u)
+        found = _pursued(problem, inputs, best, SKETCH, tick)
+        work -= size * (len(found.trace) if found else 1)
+        if found is not None and found.status == "max iterations":
+            if found.cost > PROMISING * best.cost:
+                continue
+            found = finished(problem, found.u, found.K, found.z[:-1], most=most, tick=tick)
+            work -= size * len(found.trace)
+        best = _better(found, best)
+        if work < 0:
+            break
+    return best
 
 
 def finished(
@@ -111,6 +140,32 @@ def finished(
     )
 
 
+def _pursued(
+    problem: Problem, inputs: Array, best: ddp.Solution, most: int, tick: Tick | None
+) -> ddp.Solution | None:
+    """DDP from a start; None where its own cost is hopeless."""
+    cost = float(problem.system.rollout(problem, inputs).cost[0])
+    cheap = problem.system.how == "compiled" and most > FEWEST
+    most_cost = HOPELESS if cheap else HOPELESS_SLOW
+    if not np.isfinite(cost) or (best.ok and cost > most_cost * best.cost):
+        return None
+    return finished(problem, inputs, most=most, tick=tick)
+
+
+def _better(found: ddp.Solution | None, best: ddp.Solution) -> ddp.Solution:
+    if found is None or not found.ok or (best.ok and found.cost >= best.cost * (1 - 1e-6)):
+        return best
+    return found
+
+
+def _other_optimum(found: ddp.Solution | None, best: ddp.Solution) -> bool:
+    """Whether two plans have converged to different costs, of which the worse may compete."""
+    if found is None or (found.status, best.status) != ("converged", "converged"):
+        return False
+    low, high = sorted((found.cost, best.cost))
+    return WORSE * low < high < PROMISING * low
+
+
 def _rivals(task: Task) -> Iterator[Array]:
     """Inputs (H, m) from which DDP may find a better plan than from the reference."""
     H, m = task.horizon, task.model.m
@@ -121,12 +176,36 @@ def _rivals(task: Task) -> Iterator[Array]:
         yield np.tile(held, (H, 1))
     if task.model.system.how != "compiled":
         return
-    low = np.where(np.isfinite(task.low), task.low, zero - 1.0)
-    high = np.where(np.isfinite(task.high), task.high, zero + 1.0)
-    steps = np.arange(H)
     for seed in range(STARTS):
         count, amplitude = KNOTS[seed % len(KNOTS)], AMPLITUDES[seed % len(AMPLITUDES)]
-        knots = np.linspace(0, H - 1, count)
-        drawn = np.random.default_rng(seed).normal(0.0, amplitude, (count, m)) * (high - low)
-        smooth = [np.interp(steps, knots, column) for column in drawn.T]
-        yield np.clip(zero + np.column_stack(smooth), task.low, task.high)
+        smooth = _smooth(task, np.random.default_rng(seed), count, amplitude)
+        yield np.clip(zero + smooth, task.low, task.high)
+
+
+def _random(task: Task, rng: np.random.Generator, i: int) -> Array:
+    """Wilder random inputs (H, m), of four kinds in turn."""
+    smooth = _smooth(task, rng, KNOTS[1 + i % 2], AMPLITUDES[1 + i // 2 % 2])
+    return np.clip(smooth, task.low, task.high)
+
+
+def _kicked(task: Task, rng: np.random.Generator, inputs: Array) -> Array:
+    """The same inputs (H, m) with a kick somewhere."""
+    at, width = rng.uniform(0, task.horizon), rng.uniform(*KICKED)
+    height = rng.normal(0.0, KICK, task.model.m) * _range(task)
+    shape = np.exp(-0.5 * ((np.arange(task.horizon)[:, None] - at) / width) ** 2)
+    return np.asarray(np.clip(inputs + height * shape, task.low, task.high))
+
+
+def _smooth(task: Task, rng: np.random.Generator, count: int, amplitude: float) -> Array:
+    """Random inputs (H, m) about zero, straight between `count` knots."""
+    knots = np.linspace(0, task.horizon - 1, count)
+    drawn = rng.normal(0.0, amplitude, (count, task.model.m)) * _range(task)
+    steps = np.arange(task.horizon)
+    return np.column_stack([np.interp(steps, knots, column) for column in drawn.T])
+
+
+def _range(task: Task) -> Array:
+    """The range of each input (m,), about zero and one wide to each side without a limit."""
+    zero = np.clip(np.zeros(task.model.m), task.low, task.high)
+    low = np.where(np.isfinite(task.low), task.low, zero - 1.0)
+    return np.asarray(np.where(np.isfinite(task.high), task.high, zero + 1.0) - low)

@@ -12,7 +12,7 @@ true states.
 | 1, 2 | optimal policy of the crude model              | `first_policy` (`first_guess`, `ddp`)   |
 | 3    | run it, record the trial                       | people, robots: `run`, `ingest`         |
 | 4    | add a bias to the ORIGINAL model               | `bias.ground`                           |
-| 5    | direction d from algorithm A in that model     | `direction` (`ddp`, `policy_gradient`)  |
+| 5    | direction d from algorithm A in that model     | `making.direction` (`ddp`, `secants`)   |
 | 6    | theta + alpha d, line search on the real system| `Policy.toward`, `step_size`            |
 | 7    | none improves: return the current policy       | `standing`                              |
 
@@ -24,69 +24,27 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 
-from grounded.compile import DescentOptions, Problem
 from grounded.errors import NextCommand
-from grounded.frozen import Array
 from grounded.model import Model
-from grounded.policy import Policy
-from grounded.result import Result, document
-from grounded.rollout import simulate
+from grounded.search.candidate import Candidate, Tried
 from grounded.search.first_policy import Tick, first_policy
+from grounded.search.making import About, Maker, Proposal
 from grounded.search.planner import Planner
-from grounded.search.safety import objections, spread
 from grounded.search.standing import (
-    Candidate,
     Ending,
     Phase,
     SearchOptions,
     Standing,
-    Tried,
     losers_of,
     standing,
 )
 from grounded.search.step_size import Step
-from grounded.solve import ddp
-from grounded.solve.bias import Grounding, ground
 from grounded.task import Task
-from grounded.trial import Trial, mean_trial
-
-PLANNING = DescentOptions(max_iterations=30, tolerance=1e-6)  # a direction needs no more digits
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Proposal(Result):
-    """What to run next, or why nothing is: `candidate` is None when the search has ended."""
-
-    standing: Standing
-    candidate: Candidate | None
-    is_new: bool
-    notes: tuple[str, ...] = ()
-
-    def summary(self) -> str:
-        """The candidate, or the end of the search."""
-        return self.candidate.summary() if self.candidate else self.standing.summary()
-
-    def to_json(self) -> dict[str, Any]:
-        """The document of `grounded propose --json`; `file` is for whoever writes the candidate."""
-        now, made = self.standing, self.candidate
-        known = document(
-            candidate=made and made.id,
-            file=None,
-            iteration=made.iteration if made else now.iteration,
-            alpha=made and made.alpha,
-            damping=made.damping if made and made.base else None,
-            predicted_utility=made and made.predicted_utility,
-            phase="await-trial" if made else now.phase,
-            sentence=now.sentence,
-            notes=self.notes,
-        )
-        best = now.incumbent and now.incumbent.utility
-        return known | document(best_utility=best, new=self.is_new) if made else known
+from grounded.trial import Trial
 
 
 def model_fingerprint(task: Task) -> str:
@@ -105,46 +63,6 @@ def model_fingerprint(task: Task) -> str:
     for array in (model.values, problem.delay, np.array([task.smoothing]), np.round(moved, 9)):
         digest.update(np.ascontiguousarray(array + 0.0).tobytes())
     return digest.hexdigest()[:16]
-
-
-def direction(
-    task: Task, policy: Policy, grounding: Grounding, options: SearchOptions, damping: float = 1.0
-) -> Policy:
-    """Step 5: theta' such that d = theta' - theta improves the policy in the biased model.
-
-    Args:
-        task: the manoeuvre, with the ORIGINAL model.
-        policy: theta, the policy that ran the trial.
-        grounding: the trial as the biased model replays it (step 4).
-        options: which algorithm A.
-        damping: lambda of `step_size`, the share of mu that leaving the trial's inputs costs.
-    """
-    if options.method == "policy-gradient":
-        from grounded.solve.policy_gradient import ascent
-
-        return ascent(task, policy, grounding)
-    problem = grounding.on(task.problem())
-    if options.step == "damped":
-        problem = damped(problem, grounding.inputs, damping)
-    gains = ddp.sweep(problem, grounding.z, grounding.inputs).gains
-    result = ddp.solve(problem, grounding.inputs, gains.K, grounding.z[:-1], PLANNING)
-    return task.policy(result.u, result.K, result.z[:-1])
-
-
-def damped(problem: Problem, inputs: Array, factor: float = 1.0) -> Problem:
-    """The problem with a price mu |u_t - inputs_t|^2 on leaving the trial's inputs (H, m).
-
-    The fully converged step goes to the optimum of the biased MODEL, and that need not be uphill in
-    the real system; with mu it turns towards the gradient, which is uphill while the
-    model's derivatives are within 90 degrees (section 3). mu = R + S, the problem's own weights on
-    inputs: the same idea as norm-optimal iterative learning control. Both quadratic penalties on
-    u_t are one: weight R + mu about (R u_target + mu inputs) / (R + mu).
-    """
-    mu = factor * (problem.input_weight + problem.change_weight)
-    weight = problem.input_weight + mu
-    mixed = problem.input_weight * problem.input_target + mu * inputs
-    safe = np.where(weight > 0, weight, 1.0)
-    return replace(problem, input_weight=weight, input_target=mixed / safe)
 
 
 def propose(
@@ -180,7 +98,7 @@ def propose(
         return Proposal(now, None, is_new=False)
     if options.refit and now.incumbent is not None:
         planner = planner.with_model((refit or refitted)(planner.plan, trials))
-    make = _Maker(planner, now, identity or f"c{len(candidates) + 1:04d}", fingerprint)
+    make = Maker(planner, now, identity or f"c{len(candidates) + 1:04d}", fingerprint)
     if now.incumbent is None:
         policy, plan = first_policy(planner.plan, now.caution, tick)
         made = make.checked(make.candidate(policy, planner.plan.problem(exact=True), Step()))
@@ -198,53 +116,40 @@ def refitted(task: Task, trials: Sequence[Trial]) -> Model:
     return fit(task, [t for t in trials if t.finite_steps == t.steps and t.steps > 2]).model
 
 
-def _improvement(make: _Maker, incumbent: Tried, options: SearchOptions) -> Proposal:
+def _improvement(make: Maker, incumbent: Tried, options: SearchOptions) -> Proposal:
     """Steps 4 to 6: the first step, from the one that is due on, that the model believes in.
 
-    A step whose predicted run loses is passed over in the model, at no trial's cost: d must satisfy
+    Another plan goes before it where there is reason for one (`gentler`, `own_plan`). A step
+    whose predicted run loses is passed over in the model, at no trial's cost: d must satisfy
     U^(theta + alpha d) >= U^(theta) for some alpha (step 5).
     """
-    planner, plan = make.planner, make.planner.plan
-    own = planner.lift(mean_trial(incumbent.trials, planner.task.model.angle_mask))
-    plan.model.system.check(own.states[:-1], own.inputs, plan.model.values, plan.dt)
-    matched = options.match_inputs
-    grounding = ground(plan, own, match_inputs=matched)
-    exact = ground(plan, own, exact=True, shift=grounding.shift)
-    real = exact.on(plan.problem(exact=True))
-    theta = planner.widened(incumbent.candidate.policy)
-    # Where a trial started off s_0, its utility is no measure for runs that start there: theta's
-    # own run in the grounded model is. It replays the trial when the start was s_0.
-    already = simulate(real, theta).utility
-    already = already if np.isfinite(already) else incumbent.utility
-    least = options.tolerance * abs(already)
-    lost = losers_of(make.now.history, incumbent.candidate.id, make.fingerprint)
-    losers = {(candidate.damping, candidate.alpha) for candidate in lost}
+    now = make.now
+    if (made := make.gentler(incumbent)) is not None:
+        return make.checked(made)
+    ways, promised = options.ways(incumbent.candidate), list[float]()
     unsafe: Proposal | None = None
-    promised: list[float] = []
-    directions: dict[float, Policy] = {}
-    for step in options.steps_from(make.now.step):
-        if (step.damping, step.alpha) in losers:
+    least = 0.0
+    for way in ways[ways.index(now.way) :]:
+        step = now.step
+        if way != now.way:
+            step = options.due(now.history, incumbent, make.fingerprint, way)
+        if step is None:
             continue
-        if step.damping not in directions:
-            directions[step.damping] = direction(plan, theta, grounding, options, step.damping)
-        policy = theta.toward(directions[step.damping], step.alpha)
-        made = make.candidate(policy, real, step, already)
-        if made.predicted_gain > least:
-            proposal = make.checked(made)
-            if proposal.candidate is not None:
-                return proposal
-            unsafe = proposal
-            continue
-        promised.append(made.predicted_gain)
-        if abs(made.predicted_gain) <= least:
-            break
-    if unsafe is not None:
-        return unsafe
-    return Proposal(_ended(make, incumbent, promised, least, options.tolerance), None, False)
+        about = About(make, incumbent, options, way)
+        found = about.step_from(step, promised)
+        least = options.tolerance * abs(about.already)
+        if way == ways[0] and (own := about.own_plan(found)) is not None:
+            found = own
+        if found is not None and found.candidate is not None:
+            return found
+        unsafe = unsafe or found
+    return unsafe or Proposal(
+        _ended(make, incumbent, promised, least, options.tolerance), None, False
+    )
 
 
 def _ended(
-    make: _Maker, incumbent: Tried, promised: list[float], least: float, tolerance: float
+    make: Maker, incumbent: Tried, promised: list[float], least: float, tolerance: float
 ) -> Standing:
     """The standing when no step is worth a trial, with the true reason."""
     own, finite = incumbent.candidate.id, [gain for gain in promised if np.isfinite(gain)]
@@ -277,42 +182,3 @@ def _ended(
             f"([search] tolerance): {own} is the result"
         )
     return replace(make.now, phase=phase, step=None, sentence=sentence, ending=ending, then=then)
-
-
-@dataclass(frozen=True, eq=False)
-class _Maker:
-    """Makes candidates of a policy: what a robot can run of it, and its predicted run."""
-
-    planner: Planner
-    now: Standing
-    identity: str
-    fingerprint: str
-
-    def candidate(
-        self, policy: Policy, problem: Problem, step: Step, already: float = float("nan")
-    ) -> Candidate:
-        base, policy = self.now.incumbent, self.planner.narrowed(policy)
-        predicted = simulate(problem, self.planner.widened(policy))
-        return Candidate(
-            id=self.identity,
-            policy=policy,
-            iteration=0 if base is None else self.now.iteration + 1,
-            alpha=step.alpha,
-            damping=step.damping,
-            predicted_gain=predicted.utility - already,
-            base="" if base is None else base.candidate.id,
-            model=self.fingerprint,
-            predicted_states=predicted.states[:, : self.planner.task.model.n],
-            predicted_inputs=predicted.inputs,
-            predicted_utility=predicted.utility,
-            caution=self.now.caution,
-        )
-
-    def checked(self, made: Candidate) -> Proposal:
-        """A candidate that is finite, inside the limits and predicted to stay safe; or none."""
-        task = self.planner.task
-        found = objections(task, made, spread(task, self.now.history))
-        if not found:
-            return Proposal(self.now, made, is_new=True)
-        stopped = replace(self.now, phase="stopped", sentence=found[0], ending="not allowed")
-        return Proposal(stopped, None, is_new=False, notes=tuple(found))

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from grounded.frozen import Array
-from grounded.search.standing import Candidate, Tried
+from grounded.search.candidate import Candidate, Tried
 from grounded.task import Task
 
 MAX_GAIN = 1e6  # input units per state unit: beyond it a gain is a numerical accident
@@ -26,6 +26,9 @@ def spread(task: Task, history: Sequence[Tried]) -> Array:
     what the crude model lacks, not what the next run will do, and doesn't count.
     """
     found = np.zeros((task.horizon + 1, task.model.n))
+    assert task.safety_low is not None and task.safety_high is not None
+    if not np.isfinite([task.safety_low, task.safety_high]).any():
+        return found  # nobody asks
     for tried in history:
         whole = [t.states for t in tried.trials if t.finite_steps == task.horizon]
         if len(whole) > 1:

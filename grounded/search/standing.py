@@ -18,18 +18,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
-from grounded.frozen import Array
-from grounded.policy import Policy
 from grounded.result import Result, document
+from grounded.search.candidate import Candidate, Tried, Way
 from grounded.search.certainty import in_doubt, last_improvement, repeated_exactly
 from grounded.search.step_size import Step, after_failure, after_success
 from grounded.task import Task
 from grounded.trial import Trial
+
+if TYPE_CHECKING:
+    from grounded.figures.figure import Figure
 
 Phase = Literal["propose", "await-trial", "converged", "stopped"]
 Ending = Literal[
@@ -40,9 +42,12 @@ Ending = Literal[
     "model diverges",  # grounded on the best trial
     "crashed",  # every first policy
     "not allowed",  # by [limits] or [safety]
+    "too little gained",  # by the last trials, for what they cost
     "trials used up",
 ]
 BOLDER = 3  # factors of 10 below the damping that is due, tried where all from it on lose
+OTHER_WAY = 2  # losses of "recorded inputs", which comes after all others, before it is given up
+PATIENCE = 4  # candidates in a row that may gain less than the tolerance each
 LOST = 2  # steps in a row without improvement that ask for a diagnosis
 WILD = 100.0  # times its promise that a first trial's loss may be before it asks for one
 MAX_CAUTION = 3  # times the first policy is designed again, ever more gently, after a crash
@@ -89,6 +94,30 @@ class SearchOptions:
         """The step after one that did not improve; None when the search has failed (step 7)."""
         return after_failure(step, self.max_halvings, damps=self.damps)
 
+    def ways(self, incumbent: Candidate) -> tuple[Way, ...]:
+        """The ways to make a direction, first the one that has made the incumbent."""
+        if not (self.damps and self.match_inputs):
+            return ("",)
+        recorded = incumbent.way == "recorded inputs"
+        return ("recorded inputs", "") if recorded else ("", "recorded inputs")
+
+    def due(self, history: Sequence[Tried], incumbent: Tried, model: str, way: Way) -> Step | None:
+        """The step that is due from the incumbent in one way; None where it is exhausted.
+
+        A direction belongs to one model: what was learnt with another counts for nothing.
+        """
+        made = incumbent.candidate
+        losers = losers_of(history, made.id, model, way)
+        if way != self.ways(made)[0] and (incumbent.standard_error > 0 or len(losers) >= OTHER_WAY):
+            return None  # where trials scatter, one way is enough to be told from luck
+        if losers:
+            return self.next_step(Step(losers[-1].damping, losers[-1].alpha))
+        base = next((t for t in history if t.candidate.id == made.base), None)
+        if base is None or made.model != model or made.way != way or not self.damps:
+            return self.first_step()
+        real = incumbent.utility - base.utility
+        return after_success(Step(made.damping, made.alpha), made.predicted_gain, real)
+
     def steps_from(self, step: Step | None) -> Iterator[Step]:
         """The step that is due, the more cautious ones after it, then bolder ones than it."""
         first = step
@@ -97,92 +126,6 @@ class SearchOptions:
             step = self.next_step(step)
         if first is not None and self.damps:
             yield from (Step(first.damping / 10.0**k) for k in range(1, BOLDER + 1))
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Candidate(Result):
-    """A policy to run, and how it came about."""
-
-    id: str  # c0001, c0002 ...: the order of proposal
-    policy: Policy
-    iteration: int  # i of theta^(i) that it tries to be; 0 is the model's own policy
-    alpha: float
-    base: str  # the candidate whose trials it was derived from, "" for the model's own
-    model: str  # fingerprint of the model it was planned in
-    predicted_states: Array  # (H + 1, n) in the (biased) model
-    predicted_inputs: Array  # (H, m)
-    predicted_utility: float
-    damping: float = 1.0  # lambda of `step_size`
-    predicted_gain: float = float("nan")  # over the mean trial of its base
-    caution: int = 0  # how often the first policy was redesigned after a crash
-
-    def summary(self) -> str:
-        """Its name, its step and what the model predicts."""
-        predicted = f"predicted utility {self.predicted_utility:.4g}"
-        return f"{self.id}: iteration {self.iteration}, alpha {self.alpha:g}, {predicted}"
-
-    def to_json(self) -> dict[str, Any]:
-        """How it came about; its policy is what `grounded export` writes."""
-        return document(
-            candidate=self.id,
-            iteration=self.iteration,
-            alpha=self.alpha,
-            damping=self.damping if self.base else None,
-            base=self.base or None,
-            predicted_utility=self.predicted_utility,
-        )
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Tried(Result):
-    """A candidate with its trials: mean utility and, for two trials or more, its standard error."""
-
-    candidate: Candidate
-    trials: tuple[Trial, ...]
-    utilities: tuple[float, ...]
-    accepted: bool | None  # None: not decided, trials are missing
-    in_doubt: bool = False  # its own trials are there: the incumbent's are missing
-
-    @property
-    def utility(self) -> float:
-        """Mean utility of the trials; nan without a trial, -inf when one of them failed."""
-        return float(np.mean(self.utilities)) if self.utilities else float("nan")
-
-    @property
-    def standard_error(self) -> float:
-        """Of the mean; nan for fewer than two trials, or where one of them failed."""
-        if len(self.utilities) < 2 or not np.isfinite(self.utilities).all():
-            return float("nan")
-        return float(np.std(self.utilities, ddof=1) / np.sqrt(len(self.utilities)))
-
-    def verdict(self, last: bool = True) -> str:
-        """What became of the candidate: first, better, no better; or why that is not decided.
-
-        Args:
-            last: whether it is the latest one; an earlier one without a trial will get none.
-        """
-        if self.in_doubt:
-            return "in doubt"
-        if self.accepted is None:
-            return "waiting" if last or self.trials else "no trial"
-        if not self.accepted:
-            return "no better"
-        return "better" if self.candidate.base else "first"
-
-    def summary(self) -> str:
-        """Its name, its utility and what became of it."""
-        mean = f"utility {self.utility:.4g}, trials {len(self.trials)}"
-        return f"{self.candidate.id}: {mean}, {self.verdict()}"
-
-    def to_json(self) -> dict[str, Any]:
-        """The candidate's document, and what its trials were worth."""
-        return self.candidate.to_json() | document(
-            utility=self.utility,
-            standard_error=self.standard_error,
-            trials=[trial.id for trial in self.trials],
-            accepted=self.accepted,
-            verdict=self.verdict(),
-        )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -195,6 +138,7 @@ class Standing(Result):
     outstanding: Candidate | None
     missing: int  # trials that the outstanding candidate still needs
     step: Step | None  # what to try next when a candidate is to be made
+    way: Way
     caution: int
     history: tuple[Tried, ...]
     trials: int
@@ -230,6 +174,13 @@ class Standing(Result):
             history=[t.to_json() | {"verdict": t.verdict(t is last)} for t in self.history],
         )
 
+    def figures(self) -> Sequence[Figure]:
+        """Utility by candidate, and the step sizes."""
+        from grounded.search.pictures import search_figure
+
+        found = search_figure(self)
+        return () if found is None else (found,)
+
 
 def standing(
     task: Task,
@@ -256,6 +207,7 @@ def standing(
         outstanding=None,
         missing=0,
         step=None,
+        way="",
         caution=0,
         history=history,
         trials=total,
@@ -284,18 +236,40 @@ def standing(
             )
         return replace(now, step=options.first_step(), caution=failed)
     own = incumbent.candidate.id
-    step = _next_step(history, incumbent, options, model)
+    step, way = _next_step(history, incumbent, options, model)
     if step is None:
         sentence = (
             f"no step improved on {own} down to alpha = {2.0**-options.max_halvings:g}: "
             f"{own} is the result (step 7)"
         )
         return replace(now, phase="converged", sentence=sentence, ending="no step improved")
+    if options.damps and (hardly := _hardly(history, options.tolerance)):
+        ending, why = hardly
+        why = f"{why}: {own} is the result"
+        return replace(now, phase="converged", sentence=why, ending=ending)
     sentence = f"improve on {own} with {step}"
     if why := _suspicion(history, incumbent):
         then = NextCommand("diagnose")
-        return replace(now, step=step, sentence=f"{sentence}; {why}", then=then)
-    return replace(now, step=step, sentence=sentence)
+        return replace(now, step=step, way=way, sentence=f"{sentence}; {why}", then=then)
+    return replace(now, step=step, way=way, sentence=sentence)
+
+
+def _hardly(history: tuple[Tried, ...], tolerance: float) -> tuple[Ending, str] | None:
+    """The ending where the last candidates gained too little for what they cost."""
+    before = [t.utility for t in history[:-PATIENCE] if t.accepted]
+    last = history[-PATIENCE:]
+    if not before or any(t.candidate.model != last[0].candidate.model for t in last):
+        return None
+    best = max(t.utility for t in history if t.accepted)
+    gained = best - max(before)
+    if gained == 0.0:
+        return "no step improved", f"the last {PATIENCE} candidates did not improve"
+    if gained >= PATIENCE * tolerance * abs(best):
+        return None
+    return "too little gained", (
+        f"the last {PATIENCE} candidates gained {gained:.3g} in all, less than "
+        f"{100 * tolerance:g} % each ([search] tolerance)"
+    )
 
 
 def _suspicion(history: tuple[Tried, ...], incumbent: Tried) -> str:
@@ -305,15 +279,20 @@ def _suspicion(history: tuple[Tried, ...], incumbent: Tried) -> str:
         lost = 0 if tried is incumbent or tried.accepted is None else lost + 1
     if lost >= LOST:
         return f"{lost} steps in a row did not improve: a diagnosis may say what the model lacks"
-    own = history[0]
-    if own is incumbent and own.utilities and not own.candidate.base:
-        predicted, real = own.candidate.predicted_utility, own.utility
-        if predicted - real > WILD * max(abs(predicted), 1e-9):
-            return (
-                f"its trial gave {real:.4g} where the model promised {predicted:.4g}: a diagnosis "
-                "may say what the model lacks"
-            )
+    if wild(incumbent):
+        made = incumbent.candidate
+        return (
+            f"its trial gave {incumbent.utility:.4g} where the model promised "
+            f"{made.predicted_utility:.4g}: a diagnosis may say what the model lacks"
+        )
     return ""
+
+
+def wild(tried: Tried) -> bool:
+    """Whether a model's own policy did so much worse than promised that its loop is unstable."""
+    predicted = tried.candidate.predicted_utility
+    worse = predicted - tried.utility > WILD * max(abs(predicted), 1e-9)
+    return bool(tried.utilities) and not tried.candidate.base and worse
 
 
 def _awaited(now: Standing, options: SearchOptions, model: str) -> Standing | None:
@@ -334,24 +313,31 @@ def _awaited(now: Standing, options: SearchOptions, model: str) -> Standing | No
     return replace(now, phase="await-trial", outstanding=made, missing=missing, sentence=sentence)
 
 
-def losers_of(history: Sequence[Tried], base: str, model: str) -> list[Candidate]:
-    """The steps from a candidate, planned in this model, that did not improve on it."""
+def losers_of(
+    history: Sequence[Tried], base: str, model: str, way: Way | None = None
+) -> list[Candidate]:
+    """The candidates from another one, planned in this model, that did not improve on it.
+
+    Args:
+        history: all candidates with their trials.
+        base: the id of the one that they started from.
+        model: fingerprint of the model.
+        way: only those that were made so; None: all.
+    """
     tried = [t for t in history if t.candidate.base == base and t.candidate.model == model]
-    return [t.candidate for t in tried if t.accepted is False]
+    lost = [t.candidate for t in tried if t.accepted is False]
+    return [c for c in lost if way is None or c.way == way]
 
 
 def _next_step(
     history: tuple[Tried, ...], incumbent: Tried, options: SearchOptions, model: str
-) -> Step | None:
-    """Damping and alpha after what the trials have shown; a direction belongs to one model."""
-    made = incumbent.candidate
-    step = options.first_step()
-    base = next((t for t in history if t.candidate.id == made.base), None)
-    if base is not None and made.model == model and options.damps:
-        real = incumbent.utility - base.utility
-        step = after_success(Step(made.damping, made.alpha), made.predicted_gain, real)
-    losers = losers_of(history, made.id, model)
-    return options.next_step(Step(losers[-1].damping, losers[-1].alpha)) if losers else step
+) -> tuple[Step | None, Way]:
+    """Damping and alpha after what the trials have shown, and the way to make the direction."""
+    ways = options.ways(incumbent.candidate)
+    for way in ways:
+        if (step := options.due(history, incumbent, model, way)) is not None:
+            return step, way
+    return None, ways[-1]
 
 
 def _judge(
@@ -368,8 +354,11 @@ def _judge(
     exact = False  # whether the system has repeated itself to the last bit
     ids = {c.id for c in candidates}
     spent = sum(t.candidate in ids for t in trials) >= options.max_trials
+    by_name: dict[str, list[Trial]] = {}
+    for trial in trials:
+        by_name.setdefault(trial.candidate, []).append(trial.until(task.horizon))
     for candidate in candidates:
-        own = tuple(t.until(task.horizon) for t in trials if t.candidate == candidate.id)
+        own = tuple(by_name.get(candidate.id, ()))
         utilities = tuple(task.utility(t) for t in own)
         failed = any(u == -np.inf for u in utilities)
         exact = exact or repeated_exactly(own)

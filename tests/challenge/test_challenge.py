@@ -8,6 +8,7 @@ from click.testing import CliRunner
 from cli import grounded
 from grounded.errors import GroundedError
 from grounded_cli.main import cli
+from grounded_trials.store.documents import write_document
 from grounded_trials.store.store import Store
 from grounded_trials.workspace.challenge import open_label, read_manifest, score_case
 from grounded_trials.workspace.folder import Folder
@@ -82,7 +83,7 @@ def test_cases_are_run_and_scored_as_jobs_and_a_run_goes_on(tmp_path):
     (folder / "none-0000" / "reports").mkdir()
     done = {"verdict": {"kind": "none", "effects": []}, "ranking": [], "indistinguishable": []}
     done |= {"leftover": [], "gap": {"after": 1.0}}
-    (folder / "none-0000" / "reports" / "diagnosis.json").write_text(json.dumps(done))
+    write_document(folder / "none-0000" / "reports" / "diagnosis.json", done)
     assert list(say("run", str(folder))["cpu_s"]) == ["none-0001"]  # the other one had been
     found = say("run", str(folder))
     assert found["cases"] == ["none-0001"] and found["cpu_s"]["none-0001"] > 0.05
@@ -145,7 +146,7 @@ def answered(folder):
     done |= {"leftover": [], "gap": {"after": 1.0}}
     for name in read_manifest(folder):
         (folder / name / "reports").mkdir()
-        (folder / name / "reports" / "diagnosis.json").write_text(json.dumps(done))
+        write_document(folder / name / "reports" / "diagnosis.json", done)
 
 
 def test_the_next_command_says_where_the_labels_are_to_be_looked_for(tmp_path):

@@ -225,7 +225,8 @@ RUNS = {
 def test_a_run_that_went_wrong_is_stored_with_a_warning_and_the_search_goes_on(w, trial, name):
     change, parts = RUNS[name]
     path = rewritten(trial, w / "runs" / "wrong.mcap", change)
-    done = grounded("-C", w, "ingest", path, "--json")
+    named = ("--candidate", "c0001") if name in ("far start", "beyond limits") else ()
+    done = grounded("-C", w, "ingest", path, "--json", *named)
     assert done.code == 0, done.err
     (found,) = done.json["trials"]
     text = " ".join(found["warnings"])

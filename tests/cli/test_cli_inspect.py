@@ -47,7 +47,7 @@ def test_a_cut_trial_is_damaged_and_recover_is_next(w, tmp_path):
     done = grounded("-C", w, "inspect", path)
     assert f"{path}: DAMAGED, a trial of c0001" in done.out and "[log." not in done.out
     assert last(done) == f"next: grounded recover {path}"
-    assert "ends inside a record" in done.err
+    assert "ends inside a chunk" in done.err
 
 
 @needs_data

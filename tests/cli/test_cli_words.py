@@ -95,7 +95,7 @@ def test_a_failed_first_policy_is_no_measure_of_the_gain(tmp_path):
     (tmp_path / "short.mcap").write_bytes(trial_bytes(short, about, policy))
     done = grounded("-C", folder, "ingest", tmp_path / "short.mcap")
     assert done.code == 0, done.err
-    assert "utility failed, no better: it did not run to the end" in " ".join(done.out.split())
+    assert "utility failed, crashed: it did not run to the end" in " ".join(done.out.split())
     out = said(grounded("-C", folder, "status"))
     assert "the model's own policy failed" in " ".join(out.split())
     assert "better than the model's own policy" not in " ".join(out.split())

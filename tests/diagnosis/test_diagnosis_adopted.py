@@ -16,6 +16,7 @@ from grounded.diagnosis.limits import limits
 from grounded.diagnosis.search import HypothesisSearch
 from grounded.effects import Library, memory_of, wrap
 from grounded.errors import NextCommand
+from grounded_trials.store.documents import write_document
 from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace.diagnosing import _chosen, diagnosable, read_diagnosis
 from grounded_trials.workspace.folder import Folder
@@ -111,7 +112,7 @@ def workspace(folder, effects, diagnosed, ranking):
         "parameters": {},
     }
     (folder / "reports").mkdir(exist_ok=True)
-    (folder / "reports" / "diagnosis.json").write_text(json.dumps(document))
+    write_document(folder / "reports" / "diagnosis.json", document)
     return config
 
 

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from grounded import Model, Param, Trial
-from grounded.diagnosis import held_out
 from grounded.diagnosis.attribution import attribute
 from grounded.diagnosis.data import prepare
-from grounded.diagnosis.noise import Structure
+from grounded.diagnosis.decide import causes, decide, shares
+from grounded.diagnosis.diagnose import diagnose
+from grounded.diagnosis.ruler import Gain, Ruler, folds
 from grounded.effects import Library
 
 DT = 0.02
@@ -23,7 +24,7 @@ def axis(wave, trials=2, steps=500, seed=0):
     model = Model(
         states={"x": "m", "v": "m/s"},
         inputs={"u": "m/s^2"},
-        params={"k": Param(1.0, "1")},
+        params={"k": Param(1.0, "1", std=0.3)},
         roles={"position": ("x",), "speed": "v"},
         derivative=lambda s, a, p: {"x": s.v, "v": p.k * a.u},
         name="axis",
@@ -52,64 +53,82 @@ def wavy():
     return attribute(data, Library().candidates(model, data.scales))
 
 
-def test_what_predicts_down_to_the_noise_keeps_its_noise():
-    model, trials = axis(0.0)
-    data = prepare(model, trials, np.zeros(1))
-    search, best = attribute(data, Library().candidates(model, data.scales))
-    assert best.hypothesis.effects
-    kept, same = held_out.noise_confirmed(search, best, 3, 1.0)
-    assert kept is search and same is best
+@pytest.fixture(scope="module")
+def ruler(wavy):
+    return Ruler(wavy[0].predictor)
 
 
-def test_another_noise_is_confirmed_where_the_likeliest_predicts_badly(wavy, monkeypatch):
+def test_the_ruler_measures_what_open_loop_predictions_miss(wavy, ruler):
+    """Against the model stepped by hand from the same filtered states."""
+    search, _ = wavy
+    crude, data, model = search.exact_null(), search.data, search.data.model
+    (at, run), k = ruler.starts, ruler.steps.index(25)
+    total, count = np.zeros(2), 0
+    for t, b in zip(at, run, strict=True):
+        trial = data.trial_of[b]
+        first = data.step_at[b, 0] - 500 * trial + t
+        if first + 25 > 500:
+            continue
+        x = crude.track[t, b]
+        for u in data.commands[trial, first : first + 25]:
+            x = model.system.step(x[None], u[None], model.values, DT)[0]
+        total += (data.states[501 * trial + first + 25] - x) ** 2
+        count += 1
+    np.testing.assert_allclose(ruler.errors(crude).rms[k], np.sqrt(total / count), rtol=1e-9)
+    assert ruler.steps == (1, 5, 25, 50) and ruler.held_out
+
+
+def test_what_predicts_better_is_claimed_with_its_worth(wavy, ruler):
     search, best = wavy
-    named = {(f.noise.structure, f.hypothesis.spread) for f in search.fits.values()}
-    assert len(named) > 2 and best.hypothesis.effects
-    white = (Structure(), 0.0)
-    other = next(k for k in named if k != (best.noise.structure, best.hypothesis.spread))
-    wanted = white if (best.noise.structure, best.hypothesis.spread) != white else other
-
-    def gaps(predictor, fits, where):
-        keys = [(f.noise.structure, f.hypothesis.spread) for f in fits]
-        return [1.1 if key == wanted else 3.0 for key in keys]
-
-    monkeypatch.setattr(held_out, "gaps_of", gaps)
-    found, chosen = held_out.noise_confirmed(search, best, 3, 1.0)
-    assert (chosen.noise.structure, chosen.hypothesis.spread) == wanted
-    assert chosen.hypothesis.effects
-    assert {(s, w) for s, w, names in found.fits if names} == {wanted}
-    assert found.score(chosen) > found.score(found.best_null()) + held_out.CLAIM
-
-    monkeypatch.setattr(held_out, "gaps_of", lambda p, fits, w: [1.4 for _ in fits])
-    assert held_out.noise_confirmed(search, best, 3, 1.0) == (search, best)  # not much better
+    decision = decide(search, best, ruler, 3)
+    assert decision.causes and set(decision.without) == set(decision.causes)
+    assert ruler.gain(decision.crude, decision.fit).mean > 1
+    for less in decision.without.values():
+        assert ruler.gain(less, decision.fit).beyond(1.0, 0.01)
+    worth = shares(ruler, decision)
+    assert max(worth.values()) > 0.2 and sum(worth.values()) <= 1 + 1e-9
 
 
-def test_one_trial_alone_confirms_nothing():
-    model, trials = axis(WAVE, trials=1)
-    data = prepare(model, trials, np.zeros(1))
-    search, best = attribute(data, Library().candidates(model, data.scales))
-    assert held_out.noise_confirmed(search, best, 3, 1.0) == (search, best)
+class Said:
+    """A ruler that says what it is told: the error by the names of a fit's causes."""
+
+    held_out = True
+
+    def __init__(self, error):
+        self.error = error
+
+    def gain(self, before, after):
+        mean = np.log(self.error(causes(before)) / self.error(causes(after)))
+        return Gain(mean, 0.02, mean)
 
 
-def test_in_a_misfit_an_effect_that_predicts_no_better_is_dropped(wavy, monkeypatch):
+def test_what_predicts_no_better_is_not_claimed(wavy):
     search, best = wavy
     names = set(best.hypothesis.names)
     assert len(names) >= 2
+    one = sorted(names)[0]
+    assert not decide(search, best, Said(lambda c: 1.0), 3).causes
+    assert not decide(search, best, Said(lambda c: 1.0 + len(c)), 3).causes  # worse
+    needed = decide(search, best, Said(lambda c: 0.2 if one in c else 1.0), 3)
+    assert needed.causes == (one,)
+    whole = decide(search, best, Said(lambda c: 0.5 ** len(names & set(c))), 3)
+    assert set(whole.causes) == names
 
-    def judged(worst, without, bare=100.0):
-        def gaps(predictor, fits, where):
-            return [without if f.hypothesis.names else bare for f in fits]
 
-        monkeypatch.setattr(held_out, "gaps_of", gaps)
-        gap = type("Gap", (), {"gap_before": bare, "gap_after": worst})
-        monkeypatch.setattr(held_out, "shrinkage", lambda *a: gap)
-        return held_out.confirmed(search, best, 1.0)
+def test_noise_can_not_hide_what_predicts_far_better(wavy):
+    """The likeliest claims nothing; under another noise there is one that predicts."""
+    search, _ = wavy
+    null = search.best_null()
+    found = decide(search, null, Said(lambda c: 0.1 if c else 1.0), 3)
+    assert found.causes and found.fit is not null
+    assert not decide(search, null, Said(lambda c: 0.95 if c else 1.0), 3).causes  # too little
 
-    assert judged(1.2, 1.2) is best  # predicts down to the noise: the evidence decides
-    assert judged(5.0, 9.0) is best  # each of them is worth naming
-    fewer = judged(5.0, 5.0)
-    assert len(fewer.hypothesis.names) == 1 and set(fewer.hypothesis.names) < names
-    assert not judged(5.0, 5.0, bare=6.0).hypothesis.names  # nor is one that changes little
-    assert judged(1.0, 3.0) is best
-    assert len(judged(1.0, 3.0, bare=1000.0).hypothesis.names) == 1  # 0.3 % of the gap
-    assert judged(1.0, 6.0, bare=1000.0) is best
+
+def test_one_long_log_is_held_out_by_pieces():
+    model, trials = axis(WAVE, trials=1)
+    data = prepare(model, trials, np.zeros(1))
+    assert len(np.unique(folds(data))) == 5
+    found = diagnose(model, trials)
+    assert found.prediction_error[0].held_out == "pieces" and found.effects
+    short = diagnose(model, [trials[0].until(60)])
+    assert short.no_cause and short.prediction_error[0].held_out == "no"

@@ -13,7 +13,7 @@ from grounded.diagnosis import data as diagnosis_data
 from grounded.diagnosis.data import prepare
 from grounded.diagnosis.held_out import utility_prediction
 from grounded.diagnosis.hypothesis import Hypothesis, Predictor
-from grounded.diagnosis.split import scatter
+from grounded.diagnosis.ruler import Ruler, repeated
 
 STEPS = 450  # three runs of 150 steps
 
@@ -48,10 +48,9 @@ def test_a_utility_is_predicted_from_the_trials_own_start(known):
 def test_repeats_are_compared_at_the_same_time(known):
     predictor, fit, _ = known
     fit.hypothesis = Hypothesis(shift=np.array([0.5, 0.0]))  # wrong alike in repeats
-    found = scatter(predictor, fit, 20, [[0, 2], [1, 3]])
-    np.testing.assert_allclose(found, 0.0, atol=1e-20)
-    only = scatter(predictor, fit, 20, [[1, 2]])  # nothing that begins together
-    assert only is None
+    ruler = Ruler(predictor)
+    np.testing.assert_allclose(ruler.scatter(fit, [[0, 2], [1, 3]]), 0.0, atol=1e-9)
+    assert ruler.scatter(fit, [[1, 2]]) is None  # nothing that begins together
 
 
 def test_repeats_of_different_length_are_compared_where_they_begin_together(known, monkeypatch):
@@ -60,4 +59,11 @@ def test_repeats_of_different_length_are_compared_where_they_begin_together(know
     short = replace(trials[2], states=trials[2].states[:351], inputs=trials[2].inputs[:350])
     some = Predictor(prepare(predictor.data.model, [trials[0], short]))
     fit = SimpleNamespace(hypothesis=Hypothesis(shift=np.array([0.5, 0.0])), track=some.data.y)
-    np.testing.assert_allclose(scatter(some, fit, 20, [[0, 1]]), 0.0, atol=1e-20)
+    np.testing.assert_allclose(Ruler(some).scatter(fit, [[0, 1]]), 0.0, atol=1e-9)
+
+
+def test_repeats_are_found_by_candidate_or_by_their_commands(known):
+    predictor, _, trials = known
+    assert repeated(trials, predictor.data) == [[0, 2], [1, 3]]
+    named = [replace(t, candidate="c0001" if k in (0, 1) else "") for k, t in enumerate(trials)]
+    assert [0, 1] in [group[:2] for group in repeated(named, predictor.data)]

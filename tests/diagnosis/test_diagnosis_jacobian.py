@@ -71,7 +71,7 @@ def test_a_threshold_of_the_model_has_a_slope(cars):
     model = case.model
     x = np.tile([0.0, 0.1, 0.0, 0.0, 0.0, 0.0], (9, 1))
     u = np.column_stack([np.zeros(9), np.linspace(0.16, 0.2, 9)])  # around the stall
-    _, f_p = sensitivities(model, x, u, model.values, data.dt)
+    _, _, f_p = sensitivities(model, x, u, model.values, data.dt)
     exact = model.system.sensitivities(x, u, model.values, data.dt)[2]
     stall = model.param_names.index("stall")
     assert not exact[..., stall].any()

@@ -3,17 +3,17 @@
 import numpy as np
 import pytest
 
-from grounded.diagnosis import kernels
 from grounded.diagnosis.data import prepare
-from grounded.diagnosis.delayed_measurement import Delayed
 from grounded.diagnosis.delays import delays_of
-from grounded.diagnosis.filter import UNKNOWN, Adjoint, gains, innovations, smoother, transition
 from grounded.diagnosis.held_out import held_out_errors
 from grounded.diagnosis.hypothesis import Hypothesis
 from grounded.diagnosis.noise import NoiseModel, Structure
 from grounded.diagnosis.prediction_error import horizon, normalised
 from grounded.diagnosis.search import HypothesisSearch
 from grounded.effects import Library
+from grounded.filter import kernels
+from grounded.filter.augmented import Delayed, coloured
+from grounded.filter.kalman import Adjoint, LinearSystem, gains, innovations, smoother
 from grounded.models.pendulum import model as pendulum
 from grounded.trial import Trial
 
@@ -39,7 +39,7 @@ class Problem:
         if through:
             self.G = np.tile(np.eye(n), (steps, B, 1, 1))
             self.G[:, :, n - 1, : n - 1] = rng.standard_normal((steps, B, n - 1))
-        self.A = transition(self.F, phi, self.G)
+        self.A = coloured(self.F, phi, self.G)
         self.N = self.A.shape[-1]
         self.seen = np.ones((steps + 1, B, n))
         if missing:
@@ -49,9 +49,16 @@ class Problem:
         self.r = rng.standard_normal((steps + 1, B, n, 2))
         self.q, self.v = np.exp(rng.standard_normal(self.N)), np.exp(rng.standard_normal(n))
         self.start = np.full((B, self.N - n), 0.7)
+        self.first = self.v * np.where(self.seen[0] > 0, 1.0, 1e6)
+
+    def system(self, q, v):
+        R = np.broadcast_to(v, (self.L + 1, B, n))
+        Q = np.broadcast_to(q, (self.L, B, self.N))
+        first = np.hstack([self.first, self.start])
+        return LinearSystem(self.A, Q, R, self.seen, first, self.G)
 
     def passes(self, q, v):
-        g = gains(self.A, q, v, self.seen, self.start, self.G, self.late)
+        g = gains(self.system(q, v), self.late)
         white, track = innovations(g, self.d, self.r, track=True)
         return g, white, track, smoother(g, white[..., 0])
 
@@ -59,7 +66,7 @@ class Problem:
         """Log density of what run b measures from step 1, all of it one normal vector."""
         G = np.tile(np.eye(n), (self.L, 1, 1)) if self.G is None else self.G[:, b]
         power = self.q[:n] + (self.start[b] if n < self.N else 0.0)
-        first = self.v * np.where(self.seen[0, b] > 0, 1.0, UNKNOWN)
+        first = self.first[b].copy()
         late = dict(zip(self.late.channel[b], self.late.part[b], strict=True))
         for i, p in late.items():
             first[i] += p**2 * float(G[0][i] ** 2 @ power)
@@ -98,7 +105,7 @@ class Problem:
 def test_the_likelihood_is_that_of_all_measurements_together(case, compiled, monkeypatch):
     problem = Problem(*case)
     if not compiled:
-        monkeypatch.setattr(kernels, "available", lambda n: False)
+        monkeypatch.setattr(kernels, "available", lambda n, N: False)
     g, white, track, _ = problem.passes(problem.q, problem.v)
     found = -0.5 * ((white[..., 0] ** 2).sum(axis=(0, 2)) + g.logdet.sum(axis=0))
     assert found == pytest.approx([problem.dense(b) for b in range(B)], rel=1e-9)
@@ -109,7 +116,7 @@ def test_the_likelihood_is_that_of_all_measurements_together(case, compiled, mon
 def test_kernels_and_numpy_agree(case, monkeypatch):
     problem = Problem(*case)
     fast = problem.passes(problem.q, problem.v)
-    monkeypatch.setattr(kernels, "available", lambda n: False)
+    monkeypatch.setattr(kernels, "available", lambda n, N: False)
     slow = problem.passes(problem.q, problem.v)
     for one, other in zip(fast[1:3], slow[1:3], strict=True):
         assert np.allclose(one, other, rtol=1e-8, atol=1e-8)
@@ -130,7 +137,7 @@ def test_smoother_gives_the_slope_of_the_likelihood(case):
         Q[1:] *= np.exp(logs[: problem.N])  # the first step's is part of the start
         R = np.tile(problem.v, (problem.L + 1, B, 1))
         R[1:] *= np.exp(logs[problem.N :])
-        g = gains(problem.A, Q, R, problem.seen, problem.start, problem.G, problem.late)
+        g = gains(problem.system(Q, R), problem.late)
         white, _ = innovations(g, problem.d, problem.r)
         return -0.5 * float((white[..., 0] ** 2).sum() + g.logdet.sum())
 
@@ -190,16 +197,16 @@ def test_samples_of_what_was_before_a_trial_count_like_those_of_a_state_that_dri
     delays = delays_of(Hypothesis().plus(effect, {"d": (whole + 0.25) * data.dt}), data)
     log, L, B = np.log([0.5, 1.0]), len(data.time), len(data.valid)
     noise = NoiseModel(Structure(), log, log - 1, log, log)
-    white, whiten = np.zeros((L, B, 2)), np.tile(1e-9 * np.eye(2), (L, B, 1, 1))
+    white, weight = np.zeros((L, B, 2)), np.full((L, B, 2), 1e-9)
     still = np.zeros((L + 1, B, 2))
-    found = delays.before(noise, None, still, white, whiten)
+    found = delays.before(noise, None, still, white, weight)
     t, exact = np.arange(whole + 1), 0.0
     S = np.minimum(t[1:, None], t[1:]) * 1.0 + np.exp(-1) * (np.eye(whole) + 1)
     for run in delays.first:
         missed = (data.y[1 : whole + 1] - data.y[0])[:, run, 1]
         exact -= 0.5 * (missed @ np.linalg.solve(S, missed) + np.linalg.slogdet(S)[1])
     assert list(delays.first) == [0, 2] and found == pytest.approx(exact)
-    certain = np.tile(np.eye(2), (L, B, 1, 1))  # samples that are far more likely than these
+    certain = np.ones((L, B, 2))  # samples that are far more likely than these
     assert delays.before(noise, None, still, white, certain) == pytest.approx(
         max(exact, -1.0 * whole * 2)
     )

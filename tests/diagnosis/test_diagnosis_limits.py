@@ -44,7 +44,7 @@ def test_a_model_that_is_no_number_at_a_measured_state_says_where():
     tank = Model(
         states={"h": "m"},
         inputs={"u": "1"},
-        params={"k": Param(0.2, "m/s"), "c": Param(0.3, "1")},
+        params={"k": Param(0.2, "m/s", std=0.06), "c": Param(0.3, "1", std=0.09)},
         derivative=lambda s, a, p: {"h": p.k * a.u - p.c * np.sqrt(s.h)},
         name="tank",
     )

@@ -58,7 +58,9 @@ def test_emps_has_dry_and_viscous_friction_of_the_published_size(tmp_path):
     dry, viscous = values(found, "coulomb_friction:v"), values(found, "viscous_friction:v")
     assert dry["c"] == pytest.approx(20.394 / 95.109, rel=0.05)
     assert viscous["k"] == pytest.approx(203.5 / 95.109, rel=0.05)
-    assert found["gap"]["held_out"] and found["gap"]["before"] > 20 * found["gap"]["after"]
+    ahead = next(r for r in found["prediction_error"] if r["horizon_s"] == 0.5)
+    assert ahead["held_out"] == "trials" and ahead["crude"]["q"] == pytest.approx(0.0492, rel=0.05)
+    assert ahead["with_effects"]["q"] < 1.15 * 0.00159  # the best of SOURCE.md, made by hand
 
 
 @pytest.mark.slow
@@ -93,7 +95,6 @@ def test_the_dart_throttle_has_a_dead_zone(tmp_path):
         if one["effect"] == "dead_zone:throttle"
     }
     assert 0.75 < alike["coulomb_friction:v"] < 1
-    assert "dead_zone:throttle is nearly inseparable from" in found["verdict"]["sentence"]
 
 
 def lagged(tau, way):

@@ -47,7 +47,7 @@ def test_a_state_that_is_set_outright_has_no_rate_to_be_scaled():
     model = Model(
         states={"w": "rad/s"},
         inputs={"steering": "1"},
-        params={"k": Param(1.0, "rad/s")},
+        params={"k": Param(1.0, "rad/s", std=0.3)},
         step=lambda s, a, p, dt: {"w": p.k * a.steering + 0 * s.w},
     )
     names = [effect.name for effect in Library().candidates(model)]

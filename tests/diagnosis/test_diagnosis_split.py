@@ -7,7 +7,7 @@ import pytest
 from test_diagnosis import DT, cart
 
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
-from grounded.diagnosis.split import repeated, shares
+from grounded.diagnosis.split import shares
 from grounded.effects import Library
 from grounded.task import Task
 from grounded.utility import Reward
@@ -85,10 +85,6 @@ def test_repeats_of_a_candidate_tell_the_noise():
     row = diagnose(model, same).where.split["horizon"]
     assert row.irreducible_from == "repeats"
     assert row.whole.irreducible > 0.7
-
-
-def test_groups_of_repeats():
-    assert repeated(["a", "", "b", "a", "", "c"]) == [[0, 3]]
 
 
 def test_shares_are_of_what_there_was():

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from grounded import Trial
-from grounded.diagnosis import filter as kalman
 from grounded.diagnosis.data import prepare
 from grounded.diagnosis.diagnose import diagnose
-from grounded.diagnosis.linearise import prior, smoothed, widened
+from grounded.diagnosis.linearise import prior, smoothed
 from grounded.diagnosis.search import HypothesisSearch
+from grounded.filter import kalman
 from grounded.models.pendulum import model as pendulum
 
 DT = 0.02
@@ -80,7 +80,8 @@ def test_the_start_goes_where_least_squares_over_the_whole_run_puts_it():
     L, B, n = 12, 2, 2
     F = np.array([[1.0, DT], [-0.3, 0.98]]) + 0.01 * rng.standard_normal((L, B, n, n))
     Q, R = np.array([1e-5, 1e-3]), np.full((L + 1, B, n), 1e-4)
-    g = kalman.gains(F, Q, widened(data, R, data.seen), data.seen, np.zeros((B, 0)))
+    first = np.where(data.seen[0] > 0, R[0], prior(data))
+    g = kalman.gains(kalman.LinearSystem(F, Q, R, data.seen, first))
     d, r = 0.01 * rng.standard_normal((L, B, n, 1)), 0.1 * rng.standard_normal((L + 1, B, n, 1))
     white, _ = kalman.innovations(g, d, r)
     found = smoothed(data, g, F, white[..., 0])

@@ -20,7 +20,7 @@ def servo(tau):
         name="servo",
         states={"angle": "rad"},
         inputs={"command": "rad"},
-        params={"tau": Param(tau, "s")},
+        params={"tau": Param(tau, "s", std=0.3 * tau)},
         derivative=lambda s, a, p: {"angle": (a.command - s.angle) / p.tau},
     )
 

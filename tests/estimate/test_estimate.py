@@ -17,10 +17,15 @@ from grounded.estimate import (
     record_of,
     smooth_trials,
 )
-from grounded.estimate.filter import filter_batch, sensitivity
-from grounded.estimate.likelihood import _slope
+from grounded.estimate.extended import (
+    filter_batch,
+    recursion,
+    relinked,
+    sensitivity,
+    smooth,
+    variance_slopes,
+)
 from grounded.estimate.record import batch_of
-from grounded.estimate.recursion import fixed_steps, recursion, smooth
 from grounded.estimate.steps import ModelSteps
 from grounded.estimate.tracker import nearest_step
 from grounded.model import Model, Param
@@ -121,8 +126,8 @@ def test_sensitivities_of_the_innovations_match_differences():
             for t in range(41):  # the same gains, another model
                 e = measurement.innovation(batch.y[t], x)
                 e = np.where(batch.seen[t], e, 0.0)
-                shift[t] = (base.C[t] @ e[..., None])[..., 0]
-                x = x + (base.K[t] @ e[..., None])[..., 0]
+                shift[t] = (base.gains.whitener[t] @ e[..., None])[..., 0]
+                x = x + np.einsum("bci,bc->bi", base.gains.k[t], shift[t])
                 x = car.system.step(x, batch.u[t], p, DT) if t < 40 else x
             moved += sign * shift / (2 * h)
         assert np.allclose(W[..., i], moved, atol=2e-3 * np.abs(moved).max())
@@ -151,15 +156,15 @@ def test_slopes_by_the_variances_match_differences():
     def at(theta):
         std = np.exp(theta / 2)
         noise = NoiseStd(std[:2], std[2:], DT)
-        return noise, recursion(batch, measurement, noise, fixed_steps(base))
+        return noise, *relinked(base, batch, noise)
 
     theta = 2 * np.log(np.concatenate([SPRING_NOISE.process, SPRING_NOISE.measurement]))
-    noise, here = at(theta)
-    slope = _slope(here, batch, noise)
+    noise, gains, eps, _ = at(theta)
+    slope = variance_slopes(gains, eps, batch, noise)
     for i in range(4):
         step = 1e-4 * np.eye(4)[i]
         assert slope[i] == pytest.approx(
-            (at(theta + step)[1].loglik - at(theta - step)[1].loglik) / 2e-4, rel=1e-5
+            (at(theta + step)[-1] - at(theta - step)[-1]) / 2e-4, rel=1e-5
         )
 
 
@@ -179,17 +184,22 @@ def test_the_compiled_pass_is_the_recursion(width):
     fast = filter_batch(
         batch, measurement, CAR_NOISE, steps, recursion(batch, measurement, near, steps.at)
     )
-    assert fast.done is not None
     assert fast.loglik == pytest.approx(plain.loglik, abs=1e-3)
-    for name in ("x", "x_prior", "P_prior", "e", "A", "f", "P", "K", "C", "eps"):
-        a, b = getattr(fast, name), getattr(plain, name)
-        assert np.allclose(a, b, atol=1e-3 * np.abs(b).max()), name
-    one, two = smooth(fast, batch), smooth(plain, batch)
-    for name in ("x", "P", "process_slope", "measurement_slope", "start_slope"):
+    pairs = [
+        (getattr(fast, name), getattr(plain, name)) for name in ("x", "x_prior", "e", "A", "eps")
+    ]
+    for name in ("P", "posterior", "k", "weight", "whitener"):
+        pairs.append((getattr(fast.gains, name), getattr(plain.gains, name)))
+    for a, b in pairs:
+        assert np.allclose(a, b, atol=1e-3 * np.abs(b).max())
+    one, two = smooth(fast), smooth(plain)
+    for name in ("x", "P"):
         a, b = getattr(one, name), getattr(two, name)
         assert np.allclose(a, b, atol=2e-3 * np.abs(b).max()), name
     assert np.allclose(
-        _slope(fast, batch, CAR_NOISE), _slope(plain, batch, CAR_NOISE), rtol=1e-2, atol=0.1
+        *(variance_slopes(p.gains, p.eps, batch, CAR_NOISE) for p in (fast, plain)),
+        rtol=1e-2,
+        atol=0.1,
     )
 
 

@@ -15,9 +15,9 @@ from grounded.experiments.footnote9 import Footnote9Result, Footnote9Row
 from grounded.experiments.nondeterminism import EndPointSpread, NondeterminismResult
 from grounded.experiments.repeats import NoiseResult, Outcome
 from grounded.experiments.theorem1 import Theorem1Result, Theorem1Row
+from grounded.figures.figure import Bars
+from grounded.figures.interactive import plotted
 from grounded_cli.experiment import STUDIES
-from grounded_trials.report.figures.draw import Box, Spot, Stroke, draw
-from grounded_trials.report.figures.figure import Bars
 from grounded_trials.report.studies.pictures import PICTURES, draw_study
 
 ANGLE = np.linspace(0, 2 * np.pi, 61)
@@ -96,14 +96,13 @@ def test_the_picture_holds_its_figure(name, tmp_path):
         levels = np.asarray(image.convert("L"))
     assert 0.005 < np.mean(levels < 250) < 0.5
     for panel in PICTURES[name](results()[name]).panels:
-        kinds = [
-            type(shape) for shape in draw(panel).shapes if getattr(shape, "role", "") != "grid"
-        ]
+        traces = plotted(panel)["data"]
         if isinstance(panel, Bars):
-            assert kinds.count(Box) == len(panel.bars) > 0
+            assert len(traces[0]["x"]) == len(panel.bars) > 0
         else:
-            assert kinds.count(Stroke) >= len(panel.curves) > 0
-            assert kinds.count(Spot) == len(panel.dots)
+            marks = [len(trace["x"]) for trace in traces if trace["mode"] == "markers"]
+            assert len(traces) - len(marks) == len(panel.curves) > 0
+            assert sum(marks) == len(panel.dots)
 
 
 def test_flight_enlarges_what_is_too_small_to_see():

@@ -70,6 +70,11 @@ def test_a_parameter_lies_between_its_bounds():
         Param(2.0, "1", 0.0, 1.0)
     with pytest.raises(GroundedError, match="outside"):
         Param(0.5, "1", 1.0, 0.0)
+    with pytest.raises(GroundedError):
+        Param(0.5, std=0.0)
+    assert not Param(0.5).uncertain and not Param(0.5, "1", 0.5, 0.5).uncertain
+    assert Param(0.5, "1", 0.0, 1.0).spread == pytest.approx(1 / 12**0.5)
+    assert Param(0.5, std=0.1).spread == 0.1 and Param(0.5, std=0.1).uncertain
 
 
 def test_other_values_make_a_copy_and_widen_bounds():

@@ -61,7 +61,7 @@ def test_the_file_is_valid_python_3_8():
     tree = ast.parse(source, feature_version=(3, 8))
     imported = {n.module.split(".")[0] for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)}
     imported |= {a.name for n in ast.walk(tree) if isinstance(n, ast.Import) for a in n.names}
-    assert imported == {"__future__", "sys", "io", "pathlib", "types", "typing", "numpy"}
+    assert imported == {"__future__", "sys", "io", "pathlib", "types", "typing", "zipfile", "numpy"}
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -48,7 +49,9 @@ def test_a_report_is_made_of_any_numbers(flights, tmp_path, case):
         runs.append(replace(run, trial=_drawable(replace(run.trial, states=states))))
     findings = replace(flights, runs=tuple(runs))
     text = page(findings)
-    assert "nan" not in text.split("<script>")[0].lower()
+    head, data = text.split('id="data">')
+    assert "nan" not in head.split("<style>")[0].lower() + head.split("</style>")[1].lower()
+    assert json.loads(data.split("</script>")[0])["panels"]
     for figure in all_figures(findings)[:2]:
         assert len(png(figure)) > 1000
     write_recording(findings, tmp_path / "r.rrd")

@@ -10,90 +10,71 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from grounded.diagnosis.pictures import accuracy_figure, credit_figure
+from grounded.diagnosis.report import Credit, Diagnosis, RulerRow, Verdict
+from grounded.errors import GroundedError
 from grounded.experiments.pendulum import pendulum_task
+from grounded.figures.figure import (
+    Band,
+    Curve,
+    Dot,
+    Panel,
+    fitted,
+    loss_ticks,
+    thinned,
+    without_astray,
+)
+from grounded.figures.interactive import coloured, packed, plotted
 from grounded.models import pendulum
 from grounded.rollout import simulate
 from grounded.search.first_policy import first_policy
 from grounded.search.planner import Planner
 from grounded.trial import Trial
-from grounded_trials.report.figures.axis import Axis, fitted, round_up, thinned, without_astray
-from grounded_trials.report.figures.draw import Stroke, draw, svg
-from grounded_trials.report.figures.figure import Band, Curve, Dot, Panel
-from grounded_trials.report.figures.png import dashed, plain, png
+from grounded_trials.report.figures.gap import residual_figures
+from grounded_trials.report.figures.paths import path_figure
+from grounded_trials.report.figures.png import png
 from grounded_trials.report.figures.runs import all_figures, error_figure
 from grounded_trials.report.forecast import forecast, forecast_error
 from grounded_trials.report.gathering import gather
 from grounded_trials.report.scene import scene_of
 from grounded_trials.workspace.folder import Folder
+from page_browser import unpacked
 from reported import car, cart, many_flights
 
 __all__ = ["car", "cart"]
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.integers(2, 3000), st.integers(0, 10_000), st.sampled_from(["walk", "sine", "noise"]))
-def test_thinning_moves_a_line_by_less_than_a_pixel(count, seed, kind):
+@given(st.integers(2, 6000), st.integers(0, 10_000), st.booleans())
+def test_thinning_keeps_ends_peaks_and_breaks(count, seed, broken):
     rng = np.random.default_rng(seed)
     x = np.linspace(0, 400, count)
-    y = {
-        "walk": np.cumsum(rng.normal(0, 2, count)),
-        "sine": 100 * np.sin(x / rng.uniform(5, 100)),
-        "noise": rng.uniform(0, 200, count),
-    }[kind]
-    kept = thinned(x, y)
-    assert kept[0] == 0 and kept[-1] == count - 1
-    assert y[kept].max() > y.max() - 0.5 and y[kept].min() < y.min() + 0.5
-    assert max(_distance(x, y, kept), default=0.0) < 1.01
+    y = np.cumsum(rng.normal(0, 2, count))
+    if broken:
+        y[count // 3 : count // 2] = np.nan
+    kept = thinned(x, y, 800)
+    assert len(kept) <= 810 and kept[0] == 0 and kept[-1] == count - 1
+    assert (np.diff(kept) > 0).all()
+    if np.isfinite(y).any():
+        assert np.nanmax(y[kept]) == np.nanmax(y)
+        assert np.nanmin(y[kept]) == np.nanmin(y) or broken
+    assert np.isnan(y).any() == np.isnan(y[kept]).any()
 
 
-def _distance(x, y, kept):
-    """How far each point is from the line through the kept ones."""
-    for i in range(len(x)):
-        k = int(np.searchsorted(kept, i))
-        if kept[k] == i:
-            continue
-        near = kept[max(k - 3, 0) : k + 3]
-        a = np.column_stack([x[near[:-1]], y[near[:-1]]])
-        d = np.column_stack([x[near[1:]], y[near[1:]]]) - a
-        p = np.array([x[i], y[i]]) - a
-        length = np.maximum((d**2).sum(axis=1), 1e-12)
-        part = np.clip((p * d).sum(axis=1) / length, 0.0, 1.0)
-        yield float(np.min(np.hypot(*(p - part[:, None] * d).T)))
-
-
-def test_thinning_drops_most_of_a_smooth_path():
+def test_thinning_of_a_path_is_even():
     t = np.linspace(0, 2 * np.pi, 3001)
-    x, y = 200 + 180 * np.cos(t), 200 + 180 * np.sin(t)
-    kept = thinned(x, y)
-    assert len(kept) < 300
-    radius = np.hypot(
-        (x[kept][1:] + x[kept][:-1]) / 2 - 200, (y[kept][1:] + y[kept][:-1]) / 2 - 200
-    )
-    assert np.abs(radius - 180).max() < 0.5
-
-
-@given(st.floats(-1e6, 1e6), st.floats(1e-6, 1e6))
-def test_ticks_are_round_and_inside(low, span):
-    axis = Axis(low, low + span)
-    ticks = axis.ticks(6)
-    assert len(ticks) <= 7
-    for value, text in ticks:
-        slack = 1e-6 * span + 2 * np.spacing(abs(low) + span)  # ends and ticks are rounded numbers
-        assert low - slack <= value <= low + span + slack
-        assert float(text.replace("−", "-")) == pytest.approx(value, abs=0.01 * span + 1e-9)
-
-
-@given(st.floats(1e-9, 1e9))
-def test_steps_are_one_two_or_five(step):
-    found = round_up(step)
-    assert step * (1 - 1e-6) <= found <= 2.5 * step * (1 + 1e-6)
+    kept = thinned(np.cos(t), np.sin(t), 300)
+    assert len(kept) == 300 and np.ptp(np.diff(kept)) <= 1
 
 
 def test_loss_axes_put_better_higher_and_space_by_ratio():
-    axis = Axis(-100.0, -1.0, loss=True)
-    places = [float(axis.place(v)) for v in (-100, -10, -1)]
-    assert places == pytest.approx([0.0, 0.5, 1.0])
-    assert [v for v, _ in axis.ticks()] == sorted(v for v, _ in axis.ticks())
+    curve = Curve(np.arange(3.0), np.array([-100.0, -10.0, -1.0]), "best", "b")
+    panel = Panel("p", "x", "y", (curve,), loss=True)
+    assert panel.height(curve.y).tolist() == pytest.approx([-2.0, -1.0, 0.0])
+    low, high = panel.ranges()[1]
+    ticks = loss_ticks(low, high)
+    assert ticks == sorted(ticks) and 2 <= len(ticks) <= 5
+    assert plotted(panel)["layout"]["yaxis"]["ticktext"] == [f"{t:g}" for t in ticks]
 
 
 def test_noise_beyond_zero_ends_at_the_top_of_a_loss_axis():
@@ -103,8 +84,10 @@ def test_noise_beyond_zero_ends_at_the_top_of_a_loss_axis():
         Dot(3.0, float("nan"), "model", "failed", "cross"),
     )
     panel = Panel("p", "x", "y", dots=dots, bands=(Band(-9.0, 5.0, "other", "n"),), loss=True)
-    text = svg(draw(panel), "p")
-    assert "nan" not in text and text.count("<circle") == 2
+    known, failed = plotted(panel)["data"]
+    assert np.isfinite(known["y"]).all() and np.isfinite(known["error_y"]["array"]).all()
+    low, high = panel.ranges()[1]
+    assert failed["text"] == ["failed"] and low <= failed["y"][0] <= low + 0.1 * (high - low)
 
 
 def test_a_run_that_went_astray_does_not_flatten_the_others():
@@ -114,31 +97,29 @@ def test_a_run_that_went_astray_does_not_flatten_the_others():
     assert low > -6 and high < 6
 
 
-def test_missing_samples_break_a_line():
-    y = np.array([0.0, 1, np.nan, np.nan, 2, 3])
-    panel = Panel("p", "x", "y", (Curve(np.arange(6.0), y, "best", "b"),))
-    strokes = [s for s in draw(panel).shapes if isinstance(s, Stroke) and s.role == "best"]
-    assert [len(s.points) for s in strokes] == [2, 2]
+@given(
+    st.floats(-1e6, 1e6), st.sampled_from([0.0, 1e-6, 1.0, 1e6]), st.sampled_from([0.0, 1.0, 1e5])
+)
+def test_packed_numbers_are_what_they_were_where_one_can_see_it(offset, span, outlier):
+    values = offset + span * np.linspace(0, 1, 50)
+    values[7] = np.inf
+    values[9] += outlier
+    back = unpacked(packed(values))
+    assert np.isnan(back[7])
+    inner = np.ptp(np.quantile(np.delete(values, 7), [0.02, 0.98]))
+    np.testing.assert_allclose(
+        np.delete(back, 7), np.delete(values, 7), atol=1e-3 * inner + 1e-9, rtol=1e-6
+    )
 
 
-def test_equal_axes_have_one_scale():
-    curve = Curve(np.array([0.0, 10.0]), np.array([0.0, 1.0]), "best", "b")
-    drawing = draw(Panel("p", "x", "y", (curve,), equal=True))
-    assert drawing.x is not None and drawing.y is not None
-    across = (drawing.x.high - drawing.x.low) / drawing.box[2]
-    up = (drawing.y.high - drawing.y.low) / drawing.box[3]
-    assert across == pytest.approx(up)
-
-
-def test_dashes_cover_what_they_should():
-    line = np.array([[0.0, 0], [30, 0], [30, 60]])
-    pieces = dashed(line, np.array([6.0, 3.0]))
-    drawn = sum(np.hypot(*np.diff(p, axis=0).T).sum() for p in pieces)
-    assert drawn == pytest.approx(60)
-
-
-def test_words_are_spelled_with_letters_that_the_font_has():
-    assert plain("log₂ α − 1 … Ünï 漢") == "log2 alpha - 1 ... Uni ?"
+def test_roles_become_colours_light_and_dark():
+    trace = {"line": {"color": "@best"}, "fill": "@best/0.15", "name": "v @ 2 m/s"}
+    assert coloured(trace) == {
+        "line": {"color": "#0072b2"},
+        "fill": "rgba(0,114,178,0.15)",
+        "name": "v @ 2 m/s",
+    }
+    assert coloured(trace, dark=True)["line"] == {"color": "#56b4e9"}
 
 
 @pytest.mark.extra("png")
@@ -153,16 +134,19 @@ def test_pictures_are_drawn_in_their_colours(cart):
         "error",
         "inputs",
         "bias",
+        "accuracy",
         "gap",
         "forecast",
+        "residual",
+        "autocorrelation",
     ]
     for figure in figures:
         image = Image.open(io.BytesIO(png(figure)))
         assert image.width >= 900 and image.height >= 300
-        counts = image.getcolors(1 << 24)
+        counts = image.convert("RGB").getcolors(1 << 24)
         assert counts is not None
         colours = {colour for _, colour in counts}
-        assert (0, 114, 178) in colours or figure.name in ("error", "forecast"), figure.name
+        assert (0, 114, 178) in colours or figure.name == "error", figure.name
 
 
 def test_scenes_of_car_aircraft_and_cart(cart, car):
@@ -238,4 +222,80 @@ def test_what_is_cut_off_is_marked(cart):
     assert cut is not None
     panel = cut.panels[0]
     assert panel.note == "model’s policy is cut off: it reaches −490"
-    assert panel.y_range[0] > -490 and panel.note in svg(draw(panel), "p")
+    assert panel.y_range[0] > -490
+    assert plotted(panel)["layout"]["annotations"][0]["text"] == panel.note
+
+
+@pytest.mark.extra("report")
+def test_results_plot_what_the_page_shows(cart):
+    findings = gather(Folder(cart))
+    assert findings.diagnosis is not None and findings.best is not None
+    for result, titles in (
+        (findings.diagnosis, ("Prediction error 1 s ahead", "Share of the gap by channel")),
+        (findings.standing, ("Utility of each candidate", "Step size")),
+        (findings.best.candidate, ("x", "v", "force")),
+    ):
+        drawn = result.plot()
+        said = [note.text for note in drawn.layout.annotations]
+        for title in titles:
+            assert any(text.startswith(title) for text in said), (title, said)
+        assert len(drawn.data) >= len(titles)
+    traces = findings.best.candidate.plot().data
+    np.testing.assert_allclose(traces[0].y, findings.best.candidate.predicted_states[:, 0])
+
+
+def test_a_result_without_a_figure_says_so(cart):
+    nothing = replace(gather(Folder(cart)).standing, history=())
+    with pytest.raises(GroundedError, match="nothing to draw"):
+        nothing.plot()
+
+
+def test_the_worth_of_each_effect_is_drawn_in_the_unit_of_the_state():
+    channels = {"x": "m", "v": "m/s"}
+    row = RulerRow(
+        horizon_s=1.0,
+        held_out="trials",
+        unit_by_channel=channels,
+        crude={"x": 0.2, "v": 0.5},
+        calibrated={"x": 0.1, "v": 0.4},
+        with_effects={"x": 0.1, "v": 0.05},
+        noise_floor={"x": 0.05, "v": 0.04},
+    )
+    credit = (Credit("delay:u", share=0.9, without_it={"x": 0.15, "v": 0.4}),)
+    found = Diagnosis(Verdict("effect"), credit=credit, prediction_error=(row,))
+    figure = credit_figure(found)
+    assert figure is not None
+    share, worth = figure.panels
+    assert [bar.label for bar in share.bars] == ["delay:u"] and share.bars[0].value == 0.9
+    assert worth.title == "v: error 1 s ahead"  # what predictions improved most
+    assert [bar.value for bar in worth.bars] == [0.5, 0.4, 0.05, 0.04]
+    assert worth.bars[1].label == "without delay:u" and worth.bars[1].text == "0.4 m/s"
+    (x, v) = accuracy_figure(found).panels
+    assert [bar.value for bar in x.bars] == [0.2, 0.1, 0.1, 0.05] and "v" in v.title
+
+
+def test_the_residual_is_drawn_over_what_tells_most_of_it(cart):
+    findings = gather(Folder(cart))
+    over, rest = residual_figures(findings)
+    velocity = next(panel for panel in over.panels if panel.title.startswith("v:"))
+    points, line = velocity.curves
+    assert points.style == "points" and line.name.startswith("added by the model")
+    run = findings.best
+    assert run is not None and run.explained is not None
+    added = (run.residual - run.explained)[:, 1] / findings.task.dt
+    assert added.min() <= line.y.min() <= line.y.max() <= added.max()
+    assert all(len(panel.bands) == 1 for panel in rest.panels)
+    assert all(np.abs(c.y).max() <= 1.0 for panel in rest.panels for c in panel.curves)
+
+
+def test_a_crash_is_marked_where_it_happened(car):
+    findings = gather(Folder(car))
+    run = findings.runs[0]
+    states = run.trial.states.copy()
+    states[20:] = np.nan
+    short = replace(run, trial=replace(run.trial, states=states), utility=-np.inf)
+    figure = path_figure(replace(findings, runs=(short, *findings.runs[1:])))
+    assert figure is not None and "cross" in figure.caption
+    (cross,) = figure.panels[0].dots
+    x = findings.task.model.state_names.index("x")
+    assert cross.shape == "cross" and cross.x == states[19, x] and "0.95 s" in cross.note

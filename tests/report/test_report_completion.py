@@ -26,7 +26,7 @@ def _asked(words: str, cwd=None) -> list[str]:
 
 
 def test_commands_and_their_options():
-    assert _asked("grounded re") == ["report", "recover"]
+    assert _asked("grounded re") == ["restore", "report", "recover"]
     assert set(COMMANDS) <= set(_asked("grounded "))
     assert {"--html", "--png", "--rrd"} <= set(_asked("grounded report --"))
 

@@ -12,7 +12,7 @@ from grounded.errors import GroundedError
 from grounded.plant import Noise, Plant
 from grounded.search.ask_tell import learn
 from grounded.search.improve import model_fingerprint, propose
-from grounded.search.standing import MAX_CAUTION, SearchOptions, standing
+from grounded.search.standing import MAX_CAUTION, OTHER_WAY, SearchOptions, standing
 from grounded.search.step_size import Step
 from grounded.trial import Trial, mean_trial
 from grounded.utility import Reward
@@ -107,8 +107,10 @@ def test_trials_that_do_not_improve_raise_the_damping_until_nothing_is_promised(
     story = Story(tolerance=1e-9).add()
     while story.propose().candidate is not None:
         story.add(bad)
-    made = [c.damping for c in story.candidates[1:]]
+    made = [c.damping for c in story.candidates[1:] if c.way == ""]
     assert made == sorted(set(made)) and made[0] == 1.0 and len(made) >= 1
+    others = [c.way for c in story.candidates[1 + len(made) :]]
+    assert set(others) <= {"recorded inputs"} and len(others) <= OTHER_WAY
     ended = story.propose().standing
     assert (ended.phase, ended.ending) == ("converged", "no step improved")
 

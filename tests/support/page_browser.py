@@ -15,6 +15,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 FLAGS = [
     "--headless=new",
     "--no-sandbox",
@@ -26,6 +28,14 @@ FLAGS = [
     "--disable-sync",
     "--hide-scrollbars",
 ]
+
+
+def unpacked(value: dict[str, Any]) -> np.ndarray:
+    """The numbers of a packed array."""
+    raw = np.frombuffer(base64.b64decode(value["bdata"]), "<" + value["dtype"]).astype(float)
+    if value["dtype"] != "u2":
+        return raw
+    return np.where(raw == 65535, np.nan, value["from"] + value["step"] * raw)
 
 
 def missing() -> str:
@@ -75,14 +85,49 @@ class Browser:
         mouse = {"type": "pointer", "id": "mouse", "parameters": {"pointerType": "mouse"}}
         _call("POST", f"{self._at}/actions", {"actions": [{**mouse, "actions": [move]}]})
 
+    def drag(self, identity: str, start: float, end: float) -> None:
+        """Draws a box over a part of a plot's width."""
+        self.point(f"#{identity}", start, 0.4)
+        x, y, width, height = self.run(
+            "const b = document.getElementById(arguments[0]).getBoundingClientRect();"
+            "return [b.left, b.top, b.width, b.height];",
+            identity,
+        )
+        middle = (start + end) / 2
+        places = (("Pressed", start), ("Moved", middle), ("Moved", end), ("Released", end))
+        for kind, part in places:
+            at = {"x": x + part * width, "y": y + 0.4 * height, "button": "left", "buttons": 1}
+            self.devtools(
+                "Input.dispatchMouseEvent", {"type": f"mouse{kind}", "clickCount": 1, **at}
+            )
+        time.sleep(0.5)
+
+    def key(self, identity: str, key: str) -> None:
+        """A key, as if typed while a plot has the focus."""
+        self.run(
+            "document.getElementById(arguments[0]).dispatchEvent("
+            "new KeyboardEvent('keydown', { key: arguments[1], bubbles: true }))",
+            identity,
+            key,
+        )
+        time.sleep(0.3)
+
+    def draw_all(self) -> None:
+        """Scrolls through the page, so that every panel comes into view, and back."""
+        self.run("document.querySelectorAll('details').forEach(d => { d.open = true; })")
+        for y in range(0, self.run("return document.documentElement.scrollHeight"), 800):
+            self.run("window.scrollTo(0, arguments[0])", y)
+            time.sleep(0.1)
+        for _ in range(100):
+            if self.run("return [...document.querySelectorAll('.plot')].every(p => p.drawn)"):
+                break
+            time.sleep(0.1)
+        self.run("window.scrollTo(0, 0)")
+
     def errors(self) -> list[str]:
         """What the console has logged as an error or a warning."""
         lines = _call("POST", f"{self._at}/se/log", {"type": "browser"})
         return [line["message"] for line in lines if line["level"] in ("SEVERE", "WARNING")]
-
-    def picture(self) -> bytes:
-        found = self.devtools("Page.captureScreenshot", {"captureBeyondViewport": True})
-        return base64.b64decode(found["data"])
 
 
 @contextmanager

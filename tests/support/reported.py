@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -16,10 +15,12 @@ from grounded.errors import NextCommand
 from grounded.experiments.figure8 import flight_task
 from grounded.models import aircraft
 from grounded.policy import Policy
-from grounded.search.standing import Candidate, SearchOptions, standing
+from grounded.search.candidate import Candidate
+from grounded.search.standing import SearchOptions, standing
 from grounded.solve.bias import residuals
 from grounded.trial import Trial
 from grounded_trials.report.findings import Findings, Run
+from grounded_trials.store.documents import write_document
 from workspaces import make
 
 DIAGNOSIS: dict[str, Any] = {
@@ -90,7 +91,7 @@ def cart(tmp_path_factory: pytest.TempPathFactory) -> Path:
     make(folder)
     assert grounded("-C", folder, "learn").code == 0
     (folder / "reports").mkdir(exist_ok=True)
-    (folder / "reports" / "diagnosis.json").write_text(json.dumps(DIAGNOSIS))
+    write_document(folder / "reports" / "diagnosis.json", DIAGNOSIS)
     return folder
 
 
@@ -161,6 +162,5 @@ def many_flights(trials: int = 50) -> Findings:
         lost=(),
         diagnosis=None,
         optimum=None,
-        noise=float("nan"),
         then=NextCommand("propose"),
     )

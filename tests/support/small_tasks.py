@@ -9,7 +9,7 @@ import numpy as np
 
 from grounded.model import Model, Param
 from grounded.plant import Plant
-from grounded.search.standing import Candidate
+from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded.utility import Reward

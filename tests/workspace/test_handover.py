@@ -196,12 +196,20 @@ def test_deleting_what_was_rewritten_brings_the_candidate_back(w):
     assert w.propose().candidate.id == "c0001" and w.candidate_bytes("c0001") == before
 
 
+def forget_hand_outs(w):
+    """As a workspace of 0.1, which kept none."""
+    for note in (w.folder / "trials").glob("n*.json"):
+        note.unlink()
+
+
 def test_wider_limits_in_the_file_are_found_without_a_checksum(w, tmp_path):
+    forget_hand_outs(w)
     rewrite(w, "none", low=np.array([-50.0]), high=np.array([50.0]))
     refused(w, tmp_path, "its own limits of force are [-50, 50]")
 
 
 def test_a_file_that_is_not_what_its_trial_ran_is_refused(ran, tmp_path):
+    forget_hand_outs(ran)
     gain = read_candidate(ran.candidate_path("c0001"))[0].gain
     rewrite(ran, "new", gain=gain * (1 + 1e-12))  # the prediction can't show so little
     with pytest.raises(GroundedError, match="is not the policy that t0001 ran"):
@@ -230,6 +238,7 @@ def test_metadata_that_was_rewritten_is_found(w, key):
 
 
 def test_a_file_of_an_older_version_is_handed_over_with_a_note(w):
+    forget_hand_outs(w)
     path = w.candidate_path("c0001")
     path.write_bytes(with_metadata(path.read_bytes(), "sha256", None))
     (note,) = w.propose().proposal.notes

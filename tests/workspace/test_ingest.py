@@ -71,10 +71,10 @@ def test_repeated_runs_of_a_noiseless_system_are_trials_of_their_own(tmp_path):
 
 
 def test_a_trial_that_does_not_say_what_it_ran_is_the_outstanding_ones(w, tmp_path):
-    propose_in(w)
-    write_trial(tmp_path / "t.mcap", plain(), {"kind": "trial"})
+    ran, _, _ = read_trial(run(w))
+    write_trial(tmp_path / "t.mcap", replace(ran, candidate=""), {"kind": "trial"})
     found = ingest_log(w, tmp_path / "t.mcap")
-    assert found.candidate == "c0001"
+    assert found.candidate == "c0001" and not found.warnings
     (stored,) = w.trials()
     assert stored.meta["task"] == w.task.hash and stored.trial.candidate == "c0001"
     again = ingest_log(w, tmp_path / "t.mcap", "c0001")
@@ -134,7 +134,9 @@ def test_a_recovered_trial_of_a_dead_robot_is_a_failed_candidate(w, tmp_path):
     assert refused.code == 1 and "grounded recover" in refused.err
     saved = grounded("recover", path, "-o", tmp_path / "saved.mcap", "--json")
     assert saved.code == 3 and saved.json["messages"]["/state"] >= 20
-    done = grounded("-C", w.folder, "ingest", tmp_path / "saved.mcap", "--json")
+    done = grounded(
+        "-C", w.folder, "ingest", tmp_path / "saved.mcap", "--candidate", "c0001", "--json"
+    )
     assert done.code == 0, done.err
     (trial,) = done.json["trials"]
     assert trial["failed"] and trial["candidate"] == "c0001"
@@ -149,7 +151,7 @@ def test_a_live_trial_is_the_trial_that_was_driven(w, tmp_path):
     ) as writer:
         for k in range(41):
             writer.append(0.05 * k, whole.states[k], whole.inputs[k] if k < 40 else None)
-    ingest_log(w, tmp_path / "t.mcap")
+    ingest_log(w, tmp_path / "t.mcap", made.id)
     np.testing.assert_array_equal(w.trials()[0].trial.states, whole.states)
 
 
@@ -159,8 +161,8 @@ def test_gaps_are_stored_as_they_are_and_bridged_when_read(w, tmp_path):
     states[10:13] = np.nan
     trial = plain(states=states, candidate=made.id)
     write_trial(tmp_path / "t.mcap", trial, {"kind": "trial"})
-    found = ingest_log(w, tmp_path / "t.mcap")
-    assert "6 lost samples" in found.warnings[0] and np.isfinite(found.utility)
+    found = ingest_log(w, tmp_path / "t.mcap", made.id)
+    assert any("6 lost samples" in text for text in found.warnings) and np.isfinite(found.utility)
     assert np.isnan(read_trial(w.store.list()[0].path)[0].states).sum() == 6
     assert np.isfinite(w.trials()[0].trial.states).all()
 

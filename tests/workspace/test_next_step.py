@@ -1,6 +1,5 @@
 """The last line of an output is the command to type next, the same one wherever it is asked."""
 
-import json
 import shlex
 from pathlib import Path
 
@@ -11,6 +10,7 @@ from cli import grounded, plain, process
 from grounded.diagnosis.report import Diagnosis
 from grounded_cli.main import COMMANDS, cli
 from grounded_cli.options import ELSEWHERE
+from grounded_trials.store.documents import write_document
 from grounded_trials.wording import folded
 from grounded_trials.workspace.config import set_in_model
 from grounded_trials.workspace.folder import Folder
@@ -31,7 +31,7 @@ def last(done):
 
 def diagnosed(folder: Path, **changes):
     document = {**DIAGNOSIS, **changes}
-    (folder / "reports" / "diagnosis.json").write_text(json.dumps(document))
+    write_document(folder / "reports" / "diagnosis.json", document)
 
 
 @pytest.mark.parametrize("command", ["status", "report", "learn", "propose"])

@@ -13,20 +13,21 @@ frozen result whose `to_json()` is the document that the command prints with --j
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result
-from grounded_trials.workspace.folder import Folder, Lost
+from grounded_trials.workspace.folder import Folder
 
 if TYPE_CHECKING:
     from grounded.diagnosis.report import Diagnosis
     from grounded.effects import Library
     from grounded.frozen import Array
-    from grounded.search.standing import Candidate
+    from grounded.instruments.finding import Finding
+    from grounded.search.candidate import Candidate
     from grounded_trials.report.reporting import Report
     from grounded_trials.workspace.adopting import Adopted
     from grounded_trials.workspace.exporting import Exported
@@ -35,22 +36,23 @@ if TYPE_CHECKING:
     from grounded_trials.workspace.inspecting import Inspected
     from grounded_trials.workspace.proposing import Proposed, Status
     from grounded_trials.workspace.running import Ran
+    from grounded_trials.workspace.verifying import Verified
 
 
 @dataclass(frozen=True, repr=False)
-class Verified(Result):
-    """How many files were checked, and those that are not what they were."""
+class SetAside(Result):
+    """What `discard` and `restore` answer: the trials that were named, and all that are aside."""
 
-    checked: int
-    damaged: tuple[Lost, ...]
+    trials: tuple[str, ...]
+    discarded: dict[str, str]  # t0004 -> why
 
     def summary(self) -> str:
-        """How many are good, how many not."""
-        return f"{self.checked} files, {len(self.damaged)} damaged"
+        """All that are set aside."""
+        return f"set aside: {', '.join(self.discarded) or 'none'}"
 
     def to_json(self) -> dict[str, Any]:
-        """The document of `verify --json`."""
-        return {"checked": self.checked, "damaged": [vars(one) for one in self.damaged]}
+        """The document of `discard --json` and of `restore --json`."""
+        return {"trials": list(self.trials), "discarded": self.discarded}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -101,21 +103,26 @@ class Workspace(Folder):
         log: str | Path | None = None,
         model: str | Path | None = None,
     ) -> Self:
-        """Makes a workspace from an example or from a log; nothing is ever overwritten.
+        """Makes a workspace from an example, a log or a model; nothing is ever overwritten.
 
         Args:
             folder: where it is made.
             example: car-turn, car-circle, car-figure8, flight-figure8 or pendulum.
             log: of your robot, any format; `starting.begin.begin` says what it found.
-            model: your model.py, beside `log`; None: a skeleton is written.
+            model: your model.py, beside `log`, where None writes a skeleton; or alone: target,
+                weights and drive.py are to be filled in then.
 
         Raises:
             GroundedError: if there is no such example, the log can't be read, or the folder holds
                 a workspace already.
         """
-        if (example is None) == (log is None):
-            raise GroundedError("give an example or a log to make a workspace from")
-        if log is not None:
+        if (example is None) == (log is None and model is None):
+            raise GroundedError("give an example, a log or a model to make a workspace from")
+        if log is None and model is not None:
+            from grounded_trials.starting.blank import write_blank
+
+            write_blank(Path(folder), model)
+        elif log is not None:
             from grounded_trials.starting.begin import begin
 
             begin(Path(folder), log, model=model)
@@ -298,6 +305,8 @@ class Workspace(Folder):
         max_effects: int = 3,
         without: Sequence[str] = (),
         library: Library | None = None,
+        compare: Sequence[str] = (),
+        probe: bool = False,
         progress: Callable[[str], None] | None = None,
     ) -> Diagnosis:
         """Explains the gap between model and trials; keeps reports/diagnosis.json.
@@ -306,6 +315,8 @@ class Workspace(Folder):
             trials: short names, t0007; none: all that can be used.
             max_effects: blame at most so many effects at once.
             without: families not to blame.
+            compare: a second group of trials; what changed from the first is `changed`.
+            probe: write the most instructive candidate also where nothing ties.
             library: the effects that may be blamed; None: those that are installed.
             progress: told of each stage.
         """
@@ -318,8 +329,20 @@ class Workspace(Folder):
             trials=trials,
             max_effects=max_effects,
             library=library.without(without),
+            compare=compare,
+            probe=probe,
             progress=progress,
         )
+
+    def preflight(self, trials: Sequence[str] = ()) -> tuple[Finding, ...]:
+        """Judges the instruments alone, from their own signals: late, scaled, stuck; quick.
+
+        Args:
+            trials: short names, t0007; none: all that can be used.
+        """
+        from grounded_trials.workspace.diagnosing import instruments_in
+
+        return instruments_in(self._afresh(), trials)
 
     def adopt(self, *effects: str, parameters: bool = True) -> Adopted:
         """Adds effects of the last diagnosis to the model of grounded.toml.
@@ -351,7 +374,9 @@ class Workspace(Folder):
         from grounded_trials.report import reporting
         from grounded_trials.report.gathering import gather
 
-        for asked, module, extra in ((png, "PIL", "png"), (rrd, "rerun", "view")):
+        known = {"jinja2": (html, "report"), "plotly": (html, "report")}
+        known |= {"matplotlib": (png, "png"), "rerun": (rrd, "view")}
+        for module, (asked, extra) in known.items():
             if asked:
                 needs(module, extra)
         findings, paths = gather(self._afresh()), []
@@ -362,6 +387,28 @@ class Workspace(Folder):
         if rrd:
             paths.append(reporting.save_recording(self, findings))
         return reporting.Report(findings, tuple(paths))
+
+    def watch(
+        self, *, every: float = 1.0, trouble: Callable[[GroundedError], None] = lambda error: None
+    ) -> Iterator[Report]:
+        """Keeps reports/report.html current while trials come in; open in a browser, it reloads.
+
+        Args:
+            every: how often the files are looked at [s].
+            trouble: told what keeps the page from being written for now.
+
+        Yields:
+            A report each time that the page was written; it ends when it is no longer asked.
+
+        Raises:
+            GroundedError: if the extra `report` is missing.
+        """
+        from grounded.errors import needs
+        from grounded_trials.report.reporting import watched
+
+        for module in ("jinja2", "plotly"):
+            needs(module, "report")
+        return watched(self, every, trouble)
 
     def export(
         self,
@@ -393,21 +440,37 @@ class Workspace(Folder):
         return export_candidate(here, candidate, form, file, runner=runner, anyway=anyway)
 
     def verify(self) -> Verified:
-        """Checks every stored trial against its hash, every candidate against its checksums.
+        """Checks everything that is kept: what was changed, damaged, deleted or put in its place.
 
-        A candidate must also be the one its file is named after, and do what it predicts.
+        Trials and notes against their hashes, and whether all are there that were stored;
+        candidates against their checksums, what was handed out under their names and what they
+        predict; the last diagnosis and the optimum against their checksums.
         """
-        from grounded_trials.store.own_files import FILE_LIMIT, read_file
-        from grounded_trials.workspace.handover import intact
+        from grounded_trials.workspace.verifying import verify_in
 
-        damaged = [Lost(str(one.path), one.reason) for one in self.store.verify()]
-        candidates = sorted((self.folder / "candidates").glob("*.mcap"))
-        for path in candidates:
-            try:
-                intact(read_file(path, FILE_LIMIT), path.stem)
-            except GroundedError as error:
-                damaged.append(Lost(str(path), str(error)))
-        return Verified(len(self.store.list()) + len(candidates), tuple(damaged))
+        return verify_in(self._afresh())
+
+    def discard(self, *trials: str, why: str = "") -> SetAside:
+        """Sets trials aside: search, fit, diagnosis and report leave them out; nothing is deleted.
+
+        Args:
+            trials: short names, t0004.
+            why: kept with it, for who asks later.
+        """
+        return self._noted("discard", trials, why)
+
+    def restore(self, *trials: str) -> SetAside:
+        """Takes back what `discard` did."""
+        return self._noted("restore", trials, "")
+
+    def _noted(self, note: str, trials: Sequence[str], why: str) -> SetAside:
+        here = self._afresh()
+        found = [here.store.find(name.lower()) for name in trials]
+        for one in found:
+            if (one.digest in here.noted.aside) == (note == "restore"):
+                here.notes.add({"note": note, "trial": one.digest, "why": why})
+        here.forget_trials()
+        return SetAside(tuple(one.id for one in found), here.discarded())
 
     def inspect(self, log: str | Path) -> Inspected:
         """Shows what a log holds, and guesses a [log] table for this workspace's model."""

@@ -11,17 +11,23 @@ from pathlib import Path
 from typing import Any
 
 from grounded.errors import GroundedError, NextCommand, nearest
+from grounded_trials.plain_file import open_file
 
+SIZE_LIMIT = 2**22  # [bytes] of a file
 _WORDS = {str: "a text", bool: "true or false", float: "a number", int: "a whole number"}
 _REQUIRED = object()
 
 
 class Table:
-    """One table of a TOML file; `where` is its dotted name, "" for the whole file."""
+    """One table of a TOML file; `where` is its dotted name, "" for the whole file.
+
+    It stays whole: what was taken can be taken again, as for the second of two logs.
+    """
 
     def __init__(self, values: Mapping[str, Any], file: Path, where: str = "") -> None:
         self._values = dict(values)
         self._known: set[str] = set()
+        self._taken: set[str] = set()
         self.file, self.where = file, where
 
     def error(self, key: str, text: str) -> GroundedError:
@@ -51,8 +57,8 @@ class Table:
             if default is _REQUIRED:
                 raise self.error(key, f"is missing; it must be {_WORDS.get(kind, kind.__name__)}")
             return default
-        value = self._values.pop(key)
-        return self._checked(key, value, kind)
+        self._taken.add(key)
+        return self._checked(key, self._values[key], kind)
 
     def _checked(self, key: str, value: Any, kind: type) -> Any:
         fits = isinstance(value, kind) and not (isinstance(value, bool) and kind is not bool)
@@ -77,7 +83,8 @@ class Table:
     def sub(self, key: str) -> Table:
         """The table under a key, empty when it is not there."""
         self._known.add(key)
-        value = self._values.pop(key, {})
+        self._taken.add(key)
+        value = self._values.get(key, {})
         if not isinstance(value, dict):
             raise self.error(key, f"must be a table, found {value!r}")
         return Table(value, self.file, f"{self.where}.{key}" if self.where else key)
@@ -107,12 +114,12 @@ class Table:
         return found
 
     def names(self) -> list[str]:
-        """The keys that were not taken yet."""
+        """All keys."""
         return list(self._values)
 
     def finish(self, valid: Iterable[str] | None = None) -> None:
         """Complains about a key that nobody took."""
-        for key in self._values:
+        for key in self._values.keys() - self._taken:
             known = self._known if valid is None else valid
             raise self.error(key, f"is not known here: {nearest(key, sorted(known))}")
 
@@ -126,7 +133,8 @@ def read_toml(path: Path) -> Table:
     import tomllib
 
     try:
-        text = path.read_text(encoding="utf-8")
+        with open_file(path) as stream:
+            text = stream.read(SIZE_LIMIT + 1).decode("utf-8")
     except FileNotFoundError:
         raise GroundedError(
             f"{path} does not exist: this is not a workspace; name one with -C DIR, or make one",
@@ -139,6 +147,8 @@ def read_toml(path: Path) -> Table:
     except (OSError, UnicodeDecodeError) as error:
         raise GroundedError(f"{path} can't be read: {error}") from None
     try:
+        if len(text) > SIZE_LIMIT:
+            raise ValueError(f"it has more than {SIZE_LIMIT} bytes")
         return Table(tomllib.loads(text), path)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise GroundedError(f"{path.name} is not valid TOML: {error}") from None

@@ -5,7 +5,9 @@ state, `math.sin`, a simulator) is called sample by sample; a function that take
 the samples up is found out by comparing a few samples with single calls.
 
 Central differences with a step h = 6e-6 max(1, |x|) (the cube root of the machine's precision)
-are good to about 1e-10 of the function's scale; all 2 (n + m) shifted points go in one call.
+are good to about 1e-10 of the function's scale; all 2 (n + m) shifted points go in one call. A
+function that computes in single precision would lose all its digits at that step: it is found out
+by outputs that are float32 numbers, and stepped by h = 5e-3 max(1, |x|).
 `smoothing` is ignored here: what can't be traced can't be smoothed.
 """
 
@@ -22,10 +24,16 @@ from grounded.errors import GroundedError
 from grounded.frozen import Array
 
 RELATIVE_STEP = float(np.cbrt(np.finfo(float).eps))
+SINGLE_STEP = float(np.cbrt(np.finfo(np.float32).eps))
 WRONG = 1e-2  # share of the largest by which a given derivative may differ from differences
 SLOW = (
     "; it can't take arrays of samples either and is called one sample at a time: planning takes "
     "seconds to minutes (np.where in place of `if` and np.sin in place of math.sin mend it)"
+)
+SINGLE = (
+    "; it computes in single precision (float32): derivatives are differenced with steps of 0.5 % "
+    "and good to four digits (float64 inside it mends it; in JAX, "
+    "jax.config.update('jax_enable_x64', True))"
 )
 CHUNK = 4096  # samples in one call, so that long horizons don't fill the memory
 
@@ -37,6 +45,7 @@ class DifferencedSystem(Interpreted):
 
     _batches = True  # until the function fails on arrays
     _calls = 0
+    _step = 0.0  # of the differences, relative; 0: not known yet
 
     def evaluate(self, x: Array, u: Array, p: Array, dt: float, smoothing: float) -> Array:
         """The function at N samples."""
@@ -79,6 +88,7 @@ class DifferencedSystem(Interpreted):
         """See `Interpreted.jacobian`; by central differences."""
         shifted = self.n + self.m
         both = np.concatenate([x, u], axis=1)
+        relative = self._relative_step(x, u, p, dt)
         J = np.empty((len(x), self.n, width))
         size = max(1, CHUNK // (2 * shifted))
         if self.signature.jacobian is not None:
@@ -87,11 +97,27 @@ class DifferencedSystem(Interpreted):
             J[at : at + size, :, :shifted] = self._by_state_and_input(both[at : at + size], p, dt)
         for i in range(width - shifted):
             up, down = np.array(p, float), np.array(p, float)
-            up[i] += RELATIVE_STEP * max(1.0, abs(p[i]))
-            down[i] -= RELATIVE_STEP * max(1.0, abs(p[i]))
+            up[i] += relative * max(1.0, abs(p[i]))
+            down[i] -= relative * max(1.0, abs(p[i]))
             change = self.step(x, u, up, dt) - self.step(x, u, down, dt)
             J[:, :, shifted + i] = change / (up[i] - down[i])
         return J
+
+    def _relative_step(self, x: Array, u: Array, p: Array, dt: float) -> float:
+        """The step that fits the precision in which the function computes.
+
+        Two samples that are no float32 numbers: an output that is one at both, and not the same
+        twice, was rounded.
+        """
+        if not self._step and len(x):
+            near = 1.0 + np.array([[1.234567e-3], [2.718281e-3]]) / np.pi
+            some = (x[:1] * near + (near - 1), u[:1] * near + (near - 1))
+            found = self.evaluate(*some, p, dt, 0.0)
+            rounded = (found == found.astype(np.float32)).all(axis=0) & (found[0] != found[1])
+            single = np.isfinite(found).all() and rounded.any()
+            self._step = SINGLE_STEP if single else RELATIVE_STEP
+            self.note += SINGLE * bool(single)
+        return self._step or RELATIVE_STEP
 
     def _given(self, x: Array, u: Array, p: Array, dt: float) -> Array:
         """The user's own derivatives [f_x f_u], (N, n, n + m): of arrays, or one by one."""
@@ -122,7 +148,8 @@ class DifferencedSystem(Interpreted):
     def _by_state_and_input(self, both: Array, p: Array, dt: float) -> Array:
         """(N, n + m) points -> (N, n, n + m), in one call of the step."""
         N, d = both.shape
-        h = RELATIVE_STEP * np.maximum(1.0, np.abs(both))
+        relative = self._relative_step(both[:, : self.n], both[:, self.n :], p, dt)
+        h = relative * np.maximum(1.0, np.abs(both))
         points = np.broadcast_to(both, (2, d, N, d)).copy()
         i = np.arange(d)
         points[0, i, :, i] += h.T

@@ -5,7 +5,8 @@ through ctypes, which releases the GIL while they run: threads are enough for ma
 (`parallel`).
 
 The cache is the user's: one file a kernel, of a header, the SHA-256 of the code, and the code. A
-file that is short, damaged or of another format is not used and is replaced. A file is written
+file that is short, damaged or of another format is not used and is replaced; a file or folder that
+is not the user's, or that others may write, is not used at all. A file is written
 under a temporary name and renamed, so that any number of processes may share the folder; beyond
 MAX_BYTES the files that were used longest ago go. Without a cache (a read-only home) kernels are
 compiled again. GROUNDED_CACHE names another folder; empty, it switches the cache off.
@@ -19,10 +20,13 @@ import hashlib
 import os
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
+
+from grounded.trusted import suspicion
 
 OLDEST = (0, 45)  # of llvmlite: pointers without a type
 OPTIMISATION = 1  # of LLVM's code generator; the text is optimised as it is written
@@ -148,6 +152,8 @@ def stored(digest: str) -> bytes | None:
         if home is None:
             return None
         path = home / f"{digest}.kernel"
+        if not (path.is_file() and _own(home) and _own(path)):
+            return None
         data = path.read_bytes()
         code = data[len(MAGIC) + 32 :]
         if data != MAGIC + _check(digest, code) + code:
@@ -168,6 +174,8 @@ def store(digest: str, code: bytes) -> None:
         if home is None:
             return
         home.mkdir(parents=True, exist_ok=True, mode=0o700)
+        if not _own(home):
+            return
         handle, temporary = tempfile.mkstemp(dir=home, suffix=".part")
         try:
             with os.fdopen(handle, "wb") as file:
@@ -180,6 +188,16 @@ def store(digest: str, code: bytes) -> None:
         _prune(home)
     except (OSError, RuntimeError):
         return
+
+
+@cache
+def _own(path: Path) -> bool:
+    """Whether nobody else can have put code there; said once where somebody can."""
+    why = suspicion(path)
+    if why:
+        remedy = "make it yours alone (chown, chmod go-w), or name another in GROUNDED_CACHE"
+        warnings.warn(f"the kernel cache is not used: {why}; {remedy}", stacklevel=2)
+    return not why
 
 
 def _check(digest: str, code: bytes) -> bytes:

@@ -15,9 +15,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from grounded_trials.formats.budget import step
 from grounded_trials.formats.mcap_records import windows
 from grounded_trials.formats.messages import (
-    ROW_LIMIT,
     Array,
     BadMessage,
     BadPath,
@@ -79,8 +79,6 @@ class _CdrNode(Node):
         item = self.type.item
         counts, body = self._counts()
         row, index = choose_items(counts, start, stop)
-        if len(row) > ROW_LIMIT:
-            raise BadPath(f"it finds {len(row)} values at once; name the items that are meant")
         inside = replace(body.pick(row), type=item)
         sizes = _sizes(item, self.coding)
         if sizes is not None:
@@ -166,15 +164,17 @@ class _CdrNode(Node):
         last = int(index.max(initial=0))
         if last > ITEM_LIMIT:
             raise BadMessage(self.rows[0], f"it has a list of more than {ITEM_LIMIT} {item}")
-        found = self.pos[row]
-        node = replace(self, type=item)
+        found, pos, node = self.pos[row], self.pos.copy(), replace(self, type=item)
         order = np.argsort(index, kind="stable")
         ends = np.searchsorted(index[order], np.arange(last + 1), "right")
+        furthest = np.zeros(len(pos), dtype=np.int64)
+        np.maximum.at(furthest, row, index)
+        longest_first = np.argsort(-furthest, kind="stable")
+        lives = np.searchsorted(-furthest[longest_first], -np.arange(last), "left")
         for i in range(last):
-            live = np.unique(row[order[ends[i] :]])
-            pos = node.pos.copy()
-            pos[live] = node.pick(live)._after(item)
-            node = node._at(pos)
+            step()
+            live = longest_first[: lives[i]]
+            pos[live] = node.pick(live)._at(pos[live])._after(item)
             here = order[ends[i] : ends[i + 1]]
             found[here] = pos[row[here]]
         return found
@@ -232,6 +232,7 @@ def _parts(fields: tuple[Field, ...], coding: Coding) -> tuple[Type | _Table, ..
     """Fields as the fewest steps: those of fixed size next to each other are one table."""
     parts: list[Type | _Table] = []
     for field in fields:
+        step()
         sizes = _sizes(field.type, coding)
         if sizes is None:
             parts.append(field.type)

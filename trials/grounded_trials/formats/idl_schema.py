@@ -13,6 +13,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, field
 
+from grounded_trials.formats.budget import step
 from grounded_trials.formats.messages import Array, BadSchema, Field, Number, Struct, Text, Type
 from grounded_trials.formats.schemas import COUNT_LIMIT, DEPTH_LIMIT, NUMBERS
 
@@ -38,8 +39,9 @@ _NUMBERS = {name: number for name, number in NUMBERS.items() if "int" in name} |
     "double": Number("f8"),
 }
 _REFUSED = ("union", "map", "bitset", "bitmask", "any", "interface", "valuetype")
+MODULE_LIMIT = 16  # modules inside modules
 NAME_LIMIT = 256  # characters of a module's name
-FIELD_LIMIT = 1_000_000  # of all structs together
+FIELD_LIMIT = 200_000  # of all structs together
 
 
 def parse_idl(text: str, name: str) -> Struct:
@@ -52,7 +54,7 @@ def parse_idl(text: str, name: str) -> Struct:
     try:
         return _Parser(tokens).read(name.replace("/", "::"))
     except (IndexError, ValueError, RecursionError) as error:
-        raise BadSchema(f"its IDL definition is damaged: {error}") from None
+        raise BadSchema(f"its IDL definition is damaged: {str(error)[:80]}") from None
 
 
 @dataclass
@@ -71,6 +73,8 @@ class _Parser:
         self.defined: dict[str, _Definition] = {}
         self.found: dict[tuple[str, tuple[str, ...]], str] = {}
         self.built: dict[str, Struct] = {}
+        self.aliases: dict[str, Type] = {}  # what a typedef's name means
+        self.counts: dict[str, int] = {}  # what a constant's name means
         self.fields = 0
 
     def read(self, name: str) -> Struct:
@@ -81,6 +85,8 @@ class _Parser:
         return self.struct(name, 0)
 
     def take(self) -> str:
+        if self.pos % 1000 == 0:
+            step()
         token = self.tokens[self.pos]
         self.pos += 1
         return token
@@ -116,7 +122,7 @@ class _Parser:
             self.annotation(token)
         elif token == "module":
             inner = (*scope, self.take())
-            if len(inner) > DEPTH_LIMIT or len(inner[-1]) > NAME_LIMIT:
+            if len(inner) > MODULE_LIMIT or len(inner[-1]) > NAME_LIMIT:
                 raise BadSchema(f"its IDL definition has a module '{inner[-1][:40]}' in too many")
             self.expect("{")
             while self.tokens[self.pos] != "}":
@@ -205,7 +211,7 @@ class _Parser:
         for text in reversed(counts):
             count = self.count(text, scope, 0)
             if not 0 <= count <= COUNT_LIMIT:
-                raise BadSchema(f"its IDL definition has an array of {count} items")
+                raise BadSchema(f"its IDL definition has an array of {str(count)[:20]} items")
             kind = Array(kind, count)
         return kind
 
@@ -214,8 +220,13 @@ class _Parser:
         if not text[:1].isalpha():
             return int(text)
         self.check_depth(text, depth)
-        constant = self.defined[self.find(text, scope)]
-        return self.count("".join(constant.parts[0]), constant.scope, depth + 1)
+        name = self.find(text, scope)
+        if name not in self.counts:
+            constant = self.defined[name]
+            if constant.kind != "const":
+                raise BadSchema(f"its IDL definition counts items by '{name[:80]}', not a number")
+            self.counts[name] = self.count("".join(constant.parts[0]), constant.scope, depth + 1)
+        return self.counts[name]
 
     def type(
         self, written: list[str], scope: tuple[str, ...], depth: int
@@ -241,12 +252,15 @@ class _Parser:
             return Number("u4"), written[1:]
         if definition.kind == "struct":
             return self.struct(name, depth + 1), written[1:]
-        kind, rest = self.type(definition.parts[0], definition.scope, depth + 1)
-        return self.array(kind, rest[1::3], definition.scope), written[1:]
+        if name not in self.aliases:
+            kind, rest = self.type(definition.parts[0], definition.scope, depth + 1)
+            self.aliases[name] = self.array(kind, rest[1::3], definition.scope)
+        return self.aliases[name], written[1:]
 
     def find(self, name: str, scope: tuple[str, ...]) -> str:
         """The full name that a name means, looked up from the inside out."""
         if (name, scope) not in self.found:
+            step()
             for i in range(len(scope), -1, -1):
                 full = "::".join((*scope[:i], name.removeprefix("::")))
                 if full in self.defined:

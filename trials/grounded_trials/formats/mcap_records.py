@@ -8,6 +8,7 @@ to the size that it states, never further.
 
 from __future__ import annotations
 
+import struct
 import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -15,9 +16,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from grounded_trials.formats.budget import room
+
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 1, 2, 3, 4, 5, 6
 MESSAGE_INDEX, ATTACHMENT, METADATA, DATA_END = 7, 9, 12, 15
 MESSAGE_HEADER = 22  # channel u16, sequence u32, log time u64, publish time u64
+_CHUNK = struct.Struct("<16xQII")  # times; size when decompressed, its CRC, length of a name
+_U64 = struct.Struct("<Q")
 
 
 @dataclass(frozen=True)
@@ -66,7 +71,7 @@ class Messages:
 
     def channel_ids(self) -> list[int]:
         """The channels that have messages here, in rising order."""
-        return np.flatnonzero(np.bincount(self.channels)).tolist()
+        return [int(channel) for channel in np.unique(self.channels)]
 
     def of(self, channel: int) -> Messages:
         """The messages of one channel."""
@@ -118,11 +123,10 @@ def windows(buffer: bytes, dtype: str) -> NDArray[np.generic]:
 def batch(buffer: bytes, positions: list[int]) -> Messages:
     """The message records at these positions of a buffer."""
     at = np.array(positions, dtype=np.int64)
-    lengths = windows(buffer, "<i8")[at + 1]
     return Messages(
         buffer,
         at + 9 + MESSAGE_HEADER,
-        at + 9 + lengths.astype(np.int64),
+        at + 9 + windows(buffer, "<i8")[at + 1].astype(np.int64),
         windows(buffer, "<u2")[at + 9].astype(np.uint16),
         windows(buffer, "<u4")[at + 11].astype(np.uint32),
         windows(buffer, "<i8")[at + 15].astype(np.int64),
@@ -204,10 +208,15 @@ def chunk_content(content: bytes, limit: int) -> tuple[bytes, bool]:
     Raises:
         BadRecord: for a checksum that doesn't fit, and see `decompress`.
     """
-    fields = Fields(content)
-    fields.skip(16)
-    size, crc, compression = fields.uint(64), fields.uint(32), fields.text()
-    data = decompress(compression, fields.blob(), size, limit)
+    try:
+        size, crc, length = _CHUNK.unpack_from(content)
+        name, start = content[32 : 32 + length], 40 + length
+        stored = _U64.unpack_from(content, 32 + length)[0]
+    except struct.error:
+        raise BadRecord("it is too short for what it must hold") from None
+    if start + stored > len(content):
+        raise BadRecord("it is too short for what it must hold")
+    data = decompress(name.decode("utf-8", "replace"), content[start : start + stored], size, limit)
     if crc and zlib.crc32(data) != crc:
         raise BadRecord("its checksum does not fit its content")
     return data, bool(crc)
@@ -228,8 +237,12 @@ def decompress(compression: str, data: bytes, size: int, limit: int) -> bytes:
     if size > limit:
         raise BadRecord(f"it claims {size} bytes when decompressed, the limit is {limit}")
     if compression not in ("", "zstd", "lz4"):
-        raise BadRecord(f"its compression '{compression}' is not one of zstd, lz4 and none")
-    content, error = _expand(compression, data, size + 1, whole=True)
+        raise BadRecord(f"its compression '{compression[:40]}' is not one of zstd, lz4 and none")
+    if compression == "":
+        content, error = data, None
+    else:
+        room(2 * size)
+        content, error = _expand(compression, data, size + 1, whole=True)
     if error is not None:
         raise BadRecord(f"it can't be decompressed ({error})")
     if len(content) != size:
@@ -250,11 +263,13 @@ def _expand(
     Piece by piece unless `whole`: what comes before an error is kept then.
     """
     parts: list[bytes] = []
-    pieces = {"zstd": _zstd, "lz4": _lz4}.get(compression)
+    size, pieces = 0, {"zstd": _zstd, "lz4": _lz4}.get(compression)
     try:
         for part in pieces(data, limit, whole) if pieces else (data,) * (compression == ""):
             parts.append(part)
-            if sum(map(len, parts)) >= limit:
+            size += len(part)
+            room(2 * size)
+            if size >= limit:
                 break
     except (RuntimeError, EOFError, ValueError, MemoryError) as error:
         return b"".join(parts), error

@@ -5,7 +5,8 @@ section (header, schemas, channels, messages, chunks of them, attachments, metad
 DataEnd record that may hold the CRC of everything before it; the summary that follows ends with
 the footer, which may hold the summary's CRC. Nothing in the summary is trusted or needed here.
 
-A record or chunk beyond a limit is refused before any memory is taken for it.
+A record or chunk beyond a limit is refused before any memory is taken for it. So are a schema's or
+channel's id that is given to two of them, and a message logged after 2262: 2^63 ns.
 
 Why not the mcap package: its stream reader takes 5 us a record, hands out short records at the end
 of a truncated file, and checks neither summary nor attachments; its import costs 40 ms.
@@ -19,6 +20,7 @@ from struct import Struct
 from typing import BinaryIO
 
 from grounded.errors import GroundedError, NextCommand
+from grounded_trials.formats.budget import room, step
 from grounded_trials.formats.mcap_records import (
     CHANNEL,
     CHUNK,
@@ -29,10 +31,12 @@ from grounded_trials.formats.mcap_records import (
     PARSERS,
     SCHEMA,
     BadRecord,
+    Channel,
     End,
     Fields,
     Messages,
     Record,
+    Schema,
     batch,
     chunk_content,
 )
@@ -40,7 +44,12 @@ from grounded_trials.formats.mcap_records import (
 MAGIC = b"\x89MCAP0\r\n"
 RECORD_LIMIT = 512 * 2**20  # [bytes] of one record, and of one chunk when decompressed
 BLOCK = 4 * 2**20  # [bytes] read at a time
+SMALL = 2**16  # [bytes]: chunks below this are handed on together, up to
+TOGETHER = 2**20  # [bytes] of them
+MOST = 250_000  # messages in a batch
 
+PARSED = frozenset((*PARSERS, CHUNK, MESSAGE))
+_NAMES = {MESSAGE: "a message", CHUNK: "a chunk", SCHEMA: "a schema", CHANNEL: "a channel"}
 _HEAD = Struct("<BQ")
 _U32 = Struct("<I")
 
@@ -79,6 +88,9 @@ class _Walk:
         self.buffer, self.pos, self.base = b"", 0, 0
         self.crc, self.crc_pos = 0, 0  # of the bytes up to buffer[crc_pos]
         self.data_crc: bool | None = None  # None: still in the data section
+        self.defined: dict[tuple[type, int], Schema | Channel] = {}
+        self.small: list[bytes] = []  # the contents of small chunks, and the messages in them
+        self.small_size, self.positions = 0, list[int]()
 
     @property
     def offset(self) -> int:
@@ -103,6 +115,7 @@ class _Walk:
         self.base += self.pos
         parts = [self.buffer[self.pos :]]
         have = len(parts[0])
+        room(2 * count)
         while have < count:
             block = self.stream.read(max(BLOCK, count - have))
             if not block:
@@ -114,16 +127,23 @@ class _Walk:
     def records(self) -> Iterator[Record]:
         self._magic()
         while True:
+            step()
             self.need(9, "a record's head; its end is missing")
             opcode, length = _HEAD.unpack_from(self.buffer, self.pos)
-            if opcode == MESSAGE and self.data_crc is None:
-                self.need(9 + self._allowed(length), "a message")
-                yield self._run_of_messages()
+            self.need(9 + self._allowed(length), _NAMES.get(opcode, f"a record of type {opcode}"))
+            if self.data_crc is None and opcode in PARSED:
+                if opcode != CHUNK:
+                    yield from self._together()
+                if opcode == MESSAGE:
+                    yield self._run_of_messages()
+                    continue
+            elif opcode not in (DATA_END, FOOTER):  # an index, or in the summary
+                self.pos += 9 + length
                 continue
-            self.need(9 + self._allowed(length), f"a record of type {opcode}")
             at, start = self.offset, self.pos + 9
             content = self.buffer[start : start + length]
             if opcode == DATA_END and self.data_crc is None:
+                yield from self._together()
                 self._data_end(content)
             elif opcode == FOOTER:
                 self._footer(content)
@@ -158,17 +178,53 @@ class _Walk:
             positions, self.pos = message_positions(self.buffer, self.pos, len(self.buffer))
         except BadRecord as error:
             raise self.damaged(str(error)) from None
-        return batch(self.buffer, positions)
+        return self._in_calendar(batch(self.buffer, positions))
+
+    def _in_calendar(self, messages: Messages) -> Messages:
+        if len(messages) and messages.log_times.min() < 0:
+            raise self.damaged("a message claims to be logged after the year 2262")
+        return messages
+
+    def _together(self) -> Iterator[Messages]:
+        """The messages of the small chunks so far."""
+        if self.positions:
+            yield self._in_calendar(batch(b"".join(self.small), self.positions))
+        self.small, self.small_size, self.positions = [], 0, []
+
+    def _chunk(self, data: bytes) -> Iterator[Record]:
+        if len(data) >= SMALL or self.small_size > TOGETHER or len(self.positions) > MOST:
+            yield from self._together()
+        if len(data) < SMALL:
+            for part in chunk_parts(data):
+                if isinstance(part, list):
+                    self.positions += [self.small_size + at for at in part]
+                else:
+                    yield self._defined(part)
+            self.small.append(data)
+            self.small_size += len(data)
+            return
+        for record in chunk_records(data):
+            if isinstance(record, Messages):
+                yield self._in_calendar(record)
+            else:
+                yield self._defined(record)
+
+    def _defined(self, record: Record) -> Record:
+        """The same record, unless its id belongs to another schema or channel already."""
+        if isinstance(record, Schema | Channel):
+            known = self.defined.setdefault((type(record), record.id), record)
+            if known != record:
+                raise BadRecord(again(known, record))
+        return record
 
     def _data_record(self, opcode: int, content: bytes, at: int) -> Iterator[Record]:
         try:
             if opcode == CHUNK:
-                yield from chunk_records(chunk_content(content, self.limit)[0])
+                yield from self._chunk(chunk_content(content, self.limit)[0])
             elif opcode in PARSERS:
-                yield PARSERS[opcode](Fields(content))
+                yield self._defined(PARSERS[opcode](Fields(content)))
         except BadRecord as error:
-            names = {CHUNK: "a chunk", SCHEMA: "a schema", CHANNEL: "a channel"}
-            what = names.get(opcode, f"a record of type {opcode}")
+            what = _NAMES.get(opcode, f"a record of type {opcode}")
             raise self.damaged(f"{what} is damaged: {error}", at) from None
 
     def _data_end(self, content: bytes) -> None:
@@ -198,8 +254,15 @@ class _Walk:
             raise self.damaged(f"{self.size - self.offset} bytes follow after the end")
 
 
-def chunk_records(data: bytes, *, cut: bool = False) -> Iterator[Record]:
-    """Yields the schemas and channels of a decompressed chunk, then its messages as one batch.
+def again(known: Schema | Channel, other: Schema | Channel) -> str:
+    """Why a second definition under the id of a first is refused."""
+    what = type(known).__name__.lower()
+    names = [r.topic if isinstance(r, Channel) else r.name for r in (known, other)]
+    return f"{what} {known.id} is '{names[0][:80]}' and defined again as '{names[1][:80]}'"
+
+
+def chunk_records(data: bytes, *, cut: bool = False) -> Iterator[Schema | Channel | Messages]:
+    """Yields the schemas and channels of a decompressed chunk, and its messages in batches.
 
     Args:
         data: the chunk's content.
@@ -209,6 +272,22 @@ def chunk_records(data: bytes, *, cut: bool = False) -> Iterator[Record]:
         BadRecord: if the records do not fit the chunk.
     """
     positions: list[int] = []
+    for part in chunk_parts(data, cut=cut):
+        if not isinstance(part, list):
+            yield part
+            continue
+        positions += part
+        if len(positions) >= MOST:
+            yield batch(data, positions)
+            positions = []
+    yield batch(data, positions)
+
+
+def chunk_parts(data: bytes, *, cut: bool = False) -> Iterator[Schema | Channel | list[int]]:
+    """Yields the schemas and channels of a chunk, and where the messages between them start.
+
+    Arguments and errors are those of `chunk_records`.
+    """
     pos, end = 0, len(data)
     while pos < end:
         opcode, length = _HEAD.unpack_from(data, pos) if end - pos >= 9 else (0, end)
@@ -217,24 +296,26 @@ def chunk_records(data: bytes, *, cut: bool = False) -> Iterator[Record]:
                 break
             raise BadRecord("it ends inside a record")
         if opcode == MESSAGE:
-            more, pos = message_positions(data, pos, end)
-            positions.extend(more)
+            positions, pos = message_positions(data, pos, end)
+            yield positions
             continue
         if opcode in (SCHEMA, CHANNEL):
-            yield PARSERS[opcode](Fields(data[pos + 9 : pos + 9 + length]))
+            record = PARSERS[opcode](Fields(data[pos + 9 : pos + 9 + length]))
+            assert isinstance(record, Schema | Channel)
+            yield record
         pos += 9 + length
-    yield batch(data, positions)
+        step()
 
 
 def message_positions(buffer: bytes, pos: int, end: int) -> tuple[list[int], int]:
-    """Starts of the complete message records from `pos` on, and where they stop.
+    """Starts of the complete message records from `pos` on, at most MOST; and where they stop.
 
     Raises:
         BadRecord: for a message that is shorter than its header.
     """
     positions: list[int] = []
     append, unpack = positions.append, _HEAD.unpack_from
-    while end - pos >= 9:
+    while end - pos >= 9 and len(positions) < MOST:
         opcode, length = unpack(buffer, pos)
         if opcode != MESSAGE or length > end - pos - 9:
             break

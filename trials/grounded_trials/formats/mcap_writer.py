@@ -102,7 +102,7 @@ class CopyWriter(_Writer):
         rows = zip(*(column.tolist() for column in columns), strict=True)
         for start, end, log_time, publish_time, sequence in rows:
             data = batch.buffer[start:end]
-            self._writer.add_message(channel, log_time, data, publish_time, sequence)
+            self._writer.add_message(channel, log_time, data, publish_time % 2**64, sequence)
 
     def metadata(self, record: Metadata) -> None:
         """Adds a table."""

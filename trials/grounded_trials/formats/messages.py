@@ -18,6 +18,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from grounded_trials.formats.budget import room, step
+
 
 @dataclass(frozen=True)
 class Number:
@@ -96,8 +98,9 @@ class Dynamic:
 
 Type = Number | Text | Array | Struct | Dynamic
 
-ROW_LIMIT = 10_000_000  # values that one path may find in one batch of messages
-JSON_LIMIT = 16 * 2**20  # [bytes] of a message; parsed, JSON takes many times its size
+ROW_LIMIT, ROW_BYTES = 10_000_000, 64  # values that a path may find in a batch; while it does
+# [bytes] that parsed JSON takes at most: for each object, each other value, each byte of text
+OBJECT, VALUE, LETTER = 250, 90, 2
 
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
@@ -149,6 +152,10 @@ class Node:
         """The same values with other numbers for their rows."""
         return replace(self, rows=rows)
 
+    def sample(self) -> Any:
+        """The first row's value where only it tells the type (JSON); else None."""
+        return None
+
     def names(self) -> tuple[str, ...]:
         """The fields of a struct."""
         return tuple(self.type.by_name) if isinstance(self.type, Struct) else ()
@@ -174,6 +181,9 @@ def choose_items(counts: Ints, start: int, stop: int) -> tuple[Ints, Ints]:
         first = counts + start
         last = np.where(first < 0, first - 1, first)
     lengths = np.maximum(last - first + 1, 0)
+    if (total := int(lengths.sum())) > ROW_LIMIT:
+        raise BadPath(f"it finds {total} values at once; name the items that are meant")
+    room(ROW_BYTES * total)
     rows = np.repeat(np.arange(len(counts)), lengths)
     offset = np.arange(len(rows)) - np.repeat(np.cumsum(lengths) - lengths, lengths)
     return rows, first[rows] + offset
@@ -200,12 +210,14 @@ def json_messages(buffer: bytes, start: Ints, end: Ints) -> Node:
     Raises:
         BadMessage: for one that is not JSON.
     """
-    objects = []
+    objects, taken = [], 0
     for i, (a, b) in enumerate(zip(start.tolist(), end.tolist(), strict=True)):
-        if b - a > JSON_LIMIT:
-            raise BadMessage(i, f"it has {b - a} bytes of JSON, the limit is {JSON_LIMIT}")
+        text = buffer[a:b]
+        taken += OBJECT * text.count(b"{") + VALUE * (text.count(b",") + text.count(b"["))
+        taken += LETTER * len(text)
+        room(taken)
         try:
-            objects.append(json.loads(buffer[a:b]))
+            objects.append(json.loads(text))
         except (ValueError, RecursionError) as error:
             raise BadMessage(i, f"it is not JSON: {error}") from None
     return _JsonNode(Dynamic(), np.arange(len(objects)), _as_array(objects))
@@ -217,11 +229,16 @@ class _JsonNode(Node):
 
     objects: NDArray[np.object_]
 
+    def sample(self) -> Any:
+        """The first message, parsed."""
+        return self.objects[0]
+
     def names(self) -> tuple[str, ...]:
         """Those of the first row that is an object."""
         return next((tuple(o) for o in self.objects if isinstance(o, dict)), ())
 
     def field(self, name: str) -> _JsonNode:
+        step()
         index = [i for i, o in enumerate(self.objects) if isinstance(o, dict) and name in o]
         inner = _as_array([self.objects[i][name] for i in index])
         return replace(self, rows=self.rows[np.array(index, dtype=np.int64)], objects=inner)

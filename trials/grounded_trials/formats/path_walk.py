@@ -9,6 +9,7 @@ type.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import islice
 from typing import Any
@@ -30,6 +31,7 @@ from grounded_trials.formats.message_path import (
 )
 from grounded_trials.formats.messages import (
     Array,
+    BadMessage,
     BadPath,
     Bools,
     Dynamic,
@@ -43,6 +45,7 @@ from grounded_trials.formats.messages import (
 )
 
 SECONDS, NANOSECONDS = ("sec", "secs", "seconds"), ("nanosec", "nsec", "nsecs", "nanos")
+CALENDAR_S = 9_200_000_000  # 2^63 ns: the years 1678 to 2261
 STAMPS = (("header", "stamp"), ("stamp",), ("timestamp",), ("header", "timestamp"))
 QUATERNION = ("x", "y", "z", "w")
 
@@ -163,16 +166,26 @@ def is_time(type: Struct) -> bool:
 def evaluate(root: Node, bound: Bound, stamps: bool) -> Values:
     """Walks the messages; reads the stamps too where asked for."""
     node = walk(root, bound.before)
-    messages, numbered = node.rows, node.numbered(np.arange(len(node.rows)))
-    end = walk(numbered, bound.after)
-    rows, values = _apply(end, bound.functions)
-    names = _dynamic_stamp(numbered) if isinstance(root.type, Dynamic) else bound.stamp
-    if not stamps or names is None:
-        return Values(messages[rows], values, None)
-    place, times = read_stamp(walk(numbered, tuple(Field(name) for name in names)))
+    messages = node.rows
+    with _numbered(node) as numbered:
+        end = walk(numbered, bound.after)
+        rows, values = _apply(end, bound.functions)
+        names = _dynamic_stamp(numbered) if isinstance(root.type, Dynamic) else bound.stamp
+        if not stamps or names is None:
+            return Values(messages[rows], values, None)
+        place, times = read_stamp(walk(numbered, tuple(Field(name) for name in names)))
     at = np.searchsorted(place, rows)
     known = np.append(place, -1)[at] == rows
     return Values(messages[rows[known]], values[known], times[at[known]])
+
+
+@contextmanager
+def _numbered(node: Node) -> Iterator[Node]:
+    """The node with its rows counted from 0; what is wrong inside still names its message."""
+    try:
+        yield node.numbered(np.arange(len(node.rows)))
+    except BadMessage as error:
+        raise BadMessage(node.rows[error.message], str(error)) from None
 
 
 def _dynamic_stamp(root: Node) -> tuple[str, ...] | None:
@@ -208,19 +221,24 @@ def read_stamp(node: Node) -> tuple[Ints, Ints]:
     both = np.isin(seconds.rows, rest.rows), np.isin(rest.rows, seconds.rows)
     seconds, rest = seconds.keep(both[0]), rest.keep(both[1])
     whole, part = (n.numbers() for n in (seconds, rest))
+    outside = ~((np.abs(whole) <= CALENDAR_S) & (np.abs(part) < 2**32))
+    if outside.any():
+        k = int(np.argmax(outside))
+        when = f"{whole[k]:g} s and {part[k]:g} ns"
+        raise BadMessage(seconds.rows[k], f"its stamp, {when}, is outside the calendar")
     return seconds.rows, whole.astype(np.int64) * 10**9 + part.astype(np.int64)
 
 
 def _passes(node: Node, step: Filter) -> Bools:
     """Where a filter holds; rows in which its field is absent do not pass."""
-    inner = node.numbered(np.arange(len(node.rows)))
-    for name in step.path:
-        inner = inner.field(name)
-    if isinstance(step.value, str):
-        holds = inner.equals(step.value)
-        holds = ~holds if step.operator == "!=" else holds
-    else:
-        holds = _COMPARE[step.operator](inner.numbers(), step.value)
+    with _numbered(node) as inner:
+        for name in step.path:
+            inner = inner.field(name)
+        if isinstance(step.value, str):
+            holds = inner.equals(step.value)
+            holds = ~holds if step.operator == "!=" else holds
+        else:
+            holds = _COMPARE[step.operator](inner.numbers(), step.value)
     passes = np.zeros(len(node.rows), dtype=np.bool_)
     passes[inner.rows[holds]] = True
     return passes
@@ -254,9 +272,10 @@ def _apply(node: Node, functions: Sequence[Function]) -> tuple[Ints, Floats]:
 
 def _part(node: Node, name: str) -> Floats:
     """A number of a struct in each row; NaN where it is absent."""
-    inner = node.numbered(np.arange(len(node.rows))).field(name)
     values = np.full(len(node.rows), np.nan)
-    values[inner.rows] = inner.numbers()
+    with _numbered(node) as numbered:
+        inner = numbered.field(name)
+        values[inner.rows] = inner.numbers()
     return values
 
 
@@ -279,9 +298,9 @@ def _norm(node: Node) -> Floats:
         names = node.names()
     if names:
         return np.sqrt(sum((_part(node, name) ** 2 for name in names), np.zeros(len(node.rows))))
-    items = node.numbered(np.arange(len(node.rows))).items(0, -1)
-    squares = np.bincount(items.rows, items.numbers() ** 2, minlength=len(node.rows))
-    return np.sqrt(squares)
+    with _numbered(node) as numbered:
+        items = numbered.items(0, -1)
+        return np.sqrt(np.bincount(items.rows, items.numbers() ** 2, minlength=len(node.rows)))
 
 
 _NUMPY = {"asin": "arcsin", "acos": "arccos", "atan": "arctan"}  # where its name is another

@@ -13,8 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from grounded_trials.formats.budget import room, step
 from grounded_trials.formats.mcap_records import windows
 from grounded_trials.formats.messages import (
+    ROW_BYTES,
     ROW_LIMIT,
     Array,
     BadMessage,
@@ -141,6 +143,7 @@ def _occurrences(node: _ProtobufNode, number: int) -> tuple[Ints, Ints, Ints, In
     for _ in range(MOST_FIELDS):
         if not len(active):
             break
+        step()
         limit, message = node.end[active], node.rows[active]
         tag, pos = _varints(node.buffer, cursor[active], limit, message)
         wire = (tag & np.uint64(7)).astype(np.int64)
@@ -234,11 +237,13 @@ def _unpack(
         low, high = int(start[packed].min()), int(end[packed].max())
         if high - low > PACKED_LIMIT:
             raise BadMessage(int(node.rows[0]), f"lists of more than {PACKED_LIMIT} bytes")
+        room(10 * (high - low))  # each byte may be an item
         stops = np.flatnonzero(np.frombuffer(node.buffer[low:high], np.uint8) < 0x80) + 1 + low
         first = np.searchsorted(stops, start, "right")
         counts = np.where(packed, np.searchsorted(stops, end, "right") - first, 1)
     if int(counts.sum()) > ROW_LIMIT:
         raise BadMessage(int(node.rows[0]), f"lists of more than {ROW_LIMIT} numbers")
+    room(ROW_BYTES * int(counts.sum()))
     which = np.repeat(np.arange(len(owner)), counts)
     index = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)
     inside = packed[which]

@@ -8,7 +8,6 @@ convention, and a log that mixes them is wrong.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
@@ -17,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from grounded.errors import GroundedError
+from grounded_trials.formats.budget import OverBudget, keep
 from grounded_trials.formats.mcap_records import Channel, Header, Messages, Metadata, Schema
 from grounded_trials.formats.mcap_walk import DamagedFile
 from grounded_trials.formats.message_path import is_topic, parse_path
@@ -29,11 +29,12 @@ from grounded_trials.formats.messages import (
     Ints,
 )
 from grounded_trials.formats.path_walk import Bound, bind, evaluate, number_paths
-from grounded_trials.logs.log_files import log_files, log_records
+from grounded_trials.logs.log_files import log_records, reading
 from grounded_trials.logs.signals import Decoder, decoder_of
 
 NOISE_SAMPLES = 10  # in a batch, to tell a signal's noise
 DECODED = 20_000  # messages of a topic whose numbers are looked at
+TIME_BYTES = 40  # that a message's times take until the report
 GAP = 10.0  # intervals; a longer gap is remarked on
 SKEW_S = 0.1  # a header stamp further from the log's clock is remarked on
 
@@ -190,19 +191,19 @@ def inspect_log(paths: str | Path | Sequence[str | Path]) -> LogReport:
     Raises:
         GroundedError: if a file can't be read, or is no log at all.
     """
-    files = log_files(paths)
     look = _Look()
-    for path in files:
-        look.new_file()
-        try:
-            for record in log_records(path):
-                look.add(record)
-        except DamagedFile as error:
-            if not look.headers:
-                raise
-            look.damage = str(error)
-            break
-    return look.report(files)
+    with reading(paths) as files:
+        for path in files:
+            look.new_file()
+            try:
+                for record in log_records(path):
+                    look.add(record)
+            except DamagedFile as error:
+                if not look.headers:
+                    raise
+                look.damage = str(error)
+                break
+        return look.report(files)
 
 
 class _Look:
@@ -277,6 +278,7 @@ class _Range:
 
     def add(self, values: Floats, log_times: Ints) -> None:
         if self.samples is not None:
+            keep(16 * len(values))
             self.samples.append((log_times, values))
         finite = values[np.isfinite(values)]
         self.count += len(values)
@@ -304,6 +306,7 @@ class _Topic:
 
     def add(self, batch: Messages) -> None:
         self.count += len(batch)
+        keep(TIME_BYTES * len(batch))
         self.log_times.append(batch.log_times)
         if self.problem or not len(batch):
             return
@@ -312,15 +315,16 @@ class _Topic:
         chosen[::stride] = True
         self.looked += int(chosen.sum())
         try:
-            self._look(batch.take(chosen))
+            if self.decoder is None:
+                self.decoder = decoder_of(self.channel, self.schema)
+                self._find_paths(batch)
+            for part in self.decoder.parts(batch.take(chosen)):
+                self._look(self.decoder, part)
         except (BadSchema, BadMessage, BadPath) as error:
             self.problem = str(error)
 
-    def _look(self, batch: Messages) -> None:
-        if self.decoder is None:
-            self.decoder = decoder_of(self.channel, self.schema)
-            self._find_paths(batch)
-        root = self.decoder.root(batch.buffer, batch.starts, batch.ends)
+    def _look(self, decoder: Decoder, batch: Messages) -> None:
+        root = decoder.root(batch.buffer, batch.starts, batch.ends)
         for i, found in enumerate(self.ranges.values()):
             try:
                 values = evaluate(root, found.bound, stamps=i == 0)
@@ -334,10 +338,7 @@ class _Topic:
         assert self.decoder is not None
         sample = None
         if isinstance(self.decoder.type, Dynamic):
-            try:
-                sample = json.loads(batch.buffer[batch.starts[0] : batch.ends[0]])
-            except (ValueError, RecursionError) as error:
-                raise BadMessage(0, f"it is not JSON: {error}") from None
+            sample = self.decoder.root(batch.buffer, batch.starts[:1], batch.ends[:1]).sample()
         topic = self.channel.topic if is_topic(self.channel.topic) else f'"{self.channel.topic}"'
         for rest in number_paths(self.decoder.type, sample):
             try:
@@ -345,8 +346,11 @@ class _Topic:
                 found = _Range(bind(path, self.decoder.type))
                 found.samples = [] if kind_of(path.text) else None
                 self.ranges[path.text] = found
-            except (GroundedError, BadPath):
+            except BadPath:
                 continue
+            except GroundedError as error:
+                if isinstance(error, OverBudget):
+                    raise
 
     def report(self, start: int) -> TopicReport:
         t = np.concatenate(self.log_times) if self.log_times else np.zeros(0, dtype=np.int64)

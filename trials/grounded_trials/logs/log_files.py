@@ -11,16 +11,20 @@ import re
 import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
 from grounded.errors import GroundedError, nearest
+from grounded_trials.formats.budget import budget
 from grounded_trials.formats.mcap_records import Messages, Metadata, Record
 from grounded_trials.formats.mcap_walk import MAGIC, read_records
+from grounded_trials.plain_file import open_file, read_file
 
 BAGS = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")  # files of a bag's folder
 KINDS = (*BAGS, ".bag", ".csv", ".npz", ".ulg")
 EXPANDED = 4 * 2**30  # bytes of a compressed file, at most
+LISTING_LIMIT = 2**24  # [bytes] of a metadata.yaml
 _ZSTD = b"\x28\xb5\x2f\xfd"
 _LISTED = re.compile(
     r"^\s*-\s+(?:path:\s*)?[\"']?([^\"'\s#]+\.(?:mcap|db3)(?:\.zstd)?)[\"']?\s*$", re.MULTILINE
@@ -53,7 +57,7 @@ def log_files(paths: str | Path | Sequence[str | Path]) -> tuple[Path, ...]:
 def _bag(folder: Path) -> list[Path]:
     listing = folder / "metadata.yaml"
     try:
-        text = listing.read_text("utf-8") if listing.exists() else ""
+        text = read_file(listing, LISTING_LIMIT).decode() if listing.exists() else ""
         found = [[p for p in folder.iterdir() if p.name.endswith(kind)] for kind in BAGS]
     except (OSError, UnicodeDecodeError) as error:
         raise GroundedError(f"{folder} can't be read as a bag: {error}") from None
@@ -97,10 +101,10 @@ def open_log(path: Path) -> BinaryIO:
     """Opens a log for reading.
 
     Raises:
-        GroundedError: if it can't be.
+        GroundedError: if it can't be, or is no file at all (a pipe, a device).
     """
     try:
-        return path.open("rb")
+        return open_file(path)
     except FileNotFoundError:
         raise GroundedError(f"{path} does not exist{_nearby(path)}") from None
     except IsADirectoryError:
@@ -180,17 +184,30 @@ def _expand(path: Path, stream: BinaryIO, target: Path) -> None:
         raise GroundedError(f"{path} can't be decompressed: {error}") from None
 
 
+@contextmanager
+def reading(paths: str | Path | Sequence[str | Path]) -> Iterator[tuple[Path, ...]]:
+    """The files of a log, and a budget of time and memory for what is decoded of them.
+
+    Raises:
+        GroundedError: as `log_files`, and where the budget is used up.
+    """
+    files = log_files(paths)
+    with budget(str(files[0]), files):
+        yield files
+
+
 def kind_of(path: Path) -> str:
     """The `format` that a file of ours states ahead of its messages, "" for any other file.
 
     Damage is not judged here: whoever reads the file does that.
     """
     try:
-        for record in log_records(path):
-            if isinstance(record, Metadata) and record.name == "grounded":
-                return record.data.get("format", "")
-            if isinstance(record, Messages):
-                return ""
+        with reading(path):
+            for record in log_records(path):
+                if isinstance(record, Metadata) and record.name == "grounded":
+                    return record.data.get("format", "")
+                if isinstance(record, Messages):
+                    return ""
     except GroundedError:
         return ""
     return ""

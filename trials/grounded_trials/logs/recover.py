@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import IO
 
 from grounded.errors import GroundedError
+from grounded_trials.formats.budget import OverBudget, budget, keep
 from grounded_trials.formats.mcap_records import (
     Attachment,
     Channel,
@@ -32,6 +33,8 @@ from grounded_trials.store.candidate_file import read_candidate
 from grounded_trials.store.own_files import TRIAL
 from grounded_trials.store.store import sync_folder
 from grounded_trials.wording import count
+
+MOST_LOSSES = 50  # that are told one by one
 
 
 @dataclass(frozen=True)
@@ -70,7 +73,7 @@ def recover_log(source: str | Path, target: str | Path) -> Recovery:
     source, target = Path(source), Path(target)
     if target.exists():
         raise GroundedError(f"{target} exists already; name a file that does not")
-    with open_log(source) as stream:
+    with open_log(source) as stream, budget(str(source), [source]):
         salvage = Salvage(stream, str(source))
         try:
             with target.open("xb") as out:
@@ -79,8 +82,10 @@ def recover_log(source: str | Path, target: str | Path) -> Recovery:
                     copy.add(record)
                 copy.finish()
             sync_folder(target.parent)
-        except OSError as error:
+        except (OSError, OverBudget) as error:
             target.unlink(missing_ok=True)
+            if isinstance(error, OverBudget):
+                raise
             raise GroundedError(f"{target} can't be written: {error.strerror}") from None
     if not copy.anything:
         target.unlink()
@@ -89,7 +94,9 @@ def recover_log(source: str | Path, target: str | Path) -> Recovery:
             f"{source}: there is nothing to save: {why}; expected an MCAP log, whole or damaged: "
             "look for another copy of the recording"
         )
-    losses = list(salvage.losses)
+    losses = salvage.losses[:MOST_LOSSES]
+    if more := len(salvage.losses) - len(losses):
+        losses.append(f"{more} more of these kinds")
     if copy.homeless:
         these = count(copy.homeless, "message")
         losses.append(f"{these} of topics whose name and type are lost")
@@ -120,7 +127,7 @@ def _own(found: Recovery, copy: _Copy) -> Recovery:
 def _hole(copy: _Copy, states: int) -> bool:
     """Whether the saved states do not follow each other from the start, step by step."""
     try:
-        start, step = int(copy.meta["start_ns"]), float(copy.meta["dt"]) * 1e9
+        start, step = max(int(copy.meta["start_ns"]), 0), float(copy.meta["dt"]) * 1e9
         first, last = copy.span or (start, start)
         return first - start > step / 2 or abs((last - first) / step - (states - 1)) > 0.5
     except (KeyError, ValueError, ZeroDivisionError, OverflowError):
@@ -144,6 +151,7 @@ class _Copy:
         self.channels: dict[int, Channel] = {}
         self.numbers: dict[int, int] = {}
         self.waiting: list[Messages] = []
+        self.last = b""  # the buffer of the last of them
         self.counts: Counter[str] = Counter()
         self.homeless = 0
         self.anything = False
@@ -190,6 +198,8 @@ class _Copy:
                 if final:
                     self.homeless += len(own)
                 else:
+                    keep(len(own.buffer) if own.buffer is not self.last else 40 * len(own))
+                    self.last = own.buffer
                     self.waiting.append(own)
                 continue
             if identity not in self.numbers:

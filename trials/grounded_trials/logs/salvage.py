@@ -15,6 +15,7 @@ from typing import BinaryIO
 
 import numpy as np
 
+from grounded_trials.formats.budget import step
 from grounded_trials.formats.mcap_records import (
     ATTACHMENT,
     CHUNK,
@@ -26,9 +27,11 @@ from grounded_trials.formats.mcap_records import (
     METADATA,
     PARSERS,
     BadRecord,
+    Channel,
     Fields,
     Messages,
     Record,
+    Schema,
     batch,
     chunk_content,
     decompress_part,
@@ -36,6 +39,7 @@ from grounded_trials.formats.mcap_records import (
 from grounded_trials.formats.mcap_walk import (
     MAGIC,
     RECORD_LIMIT,
+    again,
     chunk_records,
     message_positions,
 )
@@ -46,7 +50,7 @@ _NAMES = {1: "the header", 3: "a schema", 4: "a channel", 5: "a message", 6: "a 
 _NAMES |= {9: "an attached file", 12: "a table of metadata"}
 BATCH = 2**22  # [bytes] of messages outside chunks that are handed on together
 CHAIN = 3  # records in a row that make a place believed
-_BLOCK = 2**20
+_BLOCKS = (2**9, 2**20)  # [bytes] that are searched at once: growing, since gaps may be many
 
 
 class Salvage:
@@ -68,13 +72,16 @@ class Salvage:
         self._outside = 0  # messages outside checked chunks, which only the data checksum covers
         self._tables = 0  # metadata and attached files, likewise
         self._ended = False  # the data are over: what follows is an index
-        self._pending: list[bytes] = []  # messages outside chunks
+        self._pending, self._waiting = list[bytes](), 0  # messages outside chunks; their bytes
+        self._defined: dict[tuple[type, int], Schema | Channel] = {}
+        self._doubtful: set[int] = set()  # channels that are defined twice
 
     def records(self) -> Iterator[Record]:
         """Yields what can be saved, in file order."""
         pos = self._first()
         dropped_chunk = False
         while pos is not None and pos < self.size - len(MAGIC):
+            step()
             end = plausible(self.stream, self.size, pos)
             if end is None:
                 yield from self._flush()
@@ -132,7 +139,7 @@ class Salvage:
             elif opcode in PARSERS:
                 record = PARSERS[opcode](Fields(content))
                 self._tables += opcode in (METADATA, ATTACHMENT)
-                yield record
+                yield from self._sound(record)
         except BadRecord as error:
             what = _NAMES.get(opcode, f"a record of type {opcode}")
             self.losses.append(f"{what} was dropped, at byte {pos}: {error}")
@@ -144,19 +151,39 @@ class Salvage:
         for record in list(chunk_records(data)):
             if isinstance(record, Messages) and not checked:
                 self._outside += len(record)
-            yield record
+            yield from self._sound(record)
+
+    def _sound(self, record: Record) -> Iterator[Record]:
+        """The record without what nobody can place: whose channel, and when."""
+        if isinstance(record, Schema | Channel):
+            known = self._defined.setdefault((type(record), record.id), record)
+            if known != record:
+                self.losses.append(f"{again(known, record)}: what follows under it is left out")
+                self._doubtful |= {
+                    c.id
+                    for c in self._defined.values()
+                    if isinstance(c, Channel) and record.id in (c.id, c.schema_id)
+                }
+                return
+        elif isinstance(record, Messages):
+            good = (record.log_times >= 0) & ~np.isin(record.channels, list(self._doubtful))
+            if not good.all():
+                self.losses.append(f"{int((~good).sum())} messages of an unknown channel or time")
+                record = record.take(good)
+        yield record
 
     def _message(self, content: bytes) -> Iterator[Record]:
         self._pending.append(_HEAD.pack(MESSAGE, len(content)) + content)
+        self._waiting += len(content) + 9
         self._outside += 1
-        if len(self._pending) * (len(content) + 9) > BATCH:
+        if self._waiting > BATCH:
             yield from self._flush()
 
     def _flush(self) -> Iterator[Record]:
         if self._pending:
             data = b"".join(self._pending)
-            self._pending = []
-            yield batch(data, message_positions(data, 0, len(data))[0])
+            self._pending, self._waiting = [], 0
+            yield from self._sound(batch(data, message_positions(data, 0, len(data))[0]))
 
     def _data_end(self, record: bytes) -> None:
         stated = int.from_bytes(record[9:13], "little")
@@ -206,7 +233,8 @@ class Salvage:
             return
         data = decompress_part(compression, content[fields.pos + 8 :], RECORD_LIMIT)
         try:
-            yield from list(chunk_records(data, cut=True))
+            for record in list(chunk_records(data, cut=True)):
+                yield from self._sound(record)
         except BadRecord:
             return
 
@@ -249,17 +277,20 @@ def is_chunk(start: bytes, length: int) -> bool:
 
 def next_chain(stream: BinaryIO, size: int, start: int) -> int | None:
     """The first offset from `start` on where records follow each other again; None: nowhere."""
-    for block in range(start, size, _BLOCK):
-        data = np.frombuffer(read_at(stream, block, _BLOCK + 8), dtype=np.uint8)
+    block, count = start, _BLOCKS[0]
+    while block < size:
+        step()
+        data = np.frombuffer(read_at(stream, block, count + 8), dtype=np.uint8)
         if len(data) < 9:
             return None
         opcodes = data[: len(data) - 8]
         maybe = (opcodes > 0) & (opcodes <= DATA_END)
         for i in range(5, 9):  # lengths are below 2^32
             maybe &= data[i : len(data) - 8 + i] == 0
-        for i in np.flatnonzero(maybe[:_BLOCK]).tolist():
+        for i in np.flatnonzero(maybe[:count]).tolist():
             if _is_chain(stream, size, block + i):
                 return int(block + i)
+        block, count = block + count, min(8 * count, _BLOCKS[1])
     return None
 
 

@@ -20,6 +20,7 @@ from grounded_trials.logs.signals import Series, SignalSpec
 
 GAP_INTERVALS, GAP_STEPS, GAP_S = 5.0, 3.0, 0.1  # a gap, without max_age_s: more than all these
 JUMP_S = 1.0  # a clock that goes back by more was set, or a simulation was started again
+NEAR_0_S = 10.0  # a clock whose stamps come nearer to 0 may show 0 itself: it was not unset
 MIXED_S = 1.0  # signals on different clocks whose clocks differ by more don't fit each other
 SKEW_S = 0.1  # and by more than this, they may be shifted
 BRIDGED = 1.9  # a value between samples this many intervals apart was bridged
@@ -129,11 +130,10 @@ def tidy(name: str, series: Series, *, unwrap: bool) -> Samples:
     """
     spec, t = series.spec, series.t
     finite = np.isfinite(series.values)
-    stamped = t != 0 if (t != 0).any() else np.ones(len(t), dtype=np.bool_)
-    if len(t) > 1 and t[0] == 0 and 0 < t[1] < JUMP_S * 1e9:
-        stamped[0] = True  # a clock that begins with the log: simulation time, or a table's
     if not (t != 0).any() and len(t) > 1:
         raise _unusable(name, spec, f"all its {spec.clock} stamps are 0; use another clock")
+    nearest = np.abs(t[t != 0]).min(initial=2**62)
+    stamped = (t != 0) | (nearest < NEAR_0_S * 1e9)  # simulation time runs through 0
     good = finite & stamped
     if not good.any():
         raise _unusable(name, spec, f"none of its {len(t)} values is a finite number")

@@ -7,7 +7,7 @@ it was logged, when it was published, and its header's stamp.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 
 from grounded.errors import GroundedError, NextCommand, nearest
+from grounded_trials.formats.budget import keep
 from grounded_trials.formats.cdr import cdr_messages, ros1_messages
 from grounded_trials.formats.mcap_records import Channel, Messages, Schema
 from grounded_trials.formats.message_path import MessagePath, parse_path
@@ -33,10 +34,11 @@ from grounded_trials.formats.messages import (
 from grounded_trials.formats.path_walk import Bound, Values, bind, evaluate
 from grounded_trials.formats.protobuf import protobuf_messages
 from grounded_trials.formats.schemas import struct_of
-from grounded_trials.logs.log_files import log_files, log_records
+from grounded_trials.logs.log_files import log_records, reading
 
 Clock = Literal["header", "log", "publish"]
-SAMPLE_LIMIT = 100_000_000  # of one signal
+SAMPLE_BYTES = 48  # that a sample takes until it is on the grid
+JSON_PIECE = 2**20  # [bytes] of JSON that are parsed at once, or one message
 
 
 @dataclass(frozen=True)
@@ -85,18 +87,19 @@ def read_signals(
             than one value for a signal, a clock that a topic does not have.
     """
     collectors = {name: _Collector(name, spec) for name, spec in specs.items()}
-    for path in log_files(paths):
-        log = _Log(str(path), list(collectors.values()))
-        for record in log_records(path):
-            if isinstance(record, Schema):
-                log.schemas[record.id] = record
-            elif isinstance(record, Channel):
-                log.channel(record)
-            elif isinstance(record, Messages):
-                log.messages(record)
-        for collector in collectors.values():
-            collector.topics |= set(log.topics)
-    return {name: collector.series() for name, collector in collectors.items()}
+    with reading(paths) as files:
+        for path in files:
+            log = _Log(str(path), list(collectors.values()))
+            for record in log_records(path):
+                if isinstance(record, Schema):
+                    log.schemas[record.id] = record
+                elif isinstance(record, Channel):
+                    log.channel(record)
+                elif isinstance(record, Messages):
+                    log.messages(record)
+            for collector in collectors.values():
+                collector.topics |= set(log.topics)
+        return {name: collector.series() for name, collector in collectors.items()}
 
 
 class _Log:
@@ -137,18 +140,24 @@ class _Log:
         for identity, (decoder, wanting) in self.wanted.items():
             if identity not in present:
                 continue
-            own = batch.of(identity)
+            for part in decoder.parts(batch.of(identity)):
+                self._collect(decoder, wanting, part, self.channels[identity])
+
+    def _collect(
+        self, decoder: Decoder, wanting: list[_Collector], own: Messages, channel: Channel
+    ) -> None:
+        collector = wanting[0]
+        try:
+            root = decoder.root(own.buffer, own.starts, own.ends)
             for collector in wanting:
-                try:
-                    collector.collect(decoder, own)
-                except BadMessage as error:
-                    raise GroundedError(
-                        f"{self.name}: a message of {decoder.topic} ({decoder.name}) logged at "
-                        f"{own.log_times[error.message] * 1e-9:.3f} s does not fit its "
-                        f"definition: {error}"
-                    ) from None
-                except BadPath as error:
-                    raise self._misfit(self.channels[identity], collector, error) from None
+                collector.collect(root, decoder, own)
+        except BadMessage as error:
+            raise GroundedError(
+                f"{self.name}: a message of {decoder.topic} ({decoder.name}) logged at "
+                f"{own.log_times[error.message] * 1e-9:.3f} s does not fit its definition: {error}"
+            ) from None
+        except BadPath as error:
+            raise self._misfit(channel, collector, error) from None
 
     def _misfit(self, channel: Channel, collector: _Collector, error: Exception) -> GroundedError:
         name = self.topics[channel.topic]
@@ -166,6 +175,15 @@ class Decoder:
     name: str  # of the message type
     type: Type
     root: Callable[[bytes, Ints, Ints], Node] = field(repr=False)
+
+    def parts(self, batch: Messages) -> Iterator[Messages]:
+        """A batch in pieces that may be decoded at once: parsed, JSON takes many times its size."""
+        if not isinstance(self.type, Dynamic) or not len(batch):
+            yield batch
+            return
+        piece = np.cumsum(batch.ends - batch.starts) // JSON_PIECE
+        for number in np.unique(piece):
+            yield batch.take(piece == number)
 
 
 _READERS: dict[str, Callable[[bytes, Struct, Ints, Ints], Node]] = {
@@ -202,7 +220,7 @@ class _Collector:
         self.path: MessagePath = parse_path(spec.path)
         self.bound: dict[int, Bound] = {}
         self.parts: list[tuple[Ints, Floats, Ints]] = []
-        self.count = self.messages = 0
+        self.messages = 0
         self.type, self.stamped = "", False
         self.topics: set[str] = set()
 
@@ -214,9 +232,8 @@ class _Collector:
         if self.spec.clock == "header" and not self.stamped and not dynamic:
             raise BadPath('messages have no header stamp; set clock = "log" (or "publish") for it')
 
-    def collect(self, decoder: Decoder, batch: Messages) -> None:
+    def collect(self, root: Node, decoder: Decoder, batch: Messages) -> None:
         self.messages += len(batch)
-        root = decoder.root(batch.buffer, batch.starts, batch.ends)
         found = evaluate(root, self.bound[id(decoder)], self.spec.clock == "header")
         if len(found.rows) > 1 and (np.diff(found.rows) == 0).any():
             at = int(found.rows[np.argmax(np.diff(found.rows) == 0)])
@@ -224,16 +241,17 @@ class _Collector:
                 f"the message logged at {batch.log_times[at] * 1e-9:.3f} s has several values for "
                 'it; name one item, or add a filter such as {name=="arm"}'
             )
-        self.count += len(found.rows)
-        if self.count > SAMPLE_LIMIT:
-            raise BadPath(f"it has more than {SAMPLE_LIMIT} samples")
+        keep(SAMPLE_BYTES * len(found.rows))
         self.parts.append((self._times(batch, found), found.values, batch.log_times[found.rows]))
 
     def _times(self, batch: Messages, found: Values) -> Ints:
         if self.spec.clock == "log":
             return batch.log_times[found.rows]
         if self.spec.clock == "publish":
-            return batch.publish_times[found.rows]
+            times = batch.publish_times[found.rows]
+            if (times < 0).any():
+                raise BadMessage(found.rows[np.argmax(times < 0)], "published after the year 2262")
+            return times
         if found.stamps is None:
             raise BadPath('messages have no header stamp; set clock = "log" (or "publish") for it')
         return found.stamps

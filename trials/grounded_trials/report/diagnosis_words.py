@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
-from grounded.diagnosis.report import Diagnosis, Gap, Split
-from grounded_trials.wording import count, figure, percent, with_unit
+from grounded.diagnosis.report import Correction, Diagnosis, Estimate, Gap, Split
+from grounded.instruments.finding import Finding
+from grounded_trials.wording import count, figure, percent, shown, with_unit
 
 MOST = 3  # parameters that are named
 WHITE = 0.01  # p-value below which what is left is no longer taken for white noise
@@ -20,9 +21,9 @@ HORIZONS = {"one_step": "one step", "horizon": "{}", "whole_run": "whole run ({}
 
 
 def error_lines(diagnosis: Diagnosis, before: Mapping[str, float]) -> list[tuple[str, str]]:
-    """(title, text): the gap, what the error is made of, whether the rest is noise, and so on.
+    """(title, text): what was calibrated, how utilities are predicted, what acts alike.
 
-    Nothing where no cause could be named: with too little data, what was fitted is no finding.
+    Nothing where no cause could be named: with too little data, what was fitted is not a finding.
 
     Args:
         diagnosis: what was found.
@@ -31,15 +32,8 @@ def error_lines(diagnosis: Diagnosis, before: Mapping[str, float]) -> list[tuple
     if diagnosis.no_cause:
         return []
     found = []
-    if diagnosis.gap.measured:
-        found.append(("gap", gap_sentence(diagnosis.gap)))
     if text := calibrated_sentence(diagnosis, before):
         found.append(("parameters", text))
-    where = diagnosis.where
-    if where.split:
-        found.append(("error", parts_sentence(where.split)))
-    if where.whiteness:
-        found.append(("rest", whiteness_sentence(where.whiteness)))
     if text := utility_sentence(diagnosis):
         found.append(("utility", text))
     for effect in dict.fromkeys(one.effect for one in diagnosis.lookalikes):
@@ -49,6 +43,87 @@ def error_lines(diagnosis: Diagnosis, before: Mapping[str, float]) -> list[tuple
         ]
         found.append(("alike", f"{', '.join(like)} of the signal of {effect}"))
     return found
+
+
+Cells = tuple[str, ...]
+
+
+def error_table(diagnosis: Diagnosis) -> tuple[list[Cells], Cells]:
+    """(rows, header): held-out prediction errors a second ahead and over whole trials, in units."""
+    ahead = [row for row in diagnosis.prediction_error if not row.whole_trial][-1:]
+    whole = [row for row in diagnosis.prediction_error if row.whole_trial]
+    rows: list[Cells] = []
+    for row in (*ahead, *whole):
+        when = "whole trial" if row.whole_trial else f"{row.horizon_s:.3g} s ahead"
+        for name, unit in row.unit_by_channel.items():
+            if math.isnan(row.crude.get(name, math.nan)):
+                continue  # never measured
+            columns = (row.crude, row.calibrated, row.with_effects, row.noise_floor)
+            figures = (_cell(column.get(name, math.nan)) for column in columns)
+            rows.append((f"{name}, {when}", *figures, shown(unit)))
+    calibrated = any(row.calibrated for row in ahead)
+    header: Cells = ("error (rms)", "crude", "calibrated", "as diagnosed", "noise", "unit")
+    if not calibrated:
+        return [(*r[:2], *r[3:]) for r in rows], (*header[:2], *header[3:])
+    return rows, header
+
+
+def _cell(value: float) -> str:
+    return figure(value, 3) if math.isfinite(value) else "-"
+
+
+def credit_of(diagnosis: Diagnosis, effect: str) -> str:
+    """What predictions lose without a cause, in percent of what they gain; "" if it has none."""
+    return next((percent(c.share) for c in diagnosis.credit if c.of == effect), "")
+
+
+def correction_line(correction: Correction) -> str:
+    """What a correction does, and that it is none of the causes."""
+    over = " and ".join(correction.over)
+    gain = f"takes away {percent(correction.held_out_gain)} of the held-out squared error"
+    if not correction.adoptable:
+        return f"a curve of {correction.channel} over {over} predicts held-out trials no better"
+    return f"correction:{correction.channel}, a curve over {over}, {gain}; it is no cause"
+
+
+def agreement_lines(diagnosis: Diagnosis) -> list[tuple[str, str]]:
+    """What changed between two groups of trials, or the values that trials do not share."""
+    if diagnosis.changed is not None:
+        rows = [
+            (
+                "changed",
+                f"{one.effect}: {one.quantity} = {_with_spread(one.first)} in the first trials, "
+                f"{_with_spread(one.second)} in the second ({figure(one.evidence, 3)} nats)",
+            )
+            for one in diagnosis.changed
+        ]
+        return rows or [("changed", "nothing that these trials show")]
+    found = []
+    for one in diagnosis.agreement:
+        if not one.agrees:
+            values = [v for v in diagnosis.per_trial if v.effect == one.effect]
+            values = [v for v in values if v.quantity == one.quantity]
+            low, high = (f(values, key=lambda v: v.value) for f in (min, max))
+            text = (
+                f"not in {one.quantity} of {one.effect}: {figure(low.value, 3)} in {low.trial}, "
+                f"{with_unit(figure(high.value, 3), one.estimate.unit)} in {high.trial}"
+            )
+            found.append(("agreement", text + f"; it {one.goes_with}" * bool(one.goes_with)))
+    return found
+
+
+def _with_spread(estimate: Estimate) -> str:
+    text = f"{figure(estimate.value, 3)} +- {figure(estimate.std, 2)}"
+    return with_unit(text, estimate.unit)
+
+
+def instrument_lines(findings: Iterable[Finding]) -> list[str]:
+    """Each finding with its signal, whether it was corrected, and the key of [log] that does so."""
+    lines = []
+    for one in findings:
+        done = "; corrected here" * one.corrected
+        lines.append(f"{one.signal}: {one.finding}{done}{f', in [log]: {one.log}' * bool(one.log)}")
+    return lines
 
 
 def gap_sentence(gap: Gap) -> str:

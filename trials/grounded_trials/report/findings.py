@@ -15,11 +15,13 @@ from grounded.diagnosis.report import Diagnosis
 from grounded.errors import NextCommand
 from grounded.frozen import Array
 from grounded.model import Model
+from grounded.search.candidate import Candidate, Tried
 from grounded.search.planner import Planner
-from grounded.search.standing import Candidate, Standing, Tried
+from grounded.search.standing import Standing
 from grounded.task import Task
 from grounded.trial import Trial, mean_trial
-from grounded_trials.wording import figure, rendered, shown
+from grounded_trials.report.scene import scene_of
+from grounded_trials.wording import figure, rendered, shown, with_unit
 from grounded_trials.workspace.adopting import Better
 from grounded_trials.workspace.folder import Lost
 from grounded_trials.workspace.next_step import Since
@@ -66,10 +68,10 @@ class Findings:
     lost: tuple[Lost, ...]
     diagnosis: Diagnosis | None
     optimum: float | None  # of the real system, where a study computed it
-    noise: float  # standard deviation of one trial's utility, NaN while unknown
     then: NextCommand
     better: Better | None = None  # the model as diagnosed, or with adopted effects
     since: Since = field(default_factory=Since)  # the diagnosis
+    discarded: tuple[str, ...] = ()  # trials that were set aside
     folder: str | None = None  # as the user named it, None where it is the current one
 
     @property
@@ -148,6 +150,59 @@ def compared(findings: Findings) -> list[tuple[str, Run]]:
     if first is not None and best is not None and first.candidate is best.candidate:
         return [("model", first)]
     return [(role, run) for role, run in (("model", first), ("best", best)) if run is not None]
+
+
+@dataclass(frozen=True)
+class Improved:
+    """An rms error of the first trial and of the best one, in one unit; NaN before there is one."""
+
+    what: str
+    unit: str
+    before: float
+    after: float
+
+    @property
+    def text(self) -> str:
+        """`17 cm → 0.5 cm`: lengths in mm or cm where they are small."""
+        parts = [_length(v) if self.unit == "m" else (v, self.unit) for v in self._known]
+        return " → ".join(with_unit(figure(v, 2), unit) for v, unit in parts)
+
+    @property
+    def _known(self) -> list[float]:
+        return [v for v in (self.before, self.after) if np.isfinite(v)]
+
+
+def _length(metres: float) -> tuple[float, str]:
+    if metres >= 1.0:
+        return metres, "m"
+    return (1e2 * metres, "cm") if metres >= 1e-3 else (1e3 * metres, "mm")
+
+
+def improvements_in(findings: Findings) -> list[Improved]:
+    """What the reward weighs, rms over the run: of the model's own policy, and of the best trial.
+
+    The position comes first, as one distance; then the other weighted states that have a target.
+    """
+    task, scene = findings.task, scene_of(findings.task.model)
+    runs, names = compared(findings), list(task.model.states.items())
+    known = set(tracked(task))
+    weighed = {i for i in known if task.reward.state[i] or task.reward.terminal[i]}
+    position = [i for i in scene.axes if i in known] if scene.spatial else []
+    groups = [(position, "distance from the desired position")] if len(position) > 1 else []
+    rest = sorted(weighed - set(position if groups else ()))
+    groups += [([i], f"{names[i][0]}, off its target") for i in rest]
+    found = []
+    for states, what in groups:
+        missed = [
+            float(np.linalg.norm(rms(tracking_error(task, r.trial)[:, states]))) for _, r in runs
+        ]
+        if missed:
+            short = [r.label for _, r in runs if r.trial.finite_steps < task.horizon]
+            note = f"; {', '.join(short)} ended early" if short else ""
+            before = missed[0] if len(missed) > 1 else float("nan")
+            unit = shown(names[states[0]][1])
+            found.append(Improved(f"{what}, rms{note}", unit, before, missed[-1]))
+    return found
 
 
 def by_state(

@@ -29,9 +29,9 @@ class Forecast:
     def curve(self, column: int, dt: float) -> tuple[Array, Array]:
         """Times [s] and values of one state, windows in a row with NaN between."""
         values = np.where(self.steps >= 0, self.states[:, :, column], np.nan)
+        steps = np.hstack([self.steps, self.steps[:, -1:]]).reshape(-1)
         gap = np.full((len(values), 1), np.nan)
-        times = np.hstack([np.where(self.steps >= 0, self.steps * dt, np.nan), gap])
-        return times.reshape(-1), np.hstack([values, gap]).reshape(-1)
+        return np.maximum.accumulate(steps) * dt, np.hstack([values, gap]).reshape(-1)
 
 
 def forecast(planner: Planner, trial: Trial, seconds: float = SECONDS) -> Forecast | None:

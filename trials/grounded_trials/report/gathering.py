@@ -6,7 +6,6 @@ itself (grounded.toml, model.py, target.csv) must be whole, for without it nothi
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -16,13 +15,13 @@ import numpy as np
 from grounded.diagnosis.report import Diagnosis
 from grounded.errors import GroundedError
 from grounded.frozen import Array
-from grounded.search.certainty import utility_noise
 from grounded.search.planner import Planner
 from grounded.search.standing import Standing
 from grounded.solve.bias import residuals
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.report.findings import Findings, Log, Run
+from grounded_trials.store.documents import read_document
 from grounded_trials.workspace.adopting import Better, better_model
 from grounded_trials.workspace.diagnosing import LEAST_STEPS, read_diagnosis
 from grounded_trials.workspace.folder import Contents, Folder, Lost
@@ -60,10 +59,10 @@ def gather(workspace: Folder) -> Findings:
         lost=tuple(lost),
         diagnosis=diagnosis,
         optimum=_optimum(workspace.reports),
-        noise=utility_noise(now.history)[0],
         then=next_command(workspace, now, diagnosis, usable),
         better=better,
         since=since_diagnosis(workspace, diagnosis, usable) if diagnosis else Since(),
+        discarded=tuple(workspace.discarded()),
         folder=workspace.address,
     )
 
@@ -78,8 +77,9 @@ def _standing(workspace: Folder, contents: Contents) -> Standing:
 
 
 def _better(workspace: Folder, diagnosis: Diagnosis | None, lost: list[Lost]) -> Better | None:
+    named = diagnosis is not None and not diagnosis.no_cause
     try:
-        return better_model(workspace, diagnosis)
+        return better_model(workspace, diagnosis if named else None)
     except GroundedError as error:
         lost.append(Lost("the model as diagnosed", str(error)))
         return None
@@ -134,8 +134,8 @@ def _diagnosis(workspace: Folder, lost: list[Lost]) -> Diagnosis | None:
 def _optimum(reports: Path) -> float | None:
     """reports/optimum.json, {"utility": U}: written by studies that know the real system."""
     try:
-        value = float(json.loads((reports / "optimum.json").read_text())["utility"])
-    except (OSError, ValueError, KeyError, TypeError):
+        value = float(read_document(reports / "optimum.json")["utility"])
+    except (OSError, GroundedError, ValueError, KeyError, TypeError):
         return None
     return value if math.isfinite(value) else None
 

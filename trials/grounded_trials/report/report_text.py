@@ -9,8 +9,13 @@ import numpy as np
 
 from grounded.diagnosis.report import Estimate
 from grounded.errors import NextCommand
-from grounded.search.standing import Tried
-from grounded_trials.report.diagnosis_words import error_lines, sentences
+from grounded.search.candidate import Tried
+from grounded_trials.report.diagnosis_words import (
+    credit_of,
+    error_lines,
+    error_table,
+    sentences,
+)
 from grounded_trials.report.findings import (
     Findings,
     by_state,
@@ -76,6 +81,8 @@ def _head(findings: Findings) -> str:
     )
     if findings.logs:
         text += f", {count(len(findings.logs), 'log')} of data"
+    if findings.discarded:
+        text += f", set aside: {', '.join(findings.discarded)}"
     if findings.effects:
         text += "; adopted: " + ", ".join(findings.effects)
     return "\n".join(wrapped(text, "", ""))
@@ -180,17 +187,19 @@ def _diagnosis(findings: Findings, table: Table) -> str:
     before = {} if since.changed else findings.values
     for title, text in error_lines(diagnosis, before):
         lines += _wrapped(f"{title}: {text}", "  ")
+    if diagnosis.prediction_error and not diagnosis.no_cause:
+        lines.append(table(*error_table(diagnosis)))
     if diagnosis.ranking and not diagnosis.no_cause:
         rows = [
             (
                 r.effect[:30],
                 figure(r.evidence, 3),
-                figure(r.gap_after, 3),
+                credit_of(diagnosis, r.effect),
                 _fitting([_value(*one) for one in r.params.items()], VALUES).ljust(VALUES),
             )
             for r in diagnosis.ranking[:EFFECTS]
         ]
-        lines.append(table(rows, ("effect", "nats", "gap after", "parameters".ljust(VALUES))))
+        lines.append(table(rows, ("effect", "nats", "credit", "parameters".ljust(VALUES))))
     return "\n".join(lines)
 
 

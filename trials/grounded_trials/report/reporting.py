@@ -5,21 +5,28 @@ All of reports/ may be deleted and made again.
 
 from __future__ import annotations
 
-import json
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from grounded.errors import GroundedError
 from grounded.result import Result
 from grounded.task import Task
 from grounded_trials.report.findings import Findings, Run, prediction_error, rms, tracking_error
 from grounded_trials.report.gathering import gather
+from grounded_trials.store.documents import write_document
 from grounded_trials.store.store import write_atomically
 from grounded_trials.wording import rendered
 from grounded_trials.workspace.folder import Folder
 
+if TYPE_CHECKING:
+    from grounded.figures.figure import Figure
+
 RECORDING, PAGE, OPTIMUM = "recording.rrd", "report.html", "optimum.json"
+STAMP = "watched.svg"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -32,6 +39,12 @@ class Report(Result):
     def summary(self) -> str:
         """How much it shows, and its files."""
         return ", ".join([f"{len(self.findings.runs)} trials", *map(str, self.paths)])
+
+    def figures(self) -> Sequence[Figure]:
+        """All that the page shows."""
+        from grounded_trials.report.figures.runs import all_figures
+
+        return all_figures(self.findings)
 
     def to_json(self) -> dict[str, Any]:
         """The document of `report --json`, with the figures of the text by state and input."""
@@ -81,13 +94,56 @@ def save_recording(workspace: Folder, findings: Findings | None = None) -> Path:
     return path
 
 
-def save_page(workspace: Folder, findings: Findings) -> Path:
-    """reports/report.html."""
+def save_page(workspace: Folder, findings: Findings, watched: int = 0) -> Path:
+    """reports/report.html; where it is `watched`, a revision beside it that makes it reload.
+
+    A page from a file may load pictures from beside it, but no data: the revision is the width of
+    an empty picture.
+    """
     from grounded_trials.report.page.page import page
 
     path = _place(workspace) / PAGE
-    write_atomically(path, page(findings).encode())
+    write_atomically(path, page(findings, watched).encode())
+    if watched:
+        stamp = f'<svg xmlns="http://www.w3.org/2000/svg" width="{watched}" height="1"/>'
+        write_atomically(path.with_name(STAMP), stamp.encode())
     return path
+
+
+def watched(
+    workspace: Folder, every: float, trouble: Callable[[GroundedError], None]
+) -> Iterator[Report]:
+    """Writes the page now and whenever a file that it shows has changed; it ends by Ctrl-C.
+
+    Args:
+        workspace: whose files may change meanwhile.
+        every: how often they are looked at [s].
+        trouble: told what keeps the page from being written for now, a file half edited.
+    """
+    before: object = None
+    revision = int(time.time()) % 30_000
+    while True:
+        now = _changed(workspace)
+        if now != before:
+            before, revision = now, revision % 30_000 + 1
+            try:
+                workspace.forget()
+                findings = gather(workspace)
+                yield Report(findings, (save_page(workspace, findings, revision),))
+            except GroundedError as error:
+                trouble(error)
+        time.sleep(every)
+
+
+def _changed(workspace: Folder) -> list[tuple[str, int, int]]:
+    """Names, sizes and times of the files that a page is made of."""
+    found = []
+    for pattern in ("*.*", "candidates/*", "trials/**/*", f"{workspace.reports.name}/*.json"):
+        for path in workspace.folder.glob(pattern):
+            with suppress(OSError):  # gone meanwhile
+                about = path.stat()
+                found.append((str(path), about.st_size, about.st_mtime_ns))
+    return sorted(found)
 
 
 def save_pictures(workspace: Folder, findings: Findings) -> list[Path]:
@@ -106,8 +162,7 @@ def save_pictures(workspace: Folder, findings: Findings) -> list[Path]:
 def save_optimum(workspace: Folder, utility: float | None) -> None:
     """Leaves the optimum of the real system, where a study knows it, for the report to show."""
     if utility is not None:
-        document = json.dumps({"utility": utility}, allow_nan=False)
-        write_atomically(_place(workspace) / OPTIMUM, document.encode())
+        write_document(_place(workspace) / OPTIMUM, {"utility": utility})
 
 
 def _place(workspace: Folder) -> Path:

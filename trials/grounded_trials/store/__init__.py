@@ -1,7 +1,7 @@
 """Our own files, trials and candidates as MCAP, and the store that keeps them.
 
 Read `store.py` first (content-addressed, never rewritten), then `trial_file.py` and
-`candidate_file.py`; `own_files.py` is what they share.
+`candidate_file.py`; `own_files.py` is what they share. `documents.py` is what is kept as JSON.
 
 A trial has channels `/state` and `/input`, a message a sample, with one double a name; step k is
 stamped k dt after the start. A candidate has `/policy` (lists feedforward[m], gain[m * nz] row by

@@ -137,6 +137,16 @@ def read_candidate(
     return policy, x, u, own.meta
 
 
+def read_policy(path: str | Path) -> tuple[Policy, str]:
+    """A candidate's policy and task hash: what `grounded.policy.load` reads a .mcap with.
+
+    Raises:
+        GroundedError: as `read_candidate`.
+    """
+    policy, _, _, meta = read_candidate(path, str(path))
+    return policy, meta.get("task", "")
+
+
 _ABOUT = b"""A candidate policy of grounded. At step k (t = k dt) send
   u = clip(feedforward + gain (z - reference), low, high),   gain: m rows of nz numbers,
 z = the measured states, then for each input its depths[j] last sent values, newest first.

@@ -11,7 +11,8 @@ import hashlib
 import io
 import json
 import math
-from collections.abc import Iterable, Mapping
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 
 from grounded.errors import GroundedError
 from grounded.frozen import Array
+from grounded_trials.formats.budget import budget, keep
 from grounded_trials.formats.mcap_records import (
     Attachment,
     Channel,
@@ -34,9 +36,11 @@ from grounded_trials.formats.messages import Array as ArrayType
 from grounded_trials.formats.messages import BadMessage, BadSchema, Number, Struct
 from grounded_trials.formats.protobuf import ProtobufItems, protobuf_messages, uniform_doubles
 from grounded_trials.formats.schemas import struct_of
+from grounded_trials.plain_file import read_file
 
 FILE_LIMIT = 1 * 2**30  # [bytes]
 STEP_LIMIT = 2_000_000  # messages of a channel
+MESSAGE_BYTES = 48  # that a message takes beside its numbers
 NAME_LIMIT = 1000  # states, or inputs
 
 TRIAL, CANDIDATE = "grounded trial 1", "grounded candidate 1"
@@ -86,10 +90,11 @@ class OwnFile:
             raise self.bad(key, f"is '{text[:40]}', not a positive number")
         return value
 
-    def integer(self, key: str) -> int:
-        """An integer of the table that is not negative."""
+    def integer(self, key: str, *, signed: bool = False) -> int:
+        """An integer of the table, not negative unless `signed`."""
         text = self.entry(key)
-        if not (text.isascii() and text.isdigit() and len(text) < 20):
+        digits = text[1:] if signed and text.startswith("-") else text
+        if not (digits.isascii() and digits.isdigit() and len(digits) < 20):
             raise self.bad(key, f"is '{text[:40]}', not an integer")
         return int(text)
 
@@ -200,11 +205,17 @@ def read_own(source: str | Path | bytes, name: str, kind: str) -> OwnFile:
     """
     if not isinstance(source, bytes):
         name, source = str(source), read_file(Path(source), FILE_LIMIT)
+    with budget(name, len(source)):
+        return _read(source, name, kind)
+
+
+def _read(source: bytes, name: str, kind: str) -> OwnFile:
     meta: dict[str, str] | None = None
     attachments: dict[str, bytes] = {}
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
     messages: dict[str, list[Messages]] = {}
+    counts: Counter[str] = Counter()
     for record in read_records(io.BytesIO(source), name, limit=FILE_LIMIT):
         if isinstance(record, Metadata) and record.name == "grounded":
             meta = record.data
@@ -215,7 +226,12 @@ def read_own(source: str | Path | bytes, name: str, kind: str) -> OwnFile:
         elif isinstance(record, Channel):
             channels[record.id] = record
         elif isinstance(record, Messages):
-            _sort(record, channels, messages, name)
+            for topic, own in _sorted(record, channels, name):
+                messages.setdefault(topic, []).append(own)
+                counts[topic] += len(own)
+                if counts[topic] > STEP_LIMIT:
+                    raise GroundedError(f"{name}: more than {STEP_LIMIT} messages on one channel")
+                keep(MESSAGE_BYTES * len(own))
         elif isinstance(record, End) and not record.data_crc and meta is not None:
             raise DamagedFile(name, len(source), "its checksum is missing")
     if meta is None or meta.get("format") != kind:
@@ -225,36 +241,16 @@ def read_own(source: str | Path | bytes, name: str, kind: str) -> OwnFile:
     return OwnFile(name, source, meta, attachments, types, messages)
 
 
-def read_file(path: Path, limit: int) -> bytes:
-    """The bytes of a file.
-
-    Raises:
-        GroundedError: if it is missing, unreadable, or larger than `limit` bytes.
-    """
-    try:
-        with path.open("rb") as stream:
-            data = stream.read(limit + 1)
-    except FileNotFoundError:
-        raise GroundedError(f"{path} does not exist") from None
-    except OSError as error:
-        raise GroundedError(f"{path} can't be read: {error.strerror}") from None
-    if len(data) > limit:
-        raise GroundedError(f"{path} is larger than {limit} bytes: grounded writes no such file")
-    return data
-
-
-def _sort(
-    batch: Messages, channels: dict[int, Channel], messages: dict[str, list[Messages]], name: str
-) -> None:
+def _sorted(
+    batch: Messages, channels: dict[int, Channel], name: str
+) -> Iterator[tuple[str, Messages]]:
+    """A batch's messages by topic."""
     for identity in batch.channel_ids():
         if identity not in channels:
             raise DamagedFile(
                 name, 0, f"a message belongs to channel {identity}, which is not defined"
             )
-        own = messages.setdefault(channels[identity].topic, [])
-        own.append(batch.of(identity))
-        if sum(len(part) for part in own) > STEP_LIMIT:
-            raise GroundedError(f"{name}: more than {STEP_LIMIT} messages on one channel")
+        yield channels[identity].topic, batch.of(identity)
 
 
 def _type(channel: Channel, schemas: dict[int, Schema], name: str) -> Struct:

@@ -9,22 +9,22 @@ A file is copied to a temporary name in the same folder, synced, renamed, and th
 only then is it acknowledged. A lock keeps other processes out. What a killed process leaves
 behind is a temporary file, which the next one removes.
 
-The results of a study's jobs are kept by other rules: see `StudyStore`.
+What is kept as JSON (notes, diagnoses, results of studies) is told in `documents.py`.
 """
 
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import re
-from collections.abc import Iterator, MutableMapping
+import time
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from grounded.errors import GroundedError
+from grounded_trials.plain_file import open_file
 
 try:
     import fcntl
@@ -37,6 +37,8 @@ except ImportError:
 DIGITS = 16  # hex digits of the hash in a name
 _NAME = re.compile(r"^([a-z]+)(\d{4,})-([0-9a-f]{16})(\.\w+)$")
 _BLOCK = 2**20
+_TEMPORARY = re.compile(r"-[0-9a-f]{16}\.tmp$")
+OLD_S = 3600.0  # of a temporary file that nobody writes any more
 
 
 @dataclass(frozen=True)
@@ -78,6 +80,7 @@ class Store:
 
     def __init__(self, folder: str | Path, prefix: str = "t") -> None:
         self.folder, self.prefix = Path(folder), prefix
+        self._seen: dict[str, Stored | None] = {}  # what a name says
 
     def list(self) -> tuple[Stored, ...]:
         """The files in the order of their arrival; nothing is read but the folder.
@@ -86,17 +89,22 @@ class Store:
             GroundedError: if the folder can't be read.
         """
         try:
-            names = [path.name for path in self.folder.iterdir()]
+            names = os.listdir(self.folder)  # noqa: PTH208 (many times quicker)
         except FileNotFoundError:
             return ()
         except OSError as error:
             raise GroundedError(f"{self.folder} can't be read: {error.strerror}") from None
-        found = []
         for name in names:
-            match = _NAME.match(name)
-            if match and match[1] == self.prefix:
-                found.append(Stored(self.folder / name, int(match[2]), match[3]))
+            if name not in self._seen:
+                match, self._seen[name] = _NAME.match(name), None
+                if match and match[1] == self.prefix:
+                    self._seen[name] = Stored(self.folder / name, int(match[2]), match[3])
+        found = (entry for name in names if (entry := self._seen[name]) is not None)
         return tuple(sorted(found, key=lambda s: (s.number, s.digest)))
+
+    def digests(self) -> set[str]:
+        """The hashes of all files, as their names have them."""
+        return {entry.digest for entry in self.list()}
 
     def find(self, key: str) -> Stored:
         """The file whose short name, name, or hash (from 4 digits on) is `key`.
@@ -124,7 +132,8 @@ class Store:
         """
         entry = key if isinstance(key, Stored) else self.find(key)
         try:
-            data = entry.path.read_bytes()
+            with open_file(entry.path, follow=False) as stream:
+                data = stream.read()
         except OSError as error:
             raise GroundedError(f"{entry.path} can't be read: {error.strerror}") from None
         if hashlib.sha256(data).hexdigest()[:DIGITS] != entry.digest:
@@ -150,7 +159,7 @@ class Store:
         Raises:
             GroundedError: if the source can't be read or the folder not be written.
         """
-        with self._locked():
+        with self.locked():
             temporary = self.folder / f".{self.prefix}-{os.getpid()}.tmp"
             try:
                 self._sweep()
@@ -195,7 +204,12 @@ class Store:
             path.unlink(missing_ok=True)
 
     @contextmanager
-    def _locked(self) -> Iterator[None]:
+    def locked(self) -> Iterator[None]:
+        """Keeps other processes from adding a file meanwhile.
+
+        Raises:
+            GroundedError: if the folder can't be written.
+        """
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             descriptor = os.open(self.folder / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
@@ -224,8 +238,10 @@ def write_atomically(path: Path, data: bytes) -> None:
     Raises:
         GroundedError: if it can't be written.
     """
-    temporary = path.with_name(f".{path.name}-{os.getpid()}.tmp")
+    # not by the process's number: two containers may each have a process of the same
+    temporary = path.with_name(f".{path.name}-{os.urandom(8).hex()}.tmp")
     try:
+        _sweep_old(path.parent)
         _copy(data, temporary, mode=0o644)
         temporary.replace(path)
         sync_folder(path.parent)
@@ -238,6 +254,16 @@ def write_atomically(path: Path, data: bytes) -> None:
         raise GroundedError(f"{path} can't be written: {error.strerror}") from None
     finally:
         _remove(temporary)
+
+
+def _sweep_old(folder: Path) -> None:
+    """Removes the temporary files of processes that were killed, an hour after their last write."""
+    with os.scandir(folder) as entries:
+        names = [e.name for e in entries if e.name[0] == "." and _TEMPORARY.search(e.name)]
+    for path in (folder / name for name in names):
+        with suppress(OSError):
+            if path.lstat().st_mtime < time.time() - OLD_S:
+                path.unlink()
 
 
 def _remove(path: Path) -> None:
@@ -274,7 +300,7 @@ def _blocks(source: str | Path | bytes) -> Iterator[bytes]:
         yield source
         return
     try:
-        with Path(source).open("rb") as stream:
+        with open_file(Path(source)) as stream:
             while block := stream.read(_BLOCK):
                 yield block
     except OSError as error:
@@ -291,45 +317,3 @@ def hash_file(path: Path) -> str:
     for block in _blocks(path):
         hasher.update(block)
     return hasher.hexdigest()
-
-
-class StudyStore(MutableMapping[str, dict[str, Any]]):
-    """Results of a study's jobs by key, a small file each: a study that was cut off goes on.
-
-    A file is named by the hash of the job's key and holds key and result; one that can't be read,
-    or that holds another key, counts as not there.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise GroundedError(f"{folder} can't be made: {error.strerror}") from None
-
-    def _path(self, key: str) -> Path:
-        return self.folder / f"{hashlib.sha256(key.encode()).hexdigest()[:24]}.json"
-
-    def _read(self, path: Path) -> dict[str, dict[str, Any]]:
-        """A file's key and result; nothing where it can't be read."""
-        try:
-            entry = json.loads(path.read_text(encoding="utf-8"))
-            return {str(entry["key"]): dict(entry["result"])}
-        except (OSError, ValueError, KeyError, TypeError):
-            return {}
-
-    def __getitem__(self, key: str) -> dict[str, Any]:
-        return self._read(self._path(key))[key]
-
-    def __setitem__(self, key: str, value: dict[str, Any]) -> None:
-        write_atomically(self._path(key), json.dumps({"key": key, "result": value}).encode())
-
-    def __delitem__(self, key: str) -> None:
-        self._path(key).unlink()
-
-    def __iter__(self) -> Iterator[str]:
-        for path in sorted(self.folder.glob("*.json")):
-            yield from self._read(path)
-
-    def __len__(self) -> int:
-        return sum(1 for _ in self)

@@ -9,6 +9,7 @@ import io
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import zip_longest
 from pathlib import Path
 from typing import IO, TypedDict, Unpack
 
@@ -35,7 +36,8 @@ class TrialWriter:
         candidate: the candidate that is run, "" for none.
         policy: the bytes of its file.
         start_inputs: (m,) held before t = 0; None: zero.
-        start_ns: absolute time of t = 0 [ns], for display.
+        start_ns: absolute time of t = 0 [ns], for display; where it is negative (simulation time),
+            stamps count from 0, since MCAP's have no sign.
 
     Raises:
         GroundedError: if the file can't be written or an entry of `meta` is reserved.
@@ -80,7 +82,7 @@ class TrialWriter:
             self._log.attachment("policy", "application/octet-stream", policy)
         self._state = self._log.channel("/state", "State", list(states))
         self._input = self._log.channel("/input", "Input", list(inputs))
-        self._flushed = start_ns
+        self._flushed = max(start_ns, 0)
         self._log.flush()
 
     def append(self, t: float, state: Array, input: Array | None) -> None:
@@ -91,14 +93,27 @@ class TrialWriter:
         Raises:
             GroundedError: if the shapes do not fit, or the file can't be written.
         """
-        time = self._start_ns + round(t * 1e9)
+        data = self._encode_state(_row(state, self._n))
+        sent = None if input is None else self._encode_input(_row(input, self._m))
         with self._writing():
-            self._log.message(self._state, time, self._encode_state(_row(state, self._n)))
-            if input is not None:
-                self._log.message(self._input, time, self._encode_input(_row(input, self._m)))
-            if time - self._flushed >= FLUSH_NS:
-                self._log.flush()
-                self._flushed = time
+            self._add(max(self._start_ns, 0) + round(t * 1e9), data, sent)
+
+    def extend(self, trial: Trial) -> None:
+        """Adds a whole trial, as `append` does step by step."""
+        from grounded_trials.formats.mcap_writer import encode_doubles
+
+        states, inputs = encode_doubles(trial.states), encode_doubles(trial.inputs)
+        with self._writing():
+            for k, (state, input) in enumerate(zip_longest(states, inputs)):
+                self._add(max(self._start_ns, 0) + round(k * trial.dt * 1e9), state, input)
+
+    def _add(self, time: int, state: bytes, input: bytes | None) -> None:
+        self._log.message(self._state, time, state)
+        if input is not None:
+            self._log.message(self._input, time, input)
+        if time - self._flushed >= FLUSH_NS:
+            self._log.flush()
+            self._flushed = time
 
     def close(self) -> None:
         """Ends the file; a second call does nothing.
@@ -163,8 +178,7 @@ def trial_bytes(
         start_inputs=trial.start_inputs,
         start_ns=about.get("start_ns", 0),
     ) as writer:
-        for k, state in enumerate(trial.states):
-            writer.append(k * trial.dt, state, trial.inputs[k] if k < trial.steps else None)
+        writer.extend(trial)
     return stream.getvalue()
 
 
@@ -204,7 +218,7 @@ def read_trial(
     if len(u) != len(x) - 1:
         raise GroundedError(f"{own.name}: {len(x)} states need {len(x) - 1} inputs, found {len(u)}")
     for topic in ("/state", "/input"):
-        own.check_grid(topic, own.integer("start_ns"), dt)
+        own.check_grid(topic, max(own.integer("start_ns", signed=True), 0), dt)
     held = None
     if own.entry("start_inputs") != "null":
         held = own.floats(own.json("start_inputs", list), "start_inputs", len(inputs))

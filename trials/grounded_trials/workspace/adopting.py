@@ -58,12 +58,13 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
     found = read_diagnosis(workspace.reports)
     if found is None:
         raise GroundedError("nothing was diagnosed yet: diagnose first", then=AGAIN)
-    names = list(dict.fromkeys(names))
+    names = _corrections(found, list(dict.fromkeys(names)))
     before = {} if found.made is None else found.made.effects
-    _check(names, [row.effect for row in found.ranking], workspace, before)
+    known = [row.effect for row in found.ranking]
+    _check(names, known + _curves(found), workspace, before)
     claimed = _claimed(found, names)
     adopted: list[Effect] = [dict(effect) for effect in workspace.config.model.effects]
-    calibrated = found.parameters if parameters and claimed else {}
+    calibrated = found.known_parameters if parameters and claimed else {}
     params = {key: _rounded(estimate.value) for key, estimate in calibrated.items()}
     for name in names:
         values = {key: _rounded(value) for key, value in found.values(name).items()}
@@ -79,6 +80,32 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
     whole = dict(workspace.config.model.params) | own
     set_in_model(workspace.config.file, params=whole if own else None, effects=adopted or None)
     return Adopted(tuple(adopted), own, claimed)
+
+
+def _curves(found: Diagnosis) -> list[str]:
+    return [] if found.correction is None else [curve.effect for curve in found.correction.curves]
+
+
+def _corrections(found: Diagnosis, names: list[str]) -> list[str]:
+    """The names with `correction:v` replaced by its curves, which must have passed their test."""
+    curves, asked = _curves(found), [n for n in names if n.startswith("correction:")]
+    if found.correction is None or asked not in (
+        [f"correction:{found.correction.channel}"],
+        curves,
+    ):
+        return names
+    if not found.correction.adoptable:
+        raise GroundedError(
+            f"'{asked[0]}' does not predict trials better that it was not fitted to: expected a "
+            "correction that is adoptable; run more trials and diagnose again"
+        )
+    missing = [name for name in found.effects if name not in names]
+    if missing:
+        raise GroundedError(
+            f"'{asked[0]}' was fitted beside {', '.join(missing)}: adopt them together",
+            then=NextCommand("adopt", (*missing, asked[0])),
+        )
+    return [name for name in names if name not in asked] + curves
 
 
 def _nominal(found: Diagnosis, workspace: Folder, name: str) -> float:
@@ -130,7 +157,7 @@ def _claimed(found: Diagnosis, names: Sequence[str]) -> bool:
             f"too little is known to adopt anything ({found.sentence}): run another trial, ingest "
             "it, then diagnose again"
         )
-    rivals = [name for name in names if name not in found.effects]
+    rivals = [name for name in names if name not in (*found.effects, *_curves(found))]
     if rivals and len(names) > 1:
         own = f"those that it claims ({', '.join(found.effects)}), or " * bool(found.effects)
         raise GroundedError(
@@ -180,12 +207,14 @@ def _new(diagnosis: Diagnosis | None, adopted: set[str]) -> list[Effect]:
     return [
         {"name": name, **diagnosis.values(name)}
         for name in diagnosis.effects
-        if name not in adopted and diagnosis.ranked(name) is not None
+        if name not in adopted
+        and diagnosis.ranked(name) is not None
+        and name.removeprefix("parameter:") not in diagnosis.known_parameters
     ]
 
 
 def _parameters(workspace: Folder, diagnosis: Diagnosis | None) -> dict[str, float]:
     """The model's parameters as the diagnosis estimated them; its own names only."""
     known = workspace.task.model.params
-    found = diagnosis.parameters if diagnosis is not None else {}
+    found = diagnosis.known_parameters if diagnosis is not None else {}
     return {n: e.value for n, e in found.items() if n in known and e.value == e.value}

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
+from grounded_trials.store.documents import read_document
 from grounded_trials.store.store import DIGITS, Store, write_atomically
 from grounded_trials.store.trial_file import trial_bytes
 from grounded_trials.workspace.config import FILE
@@ -164,8 +165,8 @@ def score_case(
         raise GroundedError(f"{workspace.folder}: its trials are not those that were made")
     path = workspace.reports / "diagnosis.json"
     try:
-        diagnosis = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        diagnosis = read_document(path)
+    except FileNotFoundError:
         raise GroundedError(
             f"{workspace.folder} was not diagnosed", NextCommand("challenge", ("run", str(folder)))
         ) from None

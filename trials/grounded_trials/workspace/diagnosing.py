@@ -7,7 +7,6 @@ a stranger, so no text in it is trusted.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -16,11 +15,12 @@ from typing import TYPE_CHECKING
 
 from grounded.diagnosis.report import Diagnosis, Made
 from grounded.errors import GroundedError, NextCommand, nearest
-from grounded_trials.store.store import write_atomically
+from grounded_trials.store.documents import read_document, write_document
 from grounded_trials.wording import rendered
 
 if TYPE_CHECKING:
     from grounded.effects import Library
+    from grounded.instruments.finding import Finding
     from grounded.trial import Trial
     from grounded_trials.workspace.folder import Folder
 
@@ -34,17 +34,22 @@ def diagnose_in(
     trials: Sequence[str] = (),
     max_effects: int = 3,
     library: Library | None = None,
+    compare: Sequence[str] = (),
+    probe: bool = False,
     progress: Callable[[str], None] | None = None,
 ) -> Diagnosis:
     """Diagnoses the gap between the model and the stored trials; keeps reports/diagnosis.json.
 
-    Where two effects tie, it writes the candidate that would tell them apart, `.probe`.
+    Where two effects tie, it writes the candidate that would tell them apart, `.probe`; asked to,
+    else the one that teaches most. `.next_trial` says what to expect of it.
 
     Args:
         workspace: the model is diagnosed with the effects that were adopted.
         trials: short names; all usable ones by default.
         max_effects: at most so many effects at once.
         library: the effects that may be blamed.
+        compare: short names of a second group, whose differences from `trials` are told.
+        probe: write a candidate also where nothing ties.
         progress: told of each stage.
 
     Raises:
@@ -58,32 +63,42 @@ def diagnose_in(
     adopted = {name for name in names if not name.startswith("delay:")}  # whose d is no parameter
     library = library or Library()
     planner, used = workspace.planner, _chosen(workspace, trials)
+    others = _chosen(workspace, compare) if compare else []
     memory = planner.plan.model.state_names[planner.task.model.n :]
     options = DiagnosisOptions(
         library=library, max_effects=max_effects, hidden=tuple(memory), but=adopted
     )
-    lifted = [planner.lift(trial) for trial in used]
+    lifted, second = ([planner.lift(trial) for trial in some] for some in (used, others))
     made = Made(
-        trials=tuple(trial.id for trial in used),
+        trials=tuple(trial.id for trial in used + others),
         adopted=tuple(effects),
         params=dict(workspace.config.model.params),
         nominal={name: p.value for name, p in planner.plan.model.params.items()},
     )
-    found = replace(diagnose(planner.plan, lifted, options, progress=progress), made=made)
+    found = diagnose(planner.plan, lifted, options, compare=second, progress=progress)
+    found = replace(found, made=made)
     _keep(workspace, found)
-    probe = _probe(workspace, found, lifted, library)
-    if probe is not None:
-        identity, words = probe
-        run = rendered(NextCommand("run", (identity,)))
-        found = replace(found, next_trial=f"{words} ({identity}: {run})", probe=identity)
+    identity, words = _probe(workspace, found, lifted + second, library, write=probe)
+    if words:
+        run = f" ({identity}: {rendered(NextCommand('run', (identity,)))})" * bool(identity)
+        found = replace(found, next_trial=f"{words}{run}", probe=identity)
         _keep(workspace, found)
     return found
 
 
+def instruments_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[Finding, ...]:
+    """What the stored trials say of the instruments, before any physics."""
+    from grounded.instruments.preflight import preflight
+
+    planner = workspace.planner
+    memory = planner.plan.model.state_names[planner.task.model.n :]
+    lifted = [planner.lift(trial) for trial in _chosen(workspace, trials)]
+    return preflight(planner.plan, lifted, memory).findings
+
+
 def _keep(workspace: Folder, found: Diagnosis) -> None:
     workspace.reports.mkdir(exist_ok=True)
-    text = json.dumps(found.to_json(), indent=1, ensure_ascii=False, allow_nan=False)
-    write_atomically(workspace.reports / FILE, (text + "\n").encode())
+    write_document(workspace.reports / FILE, found.to_json())
 
 
 def read_diagnosis(folder: Path) -> Diagnosis | None:
@@ -94,10 +109,10 @@ def read_diagnosis(folder: Path) -> Diagnosis | None:
     """
     path = folder / FILE
     try:
-        return Diagnosis.from_json(json.loads(path.read_text(encoding="utf-8")))
+        return Diagnosis.from_json(read_document(path))
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, RecursionError, GroundedError) as error:
+    except (ValueError, RecursionError, GroundedError) as error:
         raise GroundedError(
             f"{path} can't be read ({error}): diagnose again", then=NextCommand("diagnose")
         ) from None
@@ -130,26 +145,26 @@ def _measured(trial: Trial, guessed: Sequence[str]) -> Trial:
 
 
 def _probe(
-    workspace: Folder, found: Diagnosis, trials: Sequence[Trial], library: Library
-) -> tuple[str, str] | None:
-    """Writes the candidate that would tell two tied effects apart: (id, sentence)."""
-    if not found.indistinguishable:
-        return None
+    workspace: Folder, found: Diagnosis, trials: Sequence[Trial], library: Library, *, write: bool
+) -> tuple[str, str]:
+    """Writes the candidate that would tell two tied effects apart, or if asked: (id, sentence)."""
+    if found.no_cause:
+        return "", ""
     from grounded.diagnosis.excitation import probe
     from grounded.rollout import simulate
+    from grounded.search.candidate import Candidate
     from grounded.search.improve import model_fingerprint
-    from grounded.search.standing import Candidate
     from grounded_trials.workspace.proposing import standing_in
 
     best = standing_in(workspace).incumbent
     if best is None:
-        return None
+        return "", ""
     planner = workspace.planner
     task = planner.plan
     base = planner.widened(best.candidate.policy)
     made = probe(task, base, found, trials, library)
-    if made is None:
-        return None
+    if made is None or not (write or found.indistinguishable):
+        return "", made.sentence if made is not None else ""
     policy = planner.narrowed(made.policy)
     predicted = simulate(task.problem(exact=True), planner.widened(policy))
     candidate = Candidate(
@@ -163,8 +178,10 @@ def _probe(
         predicted_inputs=predicted.inputs,
         predicted_utility=predicted.utility,
     )
-    workspace.save_candidate(candidate, workspace.task, kind="probe")
-    return candidate.id, made.sentence
+    while (saved := workspace.save_candidate(candidate, kind="probe")) is None:
+        workspace.forget_trials()  # somebody took the name
+        candidate = replace(candidate, id=workspace.next_id())
+    return saved.id, made.sentence
 
 
 def diagnosable(workspace: Folder) -> list[Trial]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -14,7 +14,7 @@ from grounded.errors import GroundedError, nearest
 from grounded.task import Task
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.config import FILE
-from grounded_trials.workspace.task_file import write_target
+from grounded_trials.workspace.task_file import target_text
 
 
 @dataclass(frozen=True)
@@ -119,42 +119,63 @@ def example(name: str) -> Example:
 def write_example(folder: Path, name: str) -> None:
     """Writes a workspace; an existing file is never overwritten.
 
+    One that was cut off goes on: what is there already must be what would be written, and
+    grounded.toml, which makes it a workspace, comes last.
+
     Raises:
         GroundedError: if the folder already holds a workspace, or can't be written.
     """
-    chosen = example(name)
-    files = (FILE, "model.py", "real.py", "target.csv")
-    for file in files:
-        if (folder / file).exists():
-            raise GroundedError(
-                f"{folder / file} exists already: name another folder, or remove it first"
-            )
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / "trials").mkdir(exist_ok=True)
-        (folder / "candidates").mkdir(exist_ok=True)
-    except OSError as error:
-        raise GroundedError(f"{folder} can't be made: {error.strerror}") from None
     import importlib
 
+    chosen = example(name)
+    _refuse(folder, [FILE])
     task, module = chosen.task(), importlib.import_module(chosen.model)
     columns = {
         state: task.target[:, i]
         for i, state in enumerate(task.model.state_names)
         if np.isfinite(task.target[:, i]).all()
     }
-    write_target(folder / "target.csv", task.dt, columns)
-    write_atomically(folder / "model.py", _source(module).encode())
-    write_atomically(folder / "real.py", chosen.real.encode())
-    write_atomically(folder / FILE, toml_of(task, name).encode())
+    files = {"target.csv": target_text(task.dt, columns), "model.py": _source(module)}
+    files |= {"real.py": chosen.real, FILE: toml_of(task, name)}
+    _refuse(folder, [file for file, text in files.items() if not _holds(folder / file, text)])
+    fresh_folder(folder, ())
+    for file, text in files.items():
+        write_atomically(folder / file, text.encode())
+
+
+def _refuse(folder: Path, names: Iterable[str]) -> None:
+    for path in (folder / name for name in names):
+        if path.exists():
+            raise GroundedError(f"{path} exists already: name another folder, or remove it first")
+
+
+def _holds(path: Path, text: str) -> bool:
+    return path.is_file() and path.stat().st_size < 10**7 and path.read_bytes() == text.encode()
+
+
+def fresh_folder(folder: Path, files: Iterable[str]) -> None:
+    """Makes the folders of a workspace in which none of these files exists yet.
+
+    Raises:
+        GroundedError: if one does, or the folder can't be made.
+    """
+    _refuse(folder, files)
+    try:
+        for made in (folder, folder / "trials", folder / "candidates"):
+            made.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise GroundedError(f"{folder} can't be made: {error.strerror}") from None
 
 
 def _source(module: ModuleType) -> str:
     return f"# From {module.__name__}: yours to change.\n" + inspect.getsource(module)
 
 
-def toml_of(task: Task, name: str) -> str:
-    """The grounded.toml of a task, with a comment on each table."""
+SIMULATED = 'model = "real.py"             # yours: command = "python drive.py {candidate} {trial}"'
+
+
+def toml_of(task: Task, name: str, system: str = SIMULATED) -> str:
+    """The grounded.toml of a task, with a comment on each table; `system`: the line of its own."""
     states, inputs = task.model.state_names, task.model.input_names
     first = np.where(np.isfinite(task.target[0]), task.target[0], 0.0)
     start = {s: v for s, v, f in zip(states, task.start, first, strict=True) if v != f}
@@ -203,8 +224,8 @@ def toml_of(task: Task, name: str) -> str:
         "max_trials = 40",
         "",
         "[system]                      # how `grounded run` reaches the real system",
-        'model = "real.py"             # yours: command = "python drive.py {candidate} {trial}"',
-        "seed = 0",
+        system,
+        *["seed = 0"] * (system == SIMULATED),
         "",
     ]
     return "\n".join(lines)

@@ -93,14 +93,15 @@ def fit_trials(workspace: Folder, names: Sequence[str] | None, *, latency: bool 
 
 
 def apply_fit(workspace: Folder, found: Fit) -> None:
-    """Writes all fitted values (and a fitted latency) to grounded.toml.
+    """Writes the fitted values (and a fitted latency) that the data identify to grounded.toml.
 
-    Those that the data do not identify by themselves go too: the others were fitted beside them,
-    and only together do they predict what was measured.
+    What they don't identify was held where it was while the others were fitted.
     """
     base = workspace.base_model
     values = {
-        name: float(f"{e.value:.8g}") for name, e in found.params.items() if name in base.params
+        name: float(f"{e.value:.8g}")
+        for name, e in found.params.items()
+        if name in base.params and e.identified
     }
     set_in_model(workspace.config.file, params=dict(workspace.config.model.params) | values)
     if "latency" in found.params and found.params["latency"].identified:

@@ -4,59 +4,46 @@
 
 All state is derived from these files. Trials are the store's (content-addressed, never rewritten).
 Candidates are files c0001.mcap ...; one that got lost is taken from the trial that ran it, which
-carries it as an attachment.
+carries it as an attachment. A trial that was set aside is left out everywhere (see `identity`).
 """
 
 from __future__ import annotations
 
+import os
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from grounded.errors import GroundedError, nearest
 from grounded.model import Model
-from grounded.search.standing import Candidate
+from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
-from grounded_trials.store.candidate_file import candidate_bytes, read_candidate
-from grounded_trials.store.store import Store, Stored, write_atomically
+from grounded_trials.store.documents import Notes
+from grounded_trials.store.store import Damaged, Store, Stored, write_atomically
 from grounded_trials.store.trial_file import read_trial
 from grounded_trials.workspace.config import Config, read_config
+from grounded_trials.workspace.identity import (
+    Noted,
+    StoredTrial,
+    candidate_of,
+    encoded,
+    named_apart,
+    noted,
+    sha256,
+)
 from grounded_trials.workspace.model_file import check_names, load_module, model_in
 from grounded_trials.workspace.task_file import build_task
 
 if TYPE_CHECKING:
     from grounded.search.planner import Planner
+    from grounded_trials.store.index import TrialIndex
 
+MANY = 200  # trials: fewer are all read, more are indexed
 _ID = re.compile(r"c\d{4,}")
-# a candidate's metadata, in the order of the file
-_FIELDS: Mapping[str, Callable[[str], Any]] = {
-    "id": str,
-    "iteration": int,
-    "alpha": float,
-    "base": str,
-    "model": str,
-    "task": str,
-    "predicted_utility": float,
-    "predicted_gain": float,
-    "damping": float,
-    "caution": int,
-}
-_ABSENT = {"predicted_gain": "nan", "damping": "1.0", "caution": "0"}  # in files of 0.1
-
-
-@dataclass(frozen=True, eq=False)
-class StoredTrial:
-    """A trial of the store with what its file says of it."""
-
-    stored: Stored
-    trial: Trial  # .id is its short name (t0007); short gaps are bridged
-    meta: dict[str, str]
-    measured: Trial  # as it was logged, gaps and all
-    policy: bytes | None  # the file of the candidate that it ran
 
 
 @dataclass(frozen=True)
@@ -86,6 +73,7 @@ class Folder:
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
         self.store = Store(self.folder / "trials", prefix="t")
+        self.notes = Notes(self.folder / "trials")
         self.reports = self.folder / "reports"
 
     @property
@@ -124,16 +112,44 @@ class Folder:
 
     @cached_property
     def _trials(self) -> tuple[StoredTrial, ...]:
-        return tuple(self._read_trials(None))
+        return self._read_trials(None)
+
+    @cached_property
+    def noted(self) -> Noted:
+        """What the notes say.
+
+        Raises:
+            GroundedError: if one is damaged.
+        """
+        return noted(self.notes.read())
+
+    def note_handed(self, identity: str, data: bytes) -> None:
+        """Keeps that a candidate was handed out, as these bytes, after the trials there are.
+
+        Nothing is kept in a folder that can only be read.
+
+        Raises:
+            GroundedError: if it can't be written.
+        """
+        stored = self.store.list()
+        after = stored[-1].path.stem if stored else ""
+        note = {"note": "hand-out", "candidate": identity, "sha256": sha256(data), "after": after}
+        try:
+            self.notes.add(note, again=False)
+        except GroundedError:
+            if os.access(self.folder, os.W_OK):
+                raise
+        vars(self).pop("noted", None)
 
     def forget(self) -> None:
         """Everything is read again when it is asked for next."""
-        for name in ("config", "base_model", "task", "planner", "_trials"):
+        for name in ("config", "base_model", "task", "planner", "_trials", "noted", "_index"):
             vars(self).pop(name, None)
 
     def forget_trials(self) -> None:
         """Trials are read again when they are asked for next."""
-        vars(self).pop("_trials", None)
+        for name in ("_trials", "noted"):
+            vars(self).pop(name, None)
 
     def read(self, *, strict: bool = True) -> Contents:
         """The trials, and the search's candidates for the present task.
@@ -147,7 +163,7 @@ class Folder:
             GroundedError: if the task can't be built; if strict, also for what is damaged.
         """
         lost: list[Lost] | None = None if strict else []
-        trials = self._trials if lost is None else tuple(self._read_trials(lost))
+        trials = self._trials if lost is None else self._read_trials(lost)
         candidates = tuple(self._read_candidates(trials, lost))
         return Contents(trials, candidates, tuple(lost or ()))
 
@@ -158,6 +174,13 @@ class Folder:
             GroundedError: if one is damaged, naming it.
         """
         return self._trials
+
+    def discarded(self) -> dict[str, str]:
+        """Trials that are set aside, t0004 -> why."""
+        aside = self.noted.aside
+        if not aside:
+            return {}
+        return {one.id: aside[one.digest] for one in self.store.list() if one.digest in aside}
 
     def fits(self, trial: Trial) -> bool:
         """Whether a trial's states and inputs are this model's, and its dt is this task's."""
@@ -187,9 +210,15 @@ class Folder:
         """Every candidate that was ever proposed, whether its file is there or only its trial."""
         return self._ids(self.trials())
 
-    def next_id(self) -> str:
-        """The name of the next candidate."""
+    def next_id(self, *, handed: bool = False) -> str:
+        """The name of the next candidate.
+
+        Args:
+            handed: beyond the names that were handed out, though their files are gone.
+        """
         ids = self.candidate_ids()
+        if handed:
+            ids = sorted({*ids, *self.noted.handed}, key=lambda name: int(name[1:]))
         return f"c{(int(ids[-1][1:]) if ids else 0) + 1:04d}"
 
     def candidate(self, identity: str) -> tuple[Candidate, dict[str, str]]:
@@ -212,55 +241,127 @@ class Folder:
             f"there is no candidate '{identity}': {nearest(identity, self.candidate_ids())}"
         )
 
-    def save_candidate(self, candidate: Candidate, task: Task, kind: str = "search") -> Path:
-        """Writes candidates/cNNNN.mcap, complete or not at all."""
-        path = self.candidate_path(candidate.id)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        values = vars(candidate) | {"task": task.hash}
-        meta = {"kind": kind} | {
-            name: repr(values[name]) if of is float else str(values[name])
-            for name, of in _FIELDS.items()
-        }
-        data = candidate_bytes(
-            candidate.policy,
-            candidate.predicted_states,
-            candidate.predicted_inputs,
-            meta,
-            state_units=dict(task.model.states),
-            input_units=dict(task.model.inputs),
-        )
-        write_atomically(path, data)
+    def names(self) -> frozenset[str]:
+        """The names of all trials and candidates."""
+        places = ((self.folder / "trials", "t"), (self.folder / "candidates", "c"))
+        return frozenset(path.name for place, first in places for path in place.glob(f"{first}*"))
+
+    def bring_back(self, identity: str) -> Path:
+        """A candidate's file, taken from a trial that ran it where it got lost."""
+        path = self.candidate_path(identity)
+        if not path.is_file():
+            write_atomically(path, self.candidate_bytes(identity))
         return path
 
-    def _read_trials(self, lost: list[Lost] | None) -> Iterator[StoredTrial]:
+    def save_candidate(
+        self, candidate: Candidate, seen: frozenset[str] | None = None, kind: str = "search"
+    ) -> Candidate | None:
+        """Writes candidates/cNNNN.mcap, complete or not at all; no file is ever replaced.
+
+        Args:
+            candidate: a new one.
+            seen: the `names` there were when it was planned; None: whatever there was.
+            kind: search or probe.
+
+        Returns:
+            The candidate, under a later name where its own was handed out for another policy;
+            None if trials or candidates came meanwhile: it must be planned again.
+        """
+        data = encoded(candidate, self.task, kind)
+        if sha256(data) not in self.noted.handed.get(candidate.id, {sha256(data)}):
+            candidate = replace(candidate, id=self.next_id(handed=True))
+            data = encoded(candidate, self.task, kind)
+        path = self.candidate_path(candidate.id)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with self.store.locked():
+            if path.exists() or seen not in (None, self.names()):
+                return None
+            write_atomically(path, data)
+        return candidate
+
+    def _read_trials(self, lost: list[Lost] | None) -> tuple[StoredTrial, ...]:
         """The stored trials; those that are damaged or gone are put into `lost` if it is there."""
-        entries = self.store.list()
+        broken: list[Damaged] = []
+        known, found = noted(self.notes.read(None if lost is None else broken)), []
+        entries = [e for e in self.store.list() if e.digest not in known.aside]
+        read = self._indexed if len(entries) >= MANY else self._whole
         for stored in entries:
             try:
-                trial, meta, policy = read_trial(self.store.read(stored), stored.path.name)
+                found.append(read(stored))
             except GroundedError as error:
                 if lost is None:
                     raise
-                lost.append(Lost(stored.path.name, str(error)))
-                continue
-            logged = replace(trial, id=stored.id)
-            yield StoredTrial(stored, interpolate_gaps(logged).trial, meta, logged, policy)
+                broken.append(Damaged(stored.path, str(error)))
+        self.save_index()
+        if lost is not None:
+            lost += [Lost(one.path.name, one.reason) for one in (*broken, *self.gone(known))]
+        return named_apart(found, known, self.candidate_path)
+
+    def _read_one(self, stored: Stored) -> tuple[Trial, dict[str, str], bytes | None]:
+        """A trial as it was logged, its metadata and the policy that it carries."""
+        trial, meta, policy = read_trial(self.store.read(stored), stored.path.name)
+        return replace(trial, id=stored.id), meta, policy
+
+    def _whole(self, stored: Stored) -> StoredTrial:
+        trial, meta, policy = self._read_one(stored)
+        ran = sha256(policy) if policy else ""
+        bridged = interpolate_gaps(trial).trial
+        return StoredTrial(stored, bridged, meta, trial, ran, lambda: policy)
+
+    @cached_property
+    def _index(self) -> tuple[TrialIndex, dict[str, StoredTrial]]:
+        """The index, and the trials that were made of it."""
+        from grounded_trials.store.index import TrialIndex
+
+        return TrialIndex(self.store.folder, self._read_one), {}
+
+    def _indexed(self, stored: Stored) -> StoredTrial:
+        index, made = self._index
+        if (known := made.get(stored.path.name)) is not None:
+            return known
+        about = index.about(stored)
+        trial = index.trial(stored, about, bridged=True)
+        measured = index.trial(stored, about, bridged=False) if about["gaps"] else trial
+        found = StoredTrial(
+            stored, trial, about["meta"], measured, about["ran"], lambda: self._read_one(stored)[2]
+        )
+        made[stored.path.name] = found
+        return found
+
+    def save_index(self) -> None:
+        """Keeps what was learnt of many trials for the next command."""
+        if "_index" in vars(self):
+            self._index[0].save()
+
+    def gone(self, known: Noted) -> Iterator[Damaged]:
+        """Trials that were stored, and are not there any more."""
+        entries = self.store.list()
         numbers = {stored.number for stored in entries}
-        for number in sorted(set(range(1, max(numbers, default=0))) - numbers):
-            if lost is not None:
-                name = f"{self.store.prefix}{number:04d}"
-                reason = f"trials/ has no file of the number {name}: it was removed"
-                lost.append(Lost(name, reason))
+        gaps = set(range(1, max(numbers, default=0))) - numbers
+        lost = known.last - {stored.path.stem for stored in entries} - {""}
+        names = {name.split("-")[0] for name in lost}
+        names |= {f"{self.store.prefix}{number:04d}" for number in gaps}
+        for name in sorted(names):
+            reason = f"trials/ has no file of the number {name}: it was removed"
+            yield Damaged(self.store.folder / name, reason)
 
     def _read_candidates(
         self, trials: tuple[StoredTrial, ...], lost: list[Lost] | None
     ) -> Iterator[Candidate]:
         """The search's candidates; unless strict, a trial's copy stands in for a damaged file."""
+        ran = {t.trial.candidate: (t.stored.id, t.ran) for t in trials if t.ran}
         for identity in self._ids(trials):
             why = GroundedError("its file is gone and no trial carries it")
             for data in self._sources(identity, trials):
                 try:
                     candidate, meta = candidate_of(data, identity)
+                    trial, known = ran.get(identity, ("", ""))
+                    if known and sha256(data) != known:
+                        raise GroundedError(
+                            f"candidates/{identity}.mcap is not the policy that {trial} ran: it "
+                            "was rewritten, or comes from another workspace; delete the file, the "
+                            "trial carries the one that was run"
+                        )
                 except GroundedError as error:
                     if lost is None:
                         raise
@@ -287,31 +388,5 @@ class Folder:
         if path.is_file():
             yield path.read_bytes()
         for one in self.trials() if trials is None else trials:
-            if one.trial.candidate == identity and one.policy is not None:
-                yield one.policy
-
-
-def candidate_of(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]:
-    """A candidate and its metadata from the bytes of its file.
-
-    Args:
-        data: the file.
-        identity: what the file is named, c0001; the candidate must have this id.
-
-    Raises:
-        GroundedError: if the file is damaged, rewritten, or another candidate's.
-    """
-    name = f"candidates/{identity}.mcap"
-    policy, states, inputs, meta = read_candidate(data, name)
-    try:
-        about = {key: of((_ABSENT | meta)[key]) for key, of in _FIELDS.items() if key != "task"}
-    except (KeyError, ValueError) as error:
-        raise GroundedError(
-            f"{name}: its metadata lacks or garbles {error}; it was not written by `propose`"
-        ) from None
-    if about["id"] != identity:
-        raise GroundedError(
-            f"{name} holds the candidate '{about['id'][:40]}': a file has the name of its "
-            "candidate. Give it its own name again, or delete it if that one is there"
-        )
-    return Candidate(policy=policy, predicted_states=states, predicted_inputs=inputs, **about), meta
+            if one.trial.candidate == identity and (policy := one.policy) is not None:
+                yield policy

@@ -21,12 +21,13 @@ from functools import cached_property
 import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
-from grounded.frozen import Array
-from grounded.policy import Policy, z_difference
-from grounded.search.standing import Candidate
+from grounded.policy import Policy
+from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial
-from grounded_trials.workspace.folder import Contents, Folder, candidate_of
+from grounded_trials.workspace.folder import Contents, Folder
+from grounded_trials.workspace.identity import candidate_of, sha256
+from grounded_trials.workspace.trial_check import commands
 
 AGREES = 1e-6  # of an input's size: how well a policy repeats its own predicted inputs
 
@@ -72,10 +73,11 @@ def checked_candidate(
     data = workspace.candidate_bytes(identity)
     candidate, meta = intact(data, identity)
     check = _Check(workspace, candidate, meta, other_task)
-    check.refuse_foreign()
+    check.refuse_foreign(sha256(data))
     reasons = tuple(check.reasons())
     if reasons and not anyway:
         raise Void(identity, reasons)
+    workspace.note_handed(identity, data)
     return Handed(candidate, meta, data, tuple(check.notes()), reasons)
 
 
@@ -92,35 +94,23 @@ def intact(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]:
         GroundedError: if it is damaged, rewritten or renamed.
     """
     candidate, meta = candidate_of(data, identity)
-    predicted = candidate.predicted_inputs
+    predicted, policy = candidate.predicted_inputs, candidate.policy
     with np.errstate(all="ignore"):
-        off = np.abs(_sent(candidate) - predicted)
+        sent = commands(
+            candidate.policy, candidate.predicted_states[None, :-1], candidate.policy.past
+        )
+        off = np.abs(sent[0] - predicted)
         wrong = off > AGREES * (1 + np.abs(predicted).max(axis=0))
     if wrong.any():
         t, j = (int(i) for i in np.argwhere(wrong)[0])
         raise GroundedError(
             f"candidates/{identity}.mcap is not the candidate that was proposed: at t = "
-            f"{t * candidate.policy.dt:g} s its policy sends {candidate.policy.input_names[j]} = "
-            f"{predicted[t, j] + off[t, j]:g} or {predicted[t, j] - off[t, j]:g}, its own "
-            f"prediction says {predicted[t, j]:g}. It was rewritten: delete the file and propose "
-            "again",
+            f"{t * policy.dt:g} s its policy sends {policy.input_names[j]} = {sent[0, t, j]:g}, "
+            f"its own prediction says {predicted[t, j]:g}. It was rewritten: delete the file and "
+            "propose again",
             NextCommand("propose"),
         )
     return candidate, meta
-
-
-def _sent(candidate: Candidate) -> Array:
-    """What the policy sends along its predicted run, (H, m)."""
-    policy, x, u = candidate.policy, candidate.predicted_states, candidate.predicted_inputs
-    asked = policy.feedforward
-    if policy.gain is not None and policy.reference is not None:
-        columns = [x[:-1]]
-        for j, depth in enumerate(policy.depths):
-            sent = np.concatenate([np.full(depth, policy.past[j]), u[:, j]])
-            columns += [sent[depth - 1 - i : -1 - i, None] for i in range(depth)]
-        off = z_difference(np.hstack(columns), policy.reference, policy.angles)
-        asked = asked + np.einsum("tij,tj->ti", policy.gain, off)
-    return np.clip(asked, policy.low, policy.high)
 
 
 @dataclass(frozen=True)
@@ -152,23 +142,31 @@ class _Check:
         """Whether the candidate was made for the task of today."""
         return self.meta.get("task") == self.workspace.task.hash
 
-    def refuse_foreign(self) -> None:
-        """Refuses a candidate for another robot, and one that differs from what was run."""
+    def refuse_foreign(self, found: str) -> None:
+        """Refuses a candidate for another robot, and one that was handed out or run otherwise.
+
+        Args:
+            found: SHA-256 of its file.
+        """
         made, model = self.candidate, self.workspace.base_model
-        for what, found, own in (
+        for what, names, own in (
             ("states", made.policy.state_names, model.state_names),
             ("inputs", made.policy.input_names, model.input_names),
         ):
-            if found != own:
+            if names != own:
                 raise GroundedError(
-                    f"{made.id} is for the {what} {', '.join(found)}; this workspace's model has "
+                    f"{made.id} is for the {what} {', '.join(names)}; this workspace's model has "
                     f"{', '.join(own)}: it is a candidate of another robot",
                     NextCommand("propose"),
                 )
+        if found not in self.workspace.noted.handed.get(made.id, {found}):
+            raise GroundedError(
+                f"candidates/{made.id}.mcap is not what was handed out under that name: it was "
+                "rewritten, or comes from another workspace; delete the file",
+                NextCommand("propose"),
+            )
         for one in self.contents.trials:
-            if one.trial.candidate != made.id or one.policy is None:
-                continue
-            if not _same(made.policy, candidate_of(one.policy, made.id)[0].policy):
+            if one.trial.candidate == made.id and one.ran not in ("", found):
                 raise GroundedError(
                     f"candidates/{made.id}.mcap is not the policy that {one.stored.id} ran: it was "
                     "rewritten, or comes from another workspace; delete the file, the trial "
@@ -285,11 +283,3 @@ def outside_limits(task: Task, policy: Policy) -> Iterator[str]:
             excess = np.maximum(low - values, values - high)
             if excess.max() > room:
                 yield f"it {what} {values[np.argmax(excess)]:g}, outside {today}"
-
-
-def _same(a: Policy, b: Policy) -> bool:
-    """Whether two policies are one, to the last bit."""
-    return a.z_names == b.z_names and all(
-        np.array_equal(getattr(a, name), getattr(b, name))
-        for name in ("feedforward", "low", "high", "past", "gain", "reference")
-    )

@@ -16,18 +16,20 @@ from typing import Any
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result
-from grounded.search.standing import Tried
+from grounded.search.candidate import Tried
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.logs.log_files import kind_of, log_files, log_records
 from grounded_trials.logs.log_table import log_mapping, read_log
 from grounded_trials.logs.samples import SignalReport
-from grounded_trials.store.own_files import CANDIDATE, FILE_LIMIT, TRIAL, read_file
-from grounded_trials.store.store import hash_file
+from grounded_trials.plain_file import read_file
+from grounded_trials.store.own_files import CANDIDATE, FILE_LIMIT, TRIAL
+from grounded_trials.store.store import DIGITS, hash_file
 from grounded_trials.store.trial_file import read_trial, trial_bytes
 from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.identity import sha256
 from grounded_trials.workspace.proposing import standing_in
-from grounded_trials.workspace.trial_check import warnings_about
+from grounded_trials.workspace.trial_check import warnings_about, what_ran
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -76,6 +78,7 @@ class _Read:
     data: bytes
     warnings: tuple[str, ...] = ()
     signals: tuple[SignalReport, ...] = ()
+    bare: bool = False  # it ran a candidate, and carries no copy of it
 
 
 def ingest_log(
@@ -100,14 +103,21 @@ def ingest_log(
     if candidate is not None and data:
         raise GroundedError("--data is for a log that ran no candidate; drop it or --candidate")
     read = (_own if kind == TRIAL else _foreign)(workspace, path, candidate, data)
+    read = _recognised(workspace, path, read, candidate)
     before = _repeated(workspace, path, read)
     added = workspace.store.add(read.data, again=before != "")
+    if read.bare:  # what it ran is kept beside it
+        ran = sha256(workspace.candidate_bytes(read.trial.candidate))
+        trial_hash = added.sha256[:DIGITS]
+        workspace.notes.add({"note": "run", "trial": trial_hash, "sha256": ran}, again=False)
     workspace.forget_trials()
     trial = replace(read.trial, id=added.id)
     warnings = (*read.warnings, *warnings_about(workspace, trial))
     if before:
         repeat = f"it repeats {before} to the last bit: the system is taken as deterministic"
         warnings = (*warnings, f"{repeat}, and no candidate is run a second time from now on")
+    if added.known and added.sha256[:DIGITS] in workspace.noted.aside:
+        warnings = (*warnings, f"{added.id} is set aside: `restore` takes that back")
     tried = _tried(workspace, trial)
     return Ingested(
         trial=added.id,
@@ -120,6 +130,23 @@ def ingest_log(
         signals=read.signals,
         verdict=_verdict(trial, tried, workspace.config.search.repeats),
     )
+
+
+def _recognised(workspace: Folder, path: Path, read: _Read, candidate: str | None) -> _Read:
+    """Refuses a log whose commands are not its candidate's; with a warning if one was named."""
+    ran = read.trial.candidate
+    if not ran or hashlib.sha256(read.data).hexdigest()[:DIGITS] in workspace.store.digests():
+        return read
+    own, _ = workspace.candidate(ran)
+    trial = interpolate_gaps(read.trial).trial
+    why = what_ran(workspace.task, trial, own, workspace.read().candidates)
+    if why and candidate is None:
+        raise GroundedError(
+            f"{path} did not run {ran}: {why}. Take it in with --data for fitting and diagnosis, "
+            "or with --candidate ID for what it ran all the same",
+            NextCommand("ingest", (str(path), "--data")),
+        )
+    return replace(read, warnings=(*read.warnings, why)) if why else read
 
 
 def _repeated(workspace: Folder, path: Path, read: _Read) -> str:
@@ -186,7 +213,7 @@ def _own(workspace: Folder, path: Path, candidate: str | None, data: bool) -> _R
         raise GroundedError(f"{path} says that it ran {trial.candidate}, not {candidate}")
     if trial.candidate:
         _check_candidate(workspace, path, trial.candidate, meta.get("task", ""), policy)
-        return _Read(trial, content)
+        return _Read(trial, content, bare=policy is None)
     trial = replace(trial, candidate=candidate or _outstanding(workspace, path))
     _check_candidate(workspace, path, trial.candidate)
     return _Read(trial, _encode(workspace, trial, _about(workspace, trial.candidate)))

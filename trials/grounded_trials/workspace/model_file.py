@@ -16,6 +16,8 @@ from typing import Any
 
 from grounded.errors import GroundedError, nearest
 from grounded.model import Model
+from grounded.trusted import check_own
+from grounded_trials.workspace.config import FILE
 
 
 def load_module(
@@ -27,6 +29,7 @@ def load_module(
         GroundedError: if it isn't there, lies outside the workspace, or fails while it runs.
     """
     if module:
+        check_own(folder, [folder / FILE])
         return _installed(module)
     path = (folder / file).resolve()
     if not path.is_relative_to(folder.resolve()):
@@ -35,6 +38,8 @@ def load_module(
         )
     if not path.is_file():
         raise GroundedError(f"grounded.toml: {key} = '{file}': {path} does not exist")
+    between = [place for place in path.parents if place.is_relative_to(folder.resolve())]
+    check_own(folder, [folder / FILE, path, path.parent / "__pycache__", *between])
     spec = importlib.util.spec_from_file_location(f"grounded_workspace_{path.stem}", path)
     assert spec is not None and spec.loader is not None
     found = importlib.util.module_from_spec(spec)

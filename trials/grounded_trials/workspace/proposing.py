@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,8 +14,10 @@ from grounded_trials.workspace.handover import Void, checked_candidate, outside_
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
 
-    from grounded.search.improve import Proposal
-    from grounded.search.standing import Candidate, Standing
+    from grounded.figures.figure import Figure
+    from grounded.search.candidate import Candidate
+    from grounded.search.making import Proposal
+    from grounded.search.standing import Standing
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -52,15 +54,20 @@ class Status(Result):
     standing: Standing
     then: NextCommand
     outdated: str = ""  # why the last diagnosis is not the last word
-    notes: tuple[str, ...] = ()  # of the search, where it has ended
+    notes: tuple[str, ...] = ()  # of the search, where it has ended; trials of namesakes
+    discarded: dict[str, str] = field(default_factory=dict)  # t0004 -> why it is set aside
 
     def summary(self) -> str:
         """The phase and the best candidate."""
         return self.standing.summary()
 
+    def figures(self) -> Sequence[Figure]:
+        """Utility by candidate."""
+        return self.standing.figures()
+
     def to_json(self) -> dict[str, Any]:
         """The document of `status --json`, the whole history in it."""
-        return self.standing.to_json()
+        return self.standing.to_json() | {"discarded": self.discarded}
 
 
 def propose_in(workspace: Folder) -> Proposed:
@@ -97,12 +104,19 @@ def _handed_over(workspace: Folder) -> tuple[Proposal, dict[str, str]]:
     """What may be run, written and checked; and what may not, though it was waiting: id -> why."""
     void: dict[str, str] = {}
     while True:
+        seen = workspace.names()
         proposal = _proposal(workspace, void)
         candidate = proposal.candidate
         if candidate is None:
             return proposal, void
-        if proposal.is_new or not workspace.candidate_path(candidate.id).is_file():
-            workspace.save_candidate(candidate, workspace.task)
+        if proposal.is_new:
+            candidate = workspace.save_candidate(candidate, seen)
+            if candidate is None:  # somebody was quicker
+                workspace.forget_trials()
+                continue
+            proposal = replace(proposal, candidate=candidate)
+        else:
+            workspace.bring_back(candidate.id)
         try:
             handed = checked_candidate(workspace, candidate.id)
         except Void as error:
@@ -174,6 +188,7 @@ def standing_in(
     trials = [t.trial for t in contents.trials if workspace.fits(t.trial)]
     task, options, planner = workspace.task, workspace.config.search, workspace.planner
     now = standing(task, contents.candidates, trials, options, model_fingerprint(planner.plan))
+    workspace.save_index()
     if ahead and now.phase == "propose" and now.incumbent is not None:
         return propose(task, contents.candidates, trials, options, planner=planner).standing
     return now
@@ -198,8 +213,22 @@ def status_of(workspace: Folder, standing: Standing, notes: tuple[str, ...] = ()
         standing,
         next_command(workspace, standing, found, usable),
         since.told(workspace.address) if since else "",
-        notes,
+        (*notes, *_namesakes(workspace)),
+        workspace.discarded(),
     )
+
+
+def _namesakes(workspace: Folder) -> list[str]:
+    """Which trials ran another policy of a candidate's name, as in two folders that were joined."""
+    names: dict[str, list[str]] = {}
+    for one in workspace.trials():
+        if "~" in one.trial.candidate:
+            names.setdefault(one.trial.candidate, []).append(one.stored.id)
+    return [
+        f"{', '.join(ids)} ran another policy that is called {name.split('~')[0]} too: data, for "
+        "fit and diagnose"
+        for name, ids in names.items()
+    ]
 
 
 def candidate_named(workspace: Folder, name: str) -> str:

@@ -21,10 +21,12 @@ from grounded.errors import GroundedError, NextCommand, nearest
 from grounded.plant import Noise, Plant
 from grounded.result import Result
 from grounded.search.ask_tell import learn
-from grounded.search.standing import Candidate, SearchOptions
+from grounded.search.candidate import Candidate
+from grounded.search.standing import SearchOptions
 from grounded.trial import Trial
-from grounded_trials.store.store import write_atomically
+from grounded.trusted import check_own
 from grounded_trials.store.trial_file import write_trial
+from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.handover import Handed, checked_candidate
 from grounded_trials.workspace.model_file import load_module, model_in
@@ -129,9 +131,8 @@ def _next_run(folder: Path, identity: str) -> Path:
 
 def _call(workspace: Folder, command: str, handed: Handed, path: Path) -> None:
     """The user's command, its output passed on to stderr."""
-    file = workspace.candidate_path(handed.candidate.id)
-    if not file.is_file():  # it came from a trial that ran it
-        write_atomically(file, handed.data)
+    check_own(workspace.folder, [workspace.folder / FILE])
+    file = workspace.bring_back(handed.candidate.id)
     words = {
         "candidate": str(file.resolve()),
         "trial": str(path.resolve()),

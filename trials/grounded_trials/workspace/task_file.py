@@ -6,6 +6,7 @@ target.csv says what the states are to do, a row a control step; a state without
 from __future__ import annotations
 
 import csv
+from io import TextIOWrapper
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from grounded.frozen import Array
 from grounded.model import Model
 from grounded.task import Task
 from grounded.utility import Reward
+from grounded_trials.plain_file import open_file
 from grounded_trials.workspace.config import Config
 from grounded_trials.workspace.model_file import check_names
 
@@ -102,7 +104,7 @@ def read_target(path: Path) -> tuple[list[str], Array]:
         GroundedError: naming the line and column that is not a number.
     """
     try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
+        with TextIOWrapper(open_file(path), encoding="utf-8-sig", newline="") as stream:
             reader = csv.reader(stream)
             names = [name.strip() for name in next(reader, [])]
             _check_header(path, names)
@@ -197,12 +199,17 @@ def target_arrays(
 
 
 def write_target(path: Path, dt: float, columns: dict[str, Array]) -> None:
-    """Writes a target; `columns` are states in the order of the file, (H + 1,) each."""
+    """Writes a target, see `target_text`."""
     from grounded_trials.store.store import write_atomically
 
+    write_atomically(path, target_text(dt, columns).encode())
+
+
+def target_text(dt: float, columns: dict[str, Array]) -> str:
+    """A target as CSV; `columns` are states in the order of the file, (H + 1,) each."""
     H = len(next(iter(columns.values())))
     lines = [",".join(["t", *columns])]
     for i in range(H):
         row = [f"{i * dt:.10g}", *(f"{values[i]:.9g}" for values in columns.values())]
         lines.append(",".join(row))
-    write_atomically(path, ("\n".join(lines) + "\n").encode())
+    return "\n".join(lines) + "\n"

@@ -1,16 +1,31 @@
-"""What a person should know about a trial before believing it, in sentences."""
+"""What a person should know about a trial before believing it, in sentences.
+
+Above all whether it ran the candidate: what the policy sends on the LOGGED states, feedback and
+clipping included, is compared with the logged commands (`follows`). A log may be a little late,
+noisy, or resampled; a person's driving, or another candidate, is something else.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from grounded.frozen import Array
 from grounded.policy import Policy, z_difference
+from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import HUGE, Trial, interpolate_gaps
 from grounded_trials.workspace.folder import Folder
 
 FAR = 0.1  # of a state's range in the trial: a start this far from s_0 is worth a warning
+LEAST = 10  # steps: less says nothing of who drove
+UNLIKE = 0.25  # of the squared difference of unrelated commands; 1 - UNLIKE: concordance (Lin 1989)
+WINDOWS = 8  # parts of a trial that must each be alike, twice as loosely: somebody may take over
+CLOSER = 1 / 3  # another candidate whose commands differ this much less is the one that ran
+BACK = (0.0, 0.5, 1.0, 1.5, 2.0, -0.5, -1.0)  # steps: states of the log older than those acted on
+OTHERS = 20  # candidates to compare with, the latest
 
 
 def warnings_about(workspace: Folder, trial: Trial) -> tuple[str, ...]:
@@ -47,7 +62,12 @@ def warnings_about(workspace: Folder, trial: Trial) -> tuple[str, ...]:
     found += _start(task, whole)
     found += _inputs(task, whole)
     candidate, _ = workspace.candidate(trial.candidate)
-    found += _late(candidate.policy, task, whole)
+    ran = follows(candidate.policy, whole, _latest(task))
+    if ran is not None and ran.alike and abs(ran.late) == 1 and ran.moved < UNLIKE:
+        found.append(
+            "the inputs fit the policy better when moved by one step: they seem to be logged a "
+            f"step {'late' if ran.late > 0 else 'early'}; log each command at the time it is sent"
+        )
     return tuple(found)
 
 
@@ -90,40 +110,148 @@ def _inputs(task: Task, trial: Trial) -> list[str]:
     ]
 
 
-def _late(policy: Policy, task: Task, trial: Trial) -> list[str]:
-    """Inputs that fit the policy better when they are moved by a step were logged late."""
+@dataclass(frozen=True)
+class Following:
+    """How the commands of a trial compare with what a policy sends on its states."""
+
+    alike: bool
+    error: float  # rms over steps and inputs, in units of each input's largest value
+    input: str  # the one that differs most
+    rms: float  # by so much, in its unit
+    until_s: float  # the commands are alike up to here
+    late: int  # steps by which the log is late
+    moved: float  # the squared difference at `late` over that without moving
+
+
+def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
+    """Compares the commands of a trial with a policy's, at the alignment that fits best.
+
+    Args:
+        policy: what should have been run.
+        trial: of the policy's states and inputs, not longer than its horizon.
+        latest: steps by which inputs may be logged late.
+
+    Returns:
+        None where the trial is too short to tell, or is of other states or inputs.
+    """
     T = min(trial.finite_steps, policy.horizon)
-    if T < 10 or (trial.state_names, trial.input_names) != (policy.state_names, policy.input_names):
-        return []
-    expected = _commands(policy, task, trial, T)
-    if expected.shape[0] < 10:
-        return []
-    scale = np.ptp(expected, axis=0) + 1e-12
-    errors = {}
-    for shift in (-1, 0, 1):
-        a = expected[max(0, -shift) : T - max(0, shift)]
-        b = trial.inputs[:T][max(0, shift) : T - max(0, -shift)]
-        errors[shift] = float(np.sqrt(np.mean(((a - b) / scale) ** 2)))
-    best = min(errors, key=errors.__getitem__)
-    if best == 0 or errors[0] < 0.01 or errors[best] > 0.5 * errors[0]:
-        return []
-    word = "late" if best == 1 else "early"
-    return [
-        f"the inputs fit the policy better when moved by one step: they seem to be logged a step "
-        f"{word}; log each command at the time it is sent"
-    ]
+    names = (policy.state_names, policy.input_names)
+    if T < LEAST or (trial.state_names, trial.input_names) != names:
+        return None
+    sent, past = np.clip(trial.inputs[:T], policy.low, policy.high), trial.start_inputs
+    width = policy.high - policy.low
+    states = np.stack([_earlier(trial.states[:T], back, policy.angles) for back in BACK])
+    free = commands(policy, states, policy.past if past is None else past)
+    size = np.maximum(np.abs(free).max(axis=1), np.abs(sent).max(axis=0))
+    size = size + np.where(np.isfinite(width), 0.1 * width, 1e-12)
+    fits = {}
+    for late in range(-1, latest + 1):
+        a, b = free[:, max(0, -late) : T - max(0, late)], sent[max(0, late) : T - max(0, -late)]
+        squares = (((a - b) / size[:, None]) ** 2).mean(axis=2)
+        usual, mean = np.median(squares, axis=1), squares.mean(axis=1)
+        for back, score in enumerate(usual + 1e-3 * mean):  # a takeover must not move the rest
+            fits[back, late] = (float(score), float(mean[back]), a[back], b, size[back])
+    back, late = min(fits, key=lambda key: fits[key][0])
+    _, error, asked, sent, size = fits[back, late]
+    unmoved = min(fit[1] for key, fit in fits.items() if key[1] == 0)
+    off = (asked - sent) ** 2
+    unrelated = asked.var(axis=0) + sent.var(axis=0) + (asked - sent).mean(axis=0) ** 2
+    noise = _noise_sent(policy, states[back], free[back])
+    room = np.maximum(UNLIKE * unrelated, (0.02 * size) ** 2 + 4 * noise[: len(off)])
+    parts = np.array_split(np.arange(len(off)), min(WINDOWS, len(off) // LEAST))
+    bad = [bool((off[k].mean(axis=0) > 2 * room[k].mean(axis=0)).any()) for k in parts]
+    share = off.mean(axis=0) / room.mean(axis=0)
+    first = parts[bad.index(True)] if any(bad) else parts[0][:1]
+    left = first[int(np.argmax((off[first] > 2 * room[first]).any(axis=1)))]
+    alike, j = bool(share.max() <= 1 and not any(bad)), int(np.argmax(share))
+    return Following(
+        alike=alike,
+        error=float(np.sqrt(error)),
+        input=policy.input_names[j],
+        rms=float(np.sqrt(off[:, j].mean())),
+        until_s=float(left) * policy.dt,
+        late=late,
+        moved=error / unmoved if unmoved > 1e-4 else 1.0,
+    )
 
 
-def _commands(policy: Policy, task: Task, trial: Trial, T: int) -> Array:
-    """What the policy commands on the trial's own states, (T, m)."""
-    u = np.array(policy.feedforward[:T])
-    if policy.gain is not None and policy.reference is not None:
-        from grounded.rollout import augmented
+def what_ran(task: Task, trial: Trial, own: Candidate, others: Sequence[Candidate]) -> str:
+    """Why a trial is not a run of its candidate, "" where nothing says so.
 
-        past = policy.past if trial.start_inputs is None else trial.start_inputs
-        z = augmented(task.problem(exact=True), trial.states[: T + 1], trial.inputs[:T], past)[:T]
-        if z.shape[1] != policy.reference.shape[1]:
-            return u[:0]
-        off = z_difference(z, policy.reference[:T], policy.angles)
-        u += np.einsum("tij,tj->ti", policy.gain[:T], off)
-    return np.clip(u, policy.low, policy.high)
+    Args:
+        task: whose latency and units hold.
+        trial: with gaps bridged; its candidate is `own`.
+        own: the candidate that it is said to have run.
+        others: those that it may have run instead, in order of proposal.
+    """
+    trial, latest = trial.until(task.horizon), _latest(task)
+    found = follows(own.policy, trial, latest)
+    if found is None or (found.alike and found.error < 1e-5):
+        return ""
+    rivals = [(follows(c.policy, trial, latest), c.id) for c in others[-OTHERS:] if c.id != own.id]
+    alike = [(f.error, name) for f, name in rivals if f is not None and f.alike]
+    error, name = min(alike, default=(np.inf, ""))
+    if error < CLOSER * found.error:
+        looks = f"they are those of {name}"
+    elif found.alike:
+        return ""
+    elif found.until_s >= LEAST * trial.dt:
+        looks = f"up to {found.until_s:.1f} s they are alike: somebody, or something, took over"
+    else:
+        looks = "somebody, or another controller, drove"
+    unit = task.model.inputs[found.input]
+    return (
+        f"its commands are not what {own.id} sends on the logged states: {found.input} differs by "
+        f"{found.rms:.3g} {unit} (rms); {looks}"
+    )
+
+
+def commands(policy: Policy, states: Array, past: Array) -> Array:
+    """What a policy sends on given states, (B, T, m).
+
+    It remembers what it sent itself: a gain on the last inputs would make any smooth log look
+    alike if they were the logged ones.
+
+    Args:
+        policy: at least T steps long.
+        states: (B, T, n), B runs.
+        past: (m,) the inputs held before the first step.
+    """
+    T, n = states.shape[1:]
+    asked: Array = np.repeat(policy.feedforward[None, :T], len(states), 0)
+    if policy.gain is None or policy.reference is None:
+        return np.clip(asked, policy.low, policy.high)
+    off = z_difference(states, policy.reference[:T, :n], policy.angles)
+    asked += np.einsum("tij,btj->bti", policy.gain[:T, :, :n], off)
+    memory, newest = policy.gain[:T, :, n:], np.cumsum([0, *policy.depths[:-1]])
+    asked -= np.einsum("tij,tj->ti", memory, policy.reference[:T, n:])
+    z = np.repeat(np.repeat(past, policy.depths)[None], len(states), 0)
+    for t in range(T):
+        asked[:, t] = np.clip(asked[:, t] + z @ memory[t].T, policy.low, policy.high)
+        z[:, 1:] = z[:, :-1].copy()
+        z[:, newest] = asked[:, t]
+    return asked
+
+
+def _latest(task: Task) -> int:
+    """Steps by which a log of what the actuators got, not of what was sent, is late."""
+    assert task.latency is not None
+    return 1 + int(np.ceil(task.latency.max() / task.dt))
+
+
+def _earlier(states: Array, steps: float, angles: tuple[bool, ...]) -> Array:
+    """The states some steps ago, between samples by a straight line, (T, n)."""
+    whole, part = divmod(steps, 1)
+    at, last = np.arange(len(states)) - int(whole), len(states) - 1
+    now, before = states[np.clip(at, 0, last)], states[np.clip(at - 1, 0, last)]
+    earlier: Array = now - part * z_difference(now, before, angles)
+    return earlier
+
+
+def _noise_sent(policy: Policy, states: Array, asked: Array) -> Array:
+    """Square of what the policy makes of the noise of the states, found by adding it, (T, m)."""
+    change = z_difference(states[1:], states[:-1], policy.angles)
+    power = (np.diff(change, axis=0) ** 2).mean(axis=0) / 6  # second differences of white noise
+    noisy = states + np.random.default_rng(0).normal(size=states.shape) * np.sqrt(power)
+    squares: Array = (commands(policy, noisy[None], policy.past)[0] - asked) ** 2
+    return squares

@@ -1,5 +1,5 @@
-"""What is drawn, before it is known how: the page and the pictures show the same figures.
+"""What a report draws: figures of `grounded.figures`, from findings, before it is known how.
 
-Read `figure.py` first (the plain values), then `runs.py`, `utilities.py` and `gap.py` (what they
-show); `axis.py`, `draw.py` and `png.py` turn them into shapes and files.
+Read `runs.py` first (over time, and the list of all), then `paths.py` and `gap.py`; `png.py` makes
+pictures of them.
 """

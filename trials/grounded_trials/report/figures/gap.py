@@ -1,97 +1,36 @@
-"""The figures of the gap.
+"""The gap in time, and what is left of it.
 
-What was diagnosed: where the gap lies, which effects explain it, how far it shrinks. And the gap in
-time: the model set on the real state every second, and then left alone.
+The model set on the real state every second and then left alone; what it lacks over the variable
+that tells most of it, with what the diagnosed model adds drawn through it; whether the rest is
+noise.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from grounded.diagnosis.report import Diagnosis
+from grounded.figures.figure import Band, Curve, Figure, Key, Panel, fitted, legend, without_astray
+from grounded.frozen import Array
 from grounded.trial import Trial
-from grounded_trials.report.figures.axis import fitted, without_astray
-from grounded_trials.report.figures.figure import Bar, Bars, Curve, Figure, Panel, legend
-from grounded_trials.report.findings import Findings
+from grounded_trials.report.findings import Findings, Run
 from grounded_trials.report.forecast import SECONDS, forecast
-from grounded_trials.wording import figure, labelled, shown, with_unit
-
-MOST = 12
-
-
-def gap_figure(diagnosis: Diagnosis | None) -> Figure | None:
-    """Shares of the gap by channel, time and region; evidence; the gap before and after."""
-    if diagnosis is None:
-        return None
-    where = diagnosis.where
-    by_channel = [
-        (c.name, c.share, ", " + with_unit(f"{c.rms:.3g}", c.unit)) for c in where.channels
-    ]
-    by_time = [(f"{t.start:g} to {t.end:g} s", t.share, "") for t in where.times]
-    by_region = [
-        (r.when, r.share, f", {100 * r.occupancy:.0f} % of the time") for r in where.regions
-    ]
-    panels = [
-        Bars(f"Share of the gap by {word}", _shares(shares, role))
-        for word, shares, role in (
-            ("channel", by_channel, "best"),
-            ("time", by_time, "step2"),
-            ("region", by_region, "accepted"),
-        )
-        if shares
-    ]
-    if diagnosis.ranking:
-        panels.append(Bars("Evidence for an effect [nats]", _ranking(diagnosis)))
-    if diagnosis.gap.measured:
-        panels.append(_shrinkage(diagnosis))
-    if not panels:
-        return None
-    caption = (
-        "Evidence is the gain in log-likelihood less its price; an effect is claimed from 3 nats. "
-        "The floor is what noise alone would leave."
-    )
-    return Figure("gap", "Gap between model and reality", caption, tuple(panels))
-
-
-def _shares(shares: Sequence[tuple[str, float, str]], role: str) -> tuple[Bar, ...]:
-    """Bars of (label, share, what else is said of it)."""
-    return tuple(
-        Bar(label, share, f"{100 * share:.0f} %{note}", role)
-        for label, share, note in shares[:MOST]
-    )
-
-
-def _ranking(diagnosis: Diagnosis) -> tuple[Bar, ...]:
-    named = set(diagnosis.effects)
-    return tuple(
-        Bar(r.effect, r.evidence, figure(r.evidence, 3), "best" if r.effect in named else "other")
-        for r in diagnosis.ranking[:MOST]
-    )
-
-
-def _shrinkage(diagnosis: Diagnosis) -> Bars:
-    gap = diagnosis.gap
-    title = f"Prediction error {gap.horizon_s:g} s ahead" if math.isfinite(gap.horizon_s) else "Gap"
-    rows = (
-        ("model", gap.before, "model"),
-        ("as diagnosed", gap.after, "best"),
-        ("noise alone", gap.floor, "other"),
-    )
-    return Bars(title, tuple(Bar(name, v, figure(v, 3), role) for name, v, role in rows))
-
+from grounded_trials.wording import labelled, per_second, shown
 
 SPAN_S = 30.0  # of a long log that is drawn: the part with the largest errors
 LOGS = 2  # that are drawn; the table has all
+CHANNELS = 4  # whose residuals are drawn
+POINTS = 1500  # of a residual
+BINS = 24
+LAGS_S, LAGS = 1.0, 60  # of the autocorrelation: a second, at most so many steps
+LEAST_STEPS = 30  # of a trial whose residual is drawn
 
 
 def forecast_figures(findings: Findings) -> list[Figure]:
-    """One for the best run, or else the last, and one for each of the longest logs."""
+    """One for a run that the diagnosis didn't see, or else the best; one for the longest logs."""
     found = []
-    run = findings.best or findings.latest
+    run = _unseen(findings) or findings.best or findings.latest
     if run is not None:
         title = f"The model {SECONDS:g} s ahead, {run.label}"
         found.append(_figure(findings, "forecast", title, run.trial))
@@ -100,6 +39,14 @@ def forecast_figures(findings: Findings) -> list[Figure]:
         title = f"The model {SECONDS:g} s ahead, data {log.trial.id}"
         found.append(_figure(findings, f"data-{log.trial.id}", title, log.trial))
     return [figure for figure in found if figure is not None]
+
+
+def _unseen(findings: Findings) -> Run | None:
+    """The latest run that the diagnosis was not made from."""
+    made = findings.diagnosis.made if findings.diagnosis is not None else None
+    seen = set(made.trials) if made is not None else None
+    fresh = [r for r in findings.runs if seen is not None and r.trial.id not in seen]
+    return fresh[-1] if fresh else None
 
 
 def _figure(findings: Findings, name: str, title: str, trial: Trial) -> Figure | None:
@@ -125,11 +72,17 @@ def _figure(findings: Findings, name: str, title: str, trial: Trial) -> Figure |
             curves.append(Curve(t + begin, values, "best", f"model {better.name}", 1.2))
         bounds = fitted(without_astray([curves[0].y], [c.y for c in curves[1:]]))
         label = labelled(state, unit)
-        panels.append(Panel(label, "time [s]", shown(unit), tuple(curves), y_range=bounds))
+        y_name = shown(unit)
+        panel = Panel(label, "time [s]", y_name, tuple(curves), y_range=bounds, kind="forecast")
+        panels.append(panel)
     caption = (
         f"Every {SECONDS:g} s the model starts from the measured state and gets the inputs that "
         "were sent: where the lines part, the model is wrong."
     )
+    made = findings.diagnosis.made if findings.diagnosis is not None else None
+    if made is not None and better is not None:
+        seen = trial.id in made.trials
+        caption += f" The diagnosis was {'' if seen else 'not '}made from this trial."
     if trial.steps < steps:
         caption += f" Drawn is the worst part of the log, from {begin:g} s on."
     return Figure(name, title, caption, tuple(panels), legend(panels))
@@ -158,3 +111,124 @@ def _part(trial: Trial, first: int, last: int) -> Trial:
     held = trial.start_inputs if first == 0 else trial.inputs[first - 1]
     states, inputs = trial.states[first : last + 1], trial.inputs[first:last]
     return replace(trial, states=states, inputs=inputs, start_inputs=held)
+
+
+def residual_figures(findings: Findings) -> list[Figure]:
+    """What the model lacks over what explains it best, and whether the rest is white noise."""
+    run = findings.best or findings.latest
+    data: list[tuple[Trial, Array, Array | None]] = [
+        (r.trial, r.residual, r.explained) for r in ([run] if run is not None else [])
+    ]
+    data = data or [(one.trial, one.residual, None) for one in findings.logs[-1:]]
+    if not data or data[0][0].finite_steps < LEAST_STEPS:
+        return []
+    trial, residual, explained = data[0]
+    whole = trial.finite_steps
+    explained = None if explained is None else explained[:whole]
+    channels = _channels(findings, trial.states[:whole], residual[:whole])
+    over = [_over(findings, trial, i, residual[:whole], explained) for i in channels]
+    rest = [_autocorrelation(findings, trial, i, residual[:whole], explained) for i in channels]
+    name, better = trial.id or "the best trial", findings.better
+    caption = f"Each dot is a step of {name}: what must be added to the {findings.plain}."
+    if explained is not None and better is not None:
+        caption += f" The line is what the model {better.name} adds."
+    same = "Within the band the residual can't be told from white noise."
+    return [
+        Figure("residual", "What the model lacks", caption, tuple(over), legend(over)),
+        Figure(
+            "autocorrelation", "Is the rest noise?", same, tuple(rest),
+            (*legend(rest), Key("other", "white noise, 95 %", "band")),
+        ),
+    ]  # fmt: skip
+
+
+def _channels(findings: Findings, states: Array, residual: Array) -> list[int]:
+    """The states that the diagnosis blames, or else those with the largest residual."""
+    names, diagnosis = findings.task.model.state_names, findings.diagnosis
+    blamed = [c.name for c in diagnosis.where.channels] if diagnosis is not None else []
+    known = [names.index(name) for name in blamed if name in names]
+    spread = np.std(states, axis=0) + 1e-9
+    sizes = np.where(np.ptp(residual, axis=0) > 0, np.std(residual, axis=0) / spread, -1.0)
+    rest = [int(i) for i in np.argsort(-sizes) if sizes[i] >= 0 and i not in known]
+    return [*known, *rest][:CHANNELS]
+
+
+def _over(
+    findings: Findings, trial: Trial, state: int, residual: Array, explained: Array | None
+) -> Panel:
+    """A state's residual over the state or input whose bins differ most in it."""
+    model, steps = findings.task.model, len(residual)
+    units = [*model.states.items(), *model.inputs.items()]
+    values = np.hstack([trial.states[:steps], trial.inputs[:steps]])
+    rate = residual[:, state] / trial.dt
+    telling = [_told(values[:, k], rate) for k in range(values.shape[1])]
+    k = int(np.argmax(telling))
+    x = values[:, k]
+    some = np.linspace(0, steps - 1, min(steps, POINTS)).astype(int)
+    curves = [
+        Curve(x[some], rate[some], "model", f"lacking in the {findings.plain}", style="points")
+    ]
+    better = findings.better
+    if explained is not None and better is not None:
+        added = rate - explained[:, state] / trial.dt
+        at, mean = _binned(x, added)
+        curves.append(Curve(at, mean, "best", f"added by the model {better.name}", 2.5))
+    name, unit = list(model.states.items())[state]
+    title = f"{name}: what the model lacks, over {units[k][0]}"
+    bounds = fitted([np.quantile(rate, [0.002, 0.998])], 0.15)
+    return Panel(
+        title, labelled(*units[k]), labelled(f"missing {name}", per_second(unit)), tuple(curves),
+        y_range=bounds,
+    )  # fmt: skip
+
+
+def _bins(x: Array) -> int:
+    return min(BINS, max(2, len(x) // 8))
+
+
+def _edges(x: Array) -> Array:
+    return np.unique(np.quantile(x, np.linspace(0, 1, _bins(x) + 1)))
+
+
+def _told(x: Array, y: Array) -> float:
+    """The share of y's variance that its means in bins of x hold."""
+    edges, total = _edges(x), float(np.var(y))
+    if len(edges) < 3 or not total > 0:
+        return 0.0
+    which = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, len(edges) - 2)
+    counts = np.bincount(which, minlength=len(edges) - 1)
+    means = np.bincount(which, y, len(edges) - 1) / np.maximum(counts, 1)
+    return float(np.sum(counts * (means - y.mean()) ** 2) / (len(y) * total))
+
+
+def _binned(x: Array, y: Array) -> tuple[Array, Array]:
+    """Means of x and y in bins of x that hold equally many."""
+    order = np.argsort(x, kind="stable")
+    parts = [p for p in np.array_split(order, _bins(x)) if len(p)]
+    return np.array([x[p].mean() for p in parts]), np.array([y[p].mean() for p in parts])
+
+
+def _autocorrelation(
+    findings: Findings, trial: Trial, state: int, residual: Array, explained: Array | None
+) -> Panel:
+    """Of a state's residual, of the model alone and as diagnosed."""
+    most = min(LAGS, len(residual) // 3, max(5, round(LAGS_S / trial.dt)))
+    lags = range(1, most + 1)
+    shown_ = [(residual, "model", findings.plain)]
+    if explained is not None and findings.better is not None:
+        shown_.append((explained, "best", f"model {findings.better.name}"))
+    curves = []
+    for values, role, name in shown_:
+        y = values[:, state] - values[:, state].mean()
+        power = float(y @ y) or 1.0
+        found = np.array([float(y[lag:] @ y[:-lag]) / power for lag in lags])
+        curves.append(
+            Curve(np.array(lags) * float(trial.dt), found, role, f"left of the {name}", 2.0)
+        )
+    bound = 1.96 / np.sqrt(len(residual))
+    band = Band(-bound, bound, "other", "white noise stays inside, 95 %")
+    name = findings.task.model.state_names[state]
+    return Panel(
+        f"{name}: autocorrelation of the residual", "lag [s]", "", tuple(curves), bands=(band,),
+        y_range=(-1.05, 1.05),
+    )  # fmt: skip

@@ -1,4 +1,4 @@
-"""The figures of the runs: paths, states, tracking error, inputs, bias; and the list of all."""
+"""The figures over time: states, tracking error, inputs, bias; and the list of all figures."""
 
 from __future__ import annotations
 
@@ -6,22 +6,24 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from grounded.frozen import Array
-from grounded_trials.report.figures.axis import fitted, without_astray
-from grounded_trials.report.figures.figure import (
+from grounded.diagnosis.pictures import gap_figures
+from grounded.figures.figure import (
     STEPS,
-    WIDTHS,
     Curve,
+    Dot,
     Figure,
     Panel,
     Rule,
+    fitted,
     legend,
+    without_astray,
 )
-from grounded_trials.report.figures.gap import forecast_figures, gap_figure
-from grounded_trials.report.figures.utilities import search_figure
+from grounded.frozen import Array
+from grounded.search.pictures import search_figure
+from grounded_trials.report.figures.gap import forecast_figures, residual_figures
+from grounded_trials.report.figures.paths import crash, name_of, named_paths, path_figure
 from grounded_trials.report.findings import (
     Findings,
-    Run,
     compared,
     prediction_error,
     selection,
@@ -32,45 +34,16 @@ from grounded_trials.report.scene import scene_of
 from grounded_trials.wording import figure, labelled, per_second, shown
 
 ITERATIONS = 5
-OTHERS = 60  # runs that are drawn faintly behind the paths
 
 
 def all_figures(findings: Findings) -> list[Figure]:
     """All figures of a report, in reading order; those without content are left out."""
-    runs = (search_figure, path_figure, state_figure, error_figure, input_figure, bias_figure)
-    made = [*(draw(findings) for draw in runs), gap_figure(findings.diagnosis)]
-    return [figure for figure in made if figure is not None] + forecast_figures(findings)
-
-
-def path_figure(findings: Findings) -> Figure | None:
-    """The paths in the plane, and seen from the side where there is an altitude."""
-    scene = scene_of(findings.task.model)
-    if len(scene.axes) < 2 or len(_paths(findings)) < 2:
-        return None
-    panels = [_plane(findings, scene.axes[0], scene.axes[1], plan=True)]
-    if scene.volume:
-        panels.append(_plane(findings, scene.axes[0], scene.axes[2], plan=False))
-    if scene.spatial and findings.runs and set(scene.axes) <= set(tracked(findings.task)):
-        panels.append(_distance(findings, list(scene.axes)))
-    caption = "Grey: all other trials." if len(findings.runs) > 2 else ""
-    if not scene.spatial:
-        caption = f"The model names no position: its first two states. {caption}"
-    return Figure("paths", "Paths", caption.strip(), tuple(panels), legend(panels))
-
-
-def _plane(findings: Findings, a: int, b: int, plan: bool) -> Panel:
-    task = findings.task
-    known = {run.trial.id for _, run in compared(findings)}
-    others = [r for r in findings.runs if r.trial.id not in known][-OTHERS:]
-    times: Array = np.arange(task.horizon + 1, dtype=np.float64) * task.dt
-    curves = [Curve(r.trial.states[:, a], r.trial.states[:, b], "other", "", 0.5) for r in others]
-    for role, name, states in _paths(findings):
-        x, y, width = states[:, a], states[:, b], WIDTHS.get(role, 1.5)
-        curves.append(Curve(x, y, role, name, width, times[: len(states)]))
-    (x_name, x_unit), (y_name, y_unit) = (list(task.model.states.items())[i] for i in (a, b))
-    names = labelled(x_name, x_unit), labelled(y_name, y_unit)
-    equal = plan and x_unit == y_unit
-    return Panel(f"{y_name} over {x_name}", *names, tuple(curves), equal=equal)
+    runs = (path_figure, state_figure, error_figure, input_figure, bias_figure)
+    made = [search_figure(findings.standing, findings.optimum), *(draw(findings) for draw in runs)]
+    if findings.diagnosis is not None:
+        made += gap_figures(findings.diagnosis)
+    made += forecast_figures(findings) + residual_figures(findings)
+    return [figure for figure in made if figure is not None]
 
 
 def _distance(findings: Findings, axes: list[int]) -> Panel:
@@ -79,37 +52,24 @@ def _distance(findings: Findings, axes: list[int]) -> Panel:
     curves = []
     for role, run in compared(findings):
         off = np.linalg.norm(tracking_error(task, run.trial)[:, axes], axis=1)
-        curves.append(_over_time(off, task.dt, role, _name(role, run)))
+        curves.append(_over_time(off, task.dt, role, name_of(role, run)))
     unit = task.model.states[task.model.state_names[axes[0]]]
     return _timed("distance from the desired position", unit, curves, spare=50.0)
-
-
-def _name(role: str, run: Run) -> str:
-    return f"{'model’s policy' if role == 'model' else 'best so far'}, {run.label}"
-
-
-def _paths(findings: Findings) -> list[tuple[str, str, Array]]:
-    """(role, name, states) of what is compared, first what lies behind."""
-    found = [(role, _name(role, run), run.trial.states) for role, run in compared(findings)]
-    waiting = findings.standing.outstanding
-    if not found and waiting is not None:
-        found = [("predicted", f"predicted for {waiting.id}", waiting.predicted_states)]
-    return [*found, ("desired", "desired", findings.task.target)]
 
 
 def state_figure(findings: Findings) -> Figure | None:
     """Each state over time, beside its target and prediction."""
     task = findings.task
-    if len(_paths(findings)) < 2:
+    if len(named_paths(findings)) < 2:
         return None
     known, panels = tracked(task), []
     for i, (name, unit) in enumerate(task.model.states.items()):
         curves = [
             _over_time(states[:, i], task.dt, role, words)
-            for role, words, states in _paths(findings)
+            for role, words, states in named_paths(findings)
             if role != "desired" or i in known
         ]
-        panels.append(_timed(name, unit, curves))
+        panels.append(_timed(name, unit, curves, marks=_crashes(findings, i)))
     return Figure("states", "States over time", "", tuple(panels), legend(panels))
 
 
@@ -119,10 +79,13 @@ def error_figure(findings: Findings) -> Figure | None:
     shown, panels = compared(findings), []
     if not shown:
         return None
+    scene = scene_of(task.model)
+    if scene.spatial and set(scene.axes) <= set(tracked(task)):
+        panels.append(_distance(findings, list(scene.axes)))
     for i in tracked(task):
         name, unit = task.model.state_names[i], list(task.model.states.values())[i]
         curves = [
-            _over_time(tracking_error(task, run.trial)[:, i], task.dt, role, _name(role, run))
+            _over_time(tracking_error(task, run.trial)[:, i], task.dt, role, name_of(role, run))
             for role, run in shown
         ]
         _, run = shown[-1]
@@ -140,7 +103,7 @@ def input_figure(findings: Findings) -> Figure | None:
         return None
     for j, (name, unit) in enumerate(task.model.inputs.items()):
         curves = [
-            _over_time(run.trial.inputs[:, j], task.dt, role, _name(role, run), 1.5)
+            _over_time(run.trial.inputs[:, j], task.dt, role, name_of(role, run), 1.5)
             for role, run in shown
         ]
         limits = [float(v) for v in (task.low[j], task.high[j]) if np.isfinite(v)]
@@ -180,8 +143,24 @@ def _over_time(values: Array, dt: float, role: str, name: str, width: float = 1.
     return Curve(times, values, role, name, width)
 
 
+def _crashes(findings: Findings, state: int) -> list[Dot]:
+    """A cross where a compared run ended early."""
+    dots = []
+    for role, run in compared(findings):
+        last = crash(run)
+        if last is not None:
+            at, note = last * findings.task.dt, f"{name_of(role, run)} ended early"
+            dots.append(Dot(at, float(run.trial.states[last, state]), role, note, "cross"))
+    return dots
+
+
 def _timed(
-    name: str, unit: str, curves: list[Curve], limits: Sequence[float] = (), spare: float = 3.0
+    name: str,
+    unit: str,
+    curves: list[Curve],
+    limits: Sequence[float] = (),
+    spare: float = 3.0,
+    marks: Sequence[Dot] = (),
 ) -> Panel:
     """A panel over time; a first run that went astray is cut off rather than flatten the others.
 
@@ -196,9 +175,11 @@ def _timed(
         "time [s]",
         shown(unit),
         tuple(curves),
+        tuple(marks),
         rules=tuple(Rule(v, "limit", "limit") for v in limits),
         y_range=(low, high),
         note=_cut_off(wild, low, high),
+        kind="time",
     )
 
 

@@ -1,153 +1,230 @@
 """report.html: one page with everything, that needs no network and runs no script but its own.
 
-What a name or a file says is text, never markup: it is escaped, and a content security policy
-allows only the one script whose hash the page states.
+What a name or a file says is text, never markup: the template escapes it, and a content security
+policy allows only the two scripts whose hashes the page states. The figures are in the page as
+data; `page.js` draws each with Plotly when it comes into view.
 """
 
 from __future__ import annotations
 
 import base64
 import hashlib
+import json
 import math
-from html import escape
+from functools import cache
 from importlib.resources import files
+from typing import Any
 
+import numpy as np
+
+from grounded.diagnosis.pictures import credit_figure
+from grounded.errors import needs
+from grounded.figures.figure import Bars, Panel
+from grounded.figures.interactive import EXTRA, packed, palette, plotted
+from grounded.search.pictures import search_figure
+from grounded_trials.report.diagnosis_words import error_lines
+from grounded_trials.report.figures.paths import crash, path_figure
 from grounded_trials.report.figures.runs import (
     bias_figure,
     error_figure,
     input_figure,
-    path_figure,
     state_figure,
 )
-from grounded_trials.report.figures.utilities import search_figure
-from grounded_trials.report.findings import Findings
-from grounded_trials.report.page.page_diagnosis import gap_section, verdict_block
-from grounded_trials.report.page.page_tables import (
+from grounded_trials.report.findings import Findings, improvements_in
+from grounded_trials.report.page.diagnosed import (
+    gap_section,
+    preflight,
+    verdict_lines,
+)
+from grounded_trials.report.page.tables import (
+    Block,
     candidate_table,
     channel_table,
-    command,
+    drawn,
     error_table,
-    figure_block,
     parameter_table,
-    role_styles,
 )
 from grounded_trials.wording import count, figure
 
+LINES = 2  # of the verdict, at the top
+OPEN = 12  # candidates whose table is open
 
-def page(findings: Findings) -> str:
-    """The whole document."""
-    package = files(__package__)
-    script = package.joinpath("page.js").read_text(encoding="utf-8")
-    style = package.joinpath("page.css").read_text(encoding="utf-8") + role_styles()
-    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    policy = (
-        "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'; "
-        f"script-src 'sha256-{digest}'"
+
+def page(findings: Findings, watched: int = 0) -> str:
+    """The whole document.
+
+    Args:
+        findings: what is shown.
+        watched: the revision that the page is of, where `report --watch` keeps it current.
+
+    Raises:
+        GroundedError: if Jinja2 or Plotly is not installed.
+    """
+    needs("jinja2", EXTRA)
+    needs("plotly", EXTRA)
+    from jinja2 import Environment
+
+    jinja = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    scripts = [_plotly(), _own("page.js")]
+    panels: list[dict[str, Any]] = []
+
+    def number(panel: Panel | Bars) -> int:
+        panels.append(_data(panel))
+        return len(panels) - 1
+
+    def data() -> str:  # asked for after every panel has its number
+        text = json.dumps({"panels": panels, "colours": palette()}, allow_nan=False)
+        return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+    return jinja.from_string(_own("page.html")).render(
+        findings=findings,
+        about=_about(findings),
+        tiles=_tiles(findings),
+        improved=_improved(findings),
+        why=_why(findings),
+        sections=[(title, blocks) for title, blocks in _sections(findings) if blocks],
+        style=_own("page.css") + _roles(),
+        scripts=scripts,
+        hashes=[_hash(script) for script in scripts],
+        number=number,
+        height=_height,
+        data=data,
+        watched=watched,
     )
-    links = bodies = ""
-    for number, (title, body) in enumerate(s for s in _sections(findings) if s[1]):
-        links += f'<a href="#s{number}">{escape(title)}</a>'
-        bodies += f'<section id="s{number}"><h2>{escape(title)}</h2>{body}</section>'
-    return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
-        f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{escape(findings.name)} – grounded</title><style>{style}</style></head>"
-        f"<body><main>{_head(findings)}<nav>{links}</nav>{bodies}</main>"
-        f'<div id="tip" role="status"></div><script>{script}</script></body></html>\n'
-    )
 
 
-def _sections(findings: Findings) -> list[tuple[str, str]]:
-    """Titles and bodies, in reading order; an empty body is left out."""
+def _own(name: str) -> str:
+    return files(__package__).joinpath(name).read_text(encoding="utf-8")
+
+
+@cache
+def _plotly() -> str:
+    from plotly.offline import get_plotlyjs
+
+    return str(get_plotlyjs()).replace("</script", "<\\/script")
+
+
+def _hash(script: str) -> str:
+    return base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+
+
+def _data(panel: Panel | Bars) -> dict[str, Any]:
+    kind = "bars" if isinstance(panel, Bars) else panel.kind
+    found: dict[str, Any] = _plain(plotted(panel))
+    return found | {"kind": kind}
+
+
+def _plain(value: Any) -> Any:
+    """Arrays packed, numbers of NumPy as Python's."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.ndarray):
+        return packed(value)
+    return float(value) if isinstance(value, np.floating) else value
+
+
+def _height(panel: Panel | Bars) -> int:
+    """Of a panel in the page [px]."""
+    if isinstance(panel, Bars):
+        return 30 + 26 * max(len(panel.bars), 1)
+    return 420 if panel.kind == "path" else 240
+
+
+def _roles() -> str:
+    """Colours of the roles for the legends, light and dark; print is light."""
+    light = "".join(f".{role}{{--c:{pair[0]}}}" for role, pair in palette().items())
+    dark = "".join(f".{role}{{--c:{pair[1]}}}" for role, pair in palette().items())
+    return f"{light}@media screen and (prefers-color-scheme: dark){{{dark}}}"
+
+
+def _sections(findings: Findings) -> list[tuple[str, list[Block]]]:
+    """Titles and parts, in reading order."""
+    paths = drawn(path_figure(findings), wide=True)
     return [
+        ("Paths", [*paths, Block("run")] if paths and findings.runs else paths),
+        ("States", drawn(state_figure(findings))),
+        ("Tracking error", drawn(error_figure(findings)) + error_table(findings)),
+        ("Inputs", drawn(input_figure(findings))),
         ("Utility", _utility(findings)),
-        ("Paths", figure_block(path_figure(findings), "two")),
-        ("States", figure_block(state_figure(findings))),
-        ("Tracking error", figure_block(error_figure(findings)) + error_table(findings)),
-        ("Inputs", figure_block(input_figure(findings))),
-        ("Bias", figure_block(bias_figure(findings))),
+        ("Bias", drawn(bias_figure(findings))),
         ("Gap", gap_section(findings)),
         ("Task and model", _task(findings)),
-        ("What to run next", _next(findings)),
     ]
 
 
-def _head(findings: Findings) -> str:
+def _about(findings: Findings) -> str:
     task = findings.task
-    about = (
+    return (
         f"{task.model.name}: {task.horizon} steps of {task.dt:g} s ({task.horizon * task.dt:g} s), "
         f"{'closed loop' if task.feedback else 'open loop'}; {findings.method}"
     )
-    diagnosis = findings.diagnosis
-    verdict = verdict_block(diagnosis, findings.since, short=True) if diagnosis else ""
-    return (
-        f'<h1>{escape(findings.name)}</h1><p class="soft">{escape(about)}</p>'
-        f"{_lost(findings)}{_tiles(findings)}{verdict}"
-    )
 
 
-def _tiles(findings: Findings) -> str:
+def _improved(findings: Findings) -> list[tuple[str, str]]:
+    """What the first trial missed by, and the best one does: in the units of the states."""
+    rows = [(one.text, one.what) for one in improvements_in(findings)]
     first, best = findings.first, findings.best
-    tiles = []
-    if best is not None:
-        tiles.append((figure(best.utility), f"best utility, {best.candidate.id}"))
-    if first is not None:
-        tiles.append((figure(first.utility), "the model’s own policy"))
-    if findings.optimum is not None:
-        tiles.append((figure(findings.optimum), "optimum of the real system"))
-    if first is not None and best is not None and -math.inf < first.utility < 0:
-        gain = 100 * (1 - best.utility / first.utility)
-        tiles.append((f"{gain:.1f} %", "of the first policy’s loss is gone"))
+    if first is not None and best is not None and best is not first:
+        gain = ""
+        if -math.inf < first.utility < 0 and best.utility <= 0:
+            gain = f": {100 * (1 - best.utility / first.utility):.1f} % of the first loss is gone"
+        moved = f"{figure(first.utility)} → {figure(best.utility)}"
+        rows.append((moved, f"utility, the model’s own policy to {best.candidate.id}{gain}"))
+    elif best is not None:
+        rows.append((figure(best.utility), f"utility, {best.candidate.id}"))
+    return rows
+
+
+def _tiles(findings: Findings) -> list[str]:
     now, logs = findings.standing, len(findings.logs)
+    found = []
     if findings.history or not logs:
-        better = count(now.iteration, "improvement")
-        tiles.append((str(now.trials), f"trial{'s' * (now.trials != 1)}, {better}"))
+        found.append(f"{count(now.trials, 'trial')}, {count(now.iteration, 'improvement')}")
     if logs:
-        tiles.append((str(logs), f"log{'s' * (logs != 1)} of data"))
-    tiles.append((now.phase, "phase of the search"))
-    inside = "".join(
-        f'<div class="tile"><b>{escape(a)}</b><span>{escape(b)}</span></div>' for a, b in tiles
-    )
-    return f'<div class="tiles">{inside}</div>'
+        found.append(f"{count(logs, 'log')} of data")
+    if findings.optimum is not None:
+        found.append(f"optimum of the real system {figure(findings.optimum)}")
+    early = [run.trial.id for run in findings.runs if crash(run) is not None]
+    return [*found, f"ended early: {', '.join(early)}"] if early else found
 
 
-def _lost(findings: Findings) -> str:
-    if not findings.lost:
-        return ""
-    items = [f"<li><b>{escape(one.file)}</b>: {escape(one.reason)}</li>" for one in findings.lost]
-    said = "<b>This report is not complete.</b> Left out: "
-    return f'<div class="lost" id="lost">{said}<ul>{"".join(items)}</ul></div>'
+def _why(findings: Findings) -> dict[str, Any]:
+    """The verdict, the lines that measure it, and the credit."""
+    diagnosis = findings.diagnosis
+    if diagnosis is None:
+        return {}
+    before = {} if findings.since.changed else findings.values
+    credit = credit_figure(diagnosis)
+    named = ("rest",) if credit else ("parameters", "error", "rest")
+    lines = [(title, text) for title, text in error_lines(diagnosis, before) if title in named]
+    return {
+        "verdict": verdict_lines(diagnosis, findings.since, LINES),
+        "preflight": preflight(diagnosis),
+        "lines": lines,
+        "credit": credit,
+    }
 
 
-def _utility(findings: Findings) -> str:
+def _utility(findings: Findings) -> list[Block]:
     if not findings.history:
         logs = count(len(findings.logs), "log")
-        return f"<p>No candidate was proposed yet; {logs} of data.</p>"
+        return [Block("text", f"No candidate was proposed yet; {logs} of data.")]
     from grounded.search.certainty import last_improvement
 
     sure = last_improvement(findings.history)
     begun = (sure[:1].upper() + sure[1:]).replace("+-", "±")
-    sentence = f"<p>{escape(begun)}.</p>" if sure else ""
-    opened = " open" if len(findings.history) <= 12 else ""
-    return (
-        f"{figure_block(search_figure(findings))}{sentence}"
-        f"<details{opened}><summary>All candidates</summary>{candidate_table(findings)}</details>"
-    )
+    few = len(findings.history) <= OPEN
+    return [
+        *drawn(search_figure(findings.standing, findings.optimum)),
+        *([Block("text", f"{begun}.")] if sure else []),
+        Block("folded", "All candidates", blocks=[candidate_table(findings)], wide=few),
+    ]
 
 
-def _task(findings: Findings) -> str:
+def _task(findings: Findings) -> list[Block]:
     adopted = ", ".join(findings.effects) or "none"
     words = f"Adopted effects: {adopted}. Stored trials of other tasks: {findings.others}."
-    return (
-        f"<p>{escape(words)}</p>{channel_table(findings)}"
-        f"<details><summary>Parameters of the model</summary>{parameter_table(findings)}</details>"
-    )
-
-
-def _next(findings: Findings) -> str:
-    parts = [f"<p>{escape(findings.standing.phase)}: {escape(findings.standing.sentence)}.</p>"]
-    if findings.diagnosis is not None and findings.diagnosis.next_trial:
-        parts.append(f"<p>To learn more: {escape(findings.diagnosis.next_trial)}</p>")
-    parts.append(f"<p>{command(findings.next_command, 'c-next')}</p>")
-    return "".join(parts)
+    parameters = Block("folded", "Parameters of the model", blocks=parameter_table(findings))
+    return [Block("text", words), channel_table(findings), parameters]

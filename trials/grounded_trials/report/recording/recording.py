@@ -23,10 +23,10 @@ from typing import Any
 import numpy as np
 
 from grounded.errors import GroundedError, needs
+from grounded.figures.figure import COLOURS as PAGE
+from grounded.figures.figure import rgb
 from grounded.frozen import Array
 from grounded.trial import Trial
-from grounded_trials.report.figures.figure import COLOURS as PAGE
-from grounded_trials.report.figures.figure import rgb
 from grounded_trials.report.findings import Findings, Run, selection, tracked
 from grounded_trials.report.recording.layout import blueprint
 from grounded_trials.report.scene import Scene, scene_of
@@ -165,6 +165,8 @@ class _Recorder:
     def trial(self, run: Run) -> None:
         """Everything of one trial, under its own name."""
         at, colour = f"trials/{run.trial.id}", "accepted" if run.accepted else "other"
+        if self.task.utility(run.trial) == -np.inf:
+            colour = "limit"  # it crashed
         for role, chosen in self.compared.items():
             if chosen is not None and run.candidate is chosen.candidate:
                 colour = role

@@ -14,7 +14,7 @@ from grounded.experiments.fit_car import FitCarResult
 from grounded.experiments.footnote9 import Footnote9Result
 from grounded.experiments.jobs import improvement
 from grounded.experiments.nondeterminism import NondeterminismResult
-from grounded_trials.report.figures.figure import Bar, Bars, Figure, Key
+from grounded.figures.figure import Bar, Bars, Figure, Key
 
 LEVEL = 2  # of SHARES: what the picture of the baselines counts trials to
 PAPER_SPREAD = 50.0  # [cm] the largest that the paper saw

@@ -2,10 +2,10 @@
 
 Made by `python -m grounded_trials.report.studies.effect_pictures docs`.
 
-A car is driven by the same commands in the model (grey) and in the model with one effect (orange);
-shown is the state that the effect changes most, in units of its own range: one that moves fast
-(speed, steering angle, heading rate) where it changes those, else a position. Strengths are chosen
-so that the change is seen: about a quarter of the range.
+A car (for a joint's effects a pendulum) is driven by the same commands in the model (grey) and in
+the model with one effect (orange); shown is the state that the effect changes most, in units of its
+own range: one that moves fast (speed, steering angle, heading rate) where it changes those, else a
+position. Strengths are chosen so that the change is seen: about a quarter of the range.
 """
 
 from __future__ import annotations
@@ -20,9 +20,11 @@ from grounded.effects import (
     Effect,
     InputFamily,
     Library,
+    LossFamily,
     MemoryFamily,
     ParamFamily,
     RateFamily,
+    Scales,
     memory_start,
     places,
     scales_of,
@@ -31,6 +33,7 @@ from grounded.effects import (
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.models.car import model as car
+from grounded.models.pendulum import model as pendulum
 from grounded.trial import Trial
 
 DT, STEPS = 0.05, 160
@@ -74,16 +77,18 @@ def settings(effect: Effect) -> list[dict[str, float]]:
 
 def signature(effect: Effect, inputs: Array, plain: Array) -> Drawn:
     """The state that changes most."""
-    size = np.maximum(np.ptp(plain, axis=0), 1e-9)
-    fast = [car.state_names.index(name) for name in places.dynamic(car)]
+    size, model = np.maximum(np.ptp(plain, axis=0), 1e-9), effect.site.model
+    fast = [model.state_names.index(name) for name in places.dynamic(model)]
     found = []
     for values in settings(effect):
-        changed = run(wrap(effect, values, DT), car, inputs)
+        changed = run(wrap(effect, values, DT), model, inputs)
         change = np.abs(changed - plain).max(axis=0) / size
         if change[fast].max() > 0.02:
-            change = np.where(np.isin(np.arange(car.n), fast), change, 0.0)
+            change = np.where(np.isin(np.arange(model.n), fast), change, 0.0)
         i = int(np.argmax(change))
-        found.append((abs(float(change[i]) - SEEN), car.state_names[i], plain[:, i], changed[:, i]))
+        found.append(
+            (abs(float(change[i]) - SEEN), model.state_names[i], plain[:, i], changed[:, i])
+        )
     return min(found, key=lambda each: each[0])[1:]
 
 
@@ -109,23 +114,35 @@ def strip(named: Mapping[str, Drawn]) -> str:
 
 def kind_of(effect: Effect) -> str:
     """The section of docs/effects.md."""
-    kinds = {InputFamily: "input", MemoryFamily: "memory", RateFamily: "rate", ParamFamily: "param"}
+    kinds = {InputFamily: "input", MemoryFamily: "memory", LossFamily: "joint", RateFamily: "rate"}
+    kinds[ParamFamily] = "param"
     name = next((k for cls, k in kinds.items() if isinstance(effect.family, cls)), "sensor")
     return "sensor" if effect.family.name == "odometry_scale" else name
 
 
+def drawn_of(model: Model, scales: Scales) -> list[Effect]:
+    """All that applies to the car; of the pendulum what acts on its joint."""
+    if model is car:
+        return list(Library().candidates(model, scales))
+    library = Library()
+    joints = [family for family in library.families if isinstance(family, LossFamily)]
+    names = [f"{family.name}:{target}" for family in joints for target in family.targets(model)]
+    return [library.effect(name, model, scales) for name in names]
+
+
 def draw_all(folder: Path) -> list[Path]:
     """Writes effects-KIND.svg for every kind; returns their paths."""
-    inputs = commands()
-    plain = run(car, car, inputs)
-    scales = scales_of(car, plain, inputs, DT, STEPS * DT)
+    inputs, swings = commands(), 2.0 * commands()[:, :1]
     strips: dict[str, dict[str, Drawn]] = {}
-    for effect in Library().candidates(car, scales):
-        named = strips.setdefault(kind_of(effect), {})
-        drawn = signature(effect, inputs, plain)
-        before = named.get(effect.family.name)
-        if before is None or _change(drawn) > _change(before):  # the target where it shows
-            named[effect.family.name] = drawn
+    for model, u in ((car, inputs), (pendulum, swings)):
+        plain = run(model, model, u)
+        scales = scales_of(model, plain, u, DT, STEPS * DT)
+        for effect in drawn_of(model, scales):
+            named = strips.setdefault(kind_of(effect), {})
+            drawn = signature(effect, u, plain)
+            before = named.get(effect.family.name)
+            if before is None or _change(drawn) > _change(before):  # the target where it shows
+                named[effect.family.name] = drawn
     paths = []
     for kind, named in strips.items():
         paths.append(folder / f"effects-{kind}.svg")

@@ -19,8 +19,7 @@ from grounded.experiments.flight import FIGURE_STEP, FlightResult
 from grounded.experiments.jobs import mean_se
 from grounded.experiments.repeats import NoiseResult, Outcome
 from grounded.experiments.theorem1 import Theorem1Result, Theorem1Row
-from grounded.frozen import Array
-from grounded_trials.report.figures.figure import (
+from grounded.figures.figure import (
     STEPS,
     WIDTHS,
     Bar,
@@ -31,8 +30,10 @@ from grounded_trials.report.figures.figure import (
     Key,
     Panel,
     Rule,
+    enlarging,
     legend,
 )
+from grounded.frozen import Array
 from grounded_trials.report.figures.png import png
 from grounded_trials.report.studies.bars import (
     baselines_figure,
@@ -44,7 +45,6 @@ from grounded_trials.report.studies.bars import (
 from grounded_trials.store.store import write_atomically
 
 FIRST, LAST, DESIRED = "the model’s controller", "after learning", "desired"
-FACTORS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
 PAPER_FIGURE = {"turn": 4, "circle": 5, "figure8": 5}
 RULE_ROLES = ("model", "step2", "accepted", "best", "other", "predicted", "desired")
 SMALLEST = 1e-300  # instead of the logarithm of nothing
@@ -61,7 +61,7 @@ def flight_figure(result: FlightResult) -> Figure:
     ]
     times = np.arange(len(result.desired), dtype=np.float64) * DT * FIGURE_STEP
     height = [Curve(times[: len(p)], p[:, 2], role, name) for role, name, p in paths]
-    factor = _enlarged(paths[0][2], paths[2][2])
+    factor = enlarging(paths[0][2], paths[2][2])
     panels = (
         _plane("Figure 1: North over East", paths, 1.0),
         _plane(f"The same, deviations {factor:g} times as large", paths, factor),
@@ -72,13 +72,6 @@ def flight_figure(result: FlightResult) -> Figure:
     key = (*legend(panels[:1]), *(Key(role, name) for role, name in more.items()))
     title = f"The aircraft’s figure-8: the median of {len(result.flown)} runs, seed {shown.seed}"
     return Figure("flight", title, "", panels, key)
-
-
-def _enlarged(path: Array, desired: Array) -> float:
-    """A round factor that makes the deviation of a path visible beside the desired one's size."""
-    off = np.abs(path - desired[: len(path)])[:, :2].max()
-    room = 0.2 * np.ptp(desired[:, :2], axis=0).max()
-    return max((f for f in FACTORS if f * off <= room), default=1.0)
 
 
 def _plane(title: str, paths: list[tuple[str, str, Array]], factor: float) -> Panel:

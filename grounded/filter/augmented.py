@@ -1,4 +1,10 @@
-"""A delayed measurement in the filter: one state more, and its three passes stay as they are.
+"""States that a filter carries beside the model's: its three passes stay as they are.
+
+Coloured noise, c_{t+1} = phi c_t + eta, enters each step as white noise does, through G:
+
+    A = [[F, G], [0, phi]]
+
+A delayed measurement shows the state of an earlier moment, and one more state remembers it:
 
     r_i(s) = (1 - p) e_i(s) + p e_i(s - 1) + v(s)         of a delayed channel i, 0 <= p < 1
 
@@ -17,22 +23,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
+from grounded.filter.kalman import LinearSystem
 from grounded.frozen import Array
 
 
-class FilterSystem(NamedTuple):
-    """What `filter.gains` takes."""
-
-    A: Array  # (L, B, N, N)
-    Q: Array  # (L, B, N)
-    R: Array  # (L + 1, B, n)
-    seen: Array  # (L + 1, B, n)
-    start: Array  # (B, N - n)
-    G: Array | None  # (L, B, n, n)
+def coloured(F: Array, phi: float | None, G: Array | None = None) -> Array:
+    """A of the filter: F alone (L, B, n, n), or with coloured noise beside it (L, B, 2 n, 2 n)."""
+    if phi is None:
+        return F
+    L, B, n, _ = F.shape
+    A, i = np.zeros((L, B, 2 * n, 2 * n)), np.arange(n)
+    A[:, :, :n, :n] = F
+    A[:, :, :n, n:] = np.eye(n) if G is None else G
+    A[:, :, n + i, n + i] = phi
+    return A
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,30 +55,30 @@ class Delayed:
         """D."""
         return int(self.channel.shape[1])
 
-    def system(self, of: FilterSystem) -> FilterSystem:
+    def system(self, of: LinearSystem) -> LinearSystem:
         """The widened system."""
         n, D = of.seen.shape[-1], self.count
         G = self._entry(of)
         still = np.zeros((*of.seen.shape[:-1], D))
         seen, R = np.concatenate([of.seen, still], axis=-1), np.concatenate([of.R, still], axis=-1)
-        mine = self.channel[None]
-        seen[:1, :, n:] = np.take_along_axis(of.seen[:1], mine, axis=-1)
-        R[:, :, n:] = np.take_along_axis(of.R, mine, axis=-1)
+        seen[:1, :, n:] = np.take_along_axis(of.seen[:1], self.channel[None], axis=-1)
         # the first measurement shows x(-p): since then a part of a step's noise has come
-        power = of.Q[0, :, :n] if of.start.shape[1] == 0 else of.Q[0, :, :n] + of.start
+        first, colour = of.start[:, :n], of.start[:, n:]
+        power = of.Q[0, :, :n] + colour if colour.size else of.Q[0, :, :n]
         since = np.einsum("bdk,bk->bd", G[0, :, n:, :n] ** 2, power)
-        R[0, :, n:] += self.part**2 * since
-        start = of.start if of.start.shape[1] == 0 else np.pad(of.start, [(0, 0), (0, D)])
-        return FilterSystem(self._transition(of, G), self.noises(of.Q, n), R, seen, start, G)
+        parts = [first, np.take_along_axis(first, self.channel, axis=-1) + self.part**2 * since]
+        parts += [colour, np.zeros((len(colour), D))] if colour.size else []
+        start = np.concatenate(parts, axis=-1)
+        return LinearSystem(self._transition(of, G), self.noises(of.Q, n), R, seen, start, G)
 
-    def _entry(self, of: FilterSystem) -> Array:
+    def _entry(self, of: LinearSystem) -> Array:
         """How noise enters, (L, B, n', n')."""
         L, B, n, D = *of.A.shape[:2], of.seen.shape[-1], self.count
         G = np.zeros((L, B, n + D, n + D))
         G[:, :, :n, :n] = np.eye(n) if of.G is None else of.G
         return self._led(G, n)
 
-    def _transition(self, of: FilterSystem, G: Array) -> Array:
+    def _transition(self, of: LinearSystem, G: Array) -> Array:
         """A of the widened state, (L, B, N', N')."""
         (L, B, N, _), n, D = of.A.shape, of.seen.shape[-1], self.count
         wide, run = n + D, np.arange(B)
@@ -125,14 +133,14 @@ class Delayed:
 
 
 def joined(
-    parts: Sequence[tuple[FilterSystem, Delayed | None]],
-) -> tuple[FilterSystem, Delayed | None]:
+    parts: Sequence[tuple[LinearSystem, Delayed | None]],
+) -> tuple[LinearSystem, Delayed | None]:
     """Systems with as many delayed channels each as one, their runs one after the other."""
     systems = [system for system, _ in parts]
     A, Q, R, seen = (np.concatenate([one[k] for one in systems], axis=1) for k in range(4))
     entries = [one.G for one in systems if one.G is not None]
     G = np.concatenate(entries, axis=1) if entries else None
-    whole = FilterSystem(A, Q, R, seen, np.concatenate([one.start for one in systems]), G)
+    whole = LinearSystem(A, Q, R, seen, np.concatenate([one.start for one in systems]), G)
     each = [delayed for _, delayed in parts if delayed is not None]
     if not each:
         return whole, None

@@ -5,9 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from grounded.diagnosis import filter as kalman
-from grounded.diagnosis import kernels
-from grounded.diagnosis.filter import innovations, smoother, transition
 from grounded.diagnosis.noise import (
     NoiseModel,
     Structure,
@@ -16,6 +13,10 @@ from grounded.diagnosis.noise import (
     likelihood_slopes,
     working,
 )
+from grounded.filter import kalman, kernels
+from grounded.filter.augmented import coloured
+from grounded.filter.kalman import innovations, smoother
+from grounded.filter.tempering import tempering
 
 L, B = 150, 2
 CASES = [
@@ -36,7 +37,7 @@ class Problem:
         if through:
             self.G = np.tile(np.eye(n), (L, B, 1, 1))
             self.G[:, :, n - 1, : n - 1] = 3 * rng.standard_normal((L, B, n - 1))
-        self.A = transition(F, phi, self.G)
+        self.A = coloured(F, phi, self.G)
         self.N = self.A.shape[-1]
         self.seen = np.ones((L + 1, B, n))
         if missing:
@@ -48,10 +49,9 @@ class Problem:
         self.v = 0.1 * np.exp(rng.standard_normal(n))
 
     def passes(self, q, v):
-        R = np.tile(v, (L + 1, 1, 1))
-        R[0] = self.v  # the start is given
-        start = np.ones((B, self.N - self.n))
-        g = kalman.gains(self.A, q, R, self.seen, start, self.G)
+        start = np.ones((B, self.N))
+        start[:, : self.n] = self.v  # the start is given
+        g = kalman.gains(kalman.LinearSystem(self.A, q, v, self.seen, start, self.G))
         white, track = innovations(g, self.d, self.r, track=True)
         return g, white, track, smoother(g, white[..., 0])
 
@@ -65,7 +65,7 @@ def test_smoother_gives_the_slope_of_the_likelihood_after_many_steps(case, monke
     problem = Problem(*case)
     for compiled in (True, False):
         if not compiled:
-            monkeypatch.setattr(kernels, "available", lambda n: False)
+            monkeypatch.setattr(kernels, "available", lambda n, N: False)
         back = problem.passes(problem.q, problem.v)[3]
         of_q = 0.5 * (problem.q * (back.r**2 - back.N)).sum(axis=(0, 1))
         of_v = 0.5 * (problem.v * (back.u**2 - back.D)).sum(axis=(0, 1))
@@ -83,9 +83,9 @@ def test_smoother_gives_the_slope_of_the_likelihood_after_many_steps(case, monke
 def test_kernels_and_numpy_agree(case, monkeypatch):
     problem = Problem(*case)
     fast = problem.passes(problem.q, problem.v)
-    monkeypatch.setattr(kernels, "available", lambda n: False)
+    monkeypatch.setattr(kernels, "available", lambda n, N: False)
     slow = problem.passes(problem.q, problem.v)
-    for name in ("K", "whiten", "logdet"):
+    for name in ("k", "weight", "logdet"):
         assert np.allclose(getattr(fast[0], name), getattr(slow[0], name), rtol=1e-9, atol=1e-11)
     for one, other in zip(fast[1:3], slow[1:3], strict=True):
         assert np.allclose(one, other, rtol=1e-9, atol=1e-9)
@@ -178,3 +178,61 @@ def test_kernels_that_another_version_of_us_wrote_are_not_used(monkeypatch):
     before = version()
     monkeypatch.setattr(Path, "read_bytes", lambda p: read(p) + b"#" * (p.name == "kernels.py"))
     assert version() != before
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_the_covariance_of_an_unstable_plant_stays_symmetric_and_settles(compiled, monkeypatch):
+    from scipy.linalg import solve_discrete_are
+
+    if not compiled:
+        monkeypatch.setattr(kernels, "available", lambda n, N: False)
+    T, A = 400, np.array([[1.34, 0.3, 0.0], [0.02, 0.9, 0.4], [0.1, 0.0, 1.2]])
+    Q, R, H = np.array([1e-6, 1e-4, 1e-5]), np.array([1e-3, 1e-4]), np.eye(2, 3)
+    one = kalman.LinearSystem(
+        np.tile(A, (T, 1, 1, 1)), Q, R, np.ones((T + 1, 1, 2)), np.full((1, 3), 1e4), None,
+        np.tile(H, (T, 1, 1, 1)),
+    )  # fmt: skip
+    for system in (one, one._replace(H=None)):  # the same measurement, told or understood
+        g = kalman.gains(system, covariances=True)
+        assert np.array_equal(g.P, g.P.swapaxes(-1, -2))
+        exact = solve_discrete_are(A.T, H.T, np.diag(Q), np.diag(R))
+        assert np.allclose(g.P[-1, 0], exact, rtol=1e-8)
+        back = smoother(g, np.ones((T, 1, 2)), covariances=True)
+        assert np.isfinite(back.whole).all() and np.abs(back.N).max() < 1e9
+
+
+@pytest.mark.parametrize("width", [1, 5, 11])
+def test_channels_may_measure_any_mixture_of_states(width, monkeypatch):
+    rng, n, N = np.random.default_rng(width), 3, 4
+    A = np.eye(N) + 0.1 * rng.standard_normal((L, width, N, N))
+    seen = (rng.random((L + 1, width, n)) > 0.2).astype(float)
+    H = rng.standard_normal((L, width, n, N))
+    system = kalman.LinearSystem(
+        A, 0.1, np.exp(rng.standard_normal(n)), seen, np.ones((width, N)), H=H
+    )
+    d, r = rng.standard_normal((L, width, N, 2)), rng.standard_normal((L + 1, width, n, 2))
+    found = []
+    for compiled in (True, False):
+        if not compiled:
+            monkeypatch.setattr(kernels, "available", lambda n, N: False)
+        g = kalman.gains(system, covariances=True)
+        white, track = innovations(g, d, r, track=True)
+        found.append(
+            [g.P, g.k, white, track, *vars(smoother(g, white[..., 0], covariances=True)).values()]
+        )
+    for one, other in zip(*found, strict=True):
+        assert np.allclose(one, other, rtol=1e-7, atol=1e-8 * np.abs(other).max())
+
+
+def test_nats_of_correlated_innovations_are_worth_as_many_as_are_news():
+    rng, T = np.random.default_rng(5), 4000
+    white, seen = rng.standard_normal((T, 2, 2)), np.ones((T, 2, 2))
+    found = tempering(white, seen)
+    assert 0.9 < found.factor <= 1 and type(found.factor) is float
+    coloured_ = white.copy()
+    for t in range(1, T):
+        coloured_[t] = 0.8 * coloured_[t - 1] + 0.6 * white[t]
+    assert tempering(coloured_, seen).factor == pytest.approx(0.2 / 1.8, rel=0.25)
+    assert tempering(3 * white, seen).factor == pytest.approx(1 / 9, rel=0.1)
+    seen[: T // 2, :, 0] = 0.0
+    assert tempering(np.where(seen > 0, coloured_, 99.0), seen).factor < 0.2

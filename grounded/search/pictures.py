@@ -1,4 +1,4 @@
-"""The figure of the search: utility by candidate, what the model promised, and the step sizes."""
+"""The figure of a search: utility by candidate, what the model promised, and the step sizes."""
 
 from __future__ import annotations
 
@@ -7,24 +7,30 @@ from dataclasses import replace
 
 import numpy as np
 
-from grounded.search.standing import Tried
-from grounded_trials.report.figures.figure import Band, Curve, Dot, Figure, Key, Panel, Rule
-from grounded_trials.report.findings import Findings, standard_error
-from grounded_trials.wording import figure
+from grounded.figures.figure import Band, Curve, Dot, Figure, Key, Panel, Rule, legend
+from grounded.search.candidate import Candidate, Tried
+from grounded.search.certainty import utility_noise
+from grounded.search.standing import Standing
 
 STEEP = 8.0  # worst over best utility from which on the axis is logarithmic
 NEAR = 4  # candidates from which on the better half has a panel of its own
 
 
-def search_figure(findings: Findings) -> Figure | None:
-    """Utility per candidate with the model's own prediction; alpha below it."""
-    tried = [t for t in findings.history if t.utilities]
+def search_figure(now: Standing, optimum: float | None = None) -> Figure | None:
+    """Utility per candidate with the model's own prediction, and the step sizes.
+
+    Args:
+        now: where the search stands.
+        optimum: of the real system, where it is known.
+    """
+    tried = [t for t in now.history if t.utilities]
     if not tried:
         return None
-    number = {t.candidate.id: k + 1 for k, t in enumerate(findings.history)}
-    whole = _utility(findings, tried, number)
+    number = {t.candidate.id: k + 1 for k, t in enumerate(now.history)}
+    noise = utility_noise(now.history)[0]
+    whole = _utility(now, tried, number, optimum, noise)
     near = (_near(whole),) if whole.loss and len(tried) > NEAR else ()
-    panels = (whole, *near, _steps(findings, number))
+    panels = (whole, *near, _steps(now, number))
     key = [
         Key("best", "first or better", "disc"),
         Key("other", "no better", "ring"),
@@ -32,10 +38,10 @@ def search_figure(findings: Findings) -> Figure | None:
         Key("best", "best so far"),
     ]
     if any(not math.isfinite(t.utility) for t in tried):
-        key.append(Key("model", "failed", "cross"))
-    if findings.optimum is not None:
+        key.append(Key("model", "crashed", "cross"))
+    if optimum is not None:
         key.append(Key("accepted", "optimum of the real system"))
-    if math.isfinite(findings.noise):
+    if math.isfinite(noise):
         key.append(Key("other", "±2 standard errors of the best", "band"))
     caption = (
         "Each candidate is run on the real system; it becomes the best so far when its utility, a "
@@ -45,17 +51,19 @@ def search_figure(findings: Findings) -> Figure | None:
     return Figure("utility", "Utility", caption, panels, tuple(key))
 
 
-def _utility(findings: Findings, tried: list[Tried], number: dict[str, int]) -> Panel:
-    dots = [d for t in tried for d in _dots(findings, t, number[t.candidate.id])]
+def _utility(
+    now: Standing, tried: list[Tried], number: dict[str, int], optimum: float | None, noise: float
+) -> Panel:
+    dots = [d for t in tried for d in _dots(t, number[t.candidate.id], t is now.history[-1])]
     rules, bands = [], []
     values = [d.y for d in dots if math.isfinite(d.y)]
-    if findings.optimum is not None:
-        rules.append(Rule(findings.optimum, "accepted", "optimum"))
-        values.append(findings.optimum)
-    best = findings.standing.incumbent
-    if best is not None and math.isfinite(findings.noise):
-        error = 2 * findings.noise / math.sqrt(len(best.utilities))
-        note = f"{figure(best.utility)} ± {figure(error, 2)}: two standard errors of the best"
+    if optimum is not None:
+        rules.append(Rule(optimum, "accepted", "optimum"))
+        values.append(optimum)
+    best = now.incumbent
+    if best is not None and math.isfinite(noise):
+        error = 2 * noise / math.sqrt(len(best.utilities))
+        note = f"{_said(best.utility)} ± {_said(error, 2)}: two standard errors of the best"
         bands.append(Band(best.utility - error, best.utility + error, "other", note))
     loss = bool(values) and max(values) < 0 and min(values) < STEEP * max(values)
     return Panel(
@@ -83,17 +91,17 @@ def _near(whole: Panel) -> Panel:
     return replace(whole, title=title, dots=dots, loss=False, y_range=bounds)
 
 
-def _dots(findings: Findings, tried: Tried, at: int) -> list[Dot]:
+def _dots(tried: Tried, at: int, last: bool) -> list[Dot]:
     candidate = tried.candidate
-    real = figure(tried.utility)
-    became = tried.verdict(tried is findings.history[-1])
+    real = _said(tried.utility)
+    became = tried.verdict(last)
     note = (
         f"{candidate.id}, iteration {candidate.iteration}, α = {candidate.alpha:g}\n"
-        f"utility {real}, predicted {figure(candidate.predicted_utility)}\n{became}"
+        f"utility {real}, predicted {_said(candidate.predicted_utility)}\n{became}"
     )
-    error = standard_error(tried)
+    error = tried.standard_error
     if math.isfinite(error):
-        note += f", ± {figure(error, 2)} over {len(tried.trials)} trials"
+        note += f", ± {_said(error, 2)} over {len(tried.trials)} trials"
     if not math.isfinite(tried.utility):
         return [Dot(at, math.nan, "model", f"{note}: the run failed", "cross")]
     shape, role = ("disc", "best") if tried.accepted else ("ring", "other")
@@ -101,6 +109,10 @@ def _dots(findings: Findings, tried: Tried, at: int) -> list[Dot]:
     if math.isfinite(candidate.predicted_utility):
         dots.insert(0, Dot(at, candidate.predicted_utility, "predicted", note, "dash"))
     return dots
+
+
+def _said(value: float, digits: int = 4) -> str:
+    return "failed" if value == -math.inf else f"{value:.{digits}g}"
 
 
 def _record(tried: list[Tried], number: dict[str, int]) -> tuple[Curve, ...]:
@@ -117,9 +129,9 @@ def _record(tried: list[Tried], number: dict[str, int]) -> tuple[Curve, ...]:
     return (Curve(x, np.repeat(values, 2), "best", "", 1.2),)
 
 
-def _steps(findings: Findings, number: dict[str, int]) -> Panel:
+def _steps(now: Standing, number: dict[str, int]) -> Panel:
     dots = []
-    for t in findings.history:
+    for t in now.history:
         c = t.candidate
         shape, role = ("disc", "best") if t.accepted else ("ring", "other")
         note = f"{c.id}: α = {c.alpha:g}, damping {c.damping:.2g}"
@@ -133,3 +145,17 @@ def _steps(findings: Findings, number: dict[str, int]) -> Panel:
         whole=True,
         y_range=(min(low, -1.0) - 0.4, 0.6),
     )
+
+
+def candidate_figure(candidate: Candidate) -> Figure:
+    """What the model predicts for a policy: its states and inputs over time."""
+    policy = candidate.policy
+    columns = [*zip(policy.state_names, candidate.predicted_states.T, strict=True)]
+    columns += zip(policy.input_names, candidate.predicted_inputs.T, strict=True)
+    panels = []
+    for name, values in columns:
+        times = np.arange(len(values), dtype=np.float64) * policy.dt
+        curve = Curve(times, values, "predicted", "predicted")
+        panels.append(Panel(name, "time [s]", "", (curve,), kind="time"))
+    title = f"{candidate.id}: predicted utility {_said(candidate.predicted_utility)}"
+    return Figure("candidate", title, "", tuple(panels), legend(panels[:1]))

@@ -1,17 +1,16 @@
-"""The page's pieces: its tables, figures with their legends, commands to copy, and colours.
+"""The page's parts as values: tables, figures, sentences, commands; a template lays them out.
 
-Every text goes through `escape`: names come from strangers' files too.
+The template escapes every text: names come from strangers' files too.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
-from html import escape
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 from grounded.diagnosis.report import Diagnosis, Estimate, Ranked
-from grounded_trials.report.figures.draw import draw, svg
-from grounded_trials.report.figures.figure import COLOURS, DASHES, Figure, Key
+from grounded.figures.figure import Figure
 from grounded_trials.report.findings import (
     Findings,
     by_state,
@@ -29,7 +28,47 @@ WIDEST = 1e6  # an interval so many times its value, or so wide, says nothing
 UNKNOWN = "–, not determined by these trials"
 
 
-def candidate_table(findings: Findings) -> str:
+@dataclass(frozen=True)
+class Block:
+    """A part of a section; `kind` says how it looks.
+
+    text, soft, heading    a sentence
+    command                a command to copy; `name` is its id
+    verdict                `lines`, one below the other
+    table                  `name`, `header` (text columns end with a blank), `rows`; `strong` ones
+    figure                 `figure`; wide: two panels a row
+    folded                 `blocks` under the title `text`; open where `wide`
+    run                    the slider that moves along the paths
+    """
+
+    kind: str
+    text: str = ""
+    name: str = ""
+    lines: Sequence[str] = ()
+    header: Sequence[str] = ()
+    rows: Sequence[Sequence[str]] = ()
+    strong: frozenset[int] = frozenset()
+    figure: Figure | None = None
+    blocks: Sequence[Block] = ()
+    wide: bool = False
+
+
+def drawn(figure: Figure | None, wide: bool = False, title: bool = False) -> list[Block]:
+    """A figure, under its own title where asked; nothing for None."""
+    if figure is None:
+        return []
+    heading = [Block("heading", figure.title)] if title else []
+    return [*heading, Block("figure", name=figure.name, figure=figure, wide=wide)]
+
+
+def table(
+    name: str, header: Sequence[str], rows: Sequence[Sequence[str]], strong: Iterable[int] = ()
+) -> Block:
+    """A table that can be copied."""
+    return Block("table", name=name, header=header, rows=rows, strong=frozenset(strong))
+
+
+def candidate_table(findings: Findings) -> Block:
     """Every candidate with its trials."""
     rows, best = [], findings.standing.incumbent
     for tried in findings.history:
@@ -50,35 +89,35 @@ def candidate_table(findings: Findings) -> str:
     return table("candidates", list(rows[0]), [list(cells.values()) for cells in rows], strong)
 
 
-def error_table(findings: Findings) -> str:
+def error_table(findings: Findings) -> list[Block]:
     """Rms by state: off the target, off the prediction, and the bias."""
     task, runs = findings.task, [run for _, run in compared(findings)]
     if findings.best is None:
-        return ""
+        return []
     columns = {f"off target, {r.candidate.id}": rms(tracking_error(task, r.trial)) for r in runs}
     columns |= {f"off prediction, {r.candidate.id}": rms(prediction_error(task, r)) for r in runs}
     columns |= {f"bias per s, {r.candidate.id}": rms(r.residual) / task.dt for r in runs}
     rows = by_state(task.model, [*columns.values()])
-    return table("errors", ("state", "unit", *columns), rows)
+    return [table("errors", ("state", "unit", *columns), rows)]
 
 
-def forecast_table(findings: Findings) -> str:
+def forecast_table(findings: Findings) -> list[Block]:
     """Rms error of the model 1 s ahead, by state, for the best run and every log."""
     best = findings.best or findings.latest
     trials = ([best.trial] if best is not None else []) + [log.trial for log in findings.logs]
     if not trials:
-        return ""
+        return []
     planners = [("without adopted effects" if findings.effects else "crude", findings.crude)]
     if findings.better is not None:
         planners.append((findings.better.name, findings.better.planner))
     names = [f"{t.id or t.candidate}, {words}" for t in trials for words, _ in planners]
     columns = [forecast_error(planner, t) for t in trials for _, planner in planners]
-    title = f"<h3>Error of the model {SECONDS:g} s ahead, rms</h3>"
+    title = Block("heading", f"Error of the model {SECONDS:g} s ahead, rms")
     rows = by_state(findings.task.model, columns)
-    return title + table("forecasts", ("state", "unit", *names), rows)
+    return [title, table("forecasts", ("state", "unit", *names), rows)]
 
 
-def effect_table(diagnosis: Diagnosis, since: Since) -> str:
+def effect_table(diagnosis: Diagnosis, since: Since) -> Block:
     """The ranked effects with their parameters and 95 % intervals."""
     rows = [
         (
@@ -116,7 +155,7 @@ def _hundredths(share: float) -> str:
     return f"{100 * share:.0f} %" if math.isfinite(share) else "-"
 
 
-def leftover_table(diagnosis: Diagnosis) -> str:
+def leftover_table(diagnosis: Diagnosis) -> Block:
     """What no known effect explains."""
     rows = [
         (
@@ -132,7 +171,7 @@ def leftover_table(diagnosis: Diagnosis) -> str:
     return table("leftover", header, rows)
 
 
-def parameter_table(findings: Findings) -> str:
+def parameter_table(findings: Findings) -> list[Block]:
     """The model's parameters, and what the diagnosis would make of them."""
     estimated = findings.diagnosis.parameters if findings.diagnosis is not None else {}
     rows = []
@@ -144,12 +183,12 @@ def parameter_table(findings: Findings) -> str:
         found = _interval(estimated[name]) if name in estimated else "-"
         rows.append((name, figure(param.value), shown(param.unit), changed, limits, found))
     if not rows:
-        return "<p>The model has no parameters.</p>"
+        return [Block("text", "The model has no parameters.")]
     header = ("parameter", "value", "unit", "in model.py", "bounds", "diagnosed, 95 %")
-    return table("parameters", header, rows)
+    return [table("parameters", header, rows)]
 
 
-def channel_table(findings: Findings) -> str:
+def channel_table(findings: Findings) -> Block:
     """States and inputs with units, weights, limits and latency."""
     task, reward, rows = findings.task, findings.task.reward, []
     assert task.latency is not None
@@ -168,69 +207,3 @@ def _range(low: float | None, high: float | None) -> str:
     a = "−∞" if low is None or not math.isfinite(low) else f"{low:g}"
     b = "∞" if high is None or not math.isfinite(high) else f"{high:g}"
     return f"{a} to {b}"
-
-
-def table(
-    identity: str,
-    header: Sequence[str],
-    rows: Sequence[Sequence[str]],
-    strong: Collection[int] = (),
-) -> str:
-    """A table with a button that copies it; text columns have a header that ends with a blank."""
-    kinds = [' class="text"' if name.endswith(" ") else "" for name in header]
-    head = "".join(f"<th{k}>{escape(h.strip())}</th>" for h, k in zip(header, kinds, strict=True))
-    lines = []
-    for number, row in enumerate(rows):
-        cells = "".join(f"<td{k}>{escape(c)}</td>" for c, k in zip(row, kinds, strict=True))
-        lines.append(f"<tr{' class=strong' if number in strong else ''}>{cells}</tr>")
-    return (
-        f'<div class="wide"><table id="{identity}"><thead><tr>{head}</tr></thead>'
-        f"<tbody>{''.join(lines)}</tbody></table></div>"
-        f'<button type="button" data-copy="{identity}">copy table</button>'
-    )
-
-
-def figure_block(figure: Figure | None, columns: str = "") -> str:
-    """A figure's caption, legend and panels; nothing for None."""
-    if figure is None:
-        return ""
-    keys = "".join(f"<li>{_key(key)}{escape(key.name)}</li>" for key in figure.key)
-    panels = "".join(
-        f"<div>{svg(draw(panel), f'{figure.name}-{number}')}</div>"
-        for number, panel in enumerate(figure.panels)
-    )
-    caption = f'<p class="soft">{escape(figure.caption)}</p>' if figure.caption else ""
-    legend = f'<ul class="key">{keys}</ul>' if keys else ""
-    return f'{caption}{legend}<div class="panels {columns}">{panels}</div>'
-
-
-def command(text: str, identity: str) -> str:
-    """A command to type, with a button that copies it."""
-    button = f'<button type="button" data-copy="{identity}">copy</button>'
-    return f'<code id="{identity}">{escape(text)}</code> {button}'
-
-
-def role_styles() -> str:
-    """Colours and dashes of the roles, light and dark; print is light."""
-    light = "".join(f".{role}{{--c:{pair[0]}}}" for role, pair in COLOURS.items())
-    dark = "".join(f".{role}{{--c:{pair[1]}}}" for role, pair in COLOURS.items())
-    dashes = "".join(
-        f".{role}.line{{stroke-dasharray:{' '.join(f'{10 * v:g}' for v in lengths)}}}"
-        for role, lengths in DASHES.items()
-    )
-    return f"{light}{dashes}@media screen and (prefers-color-scheme: dark){{{dark}}}"
-
-
-MARKS = {  # of a legend, by the shape of its entry
-    "line": '<path class="{} line" stroke-width="25" d="M0 60h260"/>',
-    "dash": '<path class="{} line whole" stroke-width="25" d="M60 60h140"/>',
-    "cross": '<path class="{} line" stroke-width="20" d="M85 15l90 90m0-90l-90 90"/>',
-    "band": '<rect class="{} fill" fill-opacity="0.3" width="260" height="120"/>',
-    "disc": '<circle class="{} fill" cx="130" cy="60" r="45"/>',
-    "ring": '<circle class="{} hollow" cx="130" cy="60" r="45"/>',
-}
-
-
-def _key(key: Key) -> str:
-    mark = MARKS[key.shape].format(key.role)
-    return f'<svg viewBox="0 0 260 120" aria-hidden="true">{mark}</svg>'

@@ -1,0 +1,113 @@
+"""The diagnosis on logs of real machines whose authors published what a crude model lacks.
+
+    python benchmarks/real_data.py [NAME ...] [--json FILE]
+
+For each: the published cause, what is named, and held-out open-loop errors in units: crude,
+calibrated, as diagnosed, noise floor, beside the best model that was made by hand (SOURCE.md of
+each folder of ../shared/data; its split of the runs and its resampling are not quite ours). Models
+and logs are those of tests/support/real_systems.py. Tuned on: EMPS, SERVO, DART_*. Kept back: BAM_*
+and the double pendulum (ACROBOT, SYSID).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
+
+import real_systems
+from grounded.diagnosis.diagnose import diagnose
+
+# system: published cause; families that are it; (seconds, or 0 for the whole run; channel, best)
+PUBLISHED = {
+    "EMPS": (
+        "Coulomb and viscous friction",
+        ("coulomb_friction", "viscous_friction", "joint_friction"),
+        [(0.5, "q", 1.59e-3), (1.0, "q", 4.22e-3)],
+    ),
+    "SERVO": (
+        "delay 40 ms, slew limit, lag",
+        ("slew_limit", "delay", "first_order_lag", "rate_limit"),
+        [(0, "position", 0.030)],
+    ),
+    "DART_THROTTLE": (
+        "dead zone, rolling friction",
+        ("dead_zone", "coulomb_friction", "stall", "stiction", "joint_friction"),
+        [(1.0, "v", 0.221), (0, "v", 0.203)],
+    ),
+    "DART_STEERING": ("lag 0.13 s", ("first_order_lag", "delay"), [(0, "w", 0.232)]),
+    "DART_STEPS": (
+        "saturating, unequal steering",
+        ("input_curve", "saturation", "grip_limit", "understeer"),
+        [(0, "w", 0.151)],
+    ),
+    "BAM_Q": (
+        "gear friction, load dependent",
+        ("coulomb_friction", "viscous_friction", "joint_friction", "load_friction"),
+        [(0.1, "q", 0.026), (0.5, "q", 0.095), (0, "q", 0.098)],
+    ),
+    "ACROBOT": (
+        "joint friction",
+        ("coulomb_friction", "viscous_friction", "joint_friction"),
+        [(0.1, "q1", 0.065), (0.5, "q1", 0.400)],
+    ),
+    "SYSID": (
+        "joint friction",
+        ("coulomb_friction", "viscous_friction", "joint_friction"),
+        [(0.1, "q1", 0.069), (0.5, "q1", 0.675)],
+    ),
+}
+PUBLISHED["BAM_QW"] = PUBLISHED["BAM_Q"]
+
+
+def placed(found, families):
+    """Where a published cause stands: its place among the named, or in a group that ties."""
+    named = [c.of for c in found.credit if c.of != "calibration"]
+    for place, effect in enumerate(named, 1):
+        if effect.partition(":")[0] in families:
+            return f"named, {place} of {len(named)}"
+    tied = {e.partition(":")[0] for group in found.indistinguishable for e in group}
+    alike = {one.like.partition(":")[0] for one in found.lookalikes}
+    return "in the named group" if (tied | alike) & set(families) else "not named"
+
+
+def told(name, found, seconds):
+    """A system's lines."""
+    cause, families, best = PUBLISHED[name]
+    print(f"\n{name}: published: {cause}; {placed(found, families)}; {seconds:.0f} s")
+    print(f"  {found.kind}: {found.sentence}")
+    by_hand = {(s, channel): value for s, channel, value in best}
+    for row in found.prediction_error:
+        for channel, unit in row.unit_by_channel.items():
+            if not row.crude[channel] >= 0:
+                continue  # never measured
+            columns = (row.crude, row.calibrated, row.with_effects, row.noise_floor)
+            figures = "  ".join(f"{c.get(channel, float('nan')):9.4g}" for c in columns)
+            key = (0 if row.whole_trial else round(row.horizon_s, 2), channel)
+            hand = f"   by hand {by_hand[key]:.4g}" if key in by_hand else ""
+            ahead = "whole trial" if row.whole_trial else f"{row.horizon_s:.2f} s"
+            print(f"  {ahead:>11}  {channel:>8} [{unit}]  {figures}{hand}")
+
+
+def main():
+    """Runs the named systems, all by default."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("names", nargs="*", choices=[[], *PUBLISHED], default=list(PUBLISHED))
+    parser.add_argument("--json", type=Path, help="write all documents there")
+    options, documents = parser.parse_args(), {}
+    print("errors: crude, calibrated, as diagnosed, noise floor")
+    for name in options.names:
+        system, start = getattr(real_systems, name), time.process_time()
+        found = diagnose(system.model, system.read())
+        told(name, found, time.process_time() - start)
+        documents[name] = found.to_json()
+        if options.json:
+            options.json.write_text(json.dumps(documents, indent=1))
+
+
+if __name__ == "__main__":
+    main()

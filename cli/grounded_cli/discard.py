@@ -1,0 +1,53 @@
+"""grounded discard, restore: trials that should not count, and take it back."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import click
+
+from grounded.errors import NextCommand
+from grounded_cli import completion as complete
+from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
+from grounded_cli.terminal import field, show, show_json
+
+if TYPE_CHECKING:
+    from grounded_trials.door import SetAside
+
+_trials = click.argument(
+    "trials", nargs=-1, required=True, metavar="TRIAL...", shell_complete=complete.trials
+)
+
+
+@click.command("discard")
+@_trials
+@click.option("--why", default="", metavar="TEXT", help="Kept with it; `status` shows it.")
+@in_workspace
+@as_json
+def command(trials: tuple[str, ...], why: str, json_: bool) -> None:
+    """Set trials aside: search, fit, diagnosis and report leave them out.
+
+    Nothing is deleted: `grounded restore` takes it back. The search goes on as if they had not
+    been run.
+    """
+    _tell(open_workspace().discard(*trials, why=why), json_)
+
+
+@click.command("restore")
+@_trials
+@in_workspace
+@as_json
+def restore(trials: tuple[str, ...], json_: bool) -> None:
+    """Count trials again that were discarded."""
+    _tell(open_workspace().restore(*trials), json_)
+
+
+def _tell(done: SetAside, json_: bool) -> None:
+    if json_:
+        show_json(done.to_json())
+        return
+    for name in done.trials:
+        show(f"{name} {'is set aside' if name in done.discarded else 'counts'}")
+    for name, why in done.discarded.items():
+        show(field("discarded", f"{name}{why and ': ' + why}"))
+    show(f"\n{next_line(NextCommand('status'))}")

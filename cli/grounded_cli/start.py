@@ -1,0 +1,13 @@
+"""Where `grounded` starts: an interrupt while modules are imported ends it without a traceback."""
+
+import signal
+from typing import NoReturn
+
+
+def main() -> NoReturn:
+    """Imports the command line and runs it."""
+    handler = signal.signal(signal.SIGINT, signal.SIG_DFL)
+    from grounded_cli.main import main as run
+
+    signal.signal(signal.SIGINT, handler)
+    run()

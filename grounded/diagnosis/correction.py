@@ -1,0 +1,152 @@
+"""When no cause fits: the shape of what is left over one variable, and a correction from it.
+
+Of all states and inputs the one is taken over which a smooth curve (`grounded.effects.correction`)
+gains most likelihood on trials left out; a second one joins where it gains CLAIM nats more. It may
+be adopted if it passes a test of its own: predictions of each trial, with weights from the other
+trials, must be better beyond their own scatter from trial to trial. It explains nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from grounded.diagnosis.fitted import Fitted
+from grounded.diagnosis.hypothesis import Hypothesis, Predictor
+from grounded.diagnosis.leftover import CLAIM, Leftover, held_out_columns
+from grounded.diagnosis.prediction_error import Horizon, errors
+from grounded.diagnosis.report import Correction, Curve
+from grounded.effects import Library
+from grounded.effects.correction import KNOTS, bells
+from grounded.effects.family import per
+from grounded.frozen import Array
+
+MOST = 2  # variables
+LEAST = 0.02  # of the held-out error that must go
+SURE = 2.0  # standard errors over the trials
+
+
+@dataclass(frozen=True)
+class _Curve:
+    """A variable, the ends of its range, the bells over it (L, B, KNOTS)."""
+
+    over: str
+    lo: float
+    hi: float
+    columns: Array
+
+    def values(self, weights: Array) -> dict[str, float]:
+        """Quantities of the effect."""
+        return {"lo": self.lo, "hi": self.hi} | {f"w{k}": float(w) for k, w in enumerate(weights)}
+
+
+def correction(
+    predictor: Predictor, fit: Fitted, left: Sequence[Leftover], where: Horizon
+) -> Correction | None:
+    """The correction of the channel with the largest leftover; None where nothing is left.
+
+    Args:
+        predictor: the data.
+        fit: the best hypothesis, beside which the correction is fitted.
+        left: what it leaves, most first.
+        where: the predictions that the correction is judged by.
+    """
+    if not left or predictor.data.count < 2:
+        return None
+    i = predictor.data.model.state_names.index(left[0].channel)
+    chosen: list[_Curve] = []
+    best, weights = CLAIM, np.zeros((predictor.data.count + 1, 0))
+    while len(chosen) < MOST:
+        rivals = [c for c in _curves(predictor, fit) if c.over not in [o.over for o in chosen]]
+        tried = [(held_out_columns(predictor, fit, _joined([*chosen, c]), i), c) for c in rivals]
+        if not tried:
+            break
+        (gain, _, each), curve = max(tried, key=lambda pair: pair[0][0])
+        if gain < best + CLAIM * bool(chosen):
+            break
+        best, weights, chosen = gain, each, [*chosen, curve]
+    if not chosen:
+        return None
+    return _judged(predictor, fit, left[0].channel, chosen, weights, where)
+
+
+def _joined(curves: Sequence[_Curve]) -> Array:
+    return np.concatenate([one.columns for one in curves], axis=-1)
+
+
+def _curves(predictor: Predictor, fit: Fitted) -> list[_Curve]:
+    """Bells over every measured state and every input as it arrives."""
+    data, model = predictor.data, predictor.data.model
+    x, u = fit.track[:-1], predictor.inputs(fit.hypothesis)
+    signals = {n: x[..., i] for i, n in enumerate(model.state_names) if i not in data.hidden}
+    signals |= {n: u[..., j] for j, n in enumerate(model.input_names)}
+    found = []
+    for name, r in signals.items():
+        lo, hi = (float(q) for q in np.quantile(r[data.valid.T > 0], [0.02, 0.98]))
+        if hi - lo > 1e-6 * max(abs(lo), abs(hi), 1e-9):
+            found.append(_Curve(name, lo, hi, np.stack(bells(r, lo, hi), axis=-1)))
+    return found
+
+
+def _judged(
+    predictor: Predictor,
+    fit: Fitted,
+    channel: str,
+    curves: Sequence[_Curve],
+    weights: Array,
+    where: Horizon,
+) -> Correction:
+    """The acceptance test: squared errors of each trial, without and with weights of the others."""
+    data, h = predictor.data, fit.hypothesis
+    of_start = data.trial_of[where.run]
+    gains = []
+    for trial, own in enumerate(weights[:-1]):
+        at = np.flatnonzero(of_start == trial)
+        if not len(at):
+            continue
+        part = Horizon(where.steps, where.at[at], where.run[at], where.spread[at])
+        before, after = (
+            float(np.nanmean((errors(predictor, one, fit.track, part) / part.spread) ** 2))
+            for one in (h, _with(h, predictor, channel, curves, own))
+        )
+        gains.append(1 - after / before)
+    gain = float(np.mean(gains))
+    scatter = float(np.std(gains, ddof=1) / np.sqrt(len(gains))) if len(gains) > 1 else np.inf
+    unit, shapes = per(data.model.states[channel]), []
+    for k, one in enumerate(curves):
+        whole = weights[-1][k * KNOTS : (k + 1) * KNOTS]
+        apart = weights[:-1, k * KNOTS : (k + 1) * KNOTS]
+        spread = np.sqrt((len(apart) - 1) * apart.var(axis=0))  # of the jackknife
+        places = np.linspace(one.lo, one.hi, KNOTS)
+        shapes.append(
+            Curve(
+                f"correction:{channel}<-{one.over}",
+                one.over,
+                tuple(float(p) for p in places),
+                tuple(float(w) for w in whole),
+                tuple(float(s) for s in spread),
+                one.values(whole),
+            )
+        )
+    return Correction(
+        channel=channel,
+        over=tuple(one.over for one in curves),
+        held_out_gain=gain,
+        adoptable=gain > max(LEAST, SURE * scatter),
+        unit=unit,
+        curves=tuple(shapes),
+    )
+
+
+def _with(
+    h: Hypothesis, predictor: Predictor, channel: str, curves: Sequence[_Curve], weights: Any
+) -> Hypothesis:
+    """The hypothesis with the correction."""
+    for k, one in enumerate(curves):
+        name = f"correction:{channel}<-{one.over}"
+        effect = Library().effect(name, predictor.data.model, predictor.data.scales)
+        h = h.plus(effect, one.values(weights[k * KNOTS : (k + 1) * KNOTS]))
+    return h

@@ -1,0 +1,168 @@
+"""Evidence proposes, the ruler decides: which hypothesis is claimed, what each cause is worth.
+
+The likeliest hypothesis can be wrong in ways that evidence does not see. Noise that may be
+coloured, or parameters that may move, explain a lasting effect away that predictions a second ahead
+still miss. A further effect takes up what is left somewhere and predicts no better. Values that one
+trial alone determines make predictions of the others worse. Far from the floor, likelihoods are
+those of a wrong model, and thousands of nats are no certainty. So the likeliest ones, and the
+likeliest of every other structure of noise, are held against the `ruler`:
+
+    a rival takes the place of the likeliest only where it predicts clearly better
+    a cause without which predictions are as good, within their scatter, is dropped
+    what predicts no better than the crude model is not claimed at all
+
+A cause is an effect or the calibration of the model's own parameters. Its credit is what is lost
+without it, the others fitted again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from grounded.diagnosis.fitted import Fitted
+from grounded.diagnosis.hypotheses import CLAIM
+from grounded.diagnosis.noise import Structure
+from grounded.diagnosis.ruler import Ruler
+from grounded.diagnosis.search import TO_THE_TOP, HypothesisSearch
+
+CALIBRATION = "calibration"
+RIVALS = 8  # likeliest hypotheses that are measured
+PAYS = (1.0, 0.01)  # scatters that a cause must gain, and the least gain in one channel
+FURTHER = (2.0, 0.01)  # the same where there are several causes
+BETTER = (2.0, 0.05)  # the same for a rival to take the place of a likelier hypothesis
+OVERRULES = (3.0, 0.1)  # and for a claim that is likely under another noise only
+SLIGHT = 0.02  # of what all causes gain: one that makes less is not named
+REFIT = 12  # iterations after a cause was taken out
+
+
+@dataclass(frozen=True, eq=False)
+class Decision:
+    """What is claimed: its fit, the crude model's, and the fit without each of its causes."""
+
+    search: HypothesisSearch
+    fit: Fitted
+    crude: Fitted
+    without: dict[str, Fitted]  # by effect, or "calibration"
+
+    @property
+    def causes(self) -> tuple[str, ...]:
+        """Effects and calibration, whatever the fit has of both."""
+        return causes(self.fit)
+
+
+def causes(fit: Fitted) -> tuple[str, ...]:
+    """What a fit explains by: its effects, and calibration where its parameters moved."""
+    return (*fit.hypothesis.names, *((CALIBRATION,) if fit.hypothesis.spread > 0 else ()))
+
+
+def decide(search: HypothesisSearch, best: Fitted, ruler: Ruler, most: int) -> Decision:
+    """The claim that held-out predictions bear out.
+
+    Args:
+        search: with all hypotheses that were fitted.
+        best: the likeliest one.
+        ruler: of the same data.
+        most: so many effects at most.
+    """
+    crude = search.exact_null()
+    search, fit = _proposed(search, best, crude, ruler, most)
+    fit, without = _pruned(search, fit, ruler)
+    if causes(fit) and not _pays(ruler, crude, fit, PAYS):
+        fit, without = crude, {}
+    return Decision(search, fit if causes(fit) else _quiet(search, fit, crude), crude, without)
+
+
+def _quiet(search: HypothesisSearch, fit: Fitted, crude: Fitted) -> Fitted:
+    """Without causes: the likeliest noise of the model as it is."""
+    return crude if fit.hypothesis.spread > 0 else fit
+
+
+def _pays(ruler: Ruler, before: Fitted, after: Fitted, bar: tuple[float, float]) -> bool:
+    return ruler.gain(before, after).beyond(*bar)
+
+
+def _proposed(
+    search: HypothesisSearch, best: Fitted, crude: Fitted, ruler: Ruler, most: int
+) -> tuple[HypothesisSearch, Fitted]:
+    """The likeliest hypothesis, or one that predicts clearly better."""
+    if not ruler.held_out:
+        return search, best
+    null, score = search.best_null(), search.score
+    size = len(best.hypothesis.effects)  # a larger set would have to pay by evidence too
+    rivals = [f for k in range(1, size + 1) for f in search.of_size(k) if f is not best]
+    rivals = [f for f in rivals if score(f) > score(null) + CLAIM]
+    rivals = sorted(rivals, key=lambda f: -score(f))[:RIVALS]
+    if search.calibrates():
+        rivals.append(null)
+    found, at = best, search
+    for rival in rivals:
+        if _pays(ruler, found, rival, BETTER):
+            found = rival
+    for structure, spread in dict.fromkeys((s, w) for s, w, _ in search.fits):
+        other = search.under(structure, spread)
+        if other is None or (structure, spread) == (best.noise.structure, best.hypothesis.spread):
+            continue
+        rival = other.chosen(most)
+        if causes(rival) and _pays(ruler, found, rival, OVERRULES):
+            if rival.hypothesis.effects:
+                other.finished(other.of_size(len(rival.hypothesis.effects))[:2], TO_THE_TOP)
+                rival = other.chosen(most)
+            found, at = rival, other
+    return at, found
+
+
+def _pruned(
+    search: HypothesisSearch, fit: Fitted, ruler: Ruler
+) -> tuple[Fitted, dict[str, Fitted]]:
+    """Without the causes that predictions don't need, the least needed first."""
+    while True:
+        without = {name: fit_without(search, fit, name) for name in causes(fit)}
+        if not ruler.held_out:
+            return fit, without
+        gains = {name: ruler.gain(less, fit) for name, less in without.items()}
+        least = SLIGHT * ruler.gain(search.exact_null(), fit).mean
+        bar = PAYS if len(gains) == 1 else FURTHER
+        idle = [n for n, gain in gains.items() if not gain.beyond(*bar) or gain.mean < least]
+        if not idle:
+            return fit, without
+        fit = without[min(idle, key=lambda name: gains[name].mean)]
+
+
+def fit_without(search: HypothesisSearch, fit: Fitted, name: str) -> Fitted:
+    """The same without one cause, all the rest fitted again under noise of the same structure."""
+    h = fit.hypothesis
+    less = replace(h, shift=None, spread=0.0) if name == CALIBRATION else h.minus(name)
+    key = (fit.noise.structure, less.spread, tuple(sorted(less.names)))
+    starts: list[Fitted | tuple] = [(less, fit.noise, fit.track)]  # type: ignore[type-arg]
+    if key in search.fits:
+        starts.append(search.fits[key])
+    found = search.refined(starts, REFIT)
+    return max(found, key=search.score) if found else search.exact_null()
+
+
+def plain(search: HypothesisSearch, fit: Fitted) -> Fitted:
+    """The same hypothesis under white noise."""
+    h = fit.hypothesis
+    if fit.noise.structure == Structure():
+        return fit
+    known = search.fits.get((Structure(), h.spread, tuple(sorted(h.names))))
+    noise = fit.noise.allowing(Structure(), search.data.dt)
+    found = [known] if known else search.refined([(h, noise, fit.track)], REFIT)
+    return found[0] if found else fit
+
+
+def shares(ruler: Ruler, decision: Decision) -> dict[str, float]:
+    """The share of what predictions gain in all (log of the error) that is lost without each cause.
+
+    Where causes overlap the shares add to less than 1; where they help one another, each as much
+    as it adds to the sum.
+    """
+    whole = ruler.gain(decision.crude, decision.fit).mean
+    lost = {n: max(ruler.gain(f, decision.fit).mean, 0.0) for n, f in decision.without.items()}
+    return {name: loss / max(whole, sum(lost.values()), 1e-12) for name, loss in lost.items()}
+
+
+def ordered(shares_: dict[str, float], names: Sequence[str]) -> list[str]:
+    """Names by their credit, largest first."""
+    return sorted(names, key=lambda name: -shares_.get(name, 0.0))

@@ -1,0 +1,203 @@
+"""What the ruler says of a decision: the table of errors, the noise floor, credit, what is left.
+
+Whatever is claimed, what stays above the floor is stated. A flexible model's correction counts as
+left where predictions gain by it, and then nothing that it predicts is noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from grounded.diagnosis.decide import Decision, ordered, plain, shares
+from grounded.diagnosis.fitted import Fitted
+from grounded.diagnosis.leftover import Leftover, leftovers
+from grounded.diagnosis.prediction_error import by_region, horizon
+from grounded.diagnosis.report import Credit, Remainder, RulerRow, RunChange, Split
+from grounded.diagnosis.ruler import Errors, Ruler, repeated
+from grounded.diagnosis.split import split
+from grounded.frozen import Array
+from grounded.trial import Trial
+
+ABOVE = 1.3  # times the noise floor: what is left is stated
+COUNTS = (2.0, 0.03)  # scatters, and least gain, of a flexible correction that is stated
+
+
+class Measured:
+    """A decision, measured; every method is one part of the `Diagnosis`."""
+
+    def __init__(self, decision: Decision, ruler: Ruler, trials: Sequence[Trial]) -> None:
+        self.decision, self.ruler, self.trials = decision, ruler, trials
+        self.search, self.best = decision.search, decision.fit
+        self.predictor, self.data = self.search.predictor, self.search.data
+        self.units = {n: self.data.model.states[n] for n in ruler.names}
+        self.credit = shares(ruler, decision)
+        self.left = leftovers(self.predictor, self.best)
+        self.flexible = self.corrections()
+        self.floor, self.source = self.noise_floor()
+
+    def rms(self, fit: Fitted) -> Array:
+        """By horizon and shown state, (K, n')."""
+        return np.asarray(self.ruler.errors(fit).rms[:, self.ruler.shown])
+
+    def calibrated(self) -> Fitted | None:
+        """The model with its parameters fitted; as it is where that predicts no better."""
+        fits = [f for (_, spread, names), f in self.search.fits.items() if spread and not names]
+        if not fits:
+            return None
+        best, crude = max(fits, key=self.search.score), self.decision.crude
+        return best if self.ruler.gain(crude, best).mean > 0 else crude
+
+    def noise_floor(self) -> tuple[Array, str]:
+        """Rms error that no model undercuts, by horizon and shown state, and where it is from.
+
+        Noise that seems coloured counts as such where no flexible model finds anything in it.
+        """
+        repeats = repeated(self.trials, self.data)
+        found, source = self.ruler.scatter(self.best, repeats), "repeats"
+        if found is None:
+            source = "short horizon"
+            fit = self.best if not self.left else plain(self.search, self.best)
+            starts = (horizon(self.predictor, fit, k * self.data.dt) for k in self.ruler.steps)
+            rows = [
+                root_mean_square(
+                    np.where(self.data.seen[w.at + w.steps, w.run] > 0, w.spread, np.nan)
+                )
+                for w in starts
+            ]
+            found = np.array([*rows, np.full_like(rows[0], np.nan)])
+        reached = [e.rms for _, e in self.ruler.measured]
+        reached += [errors.rms for _, errors in self.flexible.values()]
+        return np.fmin(found, np.fmin.reduce(reached))[:, self.ruler.shown], source
+
+    def corrections(self) -> dict[str, tuple[Leftover, Errors]]:
+        """By channel, what a flexible model corrects where predictions gain by it."""
+        names, found = self.data.model.state_names, {}
+        for left in self.left:
+            rate = np.zeros((*left.correction.shape, len(names)))
+            rate[..., names.index(left.channel)] = left.correction
+            gain, errors = self.ruler.corrected(self.best, rate)
+            if gain.beyond(*COUNTS):
+                found[left.channel] = left, errors
+        return found
+
+    def prediction_error(self) -> tuple[RulerRow, ...]:
+        """The ruler's table: 0.1, 0.5, 1 s and the whole trial."""
+        calibrated = self.calibrated()
+        columns = {
+            "crude": self.rms(self.decision.crude),
+            "calibrated": None if calibrated is None else self.rms(calibrated),
+            "with_effects": self.rms(self.best),
+            "noise_floor": self.floor,
+        }
+        by = "trials" if self.data.count > 1 else "pieces"
+        rows = []
+        for k, seconds in self.horizons():
+            found = {
+                key: {} if rms is None else dict(zip(self.units, map(float, rms[k]), strict=True))
+                for key, rms in columns.items()
+            }
+            rows.append(
+                RulerRow(
+                    seconds,
+                    k == len(self.ruler.steps),
+                    self.units,
+                    by if self.ruler.held_out else "no",
+                    floor_from=self.source,
+                    **found,
+                )
+            )
+        return tuple(rows)
+
+    def horizons(self) -> list[tuple[int, float]]:
+        """(index, seconds) of the ruler's rows; a single step is no row unless it is 0.1 s."""
+        dt, steps = self.data.dt, self.ruler.steps
+        first = 0 if len(steps) < 2 or dt > 0.05 else 1
+        rows = [(k, steps[k] * dt) for k in range(first, len(steps))]
+        return [*rows, (len(steps), float(np.median(self.data.lengths)) * dt)]
+
+    def credits(self) -> tuple[Credit, ...]:
+        """What each cause is worth, largest first."""
+        k = len(self.ruler.steps) - 1
+        return tuple(
+            Credit(
+                name,
+                self.credit[name],
+                dict(
+                    zip(
+                        self.units,
+                        map(float, self.rms(self.decision.without[name])[k]),
+                        strict=True,
+                    )
+                ),
+            )
+            for name in ordered(self.credit, list(self.credit))
+        )
+
+    def remainders(self) -> tuple[Remainder, ...]:
+        """What is left above the floor, and what a flexible model finds that would show there."""
+        k, data, ruler = len(self.ruler.steps) - 1, self.data, self.ruler
+        now, fine = self.rms(self.best), ruler.fine[ruler.shown]
+        short = slice(0, len(ruler.steps))
+        least = np.maximum(np.log(ABOVE), 2 * ruler.doubt(self.best))
+        above = (np.log(now / self.floor) > least) & (now > 2 * fine)
+        found = []
+        for i, name in enumerate(ruler.names):
+            left = self.flexible[name][0] if name in self.flexible else None
+            error, floor = float(now[k, i]), float(self.floor[k, i])
+            if left is None and not above[short, i].any():
+                continue
+            at = k
+            if left is None and not above[k, i]:
+                at = int(np.flatnonzero(above[short, i])[-1])
+                error, floor = float(now[at, i]), float(self.floor[at, i])
+            row = Remainder(
+                name,
+                error=error,
+                floor=floor,
+                horizon_s=ruler.steps[at] * data.dt,
+                error_unit=self.units[name],
+            )
+            found.append((left is None, -error / max(floor, float(fine[i])), i, left, row))
+        return tuple(self.with_region(row, left) for *_, left, row in sorted(found, key=_first))
+
+    def with_region(self, row: Remainder, left: Leftover | None) -> Remainder:
+        """A remainder with what a flexible model says of it: the missing rate, and where."""
+        if left is None:
+            return row
+        size = left.correction**2 * self.data.valid.T
+        regions = by_region(size, self.predictor, self.best, 1)
+        region = regions[0] if regions else None
+        return replace(row, size=left.size, unit=left.unit, evidence=left.gain, region=region)
+
+    def split(self) -> dict[str, Split]:
+        """Explained, unexplained, irreducible: one step, the horizon, a whole trial."""
+        steps, dt = self.ruler.steps, self.data.dt
+        rows = {"one_step": 0, "horizon": len(steps) - 1, "whole_run": len(steps)}
+        seconds = [*(k * dt for k in steps), float(np.median(self.data.lengths)) * dt]
+        before, after = self.rms(self.decision.crude), self.rms(self.best)
+        return {
+            key: split(seconds[k], self.units, before[k], after[k], self.floor[k], self.source)
+            for key, k in rows.items()
+        }
+
+    def whole_run(self) -> dict[str, RunChange]:
+        """Errors of predictions from the beginning of each trial to its end."""
+        before, after = self.rms(self.decision.crude)[-1], self.rms(self.best)[-1]
+        rows = zip(self.units.items(), before, after, strict=True)
+        return {n: RunChange(float(b), float(a), unit) for (n, unit), b, a in rows}
+
+
+def _first(each: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Sorts remainders: where a flexible model finds a rate first, then by size."""
+    return each[:3]
+
+
+def root_mean_square(error: Any) -> Any:
+    """Root mean square along the first axis; nan for a state that was never measured."""
+    count = np.isfinite(error).sum(axis=0)
+    total = np.nansum(error**2, axis=0)
+    return np.where(count > 0, np.sqrt(total / np.maximum(count, 1)), np.nan)

@@ -1,0 +1,172 @@
+"""What a diagnosis shows: predictions before and after it, the credit, where the gap lies."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from grounded.diagnosis.report import Diagnosis, RulerRow, number
+from grounded.figures.figure import Bar, Bars, Curve, Figure, Panel, legend
+
+MOST = 12
+CREDIT_S = 1.0  # how far ahead an effect's worth is measured
+MODELS = {  # keys of a prediction error: role, name
+    "crude": ("model", "model"),
+    "calibrated": ("step2", "calibrated"),
+    "with_effects": ("best", "as diagnosed"),
+    "noise_floor": ("other", "noise alone"),
+}
+
+
+def gap_figures(diagnosis: Diagnosis) -> list[Figure]:
+    """The diagnosis in figures, what matters first; nothing where no cause is known."""
+    if diagnosis.no_cause:
+        return []
+    found = (accuracy_figure(diagnosis), credit_figure(diagnosis, 6), where_figure(diagnosis))
+    return [figure for figure in found if figure is not None]
+
+
+def accuracy_figure(diagnosis: Diagnosis) -> Figure | None:
+    """How far predictions are off without the diagnosis and with it, in each state's unit."""
+    errors = diagnosis.prediction_error
+    if not errors:
+        panels: list[Panel | Bars] = [_shrinkage(diagnosis)] if diagnosis.gap.measured else []
+        held = diagnosis.gap.held_out
+    else:
+        panels = _over_horizons(errors) if len(errors) > 1 else _by_channel(errors[0])
+        held = errors[0].held_out != "no"
+    if not panels:
+        return None
+    where = "on data that was held out" if held else "on the data that it was made from"
+    caption = f"Rms error of predictions, {where}. No model gets below the noise."
+    key = legend(panels)
+    return Figure("accuracy", "Predictions before and after", caption, tuple(panels), key)
+
+
+def _over_horizons(errors: Sequence[RulerRow]) -> list[Panel | Bars]:
+    """A panel a state: its error by how far ahead is predicted."""
+    units = errors[0].unit_by_channel
+    panels: list[Panel | Bars] = []
+    ahead = np.array([error.horizon_s for error in errors])
+    for channel, unit in units.items():
+        curves = []
+        for key, (role, name) in MODELS.items():
+            values = [getattr(e, key).get(channel, math.nan) for e in errors]
+            if np.isfinite(values).any():
+                curves.append(Curve(ahead, np.array(values, float), role, name, 2.0))
+        if curves:
+            label = f"{channel} [{unit}]" if unit not in ("", "1") else channel
+            panels.append(Panel(label, "predicted ahead [s]", unit, tuple(curves)))
+    return panels
+
+
+def _by_channel(error: RulerRow) -> list[Panel | Bars]:
+    panels: list[Panel | Bars] = []
+    for channel, unit in error.unit_by_channel.items():
+        bars = []
+        for key, (role, name) in MODELS.items():
+            value = getattr(error, key).get(channel, math.nan)
+            if math.isfinite(value):
+                bars.append(Bar(name, value, _with_unit(value, unit), role))
+        if bars:
+            panels.append(Bars(f"{channel}, {error.horizon_s:g} s ahead", tuple(bars)))
+    return panels
+
+
+def credit_figure(diagnosis: Diagnosis, channels: int = 1) -> Figure | None:
+    """How much of the improvement each effect, and calibration, deserves.
+
+    Args:
+        diagnosis: what was found.
+        channels: so many states show by how much predictions are off without each, in their unit;
+            first those that predictions improved most.
+    """
+    credit = diagnosis.credit
+    if not credit:
+        return None
+    bars = tuple(Bar(c.of, c.share, f"{100 * c.share:.0f} %") for c in credit[:MOST])
+    panels = [Bars("Share of what predictions gain", bars)]
+    known = [
+        e for e in diagnosis.prediction_error if math.isclose(e.horizon_s, CREDIT_S, rel_tol=0.1)
+    ]
+    for name in _improved(known[0])[:channels] if known else ():
+        error, unit = known[0], known[0].unit_by_channel.get(name, "")
+        rows = [(MODELS["crude"], error.crude)]
+        rows += [(("limit", f"without {c.of}"), c.without_it) for c in credit[:MOST]]
+        rows += [(MODELS["with_effects"], error.with_effects)]
+        rows += [(MODELS["noise_floor"], error.noise_floor)]
+        found = [(look, values[name]) for look, values in rows if name in values]
+        bars = tuple(Bar(n, v, _with_unit(v, unit), role) for (role, n), v in found)
+        panels.append(Bars(f"{name}: error {error.horizon_s:g} s ahead", bars))
+    return Figure("credit", "What each is worth", "", tuple(panels))
+
+
+def _improved(error: RulerRow) -> list[str]:
+    """The states by how much better they are predicted, most first."""
+    gain = {
+        name: error.crude[name] / max(after, 1e-300)
+        for name, after in error.with_effects.items()
+        if error.crude.get(name)
+    }
+    return sorted(gain, key=lambda name: -gain[name])
+
+
+def where_figure(diagnosis: Diagnosis) -> Figure | None:
+    """Shares of the gap by channel, time and region, and the evidence for each effect."""
+    where = diagnosis.where
+    by_channel = [(c.name, c.share, f", {_with_unit(c.rms, c.unit)}") for c in where.channels]
+    by_time = [(f"{t.start:g} to {t.end:g} s", t.share, "") for t in where.times]
+    by_region = [
+        (r.when, r.share, f", {100 * r.occupancy:.0f} % of the time") for r in where.regions
+    ]
+    panels = [
+        Bars(f"Share of the gap by {word}", _shares(shares, role))
+        for word, shares, role in (
+            ("channel", by_channel, "best"),
+            ("time", by_time, "step2"),
+            ("region", by_region, "accepted"),
+        )
+        if shares
+    ]
+    if diagnosis.ranking:
+        panels.append(Bars("Evidence for an effect [nats]", _ranking(diagnosis)))
+    if not panels:
+        return None
+    caption = (
+        "Evidence is the gain in log-likelihood less its price; an effect is claimed from 3 nats."
+    )
+    return Figure("gap", "Where the gap lies", caption, tuple(panels))
+
+
+def _shares(shares: Sequence[tuple[str, float, str]], role: str) -> tuple[Bar, ...]:
+    """Bars of (label, share, what else is said of it)."""
+    return tuple(
+        Bar(label, share, f"{100 * share:.0f} %{note}", role)
+        for label, share, note in shares[:MOST]
+    )
+
+
+def _ranking(diagnosis: Diagnosis) -> tuple[Bar, ...]:
+    named = set(diagnosis.effects)
+    return tuple(
+        Bar(r.effect, r.evidence, number(r.evidence), "best" if r.effect in named else "other")
+        for r in diagnosis.ranking[:MOST]
+    )
+
+
+def _shrinkage(diagnosis: Diagnosis) -> Bars:
+    gap = diagnosis.gap
+    ahead = f" {gap.horizon_s:g} s ahead" if math.isfinite(gap.horizon_s) else ""
+    rows = (
+        ("model", gap.before, "model"),
+        ("as diagnosed", gap.after, "best"),
+        ("noise alone", gap.floor, "other"),
+    )
+    bars = tuple(Bar(name, v, number(v), role) for name, v, role in rows)
+    return Bars(f"Prediction error{ahead}, in units of the noise", bars)
+
+
+def _with_unit(value: float, unit: str) -> str:
+    return f"{number(value)} {'' if unit == '1' else unit}".rstrip()

@@ -1,0 +1,296 @@
+"""The ruler: how wrong held-out open-loop predictions are, in the units of each channel.
+
+From many moments of the log, and from the beginning of each trial, a hypothesis runs on with the
+commands that were sent and sees nothing more of the log. Its errors 0.1, 0.5 and 1 s later, and
+over whole trials, are what an engineer would measure; values come from the other trials, or from
+the other pieces of one long log. The noise that a diagnosis estimates has no part in them, so they
+compare between hypotheses, models and days.
+
+Two hypotheses are compared by the mean logarithm of the ratio of their errors over channels and
+horizons; its scatter is the jackknife's over runs.
+
+No model predicts better than the noise floor. Where a manoeuvre was repeated, by a candidate or by
+commands that are the same, predictions of the repeats miss by the same model error and by different
+noise: the scatter among them is the floor. Else it comes from the short horizon: what one step
+leaves, as white noise, carried on by the model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from grounded.diagnosis.data import Data
+from grounded.diagnosis.delays import delays_of
+from grounded.diagnosis.fitted import Fitted, leave_one_out, moved
+from grounded.diagnosis.hypothesis import Hypothesis, Predictor
+from grounded.frozen import Array
+from grounded.trial import Trial
+
+SECONDS = (0.1, 0.5, 1.0)
+MOST_STARTS = 400
+MOST_WHOLE = 8  # trials that are predicted from beginning to end
+FINE = 2e-3  # of a channel's spread: errors below it do not matter
+FAR = 1e6  # a state beyond it has diverged
+MOMENTS = 20  # at which repeats are compared
+ALIKE = 0.02  # of a command's spread: how much commands of repeats may differ, rms
+
+
+def folds(data: Data) -> Any:
+    """What each run is held out with, (B,): its trial; one log alone is cut into pieces."""
+    return data.trial_of if data.count > 1 else np.arange(len(data.valid))
+
+
+@dataclass(frozen=True, eq=False)
+class Errors:
+    """Sums of squared errors and their counts by horizon, run and state, (K, B, n) each."""
+
+    total: Array
+    count: Array
+
+    @cached_property
+    def rms(self) -> Array:
+        """By horizon and state, (K, n); NaN where nothing was measured."""
+        total, count = self.total.sum(axis=1), self.count.sum(axis=1)
+        return np.where(count > 0, np.sqrt(total / np.maximum(count, 1)), np.nan)
+
+
+@dataclass(frozen=True)
+class Gain:
+    """What one hypothesis predicts better than another: log ratio of errors, and its scatter."""
+
+    mean: float
+    scatter: float
+    largest: float  # of a single channel and horizon
+
+    def beyond(self, scatters: float, least: float) -> bool:
+        """Whether it is worth a claim."""
+        return self.mean > scatters * self.scatter and self.largest > least
+
+
+class Ruler:
+    """Errors of fitted hypotheses on one set of trials."""
+
+    def __init__(self, predictor: Predictor) -> None:
+        self.predictor, self.data = predictor, predictor.data
+        data = self.data
+        self.folds = folds(data)
+        self.held_out = len(np.unique(self.folds)) > 1
+        longest = int(data.lengths.max())
+        steps = (1, *(max(1, round(s / data.dt)) for s in SECONDS))
+        self.steps = tuple(dict.fromkeys(k for k in steps if k < longest))  # and the whole trial
+        self.names = [n for i, n in enumerate(data.model.state_names) if i not in data.hidden]
+        self.shown = [data.model.state_names.index(n) for n in self.names]
+        self.state0 = np.cumsum([0, *(data.lengths + 1)])[:-1]  # of each trial, flat
+        self.step0 = np.cumsum([0, *data.lengths])[:-1]
+        self._measured: dict[int, tuple[Fitted, Errors]] = {}
+
+    @cached_property
+    def starts(self) -> tuple[Any, Any]:
+        """(step within the run, run) of each moment that is predicted from, (M,) each."""
+        data, least = self.data, self.steps[0]
+        lengths = data.valid.sum(axis=1).astype(int)
+        first = data.step_at[:, 0] - self.step0[data.trial_of]
+        room = data.lengths[data.trial_of] - least - first
+        pairs = [
+            (t, b) for b in range(len(lengths)) for t in range(1, min(lengths[b], room[b] + 1))
+        ] or [(0, 0)]
+        at, run = np.array(pairs[:: max(1, len(pairs) // MOST_STARTS)]).T
+        return at, run
+
+    @cached_property
+    def wholes(self) -> Any:
+        """The first runs of the trials that are predicted whole."""
+        data = self.data
+        first = np.flatnonzero(data.step_at[:, 0] == self.step0[data.trial_of])
+        return first[np.unique(np.linspace(0, len(first) - 1, MOST_WHOLE).astype(int))]
+
+    @cached_property
+    def fine(self) -> Array:
+        """Error of each state below which nothing matters, (n,)."""
+        return np.asarray(np.maximum(FINE * self.data.filled.std(axis=0), 1e-12))
+
+    @property
+    def measured(self) -> list[tuple[Fitted, Errors]]:
+        """All hypotheses that were measured so far."""
+        return list(self._measured.values())
+
+    def errors(self, fit: Fitted) -> Errors:
+        """Held-out errors of a hypothesis, from its own filtered states."""
+        if id(fit) not in self._measured:
+            self._measured[id(fit)] = fit, self._errors(fit)
+        return self._measured[id(fit)][1]
+
+    def _errors(self, fit: Fitted) -> Errors:
+        data, h = self.data, fit.hypothesis
+        B, n, K = len(data.valid), data.model.n, len(self.steps) + 1
+        found = Errors(np.zeros((K, B, n)), np.zeros((K, B, n)))
+        each: list[tuple[Hypothesis, Any]] = [(h, np.arange(B))]
+        if self.held_out and (h.effects or h.spread > 0):
+            shifts, _ = leave_one_out(fit, self.folds)
+            groups = [np.flatnonzero(self.folds == fold) for fold in np.unique(self.folds)]
+            each = [(moved(data, h, s), own) for s, own in zip(shifts, groups, strict=True)]
+        for one, own in each:
+            self._add(found, one, fit.track, own)
+        return found
+
+    def _add(
+        self,
+        found: Errors,
+        h: Hypothesis,
+        track: Array,
+        own: Any,
+        added: Array | None = None,
+        whole: bool = True,
+    ) -> None:
+        """The errors of the runs `own`; `added` to every step within a run, (L, B, n)."""
+        at, run = self.starts
+        mine = np.isin(run, own)
+        if mine.any():
+            at, run = at[mine], run[mine]
+            error = self._along(h, track, at, run, self.steps[-1], added)
+            for k, steps in enumerate(self.steps):
+                square = error[steps] ** 2
+                np.add.at(found.total[k], run, np.nan_to_num(square))
+                np.add.at(found.count[k], run, np.isfinite(square))
+        for first in np.intersect1d(self.wholes, own) if whole else ():
+            steps = int(self.data.lengths[self.data.trial_of[first]])
+            square = self._along(h, track, np.zeros(1, int), first[None], steps)[1:, 0] ** 2
+            found.total[-1, first] += np.nan_to_num(square).sum(axis=0)
+            found.count[-1, first] += np.isfinite(square).sum(axis=0)
+
+    def _along(
+        self,
+        h: Hypothesis,
+        track: Array,
+        at: Any,
+        run: Any,
+        steps: int,
+        added: Array | None = None,
+    ) -> Array:
+        """Y - prediction 0 to `steps` steps after the moments, (steps + 1, M, n), NaN if unseen."""
+        data, predictor = self.data, self.predictor
+        trial = data.trial_of[run]
+        step = data.step_at[run, 0] - self.step0[trial] + at
+        received, delays = predictor.received(h), delays_of(h, data)
+        oldest = 0 if delays is None else max(delays.whole) + 1  # what sensors may still show
+        path = [track[np.maximum(at - j, 0), run] for j in range(oldest, -1, -1)]
+        last = data.lengths[trial]
+        for j in range(steps):
+            t = np.minimum(step + j, last - 1)
+            x = predictor.advance(h, path[-1], received[trial, t], t * data.dt)
+            if added is not None:
+                inside = (at + j < len(added))[:, None]
+                x = x + np.where(inside, added[np.minimum(at + j, len(added) - 1), run], 0.0)
+            path.append(np.clip(np.nan_to_num(x, nan=FAR), -FAR, FAR))
+        states = np.stack(path)
+        logged = (states + predictor.offset(h, states))[oldest:]
+        ahead = step + np.arange(steps + 1)[:, None]
+        flat = self.state0[trial] + np.minimum(ahead, last)
+        error = data.model.difference(data.filled[flat], logged)
+        seen = np.isfinite(data.states[flat]) & (ahead <= last)[..., None]
+        return np.where(seen, error, np.nan)
+
+    def doubt(self, fit: Fitted) -> Array:
+        """Scatter of the logarithm of each rms error, the jackknife's over runs, (K, n')."""
+        found = self.errors(fit)
+        total, count = (a[..., self.shown] for a in (found.total, found.count))
+        left = [a.sum(axis=1, keepdims=True) - a for a in (total, count)]
+        each = 0.5 * np.log(np.maximum(left[0], 1e-300) / np.maximum(left[1], 1))
+        B = each.shape[1]
+        return np.asarray(np.sqrt((B - 1) * each.var(axis=1) if B > 1 else each[:, 0] * 0 + np.inf))
+
+    def gain(self, before: Fitted, after: Fitted) -> Gain:
+        """What `after` predicts better than `before`."""
+        return self.compared(self.errors(before), self.errors(after))
+
+    def corrected(self, fit: Fitted, rate: Array) -> tuple[Gain, Errors]:
+        """What a fit would gain by a rate (L, B, n) [unit/s] added along its log; its errors."""
+        B, n, K = len(self.data.valid), self.data.model.n, len(self.steps) + 1
+        plain, other = (Errors(np.zeros((K, B, n)), np.zeros((K, B, n))) for _ in range(2))
+        for found, added in ((plain, None), (other, rate * self.data.dt)):
+            self._add(found, fit.hypothesis, fit.track, np.arange(B), added, whole=False)
+        return self.compared(plain, other), other
+
+    def compared(self, before: Errors, after: Errors) -> Gain:
+        """The same of errors."""
+        a, b = (errors.total[..., self.shown] for errors in (before, after))
+        count = before.count[..., self.shown].sum(axis=1, keepdims=True)
+        seen, least = count > 0, count * self.fine[self.shown] ** 2 + 1e-300
+
+        def ratio(x: Array, y: Array) -> Array:
+            return np.asarray(np.where(seen, 0.5 * np.log((x + least) / (y + least)), 0.0))
+
+        def without(x: Array) -> Array:
+            return np.asarray(np.maximum(x.sum(axis=1, keepdims=True) - x, 0.0))
+
+        whole = ratio(a.sum(axis=1, keepdims=True), b.sum(axis=1, keepdims=True))
+        each = ratio(without(a), without(b)).sum(axis=(0, 2)) / max(int(seen.sum()), 1)
+        B = len(each)
+        scatter = np.sqrt((B - 1) / B * ((each - each.mean()) ** 2).sum()) if B > 1 else np.inf
+        return Gain(
+            float(whole.sum() / max(int(seen.sum()), 1)), float(scatter), float(whole.max())
+        )
+
+    # -- the floor ----------------------------------------------------------------------------
+
+    def scatter(self, fit: Fitted, repeats: Sequence[Sequence[int]]) -> Array | None:
+        """Rms error that repeats leave around their mean, (K, n); None without repeats."""
+        data, h = self.data, fit.hypothesis
+        first = np.flatnonzero(data.step_at[:, 0] == self.step0[data.trial_of])
+        of_trial = dict(zip(data.trial_of[first].tolist(), first.tolist(), strict=True))
+        total = np.zeros((len(self.steps) + 1, data.model.n))
+        count = np.zeros_like(total)
+        for group in repeats:
+            runs = np.array([of_trial[i] for i in group if i in of_trial])
+            if len(runs) < 2:
+                continue
+            length = int(data.lengths[data.trial_of[runs]].min())
+            own = int(data.valid[runs].sum(axis=1).min())
+            for k, steps in enumerate((*self.steps, length)):
+                last = min(own - 1, length - steps)
+                moments = np.unique(np.linspace(min(1, last), last, MOMENTS).astype(int))
+                moments = np.zeros(1, int) if k == len(self.steps) else moments[moments >= 0]
+                at, run = np.tile(moments, len(runs)), np.repeat(runs, len(moments))
+                error = self._along(h, fit.track, at, run, steps)
+                error = error[1:] if k == len(self.steps) else error[-1:]
+                error = error.reshape(len(error), len(runs), len(moments), -1)
+                there = np.isfinite(error).all(axis=1)
+                spread = np.where(there, np.nan_to_num(error).var(axis=1, ddof=1), 0.0)
+                total[k] += spread.sum(axis=(0, 1))
+                count[k] += there.sum(axis=(0, 1))
+        if not (count[:-1][:, self.shown] > 0).all():
+            return None
+        return np.where(count > 0, np.sqrt(total / np.maximum(count, 1)), np.nan)
+
+
+def repeated(trials: Sequence[Trial], data: Data) -> list[list[int]]:
+    """Groups of trials that repeat a manoeuvre, as indices: of one candidate, or commanded alike.
+
+    Args:
+        trials: those of the data, in its order.
+        data: prepared from them.
+    """
+    groups: list[list[int]] = []
+    scale = np.maximum(
+        np.std(np.concatenate([t.inputs[: t.known_steps] for t in trials]), axis=0), 1e-12
+    )
+    for i, trial in enumerate(trials):
+        for group in groups:
+            one = trials[group[0]]
+            if trial.candidate and trial.candidate == one.candidate:
+                group.append(i)
+                break
+            length = min(int(data.lengths[i]), int(data.lengths[group[0]]))
+            apart = (trial.inputs[:length] - one.inputs[:length]) / scale
+            same = abs(int(data.lengths[i]) - int(data.lengths[group[0]])) <= 0.1 * length
+            if same and np.sqrt((apart**2).mean(axis=0)).max() < ALIKE:
+                group.append(i)
+                break
+        else:
+            groups.append([i])
+    return [group for group in groups if len(group) > 1]

@@ -1,0 +1,57 @@
+"""`correction`, a smooth curve added to a state's rate: no cause, and never offered as one.
+
+    s' = model + sum_k w_k g_k(r) / sum_k g_k(r)   (s<-r)
+
+with bells g_k at KNOTS places from lo to hi, flat beyond them. A diagnosis fits it to what no
+effect explains (`grounded.diagnosis.correction`); adopted, it is part of the model like any effect.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from grounded.effects.family import Quantity, RateFamily, Site, Values, per
+
+KNOTS = 7
+WIDTH = 0.7  # of the distance between knots
+
+
+def bells(r: Any, lo: Any, hi: Any) -> list[Any]:
+    """The KNOTS shares of each weight at r; they sum to 1."""
+    apart = (hi - lo) / (KNOTS - 1)
+    inside = np.minimum(np.maximum(r, lo), hi)
+    found = [
+        np.exp(-0.5 * ((inside - lo - k * apart) / (WIDTH * apart)) ** 2) for k in range(KNOTS)
+    ]
+    total = sum(found)
+    return [one / total for one in found]
+
+
+def _targets(model: Any) -> list[str]:
+    sources = [*model.state_names, *model.input_names]
+    return [f"{s}<-{r}" for s in model.state_names for r in sources]
+
+
+def _quantities(site: Site) -> tuple[Quantity, ...]:
+    target, _, source = site.target.partition("<-")
+    ends = [Quantity(n, site.unit(source), fixed=True) for n in ("lo", "hi")]
+    unit = per(site.unit(target))
+    return (*ends, *[Quantity(f"w{k}", unit, fixed=True) for k in range(KNOTS)])
+
+
+def _rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
+    target, _, source = site.target.partition("<-")
+    r = s[source] if source in site.model.states else a[source]
+    return {target: sum(c[f"w{k}"] * g for k, g in enumerate(bells(r, c["lo"], c["hi"])))}
+
+
+correction = RateFamily(
+    name="correction",
+    equation="s' = model + curve(r)   (s<-r)",
+    sentence="{driven} lacks a rate that depends on {source}: a correction, not a cause",
+    targets=_targets,
+    quantities=_quantities,
+    rate=_rate,
+)

@@ -1,0 +1,236 @@
+"""What a motion takes off the input that drives it: friction and inertia of a joint.
+
+    u_eff = u - T(w),      target `tau<-w`: the input tau, and the velocity w that it drives
+
+A joint's friction is a torque: through the inertia matrix, M(q)^-1 T, it acts on all accelerations,
+not on its own alone. So it is put in where the model's own torque enters, and needs nothing of the
+model but its step, be it NumPy, MuJoCo or any black box. Over a step of h
+
+    w_free            the speed that w has at the end without the loss
+    B = d w / d tau   what a unit of tau, held over the step, adds to it
+    w_end = w_free - B T                                                    T: mean over the step
+
+and w' = (w_free - w) / h - B T(w) / h is solved for this one speed, in a few implicit parts of the
+step, as if all else were constant over it. A dry friction slows a joint until it stands, holds it
+while the rest is less than c, and lets it go the other way for what is left of the step; it can't
+be too stiff for a step. It builds up over a width of speed, a hundredth of the largest or what data
+show, never so wide that it were a viscous one. Losses of several joints act on each other by B
+(k, k): a few sweeps of Gauss and Seidel.
+
+Where tau drives w alone through a constant inertia, the same friction is a Coulomb and a viscous
+one of w itself, an inertia a gain of its rate, and they go by those names (`renamed`).
+
+Pairs are found from the model: those where tau always pushes w the same way (a torque and its own
+joint's velocity; the inertia matrix is positive there, elsewhere it changes sign or brakes).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from grounded.compile.names import Named
+from grounded.effects import places
+from grounded.effects.family import Effect, LossFamily, Quantity, Site, coupled, width
+from grounded.model import Model
+
+SWEEPS = 3
+PARTS = 4  # of a step
+NUDGE = 1e-2  # of the input's unit: the difference that B is taken over
+ALIKE = 0.999  # cosine from which two slopes are one
+ONLY = 2e-3  # of a speed's answer: what an input may do besides
+FORCES = ("N", "V", "A")  # what a unit of an effort begins with: N m, V ...
+
+Pairs = Sequence[tuple[Effect, Mapping[str, Any]]]
+Loads = tuple[list[Any], list[Any], list[list[Any]], list[Any]]
+
+
+def inputs_left(pairs: Pairs, s: Any, a: Named, dt: Any, step: Callable[[Named], Any]) -> Named:
+    """The inputs that are left of `a` for the model: step(a) -> next state by name."""
+    losses, at = solved(pairs, loads(pairs, s, a, step), dt), dict(a)
+    for (effect, _), loss in zip(pairs, losses, strict=True):
+        name = coupled(effect.site)[0]
+        at[name] = at[name] - loss
+    return Named("input", tuple(at), list(at.values()))
+
+
+def loads(pairs: Pairs, s: Any, a: Named, step: Callable[[Named], Any]) -> Loads:
+    """Of each pair: speed at the start, at the end without a loss; B [w][tau]; the input."""
+    drives = [coupled(effect.site) for effect, _ in pairs]
+    free, reached = step(a), dict[str, Any]()
+    for name in dict.fromkeys(tau for tau, _ in drives):
+        more = [a[n] + NUDGE if n == name else a[n] for n in a]
+        reached[name] = step(Named("input", tuple(a), more))
+    gain = [[(reached[tau][w] - free[w]) / NUDGE for tau, _ in drives] for _, w in drives]
+    ends = [free[w] for _, w in drives]
+    return [s[w] for _, w in drives], ends, gain, [a[tau] for tau, _ in drives]
+
+
+def solved(pairs: Pairs, at: Loads, dt: Any) -> list[Any]:
+    """The mean loss of each pair over a step of dt."""
+    count, (w, free, gain, u) = len(pairs), at
+    found: list[Any] = [0.0] * count
+    for _ in range(SWEEPS if count > 1 else 1):
+        for i, (effect, values) in enumerate(pairs):
+            rest: Any = free[i]
+            for j in range(count):
+                if j != i:
+                    rest = rest - gain[i][j] * found[j]
+            own = np.maximum(np.abs(gain[i][i]), 1e-12)
+            assert isinstance(effect.family, LossFamily)
+            found[i] = effect.family.loss(w[i], rest, own, u[i], values, dt)
+    return found
+
+
+def dry(w: Any, free: Any, gain: Any, c: Any, b: Any, width: Any) -> Any:
+    """Mean of c clip(w / width, -1, 1) + b w over a step that would end at `free`.
+
+    By the implicit Euler method for the one, the trapezoidal rule for the other: in each part the
+    end is known in closed form.
+    """
+    part = gain / PARTS
+    push, by = (free - w) / PARTS, np.maximum(1 + 0.5 * part * b, 0.1)
+    g = part * c / by
+    total: Any = 0.0
+    for _ in range(PARTS):
+        end = (w + push - 0.5 * part * b * w) / by
+        slow, fast = end / (1 + g / width), np.maximum(np.abs(end) - g, 0.0)
+        last = np.where(np.abs(slow) < width, slow, np.where(end > 0, fast, -fast))
+        dry = np.minimum(np.maximum(last / width, -1.0), 1.0)
+        total = total + c * dry + 0.5 * b * (w + last)
+        w = last
+    return total / PARTS
+
+
+def _friction(site: Site) -> tuple[Quantity, ...]:
+    tau, w = coupled(site)
+    unit, most = site.unit(tau), _strongest(site)
+    by = f"{unit} s/{site.unit(w).removesuffix('/s')}"
+    viscous = Quantity("b", by, low=0.0, fixed=has_viscous(site.model, tau, w))
+    return (Quantity("c", unit, low=0.0, high=most), viscous, width(site, w))
+
+
+def _per_acceleration(site: Site) -> str:
+    """N m by rad/s is kg m^2, N by m/s kg; others as a fraction."""
+    tau, w = (site.unit(name) for name in coupled(site))
+    return {"N m": "kg m^2", "N": "kg"}.get(tau, f"{tau} s^2/{w.removesuffix('/s')}")
+
+
+def has_viscous(model: Model, tau: str, w: str) -> bool:
+    """Whether a parameter of the model is the viscous part already: d f / d p = k w d f / d tau."""
+    dt, (x, u) = places.probe(model, 1e-4), places.samples(model, 8)
+    _, f_u, f_p = model.system.sensitivities(x, u, model.values, dt)
+    speed = x[:, model.state_names.index(w)]
+    ours = (f_u[:, :, model.input_names.index(tau)] * speed[:, None]).reshape(-1)
+    theirs = f_p.reshape(len(ours), -1)
+    lengths = np.sqrt(np.sum(theirs**2, axis=0) * np.sum(ours**2))
+    return bool(((np.abs(theirs.T @ ours) > ALIKE * lengths) & (lengths > 0)).any())
+
+
+def _strongest(site: Site) -> float:
+    """A dry friction beyond which nothing would ever move: twice the largest input seen.
+
+    An input that hardly does anything (a joint without a motor) bounds nothing.
+    """
+    tau, _ = coupled(site)
+    return 2 * site.scales.peak(tau) if site.scales.moves(tau) else np.inf
+
+
+def pairs_of(model: Model) -> list[str]:
+    """`tau<-w` for every effort and the velocity that it always pushes the same way."""
+    if not any(unit.startswith(FORCES) for unit in model.inputs.values()):
+        efforts = list(model.input_names) if getattr(model.step, "timestep", 0.0) else []
+    else:
+        efforts = [n for n, unit in model.inputs.items() if unit.startswith(FORCES)]
+    velocities = places.velocities(model)
+    if not efforts or not velocities:
+        return []
+    dt = places.probe(model, 1e-2)
+    _, f_u = model.system.linearise(*places.samples(model, 8), model.values, dt)
+    found = []
+    for tau in efforts:
+        j = model.input_names.index(tau)
+        by = {w: f_u[:, model.state_names.index(w), j] for w in velocities}
+        least = {w: float(g.min()) for w, g in by.items() if g.min() > 1e-9}
+        best = max(least, key=lambda w: least[w], default=None)
+        if best is not None:
+            found.append(f"{tau}<-{best}")
+    return found
+
+
+def _inertia(w: Any, free: Any, gain: Any, u: Any, c: Any, dt: Any) -> Any:
+    wanted = c["J"] / dt
+    return wanted * (free - w) / np.maximum(1 + gain * wanted, 0.1)
+
+
+def _load(w: Any, free: Any, gain: Any, u: Any, c: Any, dt: Any) -> Any:
+    carried = np.abs(u - 0.5 * (free - w) / gain)  # the mean of what drives and what resists
+    return dry(w, free, gain, c["c"] + c["k"] * carried, c["b"], c["width"])
+
+
+def _loaded(site: Site) -> tuple[Quantity, ...]:
+    constant, viscous, constant_width = _friction(site)
+    share = tuple(float(k) for k in np.geomspace(0.02, 0.6, 6))
+    k = Quantity("k", "1", share, 0.02, 0.9, places=4)
+    return (constant, viscous, k, constant_width)
+
+
+def alone(model: Model, tau: str, w: str) -> bool:
+    """Whether tau moves nothing but w, and always as much: through a constant inertia."""
+    dt, (x, u) = places.probe(model, 1e-5), places.samples(model, 8)
+    _, f_u = model.system.linearise(x, u, model.values, dt)
+    by, i = f_u[:, :, model.input_names.index(tau)], model.state_names.index(w)
+    others = np.abs(np.delete(by, i, axis=1)).max(initial=0.0)
+    return bool(others < ONLY * by[0, i] and np.ptp(by[:, i]) < ONLY * by[0, i])
+
+
+def renamed(model: Model) -> dict[str, str]:
+    """Names that a joint has already where its inertia is constant: {dropped: kept}."""
+    found: dict[str, str] = {}
+    for pair in pairs_of(model):
+        tau, _, w = pair.partition("<-")
+        if alone(model, tau, w):
+            found |= {f"joint_friction:{pair}": f"coulomb_friction:{w}"}
+            found |= {f"added_inertia:{pair}": f"rate_gain:{w}"}
+    return found
+
+
+joint_friction = LossFamily(
+    name="joint_friction",
+    equation="u_eff = u - c sign(w) - b w   (u<-w)",
+    sentence="{driven} loses {c} to dry friction[ and {b} times {source} to viscous friction]",
+    targets=pairs_of,
+    quantities=_friction,
+    lookalikes=("coulomb_friction", "viscous_friction", "dead_zone", "stiction", "parameter"),
+    loss=lambda w, free, gain, u, c, dt: dry(w, free, gain, c["c"], c["b"], c["width"]),
+    torque=lambda w, rate, u, c: c["c"] * np.tanh(w / c["width"]) + c["b"] * w,
+)
+
+load_friction = LossFamily(
+    name="load_friction",
+    equation="u_eff = u - (c + k |u - u_load| / 2) sign(w) - b w   (u<-w)",
+    sentence="{driven} loses {c} and {k%} of what its gear carries to dry friction[, and {b} times "
+    "{source} to viscous friction]",
+    targets=pairs_of,
+    quantities=_loaded,
+    lookalikes=("joint_friction", "coulomb_friction", "viscous_friction", "input_gain"),
+    loss=_load,
+    torque=lambda w, rate, u, c: (
+        (c["c"] + c["k"] * np.abs(u)) * np.tanh(w / c["width"]) + c["b"] * w
+    ),
+)
+
+added_inertia = LossFamily(
+    name="added_inertia",
+    equation="u_eff = u - J w'   (u<-w)",
+    sentence="{driven} moves an inertia of {J} more than modelled (a rotor, a gear, a load)",
+    targets=pairs_of,
+    quantities=lambda site: (Quantity("J", _per_acceleration(site)),),
+    lookalikes=("input_gain", "rate_gain", "parameter"),
+    loss=_inertia,
+    torque=lambda w, rate, u, c: c["J"] * rate,
+)
+
+FAMILIES = (joint_friction, load_friction, added_inertia)

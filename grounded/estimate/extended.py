@@ -1,0 +1,319 @@
+"""The extended Kalman filter along all trials at once, the smoother, and their likelihood.
+
+    x^-_{t+1} = f(x_t, u_t),      A = f_x(x_t, u_t);      e_t = y_t - h(x^-_t),      H = h_x(x^-_t)
+
+The equations between are those of `grounded.filter.kalman`. How the whitened innovations react to a
+change of the model by a small theta is the same recursion, driven by f_theta (and h_theta), so that
+a fit is a least-squares problem in them (`sensitivity`).
+
+A pass is either step by step (`recursion`), linearising at each state that it reaches, or its fixed
+point: the model is evaluated along a whole track in one call, the linear filter runs about that
+track, and the filtered states are the next track. Sweep s is exact for the first s steps, and in
+practice everywhere after two or three, because a track of a neighbouring fit is at hand.
+
+The linear filter begins a step before the trial, one that changes nothing: so the first sample is
+used like any other. Arrays are time first, (T + 1, B, ...): see `grounded.estimate.record`.
+Source: Särkkä, Bayesian Filtering and Smoothing (2013), ch. 5; Ljung, System Identification, ch. 7.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from grounded.estimate.measurement import Measurement, NoiseStd
+from grounded.estimate.record import RecordBatch
+from grounded.estimate.steps import Advance, ModelSteps
+from grounded.filter import kernels
+from grounded.filter.kalman import (
+    Gains,
+    LinearSystem,
+    gains,
+    innovations,
+    predicted,
+    smoother,
+    updated,
+    whole,
+)
+from grounded.frozen import Array
+
+SWEEPS = 20
+CLOSE = 1e-2  # standard deviations: a sweep that moves the track less is the last,
+STILL = 1e-3  # [nats] or the likelihood; at a kink a track may flip for ever,
+ENOUGH = 0.05  # [nats] and then this is enough after SWEEPS
+
+
+@dataclass(frozen=True, eq=False)
+class Filtered:
+    """Arrays time first; `loglik` is minus infinity when the pass did not get through."""
+
+    x: Array  # (T + 1, B, n) filtered
+    std: Array  # (T + 1, B, n) of x
+    x_prior: Array  # (T + 1, B, n) predicted
+    e: Array  # (T + 1, B, ny) innovations, zero where not seen
+    eps: Array  # (T + 1, B, ny) the same whitened
+    more: Array  # (T, B, n) variance added to the process noise, see `steps`
+    gains: Gains  # of T + 1 steps, the first of which changes nothing; with covariances
+    loglik: float
+    status: str = "filtered"
+
+    @property
+    def A(self) -> Array:
+        """Slope of every step (T, B, n, n)."""
+        return self.gains.system.A[1:]
+
+    @cached_property
+    def columns(self) -> tuple[Array, Array]:
+        """What drives the linear filter about this pass, see `_columns`."""
+        apart = np.zeros_like(self.x)
+        apart[1:] = (self.A @ (self.x_prior - self.x)[:-1, ..., None])[..., 0]
+        return _columns(apart, self.e)
+
+
+def filter_batch(
+    batch: RecordBatch,
+    measurement: Measurement,
+    noise: NoiseStd,
+    steps: ModelSteps,
+    about: Filtered | None = None,
+) -> Filtered:
+    """One pass over a batch. Never raises for numbers that run away: see `Filtered.status`.
+
+    Args:
+        batch: the records.
+        measurement: ny channels.
+        noise: of process and measurements.
+        steps: the model.
+        about: a pass with nearly the same model and noise, where sweeps begin.
+    """
+    (T, B), n = batch.dt.shape, batch.start.shape[1]
+    if T > 0 and kernels.available(measurement.ny, n):
+        if about is not None and about.x.shape == (T + 1, B, n):
+            start = about.x[:-1], about.std[:-1], about.x_prior
+        elif measurement.states == tuple(range(n)) and batch.seen[1:].all():
+            x = np.concatenate([batch.start[None], batch.y[1:]])
+            start = x[:-1], np.broadcast_to(noise.measurement, x[:-1].shape), x
+        else:
+            first = recursion(batch, measurement, noise, replace(steps, wide=False).at)
+            if not steps.wide or not np.isfinite(first.loglik):
+                return first
+            start = first.x[:-1], first.std[:-1], first.x_prior
+        found = _sweeps(batch, measurement, noise, steps, *start)
+        if found is not None:
+            return found
+    return recursion(batch, measurement, noise, steps.at)
+
+
+def _sweeps(
+    batch: RecordBatch,
+    measurement: Measurement,
+    noise: NoiseStd,
+    steps: ModelSteps,
+    track: Array,
+    std: Array,
+    xbar: Array,
+) -> Filtered | None:
+    """The fixed point, from a track and its std (T, B, n) and predictions (T + 1, B, n).
+
+    None if it is not found.
+    """
+    last = -np.inf
+    with np.errstate(all="ignore"):
+        for sweep in range(SWEEPS):
+            f, A, more = steps.along(track, std)
+            H, e0 = _seen(batch, measurement, xbar)
+            if not all(np.isfinite(array).all() for array in (f, A, H, e0)):
+                return None
+            direct = measurement.states == tuple(range(track.shape[-1]))
+            done = _about(batch, noise, (f, A, more), (H, e0, direct), track, xbar)
+            if done is None:
+                return None
+            assert done.gains.P is not None
+            wide = np.sqrt(np.abs(np.einsum("tbii->tbi", done.gains.P))) + 1e-12
+            moved = max(
+                float(np.max(np.abs(done.x[:-1] - track) / wide[:-1])),
+                float(np.max(np.abs(done.x_prior - xbar) / wide)),
+                float(np.max(np.abs(done.std[:-1] - std) / wide[:-1])) if steps.wide else 0.0,
+            )
+            settled = abs(done.loglik - last) < (STILL if sweep < SWEEPS - 1 else ENOUGH)
+            if moved < CLOSE or settled:
+                return done
+            track, std, xbar, last = done.x[:-1], done.std[:-1], done.x_prior, done.loglik
+    return None
+
+
+def _about(
+    batch: RecordBatch,
+    noise: NoiseStd,
+    step: tuple[Array, Array, Array],
+    seen: tuple[Array, Array, bool],
+    track: Array,
+    xbar: Array,
+) -> Filtered | None:
+    """The linear filter about a track: f + A (x - track), h + H (x - xbar); None: not finite.
+
+    `direct`, the last of `seen`: channel i measures state i.
+    """
+    (f, A, more), (H, e0, direct) = step, seen
+    d = np.empty_like(xbar)
+    d[0] = batch.start - xbar[0]
+    d[1:] = f + (A @ (xbar[:-1] - track)[..., None])[..., 0] - xbar[1:]
+    still = np.broadcast_to(np.eye(A.shape[-1]), A[:1].shape)
+    try:
+        A = np.concatenate([still, A])
+        system = _system(batch, noise, A, more, None if direct else H)
+        g = gains(system, covariances=True)
+    except np.linalg.LinAlgError:
+        return None
+    white, moved = innovations(g, *_columns(d, e0), track=True)
+    assert moved is not None
+    eps, loglik = white[..., 0], likelihood(g, white[..., 0], batch)
+    if not np.isfinite(loglik):
+        return None
+    x = xbar + moved[1:, ..., 0]
+    x_prior = np.empty_like(x)
+    x_prior[0], x_prior[1:] = batch.start, f + (A[1:] @ (x[:-1] - track)[..., None])[..., 0]
+    e = e0 - (H @ (x_prior - xbar)[..., None])[..., 0]
+    assert g.P is not None
+    variance = np.einsum("tbii->tbi", g.P) - np.sum(g.k**2, axis=2)
+    return Filtered(x, np.sqrt(np.maximum(variance, 0.0)), x_prior, e, eps, more, g, loglik)
+
+
+def _system(
+    batch: RecordBatch, noise: NoiseStd, A: Array, more: Array, H: Array | None
+) -> LinearSystem:
+    """Of A (T + 1, B, n, n) with the step that changes nothing before the others."""
+    R, seen = noise.measurement**2, np.zeros((len(A) + 1, *batch.seen.shape[1:]))
+    seen[1:] = batch.seen
+    Q = np.zeros(A.shape[:-1])
+    Q[1:] = _durations(batch)[..., None] * (noise.process**2 / noise.dt) + more
+    channel = batch.start_channel
+    start = batch.start_var + np.where(channel >= 0, R[np.maximum(channel, 0)], 0.0)
+    return LinearSystem(A, Q, np.where(seen > 0, R, 1.0), seen, start, H=H)
+
+
+def _durations(batch: RecordBatch) -> Array:
+    """Of every step (T, B) [s], zero where it is not valid."""
+    return np.where(batch.valid, batch.dt, 0.0)
+
+
+def _columns(d: Array, r: Array) -> tuple[Array, Array]:
+    """One column (T + 1, B, n), (T + 1, B, ny) as the linear filter takes it."""
+    wide = whole(1, r.shape[-1])
+    columns_d, columns_r = np.zeros((*d.shape, wide)), np.zeros((len(r) + 1, *r.shape[1:], wide))
+    columns_d[..., 0], columns_r[1:, ..., 0] = d, r
+    return columns_d, columns_r
+
+
+def _seen(batch: RecordBatch, measurement: Measurement, x: Array) -> tuple[Array, Array]:
+    """H (T + 1, B, ny, n) and y - h(x) (T + 1, B, ny) along a track, zero where not seen."""
+    flat = x.reshape(-1, x.shape[-1])
+    e = measurement.innovation(batch.y, measurement.function(flat).reshape(batch.y.shape))
+    H = measurement.jacobian(flat).reshape(*batch.y.shape, x.shape[-1])
+    return H * batch.seen[..., None], np.where(batch.seen, e, 0.0)
+
+
+def likelihood(g: Gains, eps: Array, batch: RecordBatch) -> float:
+    """Log-likelihood of whitened innovations (T + 1, B, ny); minus infinity for no number."""
+    total = float(np.sum(eps**2) + g.logdet.sum()) + batch.count * np.log(2 * np.pi)
+    return -0.5 * total if np.isfinite(total) else -np.inf
+
+
+def relinked(about: Filtered, batch: RecordBatch, noise: NoiseStd) -> tuple[Gains, Array, float]:
+    """Another noise about the same linearisation: gains, whitened innovations, log-likelihood.
+
+    Raises:
+        numpy.linalg.LinAlgError: when a covariance is not finite.
+    """
+    system = about.gains.system
+    g = gains(_system(batch, noise, system.A, about.more, system.H))
+    eps = innovations(g, *about.columns)[0][..., 0]
+    return g, eps, likelihood(g, eps, batch)
+
+
+def recursion(
+    batch: RecordBatch, measurement: Measurement, noise: NoiseStd, advance: Advance
+) -> Filtered:
+    """One pass over a batch, linearising at each state that it reaches."""
+    T, B, n, ny = len(batch.dt), len(batch.lengths), batch.start.shape[1], measurement.ny
+    A, more, H = np.zeros((T + 1, B, n, n)), np.zeros((T, B, n)), np.zeros((T + 1, B, ny, n))
+    A[0] = np.eye(n)
+    system = _system(batch, noise, A, more, H)
+    k, weight, P = np.zeros_like(H), np.zeros((T + 1, B, ny)), np.zeros_like(A)
+    e, eps, x, std, x_prior = (np.zeros((T + 1, B, size)) for size in (ny, ny, n, n, n))
+    g, status, t = Gains(system, k, weight, P), "filtered", 0
+    x_prior[0], P[0] = batch.start, system.start[..., None] * np.eye(n)
+    with np.errstate(all="ignore"):
+        try:
+            for t in range(T + 1):
+                seen = batch.seen[t]
+                at = measurement.innovation(batch.y[t], measurement.function(x_prior[t]))
+                e[t] = np.where(seen, at, 0.0)
+                H[t] = measurement.jacobian(x_prior[t]) * seen[..., None]
+                k[t], W, after = updated(P[t], H[t], system.R[t + 1], system.seen[t + 1])
+                weight[t] = np.einsum("bii->bi", W) * seen
+                eps[t] = (W @ e[t][..., None])[..., 0]
+                x[t] = x_prior[t] + (k[t].swapaxes(1, 2) @ eps[t][..., None])[..., 0]
+                std[t] = np.sqrt(np.einsum("bii->bi", after))
+                if t == T:
+                    break
+                x_prior[t + 1], A[t + 1], more[t] = advance(t, x[t], std[t])
+                if not (np.isfinite(x_prior[t + 1]).all() and np.isfinite(A[t + 1]).all()):
+                    raise np.linalg.LinAlgError
+                P[t + 1] = predicted(after, A[t + 1], system.Q[t + 1] + more[t])
+        except np.linalg.LinAlgError:
+            status = f"the filter left the finite numbers at step {t + 1}"
+        loglik = likelihood(g, eps, batch) if status == "filtered" else -np.inf
+    system.Q[1:] += more
+    return Filtered(x, std, x_prior, e, eps, more, g, loglik, status)
+
+
+def sensitivity(filtered: Filtered, f_theta: Array, h_theta: Array | None = None) -> Array:
+    """How the whitened innovations react to small changes theta of the model.
+
+    Args:
+        filtered: the pass about which to linearise.
+        f_theta: change of the next state, (T, B, n, k).
+        h_theta: change of the measurement, (T + 1, B, ny, k); None: none.
+
+    Returns:
+        d eps / d theta, (T + 1, B, ny, k).
+    """
+    T, B, n, k = f_theta.shape
+    ny = filtered.e.shape[-1]
+    wide = whole(k, ny)
+    d, r = np.zeros((T + 1, B, n, wide)), np.zeros((T + 2, B, ny, wide))
+    d[1:, ..., :k] = f_theta
+    if h_theta is not None:
+        r[1:, ..., :k] = -h_theta
+    return innovations(filtered.gains, d, r)[0][..., :k]
+
+
+@dataclass(frozen=True, eq=False)
+class Smoothed:
+    """Arrays time first, as in the batch."""
+
+    x: Array  # (T + 1, B, n)
+    P: Array  # (T + 1, B, n, n)
+
+
+def smooth(filtered: Filtered) -> Smoothed:
+    """One pass backwards over a filter pass that got through."""
+    back, P = smoother(filtered.gains, filtered.eps, covariances=True), filtered.gains.P
+    assert P is not None
+    assert back.whole is not None
+    x = filtered.x_prior + (P @ back.r[..., None])[..., 0]
+    return Smoothed(x, P - P @ back.whole @ P)
+
+
+def variance_slopes(g: Gains, eps: Array, batch: RecordBatch, noise: NoiseStd) -> Array:
+    """Slope of the log-likelihood by the log variances of process and measurements, (n + ny,)."""
+    back = smoother(g, eps)
+    state = 0.5 * (back.r**2 - back.N)
+    by_q = np.einsum("tbi,tb->i", state[1:], _durations(batch)) / noise.dt
+    by_r = 0.5 * (np.einsum("tbi,tbi->i", back.u, back.u) - np.einsum("tbi->i", back.D))
+    for c in range(len(by_r)):
+        by_r[c] += state[0][batch.start_channel == c].sum()
+    return np.concatenate([by_q * noise.process**2, by_r * noise.measurement**2])

@@ -1,0 +1,263 @@
+"""Figures as plain values: what is drawn, before it is known how.
+
+A figure is a title, a caption and panels; a panel has axes and what lies in them. Plotly draws them
+in a page and a notebook, matplotlib in a picture. Colours are roles ("best", "desired"), so that a
+page follows the reader's light or dark.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from grounded.frozen import Array
+
+# Okabe & Ito (2008), told apart by colour-blind people too: role -> (on white, on black)
+COLOURS = {
+    "desired": ("#000000", "#ffffff"),
+    "real": ("#000000", "#ffffff"),
+    "model": ("#d55e00", "#d55e00"),
+    "best": ("#0072b2", "#56b4e9"),
+    "predicted": ("#cc79a7", "#cc79a7"),
+    "limit": ("#b47c00", "#e69f00"),
+    "accepted": ("#009e73", "#009e73"),
+    "other": ("#9a9a9a", "#7d7d7d"),
+    "step1": ("#009e73", "#009e73"),
+    "step2": ("#e69f00", "#f0e442"),
+    "step3": ("#9a9a9a", "#8d8d8d"),
+}
+STEPS = ("step1", "step2", "step3")  # roles of iterations, in order
+WIDTHS = {"best": 2.5, "desired": 1.0}  # of paths; 1.5 for the other roles
+DASHES = {"desired": (6.0, 3.0), "predicted": (2.0, 2.0), "limit": (8.0, 2.0, 2.0, 2.0)}
+LEAST = 1e-12  # a range below which differences are rounding
+FACTORS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)  # by which deviations are enlarged
+
+
+def rgb(colour: str) -> tuple[int, int, int]:
+    """Red, green and blue of "#rrggbb"."""
+    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """A line through points; NaN breaks it. Context has no name.
+
+    times: [s] of each point of a path.
+    shade: a value for each point, shown as its colour; `shade_name` says what it is.
+    trial: whose path it is, so that an animation finds a trial's parts.
+    """
+
+    x: Array
+    y: Array
+    role: str
+    name: str = ""
+    width: float = 1.5
+    times: Array | None = None
+    shade: Array | None = None
+    shade_name: str = ""
+    trial: str = ""
+    style: str = "line"  # line, points, or ghost: not drawn, for the animation alone
+
+
+@dataclass(frozen=True)
+class Dot:
+    """A point with what hovering says of it."""
+
+    x: float
+    y: float
+    role: str
+    note: str
+    shape: str = "disc"  # disc, ring, cross, dash
+    error: float = 0.0  # half the height of an error bar
+    trial: str = ""
+
+
+@dataclass(frozen=True)
+class Rule:
+    """A horizontal line across the panel."""
+
+    y: float
+    role: str
+    name: str
+
+
+@dataclass(frozen=True)
+class Band:
+    """A faint horizontal band across the panel."""
+
+    low: float
+    high: float
+    role: str
+    note: str
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """Axes with curves and marks. `loss`: y by the logarithm of its distance from 0."""
+
+    title: str
+    x_name: str
+    y_name: str
+    curves: tuple[Curve, ...] = ()
+    dots: tuple[Dot, ...] = ()
+    rules: tuple[Rule, ...] = ()
+    bands: tuple[Band, ...] = ()
+    equal: bool = False  # one scale for both axes
+    loss: bool = False
+    whole: bool = False  # x counts
+    y_range: tuple[float, float] | None = None
+    note: str = ""  # inside, top right
+    kind: str = ""  # time: x is the time of a run; path: where a run was
+
+    def height(self, y: float | Array) -> Array:
+        """Where a value lies on the y axis: itself, or -log10(-y) of a loss."""
+        y = np.asarray(y, float)
+        if not self.loss:
+            return y
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(-np.log10(-np.minimum(y, self._largest)))
+
+    @property
+    def _largest(self) -> float:
+        known = [v[np.isfinite(v) & (v < 0)] for v in self._heights()]
+        return max((float(v.max()) for v in known if len(v)), default=-1.0)
+
+    def _heights(self) -> list[Array]:
+        seen = [c for c in self.curves if c.name] or list(self.curves)
+        marks = [d.y for d in self.dots] + [rule.y for rule in self.rules]
+        return [*(c.y for c in seen if c.style != "ghost"), np.array(marks)]
+
+    def ranges(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Of x, and of y in `height`: they hold all that has a name, with some room."""
+        seen = [c for c in self.curves if c.name] or list(self.curves)
+        xs = [c.x for c in seen if c.style != "ghost"] + [np.array([d.x for d in self.dots])]
+        margin = 0.06 if self.equal else 0.03 if self.dots or self.kind != "time" else 0.0
+        low, high = fitted(xs, margin)
+        if self.whole:
+            low, high = low - 0.6, high + 0.6
+        ends = self.y_range or fitted([self.height(v) for v in self._heights()])
+        return (low, high), ends
+
+
+@dataclass(frozen=True)
+class Bar:
+    """A horizontal bar with its label, and what stands behind it."""
+
+    label: str
+    value: float
+    text: str
+    role: str = "best"
+
+
+@dataclass(frozen=True)
+class Bars:
+    """Horizontal bars from zero, one below the other."""
+
+    title: str
+    bars: tuple[Bar, ...]
+
+
+@dataclass(frozen=True)
+class Key:
+    """An entry of a figure's legend; `trial` where it is one of the others' path."""
+
+    role: str
+    name: str
+    shape: str = "line"
+    trial: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Figure:
+    """Panels that belong together, with one legend; `name` is its file's."""
+
+    name: str
+    title: str
+    caption: str
+    panels: tuple[Panel | Bars, ...]
+    key: tuple[Key, ...] = ()
+
+
+def legend(panels: Sequence[Panel | Bars]) -> tuple[Key, ...]:
+    """What the named curves, rules and bands of panels are, each once."""
+    found: dict[tuple[str, str], Key] = {}
+    for panel in panels:
+        if isinstance(panel, Bars):
+            continue
+        for c in panel.curves:
+            if c.name and c.style != "ghost":
+                shape = "disc" if c.style == "points" else "line"
+                trial = c.trial if c.role == "other" else ""
+                found.setdefault((c.role, c.name), Key(c.role, c.name, shape, trial))
+        for rule in panel.rules:
+            found.setdefault((rule.role, rule.name), Key(rule.role, rule.name))
+    return tuple(found.values())
+
+
+def fitted(values: Iterable[Array], margin: float = 0.06) -> tuple[float, float]:
+    """A range around finite values, with some room."""
+    kept = [v[np.isfinite(v)] for v in values]
+    kept = [v for v in kept if len(v)]
+    if not kept:
+        return 0.0, 1.0
+    low, high = min(float(v.min()) for v in kept), max(float(v.max()) for v in kept)
+    size = max(abs(low), abs(high))
+    span = high - low if high - low > 1e-9 * size else 0.0
+    room = margin * span if span > LEAST else max(0.05 * size, LEAST)
+    return low - room, high + room
+
+
+def without_astray(kept: list[Array], more: list[Array], most: float = 3.0) -> list[Array]:
+    """`kept`, and of `more` what does not leave their range by more than `most` times its size.
+
+    A first run that crashed must not flatten the picture of those that did not.
+    """
+    low, high = fitted(kept, 0.0)
+    span = (high - low) * most
+    inside = [np.where((v >= low - span) & (v <= high + span), v, np.nan) for v in more]
+    return [*kept, *inside]
+
+
+def loss_ticks(low: float, high: float, most: int = 5) -> list[float]:
+    """Losses for an axis whose `height` runs from low to high: -1, -2, -5, -10 ..., or fewer."""
+    powers = range(math.floor(-high) - 1, math.ceil(-low) + 2)
+    for factors in ((1, 1.5, 2, 3, 5, 7), (1, 2, 5), (1, 3), (1,)):
+        values = [-f * 10.0**k for k in powers for f in factors]
+        values = [v for v in values if low <= -math.log10(-v) <= high]
+        if len(values) <= most:
+            break
+    if len(values) < 2:
+        values = [float(f"{-(10.0**-v):.2g}") for v in np.linspace(low, high, 4)]
+    return sorted(values)
+
+
+def enlarging(path: Array, desired: Array) -> float:
+    """A round factor that makes the deviation of a path (T, 2) visible beside the desired one."""
+    off = np.abs(path - desired[: len(path)])[:, :2]
+    off = off[np.isfinite(off)]
+    room = 0.2 * np.ptp(desired[:, :2], axis=0).max()
+    return max((f for f in FACTORS if len(off) and f * off.max() <= room), default=1.0)
+
+
+def thinned(x: Array, y: Array, most: int) -> NDArray[np.intp]:
+    """Which of many points are enough, in order.
+
+    Where x rises, the first, lowest, highest and last of each column, so that no peak is lost;
+    else every so many.
+    """
+    count = len(x)
+    if count <= most:
+        return np.arange(count)
+    if not np.all(np.diff(x) >= 0):
+        return np.unique(np.linspace(0, count - 1, most).astype(int))
+    column = np.minimum(np.arange(count) * (most // 4) // count, most // 4 - 1)
+    known = np.isfinite(y)
+    order = np.lexsort((np.where(known, y, -np.inf), column))
+    edges = np.flatnonzero(np.diff(column)) + 1
+    starts, ends = np.r_[0, edges], np.r_[edges, count] - 1
+    breaks = np.flatnonzero(np.diff(known))
+    return np.unique(np.concatenate([starts, ends, order[starts], order[ends], breaks, breaks + 1]))

@@ -1,0 +1,269 @@
+"""Figures for Plotly: a page draws what `plotted` gives, a notebook gets `notebook_figure`.
+
+Colours are written as roles ("@best", "@best/0.15" for a faint one), which `coloured` or the page's
+script turns into colours, light or dark. Building the values needs no Plotly.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from grounded.errors import needs
+from grounded.figures.figure import (
+    COLOURS,
+    DASHES,
+    Bars,
+    Curve,
+    Dot,
+    Figure,
+    Panel,
+    loss_ticks,
+    rgb,
+    thinned,
+)
+from grounded.frozen import Array
+
+MOST = 1600  # points of a curve, fewer of one that is only context
+CONTEXT = 300
+STEPS = 65535  # of a packed number's range
+COARSE = 50.0  # times the range of nearly all values from which on two bytes are too few
+FAINT = 0.15  # opacity of a band
+PAPER = {
+    "text": ("#1a1a1a", "#e8e8e8"),
+    "grid": ("#e3e3e3", "#31363b"),
+    "paper": ("#ffffff", "#16181b"),
+}
+SYMBOLS = {"disc": "circle", "ring": "circle-open", "cross": "x-thin", "dash": "line-ew"}
+FONT = 12
+LETTER = 0.035  # of a bar's text, as a share of the longest bar
+EXTRA = "report"  # that brings Plotly
+
+
+def plotted(panel: Panel | Bars, axis: str = "") -> dict[str, Any]:
+    """A panel as Plotly's data and layout, in plain values and arrays.
+
+    Args:
+        panel: what is drawn.
+        axis: the number of its axes where several panels share a figure: "", "2", "3" ...
+    """
+    if isinstance(panel, Bars):
+        return _bars(panel, axis)
+    data = [_curve(panel, curve) for curve in panel.curves]
+    looks: dict[tuple[Any, ...], list[Dot]] = {}
+    for dot in panel.dots:
+        looks.setdefault((dot.role, dot.shape, dot.error > 0, dot.trial), []).append(dot)
+    data += [_dots(panel, same) for same in looks.values()]
+    for trace in data:
+        trace |= {"xaxis": f"x{axis}", "yaxis": f"y{axis}"}
+    (left, right), (low, high) = panel.ranges()
+    across: dict[str, Any] = {"title": {"text": panel.x_name}, "range": [left, right]}
+    up: dict[str, Any] = {"title": {"text": panel.y_name}, "range": [low, high]}
+    if panel.whole:
+        across |= {"tickformat": "d", "dtick": max(1, round((right - left) / 8))}
+    if panel.equal:
+        up |= {"scaleanchor": f"x{axis}"}
+    if panel.loss:
+        ticks = loss_ticks(low, high)
+        up |= {"tickvals": panel.height(np.array(ticks)), "ticktext": [f"{v:g}" for v in ticks]}
+    layout: dict[str, Any] = {f"xaxis{axis}": _ruled(across), f"yaxis{axis}": _ruled(up)}
+    layout["shapes"] = [_line(panel, rule.y, rule.role, axis) for rule in panel.rules]
+    layout["shapes"] += [
+        _flat(panel, band.low, band.high, axis) | {"fillcolor": f"@{band.role}/{FAINT}"}
+        for band in panel.bands
+    ]
+    layout["annotations"] = [_note(panel.note, axis)] if panel.note else []
+    return {"data": data, "layout": layout}
+
+
+def _ruled(axis: dict[str, Any]) -> dict[str, Any]:
+    return axis | {
+        "gridcolor": "@grid",
+        "zeroline": False,
+        "linecolor": "@grid",
+        "automargin": True,
+        "title": axis["title"] | {"standoff": 6},
+    }
+
+
+def _curve(panel: Panel, curve: Curve) -> dict[str, Any]:
+    near = curve.name and curve.role != "other" and curve.style != "ghost"
+    most = MOST if near else CONTEXT
+    index = thinned(curve.x, curve.y, most)
+    trace: dict[str, Any] = {
+        "type": "scatter", "mode": "lines", "x": curve.x[index], "y": panel.height(curve.y[index]),
+        "name": curve.name, "line": {"color": f"@{curve.role}", "width": curve.width},
+        "meta": {"role": curve.role, "trial": curve.trial, "style": curve.style},
+        "hovertemplate": "%{y:.5g}",
+    }  # fmt: skip
+    if curve.role in DASHES:
+        trace["line"]["dash"] = " ".join(f"{v:g}px" for v in DASHES[curve.role]).replace(" ", ",")
+    if curve.times is not None:
+        trace["customdata"] = curve.times[index]
+        trace["hovertemplate"] = "%{customdata:.2f} s: (%{x:.4g}, %{y:.4g})"
+    if not curve.name:
+        trace |= {"hoverinfo": "skip", "hovertemplate": ""}
+    if curve.style == "points":
+        trace |= {"mode": "markers", "marker": {"color": f"@{curve.role}/0.4", "size": 4}}
+    if curve.style == "ghost":
+        trace |= {"visible": False}
+    if curve.shade is not None:
+        trace |= {"mode": "lines+markers", "text": curve.shade[index]}
+        trace["marker"] = _shaded(curve.shade[index], curve.shade_name)
+        trace["hovertemplate"] += "<br>" + curve.shade_name + " %{text:.3g}"
+    return trace
+
+
+def _shaded(values: Array, name: str) -> dict[str, Any]:
+    bar = {"title": {"text": name, "side": "right"}, "thickness": 12, "outlinewidth": 0}
+    return {"color": values, "size": 7, "colorscale": "Cividis", "showscale": True, "colorbar": bar}
+
+
+def _dots(panel: Panel, dots: Sequence[Dot]) -> dict[str, Any]:
+    """Marks of one look; those without a height lie on the lower edge."""
+    heights = np.array([float(panel.height(d.y)) for d in dots])
+    low, high = panel.ranges()[1]
+    y = np.where(np.isfinite(heights), heights, low + 0.04 * (high - low))
+    one = dots[0]
+    size, width = (9, 1.5) if one.shape in ("disc", "ring") else (11, 2.5)
+    colour = f"@{one.role}"
+    line = {"color": colour, "width": width}
+    trace = {
+        "type": "scatter", "mode": "markers", "x": np.array([d.x for d in dots]), "y": y,
+        "text": [d.note.replace("\n", "<br>") for d in dots], "hovertemplate": "%{text}",
+        "name": "", "meta": {"role": one.role, "trial": one.trial, "style": one.shape},
+        "marker": {"symbol": SYMBOLS[one.shape], "color": colour, "size": size, "line": line},
+        "cliponaxis": False,
+    }  # fmt: skip
+    if one.error > 0:
+        ends = [(panel.height(d.y + d.error), panel.height(d.y - d.error)) for d in dots]
+        up, down = np.array(ends, float).T
+        trace["error_y"] = {
+            "type": "data", "symmetric": False, "array": np.abs(up - y),
+            "arrayminus": np.abs(y - down), "color": colour, "thickness": 1.2, "width": 0,
+        }  # fmt: skip
+    return trace
+
+
+def _flat(panel: Panel, low: float, high: float, axis: str) -> dict[str, Any]:
+    bottom, top = (float(panel.height(v)) for v in (low, high))
+    return {
+        "type": "rect", "xref": f"x{axis} domain", "yref": f"y{axis}", "x0": 0, "x1": 1,
+        "y0": bottom, "y1": top, "line": {"width": 0}, "layer": "below",
+    }  # fmt: skip
+
+
+def _line(panel: Panel, y: float, role: str, axis: str) -> dict[str, Any]:
+    dash = ",".join(f"{v:g}px" for v in DASHES.get(role, ())) or "solid"
+    look = {"color": f"@{role}", "width": 1.2, "dash": dash}
+    return _flat(panel, y, y, axis) | {"type": "line", "line": look}
+
+
+def _note(text: str, axis: str) -> dict[str, Any]:
+    return {
+        "text": text, "xref": f"x{axis} domain", "yref": f"y{axis} domain", "x": 1, "y": 1,
+        "xanchor": "right", "yanchor": "top", "showarrow": False, "font": {"size": FONT - 1},
+    }  # fmt: skip
+
+
+def _bars(panel: Bars, axis: str) -> dict[str, Any]:
+    bars = panel.bars[::-1]  # Plotly's first is the lowest
+    values = [bar.value if np.isfinite(bar.value) else 0.0 for bar in bars]
+    trace = {
+        "type": "bar", "orientation": "h", "x": np.array(values), "y": list(range(len(bars))),
+        "text": [bar.text for bar in bars], "textposition": "outside", "cliponaxis": False,
+        "marker": {"color": [f"@{bar.role}" for bar in bars]}, "hoverinfo": "skip",
+        "textfont": {"color": "@text"}, "xaxis": f"x{axis}", "yaxis": f"y{axis}",
+        "meta": {"role": "", "trial": "", "style": "bar"},
+    }  # fmt: skip
+    most = max([abs(v) for v in values], default=0.0) or 1.0
+    low = min([*values, 0.0])
+    room = 1.05 + max([LETTER * len(bar.text) for bar in bars], default=0.0)
+    across = {"range": [room * low, room * most], "visible": False, "fixedrange": True}
+    up = {
+        "tickvals": list(range(len(bars))), "ticktext": [bar.label for bar in bars],
+        "automargin": True, "fixedrange": True, "showgrid": False, "zeroline": False,
+    }  # fmt: skip
+    return {"data": [trace], "layout": {f"xaxis{axis}": across, f"yaxis{axis}": up}}
+
+
+def coloured(value: Any, dark: bool = False) -> Any:
+    """A plotted value with its roles turned into colours."""
+    if isinstance(value, dict):
+        return {key: coloured(item, dark) for key, item in value.items()}
+    if isinstance(value, list):
+        return [coloured(item, dark) for item in value]
+    if not (isinstance(value, str) and value.startswith("@")):
+        return value
+    role, _, opacity = value[1:].partition("/")
+    colour = (COLOURS | PAPER)[role][dark]
+    return f"rgba({','.join(map(str, rgb(colour)))},{opacity})" if opacity else colour
+
+
+def palette() -> dict[str, tuple[str, str]]:
+    """Every role's colour on white and on black."""
+    return COLOURS | PAPER
+
+
+def packed(array: Array) -> dict[str, Any]:
+    """An array as text: two bytes a number, in 65,535 steps of its range, the last is NaN.
+
+    Four or eight bytes where those steps would be too coarse, because few values lie far out.
+    """
+    values = np.where(np.isfinite(array), array, np.nan)
+    known = values[np.isfinite(values)]
+    low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 0.0)
+    inner = np.ptp(np.quantile(known, [0.02, 0.98])) if len(known) else 0.0
+    if high - low <= COARSE * inner or high == low:
+        step = (high - low) / (STEPS - 1)
+        counts = np.rint((values - low) / (step or 1.0))
+        raw = np.where(np.isfinite(counts), counts, STEPS).astype("<u2").tobytes()
+        found: dict[str, Any] = {"dtype": "u2", "from": low, "step": step}
+    else:
+        kind = "f4" if max(abs(low), abs(high)) < min(1e30, 1e4 * float(inner)) else "f8"
+        raw, found = values.astype(f"<{kind}").tobytes(), {"dtype": kind}
+    return found | {"bdata": base64.b64encode(raw).decode()}
+
+
+def notebook_figure(figures: Sequence[Figure], height: int = 300) -> Any:
+    """All panels of some figures as one Plotly figure, two side by side.
+
+    Raises:
+        GroundedError: if Plotly is not installed.
+    """
+    needs("plotly", EXTRA)
+    from plotly.graph_objects import Figure as Drawn
+    from plotly.subplots import make_subplots
+
+    panels = [panel for figure in figures for panel in figure.panels]
+    columns = min(2, len(panels))
+    rows = -(-len(panels) // 2)
+    if not panels:
+        return Drawn()
+    titles = [panel.title for panel in panels]
+    made = make_subplots(rows=rows, cols=columns, subplot_titles=titles)
+    named: set[tuple[str, str]] = set()
+    for k, panel in enumerate(panels):
+        found = coloured(plotted(panel, str(k + 1) if k else ""))
+        for trace in found["data"]:
+            trace["meta"] = None
+            key = (str(trace.get("line")), trace.get("name", ""))
+            trace["showlegend"] = bool(trace.get("name")) and key not in named
+            trace["legendgroup"] = trace.get("name", "")
+            named.add(key)
+            made.add_trace(trace)
+        shapes, notes = (found["layout"].pop(key, []) for key in ("shapes", "annotations"))
+        made.update_layout(found["layout"])
+        for shape in shapes:
+            made.add_shape(shape)
+        for note in notes:
+            made.add_annotation(note)
+    made.update_layout(height=rows * height + 80, template="plotly_white", title=_title(figures))
+    return made
+
+
+def _title(figures: Sequence[Figure]) -> Mapping[str, str] | None:
+    return {"text": figures[0].title} if len(figures) == 1 else None

@@ -1,0 +1,35 @@
+"""Finding: one thing that an instrument does, in the units in which a person would mend it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from grounded.result import Document
+
+
+@dataclass(frozen=True, eq=False)
+class Finding(Document):
+    """What was found of one signal, and whether the trials were corrected for it.
+
+    Args:
+        signal: a state or an input, or several joined by "+".
+        finding: one clause.
+        kind: delay, lag, scale, sign, degrees, wrapped, offset, stuck, held, dropout, missing,
+            quantised, saturated, constant or copy.
+        delay_s: how late the signal is [s].
+        std_s: standard deviation of that.
+        scale: what the signal shows, over what it should.
+        share: of the samples that are concerned, 0 to 1.
+        corrected: the physics was judged on corrected trials.
+        log: key and value for the signal's [log] table that correct it in the logs too.
+    """
+
+    signal: str
+    finding: str
+    kind: str = ""
+    delay_s: float = 0.0
+    std_s: float = field(default=float("nan"), metadata={"brief": True})
+    scale: float = 1.0
+    share: float = field(default=float("nan"), metadata={"brief": True})
+    corrected: bool = False
+    log: str = field(default="", metadata={"brief": True})

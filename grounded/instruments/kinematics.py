@@ -1,0 +1,174 @@
+"""What must hold between sensors whatever the physics is: read off the model, not off names.
+
+    a state whose rate is c times another state        q' = c w
+    two states whose rates turn with a third           (x', y') = R(psi) (v_x, v_y)
+
+The first ties an angle to its angular velocity: how late, of which sign, in which unit. The second
+ties a heading and a speed to the way that was travelled; a side slip or a slipping wheel acts there
+too, so that only what no physics does is put right: a mirrored heading, one in degrees.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from grounded.effects import places
+from grounded.effects.registry import integrated_states, partner
+from grounded.frozen import Array, wrapped
+from grounded.instruments.lag import Lag, lag_between
+from grounded.model import Model
+from grounded.trial import Trial
+
+SHORT = 1e-6  # [s], a step that shows the rates
+SAME = 1e-4
+FAST = 0.2  # of the largest speed: below it a course means little
+AGREE = 0.9  # length of the mean of unit vectors that point the same way
+
+
+@dataclass(frozen=True)
+class Integral:
+    """The rate of state i is c times state j; `exact`: by the model itself, not by roles."""
+
+    i: int
+    j: int
+    c: float
+    exact: bool = True
+
+
+def integrals(model: Model) -> list[Integral]:
+    """A position and its velocity, an angle and its rate; a carried heading rate as well."""
+    names = model.state_names
+    x, u = places.samples(model)
+    rates = (model.system.step(x, u, model.values, SHORT) - x) / SHORT
+    found = []
+    for name, other in integrated_states(model).items():
+        i, j = names.index(name), names.index(other)
+        found.append(Integral(i, j, float(np.mean(rates[:, i] / x[:, j]))))
+    carried = [(i, k) for i, n in enumerate(names) if (k := partner(model, n))]
+    return found + [Integral(i, names.index(k), 1.0, exact=False) for i, k in carried]
+
+
+def lag_of(model: Model, relation: Integral, trials: Sequence[Trial]) -> Lag | None:
+    """How a logged velocity stands to the rate of its logged position."""
+    dt, pairs = trials[0].dt, []
+    for piece in pieces(trials, (relation.i, relation.j)):
+        moved = np.diff(piece[:, 0])[:, None]
+        wrapped(moved, [model.angle_mask[relation.i]])
+        w = relation.c * piece[:, 1]
+        pairs.append((moved[1:-1, 0] / dt, over_steps(w)))
+    return lag_between(pairs, dt)
+
+
+def over_steps(w: Array) -> Array:
+    """The mean of w (T,) over each step but the first and the last (T - 3,), by cubics."""
+    return (13 * (w[1:-2] + w[2:-1]) - w[:-3] - w[3:]) / 24
+
+
+def pieces(trials: Sequence[Trial], columns: Sequence[int]) -> Iterator[Array]:
+    """Stretches (T, columns) of the states without gaps."""
+    for trial in trials:
+        some = trial.states[:, list(columns)]
+        good = np.isfinite(some).all(axis=1)
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], good.astype(int), [0]])))
+        for a, b in edges.reshape(-1, 2):
+            if b - a > 4:
+                yield some[a:b]
+
+
+@dataclass(frozen=True)
+class Turned:
+    """The rates of states i and j turn with the heading k; their size is that of `speed`."""
+
+    i: int
+    j: int
+    k: int
+    speed: tuple[int, ...]
+
+
+def turned(model: Model) -> Turned | None:
+    """The plane in which a model moves; None where it has none."""
+    (x, u), n = places.samples(model, 8), model.n
+    f_x, f_u = model.system.linearise(x, u, model.values, SHORT)
+    rates = (model.system.step(x, u, model.values, SHORT) - x) / SHORT
+    slopes = (f_x - np.eye(n)) / SHORT
+    free = [i for i in range(n) if np.abs(f_u[:, i]).max() < 1e-9 and np.abs(rates[:, i]).max() > 0]
+    for i in free:
+        for j in free:
+            for k in range(n):
+                if k in (i, j) or i == j:
+                    continue
+                if _near(slopes[:, i, k], -rates[:, j]) and _near(slopes[:, j, k], rates[:, i]):
+                    along = (rates[:, [i, j], None] * slopes[:, [i, j]]).sum(axis=1)
+                    size = np.abs(along).max(axis=0) > 1e-6
+                    return Turned(i, j, k, tuple(int(s) for s in np.flatnonzero(size) if s != k))
+    return None
+
+
+def _near(a: Array, b: Array) -> bool:
+    return bool(np.abs(a - b).max() < 1e-3 * max(float(np.abs(b).max()), 1e-9))
+
+
+@dataclass(frozen=True)
+class Course:
+    """The course that was travelled against the model's, from logged states.
+
+    Args:
+        agrees: 0 to 1, how well they point the same way but for a constant angle.
+        offset: that angle [rad].
+        mirrored, degrees: how well they agree with the heading's sign changed, taken for degrees.
+        speed: how the model's speed stands to the travelled one.
+    """
+
+    agrees: float
+    offset: float
+    mirrored: float
+    degrees: float
+    speed: Lag | None
+
+
+def course(model: Model, relation: Turned, trials: Sequence[Trial]) -> Course | None:
+    """How the logged positions move, and how the logged heading and speed say they do."""
+    dt, columns = trials[0].dt, range(model.n)
+    xy = [relation.i, relation.j]
+    ways = [(one, np.diff(one[:, xy], axis=0) / dt) for one in pieces(trials, columns)]
+    if not ways:
+        return None
+    way = np.concatenate([moved for _, moved in ways])
+    speeds = np.hypot(*way.T)
+    fast = speeds > FAST * float(np.quantile(speeds, 0.98))
+    if fast.sum() < 20:
+        return None
+
+    def said(factor: float) -> list[Array]:
+        """The model's velocity at the middle of each step, the heading times a factor."""
+        found = []
+        for piece, _ in ways:
+            middle = 0.5 * (piece[1:] + piece[:-1])
+            middle[:, relation.k] *= factor
+            u = np.zeros((len(middle), model.m))
+            rates = (model.system.step(middle, u, model.values, SHORT) - middle) / SHORT
+            found.append(rates[:, xy])
+        return found
+
+    angle = np.arctan2(way[:, 1], way[:, 0])[fast]
+
+    def mean(factor: float) -> complex:
+        x, y = np.concatenate(said(factor))[fast].T
+        return complex(np.exp(1j * (angle - np.arctan2(y, x))).mean())
+
+    plain = mean(1.0)
+    pairs = []
+    for (_, moved), rate in zip(ways, said(1.0), strict=True):
+        along = np.hypot(*rate.T)
+        unit = rate / np.maximum(along, 1e-12)[:, None]
+        pairs.append(((moved * unit).sum(axis=1), along))
+    return Course(
+        abs(plain),
+        float(np.angle(plain)),
+        abs(mean(-1.0)),
+        abs(mean(np.pi / 180)),
+        lag_between(pairs, dt) if abs(plain) > AGREE else None,
+    )

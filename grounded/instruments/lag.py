@@ -1,0 +1,179 @@
+"""How late one signal is behind another that shows the same, b(t) = s a(t - d), noise in both.
+
+Both are smoothed by the same window, b is moved by d, and d is where they differ least: noise in
+either adds the same to the difference whatever d is. The window is the one with the surest d; what
+others find instead adds to its uncertainty. The ratio of sizes only brackets s (Frisch): noise in a
+makes <a b> / <a a> too small, noise in b makes <b b> / <a b> too large. A first-order filter is
+told from a delay by a = b + tau b', where that fits better than any delay.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from grounded.frozen import Array
+
+Pairs = Sequence[tuple[Array, Array]]
+
+MOST = 0.3  # [s] a delay is looked for up to here, or up to FEW steps
+FEW = 6
+WINDOWS = (1, 2, 4, 8, 16, 32, 64)  # half lengths of the smoothing window, samples
+SHORTEST = 24  # samples of a pair that counts
+CLEAR = 0.9  # of the coherence: windows below it don't count
+BLOCKS = 16  # at least: the scatter over them is the uncertainty
+FILTER = 0.9  # of the misfit of a delay: below it a filter is what it is
+
+
+@dataclass(frozen=True)
+class Lag:
+    """b is `delay` seconds late behind a and `sign * scale` times it.
+
+    Args:
+        delay: [s], negative: early.
+        std: its standard deviation [s].
+        filtered: b follows a through a first-order filter of the time constant `delay`.
+        sign: 1 or -1.
+        low, high: brackets of the scale.
+        coherence: 0 to 1, how much of both is the same.
+    """
+
+    delay: float
+    std: float
+    filtered: bool
+    sign: int
+    low: float
+    high: float
+    coherence: float
+
+
+def lag_between(pairs: Pairs, dt: float) -> Lag | None:
+    """How late b is behind a.
+
+    Args:
+        pairs: pieces (a, b) without gaps, (T,) each, of the same length.
+        dt: [s].
+
+    Returns:
+        None where too little of both is seen.
+    """
+    longest = max((len(a) for a, _ in pairs), default=0)
+    reach = max(3, min(int(np.ceil(max(MOST / dt, FEW))), longest // 8))
+    found = [_smoothed(pairs, h, reach) for h in WINDOWS if 2 * h + 2 * reach < longest / 2]
+    lags = [one for p in found if (one := _measured(p, reach, dt)) is not None]
+    clear = [one for one in lags if one.coherence > CLEAR]
+    if not clear:
+        return max(lags, key=lambda lag: lag.coherence, default=None)
+    best = min(clear, key=lambda lag: lag.std)
+    apart = float(np.median([abs(one.delay - best.delay) for one in clear]))
+    return replace(best, std=float(np.hypot(best.std, apart)))
+
+
+@dataclass(frozen=True)
+class _Pieces:
+    """Pieces smoothed over `half`: a where b can be moved by `reach` either way, and all of b."""
+
+    a: list[Array]
+    b: list[Array]
+    reach: int
+    half: int
+
+    def moved(self, by: float) -> Array:
+        """B by so many samples later, at the samples of a (N,), without its means."""
+        at = self.reach + by
+        if at == int(at):
+            return _centred([b[int(at) : int(at) + len(a)] for a, b in self.sides])
+        return _centred([at_samples(b, np.arange(len(a)) + at) for a, b in self.sides])
+
+    @property
+    def groups(self) -> tuple[Any, Any]:
+        """Parts of the samples (N,): stretches of time, and of every trial the same stretch."""
+        lengths = [len(a) for a in self.a]
+        total = np.arange(sum(lengths)) * max(BLOCKS, 2 * len(lengths)) // sum(lengths)
+        return total, np.concatenate([np.arange(n) * BLOCKS // (2 * n) for n in lengths])
+
+    @property
+    def sides(self) -> list[tuple[Array, Array]]:
+        return list(zip(self.a, self.b, strict=True))
+
+
+def _smoothed(pairs: Pairs, h: int, reach: int) -> _Pieces:
+    window = np.hanning(2 * h + 3)[1:-1]
+    window /= window.sum()
+    found: tuple[list[Array], list[Array]] = ([], [])
+    for a, b in pairs:
+        if len(a) >= max(SHORTEST, 2 * (h + reach) + 4):
+            found[0].append(np.convolve(a, window, "valid")[reach:-reach])
+            found[1].append(np.convolve(b, window, "valid"))
+    return _Pieces(*found, reach, h)
+
+
+def _centred(columns: Sequence[Array]) -> Array:
+    return np.concatenate([x - x.mean() for x in columns])
+
+
+def _measured(pieces: _Pieces, reach: int, dt: float) -> Lag | None:
+    if not pieces.a:
+        return None
+    a = _centred(pieces.a)
+    h = pieces.half
+    grid = np.arange(0.0, reach, h)
+    grid = np.concatenate([-grid[:0:-1], grid])
+    shared = np.zeros(len(grid))
+    for k, by in enumerate(grid):
+        b = pieces.moved(by)
+        shared[k] = _dot(a, b) ** 2 / max(_dot(b, b), 1e-300)
+    if not shared.max() > 0:
+        return None
+    d = float(grid[int(np.argmax(shared - 1e-6 * shared.max() * np.abs(grid) / reach))])
+    for _ in range(8):
+        b, slope = pieces.moved(d), 0.5 * (pieces.moved(d + 1) - pieces.moved(d - 1))
+        s = _dot(a, b) / max(_dot(b, b), 1e-300)
+        curve = s * _dot(slope, slope)
+        step = float(np.clip(_dot(a - s * b, slope) / curve if curve else 0.0, -h, h))
+        d = float(np.clip(d + step, -reach + 1, reach - 1))
+        if abs(step) < 1e-4:
+            break
+    rest, pull = a - s * b, s * slope
+    force = max(_scatter(rest * pull, group) for group in pieces.groups)
+    std = force / max(_dot(pull, pull), 1e-300)
+    both = abs(_dot(a, b))
+    low, high = both / _dot(a, a), _dot(b, b) / max(both, 1e-300)
+    tau = _filter(pieces, a, _dot(rest, rest)) if d > 0 else None
+    late = d if tau is None else tau
+    return Lag(
+        late * dt, std * dt, tau is not None, 1 if s > 0 else -1, low, high, min(low / high, 1.0)
+    )
+
+
+def _dot(a: Array, b: Array) -> float:
+    return float((a * b).sum())  # on one thread
+
+
+def _scatter(force: Array, group: Any) -> float:
+    """Standard deviation of a sum from the scatter of its parts."""
+    parts = np.bincount(group, force)
+    return float(np.sqrt((parts**2).sum()))
+
+
+def _filter(pieces: _Pieces, a: Array, misfit: float) -> float | None:
+    """The time constant [samples] where a = s (b + tau b') fits better than a delay."""
+    b, slope = pieces.moved(0.0), 0.5 * (pieces.moved(1.0) - pieces.moved(-1.0))
+    columns = np.stack([b, slope], axis=1)
+    s, both = np.linalg.lstsq(columns, a, rcond=None)[0]
+    rest = float(((a - columns @ [s, both]) ** 2).sum())
+    return float(both / s) if rest < FILTER * misfit and both / s > 0 else None
+
+
+def at_samples(x: Array, at: Any) -> Array:
+    """X (T,) between its samples at places (N,), by cubics through four of them; NaN outside."""
+    whole = np.floor(at + 1e-9).astype(int)
+    T, line = len(x), np.concatenate([[2 * x[0] - x[1]], x, [2 * x[-1] - x[-2]]])
+    k = np.clip(whole, 0, T - 2)
+    p = at - k
+    a, b, c, d = (line[k + i] for i in range(4))
+    value = b + 0.5 * p * (c - a + p * (2 * a - 5 * b + 4 * c - d + p * (3 * (b - c) + d - a)))
+    return np.where((at < -1e-9) | (at > T - 1 + 1e-9), np.nan, value)

@@ -1,0 +1,256 @@
+"""START HERE: the instruments, from their own signals alone, before any physics is judged.
+
+single        each state by itself
+kinematics    velocities against the rates of their positions, courses against headings
+inputs        copies of one another, at their limits, constant within each trial
+
+What is certain from sensors alone is put right in the trials that the diagnosis then takes: a late
+signal is moved, a wrong sign or unit undone, samples that show nothing become missing ones. What
+could be physics as well, a scale a few percent off, a slipping wheel, is stated and left alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from grounded.frozen import Array
+from grounded.instruments.finding import Finding
+from grounded.instruments.kinematics import (
+    AGREE,
+    Integral,
+    Turned,
+    course,
+    integrals,
+    lag_of,
+    turned,
+)
+from grounded.instruments.lag import Lag, at_samples, lag_between
+from grounded.instruments.single import Signal, judge_signal
+from grounded.model import Model
+from grounded.task import Task
+from grounded.trial import Trial
+
+SURE = 5.0  # standard deviations of a delay that is found
+LEAST_STEPS = 0.1  # of a time step: less is a matter of time stamps
+LEAST_S = 0.0005
+ALIKE = 0.9  # coherence from which two sensors are compared at all
+OFF = 0.03  # of a scale, beyond both of its brackets
+DEGREES = 180 / np.pi
+UNIT = 0.1  # relative, from which a scale is taken for one of degrees
+TURNED_AWAY = np.deg2rad(20)  # what no side slip makes
+SAME_WAY = 0.95  # of a speed and the way: below it something drifts or slips
+AT_LIMITS = 0.1  # of the time
+
+
+@dataclass(frozen=True, eq=False)
+class Preflight:
+    """What was found of the instruments, and the trials without what could be corrected."""
+
+    findings: tuple[Finding, ...]
+    trials: tuple[Trial, ...]
+
+    @property
+    def settled(self) -> frozenset[str]:
+        """Sensor effects that need not be blamed any more, by name."""
+        kinds = {"delay": ("sensor_delay", "sensor_lag"), "lag": ("sensor_delay", "sensor_lag")}
+        return frozenset(
+            f"{family}:{one.signal}"
+            for one in self.findings
+            if one.corrected
+            for family in kinds.get(one.kind, ())
+        )
+
+
+def preflight(
+    subject: Task | Model, trials: Sequence[Trial], hidden: Sequence[str] = ()
+) -> Preflight:
+    """Judges the instruments of trials that fit the model.
+
+    Args:
+        subject: the model, whose kinematics tie sensors together; of a task also the limits.
+        trials: real ones, of one time grid.
+        hidden: states that no sensor has.
+    """
+    model = subject.model if isinstance(subject, Task) else subject
+    names = (model.state_names, model.input_names)
+    used = [trial for trial in trials if trial.known_steps >= 2]
+    if not used or any((trial.state_names, trial.input_names) != names for trial in used):
+        return Preflight((), tuple(trials))
+    bench = _Bench(model, [t.until(t.known_steps) for t in used], set(hidden))
+    with np.errstate(all="ignore"):
+        found = [*bench.singles(), *bench.pairs(), *bench.plane(), *_inputs(subject, bench.trials)]
+    return Preflight(tuple(found), tuple(bench.trials))
+
+
+class _Bench:
+    """Trials that are corrected finding by finding."""
+
+    def __init__(self, model: Model, trials: list[Trial], hidden: set[str]) -> None:
+        self.model, self.trials = model, trials
+        self.shown = [i for i, n in enumerate(model.state_names) if n not in hidden]
+
+    @property
+    def dt(self) -> float:
+        return self.trials[0].dt
+
+    def column(self, i: int) -> list[Array]:
+        return [trial.states[:, i] for trial in self.trials]
+
+    def put(self, i: int, columns: Sequence[Array]) -> None:
+        """The trials with other samples of one state."""
+        for k, (trial, x) in enumerate(zip(self.trials, columns, strict=True)):
+            states = np.array(trial.states)
+            states[:, i] = x
+            self.trials[k] = replace(trial, states=states)
+
+    def singles(self) -> Iterator[Finding]:
+        """Of each sensor by itself."""
+        for i in self.shown:
+            name, angle = self.model.state_names[i], bool(self.model.angle_mask[i])
+            signal = Signal(name, self.model.states[name], angle, self.column(i), self.dt)
+            findings, after = judge_signal(signal)
+            if after is not signal:
+                self.put(i, after.columns)
+            yield from findings
+
+    def pairs(self) -> Iterator[Finding]:
+        """Of each position with its velocity."""
+        for relation in integrals(self.model):
+            if relation.i not in self.shown or relation.j not in self.shown:
+                continue
+            lag = lag_of(self.model, relation, self.trials)
+            if lag is not None and lag.coherence > ALIKE:
+                yield from self.unit(relation, lag)
+                yield from self.late(relation, lag)
+
+    def unit(self, relation: Integral, lag: Lag) -> Iterator[Finding]:
+        """Sign and unit, which are put right; a scale, which may be either sensor's."""
+        q, w = (self.model.state_names[k] for k in (relation.i, relation.j))
+        if lag.sign < 0:
+            yield self.turned_round(relation.j, f"has the opposite sign of the rate of {q}")
+        size = float(np.sqrt(lag.low * lag.high))
+        for i, factor in ((relation.j, size), (relation.i, 1 / size)):
+            if abs(factor / DEGREES - 1) < UNIT:
+                yield self.from_degrees(i)
+                return
+        if lag.low > 1 + OFF or lag.high < 1 - OFF:
+            text = f"shows {100 * size:.3g} % of the rate of {q}; either may be wrong"
+            yield Finding(w, text, "scale", scale=size)
+
+    def turned_round(self, i: int, text: str) -> Finding:
+        """With the sign of state i changed."""
+        self.put(i, [-x for x in self.column(i)])
+        return _mended(self.model.state_names[i], text, "sign", "scale = -1", scale=-1.0)
+
+    def from_degrees(self, i: int) -> Finding:
+        """With state i in radians."""
+        self.put(i, [x / DEGREES for x in self.column(i)])
+        name = self.model.state_names[i]
+        text, log = f"is in degrees, not in {self.model.states[name]}", f"scale = {1 / DEGREES:.8g}"
+        return _mended(name, text, "degrees", log, scale=DEGREES)
+
+    def late(self, relation: Integral, lag: Lag) -> Iterator[Finding]:
+        """A delay: no sensor is early, so it is the later one's."""
+        d = float(abs(lag.delay))
+        if d < max(SURE * lag.std, LEAST_STEPS * self.dt, LEAST_S):
+            return
+        q, w = (self.model.state_names[k] for k in (relation.i, relation.j))
+        i, name, other = (relation.i, q, f"{w} says")
+        if lag.delay > 0:
+            i, name, other = (relation.j, w, f"the derivative of {q}")
+        text = f"{d:.3g} s later than {other}"
+        if lag.filtered:
+            text = f"follows {other} through a filter of {d:.3g} s"
+        if i == relation.i and not relation.exact:  # a disturbed heading looks late as well
+            yield Finding(name, text, "delay", d, lag.std)
+            return
+        self.put(i, [_earlier(x, d / self.dt) for x in self.column(i)])
+        kind, log = "lag" if lag.filtered else "delay", f"delay_s = {d:.3g}"
+        yield _mended(name, text, kind, log, delay_s=d, std_s=lag.std)
+
+    def plane(self) -> Iterator[Finding]:
+        """Of a heading and a speed with the way that was travelled."""
+        relation = turned(self.model)
+        if relation is None or not {relation.i, relation.j, relation.k} <= set(self.shown):
+            return
+        found = course(self.model, relation, self.trials)
+        if found is None:
+            return
+        where = "+".join(self.model.state_names[i] for i in (relation.i, relation.j))
+        way = f"the course that {where} travel"
+        if found.agrees < AGREE < found.mirrored:
+            yield self.turned_round(relation.k, f"turns the other way than {way}")
+        elif found.agrees < AGREE < found.degrees:
+            yield self.from_degrees(relation.k)
+        elif found.agrees > AGREE and abs(found.offset) > TURNED_AWAY:
+            text = f"is {np.rad2deg(-found.offset):.0f} degrees off {way}"
+            yield Finding(self.model.state_names[relation.k], text, "offset")
+        lag = found.speed
+        if lag is None or lag.coherence < SAME_WAY or lag.sign < 0:
+            return
+        yield from self.speed(relation, lag, where)
+
+    def speed(self, relation: Turned, lag: Lag, where: str) -> Iterator[Finding]:
+        """A late or wrong speed: slipping wheels and drifts do it too, so physics has to judge."""
+        if len(relation.speed) != 1:
+            return  # of a body that also moves sideways, whose noises don't add to zero
+        d, name = float(abs(lag.delay)), self.model.state_names[relation.speed[0]]
+        if d > max(SURE * lag.std, 0.5 * self.dt):
+            text = f"{d:.3g} s {'later' if lag.delay > 0 else 'earlier'} than {where} move"
+            yield Finding(name, text, "delay", float(lag.delay), lag.std)
+        if lag.low > 1 + OFF or lag.high < 1 - OFF:
+            size = float(np.sqrt(lag.low * lag.high))
+            text = f"shows {100 * size:.3g} % of the speed of {where}: a sensor, or slip"
+            yield Finding(name, text, "scale", scale=size)
+
+
+def _mended(name: str, text: str, kind: str, log: str, **values: float) -> Finding:
+    """A finding that the trials were corrected for."""
+    return Finding(name, text, kind, corrected=True, log=log, **values)
+
+
+def _earlier(x: Array, steps: float) -> Array:
+    """X as it was so many steps later; missing at the end."""
+    at = np.arange(len(x)) + steps
+    whole = round(steps)
+    if abs(steps - whole) < 0.05:
+        return np.concatenate([x[whole:], np.full(min(whole, len(x)), np.nan)])
+    return at_samples(x, at)
+
+
+def _inputs(subject: Task | Model, trials: Sequence[Trial]) -> Iterator[Finding]:
+    """Of commands: copies of one another, at their limits, conditions of a trial."""
+    names = trials[0].input_names
+    columns = [[trial.inputs[:, j] for trial in trials] for j in range(len(names))]
+    fixed = [all(np.ptp(x) == 0 for x in some) for some in columns]
+    for j, name in enumerate(names):
+        values = sorted({float(x[0]) for x in columns[j]})
+        if fixed[j] and len(values) > 1:
+            shown = ", ".join(f"{v:.4g}" for v in values[:6])
+            yield Finding(name, f"constant within each trial ({shown})", "constant")
+        if isinstance(subject, Task):
+            x = np.concatenate(columns[j])
+            share = float(((x <= subject.low[j]) | (x >= subject.high[j])).mean())
+            if share > AT_LIMITS:
+                yield Finding(
+                    name, f"at its limits {100 * share:.0f} % of the time", "saturated", share=share
+                )
+    for j, name in enumerate(names):
+        for i in range(j):
+            if fixed[i] or fixed[j]:
+                continue
+            lag = lag_between(list(zip(columns[i], columns[j], strict=True)), trials[0].dt)
+            if lag is not None and lag.coherence > 0.95 and 0.9 < lag.sign * lag.low < 1.1:
+                yield _copy(names[i], name, lag)
+
+
+def _copy(first: str, second: str, lag: Lag) -> Finding:
+    """Two inputs that are one signal, one perhaps later: a command and what was measured of it."""
+    if lag.delay < 0:
+        first, second = second, first
+    d = abs(lag.delay)
+    late = f", {d:.3g} s later" if d > max(SURE * lag.std, LEAST_S) else ""
+    return Finding(second, f"the same signal as {first}{late}", "copy", d, lag.std, lag.low)

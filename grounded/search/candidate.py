@@ -1,0 +1,117 @@
+"""A candidate: a policy to run and how it came about; and what became of it, with its trials."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from grounded.frozen import Array
+from grounded.policy import Policy
+from grounded.result import Result, document
+from grounded.trial import Trial
+
+Way = Literal[
+    "",  # a step along the direction of the model that replays the incumbent's trial
+    "recorded inputs",  # the same, the bias as the paper has it (`bias`: no matched inputs)
+    "gentler gains",  # the model's own plan with gains designed more gently, see `rivals`
+    "own plan",  # of a model that was changed since the incumbent was planned, see `rivals`
+]
+
+if TYPE_CHECKING:
+    from grounded.figures.figure import Figure
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Candidate(Result):
+    """A policy to run, and how it came about."""
+
+    id: str  # c0001, c0002 ...: the order of proposal
+    policy: Policy
+    iteration: int  # i of theta^(i) that it tries to be; 0 is the model's own policy
+    alpha: float
+    base: str  # the candidate whose trials it was derived from, "" for the model's own
+    model: str  # fingerprint of the model it was planned in
+    predicted_states: Array  # (H + 1, n) in the (biased) model
+    predicted_inputs: Array  # (H, m)
+    predicted_utility: float
+    damping: float = 1.0  # lambda of `step_size`
+    predicted_gain: float = float("nan")  # over the mean trial of its base
+    caution: int = 0  # how often the first policy, or its gains, were designed more gently
+    way: Way = ""  # how it was made
+
+    def summary(self) -> str:
+        """Its name, its step and what the model predicts."""
+        predicted = f"predicted utility {self.predicted_utility:.4g}"
+        return f"{self.id}: iteration {self.iteration}, alpha {self.alpha:g}, {predicted}"
+
+    def to_json(self) -> dict[str, Any]:
+        """How it came about; its policy is what `grounded export` writes."""
+        return document(
+            candidate=self.id,
+            iteration=self.iteration,
+            alpha=self.alpha,
+            damping=self.damping if self.base else None,
+            base=self.base or None,
+            predicted_utility=self.predicted_utility,
+        )
+
+    def figures(self) -> Sequence[Figure]:
+        """What the model predicts."""
+        from grounded.search.pictures import candidate_figure
+
+        return (candidate_figure(self),)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Tried(Result):
+    """A candidate with its trials: mean utility and, for two trials or more, its standard error."""
+
+    candidate: Candidate
+    trials: tuple[Trial, ...]
+    utilities: tuple[float, ...]
+    accepted: bool | None  # None: not decided, trials are missing
+    in_doubt: bool = False  # its own trials are there: the incumbent's are missing
+
+    @property
+    def utility(self) -> float:
+        """Mean utility of the trials; nan without a trial, -inf when one of them failed."""
+        return float(np.mean(self.utilities)) if self.utilities else float("nan")
+
+    @property
+    def standard_error(self) -> float:
+        """Of the mean; nan for fewer than two trials, or where one of them failed."""
+        if len(self.utilities) < 2 or not np.isfinite(self.utilities).all():
+            return float("nan")
+        return float(np.std(self.utilities, ddof=1) / np.sqrt(len(self.utilities)))
+
+    def verdict(self, last: bool = True) -> str:
+        """What became of the candidate: first, better, no better, crashed; or why not decided.
+
+        Args:
+            last: whether it is the latest one; an earlier one without a trial will get none.
+        """
+        if self.in_doubt:
+            return "in doubt"
+        if self.accepted is None:
+            return "waiting" if last or self.trials else "no trial"
+        if not self.accepted:
+            return "crashed" if self.utility == -np.inf else "no better"
+        return "better" if self.candidate.base else "first"
+
+    def summary(self) -> str:
+        """Its name, its utility and what became of it."""
+        mean = f"utility {self.utility:.4g}, trials {len(self.trials)}"
+        return f"{self.candidate.id}: {mean}, {self.verdict()}"
+
+    def to_json(self) -> dict[str, Any]:
+        """The candidate's document, and what its trials were worth."""
+        return self.candidate.to_json() | document(
+            utility=self.utility,
+            standard_error=self.standard_error,
+            trials=[trial.id for trial in self.trials],
+            accepted=self.accepted,
+            verdict=self.verdict(),
+        )

@@ -1,0 +1,273 @@
+"""Making a candidate: of a step, of gentler gains, or of the plan of a model that was changed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from grounded.compile import DescentOptions, Problem
+from grounded.frozen import Array
+from grounded.policy import Policy
+from grounded.result import Result, document
+from grounded.rollout import simulate
+from grounded.search.candidate import Candidate, Tried, Way
+from grounded.search.first_policy import first_policy
+from grounded.search.planner import Planner
+from grounded.search.safety import objections, spread
+from grounded.search.secants import slope_error, with_slope
+from grounded.search.standing import SearchOptions, Standing, losers_of, wild
+from grounded.search.step_size import Step
+from grounded.solve import ddp
+from grounded.solve.bias import Grounding, ground
+from grounded.task import Task
+from grounded.trial import mean_trial
+
+PLANNING = DescentOptions(max_iterations=30, tolerance=1e-6)  # a direction needs no more digits
+GENTLER = 1e3  # factor on the price of inputs from which gentler gains are designed
+GENTLER_TIMES = 2  # they are tried
+
+
+class About:
+    """The model grounded on the incumbent's trial, and what it promises of other policies.
+
+    Where a trial started off s_0, its utility is no measure for runs that start there: theta's own
+    run in the grounded model is (`already`). It replays the trial when the start was s_0.
+    """
+
+    def __init__(self, make: Maker, incumbent: Tried, options: SearchOptions, way: Way) -> None:
+        self.make, self.incumbent, self.options, self.way = make, incumbent, options, way
+        planner, plan = make.planner, make.planner.plan
+        own = planner.lift(mean_trial(incumbent.trials, planner.task.model.angle_mask))
+        plan.model.system.check(own.states[:-1], own.inputs, plan.model.values, plan.dt)
+        matched = options.match_inputs and way != "recorded inputs"
+        self.grounding = ground(plan, own, match_inputs=matched)
+        exact = ground(plan, own, exact=True, shift=self.grounding.shift)
+        self.real = exact.on(plan.problem(exact=True))
+        self.theta = planner.widened(incumbent.candidate.policy)
+        already = simulate(self.real, self.theta).utility
+        self.already = already if np.isfinite(already) else incumbent.utility
+        self.least = options.tolerance * abs(self.already)
+        self.slope: Array | None = None
+        if options.damps and np.isfinite(already):
+            self.slope = slope_error(planner, incumbent, make.now.history, self.real)
+
+    def candidate(self, policy: Policy, step: Step, way: Way) -> Candidate:
+        """A candidate with what is promised of it, mispredictions of earlier trials included."""
+        made = self.make.candidate(policy, self.real, step, self.already, way)
+        if self.slope is None:
+            return made
+        moved = made.predicted_inputs - self.grounding.inputs[: len(self.slope)]
+        more = float(np.sum(self.slope * moved))
+        return replace(
+            made,
+            predicted_gain=made.predicted_gain + more,
+            predicted_utility=made.predicted_utility + more,
+        )
+
+    def step_from(self, first: Step, promised: list[float]) -> Proposal | None:
+        """The first step worth a trial; one that is not allowed, or None; adds to the promises."""
+        make, options, plan = self.make, self.options, self.make.planner.plan
+        own = self.incumbent.candidate.id
+        lost = losers_of(make.now.history, own, make.fingerprint, self.way)
+        losers = {(candidate.damping, candidate.alpha) for candidate in lost}
+        unsafe: Proposal | None = None
+        directions: dict[float, Policy] = {}
+        for step in options.steps_from(first):
+            if (step.damping, step.alpha) in losers:
+                continue
+            if step.damping not in directions:
+                directions[step.damping] = direction(
+                    plan, self.theta, self.grounding, options, step.damping, self.slope
+                )
+            policy = self.theta.toward(directions[step.damping], step.alpha)
+            made = self.candidate(policy, step, self.way)
+            if made.predicted_gain > self.least:
+                proposal = make.checked(made)
+                if proposal.candidate is not None:
+                    return proposal
+                unsafe = proposal
+                continue
+            promised.append(made.predicted_gain)
+            if abs(made.predicted_gain) <= self.least:
+                break
+        return unsafe
+
+    def own_plan(self, rival: Proposal | None) -> Proposal | None:
+        """A model that was changed since: its own new plan, where more is promised of that.
+
+        The plan of a crude model may sit in another valley than that of the better one: going on
+        from it ends where it began. Both are judged by the grounded prediction, unless the
+        incumbent's trial was wild: a bias measured there says nothing of other runs.
+        """
+        make, base = self.make, self.incumbent.candidate
+        tried = losers_of(make.now.history, base.id, make.fingerprint, "own plan")
+        if base.model == make.fingerprint or tried:
+            return None
+        policy, _ = first_policy(make.planner.plan)
+        made = self.candidate(policy, Step(), "own plan")
+        promise = rival.candidate.predicted_gain if rival and rival.candidate else self.least
+        better = made.predicted_gain > promise or wild(self.incumbent)
+        proposal = make.checked(made) if better else None
+        return proposal if proposal is not None and proposal.candidate is not None else None
+
+
+@dataclass(frozen=True, eq=False)
+class Maker:
+    """Makes candidates of a policy: what a robot can run of it, and its predicted run."""
+
+    planner: Planner
+    now: Standing
+    identity: str
+    fingerprint: str
+
+    def candidate(
+        self,
+        policy: Policy,
+        problem: Problem,
+        step: Step,
+        already: float = float("nan"),
+        way: Way = "",
+        caution: int | None = None,
+    ) -> Candidate:
+        """A candidate; its gains are designed as gently as its incumbent's, or by `caution`."""
+        base, policy = self.now.incumbent, self.planner.narrowed(policy)
+        if caution is None:
+            follows = base is not None and base.candidate.base and way != "own plan"
+            caution = base.candidate.caution if base and follows else self.now.caution
+        if caution and base is not None:
+            policy = self._gently(policy, problem, caution)
+        predicted = simulate(problem, self.planner.widened(policy))
+        return Candidate(
+            id=self.identity,
+            policy=policy,
+            iteration=0 if base is None else self.now.iteration + 1,
+            alpha=step.alpha,
+            damping=step.damping,
+            predicted_gain=predicted.utility - already,
+            base="" if base is None else base.candidate.id,
+            model=self.fingerprint,
+            predicted_states=predicted.states[:, : self.planner.task.model.n],
+            predicted_inputs=predicted.inputs,
+            predicted_utility=predicted.utility,
+            caution=caution,
+            way=way,
+        )
+
+    def gentler(self, incumbent: Tried) -> Candidate | None:
+        """The model's own plan with gentler gains, where its loop was unstable on the robot.
+
+        High gains and a delay that the model lacks make a limit cycle, which no step along a
+        direction leaves: the grounded model replays it, and has no delay to blame.
+        """
+        own = incumbent.candidate
+        lost = losers_of(self.now.history, own.id, self.fingerprint, "gentler gains")
+        if not wild(incumbent) or own.policy.gain is None or len(lost) >= GENTLER_TIMES:
+            return None
+        if own.model != self.fingerprint:
+            return None
+        problem, real = self.planner.plan.problem(exact=True), incumbent.utility
+        caution = own.caution + len(lost) + 1
+        return self.candidate(own.policy, problem, Step(), real, "gentler gains", caution)
+
+    def _gently(self, policy: Policy, problem: Problem, caution: int) -> Policy:
+        """The same run with the gains of a regulator whose inputs cost GENTLER ** caution more."""
+        if policy.gain is None:
+            return policy
+        run = simulate(problem, self.planner.widened(policy))
+        factor = GENTLER**caution
+        weight = factor * problem.input_weight + (factor - 1) * problem.change_weight
+        found = ddp.sweep(replace(problem, input_weight=weight), run.z, run.inputs)
+        if not (found.ok and np.isfinite(run.z).all()):
+            return policy
+        plan = self.planner.plan
+        return self.planner.narrowed(plan.policy(run.inputs, found.gains.K, run.z[:-1]))
+
+    def checked(self, made: Candidate) -> Proposal:
+        """A candidate that is finite, inside the limits and predicted to stay safe; or none."""
+        task = self.planner.task
+        found = objections(task, made, spread(task, self.now.history))
+        if not found:
+            return Proposal(self.now, made, is_new=True)
+        stopped = replace(self.now, phase="stopped", sentence=found[0], ending="not allowed")
+        return Proposal(stopped, None, is_new=False, notes=tuple(found))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Proposal(Result):
+    """What to run next, or why nothing is: `candidate` is None when the search has ended."""
+
+    standing: Standing
+    candidate: Candidate | None
+    is_new: bool
+    notes: tuple[str, ...] = ()
+
+    def summary(self) -> str:
+        """The candidate, or the end of the search."""
+        return self.candidate.summary() if self.candidate else self.standing.summary()
+
+    def to_json(self) -> dict[str, Any]:
+        """The document of `grounded propose --json`; `file` is for whoever writes the candidate."""
+        now, made = self.standing, self.candidate
+        known = document(
+            candidate=made and made.id,
+            file=None,
+            iteration=made.iteration if made else now.iteration,
+            alpha=made and made.alpha,
+            damping=made.damping if made and made.base else None,
+            predicted_utility=made and made.predicted_utility,
+            phase="await-trial" if made else now.phase,
+            sentence=now.sentence,
+            notes=self.notes,
+        )
+        best = now.incumbent and now.incumbent.utility
+        return known | document(best_utility=best, new=self.is_new) if made else known
+
+
+def direction(
+    task: Task,
+    policy: Policy,
+    grounding: Grounding,
+    options: SearchOptions,
+    damping: float = 1.0,
+    slope: Array | None = None,
+) -> Policy:
+    """Step 5: theta' such that d = theta' - theta improves the policy in the biased model.
+
+    Args:
+        task: the manoeuvre, with the ORIGINAL model.
+        policy: theta, the policy that ran the trial.
+        grounding: the trial as the biased model replays it (step 4).
+        options: which algorithm A.
+        damping: lambda of `step_size`, the share of mu that leaving the trial's inputs costs.
+        slope: what the utility's slope by the inputs is more than the model's, see `secants`.
+    """
+    if options.method == "policy-gradient":
+        from grounded.solve.policy_gradient import ascent
+
+        return ascent(task, policy, grounding)
+    problem = grounding.on(task.problem())
+    if options.step == "damped":
+        problem = damped(problem, grounding.inputs, damping)
+    if slope is not None:
+        problem = with_slope(problem, slope)
+    gains = ddp.sweep(problem, grounding.z, grounding.inputs).gains
+    result = ddp.solve(problem, grounding.inputs, gains.K, grounding.z[:-1], PLANNING)
+    return task.policy(result.u, result.K, result.z[:-1])
+
+
+def damped(problem: Problem, inputs: Array, factor: float = 1.0) -> Problem:
+    """The problem with a price mu |u_t - inputs_t|^2 on leaving the trial's inputs (H, m).
+
+    The fully converged step goes to the optimum of the biased MODEL, and that need not be uphill in
+    the real system; with mu it turns towards the gradient, which is uphill while the
+    model's derivatives are within 90 degrees (section 3). mu = R + S, the problem's own weights on
+    inputs: the same idea as norm-optimal iterative learning control. Both quadratic penalties on
+    u_t are one: weight R + mu about (R u_target + mu inputs) / (R + mu).
+    """
+    mu = factor * (problem.input_weight + problem.change_weight)
+    weight = problem.input_weight + mu
+    mixed = problem.input_weight * problem.input_target + mu * inputs
+    safe = np.where(weight > 0, weight, 1.0)
+    return replace(problem, input_weight=weight, input_target=mixed / safe)

@@ -1,0 +1,234 @@
+"""Terminals, pipes, devices, strangers' code: what a file or a shell may do to a command."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import warnings
+from pathlib import Path
+
+import pytest
+
+from bombs import log
+from cli import COMMAND, grounded, process
+from grounded.compile.run import jit
+from grounded.errors import GroundedError
+from grounded.trusted import TRUST, check_own, suspicion
+from grounded_cli.terminal import harmless, show, show_json, style, table
+from grounded_trials.store.store import Store, write_atomically
+from workspaces import make
+
+EVIL = "\x1b]0;title\x07\x1b[8m\x9b2J\u202e\u200b\r"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return make(tmp_path / "w").folder
+
+
+def test_control_characters_of_a_file_do_not_reach_the_terminal(tmp_path: Path) -> None:
+    """Fails on 0.1: errors were printed as they were, and any colour passed (FACTS 9)."""
+    path = tmp_path / "log.mcap"
+    data = log("json", None, [b"{}"]).replace(b"/t", b"\x1b[")
+    path.write_bytes(data.replace(b"json", b"\x1b[8m"))
+    for words in (["inspect", str(path)], ["recover", str(path)], ["ingest", f"{tmp_path}/{EVIL}"]):
+        done = grounded(*words)
+        shown = (done.out + done.err).replace("\n", "")
+        assert shown.isprintable(), repr(shown)
+
+
+def test_output_is_printable_and_json_is_escaped(capsys: pytest.CaptureFixture[str]) -> None:
+    show(EVIL + "\ud800")
+    assert "".join(capsys.readouterr().out.split("\n")).isprintable()
+    show_json({EVIL: ["\ud800", "größe 🤖"]})
+    text = capsys.readouterr().out
+    assert "".join(text.split("\n")).isprintable() and "größe 🤖" in text
+    assert json.loads(text) == {EVIL: ["\ud800", "größe 🤖"]}
+    assert table([("a\nnext: rm", "1")], ("x", "y")).count("\n") == 1
+
+
+def test_our_own_marks_colour_only_a_terminal() -> None:
+    assert harmless(style("a")) == "a" and harmless("\x1b[1ma") == "?[1ma"
+    assert harmless(style("a"), coloured=True) == "\x1b[1ma\x1b[0m"
+
+
+@pytest.mark.parametrize("what", ["pipe", "device", "folder"])
+@pytest.mark.parametrize("name", ["grounded.toml", "target.csv", "model.py", "log.mcap"])
+def test_what_is_no_file_is_refused_at_once(what: str, name: str, folder: Path) -> None:
+    """Fails on 0.1: a pipe in the place of a file was waited for for ever."""
+    path = folder / name
+    path.unlink(missing_ok=True)
+    if what == "pipe":
+        os.mkfifo(path)
+    elif what == "device":
+        path.symlink_to("/dev/zero")
+    else:
+        path.mkdir()
+    began = time.monotonic()
+    words = ["ingest", str(path)] if name == "log.mcap" else ["propose"]
+    done = process("-C", str(folder), *words)
+    assert done.code == 1 and "Traceback" not in done.err and name in done.err, done.err
+    assert time.monotonic() - began < 10
+
+
+def test_a_link_is_no_stored_file(tmp_path: Path) -> None:
+    store = Store(tmp_path / "trials")
+    entry = store.add(b"content")
+    moved = tmp_path / "elsewhere"
+    entry.path.rename(moved)
+    entry.path.symlink_to(moved)
+    with pytest.raises(GroundedError, match="is a link"):
+        store.read(entry.path.name)
+    assert len(store.verify()) == 1
+
+
+@pytest.mark.parametrize("place", [".", "model.py", "grounded.toml", "__pycache__"])
+@pytest.mark.parametrize("mode", [0o777, 0o775])
+def test_code_that_others_may_change_is_not_executed(place: str, mode: int, folder: Path) -> None:
+    """Fails on 0.1: it was (FACTS 9)."""
+    (folder / "__pycache__").mkdir(exist_ok=True)
+    marker = folder / "executed"
+    source = (folder / "model.py").read_text()
+    (folder / "model.py").write_text(f"open({str(marker)!r}, 'w')\n" + source)
+    os.chown(folder / place, -1, 12345 if os.getuid() == 0 else -1)
+    (folder / place).chmod(mode)
+    if mode == 0o775 and not suspicion(folder / place):
+        pytest.skip("the group is the user's private one")
+    done = grounded("-C", folder, "propose")
+    assert done.code == 1 and "writable for" in done.err and "chmod" in done.err
+    assert not marker.exists()
+
+
+def test_a_stranger_s_file_is_not_executed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    if os.getuid() != 0:
+        pytest.skip("only root gives files away")
+    os.chown(folder / "model.py", 12345, -1)
+    with pytest.raises(GroundedError, match="belongs to another user"):
+        check_own(folder, [folder / "model.py"])
+    monkeypatch.setenv(TRUST, str(folder.parent))
+    check_own(folder, [folder / "model.py"])
+
+
+def test_a_kernel_cache_that_others_may_write_is_not_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Fails on 0.1: machine code from it was executed (FACTS 9)."""
+    monkeypatch.setenv("GROUNDED_CACHE", str(tmp_path / "cache"))
+    jit._own.cache_clear()
+    jit.store("0" * 64, b"code")
+    jit._own.cache_clear()
+    assert jit.stored("0" * 64) == b"code"
+    for place in (tmp_path / "cache", tmp_path / "cache" / ("0" * 64 + ".kernel")):
+        before = place.stat().st_mode
+        place.chmod(0o777)
+        jit._own.cache_clear()
+        with pytest.warns(UserWarning, match="the kernel cache is not used.*writable"):
+            assert jit.stored("0" * 64) is None
+        place.chmod(before)
+    jit._own.cache_clear()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert jit.stored("0" * 64) == b"code"
+
+
+SHELL = " ".join(f"'{word}'" for word in COMMAND)
+
+
+@pytest.mark.parametrize(
+    ("how", "code"),
+    [
+        ("--help | true", 0),
+        ("{status} | true", 0),
+        ("{status} >&-", 0),
+        ("{status} 2>&-", 0),
+        ("{status} >/dev/full", 1),
+        ("{status} 2>/dev/full", 0),
+        ("nothing 2>&-", 2),
+        ("nothing 2>/dev/full", 1),
+    ],
+)
+def test_closed_and_full_outputs(how: str, code: int, folder: Path) -> None:
+    """Fails on 0.1: tracebacks, or Python's own complaint at its end."""
+    words = how.format(status=f"-C {folder} status")
+    line = f"set -o pipefail; {SHELL} {words}"
+    done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, check=False)
+    assert done.returncode == code, done.stderr
+    assert "Traceback" not in done.stderr and "Exception" not in done.stderr
+
+
+@pytest.mark.slow
+def test_an_interrupt_at_any_moment_leaves_no_traceback(folder: Path) -> None:
+    """Fails on 0.1: an interrupt during imports was a traceback."""
+    start = "from grounded_cli.start import main; main()"
+    for k in range(40):
+        child = subprocess.Popen(
+            [sys.executable, "-X", "utf8", "-c", start, "-C", str(folder), "propose"],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        time.sleep(0.05 + 0.025 * k)  # Python's own start is out of our hands
+        child.send_signal(signal.SIGINT)
+        _, err = child.communicate()
+        assert "Traceback" not in err or "<string>" not in err, err
+        assert child.returncode in (0, 130, -signal.SIGINT), (child.returncode, err)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["run", "c0001"], ["learn"], ["report", "--html"], ["init", "new"], ["fit"]],
+)
+def test_a_read_only_folder_is_one_sentence(words: list[str], folder: Path) -> None:
+    """Fails on 0.1 with a traceback, for some of them."""
+    limited = ["setpriv", "--bounding-set", "-dac_override"] if os.getuid() == 0 else []
+    if limited and not shutil.which("setpriv"):
+        pytest.skip("root may write anywhere")
+    assert grounded("-C", folder, "propose").code == 0
+    for path in (folder, *folder.rglob("*")):
+        path.chmod(0o555 if path.is_dir() else 0o444)
+    words = [*words, "--example", "pendulum"] if words[0] == "init" else ["-C", str(folder), *words]
+    done = subprocess.run(
+        [*limited, *COMMAND, *words], capture_output=True, text=True, check=False, cwd=folder
+    )
+    for path in (folder, *folder.rglob("*")):
+        path.chmod(0o755)
+    errors = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
+    assert done.returncode == 1 and len(errors) == 1 and "Traceback" not in done.stderr, done.stderr
+
+
+def test_init_that_was_cut_off_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fails on 0.1: "model.py exists already"; and nothing of the user's is overwritten."""
+    words = ("init", tmp_path / "w", "--example", "pendulum")
+    for count in range(4):
+        done = 0
+
+        def cut(path: Path, data: bytes, count: int = count) -> None:
+            nonlocal done
+            if done == count:
+                raise KeyboardInterrupt
+            done += 1
+            write_atomically(path, data)
+
+        monkeypatch.setattr("grounded_trials.workspace.examples.write_atomically", cut)
+        assert grounded(*words).code == 130
+    monkeypatch.undo()
+    assert grounded(*words).code == 0 and grounded("-C", tmp_path / "w", "status").code == 0
+    assert "exists already" in grounded(*words).err
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "model.py").write_text("mine")
+    assert "exists already" in grounded("init", tmp_path / "mine", "--example", "pendulum").err
+    assert (tmp_path / "mine" / "model.py").read_text() == "mine"
+
+
+def test_temporary_files_of_killed_processes_are_swept(tmp_path: Path) -> None:
+    old, new = (tmp_path / f".a.csv-{name * 16}.tmp" for name in "ab")
+    for path in (old, new):
+        path.write_text("half")
+    os.utime(old, (0, 0))
+    write_atomically(tmp_path / "b.csv", b"b")
+    assert sorted(p.name for p in tmp_path.iterdir()) == [new.name, "b.csv"]

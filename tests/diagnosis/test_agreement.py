@@ -1,0 +1,58 @@
+"""Whether trials agree in what is claimed, and what changed between two groups of them."""
+
+import json
+
+import numpy as np
+import pytest
+from test_diagnosis import cart
+
+from cli import grounded
+from grounded.diagnosis.diagnose import diagnose
+from grounded.diagnosis.report import Diagnosis
+from grounded_trials.report.diagnosis_words import agreement_lines
+
+
+def test_trials_of_one_system_agree():
+    model, trials = cart(friction=0.3, trials=5)
+    found = diagnose(model, trials)
+    assert [one.effect for one in found.agreement] == ["coulomb_friction:v"]
+    assert found.agreement[0].agrees and found.agreement[0].chance > 1e-3
+    assert [v.agrees for v in found.per_trial] == [True] * 5
+    off = [(v.value - 0.3) / v.std for v in found.per_trial]
+    assert np.abs(off).max() < 5 and not agreement_lines(found)
+
+
+def test_a_value_that_differs_by_trial_is_told_with_what_it_goes_with():
+    trials = [cart(friction=0.25 + 0.05 * k, trials=1, seed=k)[1][0] for k in range(6)]
+    found = diagnose(cart()[0], trials)
+    (one,) = (a for a in found.agreement if a.effect == "coulomb_friction:v")
+    assert not one.agrees and one.goes_with == "rises with the order of the trials"
+    values = [v.value for v in found.per_trial if v.effect == one.effect]
+    assert np.polyfit(np.arange(6), values, 1)[0] == pytest.approx(0.05, rel=0.25)
+    assert [title for title, _ in agreement_lines(found)] == ["agreement"]
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "effect", "values"),
+    [
+        ({"friction": 0.3}, {"friction": 0.5}, "coulomb_friction:v", (0.3, 0.5)),
+        ({}, {"dead": 0.15}, "dead_zone:u", (0.0, 0.15)),
+        ({"friction": 0.3}, {"friction": 0.3}, "", ()),
+    ],
+)
+def test_what_changed_between_two_groups(first, second, effect, values):
+    (model, before), (_, after) = cart(**first, trials=3, seed=1), cart(**second, trials=3, seed=2)
+    found = diagnose(model, before, compare=after)
+    assert found.trials == 6 and found.changed is not None
+    assert [one.effect for one in found.changed] == ([effect] if effect else [])
+    for one in found.changed:
+        assert (one.first.value, one.second.value) == pytest.approx(values, abs=0.06)
+        assert one.evidence > 20 and one.chance < 1e-6
+    again = Diagnosis.from_json(json.loads(json.dumps(found.to_json())))
+    assert again == found and again.changed == found.changed
+
+
+def test_groups_that_overlap_are_refused(workspace_of):
+    folder = workspace_of().folder
+    done = grounded("-C", folder, "diagnose", "--compare", "t0001,t0002", "t0002")
+    assert done.code == 1 and "two groups of different trials" in done.err

@@ -1,0 +1,211 @@
+"""What a motion takes off the input that drives it: in small steps, wrapped, and in MuJoCo."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import grounded as gr
+from grounded import Model, Param, Trial
+from grounded.compile import Named
+from grounded.diagnosis.data import prepare
+from grounded.diagnosis.hypothesis import Hypothesis, Predictor
+from grounded.diagnosis.linearise import sensitivities_of, step_jacobian
+from grounded.effects import Library, wrap
+from grounded.effects.joint import dry, has_viscous, pairs_of
+from grounded.models.pendulum import model as pendulum
+
+DT = 0.02
+
+
+def mass(s: Any, a: Any, p: Any) -> tuple[Any, Any, Any]:
+    """Inertia matrix of two uniform rods, by its three numbers."""
+    h = 0.5 * p.m2 * 0.2 * np.cos(s.q2)
+    second = p.m2 * 0.04 + 0.0133
+    return 0.125 + 0.25 * p.m2 + second + 2 * h, second + h, second
+
+
+def dynamics(s: Any, a: Any, p: Any) -> dict[str, Any]:
+    m11, m12, m22 = mass(s, a, p)
+    h = 0.1 * p.m2 * np.sin(s.q2)
+    r1 = a.t1 + h * (2 * s.w1 * s.w2 + s.w2**2)
+    r2 = a.t2 - h * s.w1**2
+    det = m11 * m22 - m12**2
+    return {
+        "q1": s.w1,
+        "q2": s.w2,
+        "w1": (m22 * r1 - m12 * r2) / det,
+        "w2": (m11 * r2 - m12 * r1) / det,
+    }
+
+
+arm = Model(
+    name="arm",
+    states={"q1": "rad", "q2": "rad", "w1": "rad/s", "w2": "rad/s"},
+    inputs={"t1": "N m", "t2": "N m"},
+    params={"m2": Param(1.0, "kg", 0.3, 3.0)},
+    derivative=dynamics,
+)
+PAIRS = ["t1<-w1", "t2<-w2"]
+
+
+def rates(x, u, c, J):
+    """ds/dt of the real arm: friction in its joints, inertia on their axes."""
+    p, s = Named("parameter", ("m2",), [1.0]), Named("state", arm.state_names, x)
+    left = u - np.array(c) * np.tanh(x[2:] / 2e-3)
+    own = dynamics(s, Named("input", arm.input_names, left), p)
+    m11, m12, m22 = mass(s, None, p)
+    M = np.array([[m11, m12], [m12, m22]])
+    return np.concatenate([x[2:], np.linalg.solve(M + np.diag(J), M @ [own["w1"], own["w2"]])])
+
+
+def real_trials(count=3, steps=100, c=(0.0, 0.0), J=(0.0, 0.0)):
+    """The arm with friction in its joints, by the midpoint rule in 40 parts of a step; noise."""
+    rng, found, h = np.random.default_rng(1), [], DT / 40
+    for _ in range(count):
+        t, w = DT * np.arange(steps), rng.uniform(2, 7, 4)
+        u = np.stack([1.5 * np.sin(w[0] * t) + np.sin(w[1] * t), 0.4 * np.sin(w[2] * t)], 1)
+        u[:, 1] += 0.3 * np.sin(w[3] * t)
+        x, states = np.zeros(4), [np.zeros(4)]
+        for row in u:
+            for _ in range(40):
+                x = x + h * rates(x + 0.5 * h * rates(x, row, c, J), row, c, J)
+            x = x + np.array([0, 0, 2e-3, 4e-3]) * rng.standard_normal(4)
+            states.append(x)
+        y = np.array(states) + np.array([5e-4, 5e-4, 1e-2, 1e-2]) * rng.standard_normal(
+            (steps + 1, 4)
+        )
+        found.append(Trial(y, u, DT, arm.state_names, arm.input_names, start_inputs=np.zeros(2)))
+    return found
+
+
+def test_a_pair_is_a_torque_and_the_velocity_of_its_own_joint():
+    assert pairs_of(arm) == PAIRS
+    assert pairs_of(pendulum) == ["torque<-omega"]
+    names = [effect.name for effect in Library().candidates(arm)]
+    assert {f"joint_friction:{pair}" for pair in PAIRS} <= set(names)
+
+
+def test_where_inertia_is_constant_the_joint_has_its_old_names():
+    names = {effect.name for effect in Library().candidates(pendulum)}
+    assert "coulomb_friction:omega" in names
+    assert "joint_friction:torque<-omega" not in names
+    assert "added_inertia:torque<-omega" not in names
+
+
+def test_viscous_friction_that_the_model_has_is_not_offered_twice():
+    assert has_viscous(pendulum, "torque", "omega")
+    assert not has_viscous(arm, "t1", "w1")
+    effect = Library().effect("joint_friction:torque<-omega", pendulum)
+    assert [q.name for q in effect.free] == ["c"]
+
+
+@pytest.mark.parametrize("free", [-3.0, -0.4, -0.1, 0.0, 0.05, 0.3, 2.0])
+@pytest.mark.parametrize("w", [-0.3, 0.0, 0.02, 0.6])
+def test_dry_friction_over_a_step_is_that_of_many_small_ones(w, free):
+    """Slides, stands, turns round; c / width is far too stiff for the step."""
+    gain, c, b, width, x, N = 0.5, 0.5, 0.2, 1e-3, w, 20_000
+    for _ in range(N):
+        push = x + (free - w) / N - gain * b * x / N
+        x = np.sign(push) * max(abs(push) - gain * c / N, 0.0)
+    end = free - gain * dry(w, free, gain, c, b, width)
+    assert end == pytest.approx(x, abs=gain * c / 2 + 1.5 * width)
+    if w * x > 0 or w == 0:  # it does not turn round
+        assert end == pytest.approx(x, abs=5e-3 + 1.5 * width)
+
+
+@pytest.mark.parametrize("family", ["joint_friction", "load_friction", "added_inertia"])
+def test_an_adopted_loss_is_the_one_that_was_diagnosed(family):
+    trials = real_trials(2, 60)
+    predictor, h, model = Predictor(prepare(arm, trials)), Hypothesis(), arm
+    values = {"c": 0.3, "b": 0.1, "width": 0.02, "k": 0.1, "J": 0.05}
+    for pair in PAIRS:
+        effect = Library().effect(f"{family}:{pair}", arm, predictor.data.scales)
+        own = {q.name: values[q.name] for q in effect.quantities}
+        h = h.plus(effect, own)
+        model = wrap(Library().effect(f"{family}:{pair}", model), own, DT)
+    x, u = trials[0].states[:-1], trials[0].inputs
+    want = predictor.advance(h, x, u, np.zeros(len(x)))
+    got = model.system.step(x, u, model.values, DT)
+    np.testing.assert_allclose(got, want, atol=1e-9)
+    assert np.abs(want - predictor.step(x, u, arm.values)).max() > 1e-3
+    assert not model.system.note  # it is compiled
+
+
+@pytest.mark.parametrize("family", ["joint_friction", "added_inertia"])
+def test_the_jacobian_goes_through_a_loss(family):
+    predictor = Predictor(prepare(arm, real_trials(2, 60)))
+    h = Hypothesis()
+    for pair in PAIRS:
+        effect = Library().effect(f"{family}:{pair}", arm, predictor.data.scales)
+        h = h.plus(effect, {"c": 0.3, "b": 0.2} if family == "joint_friction" else {"J": 0.05})
+    track, u = predictor.data.y, predictor.inputs(h)
+    F = step_jacobian(predictor, h, track)
+    both, f_p = sensitivities_of(predictor, h, track[:-1], u)
+    np.testing.assert_allclose(both, F, atol=1e-9)
+    x, size, t = track[:-1], 1e-6, predictor.data.time
+    for j in range(4):
+        up, down = x.copy(), x.copy()
+        up[..., j] += size
+        down[..., j] -= size
+        slope = predictor.advance(h, up, u, t) - predictor.advance(h, down, u, t)
+        error = np.abs(F[..., j] - slope / (2 * size)).max(axis=-1)
+        assert np.quantile(error, 0.85) < 0.02 * np.abs(F).max()
+    heavier = replace(h, shift=np.array([size]))
+    slope = (predictor.advance(heavier, x, u, t) - predictor.advance(h, x, u, t)) / size
+    assert np.quantile(np.abs(f_p[..., 0] - slope), 0.85) < 0.02 * np.abs(slope).max()
+
+
+@pytest.mark.slow
+def test_friction_of_both_joints_is_found():
+    found = gr.diagnose(arm, real_trials(c=(0.4, 0.15)))
+    assert set(found.effects) == {f"joint_friction:{pair}" for pair in PAIRS}
+    size = {row.effect: row.params["c"].value for row in found.ranking if row.claimed}
+    assert size["joint_friction:t1<-w1"] == pytest.approx(0.4, rel=0.05)
+    assert size["joint_friction:t2<-w2"] == pytest.approx(0.15, rel=0.05)
+
+
+@pytest.mark.slow
+def test_an_inertia_that_was_left_out_is_found():
+    found = gr.diagnose(arm, real_trials(J=(0.08, 0.0)))
+    assert found.effects == ("added_inertia:t1<-w1",)
+    assert found.ranking[0].params["J"].value == pytest.approx(0.08, rel=0.03)
+
+
+MJCF = """
+<mujoco model="arm">
+  <option timestep="0.005" integrator="implicitfast"/>
+  <worldbody>
+    <body>
+      <joint name="q1" axis="0 -1 0" {q1}/>
+      <inertial pos="0.25 0 0" mass="1.5" diaginertia="0.001 0.031 0.031"/>
+      <body pos="0.5 0 0">
+        <joint name="q2" axis="0 -1 0"/>
+        <inertial pos="0.2 0 0" mass="1.0" diaginertia="0.001 0.0133 0.0133"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor name="t1" joint="q1"/><motor name="t2" joint="q2"/></actuator>
+</mujoco>"""
+
+
+@pytest.mark.slow
+def test_a_mujoco_model_finds_mujocos_own_friction():
+    pytest.importorskip("mujoco", reason="the adapter's extra, .[mujoco]")
+    from grounded.adapters import mujoco
+
+    crude = mujoco.model(MJCF.format(q1=""))
+    real = mujoco.model(MJCF.format(q1='frictionloss="0.5"'))
+    rng, trials = np.random.default_rng(0), []
+    for _ in range(3):
+        t, w = DT * np.arange(80), rng.uniform(2, 6, 2)
+        u = np.stack([4 + 5 * np.sin(w[0] * t), 2 * np.sin(w[1] * t)], 1)
+        x = [np.array([-1.2, 0.3, 0.0, 0.0])]
+        for row in u:
+            x.append(real.system.step(x[-1][None], row[None], real.values, DT)[0])
+        y = np.array(x) + np.array([5e-4, 5e-4, 1e-2, 1e-2]) * rng.standard_normal((81, 4))
+        trials.append(Trial(y, u, DT, crude.state_names, crude.input_names, start_inputs=u[0]))
+    found = gr.diagnose(crude, trials)
+    assert found.effects[0] == "joint_friction:t1<-q1_vel"
+    assert found.ranking[0].params["c"].value == pytest.approx(0.5, rel=0.05)

@@ -1,0 +1,60 @@
+"""Constants never move; of uncertain parameters only what the trials identify is written."""
+
+import numpy as np
+import pytest
+
+from grounded import Model, Param, Trial
+from grounded.diagnosis.diagnose import diagnose
+from grounded.errors import GroundedError
+from grounded.fit import fit
+
+
+def motor(**params):
+    return Model(
+        states={"v": "m/s"},
+        inputs={"u": "N"},
+        params=params,
+        derivative=lambda s, a, p: {"v": (p.gain * a.u - p.drag * s.v) / p.mass},
+    )
+
+
+def trials(count=3, mass=2.0, gain=3.0, drag=0.5, T=56):
+    rng, found = np.random.default_rng(3), []
+    for _ in range(count):
+        u = np.repeat(rng.uniform(-1, 1, T // 8), 8)[:, None]
+        v = np.zeros(T + 1)
+        for k in range(T):
+            v[k + 1] = v[k] + 0.05 * (gain * u[k, 0] - drag * v[k]) / mass
+        noisy = (v + 1e-3 * rng.standard_normal(T + 1))[:, None]
+        found.append(Trial(noisy, u, 0.05, ("v",), ("u",), start_inputs=np.zeros(1)))
+    return found
+
+
+def test_a_constant_is_neither_fitted_nor_blamed_nor_calibrated():
+    model = motor(mass=Param(2.0, "kg"), gain=Param(3.0), drag=Param(0.3, "N s/m", 0.0, 2.0))
+    found = fit(model, trials())
+    assert list(found.params) == ["drag"] and found.params["drag"].value == pytest.approx(0.5, 0.1)
+    assert found.model.params["mass"] == model.params["mass"]
+    with pytest.raises(GroundedError, match="constant"):
+        fit(model, trials(), ["mass"])
+    diagnosis = diagnose(model, trials())
+    assert set(diagnosis.parameters) <= {"drag"}
+    assert not {"parameter:mass", "parameter:gain"} & {row.effect for row in diagnosis.ranking}
+    assert [one.parameter for one in diagnosis.identifiable] == ["drag"]
+    constants = motor(mass=Param(2.0), gain=Param(3.0), drag=Param(0.3))
+    with pytest.raises(GroundedError, match="no uncertain parameter"):
+        fit(constants, trials())
+
+
+def test_of_a_combination_the_surest_parameter_stays():
+    """Only gain / mass and drag / mass are known."""
+    model = motor(
+        mass=Param(2.0, "kg", std=0.1), gain=Param(2.5, std=0.5), drag=Param(0.4, std=0.2)
+    )
+    found = fit(model, trials())
+    assert not found.params["mass"].identified and found.params["mass"].value == 2.0
+    assert found.params["gain"].identified and found.params["gain"].value == pytest.approx(3, 0.03)
+    diagnosis = diagnose(model, trials())
+    verdicts = {one.parameter: one.verdict for one in diagnosis.identifiable}
+    assert verdicts["mass"] == "not identifiable"
+    assert "mass" not in diagnosis.known_parameters

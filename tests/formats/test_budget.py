@@ -1,0 +1,187 @@
+"""Budgets of time and memory, stamps, ids: what 0.1 read for minutes, or wrongly."""
+
+from __future__ import annotations
+
+import io
+import struct
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.writer import CompressionType, Writer
+
+from bombs import BOMBS, explode, idl, log, ros
+from grounded.errors import GroundedError, nearest
+from grounded.trial import Trial
+from grounded_trials.formats.budget import MEMORY, SECONDS, OverBudget, budget, keep, room, step
+from grounded_trials.formats.mcap_walk import DamagedFile, read_records
+from grounded_trials.logs.inspect_log import inspect_log
+from grounded_trials.logs.recover import recover_log
+from grounded_trials.logs.signals import SignalSpec, read_signals
+from grounded_trials.store.trial_file import read_trial, trial_bytes
+
+QUICK = ("JSON, nested lists",)
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_a_bomb_ends_at_once(name: str, tmp_path: Path) -> None:
+    """Fails on 0.1: 12 kB of JSON took 3.1 GB, a packed list 1.7 GB (FACTS 9)."""
+    assert {what: cost.wrong for what, cost in explode(name, tmp_path).items() if cost.wrong} == {}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in BOMBS if name not in QUICK])
+def test_every_bomb_ends_in_time(name: str, tmp_path: Path) -> None:
+    """Fails on 0.1: 46 kB of messages took 120 s, 300,000 chunks 30 s (FACTS 9)."""
+    assert {what: cost.wrong for what, cost in explode(name, tmp_path).items() if cost.wrong} == {}
+
+
+def test_a_trial_in_many_small_chunks_is_read_in_linear_time() -> None:
+    """Fails on 0.1: time grew with the square of the steps, 19 s for 400,000 (FACTS 9)."""
+    steps = 20_000
+    trial = Trial(np.zeros((steps + 1, 1)), np.zeros((steps, 1)), 1.0, ("x",), ("u",))
+    data = trial_bytes(trial, {})
+    began = time.process_time()
+    assert read_trial(data)[0].steps == steps
+    assert time.process_time() - began < 2.0  # 0.15 here; 0.1 took 30 s
+
+
+def test_an_idl_definition_of_a_megabyte_is_read_in_linear_time(tmp_path: Path) -> None:
+    """Fails on 0.1: each use of a constant read its text again, and of a typedef its chain."""
+    long = "1" + "0" * 2000
+    members = "".join(f"long m{i}[C];" for i in range(20_000))
+    text = f"const long C = {long};\nmodule a {{ struct M {{ {members} }}; }};"
+    path = tmp_path / "log.mcap"
+    path.write_bytes(idl(text))
+    began = time.process_time()
+    with pytest.raises(GroundedError) as refused:
+        read_signals(path, {"x": SignalSpec("/t.x", clock="log")})
+    assert time.process_time() - began < 1.0 and len(str(refused.value)) < 2000
+
+
+def test_a_budget_counts_time_and_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    step(), keep(10**12)  # outside a budget nothing is counted
+    monkeypatch.setenv(SECONDS, "0.01")
+    monkeypatch.setenv(MEMORY, "1")
+    with budget("a log", 0):
+        keep(600_000)
+        room(300_000)
+        with pytest.raises(OverBudget, match=r"a log.*1 MB of memory.*GROUNDED_FILE_MB"):
+            room(500_000)
+        keep(300_000)
+        with pytest.raises(OverBudget, match="memory"):
+            keep(300_000)
+    with budget("a log", 0), pytest.raises(OverBudget, match=r"0\.0 s of CPU.*GROUNDED_FILE_S"):
+        while True:
+            step()
+    with pytest.raises(OverBudget, match="memory that there is"), budget("a log", 0):
+        raise MemoryError
+    monkeypatch.setenv(SECONDS, "much")
+    with pytest.raises(GroundedError, match="'much'"), budget("a log", 0):
+        pass
+
+
+def two_channels() -> bytes:
+    """Channel 1 is /a, then /b: 1.0 goes to /a, 2.0 to /b by the file's order."""
+    stream = io.BytesIO()
+    writer = Writer(stream, compression=CompressionType.NONE, use_chunking=False)
+    writer.start("ros2")
+    schema = writer.register_schema("a/msg/M", "ros2msg", b"float64 x")
+    numbers = []
+    for i, topic in enumerate(("/a", "/b")):
+        numbers.append(writer.register_channel(topic, "cdr", schema))
+        writer.add_message(numbers[-1], i, b"\0\1\0\0" + struct.pack("<d", i + 1.0), i)
+    writer.finish()
+    data = bytearray(stream.getvalue())
+    for opcode in (4, 5):  # channel /b, and its messages, get the id of /a
+        length = 8
+        at = 8
+        while at < len(data) - 8:
+            length = int.from_bytes(data[at + 1 : at + 9], "little")
+            if data[at] == opcode and data[at + 9 : at + 11] == bytes([numbers[1], 0]):
+                data[at + 9] = numbers[0]
+            if data[at] == 15:
+                data[at + 9 : at + 13] = bytes(4)  # the checksum of the data: none
+                break
+            at += 9 + length
+    return bytes(data)
+
+
+def test_a_channel_that_is_defined_again_is_refused(tmp_path: Path) -> None:
+    """Fails on 0.1: the numbers of /b were read as /a's (FACTS 9)."""
+    path = tmp_path / "log.mcap"
+    path.write_bytes(two_channels())
+    with pytest.raises(DamagedFile, match=r"channel 1 is '/a' and defined again as '/b'"):
+        read_signals(path, {"x": SignalSpec("/a.x", clock="log")})
+    saved = recover_log(path, tmp_path / "saved.mcap")
+    assert not saved.complete and any("defined again" in loss for loss in saved.losses)
+    series = read_signals(tmp_path / "saved.mcap", {"x": SignalSpec("/a.x", clock="log")})
+    assert series["x"].values.tolist() == [1.0]
+
+
+STAMPED = "a/Header header\nfloat64 x\n" + "=" * 80
+STAMPED += "\nMSG: a/Header\nbuiltin_interfaces/Time stamp\nuint32 seq\n"
+
+
+def stamped(seconds: list[int]) -> bytes:
+    return ros(
+        STAMPED,
+        (b"\0\1\0\0" + struct.pack("<iIIxxxxd", s, 0, 0, float(i)) for i, s in enumerate(seconds)),
+    )
+
+
+def test_negative_stamps_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    path.write_bytes(stamped([-2, -1, 0, 1]))
+    series = read_signals(path, {"x": SignalSpec("/t.x")})["x"]
+    assert series.t.tolist() == [s * 10**9 for s in (-2, -1, 0, 1)]
+
+
+@pytest.mark.parametrize("stamp", ['{"sec": 1e30, "nanosec": 0}', '{"sec": null, "nanosec": 0}'])
+def test_stamps_outside_the_calendar_are_refused(stamp: str, tmp_path: Path) -> None:
+    """Fails on 0.1: a stamp of 1e30 s or of no number became some other time (FACTS 9)."""
+    path = tmp_path / "log.mcap"
+    good = '{"x": 1, "header": {"stamp": {"sec": 5, "nanosec": 0}}}'
+    bad = f'{{"x": 1, "header": {{"stamp": {stamp}}}}}'
+    path.write_bytes(log("json", None, [good.encode(), bad.encode()]))
+    with pytest.raises(GroundedError, match=r"logged at 0\.010 s.*outside the calendar"):
+        read_signals(path, {"x": SignalSpec("/t.x")})
+    assert "outside the calendar" in inspect_log(path).topics[0].problem
+
+
+def test_a_log_time_after_2262_is_refused_and_left_out_by_recover(tmp_path: Path) -> None:
+    """Fails on 0.1: it wrapped around to 1677 (FACTS 9)."""
+    path = tmp_path / "log.mcap"
+    stream = io.BytesIO()
+    writer = Writer(stream)
+    writer.start("ros2")
+    schema = writer.register_schema("a/msg/M", "ros2msg", b"float64 x")
+    channel = writer.register_channel("/t", "cdr", schema)
+    for when in (1, 2**63 + 5, 3):
+        writer.add_message(channel, when, b"\0\1\0\0" + bytes(8), when)
+    writer.finish()
+    path.write_bytes(stream.getvalue())
+    with pytest.raises(DamagedFile, match="after the year 2262"):
+        read_signals(path, {"x": SignalSpec("/t.x", clock="log")})
+    saved = recover_log(path, tmp_path / "saved.mcap")
+    assert saved.messages == {"/t": 2} and not saved.complete
+
+
+def test_a_trial_may_start_before_zero() -> None:
+    """Fails on 0.1: a start before 0, as in simulation time, was a traceback (FACTS 9)."""
+    trial = Trial(np.arange(6.0)[:, None], np.ones((5, 1)), 0.5, ("x",), ("u",))
+    back, meta, _ = read_trial(trial_bytes(trial, {}, start_ns=-3 * 10**9))
+    assert np.array_equal(back.states, trial.states) and meta["start_ns"] == "-3000000000"
+
+
+def test_small_chunks_are_handed_on_together(tmp_path: Path) -> None:
+    data = ros("float64 x", (b"\0\1\0\0" + bytes(8) for _ in range(1000)), chunk=1)
+    batches = [r for r in read_records(io.BytesIO(data), "f") if hasattr(r, "starts")]
+    assert len(batches) == 1 and len(batches[0]) == 1000
+    assert batches[0].log_times.tolist() == [i * 10**7 for i in range(1000)]
+
+
+def test_a_message_lists_few_names() -> None:
+    text = nearest("x", (f"name{i}" for i in range(100_000)))
+    assert len(text) < 1000 and "99960 more" in text

@@ -1,0 +1,232 @@
+"""The instruments, judged from their own signals: known faults of generated ones, real ones."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from grounded import Model, Param, Trial
+from grounded.diagnosis.diagnose import diagnose
+from grounded.instruments.kinematics import integrals, turned
+from grounded.instruments.lag import at_samples, lag_between
+from grounded.instruments.preflight import preflight
+from grounded.models.car import model as car
+from grounded.models.pendulum import model as pendulum
+from real_systems import DART_STEERING, EMPS, SERVO
+from shared_data import data, needs_data
+
+DT = 0.02
+ARM = Model(
+    states={"q": "rad", "w": "rad/s"},
+    inputs={"u": "N m"},
+    params={"b": Param(0.3, "1/s", 0.0, 3.0)},
+    derivative=lambda s, a, p: {"q": s.w, "w": a.u - p.b * s.w - 4 * np.sin(s.q)},
+)
+
+
+def arm(fault=lambda x: x, seed=0, trials=4, steps=200, friction=0.0):
+    """Trials of an arm whose noisy sensors have a fault: (T + 1, 2) -> (T + 1, 2)."""
+    rng, found = np.random.default_rng(seed), []
+    for _ in range(trials):
+        t = np.arange(steps) * DT
+        u = 2 * np.sin(rng.uniform(1, 4) * t + rng.uniform(0, 6)) + np.sin(rng.uniform(4, 9) * t)
+        states = [np.zeros(2)]
+        for k in range(steps):
+            z = states[-1]
+            for _ in range(4):
+                push = u[k] - friction * np.tanh(z[1] / 0.02)
+                z = ARM.system.step(z[None], np.array([[push]]), ARM.values, DT / 4)[0]
+            states.append(z)
+        y = np.array(states) + rng.standard_normal((steps + 1, 2)) * [1e-3, 1e-2]
+        found.append(Trial(fault(y), u[:, None], DT, ("q", "w"), ("u",)))
+    return found
+
+
+def late(x, steps):
+    before = np.concatenate([np.full(20, x[0]), x])
+    return at_samples(before, np.arange(len(x)) + 20 - steps)
+
+
+def lagged(x, tau):
+    out, a = x.copy(), np.exp(-DT / tau)
+    for k in range(1, len(x)):
+        out[k] = a * out[k - 1] + (1 - a) * 0.5 * (x[k] + x[k - 1])
+    return out
+
+
+def columns(q=lambda x: x, w=lambda x: x):
+    return lambda y: np.stack([q(y[:, 0]), w(y[:, 1])], axis=1)
+
+
+@pytest.mark.parametrize(
+    ("fault", "signal", "kind", "delay", "scale"),
+    [
+        (columns(w=lambda x: late(x, 1.0)), "w", "delay", 0.02, 1),
+        (columns(w=lambda x: late(x, 0.4)), "w", "delay", 0.008, 1),
+        (columns(q=lambda x: late(x, 1.5)), "q", "delay", 0.03, 1),
+        (columns(w=lambda x: lagged(x, 0.08)), "w", "lag", 0.08, 1),
+        (columns(w=lambda x: -x), "w", "sign", 0, -1),
+        (columns(w=np.rad2deg), "w", "degrees", 0, 180 / np.pi),
+        (columns(q=np.rad2deg), "q", "degrees", 0, 180 / np.pi),
+        (columns(w=lambda x: 1.06 * x), "w", "scale", 0, 1.06),
+    ],
+)
+def test_a_velocity_is_held_against_its_position(fault, signal, kind, delay, scale):
+    found = preflight(ARM, arm(fault))
+    assert [(one.signal, one.kind) for one in found.findings] == [(signal, kind)]
+    one = found.findings[0]
+    assert one.delay_s == pytest.approx(delay, rel=0.1, abs=2e-4)
+    assert one.scale == pytest.approx(scale, rel=0.01)
+    assert one.corrected is (kind != "scale")
+    if one.corrected:
+        assert all(abs(f.delay_s) < 0.2 * delay for f in preflight(ARM, found.trials).findings)
+
+
+def test_sound_sensors_are_left_alone():
+    for seed in range(6):
+        trials = arm(seed=seed)
+        found = preflight(ARM, trials)
+        assert found.findings == () and not found.settled
+        for before, after in zip(trials, found.trials, strict=True):
+            np.testing.assert_array_equal(before.states, after.states)
+
+
+def stuck(x):
+    out = x.copy()
+    out[60:85] = out[60]
+    return out
+
+
+def dropped(x):
+    out = x.copy()
+    out[[50, 90, 91, 130]] = -20.0
+    return out
+
+
+@pytest.mark.parametrize(
+    ("fault", "kind", "lost"),
+    [
+        (stuck, "stuck", 24),
+        (dropped, "dropout", 4),
+        (lambda x: np.repeat(x[::4], 4)[:201], "held", 150),
+    ],
+)
+def test_samples_that_show_nothing_become_missing(fault, kind, lost):
+    found = preflight(ARM, arm(columns(q=fault), trials=2))
+    one = next(f for f in found.findings if f.kind == kind)
+    assert (one.signal, one.corrected) == ("q", True)
+    gone = [int(np.isnan(t.states[:, 0]).sum()) for t in found.trials]
+    assert max(gone) == pytest.approx(lost, abs=1)  # a turn hides it in the other trial
+    assert one.share == pytest.approx(sum(gone) / 402)
+
+
+def test_coarse_missing_and_clipped_samples_are_stated_and_left():
+    def coarse(y):
+        y = np.round(y / [0.2, 1e-9]) * [0.2, 1e-9]
+        y[100:110, 1] = np.nan
+        return y
+
+    found = preflight(ARM, arm(coarse))
+    assert {(f.signal, f.kind) for f in found.findings} == {("q", "quantised"), ("w", "missing")}
+    assert not any(f.corrected for f in found.findings)
+    clipped = preflight(ARM, arm(columns(w=lambda x: np.minimum(x, 0.7))))
+    assert ("w", "saturated") in {(f.signal, f.kind) for f in clipped.findings}
+
+
+def test_jumps_by_a_full_turn_are_taken_out():
+    def turn(y, full):
+        y = y + np.array([3.0, 0])
+        y[:, 0] = (y[:, 0] * full / (2 * np.pi) + full / 2) % full - full / 2
+        return y
+
+    for full, kind in ((2 * np.pi, "wrapped"), (360.0, "degrees")):
+        found = preflight(ARM, arm(lambda y, full=full: turn(y, full)))
+        assert [f.kind for f in found.findings] == [kind]
+        steps = np.concatenate([np.diff(t.states[:, 0]) for t in found.trials])
+        assert np.abs(steps).max() < 0.3
+
+
+def test_inputs_that_are_copies_or_constant_are_stated():
+    model = replace(ARM, inputs={"u": "N m", "seen": "N m", "kp": "1"})
+    trials = []
+    for k, t in enumerate(arm(trials=4)):
+        u = t.inputs[:, 0]
+        inputs = np.stack([u, np.concatenate([u[:1], u[:1], u[:-2]]), np.full(len(u), k)], axis=1)
+        trials.append(Trial(t.states, inputs, DT, ("q", "w"), ("u", "seen", "kp")))
+    found = {f.signal: f for f in preflight(model, trials).findings}
+    assert {n: f.kind for n, f in found.items()} == {"seen": "copy", "kp": "constant"}
+    assert found["seen"].delay_s == pytest.approx(2 * DT, rel=0.02)
+
+
+def test_kinematics_come_from_the_model():
+    assert [
+        (pendulum.state_names[r.i], pendulum.state_names[r.j]) for r in integrals(pendulum)
+    ] == [("theta", "omega")]
+    plane = turned(car)
+    assert plane is not None and turned(ARM) is None
+    names = [car.state_names[i] for i in (plane.i, plane.j, plane.k)]
+    assert set(names[:2]) == {"x", "y"} and names[2] == "psi"
+
+
+@pytest.mark.parametrize("fault", [lambda a: -a, np.rad2deg, lambda a: a + np.pi / 2])
+def test_a_heading_is_held_against_the_way_that_was_travelled(fault):
+    model = Model(
+        states={"x": "m", "y": "m", "psi": "rad"},
+        inputs={"r": "rad/s", "v": "m/s"},
+        derivative=lambda s, a, p: {"x": 2 * np.cos(s.psi), "y": 2 * np.sin(s.psi), "psi": a.r},
+    )
+    rng, trials = np.random.default_rng(0), []
+    for _ in range(3):
+        psi = np.cumsum(0.1 * np.sin(np.arange(150) * 0.05) + 0.02)
+        x, y = (np.cumsum(0.1 * f(psi)) for f in (np.cos, np.sin))
+        states = np.stack([x, y, fault(psi)], axis=1) + 1e-3 * rng.standard_normal((150, 3))
+        trials.append(Trial(states, np.zeros((149, 2)), 0.05, ("x", "y", "psi"), ("r", "v")))
+    found = preflight(model, trials)
+    assert [f.signal for f in found.findings] == ["psi"]
+    assert found.findings[0].kind in ("sign", "degrees", "offset")
+    if found.findings[0].corrected:
+        assert not preflight(model, found.trials).findings
+
+
+def test_noise_in_both_brackets_the_scale():
+    rng, t = np.random.default_rng(0), np.arange(2000) * DT
+    true = np.sin(1.3 * t) + np.sin(3.1 * t)
+    a = true + 0.3 * rng.standard_normal(2000)
+    lag = lag_between([(a, 1.2 * true + 0.3 * rng.standard_normal(2000))], DT)
+    assert lag is not None and lag.low < 1.2 < lag.high
+    assert abs(lag.delay) < 5 * lag.std < 0.02
+
+
+def test_a_late_sensor_is_not_counted_against_the_effects():
+    trials = arm(columns(w=lambda x: late(x, 1.0)), friction=0.5, steps=120)
+    found = diagnose(ARM, trials)
+    assert [(f.signal, f.kind, f.corrected) for f in found.preflight] == [("w", "delay", True)]
+    assert found.effects == ("coulomb_friction:w",), found.sentence
+    assert not any(row.effect == "sensor_delay:w" for row in found.ranking)
+    again = type(found).from_json(found.to_json())
+    assert again.preflight == found.preflight
+
+
+@needs_data
+def test_the_late_velocity_registers_of_real_joints():
+    """Published beside the data: about 20 ms (BAM) and 15 ms (the double pendulum)."""
+    for parts, columns, step, late in (
+        (("bam_xl330_servo", "bam_xl330_pendulum"), (0, 1), 0.005, 0.020),
+        (("dfki_double_pendulum", "acrobot_mcpilco"), (1, 3), 0.03, 0.015),
+    ):
+        log, trials = np.load(data(parts[0], f"{parts[1]}.npz"), allow_pickle=True), []
+        for name in (n for n in log.files if n.startswith("run") and not n.endswith("_t")):
+            t = log[f"{name}_t"]
+            grid = np.arange(t[0], t[-1], step)
+            states = np.stack([np.interp(grid, t, log[name][:, c]) for c in columns], axis=1)
+            none = np.zeros((len(grid) - 1, 1))
+            trials.append(Trial(states, none, step, ("q", "w"), ("u",)))
+        found = preflight(ARM, trials).findings
+        assert [(one.signal, one.kind) for one in found] == [("w", "delay")]
+        assert found[0].delay_s == pytest.approx(late, abs=0.001)
+
+
+@needs_data
+def test_sound_sensors_of_real_systems():
+    for system in (EMPS, SERVO, DART_STEERING):
+        assert preflight(system.model, system.read()).findings == ()

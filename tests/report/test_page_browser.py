@@ -1,0 +1,258 @@
+"""The page in a real browser: drawn, zoomed, switched, moved, dark, narrow, printed, reloaded."""
+
+from __future__ import annotations
+
+import base64
+import re
+import time
+
+import numpy as np
+import pytest
+from test_page import hostile
+
+from grounded_trials import Workspace
+from grounded_trials.report.gathering import gather
+from grounded_trials.report.page.page import page
+from grounded_trials.workspace.folder import Folder
+from page_browser import browser, missing
+from reported import car, cart, copied, many_flights
+
+__all__ = ["car", "cart"]
+pytestmark = [
+    pytest.mark.skipif(bool(missing()), reason=missing() or "-"),
+    pytest.mark.extra("report"),
+    pytest.mark.slow,
+]
+
+
+@pytest.fixture(scope="module")
+def window():
+    with browser() as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def car_page(car, tmp_path_factory):
+    path = tmp_path_factory.mktemp("page") / "page.html"
+    path.write_text(page(gather(Folder(car))))
+    return path
+
+
+@pytest.fixture
+def opened(window, car_page):
+    """The car's page at a desk's width, every panel drawn."""
+    window.dark(False)
+    window.resize(1400, 900)
+    window.open(car_page)
+    window.draw_all()
+    yield window
+    assert window.errors() == []
+
+
+def _range(window, plot):
+    return window.run(
+        "return document.getElementById(arguments[0]).layout.xaxis.range.map(Number)", plot
+    )
+
+
+def test_every_panel_is_drawn_when_it_comes_into_view(window, car_page):
+    window.resize(1400, 900)
+    window.open(car_page)
+    drawn = "return document.querySelectorAll('.plot .main-svg').length"
+    time.sleep(0.3)
+    first = window.run(drawn)
+    window.draw_all()
+    assert 0 < first < window.run(drawn)
+    sizes = window.run(
+        "return [...document.querySelectorAll('.plot')].map(p => {"
+        " const b = p.querySelector('.main-svg').getBoundingClientRect();"
+        " return [b.width, b.height, b.right]; })"
+    )
+    assert len(sizes) >= 15
+    assert all(w > 300 and h > 40 and right <= 1400 for w, h, right in sizes)
+    assert window.errors() == []
+
+
+def test_time_panels_zoom_together(opened):
+    home = _range(opened, "states-0")
+    opened.drag("states-0", 0.3, 0.6)
+    low, high = _range(opened, "states-0")
+    assert home[0] < low < high < home[1]
+    for other in ("states-3", "error-0", "inputs-1"):
+        assert _range(opened, other) == pytest.approx([low, high])
+    assert _range(opened, "paths-0")[0] < 0  # a path's axes are no time
+    opened.key("states-0", "0")
+    assert _range(opened, "states-3") == pytest.approx(home)
+
+
+def test_keys_zoom_where_the_focus_is(opened):
+    home = _range(opened, "states-1")
+    opened.key("states-1", "+")
+    low, high = _range(opened, "states-1")
+    assert high - low == pytest.approx((home[1] - home[0]) / 2)
+    opened.key("states-1", "ArrowRight")
+    assert _range(opened, "states-1")[0] > low
+
+
+def test_a_trial_is_switched_off_and_on(opened):
+    visible = (
+        "return document.getElementById('paths-0')._fullData.filter(t => t.visible === true)"
+        ".map(t => t.name)"
+    )
+    names = opened.run(visible)
+    chip = opened.run(
+        "const chips = [...document.querySelectorAll('[data-figure=paths] .chip')];"
+        "const chip = chips.find(c => c.dataset.trial) || chips[0]; chip.click();"
+        "return chip.dataset.name"
+    )
+    assert chip in names and chip not in opened.run(visible)
+    opened.run(
+        "[...document.querySelectorAll('[data-figure=paths] .chip')]"
+        ".find(c => c.dataset.name === arguments[0]).click()",
+        chip,
+    )
+    assert opened.run(visible) == names
+
+
+def test_one_cursor_in_all_panels(opened, car):
+    opened.point("#states-1", 0.5, 0.5)
+    time.sleep(0.5)
+    t = float(opened.run("return document.documentElement.dataset.time"))
+    assert 0.5 < t < 2.5
+    for plot in ("states-0", "states-4", "error-1", "inputs-0"):
+        at = opened.run(
+            "const p = document.getElementById(arguments[0]), { xaxis } = p._fullLayout;"
+            "const mark = p.querySelector('.over');"
+            "return xaxis.p2l(parseFloat(mark.style.left) - xaxis._offset)",
+            plot,
+        )
+        assert at == pytest.approx(t, abs=0.01), plot
+    assert opened.run("return Number(document.getElementById('time').value)") == pytest.approx(
+        t, abs=0.05
+    )
+
+
+def test_the_slider_moves_the_run_along_its_path(opened, car):
+    findings = gather(Folder(car))
+    best = findings.best
+    assert best is not None
+    opened.run(
+        "const s = document.getElementById('time'); s.value = 1.5;"
+        "s.dispatchEvent(new Event('input'))"
+    )
+    time.sleep(0.3)
+    at = opened.run(
+        "const p = document.getElementById('paths-0'), { xaxis, yaxis } = p._fullLayout;"
+        "return Object.fromEntries([...p.querySelectorAll('.over')].map(m => [m.dataset.name,"
+        " [xaxis.p2l(parseFloat(m.style.left) - xaxis._offset),"
+        "  yaxis.p2l(parseFloat(m.style.top) - yaxis._offset)]]))"
+    )
+    k = round(1.5 / findings.task.dt)
+    columns = [findings.task.model.state_names.index(name) for name in ("x", "y")]
+    for name, states in (
+        ("real", best.trial.states),
+        ("predicted", best.candidate.predicted_states),
+        ("desired", findings.task.target),
+    ):
+        np.testing.assert_allclose(at[name], states[k, columns], atol=0.01, err_msg=name)
+
+
+def test_playing_moves_time_on(opened):
+    opened.run("document.getElementById('play').click()")
+    time.sleep(0.6)
+    t = float(opened.run("return document.documentElement.dataset.time"))
+    opened.run("document.getElementById('play').click()")
+    assert t > 0.1
+
+
+@pytest.mark.parametrize("width", [1400, 390])
+@pytest.mark.parametrize("dark", [False, True])
+def test_light_and_dark_wide_and_narrow(window, car_page, width, dark):
+    window.resize(width, 900)
+    window.dark(dark)
+    window.open(car_page)
+    window.draw_all()
+    assert window.run("return document.documentElement.scrollWidth") <= width
+    for heading in ("What improved", "Why the model was wrong", "What to run next", "Paths", "Gap"):
+        found = window.run(
+            "return [...document.querySelectorAll('h2')].filter(h => h.textContent === arguments[0]"
+            " && h.getBoundingClientRect().height > 10).length",
+            heading,
+        )
+        assert found == 1, heading
+    back = window.run("return getComputedStyle(document.body).backgroundColor")
+    assert (sum(map(int, re.findall(r"\d+", back)[:3])) < 200) == dark
+    text = window.run("return document.getElementById('states-0').layout.font.color")
+    assert text == ("#e8e8e8" if dark else "#1a1a1a")
+    window.dark(not dark)
+    time.sleep(0.5)
+    text = window.run("return document.getElementById('states-0').layout.font.color")
+    assert text == ("#1a1a1a" if dark else "#e8e8e8")
+    assert window.errors() == []
+
+
+def test_print_shows_every_panel_in_light_colours(window, car_page):
+    window.dark(True)
+    window.resize(1400, 900)
+    window.open(car_page)
+    window.run(
+        "addEventListener('beforeprint', () => setTimeout(() => {}, 0));"
+        "addEventListener('afterprint', () => { document.documentElement.dataset.printed ="
+        " [...document.querySelectorAll('.plot')].every(p => p.querySelector('.main-svg')); })"
+    )
+    made = window.devtools("Page.printToPDF", {"paperWidth": 8.27, "paperHeight": 11.69})
+    assert base64.b64decode(made["data"]).count(b"/Type /Page\n") >= 3
+    assert window.run("return document.documentElement.dataset.printed") == "true"
+    assert window.run("return document.getElementById('states-0').layout.font.color") == "#e8e8e8"
+    assert window.errors() == []
+
+
+def test_hostile_names_run_nothing(cart, tmp_path, window):
+    path = tmp_path / "page.html"
+    path.write_text(page(hostile(cart)))
+    window.open(path)
+    window.draw_all()
+    window.point("#states-0", 0.5, 0.5)
+    window.run("document.querySelectorAll('.plot').forEach(e => e.focus())")
+    assert window.run("return window.hacked") is None
+    assert window.errors() == []
+
+
+def test_tables_can_be_copied(opened):
+    copied_text = opened.run(
+        "let text = ''; const area = () => document.querySelector('textarea').value;"
+        "document.execCommand = () => { text = area(); };"
+        "navigator.clipboard.writeText = () => Promise.reject();"
+        "document.querySelector('button[data-copy=errors]').click();"
+        "return new Promise(done => setTimeout(() => done(text), 100));"
+    )
+    rows = [line.split("\t") for line in copied_text.split("\n")]
+    assert rows[0][:2] == ["state", "unit"] and rows[1][:2] == ["delta", "rad"]
+    assert len({len(row) for row in rows}) == 1
+
+
+def test_a_watched_page_reloads_itself(cart, tmp_path, window):
+    folder = copied(cart, tmp_path / "w")
+    watching = Workspace(folder).watch(every=0.01)
+    first = next(watching)
+    window.open(first.paths[0])
+    before = window.run("return document.documentElement.dataset.watched")
+    (folder / "grounded.toml").touch()
+    next(watching)
+    for _ in range(50):
+        time.sleep(0.1)
+        if window.run("return document.documentElement.dataset.watched") != before:
+            break
+    assert window.run("return document.documentElement.dataset.watched") != before
+    assert window.errors() == []
+
+
+def test_fifty_long_trials_open_at_once(tmp_path, window):
+    path = tmp_path / "page.html"
+    path.write_text(page(many_flights(50)))
+    assert path.stat().st_size < 8e6
+    window.resize(390, 900)
+    window.open(path)
+    window.draw_all()
+    assert window.run("return document.documentElement.scrollWidth") <= 390
+    assert window.errors() == []

@@ -1,0 +1,24 @@
+"""A little of each attack of `benchmarks/attack.py`, seeded."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+
+from attacks import ATTACKS
+
+
+@pytest.mark.parametrize(
+    ("name", "seconds"), [("mutants", 0.7), ("configurations", 0.7), ("flips", 0.5)]
+)
+def test_a_little_of_each_attack_breaks_nothing(name: str, seconds: float) -> None:
+    tally = ATTACKS[name][1](random.Random(5), seconds)
+    assert tally.failures == [] and tally.tries > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["kills", "short writes", "crowds"])
+def test_commands_that_are_attacked_break_nothing(name: str) -> None:
+    tally = ATTACKS[name][1](random.Random(5), 15)
+    assert tally.failures == [] and tally.tries > 0

@@ -1,0 +1,133 @@
+"""The index of a large store: the same answers, quickly; derived, checked and deletable."""
+
+import hashlib
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from grounded.errors import GroundedError
+from grounded_trials import Workspace
+from grounded_trials.store.index import KnownTrial
+from grounded_trials.store.trial_file import trial_bytes
+from grounded_trials.workspace import folder as folder_module
+from workspaces import CONFIG, make
+
+COUNT = 240
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A search with hundreds of repeats and logs of data, one with gaps, one that ended early."""
+    config = CONFIG.replace("max_trials = 12", "max_trials = 1000")
+    w = Workspace(make(tmp_path_factory.mktemp("index") / "w", config=config).folder)
+    w.learn(3)
+    rng, ran = np.random.default_rng(0), w.trials()
+    for k in range(len(ran), COUNT):
+        one = ran[k % len(ran)]
+        states = one.trial.states + rng.normal(0, 1e-3, one.trial.states.shape)
+        if k == 50:
+            states[10:12] = np.nan
+        trial = replace(one.trial, states=states, candidate="" if k % 2 else one.trial.candidate)
+        trial = trial.until(20) if k == 60 else trial
+        meta = {key: one.meta[key] for key in ("kind", "iteration", "alpha", "task")}
+        data = trial_bytes(trial, meta, policy=None if k % 2 else one.policy)
+        name = f"t{k + 1:04d}-{hashlib.sha256(data).hexdigest()[:16]}.mcap"
+        (w.store.folder / name).write_bytes(data)
+    return w
+
+
+@pytest.fixture
+def indexed(made, monkeypatch):
+    """Small enough for a test, large enough for the index."""
+    monkeypatch.setattr(folder_module, "MANY", 100)
+    file = made.store.folder / ".index.sqlite"
+    file.unlink(missing_ok=True)
+    return made, file
+
+
+def plainly(made, monkeypatch):
+    monkeypatch.setattr(folder_module, "MANY", 10**6)
+    return Workspace(made.folder)
+
+
+def test_the_index_changes_no_answer(indexed, monkeypatch):
+    w, file = indexed
+    first = Workspace(w.folder).status().to_json()
+    assert file.is_file()
+    again = Workspace(w.folder)
+    assert again.status().to_json() == first
+    known = again.trials()
+    plain = plainly(w, monkeypatch)
+    assert plain.status().to_json() == first
+    assert sum(isinstance(t.trial, KnownTrial) for t in known) == COUNT - 1
+    for one, other in zip(known, plain.trials(), strict=True):
+        for a, b in ((one.trial, other.trial), (one.measured, other.measured)):
+            about = ("id", "candidate", "dt", "state_names", "steps", "finite_steps", "known_steps")
+            assert all(getattr(a, name) == getattr(b, name) for name in about)
+            np.testing.assert_array_equal(a.states, b.states)
+            np.testing.assert_array_equal(a.inputs, b.inputs)
+        assert (one.meta, one.ran, one.policy) == (other.meta, other.ran, other.policy)
+
+
+def test_a_changed_copy_of_a_known_trial_knows_nothing_stale(indexed):
+    w, _ = indexed
+    Workspace(w.folder).status()
+    trial = next(t.trial for t in Workspace(w.folder).trials() if t.stored.id == "t0003")
+    cut = trial.until(7)
+    assert (trial.steps, cut.steps, cut.finite_steps, len(cut.states)) == (40, 7, 7, 8)
+    moved = replace(trial, states=trial.states + 1.0)
+    assert w.task.utility(moved) != w.task.utility(trial) and not moved.repeats(trial)
+
+
+@pytest.mark.parametrize("how", ["gone", "empty", "nonsense", "half", "directory"])
+def test_an_index_that_is_damaged_is_made_again(indexed, how):
+    w, file = indexed
+    answer = Workspace(w.folder).status().to_json()
+    data = file.read_bytes()
+    file.unlink()
+    if how == "directory":
+        file.mkdir()
+    elif how != "gone":
+        file.write_bytes({"empty": b"", "nonsense": b"nonsense" * 900, "half": data[:9000]}[how])
+    assert Workspace(w.folder).status().to_json() == answer
+    if how == "directory":
+        file.rmdir()
+
+
+def test_flipped_bytes_of_the_index_never_change_an_answer(indexed):
+    w, file = indexed
+    answer = Workspace(w.folder).status().to_json()
+    data, rng = file.read_bytes(), np.random.default_rng(0)
+    (utility,) = {repr(t.utilities[0]) for t in w.status().standing.history[:1]}
+    for place in (data.index(utility.encode()) + 2, *rng.integers(0, len(data), 12).tolist()):
+        file.write_bytes(data[:place] + bytes([data[place] ^ 16]) + data[place + 1 :])
+        assert Workspace(w.folder).status().to_json() == answer, place
+
+
+def test_a_trial_that_was_damaged_behind_the_index_is_found(indexed):
+    w, _ = indexed
+    Workspace(w.folder).status()
+    (path,) = w.store.folder.glob("t0100-*")
+    data = path.read_bytes()
+    path.chmod(0o644)
+    path.write_bytes(data[:900] + bytes([data[900] ^ 1]) + data[901:])
+    try:
+        with pytest.raises(GroundedError, match="t0100"):
+            Workspace(w.folder).status()
+    finally:
+        path.write_bytes(data)
+    assert Workspace(w.folder).status().standing.trials > 100
+
+
+def test_a_second_reading_is_much_quicker(indexed):
+    w, _ = indexed
+
+    def seconds():
+        start = time.process_time()
+        Workspace(w.folder).trials()
+        return time.process_time() - start
+
+    first = seconds()
+    assert min(seconds() for _ in range(3)) < first / 3

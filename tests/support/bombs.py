@@ -1,0 +1,336 @@
+"""Small files that ask for gigabytes or for hours, each of one kind; see `BOMBS`.
+
+`bomb(name, folder)` writes one and says which number of it to read.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import re
+import struct
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from mcap.writer import CompressionType, Writer
+
+from grounded.trial import Trial
+from grounded_trials.formats.mcap_records import CHUNK
+from grounded_trials.formats.mcap_walk import MAGIC
+from grounded_trials.store.trial_file import trial_bytes
+
+DEEP = 12  # modules inside modules
+BREAK = "=" * 80 + "\n"
+TEXTS = f"T[] list\nfloat64 x\n{BREAK}MSG: a/T\nstring s\n"
+
+
+def log(
+    encoding: str,
+    schema: tuple[str, str, bytes] | None,
+    messages: Iterable[bytes],
+    *,
+    compression: CompressionType = CompressionType.ZSTD,
+    chunk: int = 2**20,
+) -> bytes:
+    """A log of one topic, /t."""
+    stream = io.BytesIO()
+    writer = Writer(stream, chunk_size=chunk, compression=compression)
+    writer.start("ros2")
+    number = writer.register_schema(*schema) if schema else 0
+    channel = writer.register_channel("/t", encoding, number)
+    for i, data in enumerate(messages):
+        writer.add_message(channel, i * 10**7, data, i * 10**7)
+    writer.finish()
+    return stream.getvalue()
+
+
+def ros(text: str, messages: Iterable[bytes], **how: object) -> bytes:
+    return log("cdr", ("a/msg/M", "ros2msg", text.encode()), messages, **how)  # type: ignore[arg-type]
+
+
+def idl(text: str, name: str = "a/M") -> bytes:
+    return log("cdr", (name, "omgidl", text.encode()), [b"\0\1\0\0" + bytes(64)] * 3)
+
+
+def _nested_json() -> Iterable[bytes]:
+    inner = b"[" + b",".join([b"[]"] * 2_000_000) + b"]"
+    return (b'{"x": 1, "y": ' + inner + b"}" for _ in range(16))
+
+
+def _objects_json() -> Iterable[bytes]:
+    inner = b"[" + b",".join([b'{"a":{}}'] * 1_500_000) + b"]"
+    return (b'{"x": 1, "y": ' + inner + b"}" for _ in range(4))
+
+
+def _texts_in_a_list(count: int, messages: int) -> Iterable[bytes]:
+    """A list of texts of unequal size in front of the number that is read."""
+    item = struct.pack("<I3sx", 3, b"ab\0")
+    body = b"\0\1\0\0" + struct.pack("<I", count) + item * count
+    body += bytes(-(len(body) - 4) % 8) + struct.pack("<d", 1.0)
+    return (body for _ in range(messages))
+
+
+def _many_fields(count: int, messages: int) -> Iterable[bytes]:
+    return (b"\x08\x01" * count + b"\x11" + struct.pack("<d", 1.0) for _ in range(messages))
+
+
+def _protobuf(messages: Iterable[bytes]) -> bytes:
+    from google.protobuf.descriptor_pb2 import FileDescriptorSet
+
+    files = FileDescriptorSet()
+    message = files.file.add(name="m", package="p").message_type.add(name="M")
+    message.field.add(name="y", number=1, type=5, label=3)
+    message.field.add(name="x", number=2, type=1, label=1)
+    return log("protobuf", ("p.M", "protobuf", files.SerializeToString()), messages)
+
+
+def _zeros(compression: str, count: int, size: int) -> bytes:
+    """Chunks that hold one record of zeros of a type that nobody knows."""
+    import lz4.frame
+    import zstandard
+
+    data = struct.pack("<BQ", 0x80, size - 9) + bytes(size - 9)
+    pack = zstandard.compress if compression == "zstd" else lz4.frame.compress
+    packed, name = pack(data), compression.encode()
+    head = struct.pack("<QQQII", 0, 0, size, 0, len(name)) + name + struct.pack("<Q", len(packed))
+    record = struct.pack("<BQ", CHUNK, len(head) + len(packed)) + head + packed
+    end = struct.pack("<BQI", 15, 4, 0) + struct.pack("<BQQQI", 2, 20, 0, 0, 0) + MAGIC
+    header = struct.pack("<BQII", 1, 8, 0, 0)
+    return MAGIC + header + record * count + end
+
+
+def _tiny_messages(count: int) -> bytes:
+    return ros("float64 x", (b"\0\1\0\0" + bytes(8) for _ in range(count)), chunk=2**27)
+
+
+def _chunks(count: int) -> bytes:
+    """A chunk a message, without compression."""
+    body = b"\0\1\0\0" + struct.pack("<d", 1.0)
+    none = CompressionType.NONE
+    return ros("float64 x", (body for _ in range(count)), compression=none, chunk=1)
+
+
+def _trial(steps: int, dt: float) -> bytes:
+    rng = np.random.default_rng(0)
+    states, inputs = rng.normal(size=(steps + 1, 2)), rng.normal(size=(steps, 1))
+    return trial_bytes(Trial(states, inputs, dt, ("v", "x"), ("u",)), {"kind": "data"})
+
+
+def _ranges(count: int, messages: int) -> bytes:
+    """Arrays of a fixed length, of which a path takes all."""
+    return ros(f"float64[{count}] x", (b"\0\1\0\0" + bytes(8 * count) for _ in range(messages)))
+
+
+def _typedefs() -> str:
+    chain = "".join(f"typedef T{i} T{i + 1};\n" for i in range(60))
+    members = "".join(f"T60 m{i};\n" for i in range(70_000))
+    return f"typedef long T0;\n{chain}module a {{ struct M {{ {members} }}; }};"
+
+
+def _constants() -> str:
+    long = "+".join(["1"] * 250_000)
+    members = "".join(f"long m{i}[C];\n" for i in range(30_000))
+    return f"const long C = {long};\nmodule a {{ struct M {{ {members} }}; }};"
+
+
+def _modules() -> str:
+    opened = "".join(f"module m{i} {{ " for i in range(DEEP))
+    names = "".join(f"typedef long X{i};" for i in range(30_000))
+    members = "".join(f"X{i} m{i};" for i in range(30_000))
+    return f"{names}{opened}struct M {{ {members} }};{'};' * DEEP}"
+
+
+def _wide() -> str:
+    members = "".join(f"string s{i};\n" for i in range(60_000))
+    return f"module a {{ struct M {{ {members} double x; }}; }};"
+
+
+def _bases() -> str:
+    first = "".join(f"long m{i};\n" for i in range(40_000))
+    rest = "".join(f"struct S{i + 1} : S{i} {{ long n{i}; }};\n" for i in range(60))
+    return f"module a {{ struct S0 {{ {first} }};\n{rest} struct M : S60 {{ double x; }}; }};"
+
+
+def _ros_fields() -> str:
+    return "".join(f"string s{i}\n" for i in range(60_000)) + "float64 x\n"
+
+
+def _ros_doubling() -> str:
+    parts = [f"T0 a\nT0 b\nfloat64 x\n{BREAK}"]
+    parts += [f"MSG: a/T{i}\nT{i + 1}[3] a\nT{i + 1}[] b\n{BREAK}" for i in range(40)]
+    return "".join(parts) + "MSG: a/T40\nstring s\n"
+
+
+def _attachments() -> bytes:
+    stream = io.BytesIO()
+    writer = Writer(stream)
+    writer.start()
+    for _ in range(40_000):
+        writer.add_attachment(0, 0, "a", "b", b"c")
+        writer.add_metadata("grounded", {"format": "x"})
+    writer.finish()
+    return stream.getvalue()
+
+
+def _gaps() -> bytes:
+    """Sound records with a byte between them that is none: for `recover`."""
+    record = struct.pack("<BQ", 12, 8) + bytes(8)
+    return MAGIC + (record * 4 + b"\xff" * 3) * 30_000
+
+
+# name -> (the file, the path of the number to read in it; "": it is read as a trial of ours)
+BOMBS: dict[str, tuple[Callable[[], bytes], str]] = {
+    "JSON, nested lists": (lambda: log("json", None, _nested_json()), "/t.x"),
+    "JSON, nested objects": (lambda: log("json", None, _objects_json()), "/t.x"),
+    "JSON, one message": (
+        lambda: log("json", None, [json.dumps({"x": 1, "y": [[]] * 20_000_000}).encode()]),
+        "/t.x",
+    ),
+    "lists of texts, ROS 2": (lambda: ros(TEXTS, _texts_in_a_list(99_000, 100)), "/t.x"),
+    "all texts of a list, ROS 2": (
+        lambda: ros(TEXTS.replace("string s", "string s\nfloat64 y"), _texts_in_a_list(60_000, 4)),
+        "/t.list[59000].y",
+    ),
+    "fields, protobuf": (lambda: _protobuf(_many_fields(190_000, 50)), "/t.x"),
+    "packed lists, protobuf": (
+        lambda: _protobuf(b"\x0a" + b"\x80\x80\x80\x30" + bytes(100_663_296) for _ in range(2)),
+        "/t.y[:]",
+    ),
+    "zeros, zstd": (lambda: _zeros("zstd", 200, 500 * 2**20), "/t.x"),
+    "zeros, zstd, in smaller chunks": (lambda: _zeros("zstd", 250, 90 * 2**20), "/t.x"),
+    "zeros, lz4": (lambda: _zeros("lz4", 6, 100 * 2**20), "/t.x"),
+    "tiny messages": (lambda: _tiny_messages(2_000_000), "/t.x"),
+    "300,000 chunks": (lambda: _chunks(300_000), "/t.x"),
+    "items of fixed lists": (lambda: _ranges(1_000_000, 30), "/t.x[:]"),
+    "IDL, typedefs of typedefs": (lambda: idl(_typedefs()), "/t.x"),
+    "IDL, a long constant": (lambda: idl(_constants()), "/t.x"),
+    "IDL, names in modules": (
+        lambda: idl(_modules(), "/".join([*(f"m{i}" for i in range(DEEP)), "M"])),
+        "/t.x",
+    ),
+    "IDL, texts before a number": (lambda: idl(_wide()), "/t.x"),
+    "IDL, bases of bases": (lambda: idl(_bases()), "/t.x"),
+    "ROS, texts before a number": (lambda: ros(_ros_fields(), [bytes(300_000)] * 3), "/t.x"),
+    "ROS, types that double": (lambda: ros(_ros_doubling(), [bytes(300_000)] * 3), "/t.x"),
+    "metadata and attachments": (_attachments, "/t.x"),
+    "gaps between records": (_gaps, "/t.x"),
+    "a trial of 400,000 steps, a chunk each": (lambda: _trial(400_000, 1.0), ""),
+}
+
+
+def bomb(name: str, folder: Path) -> tuple[Path, str]:
+    """Writes a bomb; the file and the path to read in it."""
+    build, text = BOMBS[name]
+    path = folder / "bomb.mcap"
+    path.write_bytes(build())
+    return path, text
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a command did, and what it took."""
+
+    exit: int  # negative: the signal that ended it
+    cpu_s: float
+    peak_mb: float
+    text: str  # of both outputs
+    size_mb: float = 0.0  # of the file that it read
+
+    @property
+    def wrong(self) -> str:
+        """Why this is no clean end, "" where it is: no traceback, 5 s (1 s a MB), 500 MB."""
+        if "Traceback" in self.text or self.exit not in (0, 1, 3):
+            return f"exit {self.exit}: {self.text[-300:]}"
+        allowed = max(5.0, self.size_mb)
+        over = self.cpu_s > allowed or self.peak_mb > 500 or len(self.text) > 20_000
+        took = f"{self.cpu_s:.1f} s, {self.peak_mb:.0f} MB, {len(self.text)} letters"
+        return took if over else ""
+
+
+_START = """
+import pathlib, re, resource, sys
+def told(_, peak=sys.argv.pop(1)):
+    status = pathlib.Path("/proc/self/status").read_text()  # not of the process that forked
+    pathlib.Path(peak).write_text(re.search(r"VmHWM:\\s+(\\d+)", status)[1])
+import atexit
+atexit.register(told, 0)
+"""
+_CLI = "from grounded_cli.main import main\nmain()"
+_READ = """
+from grounded.errors import GroundedError
+from grounded_trials.logs.signals import SignalSpec, read_signals
+from grounded_trials.store.trial_file import read_trial
+try:
+    if sys.argv[2]:
+        read_signals(sys.argv[1], {"x": SignalSpec(sys.argv[2], clock="log")})
+    else:
+        read_trial(sys.argv[1])
+except GroundedError as error:
+    sys.exit(f"error: {error}")
+"""
+
+
+def measured(
+    words: Sequence[str], code: str = _CLI, timeout_s: float = 60, env: Mapping[str, str] = {}
+) -> Cost:
+    """Runs `grounded WORDS` (or other code) in a process and measures it."""
+    with tempfile.TemporaryDirectory() as folder:
+        output, peak = Path(folder, "output"), Path(folder, "peak")
+        with output.open("wb") as out:
+            limited = ["timeout", "-s", "KILL", str(timeout_s)]
+            child = subprocess.Popen(
+                [*limited, sys.executable, "-c", _START + code, str(peak), *words],
+                stdout=out,
+                stderr=subprocess.STDOUT,
+                env={**os.environ, **env},
+            )
+            _, status, used = os.wait4(child.pid, 0)
+            child.returncode = os.waitstatus_to_exitcode(status)
+        mb = int(peak.read_text()) / 1000 if peak.exists() else 0.0
+        text = output.read_text(errors="replace")
+        return Cost(child.returncode, used.ru_utime + used.ru_stime, mb, text)
+
+
+def explode(name: str, folder: Path) -> dict[str, Cost]:
+    """Reads, inspects and recovers a bomb; it is built in a process of its own."""
+    here = Path(__file__).parent
+    make = (
+        f"sys.path.insert(0, {str(here)!r})\nfrom bombs import bomb\n"
+        f"bomb({name!r}, pathlib.Path(sys.argv[1]))"
+    )
+    made = measured([str(folder)], make, 300)
+    assert made.exit == 0, made.text
+    path = str(folder / "bomb.mcap")
+    size = Path(path).stat().st_size / 1e6
+    saved = folder / "saved.mcap"
+    costs = {
+        "read": measured([path, BOMBS[name][1]], _READ),
+        "inspect": measured(["inspect", path]),
+        "recover": measured(["recover", path, "-o", str(saved)]),
+    }
+    saved.unlink(missing_ok=True)
+    return {what: replace(cost, size_mb=size) for what, cost in costs.items()}
+
+
+def main() -> None:
+    """Prints a line a bomb: python tests/support/bombs.py [NAME ...]"""
+    for name in BOMBS:
+        if sys.argv[1:] and not any(re.search(word, name) for word in sys.argv[1:]):
+            continue
+        with tempfile.TemporaryDirectory() as folder:
+            for what, cost in explode(name, Path(folder)).items():
+                print(
+                    f"{name:40} {1e3 * cost.size_mb:8.0f} kB {what:8} {cost.cpu_s:5.1f} s"
+                    f" {cost.peak_mb:5.0f} MB exit {cost.exit} {cost.wrong[:300]}",
+                    flush=True,
+                )
+
+
+if __name__ == "__main__":
+    main()

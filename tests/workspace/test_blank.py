@@ -1,0 +1,98 @@
+"""A workspace from a model alone, and the robot's program that comes with it."""
+
+import importlib.util
+import tomllib
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from grounded.errors import GroundedError
+from grounded.policy import load
+from grounded_trials import Workspace
+
+ROOT = Path(__file__).resolve().parents[2]
+MODEL = """
+from grounded import Model, Param
+
+def rate(s, a, p):
+    return {"x": s.v, "v": (a.force - p.c * s.v) / p.M}
+
+model = Model(name="sled", states={"x": "m", "v": "m/s"}, inputs={"force": "N"},
+              params={"M": Param(1.0, "kg", 0.5, 2.0), "c": Param(0.3, "1", 0.0, 1.0)},
+              derivative=rate)
+"""
+
+
+@pytest.fixture(autouse=True)
+def installed(monkeypatch):
+    """The entry points as pyproject.toml declares them, installed or not."""
+    points = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]
+
+    def found(group):
+        return [EntryPoint(name, value, group) for name, value in points.get(group, {}).items()]
+
+    monkeypatch.setattr("importlib.metadata.entry_points", found)
+
+
+@pytest.fixture
+def blank(tmp_path):
+    (tmp_path / "sled.py").write_text(MODEL)
+    return Workspace.create(tmp_path / "w", model=tmp_path / "sled.py")
+
+
+def driver(folder):
+    spec = importlib.util.spec_from_file_location("drive", folder / "drive.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_a_blank_workspace_goes_from_a_model_to_an_accepted_trial(blank, tmp_path, monkeypatch):
+    proposed = blank.propose()
+    drive = driver(blank.folder)
+    state, sent = np.array([0.0, 0.0]), []  # target.csv says where it starts
+    monkeypatch.setattr(drive.time, "sleep", lambda seconds: None)
+
+    def send(u):
+        sent.append(float(u[0]))
+        state[:] += 0.05 * np.array([state[1], u[0] - 0.5 * state[1]])
+
+    monkeypatch.setattr(drive, "measure", lambda: state.copy())
+    monkeypatch.setattr(drive, "send", send)
+    drive.main(str(proposed.file), str(tmp_path / "run.mcap"))
+    assert len(sent) == 101
+    taken = blank.ingest(tmp_path / "run.mcap")
+    assert taken.candidate == "c0001"
+    assert blank.status().standing.incumbent.candidate.id == "c0001"
+
+
+def test_what_is_missing_in_the_robots_program_is_named(blank):
+    with pytest.raises(NotImplementedError, match="measure"):
+        driver(blank.folder).measure()
+
+
+def test_a_candidate_as_proposed_runs_like_its_export(blank, tmp_path):
+    candidate = blank.propose()
+    as_proposed = load(candidate.file, states=("x", "v"), inputs=("force",))
+    as_exported = load(blank.export("c0001", tmp_path / "c0001.npz").file)
+    for t, s in ((0.0, [1.0, 0.2]), (0.05, [0.9, 0.1]), (99.0, [0.0, 0.0])):
+        np.testing.assert_array_equal(as_proposed.action(t, s), as_exported.action(t, s))
+    with pytest.raises(GroundedError, match="this robot has"):
+        load(candidate.file, states=("v", "x"))
+    with pytest.raises(GroundedError, match="set up for"):
+        load(candidate.file, task="0" * 16)
+
+
+def test_a_candidate_is_not_read_where_nothing_reads_it(blank, monkeypatch):
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: [])
+    with pytest.raises(GroundedError, match="npz"):
+        load(blank.propose().file)
+
+
+def test_nothing_is_overwritten(blank, tmp_path):
+    before = (blank.folder / "drive.py").read_bytes()
+    with pytest.raises(GroundedError, match="exists already"):
+        Workspace.create(blank.folder, model=tmp_path / "sled.py")
+    assert (blank.folder / "drive.py").read_bytes() == before

@@ -1,0 +1,218 @@
+"""One name, one policy; and `verify` proves the whole workspace.
+
+What was measured on 0.1: a rewritten candidate was sent and `verify` was clean, joined workspaces
+averaged two policies called c0002, one bit in diagnosis.json was adopted as 9.54 for 1.54 (1,539 of
+6,000 flips silent), a slow `propose` replaced a candidate that was handed out.
+"""
+
+import shutil
+
+import numpy as np
+import pytest
+from test_next_step import diagnosed
+
+from grounded.errors import GroundedError
+from grounded_trials import Workspace
+from grounded_trials.report.reporting import save_optimum
+from grounded_trials.store.documents import StudyStore, proven
+from grounded_trials.workspace.diagnosing import read_diagnosis
+from grounded_trials.workspace.proposing import standing_in
+from reported import cart, copied
+from workspaces import CONFIG, make
+
+__all__ = ["cart"]
+
+
+def learnt(folder, trials=2, **files):
+    w = Workspace(make(folder, **files).folder)
+    w.learn(trials)
+    return w
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    return learnt(tmp_path_factory.mktemp("identity") / "w")
+
+
+@pytest.fixture
+def w(made, tmp_path):
+    return Workspace(shutil.copytree(made.folder, tmp_path / "w"))
+
+
+def test_every_flipped_bit_of_a_diagnosis_is_found(cart, tmp_path):
+    """All of them: on 0.1, 1,539 of 6,000 were read as another diagnosis."""
+    folder = copied(cart, tmp_path / "w")
+    w = Workspace(folder)
+    path = folder / "reports" / "diagnosis.json"
+    data, silent = path.read_bytes(), 0
+    assert read_diagnosis(w.reports) is not None
+    for bit in range(8 * len(data)):
+        flipped = bytearray(data)
+        flipped[bit // 8] ^= 1 << bit % 8
+        try:
+            proven(bytes(flipped), path)
+            silent += 1
+        except GroundedError:
+            pass
+    assert silent == 0 and len(data) > 2000
+    path.write_bytes(data[:700] + bytes([data[700] ^ 4]) + data[701:])
+    assert [one.file for one in w.verify().damaged] == [str(path)]
+    with pytest.raises(GroundedError, match="diagnose again"):
+        w.adopt("viscous_friction:v")
+
+
+def test_a_diagnosis_without_a_checksum_is_not_adopted(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    path = folder / "reports" / "diagnosis.json"
+    text = path.read_text()
+    path.write_text("{" + text.split(",", 1)[1])
+    with pytest.raises(GroundedError, match="has no checksum"):
+        Workspace(folder).adopt("viscous_friction:v")
+
+
+def test_a_flipped_optimum_and_a_flipped_result_of_a_study_are_not_read(w, tmp_path):
+    save_optimum(w, -1.5)
+    path = w.reports / "optimum.json"
+    path.write_bytes(path.read_bytes().replace(b"-1.5", b"-9.5"))
+    assert w.report().findings.optimum is None
+    assert [one.file for one in w.verify().damaged] == [str(path)]
+    store = StudyStore(tmp_path / "study")
+    store["seed 1"] = {"utility": 1.5, "error": float("nan")}
+    assert store["seed 1"]["utility"] == 1.5 and len(store) == 1
+    (path,) = store.folder.iterdir()
+    path.write_bytes(path.read_bytes().replace(b"1.5", b"9.5"))
+    assert "seed 1" not in store and len(store) == 0
+
+
+def test_every_flipped_byte_of_a_note_is_found(w):
+    (note, *_) = sorted(w.store.folder.glob("n*.json"))
+    data = note.read_bytes()
+    note.chmod(0o644)
+    for k in range(0, len(data), 7):
+        note.write_bytes(data[:k] + bytes([data[k] ^ 1]) + data[k + 1 :])
+        assert [one.file for one in w.verify().damaged] == [str(note)], k
+
+
+@pytest.mark.parametrize("which", [0, -1])
+def test_a_deleted_trial_is_found_the_last_one_too(w, which):
+    """On 0.1 `verify` counted what was left."""
+    w.propose()  # this hand-out has seen the last trial
+    trials = sorted(w.store.folder.glob("t*.mcap"))
+    assert w.verify().damaged == ()
+    trials[which].unlink()
+    (found,) = w.verify().damaged
+    assert "was removed" in found.reason
+    assert w.report().findings.lost
+
+
+def test_a_deleted_candidate_is_found_unless_a_trial_carries_it(w):
+    waiting = w.propose().candidate.id
+    w.candidate_path("c0001").unlink()
+    assert w.verify().damaged == ()
+    w.candidate_path(waiting).unlink()
+    (found,) = w.verify().damaged
+    assert waiting in found.file
+
+
+def test_a_rewritten_candidate_with_a_checksum_of_its_own_is_found(w, tmp_path):
+    """Another workspace's c0003 is whole and predicts itself; it is not what was handed out."""
+    waiting = w.propose().candidate.id
+    other = learnt(tmp_path / "other", config=CONFIG.replace("x = 10.0", "x = 20.0"))
+    other.propose()
+    shutil.copy(other.candidate_path(waiting), w.candidate_path(waiting))
+    (found,) = w.verify().damaged
+    assert "was rewritten" in found.reason
+    with pytest.raises(GroundedError, match="not what was handed out"):
+        w.run(waiting)
+
+
+def test_joined_workspaces_never_mix_two_policies_of_one_name(w, tmp_path):
+    """On 0.1 the two trials of c0002 were averaged, though two policies had run."""
+    config = CONFIG.replace("max_trials", "refit = true\nmax_trials")  # the same task
+    other = learnt(tmp_path / "other", config=config)
+    assert other.task.hash == w.task.hash
+    assert other.candidate_bytes("c0002") != w.candidate_bytes("c0002")
+    before = w.status()
+    for path in (other.folder / "trials").iterdir():
+        if not (w.store.folder / path.name).exists():
+            shutil.copy(path, w.store.folder)
+    now = w.status()
+    tried = now.standing.history[1]
+    assert len(tried.trials) == 1 and tried.utility == before.standing.history[1].utility
+    assert len(w.trials()) > len(before.standing.history)
+    (name,) = {t.trial.candidate for t in w.trials() if "~" in t.trial.candidate}
+    assert name.startswith("c0002~") and any("c0002" in note for note in now.notes)
+    assert w.verify().damaged == ()
+    w.candidate_path("c0002").unlink()  # and the first that ran it has the name
+    assert len(w.status().standing.history[1].trials) == 1
+
+
+def test_a_slow_propose_does_not_replace_what_was_handed_out(w, monkeypatch):
+    """On 0.1 the second wrote over the file that a robot was about to run."""
+    from grounded.search import improve
+
+    plan, quick = improve.propose, []
+
+    def slow(*args, **kwargs):
+        proposal = plan(*args, **kwargs)
+        if not quick:  # somebody else proposes while this one plans
+            quick.append(True)
+            other = Workspace(w.folder)
+            quick.append(other.propose().candidate.id)
+            quick.append(other.candidate_bytes(quick[1]))
+        return proposal
+
+    monkeypatch.setattr(improve, "propose", slow)
+    mine = w.propose()
+    assert mine.candidate.id == quick[1] and not mine.proposal.is_new
+    assert w.candidate_bytes(quick[1]) == quick[2] and w.verify().damaged == ()
+
+
+def test_another_policy_never_gets_the_name_of_one_that_was_handed_out(w):
+    """Its file is gone, the robot may still run it: the next policy has another name."""
+    first = w.propose().candidate
+    w.candidate_path(first.id).unlink()
+    w.forget()
+    again = w.propose().candidate
+    assert again.id == first.id  # the same policy
+    w.candidate_path(first.id).unlink()
+    w.config.file.write_text(w.config.file.read_text().replace("x = 10.0", "x = 11.0"))
+    other = w.propose().candidate
+    assert other.id != first.id
+    assert not np.array_equal(other.policy.feedforward, first.policy.feedforward)
+
+
+def test_a_hand_out_is_recorded_once(w):
+    identity = w.propose().candidate.id
+    count = len(w.notes.store.list())
+    w.propose()
+    assert len(w.notes.store.list()) == count
+    assert set(w.noted.handed) == {"c0001", "c0002", identity}
+
+
+def test_a_workspace_of_an_older_version_is_read_as_it_is(w):
+    """It has no notes, and trials that name a candidate without carrying it."""
+    before = standing_in(w).utilities
+    for note in w.store.folder.glob("n*.json"):
+        note.unlink()
+    w.forget()
+    assert standing_in(w).utilities == before and w.verify().damaged == ()
+    assert w.propose().candidate is not None
+
+
+def test_what_a_bare_trial_ran_is_kept_beside_it(w, tmp_path):
+    from grounded_trials.store.trial_file import read_trial, write_trial
+
+    ran = w.run(w.propose().candidate.id)
+    trial, meta, _ = read_trial(ran.trial_file)
+    write_trial(tmp_path / "bare.mcap", trial, {"kind": "trial", "task": meta["task"]})
+    found = w.ingest(tmp_path / "bare.mcap")
+    assert w.noted.ran.keys() == {found.sha256[:16]}
+
+
+def test_a_diagnosis_is_told_apart_from_no_diagnosis(tmp_path):
+    w = make(tmp_path / "w")
+    assert read_diagnosis(w.reports) is None
+    w.reports.mkdir()
+    diagnosed(w.folder)
+    assert read_diagnosis(w.reports) is not None

@@ -1,0 +1,216 @@
+"""Is this log that run? What FACTS of 0.1 found: a manual-driving log was taken for a candidate's.
+
+Every test here fails on 0.1, which compared nothing and knew no `discard`.
+"""
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cli import grounded
+from grounded.errors import GroundedError
+from grounded.trial import Trial
+from grounded_trials import Workspace
+from grounded_trials.store.trial_file import read_trial, write_trial
+from grounded_trials.workspace.ingest import ingest_log
+from grounded_trials.workspace.proposing import propose_in, standing_in
+from grounded_trials.workspace.running import run_candidate
+from grounded_trials.workspace.trial_check import what_ran
+from workspaces import CONFIG, make
+
+NOISY = CONFIG + "[system.noise.measurement]\nx = 0.002\nv = 0.01\n"
+
+
+@pytest.fixture(scope="module")
+def learnt(tmp_path_factory):
+    """Three candidates of a cart with noisy sensors, each with its trial."""
+    w = make(tmp_path_factory.mktemp("w") / "w", config=NOISY)
+    for _ in range(3):
+        ingest_log(w, run_candidate(w, propose_in(w).candidate.id).trial_file)
+    return w
+
+
+def runs(w):
+    contents = w.read()
+    by_id = {c.id: c for c in contents.candidates}
+    return [(by_id[t.trial.candidate], t.trial, contents.candidates) for t in contents.trials]
+
+
+def late(x):
+    return np.vstack([x[:1], x[:-1]])
+
+
+HONEST = {
+    "as it was": lambda x, u: (x, u),
+    "inputs a step late": lambda x, u: (x, late(u)),
+    "states a step late": lambda x, u: (late(x), u),
+    "noisy log": lambda x, u: (x + np.random.default_rng(1).normal(0, 0.01, x.shape), u),
+    "coarse commands": lambda x, u: (x, np.round(u, 1)),
+    "before clipping": lambda x, u: (x, np.where(np.abs(u) >= 5, 1.5 * u, u)),
+}
+OTHERS = {
+    "somebody": lambda u: 3 * np.sin(np.arange(len(u)) / 3)[:, None],
+    "the same half a second late": lambda u: np.vstack([u[:1]] * 10 + [u[:-10]]),
+    "nobody": lambda u: 0 * u,
+    "backwards": lambda u: u[::-1],
+}
+
+
+@pytest.mark.parametrize("kind", HONEST)
+def test_a_run_is_recognised_though_the_log_is_not_perfect(learnt, kind):
+    for own, trial, candidates in runs(learnt):
+        states, inputs = HONEST[kind](np.array(trial.states), np.array(trial.inputs))
+        logged = replace(trial, states=states, inputs=inputs)
+        assert what_ran(learnt.task, logged, own, candidates) == ""
+
+
+@pytest.mark.parametrize("kind", OTHERS)
+def test_other_commands_are_not_the_candidate_s(learnt, kind):
+    for own, trial, candidates in runs(learnt):
+        logged = replace(trial, inputs=OTHERS[kind](np.array(trial.inputs)))
+        assert "force differs by" in what_ran(learnt.task, logged, own, candidates)
+
+
+def test_every_pair_of_candidates_is_told_apart(learnt):
+    for own, trial, candidates in runs(learnt):
+        for other in candidates:
+            why = what_ran(learnt.task, replace(trial, candidate=other.id), other, candidates)
+            assert why.endswith(f"those of {own.id}") if other.id != own.id else why == ""
+
+
+def test_a_takeover_is_dated(learnt):
+    own, trial, candidates = runs(learnt)[0]
+    inputs = np.array(trial.inputs)
+    inputs[25:] = -inputs[25:] + 2
+    why = what_ran(learnt.task, replace(trial, inputs=inputs), own, candidates)
+    assert re.search(r"up to 1\.[0-3] s", why)
+
+
+@pytest.fixture
+def waiting(tmp_path):
+    """A workspace that waits for c0002, and a log of manual driving."""
+    w = Workspace(make(tmp_path / "w").folder)
+    ran = w.run(w.propose().candidate.id).trial_file
+    w.ingest(ran)
+    w.propose()
+    t = 0.05 * np.arange(41)
+    driven = Trial(
+        states=np.column_stack([1 - np.cos(t), np.sin(t)]),
+        inputs=(1.4 * np.cos(t) + 0.5 * np.sin(t))[:40, None],
+        dt=0.05,
+        state_names=("x", "v"),
+        input_names=("force",),
+    )
+    write_trial(tmp_path / "driven.mcap", driven, {"kind": "trial"})
+    return w, ran, tmp_path / "driven.mcap"
+
+
+def test_manual_driving_is_refused_and_taken_as_data(waiting):
+    w, _, driven = waiting
+    refused = grounded("-C", w.folder, "ingest", driven)
+    assert refused.code == 1 and "did not run c0002" in refused.err and "--data" in refused.err
+    assert len(w.store.list()) == 1
+    taken = grounded("-C", w.folder, "ingest", driven, "--data", "--json")
+    assert taken.code == 0 and taken.json["trials"][0]["candidate"] is None
+    w.forget()
+    assert standing_in(w).outstanding.id == "c0002"
+
+
+def test_a_named_candidate_overrides_with_a_warning(waiting):
+    w, _, driven = waiting
+    found = w.ingest(driven, candidate="c0002")
+    assert found.candidate == "c0002" and "force differs by" in found.warnings[0]
+
+
+def test_the_log_of_another_candidate_says_so(waiting, tmp_path):
+    w, ran, _ = waiting
+    trial, _, _ = read_trial(ran)
+    write_trial(tmp_path / "again.mcap", replace(trial, candidate=""), {"kind": "trial"})
+    with pytest.raises(GroundedError, match="those of c0001"):
+        w.ingest(tmp_path / "again.mcap")
+    assert w.ingest(tmp_path / "again.mcap", candidate="c0001").candidate == "c0001"
+
+
+def test_a_discarded_trial_counts_nowhere_until_it_is_restored(waiting):
+    w, _, driven = waiting
+    w.ingest(w.run().trial_file)
+    before = w.status()
+    w.ingest(driven, data=True)
+    done = grounded("-C", w.folder, "discard", "T0002", "--why", "a wheel was loose", "--json")
+    assert done.code == 0 and done.json == {
+        "trials": ["t0002"],
+        "discarded": {"t0002": "a wheel was loose"},
+    }
+    now = w.status()
+    assert now.standing.outstanding.id == "c0002" and now.standing.trials == 1
+    assert [t.stored.id for t in w.trials()] == ["t0001", "t0003"]
+    assert "a wheel was loose" in grounded("-C", w.folder, "status").out
+    assert grounded("-C", w.folder, "status", "--json").json["discarded"] == now.discarded
+    assert "aside: t0002" in grounded("-C", w.folder, "report").out
+    assert len(w.store.list()) == 3 and w.verify().damaged == ()  # nothing is deleted
+    assert w.restore("t0002").discarded == {}
+    assert w.status().standing.utilities == before.standing.utilities
+    assert w.discard("t0002").discarded == {"t0002": ""}  # and again
+
+
+def test_a_discarded_trial_that_is_ingested_again_stays_aside(waiting):
+    w, ran, _ = waiting
+    w.discard("t0001")
+    found = w.ingest(ran)
+    assert found.known and any("set aside" in text for text in found.warnings)
+    assert w.status().standing.trials == 0
+
+
+def test_a_name_that_no_trial_has(waiting):
+    w, _, _ = waiting
+    with pytest.raises(GroundedError, match="no file 't0009'"):
+        w.discard("t0001", "T0009")
+    assert w.discarded() == {}
+
+
+def test_a_damaged_note_is_named_and_the_trial_does_not_come_back_silently(waiting):
+    w, _, _ = waiting
+    w.discard("t0001")
+    (note,) = (w.folder / "trials").glob("n0001-*.json")
+    note.chmod(0o644)
+    note.write_text(json.dumps({"note": "restore", "trial": "0" * 16, "why": ""}))
+    assert [one.file for one in w.verify().damaged] == [str(note)]
+    with pytest.raises(GroundedError, match="is damaged"):
+        w.status()
+
+
+FOREIGN = CONFIG.replace("[system]", "[unused]").split("[unused]")[0] + (
+    '[log]\nclock = "publish"\n[log.state.x]\npath = "/state.x"\n[log.state.v]\n'
+    'path = "/state.v"\n[log.input.force]\npath = "/input.force"\nresample = "hold"\n'
+)
+
+
+def test_several_foreign_logs_are_taken_in_one_after_another(tmp_path):
+    """`ingest A B C`: on 0.1 the first emptied the [log] table, and the second was refused."""
+    w = make(tmp_path / "w", config=FOREIGN)
+    paths = [tmp_path / f"{k}.mcap" for k in range(3)]
+    for k, path in enumerate(paths):
+        foreign_log(path, k)
+    for path in paths:
+        assert not ingest_log(w, path, data=True).known
+    assert grounded("-C", w.folder, "ingest", "--data", *paths).code == 0
+    assert len(w.store.list()) == 3
+
+
+def foreign_log(path, seed):
+    """A log that is no trial of ours: the same channels, without the table `grounded`."""
+    from grounded_trials.formats.mcap_writer import LogWriter, encode_doubles
+
+    values = np.random.default_rng(seed).normal(size=(81, 3))
+    with path.open("wb") as stream:
+        log = LogWriter(stream)
+        state = log.channel("/state", "State", ["x", "v"])
+        force = log.channel("/input", "Input", ["force"])
+        rows = zip(encode_doubles(values[:, :2]), encode_doubles(values[:, 2:]), strict=True)
+        for k, (x, u) in enumerate(rows):
+            log.message(state, k * 25_000_000, x)
+            log.message(force, k * 25_000_000, u)
+        log.finish()

@@ -1,0 +1,167 @@
+"""The page's section on the diagnosis: predictions before and after it, then the details."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from grounded.diagnosis.pictures import accuracy_figure, credit_figure, where_figure
+from grounded.diagnosis.report import ChannelParts, Diagnosis, Parts, Split
+from grounded_trials.report.diagnosis_words import (
+    WHITE,
+    gap_sentence,
+    horizons,
+    main_horizon,
+    parts_sentence,
+    sentences,
+    utility_sentence,
+    whiteness_sentence,
+)
+from grounded_trials.report.figures.gap import forecast_figures, residual_figures
+from grounded_trials.report.findings import Findings
+from grounded_trials.report.page.tables import (
+    Block,
+    drawn,
+    effect_table,
+    forecast_table,
+    leftover_table,
+    table,
+)
+from grounded_trials.wording import figure, percent, rendered
+from grounded_trials.workspace.next_step import DIAGNOSE, Since
+
+MOST = 6  # states whose error without each effect is drawn
+
+
+def gap_section(findings: Findings) -> list[Block]:
+    """What was diagnosed, and forecasts of the crude model beside the better one."""
+    diagnosis = findings.diagnosis
+    ahead = [b for each in forecast_figures(findings) for b in drawn(each, title=True)]
+    lacking = [b for each in residual_figures(findings) for b in drawn(each, title=True)]
+    if diagnosis is None:
+        words = "Not diagnosed yet. This says where the model is wrong, and what makes it so:"
+        command = Block("command", rendered(DIAGNOSE), "c-diagnose")
+        return [Block("text", words), command, *ahead, *forecast_table(findings), *lacking]
+    verdict = Block("verdict", lines=verdict_lines(diagnosis, findings.since))
+    if diagnosis.no_cause:  # with too little data, what was fitted is no finding
+        return [verdict, *ahead, *forecast_table(findings), *lacking]
+    proof = drawn(accuracy_figure(diagnosis), title=True)
+    proof += drawn(credit_figure(diagnosis, MOST), title=True)
+    proof += [*ahead, *forecast_table(findings)]
+    return [verdict, *proof, *lacking, *_details(diagnosis, findings.since)]
+
+
+def verdict_lines(diagnosis: Diagnosis, since: Since, most: int = 99) -> list[str]:
+    """The verdict, a line for each of its sentences; what happened since stands before it."""
+    texts = sentences(diagnosis.sentence or diagnosis.kind)[:most]
+    if since.adopted:
+        texts[0] = f"Before that: {texts[0]}"
+    return [f"{_begun(since.sentence)}."] * bool(since.sentence) + texts
+
+
+def _details(diagnosis: Diagnosis, since: Since) -> list[Block]:
+    found = drawn(where_figure(diagnosis), title=True)
+    if diagnosis.ranking:
+        found += [Block("heading", "Effects that were weighed"), effect_table(diagnosis, since)]
+    found += _alike(diagnosis) + _by_trial(diagnosis)
+    if diagnosis.leftover:
+        found += [Block("heading", "What no known effect explains"), leftover_table(diagnosis)]
+    found += _made_of(diagnosis.where.split) + _rest(diagnosis)
+    if text := utility_sentence(diagnosis):
+        found += [Block("heading", "Utility, predicted"), Block("text", f"{_begun(text)}.")]
+    if diagnosis.gap.measured:
+        found.append(Block("soft", f"Gap: {gap_sentence(diagnosis.gap)}."))
+    return found
+
+
+def preflight(diagnosis: Diagnosis) -> list[str]:
+    """What was found wrong with the signals themselves, before any effect was weighed."""
+    found: Sequence[Any] = getattr(diagnosis, "preflight", ())
+    corrected = {True: ": corrected", False: ": not corrected"}
+    return [f"{p.signal}: {p.finding}{corrected[bool(p.corrected)]}." for p in found]
+
+
+def _by_trial(diagnosis: Diagnosis) -> list[Block]:
+    """Whether every trial asks for the same value."""
+    found: Sequence[Any] = getattr(diagnosis, "per_trial", ())
+    if not found:
+        return []
+    rows = [
+        (
+            p.effect,
+            p.trial,
+            f"{figure(p.value, 3)} ± {figure(p.std, 2)}",
+            "yes" if p.agrees else "no",
+        )
+        for p in found
+    ]
+    header = ("effect", "trial ", "value", "agrees with the others")
+    strong = [i for i, p in enumerate(found) if not p.agrees]
+    return [Block("heading", "Trial by trial"), table("per-trial", header, rows, strong)]
+
+
+def _alike(diagnosis: Diagnosis) -> list[Block]:
+    """Ties, and effects that would do nearly the same as one that is claimed."""
+    found = [
+        Block("text", f"These data can’t tell apart: {', '.join(group)}.")
+        for group in diagnosis.indistinguishable
+    ]
+    if diagnosis.lookalikes:
+        rows = [(one.effect, one.like, percent(one.share)) for one in diagnosis.lookalikes]
+        words = (
+            "In these trials the look-alike, by itself, would make this share of what the claimed "
+            "effect does. A trial in which the two differ settles it."
+        )
+        found += [Block("heading", "Look-alikes"), Block("text", words)]
+        found.append(table("lookalikes", ("claimed effect", "look-alike ", "share"), rows))
+    return found
+
+
+def _made_of(splits: Mapping[str, Split]) -> list[Block]:
+    """The squared error in three parts: at each horizon in all, and by state."""
+    if not splits:
+        return []
+    header = ("ahead", "explained", "unexplained", "noise")
+    rows = [(words, *_shares(one.whole)) for words, one in horizons(splits)]
+    ahead, main = main_horizon(splits)
+    by_state = [(parts.name, *_shares(parts)) for parts in main.channels]
+    repeated = any(one.irreducible_from == "repeats" for one in splits.values())
+    source = "repeated trials" if repeated else "the estimated noise"
+    words = (
+        f"{_begun(parts_sentence(splits))}. Explained is what the effects take away on trials that "
+        "were held out, unexplained what they leave above the noise; how large the noise is comes "
+        f"from {source}."
+    )
+    each = table("split-states", ("state", *header[1:]), by_state)
+    return [
+        Block("heading", "What the error is made of"),
+        Block("text", words),
+        table("split", header, rows),
+        Block("folded", f"By state, {ahead} ahead", blocks=[each]),
+    ]
+
+
+def _shares(parts: Parts | ChannelParts) -> tuple[str, str, str]:
+    shares = (parts.explained, parts.unexplained, parts.irreducible)
+    explained, unexplained, noise = (f"{100 * s:.1f} %" if s == s else "-" for s in shares)
+    return explained, unexplained, noise
+
+
+def _rest(diagnosis: Diagnosis) -> list[Block]:
+    """Whether what the effects leave is noise, by state."""
+    whiteness = diagnosis.where.whiteness
+    if not whiteness:
+        return []
+    rows = [
+        (name, f"{p:.2g}" if p >= 1e-4 else "< 0.0001", "pattern" if p < WHITE else "white noise")
+        for name, p in whiteness.items()
+    ]
+    return [
+        Block("heading", "Is there a pattern in the rest?"),
+        Block("text", f"{_begun(whiteness_sentence(whiteness))}."),
+        table("whiteness", ("state", "p (white noise)", "what is left "), rows),
+    ]
+
+
+def _begun(sentence: str) -> str:
+    return sentence[:1].upper() + sentence[1:]

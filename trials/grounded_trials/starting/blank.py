@@ -1,0 +1,120 @@
+"""A workspace from a model file alone: what a robot that no example is like begins with.
+
+Everything that has to be said about the task is there with a value that runs, to be replaced: the
+target holds every state at zero, each weighs 1, no input has a limit. `drive.py` is the robot's
+program: it reads the candidate and writes the trial, and lacks two functions, `measure` and `send`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from grounded.errors import GroundedError
+from grounded.model import Model
+from grounded.task import Task
+from grounded.utility import Reward
+from grounded_trials.store.store import write_atomically
+from grounded_trials.workspace.config import FILE
+from grounded_trials.workspace.examples import fresh_folder, toml_of
+from grounded_trials.workspace.model_file import load_module, model_in
+from grounded_trials.workspace.task_file import write_target
+
+DT, HORIZON = 0.05, 100  # [s], steps
+COMMAND = 'command = "python drive.py {candidate} {trial}"   # or by hand: propose, drive, ingest'
+DRIVE = '''"""The robot's program: runs a candidate, writes its trial. `grounded run` calls it so:
+
+    python drive.py candidates/c0001.mcap runs/c0001-1.mcap
+"""
+
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from grounded.policy import load
+from grounded_trials.store.trial_file import TrialWriter
+
+STATES = {states}
+INPUTS = {inputs}
+
+
+def measure():
+    """The robot's states now, in the order of STATES: one number each."""
+    raise NotImplementedError("drive.py: measure() is yours to write")
+
+
+def send(u):
+    """Sends the inputs u, in the order of INPUTS; they are inside [limits]."""
+    raise NotImplementedError("drive.py: send() is yours to write")
+
+
+def main(candidate, trial):
+    runner = load(candidate, states=tuple(STATES), inputs=tuple(INPUTS))
+    dt, steps = runner.policy.dt, len(runner.policy.feedforward)
+    about = dict(dt=dt, states=STATES, inputs=INPUTS, meta={{"kind": "trial"}})
+    with TrialWriter(trial, candidate=Path(candidate).stem, **about) as log:
+        start = time.monotonic()
+        for step in range(steps + 1):
+            time.sleep(max(0.0, start + step * dt - time.monotonic()))
+            state = np.asarray(measure(), dtype=float)
+            u = runner.action(step * dt, state)  # past the end: the input that was held before
+            send(u)
+            log.append(step * dt, state, u if step < steps else None)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
+'''
+
+
+def write_blank(folder: Path, file: str | Path) -> None:
+    """Writes a workspace for the model of a file; an existing file is never overwritten.
+
+    Args:
+        folder: where it is made.
+        file: holds `model`; it is copied to model.py, files that it imports are not.
+
+    Raises:
+        GroundedError: if the file holds no model, or the folder a workspace already.
+    """
+    file = Path(file)
+    model = model_in(load_module(file.resolve().parent, file.name, key="--blank"))
+    try:
+        source = file.read_bytes()
+    except OSError as error:
+        raise GroundedError(f"{file} can't be read: {error.strerror}") from None
+    own = file.resolve() == (folder / "model.py").resolve()
+    fresh_folder(folder, (FILE, "target.csv", "drive.py") if own else FILES)
+    if not own:
+        write_atomically(folder / "model.py", source)
+    task = _task(model)
+    columns = {name: task.target[:, i] for i, name in enumerate(model.state_names)}
+    write_target(folder / "target.csv", task.dt, columns)
+    drive = DRIVE.format(states=dict(model.states), inputs=dict(model.inputs))
+    write_atomically(folder / "drive.py", drive.encode())
+    text = toml_of(
+        task, f"{model.name or file.stem}: target, weights and limits are yours", COMMAND
+    )
+    write_atomically(folder / FILE, text.encode())
+
+
+FILES = (FILE, "model.py", "target.csv", "drive.py")
+
+
+def _task(model: Model) -> Task:
+    """Hold every state at zero for five seconds."""
+    n, m = model.n, model.m
+    free = np.full(m, np.inf)
+    return Task(
+        model=model,
+        dt=DT,
+        target=np.zeros((HORIZON + 1, n)),
+        reward=Reward(np.ones(n), np.zeros(n), np.full(m, 0.01), np.full(m, 0.01)),
+        start=np.zeros(n),
+        past=np.zeros(m),
+        low=-free,
+        high=free,
+    )

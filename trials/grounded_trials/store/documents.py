@@ -1,0 +1,153 @@
+"""What is kept as JSON: documents that prove themselves, results of studies, notes on trials.
+
+A document's file begins with the SHA-256 of every byte behind it, so that no flipped bit is read as
+another number:
+
+    {
+     "sha256": "3f9a...",
+     "verdict": ...
+
+A note says what a person decided, or what was handed out. Notes are files of the store, numbered
+and named by their hashes, never rewritten and never deleted: the later one holds, and copying a
+folder copies them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Iterator, Mapping, MutableMapping
+from pathlib import Path
+from typing import Any
+
+from grounded.errors import GroundedError
+from grounded_trials.store.store import Damaged, Store, write_atomically
+
+_SEALED = re.compile(rb'\{\n "sha256": "([0-9a-f]{64})",(\n.*)', re.DOTALL)
+
+
+def write_document(path: Path, document: Mapping[str, Any], *, nan: bool = False) -> None:
+    """Writes a JSON document with its checksum; the file appears complete or not at all.
+
+    Args:
+        path: the file.
+        document: what goes in.
+        nan: allow numbers that JSON has not, which Python reads.
+
+    Raises:
+        GroundedError: if it can't be written.
+        ValueError: if a number in it is not finite, unless `nan`.
+    """
+    text = json.dumps(dict(document), indent=1, ensure_ascii=False, allow_nan=nan)
+    rest = text[1:].encode() + b"\n"
+    digest = hashlib.sha256(rest).hexdigest()
+    write_atomically(path, b'{\n "sha256": "' + digest.encode() + b'",' + rest)
+
+
+def read_document(path: Path) -> dict[str, Any]:
+    """The document of a file, without its checksum.
+
+    Raises:
+        FileNotFoundError: if there is none.
+        GroundedError: if it can't be read, or is not what was written.
+    """
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise GroundedError(f"{path} can't be read: {error.strerror}") from None
+    return proven(data, path)
+
+
+def proven(data: bytes, path: Path) -> dict[str, Any]:
+    """The same from the bytes of a file; `path` is for messages."""
+    found = _SEALED.fullmatch(data)
+    if found is None:
+        raise GroundedError(f"{path} has no checksum: it is damaged, or of an older version")
+    if hashlib.sha256(found[2]).hexdigest() != found[1].decode():
+        raise GroundedError(f"{path} is not what was written: its checksum does not fit")
+    document: dict[str, Any] = json.loads(b"{" + found[2])
+    return document
+
+
+class StudyStore(MutableMapping[str, dict[str, Any]]):
+    """Results of a study's jobs by key, a document each: a study that was cut off goes on.
+
+    A file is named by the hash of the job's key and holds key and result; one that can't be read,
+    or that holds another key, counts as not there.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise GroundedError(f"{folder} can't be made: {error.strerror}") from None
+
+    def _path(self, key: str) -> Path:
+        return self.folder / f"{hashlib.sha256(key.encode()).hexdigest()[:24]}.json"
+
+    def _read(self, path: Path) -> dict[str, dict[str, Any]]:
+        """A file's key and result; nothing where it can't be read."""
+        try:
+            entry = read_document(path)
+            return {str(entry["key"]): dict(entry["result"])}
+        except (OSError, ValueError, KeyError, TypeError, GroundedError):
+            return {}
+
+    def __getitem__(self, key: str) -> dict[str, Any]:
+        return self._read(self._path(key))[key]
+
+    def __setitem__(self, key: str, value: dict[str, Any]) -> None:
+        write_document(self._path(key), {"key": key, "result": value}, nan=True)
+
+    def __delitem__(self, key: str) -> None:
+        self._path(key).unlink()
+
+    def __iter__(self) -> Iterator[str]:
+        for path in sorted(self.folder.glob("*.json")):
+            yield from self._read(path)
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
+
+
+class Notes:
+    """Notes on trials and candidates, n0001-<hash>.json beside the trials."""
+
+    def __init__(self, folder: Path) -> None:
+        self.store = Store(folder, prefix="n")
+
+    def add(self, note: Mapping[str, str], *, again: bool = True) -> None:
+        """Adds a note.
+
+        Args:
+            note: what it says.
+            again: though there is one that says the same.
+
+        Raises:
+            GroundedError: if it can't be written.
+        """
+        text = json.dumps(dict(note), sort_keys=True)
+        self.store.add(text.encode(), ".json", again=again)
+
+    def read(self, lost: list[Damaged] | None = None) -> Iterator[dict[str, str]]:
+        """All notes in the order in which they were made.
+
+        Args:
+            lost: gets those that are damaged; None: they are complained about.
+
+        Raises:
+            GroundedError: for a damaged one, naming it.
+        """
+        for entry in self.store.list():
+            try:
+                note: dict[str, str] = json.loads(self.store.read(entry))
+            except GroundedError as error:
+                if lost is None:
+                    raise
+                lost.append(Damaged(entry.path, str(error)))
+                continue
+            yield note

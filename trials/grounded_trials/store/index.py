@@ -1,0 +1,245 @@
+"""What the trials of a large store hold, in one file, so that not each is read at every command.
+
+trials/.index.sqlite is derived: it may be deleted, and is made again where it is missing, damaged
+or of another version. A row stands for a file as it was read and proven; it is believed while the
+file has the same size, times and place, and its own checksum fits. Numbers are read when they are
+asked for.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sqlite3
+from collections.abc import Callable
+from contextlib import suppress
+from functools import cached_property
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from grounded.frozen import Array, readonly
+from grounded.trial import Trial, interpolate_gaps
+from grounded_trials.store.store import Stored
+
+KEPT = 2**20  # [bytes] numbers of a longer trial are read from its own file
+_VERSION = 1  # of the tables, and of what `_about` says
+_TABLES = """
+CREATE TABLE trials (name TEXT PRIMARY KEY, stamp TEXT, about TEXT, proof BLOB);
+CREATE TABLE numbers (name TEXT PRIMARY KEY, states BLOB, inputs BLOB, proof BLOB);
+CREATE TABLE worth (name TEXT, task TEXT, utility TEXT, proof BLOB, PRIMARY KEY (name, task));
+"""
+_KNOWN = ("steps", "finite_steps", "known_steps")
+
+
+class KnownTrial(Trial):
+    """A trial whose numbers are read when they are asked for."""
+
+    @classmethod
+    def of(cls, load: Callable[[], Trial], about: dict[str, Any], worth: Worth) -> KnownTrial:
+        """A trial of which `about` is known; `load` reads it, `worth` keeps its utility."""
+        made = object.__new__(cls)
+        held = about["start_inputs"]
+        vars(made).update(
+            dt=about["dt"],
+            state_names=tuple(about["states"]),
+            input_names=tuple(about["inputs"]),
+            id=about["id"],
+            candidate=about["candidate"],
+            start_inputs=None if held is None else readonly(held),
+            _known=about,
+            _load=load,
+            _worth=worth,
+        )
+        return made
+
+    @cached_property
+    def states(self) -> Array:
+        """(T + 1, n), read now."""
+        return cast(Array, vars(self)["_load"]().states)
+
+    @cached_property
+    def inputs(self) -> Array:
+        """(T, m), read now."""
+        return cast(Array, vars(self)["_load"]().inputs)
+
+    @property
+    def steps(self) -> int:
+        """T, without reading the numbers."""
+        return self._of("steps")
+
+    @property
+    def finite_steps(self) -> int:
+        """As a trial's, without reading the numbers."""
+        return self._of("finite_steps")
+
+    @property
+    def known_steps(self) -> int:
+        """As a trial's, without reading the numbers."""
+        return self._of("known_steps")
+
+    def _of(self, name: str) -> int:
+        known = vars(self).get("_known")  # a changed copy has none
+        return int(known[name] if known else getattr(Trial, name).fget(self))
+
+    def repeats(self, other: Trial) -> bool:
+        """As a trial's, by the hash of finite states."""
+        mine, its = (vars(one).get("_known", {}).get("print") for one in (self, other))
+        return bool(mine == its) if mine and its else super().repeats(other)
+
+    def worth(self, task: str, compute: Callable[[], float]) -> float:
+        """The utility in a task, computed once."""
+        worth = vars(self).get("_worth")
+        return compute() if worth is None else worth(task, compute)
+
+
+Worth = Callable[[str, Callable[[], float]], float]
+Reader = Callable[[Stored], tuple[Trial, dict[str, str], bytes | None]]
+
+
+class TrialIndex:
+    """The index of a store's trials.
+
+    Args:
+        folder: where the trials lie.
+        read: reads and proves one, `.id` its short name.
+    """
+
+    def __init__(self, folder: Path, read: Reader) -> None:
+        self._path, self._read = folder / ".index.sqlite", read
+        self._file = self._opened()
+        rows = self._file.execute("SELECT name, stamp, about, proof FROM trials")
+        self._rows = {name: (stamp, about, proof) for name, stamp, about, proof in rows}
+        self._worth: dict[str, dict[str, float]] = {}
+        for *row, proof in self._file.execute("SELECT name, task, utility, proof FROM worth"):
+            if _proof(*row) == proof:
+                self._worth.setdefault(row[0], {})[row[1]] = float(row[2])
+
+    def _opened(self) -> sqlite3.Connection:
+        """The file; where it can't be used, an empty one in memory."""
+        for path in (self._path, self._path, ":memory:"):
+            with suppress(sqlite3.Error, OSError):
+                file = sqlite3.connect(path, timeout=2.0)
+                if file.execute("PRAGMA user_version").fetchone()[0] == _VERSION:
+                    file.execute("SELECT 1 FROM trials, numbers, worth LIMIT 1")
+                    return file
+                file.executescript(f"BEGIN;{_TABLES}PRAGMA user_version={_VERSION};COMMIT;")
+                return file
+            with suppress(OSError):  # damaged, or of another version
+                self._path.unlink(missing_ok=True)
+        raise AssertionError("a database in memory can always be made")
+
+    def about(self, stored: Stored) -> dict[str, Any]:
+        """What is known of a file: its metadata, names, steps, and the hash of what it ran.
+
+        Raises:
+            GroundedError: if the file is damaged.
+        """
+        name, stamp = stored.path.name, _stamp(stored.path)
+        row = self._rows.get(name)
+        if row is not None and row[0] == stamp and _proof(row[0], row[1]) == row[2]:
+            known: dict[str, Any] = json.loads(row[1])
+            return known
+        trial, meta, policy = self._read(stored)
+        about = _about(trial, meta, policy)
+        text = json.dumps(about)
+        row = (stamp, text, _proof(stamp, text))
+        self._rows[name] = row
+        self._write("INSERT OR REPLACE INTO trials VALUES (?, ?, ?, ?)", (name, *row))
+        self._write("DELETE FROM worth WHERE name = ?", (name,))
+        self._worth.pop(name, None)
+        if trial.states.nbytes + trial.inputs.nbytes < KEPT:
+            blobs = (trial.states.tobytes(), trial.inputs.tobytes())
+            numbers = (name, *blobs, _proof(stamp, *blobs))
+            self._write("INSERT OR REPLACE INTO numbers VALUES (?, ?, ?, ?)", numbers)
+        return about
+
+    def trial(self, stored: Stored, about: dict[str, Any], *, bridged: bool) -> Trial:
+        """A trial whose numbers are read when they are asked for.
+
+        Args:
+            stored: its file.
+            about: what `about` said.
+            bridged: short gaps are interpolated.
+        """
+        if bridged and about["gaps"]:
+            return interpolate_gaps(self._loaded(stored, about)).trial
+        return KnownTrial.of(
+            lambda: self._loaded(stored, about), about, self._worth_of(stored.path.name)
+        )
+
+    def _loaded(self, stored: Stored, about: dict[str, Any]) -> Trial:
+        name = stored.path.name
+        with suppress(sqlite3.Error):
+            query = "SELECT states, inputs, proof FROM numbers WHERE name = ?"
+            row = self._file.execute(query, (name,)).fetchone()
+            if row is not None and _proof(self._rows[name][0], *row[:2]) == row[2]:
+                n, m = len(about["states"]), len(about["inputs"])
+                states = np.frombuffer(row[0]).reshape(-1, n)
+                return Trial(
+                    states=states,
+                    inputs=np.frombuffer(row[1]).reshape(-1, m),
+                    dt=about["dt"],
+                    state_names=tuple(about["states"]),
+                    input_names=tuple(about["inputs"]),
+                    id=about["id"],
+                    candidate=about["candidate"],
+                    start_inputs=about["start_inputs"] and np.array(about["start_inputs"]),
+                )
+        return self._read(stored)[0]
+
+    def _worth_of(self, name: str) -> Worth:
+        def worth(task: str, compute: Callable[[], float]) -> float:
+            known = self._worth.setdefault(name, {})
+            if task not in known:
+                known[task] = compute()
+                row = (name, task, repr(float(known[task])))
+                values = (*row, _proof(*row))
+                self._write("INSERT OR REPLACE INTO worth VALUES (?, ?, ?, ?)", values)
+            return known[task]
+
+        return worth
+
+    def _write(self, command: str, values: tuple[Any, ...]) -> None:
+        with suppress(sqlite3.Error):  # read-only, full, or another process writes: only slower
+            self._file.execute(command, values)
+
+    def save(self) -> None:
+        """Keeps what was learnt; where that fails it is learnt again."""
+        with suppress(sqlite3.Error):
+            self._file.commit()
+
+
+def _about(trial: Trial, meta: dict[str, str], policy: bytes | None) -> dict[str, Any]:
+    whole = interpolate_gaps(trial).trial
+    held = trial.start_inputs
+    finite = bool(np.isfinite(trial.states).all())
+    return {
+        "print": hashlib.sha256(trial.states.tobytes()).hexdigest() if finite else "",
+        "id": trial.id,
+        "candidate": trial.candidate,
+        "dt": trial.dt,
+        "states": trial.state_names,
+        "inputs": trial.input_names,
+        "start_inputs": None if held is None else held.tolist(),
+        "gaps": whole is not trial,
+        "ran": "" if policy is None else hashlib.sha256(policy).hexdigest(),
+        "meta": meta,
+    } | {name: getattr(trial, name) for name in _KNOWN}
+
+
+def _stamp(path: Path) -> str:
+    """What changes with a file: size, times, place."""
+    try:
+        found = path.stat()
+    except OSError:
+        return ""
+    return f"{found.st_size}-{found.st_mtime_ns}-{found.st_ctime_ns}-{found.st_ino}"
+
+
+def _proof(*parts: str | bytes) -> bytes:
+    digest = hashlib.sha256()
+    for part in parts:
+        digest.update(part.encode() if isinstance(part, str) else part)
+    return digest.digest()
