@@ -13,7 +13,7 @@ import os
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -395,4 +395,4 @@ class Folder:
             yield own
         for one in self.trials() if trials is None else trials:
             if one.trial.candidate == identity and (policy := one.policy) is not None:
-                yield lambda policy=policy: policy
+                yield partial(bytes, policy)
