@@ -31,7 +31,14 @@ from grounded.estimate import Measurement, NoiseStd, Record, Tracker, noise_of, 
 from grounded.experiments.bench import Bench, optimum, standing_still
 from grounded.experiments.car import BUDGET, ITERATIONS, PAPER, real_case
 from grounded.experiments.driving import RATE, START, film, hands, markers
-from grounded.experiments.jobs import Running, StudyTable, improvement, mean_text, run_study
+from grounded.experiments.jobs import (
+    Running,
+    StudyTable,
+    every,
+    improvement,
+    mean_text,
+    run_study,
+)
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.onboard import Runner
@@ -289,12 +296,7 @@ def run(
     **how: Unpack[Running],
 ) -> EstimatedResult:
     """Every manoeuvre for each seed, on estimated and on true states."""
-    cases = (
-        {"manoeuvre": manoeuvre, "seed": int(seed), "states": states}
-        for manoeuvre in manoeuvres
-        for states in WAYS
-        for seed in seeds
-    )
+    cases = every(manoeuvre=manoeuvres, states=WAYS, seed=map(int, seeds))
     return EstimatedResult(run_study(EstimatedRun, estimated_job, cases, **how))
 
 
