@@ -8,7 +8,7 @@ Trial of MEASURED states and COMMANDED inputs, as from a robot.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -62,8 +62,8 @@ class Plant:
         for name in self.latency:
             self._index(name, model.input_names)
         x = np.array([start.get(name, 0.0) for name in model.state_names], dtype=float)
-        x += self._std(self.noise.start) * rng.standard_normal(model.n)
-        process, error = self._std(self.noise.process), self._std(self.noise.measurement)
+        start_std, process, error = self.stds
+        x += start_std * rng.standard_normal(model.n)
         runner = Runner(policy)
         commands = np.tile(policy.past, (H, 1))
         measured = np.full((H + 1, len(columns)), np.nan)
@@ -71,7 +71,7 @@ class Plant:
         done = H
         for t in range(H):
             commands[t] = runner.action(t * policy.dt, measured[t])
-            x = self._advance(x, commands, t, policy, order)
+            x = self.advance(x[None], commands[None], t, policy, order)[0]
             x = x + process * rng.standard_normal(model.n)
             if not np.isfinite(x).all() or np.abs(x).max() > 1e9:
                 done = t
@@ -86,26 +86,38 @@ class Plant:
             start_inputs=policy.past,
         )
 
-    def _advance(
-        self, x: Array, commands: Array, t: int, policy: Policy, order: list[int]
+    def advance(
+        self, x: Array, commands: Array, t: int, policy: Policy, order: Sequence[int]
     ) -> Array:
-        """One control step in substeps, each with the commands that have arrived by its middle."""
+        """Control step t of N runs in substeps, each with what has arrived by its middle.
+
+        Args:
+            x: states (N, n).
+            commands: sent so far, (N, H, m) in the policy's order.
+            t: the step.
+            policy: that was run.
+            order: index of each of the policy's inputs among the plant's.
+        """
         h = policy.dt / self.substeps
-        u = np.zeros(self.model.m)
+        u = np.zeros((len(x), self.model.m))
         for i in range(self.substeps):
             for j, name in enumerate(policy.input_names):
                 age = self.latency.get(name, 0.0) - (i + 0.5) * h
                 row = t - int(np.ceil(age / policy.dt - 1e-9)) if age > 0 else t
-                u[order[j]] = commands[row, j] if row >= 0 else policy.past[j]
+                u[:, order[j]] = commands[:, row, j] if row >= 0 else policy.past[j]
             with np.errstate(all="ignore"):
-                x = self.model.system.step(x[None], u[None], self.model.values, h)[0]
+                x = self.model.system.step(x, u, self.model.values, h)
         return x
 
-    def _std(self, by_name: Mapping[str, float]) -> Array:
-        std = np.zeros(self.model.n)
-        for name, value in by_name.items():
-            std[self._index(name, self.model.state_names)] = value
-        return std
+    @property
+    def stds(self) -> Array:
+        """Standard deviations of start, process and measurement, (3, n)."""
+        found, noise = np.zeros((3, self.model.n)), self.noise
+        named = (noise.start, noise.process, noise.measurement)
+        for row, by_name in zip(found, named, strict=True):
+            for name, value in by_name.items():
+                row[self._index(name, self.model.state_names)] = value
+        return found
 
     @staticmethod
     def _index(name: str, names: tuple[str, ...]) -> int:

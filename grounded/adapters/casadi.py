@@ -9,7 +9,7 @@ state, columns of n, m and k numbers. A function without dt is taken to step one
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -52,7 +52,7 @@ def model(
             f"last, after the parameters) and return {len(states)}; it takes {found} and returns "
             f"{function.numel_out(0)}"
         )
-    stepper = CasadiStepper(function, tuple(states), tuple(inputs), tuple(params))
+    stepper = CasadiStepper(function, states, inputs, params)
     fields = {"states": states, "inputs": inputs, "params": params, "angles": angles, "name": name}
     return model_of(stepper, **fields)
 
@@ -60,14 +60,8 @@ def model(
 class CasadiStepper(Stepper):
     """A CasADi function over batches."""
 
-    def __init__(
-        self,
-        function: Any,
-        states: tuple[str, ...],
-        inputs: tuple[str, ...],
-        params: tuple[str, ...],
-    ) -> None:
-        super().__init__(states, inputs, params)
+    def __init__(self, function: Any, *names: Iterable[str]) -> None:
+        super().__init__(*names)
         self.function = function
         ca = library("casadi")
         given = [ca.MX.sym(f"i{i}", function.sparsity_in(i)) for i in range(function.n_in())]

@@ -9,7 +9,7 @@ where `step(x, u, p, dt)` takes arrays (n,), (m,), (k,) and a number and returns
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -42,7 +42,7 @@ def model(
         GroundedError: without jax.
     """
     params = params or {}
-    stepper = JaxStepper(step, tuple(states), tuple(inputs), tuple(params))
+    stepper = JaxStepper(step, states, inputs, params)
     fields = {"states": states, "inputs": inputs, "params": params, "angles": angles, "name": name}
     return model_of(stepper, **fields)
 
@@ -50,14 +50,8 @@ def model(
 class JaxStepper(Stepper):
     """A JAX function over batches."""
 
-    def __init__(
-        self,
-        step: Callable[..., Any],
-        states: tuple[str, ...],
-        inputs: tuple[str, ...],
-        params: tuple[str, ...],
-    ) -> None:
-        super().__init__(states, inputs, params)
+    def __init__(self, step: Callable[..., Any], *names: Iterable[str]) -> None:
+        super().__init__(*names)
         self.step = step
         self._prepare()
 

@@ -34,11 +34,12 @@ from grounded.adapters.mujoco_names import (
     FREE,
     SLIDE,
     Controls,
+    Setting,
     controls_of,
     joint_name,
+    setting_of,
     states_of,
 )
-from grounded.adapters.mujoco_params import Setting, setting_of
 from grounded.adapters.stepper import Stepper, library, model_of
 from grounded.adapters.tangent import Coordinates
 from grounded.errors import GroundedError, nearest

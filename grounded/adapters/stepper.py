@@ -7,7 +7,7 @@ step and for its derivatives.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from grounded.model import Model
 class Stepper:
     """Steps and derivatives of software that computes on arrays; subclasses do the computing."""
 
-    def __init__(self, states: Sequence[str], inputs: Sequence[str], params: Sequence[str]) -> None:
+    def __init__(self, states: Iterable[str], inputs: Iterable[str], params: Iterable[str]) -> None:
         self.states, self.inputs, self.params = tuple(states), tuple(inputs), tuple(params)
 
     def __call__(

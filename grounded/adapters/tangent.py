@@ -14,6 +14,7 @@ step is continuous and a full turn counts on.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,38 +36,32 @@ class Coordinates:
 
     def to_qpos(self, r: Array) -> Array:
         """Coordinates (N, nv) -> positions (N, nq)."""
+        from scipy.spatial.transform import Rotation
+
         qpos = np.tile(self.reference, (len(r), 1))
         qpos[:, self.plain] = r[:, self.plain_columns]
         for place, column in zip(self.quaternions, self.rotations, strict=True):
-            turned = exponential(r[:, column : column + 3])
-            about = self.reference[place : place + 4]
-            qpos[:, place : place + 4] = product(about, turned)
+            turned = self._about(place) * Rotation.from_rotvec(r[:, column : column + 3])
+            qpos[:, place : place + 4] = np.roll(turned.as_quat(), 1, axis=1)  # MuJoCo: w first
         return qpos
 
     def from_qpos(self, qpos: Array, near: Array) -> Array:
         """Positions (N, nq) -> coordinates (N, nv), rotation vectors nearest to `near` (N, nv)."""
+        from scipy.spatial.transform import Rotation
+
         r = np.zeros((len(qpos), len(self.plain) + 3 * len(self.rotations)))
         r[:, self.plain_columns] = qpos[:, self.plain]
         for place, column in zip(self.quaternions, self.rotations, strict=True):
-            about = self.reference[place : place + 4] * [1.0, -1.0, -1.0, -1.0]
-            found = logarithm(product(about, qpos[:, place : place + 4]))
+            turned = Rotation.from_quat(np.roll(qpos[:, place : place + 4], -1, axis=1))
+            found = (self._about(place).inv() * turned).as_rotvec()
             r[:, column : column + 3] = nearest_turn(found, near[:, column : column + 3])
         return r
 
+    def _about(self, place: int) -> Any:
+        """The reference orientation of the quaternion at a place in qpos."""
+        from scipy.spatial.transform import Rotation
 
-def exponential(r: Array) -> Array:
-    """Rotation vectors (N, 3) -> unit quaternions (N, 4)."""
-    angle = np.linalg.norm(r, axis=-1, keepdims=True)
-    return np.concatenate([np.cos(angle / 2), 0.5 * np.sinc(angle / (2 * np.pi)) * r], axis=-1)
-
-
-def logarithm(q: Array) -> Array:
-    """Unit quaternions (N, 4) -> rotation vectors (N, 3) of at most pi."""
-    q = np.where(q[:, :1] < 0, -q, q)
-    sine = np.linalg.norm(q[:, 1:], axis=-1, keepdims=True)
-    angle = 2 * np.arctan2(sine, q[:, :1])
-    factor = np.where(sine > 1e-12, angle / np.where(sine > 1e-12, sine, 1.0), 2.0)
-    return np.asarray(factor * q[:, 1:])
+        return Rotation.from_quat(np.roll(self.reference[place : place + 4], -1))
 
 
 def nearest_turn(r: Array, near: Array) -> Array:
@@ -75,18 +70,3 @@ def nearest_turn(r: Array, near: Array) -> Array:
     axis = r / np.where(angle > 1e-12, angle, 1.0)
     along = np.sum(axis * near, axis=-1, keepdims=True)
     return np.asarray(r + 2 * np.pi * np.rint((along - angle) / (2 * np.pi)) * axis)
-
-
-def product(a: Array, b: Array) -> Array:
-    """Quaternion products (N, 4) of a (4,) or (N, 4) with b (N, 4)."""
-    w, x, y, z = np.moveaxis(np.asarray(a), -1, 0)
-    W, X, Y, Z = np.moveaxis(b, -1, 0)
-    return np.stack(
-        [
-            w * W - x * X - y * Y - z * Z,
-            w * X + x * W + y * Z - z * Y,
-            w * Y - x * Z + y * W + z * X,
-            w * Z + x * Y - y * X + z * W,
-        ],
-        axis=-1,
-    )

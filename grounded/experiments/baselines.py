@@ -37,7 +37,7 @@ from grounded.experiments.bench import (
 )
 from grounded.experiments.car_tasks import NAMES
 from grounded.experiments.ilc import gradient_of, lifted, update
-from grounded.experiments.jobs import Running, StudyTable, run_study
+from grounded.experiments.jobs import Running, StudyTable, every, run_study
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.search.first_policy import first_policy
@@ -206,12 +206,9 @@ def run(
 ) -> BaselinesResult:
     """Every method on every case; a job is one of them."""
     cases = (
-        {"method": method, "manoeuvre": manoeuvre, "kind": kind, "seed": seed}
-        for manoeuvre in manoeuvres
-        for kind in kinds
-        for method in methods
-        for seed in seeds
-        if not (method == "differences" and kind == "noise")  # it was given the true gradient
+        case
+        for case in every(manoeuvre=manoeuvres, kind=kinds, method=methods, seed=seeds)
+        if (case["method"], case["kind"]) != ("differences", "noise")  # given the true gradient
     )
     return BaselinesResult(run_study(Line, baselines_job, cases, **how))
 

@@ -173,17 +173,14 @@ def many_runs(
     model, H, N = plant.model, policy.horizon, len(streams)
     assert model.state_names == policy.state_names and model.input_names == policy.input_names
     draws = np.stack([rng.standard_normal((2 + 2 * H, model.n)) for rng in streams])
-    start, process, error = (
-        np.array([getattr(plant.noise, kind).get(name, 0.0) for name in model.state_names])
-        for kind in ("start", "process", "measurement")
-    )
+    start, process, error = plant.stds
     x = task.start + start * draws[:, 0]
     measured = np.full((N, H + 1, model.n), np.nan)
     measured[:, 0] = x + error * draws[:, 1]
     sent = np.tile(policy.past, (N, H, 1))
     for t in range(H):
         sent[:, t] = _actions(policy, measured[:, t], sent, t)
-        x = _advanced(plant, policy, x, sent, t) + process * draws[:, 2 + 2 * t]
+        x = plant.advance(x, sent, t, policy, range(model.m)) + process * draws[:, 2 + 2 * t]
         x = np.where(np.abs(x).max(axis=1, keepdims=True) <= 1e9, x, np.nan)
         measured[:, t + 1] = x + error * draws[:, 3 + 2 * t]
     names = (policy.state_names, policy.input_names)
@@ -208,20 +205,6 @@ def _actions(policy: Policy, x: Array, sent: Array, t: int) -> Array:
         u += np.where(np.isfinite(correction).all(axis=1, keepdims=True), correction, 0.0)
     clipped: Array = np.clip(u, policy.low, policy.high)
     return clipped
-
-
-def _advanced(plant: Plant, policy: Policy, x: Array, sent: Array, t: int) -> Array:
-    """One control step of N cars in substeps, each with the commands that have arrived."""
-    h = policy.dt / plant.substeps
-    for i in range(plant.substeps):
-        u = np.empty((len(x), len(policy.input_names)))
-        for j, name in enumerate(policy.input_names):
-            age = plant.latency.get(name, 0.0) - (i + 0.5) * h
-            row = t - int(np.ceil(age / policy.dt - 1e-9)) if age > 0 else t
-            u[:, j] = sent[:, row, j] if row >= 0 else policy.past[j]
-        with np.errstate(all="ignore"):
-            x = plant.model.system.step(x, u, plant.model.values, h)
-    return x
 
 
 def standing_still(task: Task) -> float:

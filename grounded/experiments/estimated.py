@@ -31,7 +31,14 @@ from grounded.estimate import Measurement, NoiseStd, Record, Tracker, noise_of, 
 from grounded.experiments.bench import Bench, optimum, standing_still
 from grounded.experiments.car import BUDGET, ITERATIONS, PAPER, real_case
 from grounded.experiments.driving import RATE, START, film, hands, markers
-from grounded.experiments.jobs import Running, StudyTable, improvement, mean_text, run_study
+from grounded.experiments.jobs import (
+    Running,
+    StudyTable,
+    every,
+    improvement,
+    mean_text,
+    run_study,
+)
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.onboard import Runner
@@ -109,8 +116,7 @@ class _Film:
         task, plant = filmed.task, filmed.plant
         names = plant.model.state_names
         self.latency = np.array([plant.latency.get(name, 0.0) for name in task.model.input_names])
-        scatter = np.array([plant.noise.start.get(name, 0.0) for name in names])
-        process = np.array([plant.noise.process.get(name, 0.0) for name in names])
+        scatter, process, _ = plant.stds
         self.process = process / np.sqrt(FINE * RATE * policy.dt)  # declared per control step
         self.x = np.array(task.start) + scatter * rng.standard_normal(len(names))
         self.true = np.full((ROWS * frames + 1, len(names)), np.nan)
@@ -289,12 +295,7 @@ def run(
     **how: Unpack[Running],
 ) -> EstimatedResult:
     """Every manoeuvre for each seed, on estimated and on true states."""
-    cases = (
-        {"manoeuvre": manoeuvre, "seed": int(seed), "states": states}
-        for manoeuvre in manoeuvres
-        for states in WAYS
-        for seed in seeds
-    )
+    cases = every(manoeuvre=manoeuvres, states=WAYS, seed=map(int, seeds))
     return EstimatedResult(run_study(EstimatedRun, estimated_job, cases, **how))
 
 
@@ -302,7 +303,6 @@ def assumed_noise(case: Bench, see: Measurement, seed: int) -> NoiseStd:
     """Process and measurement noise of the crude model on manual driving of the real car."""
     rng = np.random.default_rng([seed, 13])
     plant, task = case.plant, case.task
-    per_step = [plant.noise.process.get(name, 0.0) for name in plant.model.state_names]
     assert task.latency is not None
     films = film(
         plant.model,
@@ -311,7 +311,7 @@ def assumed_noise(case: Bench, see: Measurement, seed: int) -> NoiseStd:
         see,
         rng,
         camera=CAMERA,
-        process=np.array(per_step) / np.sqrt(RATE * task.dt),
+        process=plant.stds[1] / np.sqrt(RATE * task.dt),
     )
     return noise_of(task.model, films, latency=task.latency, measurement=see).noise
 

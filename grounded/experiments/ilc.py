@@ -26,8 +26,9 @@ import numpy as np
 
 from grounded.frozen import Array
 from grounded.policy import Policy
-from grounded.rollout import augmented, simulate
+from grounded.rollout import simulate
 from grounded.solve.bias import effective_inputs
+from grounded.solve.policy_gradient import adjoint, linearised
 from grounded.task import Task
 from grounded.trial import Trial
 
@@ -43,17 +44,11 @@ class Lifted:
 def lifted(task: Task, policy: Policy) -> Lifted:
     """The model linearised along the run that it predicts for a policy."""
     problem = task.problem()
-    run = simulate(problem, policy)
-    return lifted_along(task, run.z, run.inputs, policy.gain)
-
-
-def lifted_along(task: Task, z: Array, inputs: Array, gain: Array | None) -> Lifted:
-    """The model linearised along z (H + 1, nz) and inputs (H, m), with feedback gain (H, m, nz)."""
-    problem = task.problem()
+    run, gain = simulate(problem, policy), policy.gain
     n, m, H = task.model.n, task.model.m, task.horizon
-    received = effective_inputs(z, inputs, problem.delay, problem.depths, n)
+    received = effective_inputs(run.z, run.inputs, problem.delay, problem.depths, n)
     f_x, f_u = problem.system.linearise(
-        z[:-1, :n], received, problem.p, problem.dt, problem.smoothing
+        run.z[:-1, :n], received, problem.p, problem.dt, problem.smoothing
     )
     G_x, G_u = np.zeros((H + 1, n, H * m)), np.zeros((H, m, H * m))
     nothing = np.zeros(H * m)
@@ -85,14 +80,12 @@ def update(task: Task, model: Lifted, policy: Policy, trial: Trial) -> Policy:
 
 def gradient_of(task: Task, policy: Policy) -> tuple[float, Array]:
     """Utility and its gradient (H, m) by the feed-forward when `task.model` is the real system."""
-    policy = deepened(policy, task.problem().depths)
+    problem = task.problem()
+    policy = deepened(policy, problem.depths)
     run = simulate(task.problem(exact=True), policy)
-    names = (task.model.state_names, task.model.input_names)
-    trial = Trial(run.states, run.inputs, task.dt, *names, start_inputs=task.past)
-    z = augmented(task.problem(), trial.states, trial.inputs, task.past)
-    responses = lifted_along(task, z, run.inputs, policy.gain)
-    gradient, _ = _quadratic(task, responses, trial, curved=False)
-    return run.utility, -2 * gradient.reshape(task.horizon, -1)
+    answer = np.zeros((*run.inputs.shape, problem.nz)) if policy.gain is None else policy.gain
+    slope, _ = adjoint(linearised(problem, run.z, run.inputs), answer, np.ones_like(run.inputs))
+    return run.utility, -slope
 
 
 def deepened(policy: Policy, depths: tuple[int, ...]) -> Policy:
@@ -111,7 +104,7 @@ def deepened(policy: Policy, depths: tuple[int, ...]) -> Policy:
     )
 
 
-def _quadratic(task: Task, model: Lifted, trial: Trial, curved: bool = True) -> tuple[Array, Array]:
+def _quadratic(task: Task, model: Lifted, trial: Trial) -> tuple[Array, Array]:
     """Half the gradient and half the curvature of the cost by the feed-forward."""
     H, reward = task.horizon, task.reward
     assert task.input_target is not None
@@ -132,6 +125,5 @@ def _quadratic(task: Task, model: Lifted, trial: Trial, curved: bool = True) -> 
         rows = response.reshape(-1, size)
         scaled = rows * weights.reshape(-1, 1)
         gradient += scaled.T @ value.ravel()
-        if curved:
-            curvature += scaled.T @ rows
+        curvature += scaled.T @ rows
     return gradient, curvature

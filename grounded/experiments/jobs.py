@@ -26,6 +26,7 @@ from collections.abc import Callable, Iterable, Iterator, MutableMapping, Sequen
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
+from itertools import product
 from pathlib import Path
 from typing import Any, TypedDict, TypeVar, Unpack
 
@@ -136,6 +137,11 @@ def run_jobs(
         f"{len(waiting)} of {total} jobs lost their worker {ROUNDS} times (out of memory?); the "
         f"finished ones are kept, run the study again with fewer --jobs: {lost}"
     )
+
+
+def every(**axes: Iterable[Any]) -> list[dict[str, Any]]:
+    """The cases of a grid: each value of the first argument with each of the second, and so on."""
+    return [dict(zip(axes, values, strict=True)) for values in product(*axes.values())]
 
 
 def run_study(
@@ -264,11 +270,6 @@ def mean_se(values: Sequence[float]) -> tuple[float, float]:
     return float(data.mean()), float(data.std(ddof=1) / math.sqrt(len(data)))
 
 
-def loglog_slope(x: Sequence[float], y: Sequence[float]) -> tuple[float, float]:
-    """Least-squares slope of log y over log x, and its standard error."""
-    u, v = np.log(np.asarray(x, dtype=float)), np.log(np.asarray(y, dtype=float))
-    centred = u - u.mean()
-    value = float(centred @ v / (centred @ centred))
-    left = v - v.mean() - value * centred
-    spread = math.sqrt(float(left @ left) / max(len(u) - 2, 1) / float(centred @ centred))
-    return value, spread
+def loglog_slope(x: Sequence[float], y: Sequence[float]) -> float:
+    """Least-squares slope of log y over log x."""
+    return float(np.polyfit(np.log(x), np.log(y), 1)[0])

@@ -16,7 +16,7 @@ import numpy as np
 
 from grounded.experiments.bench import scaled
 from grounded.experiments.car_tasks import DT, car_task
-from grounded.experiments.jobs import Running, StudyTable, run_study
+from grounded.experiments.jobs import Running, StudyTable, every, run_study
 from grounded.experiments.real_car import real_plant
 from grounded.frozen import Array
 from grounded.models.car import model as car
@@ -84,11 +84,7 @@ def run(
     **how: Unpack[Running],
 ) -> NondeterminismResult:
     """Repeats every sequence `runs` times at each level of scatter."""
-    cases = (
-        {"sequence": name, "level": level, "runs": runs, "seed": seed}
-        for name in sequences()
-        for level in levels
-    )
+    cases = every(sequence=sequences(), level=levels, runs=[runs], seed=[seed])
     spreads = run_study(EndPointSpread, nondeterminism_job, cases, **how)
     return NondeterminismResult(spreads, runs)
 

@@ -23,7 +23,7 @@ from typing import Any, Unpack
 import numpy as np
 
 from grounded.experiments.bench import bench, optimum, scaled, searched, true_utility
-from grounded.experiments.jobs import Running, StudyTable, mean_se, run_study
+from grounded.experiments.jobs import Running, StudyTable, every, mean_se, run_study
 from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.search.standing import SearchOptions
@@ -175,13 +175,7 @@ def run(
     **how: Unpack[Running],
 ) -> NoiseResult:
     """Every rule on every case; a job is one of them."""
-    cases = (
-        {"rule": vars(rule), "manoeuvre": manoeuvre, "level": level, "seed": seed}
-        for manoeuvre in manoeuvres
-        for level in levels
-        for rule in rules
-        for seed in seeds
-    )
+    cases = every(manoeuvre=manoeuvres, level=levels, rule=map(vars, rules), seed=seeds)
     return NoiseResult(run_study(Outcome, repeats_job, cases, **how))
 
 

@@ -27,7 +27,7 @@ from typing import Any, Unpack
 import numpy as np
 
 from grounded.compile import Problem
-from grounded.experiments.jobs import Running, StudyTable, loglog_slope, mean_se, run_study
+from grounded.experiments.jobs import Running, StudyTable, every, loglog_slope, mean_se, run_study
 from grounded.frozen import Array
 from grounded.model import Model, Param
 from grounded.result import plain
@@ -75,8 +75,8 @@ class Theorem1Result:
         for seed in dict.fromkeys(row.seed for row in self.rows):
             own = [row for row in self.rows if row.seed == seed]
             x = [row.epsilon for row in own]
-            found["gradient_error"].append(loglog_slope(x, [row.error for row in own])[0])
-            found["squared_gradient"].append(loglog_slope(x, [row.squared for row in own])[0])
+            found["gradient_error"].append(loglog_slope(x, [row.error for row in own]))
+            found["squared_gradient"].append(loglog_slope(x, [row.squared for row in own]))
         return {name: mean_se(values) for name, values in found.items()}
 
     def to_json(self) -> dict[str, Any]:
@@ -134,7 +134,7 @@ def run(
     **how: Unpack[Running],
 ) -> Theorem1Result:
     """A search for each epsilon and seed; the seed draws the shape of the model's error."""
-    cases = ({"epsilon": float(e), "seed": seed} for e in epsilons for seed in seeds)
+    cases = every(epsilon=map(float, epsilons), seed=seeds)
     return Theorem1Result(run_study(Theorem1Row, theorem1_job, cases, **how))
 
 

@@ -100,10 +100,10 @@ def test_page_shows_what_the_issue_lists(cart):
         "N s/m",
         "1.400 (1.36 to 1.44)",
         "x > 0.2",
-        "90.5 % of the squared error is explained",
+        "90.5 %",  # of the squared error is explained
         "whole run (2 s)",
         "By state, 1 s ahead",
-        "What is left of v is no white noise",
+        "Is there a pattern in the rest?",
         "by 3.21, the diagnosed one by 0.0456",
         "coulomb_friction:v",
         "96.0 %",

@@ -11,13 +11,11 @@ import math
 import re
 from collections.abc import Iterable, Mapping
 
-from grounded.diagnosis.report import Correction, Diagnosis, Estimate, Gap, Split
+from grounded.diagnosis.report import Correction, Diagnosis, Estimate, Gap
 from grounded.instruments.finding import Finding
 from grounded_trials.wording import count, figure, percent, shown, with_unit
 
 MOST = 3  # parameters that are named
-WHITE = 0.01  # p-value below which what is left is no longer taken for white noise
-HORIZONS = {"one_step": "one step", "horizon": "{}", "whole_run": "whole run ({})"}
 
 
 def error_lines(diagnosis: Diagnosis, before: Mapping[str, float]) -> list[tuple[str, str]]:
@@ -151,43 +149,6 @@ def calibrated_sentence(diagnosis: Diagnosis, before: Mapping[str, float]) -> st
     named = [text for _, text in sorted(moved)[:MOST]]
     more = f" (and {len(moved) - MOST} more)" * (len(moved) > MOST)
     return f"calibrated beside them: {', '.join(named)}{more}" if named else ""
-
-
-def horizons(splits: Mapping[str, Split]) -> list[tuple[str, Split]]:
-    """How far ahead in words ("one step", "1 s", "whole run (3 s)"), nearest first."""
-    return [
-        (words.format(f"{splits[key].horizon_s:.3g} s"), splits[key])
-        for key, words in HORIZONS.items()
-        if key in splits
-    ]
-
-
-def main_horizon(splits: Mapping[str, Split]) -> tuple[str, Split]:
-    """The horizon that the gap is measured at, with how far ahead it is in words."""
-    return horizons({"horizon": splits["horizon"]} if "horizon" in splits else splits)[0]
-
-
-def parts_sentence(splits: Mapping[str, Split]) -> str:
-    """`1 s ahead 99.7 % of the squared error is explained, 0.1 % is not, 0.2 % is noise`."""
-    ahead, main = main_horizon(splits)
-    parts = main.whole
-    return (
-        f"{ahead} ahead, {percent(parts.explained)} of the squared error is explained, "
-        f"{percent(parts.unexplained)} is not, {percent(parts.irreducible)} is noise"
-    )
-
-
-def whiteness_sentence(whiteness: Mapping[str, float]) -> str:
-    """Whether what the effects leave of each state is noise, or still has a pattern."""
-    clear = sorted((p, name) for name, p in whiteness.items() if p < WHITE)
-    names, total = [name for _, name in clear], len(whiteness)
-    if not names:
-        return "what is left of every state looks like white noise (Ljung-Box, p >= 0.01)"
-    which = "every state" if len(names) == total else f"{', '.join(names)}"
-    return (
-        f"what is left of {which} is no white noise (Ljung-Box, p < 0.01): "
-        "a part of it follows a pattern that is not in the model"
-    )
 
 
 def utility_sentence(diagnosis: Diagnosis) -> str:

@@ -18,6 +18,8 @@ import numpy as np
 from grounded.frozen import Array
 from grounded.model import Model
 
+NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # to east, north, up
+
 
 @dataclass(frozen=True)
 class Scene:
@@ -49,15 +51,14 @@ class Scene:
 
     def rotations(self, states: Array) -> Array:
         """Body axes (nose, left, up) as the columns of rotation matrices (T, 3, 3)."""
-        if self.attitude:
-            return _aircraft(*(states[:, i] for i in self.attitude))
-        if self.heading is None:
-            return np.tile(np.eye(3), (len(states), 1, 1))
-        psi = states[:, self.heading]
-        angle = np.pi / 2 - psi if self.map else psi
-        c, s, zero = np.cos(angle), np.sin(angle), np.zeros(len(states))
-        rows = [[c, -s, zero], [s, c, zero], [zero, zero, zero + 1]]
-        return np.moveaxis(np.array(rows), 2, 0)
+        from scipy.spatial.transform import Rotation
+
+        if self.attitude:  # of nose, right, down in north, east, down
+            turned = Rotation.from_euler("ZYX", states[:, list(self.attitude[::-1])]).as_matrix()
+            return np.asarray(NED @ turned * [1.0, -1.0, -1.0])
+        psi = np.zeros(len(states)) if self.heading is None else states[:, self.heading]
+        angle = np.pi / 2 - psi if self.map and self.heading is not None else psi
+        return np.asarray(Rotation.from_euler("z", angle[:, None]).as_matrix())
 
 
 def scene_of(model: Model) -> Scene:
@@ -86,15 +87,3 @@ def scene_of(model: Model) -> Scene:
         map=is_map,
         spatial=spatial,
     )
-
-
-def _aircraft(phi: Array, theta: Array, psi: Array) -> Array:
-    """Columns nose, left wing, up in (east, north, up), from yaw, pitch, roll about z, y, x."""
-    cf, sf, ct, st = np.cos(phi), np.sin(phi), np.cos(theta), np.sin(theta)
-    cp, sp = np.cos(psi), np.sin(psi)
-    nose = [ct * cp, ct * sp, -st]  # in north, east, down
-    right = [sf * st * cp - cf * sp, sf * st * sp + cf * cp, sf * ct]
-    down = [cf * st * cp + sf * sp, cf * st * sp - sf * cp, cf * ct]
-    columns = [nose, [-v for v in right], [-v for v in down]]
-    enu = [[v[1], v[0], -v[2]] for v in columns]
-    return np.moveaxis(np.array(enu), 2, 0).swapaxes(1, 2)

@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping
 
 from grounded.diagnosis.pictures import accuracy_figure, credit_figure, where_figure
 from grounded.diagnosis.report import ChannelParts, Diagnosis, Parts, Split
 from grounded_trials.report.diagnosis_words import (
-    WHITE,
     gap_sentence,
-    horizons,
-    main_horizon,
-    parts_sentence,
     sentences,
     utility_sentence,
-    whiteness_sentence,
 )
 from grounded_trials.report.figures.gap import forecast_figures, residual_figures
 from grounded_trials.report.findings import Findings
@@ -31,6 +25,8 @@ from grounded_trials.wording import figure, percent, rendered
 from grounded_trials.workspace.next_step import DIAGNOSE, Since
 
 MOST = 6  # states whose error without each effect is drawn
+WHITE = 0.01  # p-value below which what is left is no longer taken for white noise
+HORIZONS = {"one_step": "one step", "horizon": "{}", "whole_run": "whole run ({})"}
 
 
 def gap_section(findings: Findings) -> list[Block]:
@@ -74,16 +70,9 @@ def _details(diagnosis: Diagnosis, since: Since) -> list[Block]:
     return found
 
 
-def preflight(diagnosis: Diagnosis) -> list[str]:
-    """What was found wrong with the signals themselves, before any effect was weighed."""
-    found: Sequence[Any] = getattr(diagnosis, "preflight", ())
-    corrected = {True: ": corrected", False: ": not corrected"}
-    return [f"{p.signal}: {p.finding}{corrected[bool(p.corrected)]}." for p in found]
-
-
 def _by_trial(diagnosis: Diagnosis) -> list[Block]:
     """Whether every trial asks for the same value."""
-    found: Sequence[Any] = getattr(diagnosis, "per_trial", ())
+    found = diagnosis.per_trial
     if not found:
         return []
     rows = [
@@ -122,13 +111,18 @@ def _made_of(splits: Mapping[str, Split]) -> list[Block]:
     if not splits:
         return []
     header = ("ahead", "explained", "unexplained", "noise")
-    rows = [(words, *_shares(one.whole)) for words, one in horizons(splits)]
-    ahead, main = main_horizon(splits)
-    by_state = [(parts.name, *_shares(parts)) for parts in main.channels]
+    named = {
+        key: words.format(f"{one.horizon_s:.3g} s")
+        for key, words in HORIZONS.items()
+        if (one := splits.get(key)) is not None
+    }
+    rows = [(words, *_shares(splits[key].whole)) for key, words in named.items()]
+    main = "horizon" if "horizon" in named else next(iter(named))
+    by_state = [(parts.name, *_shares(parts)) for parts in splits[main].channels]
     repeated = any(one.irreducible_from == "repeats" for one in splits.values())
     source = "repeated trials" if repeated else "the estimated noise"
     words = (
-        f"{_begun(parts_sentence(splits))}. Explained is what the effects take away on trials that "
+        "Explained is the share of the squared error that the effects take away on trials that "
         "were held out, unexplained what they leave above the noise; how large the noise is comes "
         f"from {source}."
     )
@@ -137,7 +131,7 @@ def _made_of(splits: Mapping[str, Split]) -> list[Block]:
         Block("heading", "What the error is made of"),
         Block("text", words),
         table("split", header, rows),
-        Block("folded", f"By state, {ahead} ahead", blocks=[each]),
+        Block("folded", f"By state, {named[main]} ahead", blocks=[each]),
     ]
 
 
@@ -158,7 +152,7 @@ def _rest(diagnosis: Diagnosis) -> list[Block]:
     ]
     return [
         Block("heading", "Is there a pattern in the rest?"),
-        Block("text", f"{_begun(whiteness_sentence(whiteness))}."),
+        Block("text", f"White noise (Ljung-Box, p >= {WHITE:g}) is what no model could predict."),
         table("whiteness", ("state", "p (white noise)", "what is left "), rows),
     ]
 

@@ -22,7 +22,7 @@ from grounded.errors import needs
 from grounded.figures.figure import Bars, Panel
 from grounded.figures.interactive import EXTRA, packed, palette, plotted
 from grounded.search.pictures import search_figure
-from grounded_trials.report.diagnosis_words import error_lines
+from grounded_trials.report.diagnosis_words import error_lines, instrument_lines
 from grounded_trials.report.figures.paths import crash, path_figure
 from grounded_trials.report.figures.runs import (
     bias_figure,
@@ -31,11 +31,7 @@ from grounded_trials.report.figures.runs import (
     state_figure,
 )
 from grounded_trials.report.findings import Findings, improvements_in
-from grounded_trials.report.page.diagnosed import (
-    gap_section,
-    preflight,
-    verdict_lines,
-)
+from grounded_trials.report.page.diagnosed import gap_section, verdict_lines
 from grounded_trials.report.page.tables import (
     Block,
     candidate_table,
@@ -197,11 +193,11 @@ def _why(findings: Findings) -> dict[str, Any]:
         return {}
     before = {} if findings.since.changed else findings.values
     credit = credit_figure(diagnosis)
-    named = ("rest",) if credit else ("parameters", "error", "rest")
-    lines = [(title, text) for title, text in error_lines(diagnosis, before) if title in named]
+    told = [] if credit else error_lines(diagnosis, before)
+    lines = [(title, text) for title, text in told if title == "parameters"]
     return {
         "verdict": verdict_lines(diagnosis, findings.since, LINES),
-        "preflight": preflight(diagnosis),
+        "preflight": instrument_lines(diagnosis.preflight),
         "lines": lines,
         "credit": credit,
     }
