@@ -1,8 +1,9 @@
 """Mechanisms in MuJoCo, and the crude models that plan for them.
 
 The crude models of the cart-pole and the two-link arm are their equations of motion in plain NumPy
-(`grounded.models`), with the simulator's own masses and lengths: what a set-up withholds is all that differs. The
-seven-joint arm is planned in MuJoCo itself, the pushed block in a quasi-static model.
+(`grounded.models`), with the simulator's own masses and lengths: what a set-up withholds is all
+that differs. The seven-joint arm is planned in MuJoCo itself, the pushed block in a quasi-static
+model.
 """
 
 from __future__ import annotations
@@ -12,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from benchmarks.foreign.robots import Robot, minimum_jerk, task_of, with_true_model
-from grounded.challenge.mechanism import arm_xml, cart_xml
 from grounded.model import Model, Param
 from grounded.models import arm, cart_pole
 from grounded.task import Task
+
 
 class MujocoRobot:
     """MuJoCo, stepped as its users do: it keeps its warm start, its time and its contacts."""
@@ -82,6 +83,7 @@ def cart_task(kind: str) -> Task:
 
 
 # Two-link arm in the vertical plane: a reach of 0.8 s, then hold.
+
 
 def arm_task() -> Task:
     start, end = np.array([-1.4, 0.3]), np.array([0.5, 1.0])

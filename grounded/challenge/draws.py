@@ -122,8 +122,9 @@ def _value(
         return sign * size
     if family == "parameter":
         known = effect.site.model.params[target]
-        change = sign * size * (abs(known.value) or min((known.high - known.low) / 2, 0.5))
-        return change if known.value + change >= known.low else -change
+        low, high = (-np.inf if known.low is None else known.low), known.high or np.inf
+        change = sign * size * (abs(known.value) or min((high - low) / 2, 0.5))
+        return float(change if known.value + change >= low else -change)
     if family in ("viscous_friction", "quadratic_drag", "coulomb_friction", "stiction"):
         speed = scales.peak(target)
         over = {"viscous_friction": 1.0, "quadratic_drag": speed}.get(family, 1 / speed)

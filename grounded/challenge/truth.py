@@ -99,7 +99,7 @@ class _Run:
         self.queues = [[held[j]] * (int(whole) + 1) for j, (whole, _) in enumerate(self.late)]
         self.gust, self.last, self.past = np.zeros(model.n), self.held, [self.x.copy()]
         pairs = ((n, partner(model, n)) for n in self.names)
-        self.plant = truth.mechanism and truth.mechanism.plant(self.fine)
+        self.plant = None if truth.mechanism is None else truth.mechanism.plant(self.fine)
         self.tied = [(self.names.index(n), self.names.index(k)) for n, k in pairs if k is not None]
 
     def trial(self, controller: Callable[[int, Array], Array], steps: int) -> Trial:
