@@ -122,7 +122,8 @@ def _value(
         return sign * size
     if family == "parameter":
         known = effect.site.model.params[target]
-        low, high = (-np.inf if known.low is None else known.low), known.high or np.inf
+        low = -np.inf if known.low is None else known.low
+        high = np.inf if known.high is None else known.high
         change = sign * size * (abs(known.value) or min((high - low) / 2, 0.5))
         return float(change if known.value + change >= low else -change)
     if family in ("viscous_friction", "quadratic_drag", "coulomb_friction", "stiction"):

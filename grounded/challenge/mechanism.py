@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from grounded.errors import GroundedError
+from grounded.errors import needs
 from grounded.frozen import Array
 
 STEP = 1e-3  # [s] of the simulator, at most
@@ -80,10 +80,10 @@ def cart_xml(
     armature: float = 0.0,
     spring: float = 0.0,
     hung: float = 0.0,
-    **true: float,
+    true: Mapping[str, float] | None = None,
 ) -> str:
     """The cart-pole; `true` are M, m, l, b of `grounded.models.cart_pole` where they differ."""
-    p = {"M": 1.0, "m": 0.3, "l": 0.5, "b": 0.0} | true
+    p = {"M": 1.0, "m": 0.3, "l": 0.5, "b": 0.0} | dict(true or {})
     return CART.format(
         timestep=timestep,
         integrator=integrator,
@@ -109,7 +109,7 @@ def arm_xml(
     lag: tuple[float, float] = (0.0, 0.0),
     spring: float = 0.0,
     hung: float = 0.0,
-    **true: float,
+    true: Mapping[str, float] | None = None,
 ) -> str:
     """The two-link arm; `true` are m2, b1, b2 of `grounded.models.arm` where they differ."""
     a1, a2 = np.broadcast_to(armature, 2)
@@ -126,14 +126,14 @@ def arm_xml(
         act2=_filter(lag[1]),
         spring=spring,
         hung=HUNG.format(at="0 0 0", down=-0.15, mass=hung) if hung else "",
-        **({"m2": 1.0, "b1": 0.0, "b2": 0.0} | true),
+        **({"m2": 1.0, "b1": 0.0, "b2": 0.0} | dict(true or {})),
     )
 
 
 def cart_built(part: Mapping[str, Mapping[str, float]], **more: Any) -> str:
     """The cart-pole with what a case gives its joint: by kind, then by input or parameter."""
     at = {kind: values.get("force", 0.0) for kind, values in part.items() if kind != "true"}
-    return cart_xml(integrator="implicitfast", **at, **part["true"], **more)
+    return cart_xml(integrator="implicitfast", true=part["true"], **at, **more)
 
 
 def arm_built(part: Mapping[str, Mapping[str, float]], **more: Any) -> str:
@@ -143,7 +143,7 @@ def arm_built(part: Mapping[str, Mapping[str, float]], **more: Any) -> str:
     true = dict(part["true"])
     load = max(true.pop("load"), 1e-9)
     return arm_xml(
-        payload=load, f1=f1, f2=f2, armature=two["armature"], lag=two["lag"], **true, **more
+        payload=load, f1=f1, f2=f2, armature=two["armature"], lag=two["lag"], true=true, **more
     )
 
 
@@ -194,13 +194,6 @@ def simulator() -> Any:
     """MuJoCo.
 
     Raises:
-        GroundedError: if it is not installed.
+        GroundedError: if it is not installed, with what to install.
     """
-    try:
-        import mujoco
-    except ImportError:
-        raise GroundedError(
-            "systems 'mujoco' need MuJoCo, which is not installed: pip install "
-            '"grounded-robotics[mujoco]", or leave them out with --systems own,kinked'
-        ) from None
-    return mujoco
+    return needs("mujoco", "mujoco")
