@@ -50,6 +50,9 @@ class Param:
     std: float | None = None
 
     def __post_init__(self) -> None:
+        numbers = [self.value] + [n for n in (self.low, self.high, self.std) if n is not None]
+        if bad := [one for one in numbers if not isinstance(one, (int, float, np.number))]:
+            raise GroundedError(f"a parameter's numbers must be numbers, got {bad[0]!r:.60}")
         if not np.isfinite(self.value):
             raise GroundedError(f"a parameter's value must be a finite number, got {self.value}")
         low = -np.inf if self.low is None else self.low
@@ -142,6 +145,10 @@ class Model:
             if not name.isidentifier():
                 raise GroundedError(f"model '{self.name}': '{name}' is not a valid Python name")
         units: dict[str, object] = {**self.states, **self.inputs}
+        for name, param in dict[str, object](self.params).items():
+            if not isinstance(param, Param):
+                found = type(param).__name__
+                raise GroundedError(f"model '{self.name}': params '{name}' is a {found}, no Param")
         for name, unit in units.items():
             if not isinstance(unit, str):
                 found = type(unit).__name__

@@ -222,14 +222,44 @@ def test_rates_are_found_in_any_model(mine, tmp_path):
 
 
 def test_the_real_car_of_a_laboratory(tmp_path):
-    """DART: what fits is found, what no topic shows is asked for, nothing is guessed silently."""
+    """DART: the speed has no name, and is found by the position's; what two topics hold is asked."""
     folder = data("dart_small_car")
     found = begin(tmp_path / "w", folder / "dart_4_sept_random_driving_slow_ros2.mcap")
     by = {g.name: g for g in (*found.states, *found.inputs)}
     assert by["x"].path == "/vicon/jetracer1.pose.pose.position.x" and by["x"].sure
     assert by["throttle"].path == "/throttle_1.data"
-    assert not by["v"].path and not by["v"].sure
+    both = {"/arduino_data_1.data[3]", "/sensors_and_input_1.data[6]"}
+    assert both <= {by["v"].path, *by["v"].others} and not by["v"].sure
     assert not by["steering"].sure and len(by["steering"].others) == 1
+
+
+@pytest.mark.parametrize("name", ["flybag", "pitch-45bag", "roll2bag", "yx3bag"])
+def test_a_real_drone_s_commands_are_asked_for(tmp_path, name):
+    """A Pose is abused for torques there: no name says which, so all that is commanded is offered."""
+    found = begin(tmp_path / "w", data("crazyflie_p4_ros2_mcap") / f"{name}.mcap")
+    assert found.kind == "drone" and not any(g.path for g in found.inputs)
+    assert all("/cf_controll.position.x" in g.others for g in found.inputs)
+    by = {g.name: g for g in found.states}
+    assert by["x"].path.startswith("/vicon/") and not by["x"].sure
+    assert not any(by[name].path or by[name].sure for name in ("vx", "vy", "vz"))
+
+
+def test_a_robot_in_the_plane_without_commands(tmp_path):
+    bag = data("mcap_format_fixtures") / "evo" / "nav2_turtlebot_SIM.mcap"
+    found = begin(tmp_path / "w", bag)
+    assert found.kind == "rover" and all(g.sure for g in found.states)
+    assert found.states[1].path == "/odom.twist.twist.angular.z"
+    assert not any(g.path for g in found.inputs)
+
+
+def test_what_only_the_log_names_is_never_sure(tmp_path):
+    """A servo's supply voltage looks like an input, its temperature like a state: both are asked."""
+    found = begin(tmp_path / "w", data("bam_xl330_servo") / "bam_xl330_pendulum.npz")
+    guesses = (*found.states, *found.inputs)
+    assert found.kind == "generic" and found.unsure == guesses
+    dart = begin(tmp_path / "d", data("dart_small_car") / "steering_sine_10Hz.npz")
+    by = {g.name: g.path for g in (*dart.states, *dart.inputs)}
+    assert by["v"] == "/run00.vel_encoder" and by["x"] == by["psi"] == ""
 
 
 # targets

@@ -344,6 +344,7 @@ def configurations(rng: random.Random, seconds: float) -> Tally:
         for k in during(seconds):
             kind, fuzz = FUZZES[k % 3]
             text = fuzz(rng)
+            np.nan, np.inf = float("nan"), float("inf")  # a model.py may have assigned to them
             where = Path(folder, "w")
             shutil.rmtree(where, ignore_errors=True)
             with trying(tally, f"{kind} {k}"):

@@ -64,7 +64,9 @@ def weigh(
     guesses = {name: _joint(guess, units[name], joints) for name, guess in guesses.items()}
     guesses |= _in_order(guesses, units, joints, log)
     guesses = {name: _unit(guess, units[name]) for name, guess in guesses.items()}
+    guesses |= _speed_asked(guesses, model, log)
     signals = _Signals(log, guesses.values())
+    guesses |= _speed(guesses, model, signals)
     for position, rate in rates_of(model).items():
         if position in guesses and rate in guesses:
             guesses |= _derivative(guesses[position], guesses[rate], signals, units[rate])
@@ -277,6 +279,41 @@ def _one_by_one(files: Sequence[Path], specs: Mapping[str, SignalSpec]) -> dict[
         except GroundedError:
             continue
     return found
+
+
+def _speed_asked(guesses: Mapping[str, Guess], model: Model, log: LogReport) -> dict[str, Guess]:
+    """A speed that no name gives, with the numbers of the log that have no name as its rivals."""
+    name = str(model.roles.get("speed", ""))
+    taken = {guess.path for guess in guesses.values()}
+    if name not in guesses or guesses[name].path or guesses[name].others:
+        return {}
+    fields = [f for t in log.topics for f in t.fields if f.low != f.high and f.path not in taken]
+    bare = [f.path for f in fields if re.search(r"\.data(\[\d+\])?$", f.path)]
+    return {name: replace(guesses[name], others=tuple(bare[:COMBINATIONS]))}
+
+
+def _speed(guesses: Mapping[str, Guess], model: Model, signals: _Signals) -> dict[str, Guess]:
+    """The number without a name that goes with the speed of the position."""
+    name, position = str(model.roles.get("speed", "")), model.roles.get("position", ())
+    axes = [guesses[axis].path for axis in position if axis in guesses]
+    if name not in guesses or guesses[name].path or not axes or not all(axes):
+        return {}
+    tried = []
+    for path in guesses[name].others:
+        gridded = signals.grid((*axes, path))
+        if gridded is not None:
+            step, (*places, speed) = gridded
+            steps = np.sqrt(sum(np.diff(p) ** 2 for p in places))
+            found = _follows(np.concatenate([[0.0], np.cumsum(steps)]), speed, step)
+            tried.append((found.correlation, found.slope, path))
+    good = sorted((one for one in tried if one[0] > FOLLOWS), reverse=True)
+    if not good:
+        return {name: replace(guesses[name], others=())}
+    best, slope, path = good[0]
+    rivals = tuple(p for value, _, p in good[1:] if best - value < 0.05)
+    why = f"no name says it; it goes with the speed of {' and '.join(position)}, correlation {best:.3f}"
+    why += f", {slope:.3g} times as large"
+    return {name: replace(guesses[name], path=path, others=rivals[:3], reasons=(why,))}
 
 
 def rates_of(model: Model) -> dict[str, str]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -50,6 +50,7 @@ _MEANINGS: dict[str, tuple[str, ...]] = {
     "torque": ("torque", "effort", "tau"),
 }
 _COMMANDED = ("ref", "desired", "des", "target", "setpoint", "goal", "cmd", "command")
+_COMMAND_TOPIC = re.compile("control|cmd|command|setpoint|ref|target")
 _ANGLES = ("roll", "pitch", "yaw")
 _QUATERNION = tuple(f"{name}.{part}" for name in ("orientation", "rotation") for part in "xyzw")
 _WORD = re.compile(r"[a-z]+")
@@ -92,8 +93,22 @@ def guess_mapping(
     rest = []
     for name in inputs:
         candidates = [c for c in _candidates(log, name, is_input=True) if c.field.path not in taken]
-        rest.append(_choose(log, name, candidates, {}))
+        guess = _choose(log, name, candidates, {})
+        rest.append(guess if guess.path or guess.others else _commands_of(log, guess, taken))
     return found, tuple(rest)
+
+
+def _commands_of(log: LogReport, guess: Guess, taken: set[str]) -> Guess:
+    """An input that nothing is named after, with the numbers of topics that carry commands."""
+    commands = [t for t in log.topics if _COMMAND_TOPIC.search(t.topic.lower())]
+    moving = [f.path for t in commands for f in t.fields if f.low != f.high]
+    others = tuple(path for path in moving if path not in taken and not _part(path))
+    why = ("no name says it; these are commanded",) if others else ()
+    return replace(guess, others=others[:8], reasons=why)
+
+
+def _part(path: str) -> bool:
+    return path.endswith(_QUATERNION)
 
 
 def _candidates(log: LogReport, name: str, *, is_input: bool) -> list[_Candidate]:
@@ -136,9 +151,16 @@ def _fit(name: str, inside: str, topic: str) -> float:
         last = re.sub(r"[_\d]+$", "", topic.rsplit("/", 1)[-1])
         if inside in ("data", "value") and last == meaning:
             best = max(best, worth)
-        elif inside in ("data", "value") and meaning in _WORD.findall(last) and len(meaning) > 1:
+        elif len(meaning) > 1 and meaning in _WORD.findall(_named(inside, last)):
             best = max(best, worth - 1.0)
     return best
+
+
+def _named(inside: str, last: str) -> str:
+    """The text whose words name a number: a topic of one number, or a table's column."""
+    if inside in ("data", "value"):
+        return last
+    return "" if "." in inside or "[" in inside or last not in ("npz", "csv", "run") else inside
 
 
 def _homes(scored: dict[str, list[_Candidate]]) -> dict[str, float]:

@@ -146,6 +146,10 @@ def _begin(
     found = _model_in(folder, text)
     states, inputs = guess_mapping(report, found.state_names, found.input_names)
     states, inputs = weigh(report, found, states, inputs)
+    if chosen == "generic" and not model:
+        states, inputs = (
+            tuple(_only_named(g, of) for g in s) for s, of in ((states, "state"), (inputs, "input"))
+        )
     if ask is not None:
         states, inputs = (tuple(_asked(g, ask) for g in some) for some in (states, inputs))
     step = dt or _interval(report, inputs, states)
@@ -206,6 +210,12 @@ def _model_in(folder: Path, text: str) -> Model:
     if not isinstance(found, Model):
         raise GroundedError("model.py has no `model = grounded.Model(...)`")
     return found
+
+
+def _only_named(guess: Guess, of: str) -> Guess:
+    """A guess of the generic skeleton: the log's own name, and nothing that says what it is."""
+    why = f"named as in the log; that it is a{'n' * (of == 'input')} {of} is a guess"
+    return replace(guess, sure=False, reasons=(*guess.reasons, why)) if guess.path else guess
 
 
 def _asked(guess: Guess, ask: Ask) -> Guess:

@@ -19,6 +19,10 @@ COMMANDED = re.compile(
     r"|goal|control|_con|_ref"
 )
 
+FLYING = re.compile(
+    r"(^|[/_])(cf\d*|crazyflie|quad(rotor|copter)?|drone|uav|mavros|copter)([/_]|$)"
+)
+
 
 @dataclass(frozen=True)
 class Skeleton:
@@ -231,6 +235,9 @@ def kind_in(log: LogReport) -> tuple[str, str]:
         where, names = next(iter(joints.items()))
         kind = "arm" if len(names) > 1 else "pendulum"
         return kind, f"{where} has {len(names)} joints: {', '.join(names[:6])}"
+    flying = next((t.topic for t in log.topics if FLYING.search(t.topic.lower())), None)
+    if flying is not None:
+        return "drone", f"{flying} is named after one"
     for wanted, kind, what in (
         (("steer",), "car", "names a steering"),
         (("thrust", "attitude_setpoint", "actuator_outputs"), "drone", "names a thrust"),
@@ -242,7 +249,17 @@ def kind_in(log: LogReport) -> tuple[str, str]:
     words = {_word(one.path).lower() for topic in log.topics for one in topic.fields}
     if words & {"theta", "angle", "q", "q_rad", "position"} and words & {"torque", "tau", "u"}:
         return "pendulum", "an angle and a torque"
-    return "generic", "nothing tells what kind of robot it is"
+    if flat := next((t.topic for t in log.topics if _in_the_plane(t)), None):
+        return "rover", f"{flat} moves in the plane and no steering is named"
+    return "generic", "nothing tells what kind of robot it is: the names are the log's"
+
+
+def _in_the_plane(topic: TopicReport) -> bool:
+    """An odometry that neither rises nor moves sideways."""
+    still = ("position.z", "linear.y", "linear.z")
+    fields = [one for one in topic.fields if one.path.endswith(still)]
+    odometry = topic.type.endswith("/Odometry") and topic.messages > 2
+    return odometry and len(fields) == 3 and all(one.low == one.high for one in fields)
 
 
 def _says(topic: TopicReport, words: Sequence[str]) -> bool:

@@ -160,7 +160,7 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
     within = free[near, start : start + len(sent)]
     off = (sent - np.clip(sent, within.min(axis=0), within.max(axis=0))) ** 2
     unrelated = asked.var(axis=0) + sent.var(axis=0) + (asked - sent).mean(axis=0) ** 2
-    noise = _noise_sent(policy, states[back], free[back])
+    noise = _noise_sent(policy, trial.states[:T], free[0])  # between samples there is less
     room = np.maximum(UNLIKE * unrelated, (0.02 * size) ** 2 + 4 * noise[: len(off)])
     parts = np.array_split(np.arange(len(off)), min(WINDOWS, len(off) // LEAST))
     bad = [bool((off[k].mean(axis=0) > 2 * room[k].mean(axis=0)).any()) for k in parts]
