@@ -9,7 +9,7 @@ import click
 
 from grounded.errors import GroundedError, NextCommand
 from grounded_cli.options import as_json, parallel, typed
-from grounded_cli.terminal import bar, names_in, number, show, show_json, table
+from grounded_cli.terminal import bar, names_in, number, say, show, show_json, table
 from grounded_trials.wording import count
 
 if TYPE_CHECKING:
@@ -36,6 +36,12 @@ def command() -> None:
 @click.option(
     "--seed", type=click.IntRange(0), required=True, metavar="S", help="Of all that is drawn."
 )
+@click.option(
+    "--systems",
+    default="own",
+    metavar="G1,G2",
+    help="Of own, kinked, mujoco (default: own, which is half of the cases where there are more).",
+)
 @click.option("--labels", metavar="DIR", help="Where the labels go (default: DIR-labels).")
 @click.option(
     "--param-error",
@@ -49,6 +55,7 @@ def make_cases(
     kind: str,
     cases: int,
     seed: int,
+    systems: str,
     labels: str | None,
     param_error: float | None,
     json_: bool,
@@ -58,7 +65,8 @@ def make_cases(
     from grounded_trials.workspace.challenge import write_cases
 
     sealed = Path(labels or f"{folder}-labels")
-    drawn = make(kind, cases, seed, param_error=param_error)  # type: ignore[arg-type]
+    groups = _at_hand(names_in(systems))
+    drawn = make(kind, cases, seed, groups=groups, param_error=param_error)  # type: ignore[arg-type]
     with bar("cases") as progress:
         names = write_cases(drawn, Path(folder), sealed, lambda done: progress(done, cases))
     if json_:
@@ -67,6 +75,21 @@ def make_cases(
     made = count(len(names), "case")
     show(f"{made} in {folder}, the labels in {sealed} (keep them away from it)")
     show(f"\nnext: {typed(NextCommand('challenge', ('run', folder)))}")
+
+
+def _at_hand(groups: list[str]) -> list[str]:
+    """The groups without MuJoCo's where it is missing and there are others; stderr says so."""
+    from grounded.challenge import simulator
+
+    try:
+        if "mujoco" in groups:
+            simulator()
+    except GroundedError as error:
+        if len(groups) == 1:
+            raise
+        say(f"left out: {error}")
+        return [group for group in groups if group != "mujoco"]
+    return groups
 
 
 @command.command("run", short_help="Diagnose the cases that have no diagnosis yet.")

@@ -78,6 +78,7 @@ def _tell(document: dict[str, Any]) -> None:
         show(field("optimum", f"{number(document['optimum'])}, {known}"))
     show(field("gap", document["verdict"]["sentence"]))
     for kind, path in document["paths"].items():
-        show(field(kind, path))
+        if kind in ("html", "rrd"):
+            show(field(kind, path))
     verb = "view" if "rrd" in document["paths"] else "report"
     show(f"\n{next_line(NextCommand(verb), document['workspace'])}")

@@ -11,8 +11,8 @@ import click
 from grounded.errors import NextCommand
 from grounded_cli import completion as complete
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace, typed
-from grounded_cli.terminal import field, names_in, number, show, show_json, stages, table
-from grounded_trials.wording import rendered, with_unit
+from grounded_cli.terminal import field, names_in, number, show, show_json, stages, table, tinted
+from grounded_trials.wording import rendered, with_unit, wrapped
 
 if TYPE_CHECKING:
     from grounded.diagnosis.report import Diagnosis, Ranked, Where
@@ -126,7 +126,7 @@ def _tell(found: Diagnosis, before: dict[str, float]) -> None:
     if not found.no_cause:
         if found.prediction_error:
             show("\n" + table(*error_table(found)))
-            show(f"  open loop, {_held_out(found)}")
+            _note(f"open loop, {_held_out(found)}")
         _effects(found)
     _places(found.where)
     for title, text in error_lines(found, before):
@@ -158,13 +158,21 @@ def _instruments(findings: Sequence[Finding]) -> None:
         show(field("sensors" if k == 0 else "", line))
 
 
+def _note(text: str) -> None:
+    """What a table's columns mean."""
+    show("\n".join(wrapped(text, "  ", "  ")))
+
+
 def _verdict(kind: str, text: str) -> str:
-    """The kind, then a sentence a line: they say different things."""
+    """The kind, then a cause or a sentence a line: they say different things."""
     from grounded_trials.report.diagnosis_words import sentences
 
-    first, *others = sentences(text)
-    lines = [field("verdict", f"{kind}: {first}")]
-    return "\n".join([*lines, *(field("", sentence) for sentence in others)])
+    causes, *others = sentences(text)
+    first, *more = causes.split("; ") if kind in ("effect", "several") else [causes]
+    lines = [field("verdict", kind).replace(kind, tinted(kind), 1)]
+    for line in (first, *(f"- {cause}" for cause in more), *others):
+        lines += wrapped(line, "  ", "    ")
+    return "\n".join(lines)
 
 
 def _places(where: Where) -> None:
@@ -197,7 +205,7 @@ def _effects(found: Diagnosis) -> None:
         if share := credit_of(found, "calibration"):
             rows.insert(0, ("  (calibration)", share, "", "the model's own parameters, below"))
         show("\n" + table(rows, ("effect (*: claimed)", "credit", "evidence [nats]", "value")))
-        show("  credit: what predictions lose without it, of what they gain in all")
+        _note("credit: what predictions lose without it, of what they gain in all")
     for group in found.indistinguishable:
         show(field("tied", f"the data can't tell apart: {', '.join(group)}"))
 

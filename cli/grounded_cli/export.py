@@ -6,8 +6,9 @@ from pathlib import Path
 
 import click
 
+from grounded.errors import NextCommand
 from grounded_cli import completion as complete
-from grounded_cli.options import anyway, as_json, in_workspace, open_workspace
+from grounded_cli.options import anyway, as_json, in_workspace, next_line, open_workspace
 from grounded_cli.terminal import remark, show, show_json
 
 # the formats, and how a program begins with each
@@ -71,3 +72,5 @@ def command(
             show(f"  {USES[done.format]}")
         else:
             show(f"  on the robot, with Python 3.8 and numpy alone: {done.runner}")
+            then = next_line(NextCommand("next", ("LOG",)))
+            show(f"\ncopy both to the robot, run it, record a log, then\n{then}")

@@ -8,7 +8,7 @@ import click
 
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
 from grounded_cli.status import summary
-from grounded_cli.terminal import number, remark, say, show, show_json, stages
+from grounded_cli.terminal import number, remark, say, show, show_json, stages, tinted
 
 if TYPE_CHECKING:
     from grounded.search.candidate import Candidate
@@ -40,9 +40,9 @@ def narrated(workspace: Workspace, trials: int | None = None) -> Status:
             for warning in found.warnings:
                 remark("warning", f"{found.trial}: {warning}")
             say(
-                f"{found.trial} {candidate.id} iter {candidate.iteration:<3} "
-                f"alpha {candidate.alpha:<8g} predicted {number(candidate.predicted_utility):>10} "
-                f"real {number(found.utility):>10}  {found.verdict}"
+                f"{found.trial}  {candidate.id}  predicted "
+                f"{number(candidate.predicted_utility):>9}  real {number(found.utility):>9}  "
+                f"{tinted(found.verdict)}"
             )
 
         status = workspace.learn(trials, progress=tell, each=each)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import click
 
+from grounded.errors import NextCommand
 from grounded_cli.ingest import tell
-from grounded_cli.options import as_json, in_workspace, open_workspace
+from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
 from grounded_cli.propose import tell_proposed
 from grounded_cli.terminal import field, progress, show, show_json
 
@@ -31,4 +32,6 @@ def command(log: str, json_: bool) -> None:
     tell_proposed(workspace, done.proposed, last=done.exported is None)
     if done.exported is not None:
         show(field("files", f"{done.exported.file}, {done.exported.runner}", "  "))
-        show(f"\ncopy both to the robot, run {done.exported.candidate}, then: grounded next LOG")
+        then = next_line(NextCommand("next", ("LOG",)))
+        ran = done.exported.candidate
+        show(f"\ncopy both to the robot, run {ran}, record a log, then\n{then}")

@@ -39,6 +39,8 @@ def command(html: bool, png: bool, rrd: bool, watch: bool, json_: bool) -> None:
     elif report.paths:
         for path in report.paths:
             show(str(path))
+        if html or rrd:
+            remark("layouts", "load one in Foxglove or PlotJuggler, then open a trial in trials/")
         show(f"\n{next_line(report.findings.then)}")
     else:
         from grounded_trials.report.report_text import report_text

@@ -9,6 +9,7 @@ import click
 
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
 from grounded_cli.terminal import field, number, progress, remark, show, show_json, sparkline, table
+from grounded_trials.wording import wrapped
 
 if TYPE_CHECKING:
     from grounded.search.candidate import Tried
@@ -42,15 +43,14 @@ def command(json_: bool) -> None:
 def summary(status: Status) -> str:
     """The history as a table, with a line of bars and how sure the last improvement is."""
     from grounded.search.certainty import last_improvement
-    from grounded_trials.report.report_text import spaced
 
     standing, lines = status.standing, []
     if standing.history:
-        header = ("id", "iter", "alpha", "damp", "predicted", "utility", "+-", "trials", "")
+        header = ("id", "iter", "alpha", "damp", "predicted", "utility", "+-", "runs", "")
         last = standing.history[-1]
         lines.append(table([_row(t, t is last) for t in standing.history], header))
-        lines.append(f"  {LEGEND}")
-        bars = sparkline(spaced([t.utility for t in standing.history if t.utilities]))
+        lines += wrapped(LEGEND, "  ", "  ")
+        bars = sparkline([t.utility for t in standing.history if t.utilities])
         lines.append("\n" + field("utility", bars))
     if standing.incumbent is not None:
         best = standing.incumbent
@@ -81,10 +81,10 @@ def _row(tried: Tried, last: bool) -> tuple[str, ...]:
         tried.candidate.id,
         str(tried.candidate.iteration),
         f"{tried.candidate.alpha:g}",
-        f"{tried.candidate.damping:.2g}" if tried.candidate.base else "-",
+        number(tried.candidate.damping, 2) if tried.candidate.base else "-",
         number(tried.candidate.predicted_utility),
         number(tried.utility),
-        "-" if error != error else f"{error:.2g}",
+        number(error, 2),
         str(len(tried.trials)),
         tried.verdict(last),
     )

@@ -13,19 +13,30 @@ from contextlib import contextmanager
 from typing import Any, TextIO
 
 from grounded.result import plain
-from grounded_trials.wording import WIDTH, figure, wrapped
+from grounded_trials.wording import MARKS, columns, figure, glued, wrapped
 
 number = figure
+BARS = "▁▂▃▄▅▆▇█"
 
 
 # Our own marks in a text, which are no characters: what strangers' files say can't be anything else
-_MARKS = {"\ufdd0": "\033[1m", "\ufdd1": "\033[1;31m", "\ufdd2": "\033[0m"}
-BOLD, ALARM, _END = _MARKS
+_MARKS = dict(zip(MARKS, (f"\033[{code}m" for code in ("1", "1;31", "0", "32", "33")), strict=True))
+BOLD, ALARM, _END, GOOD, DOUBT = _MARKS
+MEANING = {
+    **dict.fromkeys(("better", "first", "effect", "several", "none", "converged"), GOOD),
+    **dict.fromkeys(("crashed", "failed", "DAMAGED", "damaged", "lost"), ALARM),
+    **dict.fromkeys(("in doubt", "waiting", "unknown", "UNSURE", "warning", "left out"), DOUBT),
+}  # words that are shown in a colour where there is one
 
 
 def style(text: str, mark: str = BOLD) -> str:
     """Text in bold, or in another of the styles here, where it is shown in colour."""
     return f"{mark}{text}{_END}"
+
+
+def tinted(word: str) -> str:
+    """A word in the colour of what it means: good, doubtful or bad; others as they are."""
+    return style(word, MEANING[word]) if word in MEANING else word
 
 
 def say(text: str) -> None:
@@ -69,14 +80,16 @@ def _escaped(found: re.Match[str]) -> str:
 
 
 def field(label: str, text: str, indent: str = "") -> str:
-    """A label and its text, wrapped to 80 columns under itself; a number keeps its %."""
+    """A label and its text, wrapped to the terminal under itself; a number keeps its %."""
     head = f"{indent}{label:<10} "
-    return "\n".join(wrapped(text, head, " " * len(head)) or [head.rstrip()])
+    first, *rest = wrapped(text, head, " " * len(head)) or [head.rstrip()]
+    return "\n".join([first.replace(label, tinted(label), 1) if label else first, *rest])
 
 
 def remark(kind: str, text: str) -> None:
-    """Narration with a word ahead, `note: ...`, wrapped to 80 columns."""
-    say("\n".join(wrapped(text, f"{kind}: ", "  ")))
+    """Narration with a word ahead, `note: ...`, wrapped to the terminal."""
+    first, *rest = wrapped(text, f"{kind}: ", "  ")
+    say("\n".join([first.replace(kind, tinted(kind), 1), *rest]))
 
 
 def names_in(text: str | None) -> list[str]:
@@ -122,45 +135,101 @@ def bar(text: str) -> Iterator[Callable[[int, int], None]]:
 
 
 def table(rows: Sequence[Sequence[str]], header: Sequence[str]) -> str:
-    """Aligned columns: the first to the left, numbers to the right, two blanks between.
+    """Aligned columns: the first and those of words to the left, numbers to the right.
 
-    Where it is wider than a terminal, names of columns are broken at their blanks.
+    Where it is wider than a terminal, names of columns are broken at their blanks, then cells at
+    theirs; what is wider still goes on in a second table under the same first column.
     """
-    rows = [[cell.replace("\n", "?") for cell in row] for row in rows]
-    heads = [[name] for name in header]
-    if sum(_widths(rows, heads)) + 2 * (len(header) - 1) > WIDTH:
-        widths = [
-            max(max((len(row[i]) for row in rows), default=0), *map(len, name.split() or [""]))
-            for i, name in enumerate(header)
+    body = [[cell.replace("\n", "?") for cell in row] for row in rows]
+    for gap in (2, 1):
+        widths = _fit([list(header), *body], gap)
+        kept = _reach(widths, gap)
+        if kept == len(widths):
+            break
+    if kept < len(widths):
+        parts = [
+            [[row[0], *row[k]] for row in (header, *body)]
+            for k in (slice(1, kept), slice(kept, None))
         ]
-        heads = [textwrap.wrap(n, w) or [""] for n, w in zip(header, widths, strict=True)]
-    widths, tall = _widths(rows, heads), max(map(len, heads))
-    top = [[""] * (tall - len(lines)) + lines for lines in heads]
-    lines = [list(line) for line in zip(*top, strict=True)] + [list(row) for row in rows]
+        return "\n\n".join(table(part[1:], part[0]) for part in parts)
+    left = [i == 0 or _words([row[i] for row in body]) for i in range(len(widths))]
     out = []
-    for k, line in enumerate(lines):
-        cells = [
-            cell.ljust(width) if i == 0 else cell.rjust(width)
-            for i, (cell, width) in enumerate(zip(line, widths, strict=True))
-        ]
-        text = "  ".join(cells).rstrip()
-        out.append(style(text) if k < tall else text)
+    for k, row in enumerate([list(header), *body]):
+        cells = [_broken(cell, width) for cell, width in zip(row, widths, strict=True)]
+        tall = max(map(len, cells), default=0)
+        for j in range(tall):
+            text = ""
+            for i, lines in enumerate(cells):
+                at = j - (tall - len(lines)) if k == 0 else j  # names stand on the line below them
+                cell = lines[at] if 0 <= at < len(lines) else ""
+                pad = " " * (widths[i] - len(cell))
+                text += " " * gap * (i > 0) + (
+                    tinted(cell) + pad if left[i] else pad + tinted(cell)
+                )
+            out.append(style(text.rstrip()) if k == 0 else text.rstrip())
     return "\n".join(out)
 
 
-def _widths(rows: Sequence[Sequence[str]], heads: Sequence[Sequence[str]]) -> list[int]:
-    return [
-        max([len(row[i]) for row in rows] + [len(line) for line in lines])
-        for i, lines in enumerate(heads)
-    ]
+def _fit(lines: list[list[str]], gap: int) -> list[int]:
+    """The widths of columns within a terminal, as far as words allow: first of names, then all."""
+    across = list(zip(*lines, strict=True))
+    widths = [max(map(len, column)) for column in across]
+    for whole in (True, False):  # cells
+        least = [
+            max([_longest(name), *(len(c) if whole else _longest(c) for c in cells)])
+            for name, *cells in across
+        ]
+        while _total(widths, gap) > columns() and widths != least:
+            loose = [w * (w > n) for w, n in zip(widths, least, strict=True)]
+            widths[loose.index(max(loose))] -= 1
+    return widths
+
+
+def _longest(cell: str) -> int:
+    """The widest part of a cell that is not broken."""
+    return max(map(len, glued(cell).split(" ")))
+
+
+def _total(widths: Sequence[int], gap: int) -> int:
+    return sum(widths) + gap * (len(widths) - 1)
+
+
+def _reach(widths: Sequence[int], gap: int) -> int:
+    """How many columns a terminal shows beside each other, two at least."""
+    whole = range(len(widths), 2, -1)
+    fitting = (k for k in whole if _total(widths[:k], gap) <= columns())
+    return next(fitting, min(len(widths), 2))
+
+
+def _words(cells: Sequence[str]) -> bool:
+    """Whether a column holds words rather than numbers."""
+    known = [cell for cell in cells if cell]
+    return all(cell[0].isalpha() for cell in known) or any(len(c.split()) > 3 for c in known)
+
+
+def _broken(cell: str, width: int) -> list[str]:
+    """A cell's lines."""
+    if len(cell) <= width:
+        return [cell]
+    lines = textwrap.wrap(glued(cell), width, break_long_words=False, break_on_hyphens=False)
+    return [line.replace("\xa0", " ") for line in lines]
 
 
 def sparkline(values: Sequence[float]) -> str:
-    """Values as little bars, lowest to highest; a failed run is a cross."""
-    known = [v for v in values if math.isfinite(v)]
+    """Utilities as little bars, worst to best; a failed run is a cross.
+
+    By the logarithm of the distance from 0 where the worst would flatten all others; the scale is
+    said beside it.
+    """
+    shown = list(values)[-columns() // 2 :]
+    known = [v for v in shown if math.isfinite(v)]
     if not known:
-        return "x" * len(values)
+        return "x" * len(shown)
     low, high = min(known), max(known)
-    bars = "▁▂▃▄▅▆▇█"
-    span = (high - low) or 1.0
-    return "".join(bars[round((v - low) / span * 7)] if math.isfinite(v) else "x" for v in values)
+    log = high < 0 and low < 2 * high
+    places = [-math.log(-v) if log and math.isfinite(v) else v for v in shown]
+    least, most = (-math.log(-v) if log else v for v in (low, high))
+    span = (most - least) or 1.0
+    bars = (BARS[round((v - least) / span * 7)] if math.isfinite(v) else "x" for v in places)
+    scale = figure(low) + f" to {figure(high)}" * (low < high) + ", logarithmic" * log
+    return f"{''.join(bars)}  {scale}" + ", x: failed" * (len(known) < len(shown))

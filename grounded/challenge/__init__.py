@@ -4,13 +4,15 @@
     judge(label, diagnosis, oracle(...)), summary(marks)
 
 Read `cases` first (what a case is and how it is drawn), then `systems` (what is driven), `draws`
-(the effects, in the library and not), `truth` (the simulated real system), `score` (oracle and
-marks). Nothing in `grounded.diagnosis` imports this folder: the diagnosis can't reach the truth.
+(the effects, in the library and not), `truth` (the simulated real system), `mechanism` (the same in
+MuJoCo), `score` (oracle and marks). Nothing in `grounded.diagnosis` imports this folder: the
+diagnosis can't reach the truth.
 """
 
 from __future__ import annotations
 
 from grounded.challenge.cases import KINDS, Case, make, sealed
+from grounded.challenge.mechanism import simulator
 from grounded.challenge.score import Oracle, judge, oracle, study, summary, task_of
 
 __all__ = [
@@ -21,6 +23,7 @@ __all__ = [
     "make",
     "oracle",
     "sealed",
+    "simulator",
     "study",
     "summary",
     "task_of",

@@ -9,14 +9,16 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
 
 from grounded.challenge import systems
-from grounded.challenge.draws import draw_effect, draw_withheld, values_of
+from grounded.challenge.draws import JOINT, draw_effect, draw_withheld, values_of
+from grounded.challenge.mechanism import Mechanism, simulator
 from grounded.challenge.truth import Disturbance, Truth
 from grounded.effects import Effect, ParamFamily, scales_of
 from grounded.errors import GroundedError
@@ -53,6 +55,7 @@ def make(
     seed: int,
     *,
     only: str | None = None,
+    groups: Sequence[str] = ("own",),
     param_error: float | None = None,
     noise: str | None = None,
 ) -> Iterator[Case]:
@@ -62,22 +65,48 @@ def make(
         kind: single, double, none or withheld.
         count: how many.
         seed: everything follows from it.
-        only: one system instead of all three.
+        only: one system instead of all.
+        groups: of systems (`systems.GROUPS`); "own" is half of the cases where there are others.
         param_error: relative errors of the model's parameters (uniform), instead of a random third
             of the cases with 5 %.
         noise: "white", "coloured" or "heavy", instead of mostly white (of all three for "none").
 
     Raises:
-        GroundedError: for an unknown kind or system.
+        GroundedError: for an unknown kind or system, or mechanisms without MuJoCo.
     """
     if kind not in KINDS:
         raise GroundedError(f"a challenge is one of {', '.join(KINDS)}; got '{kind}'")
     if only is not None and only not in systems.SYSTEMS:
         raise GroundedError(f"systems of the challenge: {', '.join(systems.SYSTEMS)}; got '{only}'")
+    share = _shares(groups)
+    if only is None and "mujoco" in groups:
+        simulator()
     for i in range(count):
         rng = np.random.default_rng([seed, KINDS.index(kind), i])
-        name = only or rng.choice(list(systems.SYSTEMS), p=[0.6, 0.2, 0.2])
-        yield _case(f"{kind}-{i:04d}", kind, i, systems.SYSTEMS[name](), rng, param_error, noise)
+        name = only or str(rng.choice(list(share), p=list(share.values())))
+        case = None
+        while case is None:
+            case = _case(
+                f"{kind}-{i:04d}", kind, i, systems.SYSTEMS[name](), rng, param_error, noise
+            )
+        yield case
+
+
+def _shares(groups: Sequence[str]) -> dict[str, float]:
+    """How often each system is drawn.
+
+    Raises:
+        GroundedError: for an unknown group, or none.
+    """
+    if not groups or not set(groups) <= set(systems.GROUPS):
+        raise GroundedError(
+            f"groups of systems: {', '.join(systems.GROUPS)}; got '{', '.join(groups)}'"
+        )
+    weight = {g: max(len(groups) - 1, 1) if g == "own" else 1 for g in groups}
+    total = sum(weight.values())
+    return {
+        name: part * weight[g] / total for g in weight for name, part in systems.GROUPS[g].items()
+    }
 
 
 def sealed(label: Mapping[str, Any]) -> str:
@@ -106,9 +135,10 @@ def _case(
     rng: np.random.Generator,
     param_error: float | None,
     noise: str | None,
-) -> Case:
+) -> Case | None:
+    """A case; None where a mechanism lost its way, as nobody would keep such runs."""
     dt = 1.0 / float(rng.choice(system.rates))
-    duration = float(rng.uniform(5, 10)) if system.name != "aircraft" else float(rng.uniform(5, 7))
+    duration = float(rng.uniform(*system.duration))
     drawn = NOISE_KINDS[index % 3] if kind == "none" else rng.choice(NOISE_KINDS, p=[0.8, 0.1, 0.1])
     setting = _Setting(
         dt=dt,
@@ -127,9 +157,12 @@ def _case(
         {k: v * setting.roughness for k, v in system.process.items()},
         {k: v * setting.level for k, v in system.measurement.items()},
         setting.kind,
+        grows=system.grows,
     )
     truth, label = _truth(kind, system, plans, setting, disturbance, rng)
     runs = [_run(system, truth, plan, setting, rng) for plan in plans]
+    if system.built and any(map(partial(_lost, crude), runs, plans)):
+        return None
     label |= {"noise": setting.kind, "level": setting.level, "roughness": setting.roughness}
     label |= {"param_error": error, "system": system.name, "kind": kind, "case": name}
     return Case(
@@ -156,6 +189,15 @@ def _with_errors(model: Model, error: float, rng: np.random.Generator) -> Model:
     return model.with_values({n: p.value * float(f) for (n, p), f in names if p.uncertain})
 
 
+LOST = 2.0  # [rad or m] from the target
+
+
+def _lost(model: Model, trial: Trial, plan: Plan) -> bool:
+    """Whether a position went far from its target."""
+    error = model.difference(trial.states, plan[2])[:, : model.n // 2]
+    return not np.abs(error).max() < LOST
+
+
 Plan = tuple[Array, Array, Array, Array]  # inputs (T, m), start (n,), target (T + 1, n), gains
 
 
@@ -169,7 +211,7 @@ def _plans(
         if i == 0 or not setting.same_task:
             u, start = system.manoeuvre(rng, t, crude)
         else:
-            spread = 0.05 * (system.high - system.low)
+            spread = system.bend * (system.high - system.low)
             bend = np.column_stack([systems.wave(rng, t, 2, 0.1, 0.5) for _ in range(crude.m)])
             u, start = np.clip(found[0][0] + spread * bend, system.low, system.high), found[0][1]
         target, gains = systems.regulator(system, crude, u, start, setting.dt)
@@ -191,7 +233,7 @@ def _run(
         error = np.clip(model.difference(y, target[t]), -2.0, 2.0)
         return np.asarray(np.clip(u[t] + gains[t] @ error, system.low, system.high))
 
-    held = u[0] if system.name == "aircraft" else system.held
+    held = u[0] if system.settled else system.held
     wobble = np.array([truth.disturbance.measurement.get(n, 0.0) for n in model.state_names])
     first = start + wobble * rng.standard_normal(model.n)
     return truth.run(rng, control, first, held, setting.steps, setting.dt)
@@ -210,26 +252,29 @@ def _truth(
     inputs = np.concatenate([plan[0] for plan in plans])
     scales = scales_of(model, states, inputs, setting.dt, setting.steps * setting.dt)
     if kind == "none":
-        return Truth(model, disturbance=disturbance, latency=latency), {"effects": []}
+        return _built(system, Truth(model, disturbance=disturbance, latency=latency)), {
+            "effects": []
+        }
     if kind == "withheld":
-        driven = "v" if system.name == "car" else ("omega" if system.name == "pendulum" else "q")
-        rate = float(np.quantile(np.abs(np.diff(states[:, model.state_names.index(driven)])), 0.9))
+        moved = np.diff(states[:, model.state_names.index(system.driven)])
+        rate = float(np.quantile(np.abs(moved), 0.9))
         hidden = draw_withheld(
             rng,
             model,
             np.abs(inputs - inputs.mean(axis=0)).max(axis=0) + 0.5 * np.abs(inputs).max(axis=0),
-            driven,
+            system.driven,
             max(rate / setting.dt, 0.3),
             setting.steps * setting.dt,
+            system.built is not None,
         )
         truth = Truth(model, (), disturbance, hidden.actuators, hidden.rates, latency)
         label = {"name": hidden.name, "target": hidden.target, "params": hidden.params}
-        return truth, {"effects": [], "withheld": label}
+        return _built(system, truth, hidden.joint), {"effects": [], "withheld": label}
     effects: list[tuple[Effect, dict[str, float]]] = []
     while len(effects) < (2 if kind == "double" else 1):
-        effect = draw_effect(model, scales, rng)
+        effect = draw_effect(model, scales, rng, JOINT if system.built else ())
         if effect.name not in [e.name for e, _ in effects]:
-            effects.append((effect, values_of(effect, scales, rng, states)))
+            effects.append((effect, values_of(effect, scales, rng, states, bool(system.built))))
     true_model = model
     for effect, values in effects:
         if isinstance(effect.family, ParamFamily):
@@ -237,4 +282,26 @@ def _truth(
             true_model = true_model.with_values({name: true_model.params[name].value + values["d"]})
     acting = tuple((e, v) for e, v in effects if not isinstance(e.family, ParamFamily))
     named = [{"effect": e.name, "params": dict(v)} for e, v in effects]
-    return Truth(true_model, acting, disturbance, latency=latency), {"effects": named}
+    truth = Truth(true_model, acting, disturbance, latency=latency)
+    return _built(system, truth), {"effects": named}
+
+
+INSIDE = {"joint_friction": "friction", "added_inertia": "armature", "first_order_lag": "lag"}
+
+
+def _built(
+    system: systems.SystemUnderTest, truth: Truth, more: Mapping[str, float] | None = None
+) -> Truth:
+    """The same in MuJoCo, where the system has a double there; what its joints do, they do."""
+    if system.built is None:
+        return truth
+    true = dict(zip(truth.model.param_names, map(float, truth.model.values), strict=True))
+    part: dict[str, dict[str, float]] = {kind: {} for kind in INSIDE.values()} | {"true": true}
+    for effect, values in truth.effects:
+        if (kind := INSIDE.get(effect.family.name)) is not None:
+            size = next(values[q] for q in ("c", "J", "tau") if q in values)
+            for name in effect.site.targets:
+                part[kind][name.partition("<-")[0]] = size
+    outside = tuple((e, v) for e, v in truth.effects if e.family.name not in INSIDE)
+    built = Mechanism(system.built, part, more or {})
+    return replace(truth, effects=outside, mechanism=built)

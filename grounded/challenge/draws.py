@@ -10,12 +10,16 @@ crosstalk     one input leaks, squared, into another
 quantised     commands arrive in coarse steps
 gusts         pushes of half a second at random times
 hysteresis    drag that depends on whether the speed rises or falls
+spring        a cable pulls at the first joint (mechanisms only)
+hung          something swings from the tip (mechanisms only)
+
+A mechanism's effects are those of its joints and drives (`JOINT`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -25,20 +29,31 @@ from grounded.effects import Effect, Library, Scales
 from grounded.frozen import Array
 from grounded.model import Model
 
+JOINT = (
+    "joint_friction", "added_inertia", "parameter", "first_order_lag", "delay", "dead_zone",
+)  # fmt: skip
+DRIVE = {"delay": 0.12, "first_order_lag": 0.3}  # [s] of a mechanism, times the size
 SMALLEST, LARGEST = 0.04, 0.35  # of the signals an effect acts on
 
 
-def draw_effect(model: Model, scales: Scales, rng: np.random.Generator) -> Effect:
-    """A family at random, then one of its targets."""
+def draw_effect(
+    model: Model, scales: Scales, rng: np.random.Generator, families: Sequence[str] = ()
+) -> Effect:
+    """A family at random (of `families`, if any are named), then one of its targets."""
     by_family: dict[str, list[Effect]] = {}
     for effect in Library().candidates(model, scales):
-        by_family.setdefault(effect.family.name, []).append(effect)
+        if not families or effect.family.name in families:
+            by_family.setdefault(effect.family.name, []).append(effect)
     options = by_family[rng.choice(sorted(by_family))]
     return options[int(rng.integers(0, len(options)))]
 
 
 def values_of(
-    effect: Effect, scales: Scales, rng: np.random.Generator, visited: Array
+    effect: Effect,
+    scales: Scales,
+    rng: np.random.Generator,
+    visited: Array,
+    mechanism: bool = False,
 ) -> dict[str, float]:
     """A size from barely visible to large, as a part of the signals it acts on.
 
@@ -49,13 +64,14 @@ def values_of(
         scales: sizes of the signals.
         rng: draws.
         visited: (N, n) states of the manoeuvres: a place that differs is one that is visited.
+        mechanism: whether it is one, whose loop a late drive shakes sooner.
     """
     size = float(np.exp(rng.uniform(np.log(SMALLEST), np.log(LARGEST))))
     sign = float(rng.choice([-1, 1]))
     family, values = effect.family.name, dict(effect.fixed)
     top = _rate_scale(scales, effect.site.target) * size
     for q in effect.free:
-        values[q.name] = _value(effect, q.name, size, sign, scales, rng)
+        values[q.name] = _value(effect, q.name, size, sign, scales, rng, mechanism)
     if family == "periodic":
         phase = rng.uniform(0, 2 * np.pi)
         values |= {"A": top * np.cos(phase), "B": top * np.sin(phase)}
@@ -81,6 +97,7 @@ def _value(
     sign: float,
     scales: Scales,
     rng: np.random.Generator,
+    mechanism: bool,
 ) -> float:
     family, target = effect.family.name, effect.site.target
     if family in ("dead_zone", "stall"):
@@ -91,6 +108,8 @@ def _value(
         return size * scales.spread(target)
     if family in ("rate_limit", "slew_limit"):
         return float(float(scales.spread(target)) * np.exp(rng.uniform(np.log(0.3), np.log(3.0))))
+    if mechanism and family in DRIVE:
+        return DRIVE[family] * size
     if family in ("delay", "sensor_delay"):
         return 0.6 * size
     if family in ("first_order_lag", "sensor_lag"):
@@ -102,8 +121,11 @@ def _value(
     if family in ("input_gain", "input_curve", "rate_gain", "odometry_scale", "sensor_scale"):
         return sign * size
     if family == "parameter":
-        value = effect.site.model.params[target].value
-        return sign * size * (abs(value) if value else 0.2)
+        known = effect.site.model.params[target]
+        low = -np.inf if known.low is None else known.low
+        high = np.inf if known.high is None else known.high
+        change = sign * size * (abs(known.value) or min((high - low) / 2, 0.5))
+        return float(change if known.value + change >= low else -change)
     if family in ("viscous_friction", "quadratic_drag", "coulomb_friction", "stiction"):
         speed = scales.peak(target)
         over = {"viscous_friction": 1.0, "quadratic_drag": speed}.get(family, 1 / speed)
@@ -155,10 +177,17 @@ class Withheld:
     params: dict[str, float]
     actuators: tuple[Actuator, ...] = ()
     rates: tuple[Rate, ...] = ()
+    joint: Mapping[str, float] = field(default_factory=dict)  # of a mechanism
 
 
 def draw_withheld(
-    rng: np.random.Generator, model: Model, peak: Array, driven: str, rate: float, duration: float
+    rng: np.random.Generator,
+    model: Model,
+    peak: Array,
+    driven: str,
+    rate: float,
+    duration: float,
+    mechanism: bool = False,
 ) -> Withheld:
     """A random withheld effect for a model.
 
@@ -169,10 +198,13 @@ def draw_withheld(
         driven: the state that gusts and hysteresis act on.
         rate: typical size of that state's rate.
         duration: of a trial [s].
+        mechanism: whether it is one: what would push its states hangs or pulls at it instead.
     """
     makers = [_resonance, _dropouts, _fault, _quantised, _crosstalk]
     kind = int(rng.integers(0, len(makers) + 2))
     j = int(rng.integers(0, model.m))
+    if mechanism and kind >= len(makers):
+        return _attached(rng, driven)
     if kind == len(makers) or (model.m == 1 and kind == len(makers) - 1):
         return _gusts(rng, driven, rate, duration)
     if kind == len(makers) + 1:
@@ -181,6 +213,12 @@ def draw_withheld(
     params, act = maker(rng, j, model.m, float(peak[j]), duration)
     name = maker.__name__.removeprefix("_")
     return Withheld(name, model.input_names[j], params, actuators=(act,))
+
+
+def _attached(rng: np.random.Generator, driven: str) -> Withheld:
+    name = str(rng.choice(["spring", "hung"]))
+    size = float(rng.uniform(0.5, 3.0) if name == "spring" else rng.uniform(0.05, 0.2))
+    return Withheld(name, driven, {name: size}, joint={name: size})
 
 
 _Made = tuple[dict[str, float], Actuator]  # what is sealed, what acts

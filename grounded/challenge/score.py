@@ -1,15 +1,20 @@
 """Judging diagnoses against opened labels, and against an oracle that knows the effect.
 
 The oracle fits the true effects (values free, noise and parameters as in a diagnosis) and nothing
-else: a case counts as detectable where its evidence exceeds 3 nats, and its held-out gap is what a
-diagnosis is compared with. `study` makes, diagnoses and judges cases in memory, without files.
+else: a case counts as detectable where its evidence exceeds 3 nats, as distinguishable where it is
+also 3 nats ahead of the likeliest others that the diagnosis ranked, fitted in the same way. What a
+diagnosis predicts, held out and in units, is compared with what the oracle predicts.
+
+Besides a first name that is wrong there are a second one that nothing makes (`false_second`), the
+right family at the wrong place (`wrong_place`), and names that predict worse than the model without
+them (`worse`). `study` makes, diagnoses and judges cases in memory, without files.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -20,6 +25,7 @@ from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.held_out import held_out_errors
 from grounded.diagnosis.hypothesis import Hypothesis
 from grounded.diagnosis.prediction_error import horizon, normalised
+from grounded.diagnosis.ruler import Ruler
 from grounded.diagnosis.search import HypothesisSearch
 from grounded.effects import Library
 from grounded.frozen import Array
@@ -29,6 +35,8 @@ from grounded.trial import Trial
 from grounded.utility import Reward
 
 DETECTABLE = 3.0  # nats
+WORSE = 1.01  # ratio of errors in units from which names predict worse than none
+RIVALS = 2
 
 
 @dataclass(frozen=True)
@@ -38,12 +46,26 @@ class Oracle:
     evidence: float
     gap_after: float
     each: Mapping[str, float]  # what the evidence loses without each true effect
+    rival: float = -np.inf  # evidence of the likeliest other [nats]
+    errors: Mapping[str, float] = field(default_factory=dict)  # 1 s ahead, held out, in units
 
 
 def oracle(
-    model: Model, trials: Sequence[Trial], latency: Array, label: Mapping[str, Any]
+    model: Model,
+    trials: Sequence[Trial],
+    latency: Array,
+    label: Mapping[str, Any],
+    ranking: Sequence[Mapping[str, Any]] = (),
 ) -> Oracle | None:
-    """What knowing the label would give; None where the library has no such effect."""
+    """What knowing the label would give; None where the library has no such effect.
+
+    Args:
+        model: the crude one.
+        trials: the case's.
+        latency: of its inputs (m,) [s].
+        label: opened.
+        ranking: a diagnosis', whose likeliest others are fitted too where one effect is true.
+    """
     if not label["effects"]:
         return None
     data = prepare(model, trials, latency)
@@ -52,6 +74,12 @@ def oracle(
         {q.name: float(e["params"][q.name]) for q in effect.free}
         for e, effect in zip(label["effects"], effects, strict=True)
     ]
+    known = [effect.name for effect in effects]
+    others = sorted((r for r in ranking if r["effect"] not in known), key=lambda r: -r["evidence"])
+    others = [] if len(known) > 1 else others[:RIVALS]
+    for row in others:
+        effects.append(Library().effect(row["effect"], model, data.scales))
+        values.append({q.name: float(row["params"][q.name]["value"]) for q in effects[-1].free})
     search = HypothesisSearch(data, Library().candidates(model, data.scales))
     search.nulls()
 
@@ -72,17 +100,23 @@ def oracle(
         search.fair(found[0])
         return search.score(found[0])
 
-    everything = list(range(len(effects)))
+    everything = list(range(len(known)))
     whole = fitted(everything)
     each = {}
-    for i, effect in enumerate(effects):
+    for i, effect in enumerate(effects[: len(known)]):
         rest = [j for j in everything if j != i]
         below = fitted(rest) if rest else search.score(search.best_null())
         each[effect.name] = whole - below
-    best = search.of_size(len(effects))[0]
+    names = tuple(sorted(known))
+    best = next(f for f in search.of_size(len(known)) if tuple(sorted(f.hypothesis.names)) == names)
     where = horizon(search.predictor, best, 1.0)
     gap = normalised(held_out_errors(search.predictor, best, best.track, where), where)
-    return Oracle(whole - search.score(search.best_null()), gap, each)
+    none = search.score(search.best_null())
+    rivals = [fitted([len(known) + i]) - none for i in range(len(others))]
+    ruler = Ruler(search.predictor)
+    rms = ruler.errors(best).rms[len(ruler.steps) - 1, ruler.shown]
+    errors = dict(zip(ruler.names, map(float, rms), strict=True))
+    return Oracle(whole - none, gap, each, max(rivals, default=-np.inf), errors)
 
 
 def _plain(search: HypothesisSearch) -> list[Any]:
@@ -120,15 +154,59 @@ def judge(
         "both": set(truth) <= set(named),
         "leftover": bool(diagnosis["leftover"]),
         "gap_after": diagnosis["gap"]["after"],
-        "false_effect": not truth and any(not n.startswith("parameter:") for n in named),
+        "system": label["system"],
+        "false_effect": not truth and bool(_physical(named, label)),
+        "false_second": bool(truth) and _spare(truth, named, label) > 0,
+        "wrong_place": _misplaced(truth, order),
+        "worse": bool(named) and _ratio(diagnosis, _without(diagnosis)) > WORSE,
     }
     if known is not None:
         marks["evidence"] = known.evidence
         marks["detectable"] = known.evidence > DETECTABLE
+        marks["distinguishable"] = known.evidence > max(known.rival, 0.0) + DETECTABLE
         marks["each_detectable"] = all(v > DETECTABLE for v in known.each.values())
         marks["gap_ratio"] = diagnosis["gap"]["after"] / max(known.gap_after, 1e-9)
+        marks["units_ratio"] = _ratio(diagnosis, known.errors)
     marks |= _values(label, diagnosis)
     return marks
+
+
+def _physical(named: Sequence[str], label: Mapping[str, Any]) -> list[str]:
+    """The names without parameters, where those are off too."""
+    return [n for n in named if not (label["param_error"] and n.startswith("parameter:"))]
+
+
+def _spare(truth: Sequence[str], named: Sequence[str], label: Mapping[str, Any]) -> int:
+    """How many names are claimed beside the true ones, or beside one that stands for each."""
+    return len(set(_physical(named, label)) | (set(truth) & set(named))) - len(truth)
+
+
+def _misplaced(truth: Sequence[str], order: Sequence[str]) -> bool:
+    """Whether the first name is a true family, at another place."""
+    if not truth or not order or order[0] in truth:
+        return False
+    return order[0].partition(":")[0] in {name.partition(":")[0] for name in truth}
+
+
+def _row(diagnosis: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The ruler's row of the longest horizon that is not the whole trial."""
+    rows = [row for row in diagnosis.get("prediction_error", ()) if not row["whole_trial"]]
+    return rows[-1] if rows else {}
+
+
+def _without(diagnosis: Mapping[str, Any]) -> Mapping[str, float]:
+    """Errors without what is named: calibrated, unless it is parameters that are named."""
+    row, named = _row(diagnosis), diagnosis["verdict"]["effects"]
+    effects = any(not name.startswith("parameter:") for name in named)
+    return dict((effects and row.get("calibrated")) or row.get("crude", {}))
+
+
+def _ratio(diagnosis: Mapping[str, Any], other: Mapping[str, float]) -> float:
+    """Held-out errors of a diagnosis in units over others, the geometric mean over channels."""
+    own = _row(diagnosis).get("with_effects", {})
+    pairs = [(own[n], other[n]) for n in own if n in other]
+    logs = [np.log(a / b) for a, b in pairs if a is not None and b is not None and a > 0 and b > 0]
+    return float(np.exp(np.mean(logs))) if logs else float("nan")
 
 
 def _values(label: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> dict[str, Any]:
@@ -158,15 +236,20 @@ def summary(marks: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
             v: sum(m["verdict"] == v for m in some)
             for v in ("effect", "several", "none", "unknown")
         }
+        row["worse"] = _part(some, "worse")
         if kind == "single":
             seen = [m for m in some if m.get("detectable")]
+            apart = [m for m in seen if m["distinguishable"]]
             row |= {
                 "detectable": len(seen),
                 "first": _part(seen, "first"),
+                "distinguishable": len(apart),
+                "first_of_distinguishable": _part(apart, "first"),
                 "in_group": _part(seen, "in_group"),
                 "top3": _part(seen, "top3"),
                 "first_of_all": _part(some, "first"),
                 "leftover": _part(seen, "leftover"),
+                "wrong_place": _part(seen, "wrong_place"),
             }
         if kind == "double":
             seen = [m for m in some if m.get("each_detectable")]
@@ -174,9 +257,13 @@ def summary(marks: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         if kind in ("single", "double"):
             covered = [c for m in some for c in m["covered"]]
             ratios = [m["gap_ratio"] for m in some if m.get("detectable")]
+            row["false_second"] = _part(some, "false_second")
             row["coverage"] = float(np.mean(covered)) if covered else None
             row["gap_ratio_median"] = float(np.median(ratios)) if ratios else None
             row["gap_within_1.15"] = float(np.mean(np.array(ratios) < 1.15)) if ratios else None
+            units = [m["units_ratio"] for m in some if np.isfinite(m.get("units_ratio", np.nan))]
+            row["units_ratio_median"] = float(np.median(units)) if units else None
+            row["units_within_1.15"] = float(np.mean(np.array(units) < 1.15)) if units else None
             errors = [e for m in some for e in m["errors"]]
             row["param_error_median"] = float(np.median(errors)) if errors else None
         if kind == "none":
@@ -243,7 +330,7 @@ def study(
         begin = time.process_time()
         found = diagnose(task_of(case), case.trials, options).to_json()
         spent = time.process_time() - begin
-        known = oracle(case.model, case.trials, case.latency, case.label)
+        known = oracle(case.model, case.trials, case.latency, case.label, found["ranking"])
         marks.append({**judge(case.label, found, known), "cpu_s": spent})
         if progress is not None:
             progress(marks[-1])

@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from grounded.challenge import mechanism
+from grounded.compile import Named
 from grounded.frozen import Array
 from grounded.model import Model
 
@@ -20,7 +22,9 @@ from grounded.model import Model
 class SystemUnderTest:
     """A system: its model, limits, noise at level 1, random manoeuvres.
 
-    `manoeuvre(rng, times, model)` gives inputs (T, m) and the start state (n,).
+    `manoeuvre(rng, times, model)` gives inputs (T, m) and the start state (n,). `driven` is the
+    state that withheld effects act on, `grows` says what process noise scales with (`Disturbance`),
+    `built` writes the XML of its double in MuJoCo.
     """
 
     name: str
@@ -35,6 +39,12 @@ class SystemUnderTest:
     held: Array
     rates: tuple[float, ...] = (20.0, 30.0, 50.0)  # [Hz]
     latency: tuple[float, ...] = ()
+    driven: str = "v"
+    duration: tuple[float, float] = (5.0, 10.0)  # [s]
+    settled: bool = False  # the first inputs were held before the start
+    grows: tuple[str, float] | None = None
+    bend: float = 0.05  # of the limits: how trials of one task differ
+    built: Callable[..., str] | None = None
 
 
 def wave(rng: np.random.Generator, t: Any, count: int, low: float, high: float) -> Array:
@@ -130,6 +140,7 @@ def pendulum() -> SystemUnderTest:
         effort=np.array([0.2]),
         manoeuvre=_swing,
         held=np.zeros(1),
+        driven="omega",
     )
 
 
@@ -154,6 +165,147 @@ def aircraft() -> SystemUnderTest:
         manoeuvre=_fly,
         held=np.zeros(4),
         rates=(50.0,),
+        driven="q",
+        duration=(5.0, 7.0),
+        settled=True,
+    )
+
+
+def _crawl(rng: np.random.Generator, t: Array, model: Model) -> tuple[Array, Array]:
+    u, start = _drive(rng, t, model)
+    start[model.state_names.index("v")] = rng.uniform(0.0, 1.0)
+    return u, start
+
+
+def buggy() -> SystemUnderTest:
+    """A car with a kink between driving and braking, in noise that grows with its speed."""
+    from grounded.models.buggy import model
+
+    return SystemUnderTest(
+        name="buggy",
+        model=model,
+        low=np.array([-1.0, -0.3]),
+        high=np.array([1.0, 1.0]),
+        process={"x": 0.01, "y": 0.01, "psi": 0.04, "v": 0.15},
+        measurement={"x": 0.004, "y": 0.004, "psi": 0.01, "v": 0.02},
+        tracking={"x": 4.0, "y": 4.0, "psi": 1.0, "v": 1.0},
+        effort=np.array([2.0, 2.0]),
+        manoeuvre=_crawl,
+        held=np.zeros(2),
+        rates=(20.0, 50.0, 100.0),
+        grows=("v", 1.5),
+    )
+
+
+def _hoist(rng: np.random.Generator, t: Array, model: Model) -> tuple[Array, Array]:
+    volts = rng.uniform(1.5, 5.0) * wave(rng, t, 3, 0.1, 1.0)
+    if rng.random() < 0.4:
+        volts = steps(rng, t, -4.0, 4.0, 0.8)
+    return np.clip(volts, -6, 6)[:, None], np.zeros(2)
+
+
+def lift() -> SystemUnderTest:
+    """An axis with kinks in its drive and its friction, in noise that grows with its speed."""
+    from grounded.models.lift import model
+
+    return SystemUnderTest(
+        name="lift",
+        model=model,
+        low=np.array([-6.0]),
+        high=np.array([6.0]),
+        process={"z": 0.001, "w": 0.12},
+        measurement={"z": 0.002, "w": 0.02},
+        tracking={"z": 10.0, "w": 0.5},
+        effort=np.array([0.05]),
+        manoeuvre=_hoist,
+        held=np.zeros(1),
+        rates=(20.0, 50.0, 100.0),
+        driven="w",
+        grows=("w", 0.7),
+    )
+
+
+def _reach(rng: np.random.Generator, t: Array, model: Model) -> tuple[Array, Array]:
+    """Torques that lead the crude model along waves about hanging, by its inverse dynamics."""
+    dt = float(t[1] - t[0])
+    reach = rng.uniform(0.3, 1.1, 2)
+    path = np.column_stack([r * wave(rng, t, 2, 0.15, 0.7) for r in reach])
+    path += np.array([-np.pi / 2, rng.uniform(0.0, 0.8)])
+    speed = np.gradient(path, dt, axis=0)
+    wanted = np.gradient(speed, dt, axis=0)
+    x = start = np.concatenate([path[0], speed[0]])
+    u = np.empty((len(t), 2))
+    for k in range(len(t)):
+        free, by = _accelerations(model, x)
+        pull = wanted[k] + 60 * (path[k] - x[:2]) + 15 * (speed[k] - x[2:])
+        u[k] = np.clip(np.linalg.solve(by, pull - free), -15, 15)
+        x = model.system.step(x[None], u[k][None], model.values, dt)[0]
+    return u, start
+
+
+def _accelerations(model: Model, x: Array) -> tuple[Array, Array]:
+    """Of the joints: without torques (2,), and by each torque (2, 2)."""
+    assert model.derivative is not None
+    p = Named("parameter", model.param_names, list(model.values))
+    s, found = Named("state", model.state_names, list(x)), []
+    for u in ([0.0, 0.0], [1.0, 0.0], [0.0, 1.0]):
+        rate = model.derivative(s, Named("input", model.input_names, u), p)
+        found.append(np.array([rate[n] for n in model.state_names[2:]]))
+    return found[0], np.column_stack([found[1] - found[0], found[2] - found[0]])
+
+
+def arm() -> SystemUnderTest:
+    """A two-link arm with encoders; the real one is MuJoCo's."""
+    from grounded.models.arm import model
+
+    return SystemUnderTest(
+        name="arm",
+        model=model,
+        low=np.array([-15.0, -15.0]),
+        high=np.array([15.0, 15.0]),
+        process={"q1_vel": 0.03, "q2_vel": 0.05},
+        measurement={"q1": 0.001, "q2": 0.001, "q1_vel": 0.01, "q2_vel": 0.01},
+        tracking={"q1": 20.0, "q2": 20.0, "q1_vel": 0.3, "q2_vel": 0.3},
+        effort=np.array([0.05, 0.05]),
+        manoeuvre=_reach,
+        held=np.zeros(2),
+        rates=(50.0, 100.0),
+        driven="q1_vel",
+        duration=(4.0, 7.0),
+        settled=True,
+        bend=0.005,
+        built=mechanism.arm_built,
+    )
+
+
+def _shove(rng: np.random.Generator, t: Array, model: Model) -> tuple[Array, Array]:
+    force = rng.uniform(1.5, 5.0) * wave(rng, t, 3, 0.2, 1.0)
+    if rng.random() < 0.3:
+        force = steps(rng, t, -4.0, 4.0, 0.6)
+    start = np.array([0.0, np.pi + rng.uniform(-0.4, 0.4), 0.0, 0.0])
+    return np.clip(force, -10, 10)[:, None], start
+
+
+def cart_pole() -> SystemUnderTest:
+    """A cart whose pole hangs and swings; the real one is MuJoCo's."""
+    from grounded.models.cart_pole import model
+
+    return SystemUnderTest(
+        name="cart_pole",
+        model=model,
+        low=np.array([-10.0]),
+        high=np.array([10.0]),
+        process={"x_vel": 0.02, "theta_vel": 0.03},
+        measurement={"x": 0.002, "theta": 0.003, "x_vel": 0.02, "theta_vel": 0.03},
+        tracking={"x": 5.0, "theta": 2.0, "x_vel": 0.5, "theta_vel": 0.2},
+        effort=np.array([0.1]),
+        manoeuvre=_shove,
+        held=np.zeros(1),
+        rates=(20.0, 50.0, 100.0),
+        driven="x_vel",
+        duration=(4.0, 8.0),
+        bend=0.02,
+        built=mechanism.cart_built,
     )
 
 
@@ -181,4 +333,11 @@ def regulator(
     return x, 0.7 * K
 
 
-SYSTEMS: dict[str, Any] = {"car": car, "pendulum": pendulum, "aircraft": aircraft}
+SYSTEMS: dict[str, Callable[[], SystemUnderTest]] = {
+    made.__name__: made for made in (car, pendulum, aircraft, buggy, lift, arm, cart_pole)
+}
+GROUPS: dict[str, dict[str, float]] = {  # systems, and how often each is drawn
+    "own": {"car": 0.6, "pendulum": 0.2, "aircraft": 0.2},
+    "kinked": {"buggy": 0.6, "lift": 0.4},
+    "mujoco": {"arm": 0.6, "cart_pole": 0.4},
+}

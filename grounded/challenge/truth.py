@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from grounded.challenge.mechanism import Mechanism
 from grounded.compile import Named
 from grounded.effects import (
     Effect,
@@ -42,17 +43,22 @@ class Disturbance:
     """Noise of the real system, by state: process in unit/sqrt(s), measurement in unit.
 
     kind: "white", "coloured" (correlated over `tau`), "heavy" (Student-t of 3, 1 % outliers).
+    grows: (state, size): process noise scales with 0.2 + |state| / size.
     """
 
     process: Mapping[str, float]
     measurement: Mapping[str, float]
     kind: str = "white"
     tau: float = 0.1
+    grows: tuple[str, float] | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """The real system: a model with true parameters, effects, disturbances, withheld parts."""
+    """The real system: a model with true parameters, effects, disturbances, withheld parts.
+
+    A mechanism takes the place of the model's derivative, and of the effects that it has itself.
+    """
 
     model: Model
     effects: tuple[tuple[Effect, Mapping[str, float]], ...] = ()
@@ -60,6 +66,7 @@ class Truth:
     actuators: tuple[Actuator, ...] = ()
     rates: tuple[Callable[[Any, Any, float, Mapping[str, Any]], Mapping[str, float]], ...] = ()
     latency: tuple[float, ...] = ()
+    mechanism: Mechanism | None = None
 
     def run(
         self,
@@ -92,6 +99,7 @@ class _Run:
         self.queues = [[held[j]] * (int(whole) + 1) for j, (whole, _) in enumerate(self.late)]
         self.gust, self.last, self.past = np.zeros(model.n), self.held, [self.x.copy()]
         pairs = ((n, partner(model, n)) for n in self.names)
+        self.plant = None if truth.mechanism is None else truth.mechanism.plant(self.fine)
         self.tied = [(self.names.index(n), self.names.index(k)) for n, k in pairs if k is not None]
 
     def trial(self, controller: Callable[[int, Array], Array], steps: int) -> Trial:
@@ -161,8 +169,11 @@ class _Run:
         return np.array([total[n] for n in self.names])
 
     def advance(self, u: Array, t: float) -> None:
-        """One fine step by the midpoint rule."""
+        """One fine step, by the midpoint rule or the foreign simulator."""
         received = self.last = self.received(u, t)
+        if self.plant is not None:
+            self.x = self.plant.advance(self.x, received)
+            return
         half = self.x + 0.5 * self.fine * self.rates(self.x, received, t)
         self.x = self.x + self.fine * self.rates(half, received, t + 0.5 * self.fine)
 
@@ -177,6 +188,9 @@ class _Run:
         """Process noise over a control step."""
         noise, dt = self.truth.disturbance, self.dt
         scale = np.array([noise.process.get(n, 0.0) for n in self.names])
+        if noise.grows is not None:
+            name, size = noise.grows
+            scale = scale * (0.2 + abs(self.x[self.names.index(name)]) / size)
         if noise.kind == "coloured":  # the same spectrum at low frequencies as the white noise
             phi = np.exp(-dt / noise.tau)
             kick = self.rng.standard_normal(len(scale)) * np.sqrt(1 - phi**2)

@@ -33,6 +33,7 @@ FURTHER = (2.0, 0.01)  # the same where there are several causes
 BETTER = (2.0, 0.05)  # the same for a rival to take the place of a likelier hypothesis
 OVERRULES = (3.0, 0.1)  # and for a claim that is likely under another noise only
 SLIGHT = 0.02  # of what all causes gain: one that makes less is not named
+AMOUNTS = 0.1  # of what the likeliest gains: what a rival has to gain beyond it
 REFIT = 12  # iterations after a cause was taken out
 
 
@@ -66,6 +67,7 @@ def decide(search: HypothesisSearch, best: Fitted, ruler: Ruler, most: int) -> D
         most: so many effects at most.
     """
     crude = search.exact_null()
+    ruler.beside(crude)
     search, fit = _proposed(search, best, crude, ruler, most)
     fit, without = _pruned(search, fit, ruler)
     if causes(fit) and not _pays(ruler, crude, fit, PAYS):
@@ -80,6 +82,14 @@ def _quiet(search: HypothesisSearch, fit: Fitted, crude: Fitted) -> Fitted:
 
 def _pays(ruler: Ruler, before: Fitted, after: Fitted, bar: tuple[float, float]) -> bool:
     return ruler.gain(before, after).beyond(*bar)
+
+
+def _overrules(
+    ruler: Ruler, crude: Fitted, found: Fitted, rival: Fitted, bar: tuple[float, float]
+) -> bool:
+    """Whether predictions bear out a less likely hypothesis, by an amount that matters."""
+    more, whole = ruler.gain(found, rival), ruler.gain(crude, found).mean
+    return more.beyond(*bar) and more.mean > AMOUNTS * whole
 
 
 def _proposed(
@@ -97,14 +107,14 @@ def _proposed(
         rivals.append(null)
     found, at = best, search
     for rival in rivals:
-        if _pays(ruler, found, rival, BETTER):
+        if _overrules(ruler, crude, found, rival, BETTER):
             found = rival
     for structure, spread in dict.fromkeys((s, w) for s, w, _ in search.fits):
         other = search.under(structure, spread)
         if other is None or (structure, spread) == (best.noise.structure, best.hypothesis.spread):
             continue
         rival = other.chosen(most)
-        if causes(rival) and _pays(ruler, found, rival, OVERRULES):
+        if causes(rival) and _overrules(ruler, crude, found, rival, OVERRULES):
             if rival.hypothesis.effects:
                 other.finished(other.of_size(len(rival.hypothesis.effects))[:2], TO_THE_TOP)
                 rival = other.chosen(most)

@@ -55,6 +55,7 @@ from grounded.effects import Library
 from grounded.instruments.preflight import preflight
 from grounded.model import Model
 from grounded.task import Task
+from grounded.threads import one_blas_thread
 from grounded.trial import Trial
 
 
@@ -77,6 +78,7 @@ class DiagnosisOptions:
     but: Collection[str] = ()
 
 
+@one_blas_thread()
 def diagnose(
     subject: Task | Model,
     trials: Sequence[Trial],

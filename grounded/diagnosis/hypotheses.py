@@ -134,7 +134,7 @@ def parametric(fit: Fitted) -> bool:
 
 PARAM_PRIOR = 0.2  # prior relative error of one parameter that is blamed
 BRIEF = 0.1  # of a control step: shorter delays and lags are a matter of time stamps
-TIMES = {"delay": "d", "sensor_delay": "d", "first_order_lag": "tau"}
+TIMES = {"delay": "d", "sensor_delay": "d", "first_order_lag": "tau", "sensor_lag": "tau"}
 LEFT = 0.25  # of the larger of two rates, from which one is more than the other's counterpart
 SAME = 0.05  # part of a dead zone's power that a mere offset may lack and still be the same
 

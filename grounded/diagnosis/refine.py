@@ -40,7 +40,7 @@ from grounded.filter.augmented import Delayed, joined
 from grounded.filter.kalman import LinearSystem
 from grounded.frozen import Array
 
-MOST_NUMBERS = 2e6  # of one (L, B, N, N) array: what fits in the cache goes fastest
+MOST_NUMBERS = 1e5  # of one (L, B, N, N) array: what fits in the cache goes fastest
 SHORTEST = 0.05  # part of a step that is still tried
 
 

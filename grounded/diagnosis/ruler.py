@@ -35,6 +35,7 @@ SECONDS = (0.1, 0.5, 1.0)
 MOST_STARTS = 400
 MOST_WHOLE = 8  # trials that are predicted from beginning to end
 FINE = 2e-3  # of a channel's spread: errors below it do not matter
+SLIGHT = 1e-2  # nor below this part of the crude model's, or of the spread where that is less
 FAR = 1e6  # a state beyond it has diverged
 MOMENTS = 20  # at which repeats are compared
 ALIKE = 0.02  # of a command's spread: how much commands of repeats may differ, rms
@@ -113,6 +114,11 @@ class Ruler:
     def fine(self) -> Array:
         """Error of each state below which nothing matters, (n,)."""
         return np.asarray(np.maximum(FINE * self.data.filled.std(axis=0), 1e-12))
+
+    def beside(self, crude: Fitted) -> None:
+        """What matters from now on is measured by what the crude model misses."""
+        missed = np.nan_to_num(self.errors(crude).rms[:-1].max(axis=0))
+        self.fine = np.maximum(self.fine, SLIGHT * np.minimum(missed, self.data.filled.std(axis=0)))
 
     @property
     def measured(self) -> list[tuple[Fitted, Errors]]:

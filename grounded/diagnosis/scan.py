@@ -42,7 +42,7 @@ from grounded.filter import kalman
 from grounded.frozen import Array
 
 BLOCK = 160  # columns filtered at once
-MOST_NUMBERS = 3e6  # of one block of whitened columns
+MOST_NUMBERS = 1e6  # of one block of whitened columns
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,7 +24,7 @@ it are held; directions of which the data say nothing are not moved.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -251,11 +251,16 @@ class FitData:
     records: tuple[Record, ...]
     measurement: Measurement
     unknowns: Unknowns
+    last: dict[bytes, RecordBatch] = field(default_factory=dict, repr=False)  # by latency, one
 
     def batch(self, theta: Array) -> RecordBatch:
         """The records side by side, inputs delayed as theta says."""
         latency = self.unknowns.unpack(theta)[1]
-        return batch_of(self.records, self.measurement, self.system.n, latency)
+        if (found := self.last.get(latency.tobytes())) is None:
+            found = batch_of(self.records, self.measurement, self.system.n, latency)
+            self.last.clear()
+            self.last[latency.tobytes()] = found
+        return found
 
 
 @dataclass(frozen=True, eq=False)

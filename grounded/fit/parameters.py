@@ -20,9 +20,11 @@ from grounded.fit.search import SearchEnd, data_of, first_search, search_paramet
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.task import Task
+from grounded.threads import one_blas_thread
 from grounded.trial import Trial
 
 
+@one_blas_thread()
 def fit(
     model: Model | Task,
     trials: Sequence[Trial | Record],

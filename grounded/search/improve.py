@@ -143,6 +143,9 @@ def _improvement(make: Maker, incumbent: Tried, options: SearchOptions) -> Propo
         if found is not None and found.candidate is not None:
             return found
         unsafe = unsafe or found
+        lost = losers_of(now.history, incumbent.candidate.id, make.fingerprint)
+        if promised and not lost and 0 <= max(promised) <= least:
+            break  # at the optimum as far as the model can tell: no trial is spent on another way
     return unsafe or Proposal(
         _ended(make, incumbent, promised, least, options.tolerance), None, False
     )

@@ -25,6 +25,7 @@ from grounded.task import Task
 from grounded.trial import mean_trial
 
 PLANNING = DescentOptions(max_iterations=30, tolerance=1e-6)  # a direction needs no more digits
+HALF = 0.5  # of the gain that was promised: less says that the model's slopes are wrong
 GENTLER = 1e3  # factor on the price of inputs from which gentler gains are designed
 GENTLER_TIMES = 2  # they are tried
 
@@ -50,7 +51,7 @@ class About:
         self.already = already if np.isfinite(already) else incumbent.utility
         self.least = options.tolerance * abs(self.already)
         self.slope: Array | None = None
-        if options.damps and np.isfinite(already):
+        if options.damps and np.isfinite(already) and make.doubts(incumbent):
             self.slope = slope_error(planner, incumbent, make.now.history, self.real)
 
     def candidate(self, policy: Policy, step: Step, way: Way) -> Candidate:
@@ -154,6 +155,15 @@ class Maker:
             caution=caution,
             way=way,
         )
+
+    def doubts(self, incumbent: Tried) -> bool:
+        """Whether the model's slopes have failed here: a step lost, or gave half its promise."""
+        own = incumbent.candidate
+        if losers_of(self.now.history, own.id, self.fingerprint):
+            return True
+        before = [t.utility for t in self.now.history if t.candidate.id == own.base]
+        gained = incumbent.utility - before[0] if before else np.inf
+        return bool(gained < HALF * own.predicted_gain)
 
     def gentler(self, incumbent: Tried) -> Candidate | None:
         """The model's own plan with gentler gains, where its loop was unstable on the robot.

@@ -2,7 +2,7 @@
 
 import pytest
 
-from grounded_cli.terminal import field, harmless, names_in, remark, table
+from grounded_cli.terminal import field, harmless, names_in, remark, sparkline, table
 
 
 def test_a_narrow_table_has_one_line_of_names():
@@ -19,7 +19,7 @@ def test_a_wide_table_breaks_the_names_of_its_columns():
     assert max(map(len, lines)) <= 110 and len(lines) > 2
     assert lines[-1].split()[0] == "turn" and "manoeuvre" in lines[-2]
     narrow = table([("turn", *["98.9 %"] * 4)], names[:5])
-    assert max(map(len, narrow.splitlines())) <= 80
+    assert max(map(len, harmless(narrow).splitlines())) <= 80
 
 
 def test_a_table_without_rows_or_names():
@@ -45,3 +45,26 @@ def test_a_remark_is_wrapped(capsys):
 
 def test_names_of_a_list():
     assert names_in(" a, b,,a ") == ["a", "b"] and names_in(None) == []
+
+
+@pytest.mark.parametrize("columns", [60, 72, 80])
+def test_a_table_is_as_wide_as_the_terminal(monkeypatch, columns):
+    monkeypatch.setenv("COLUMNS", str(columns))
+    rows = [("delay:steering+throttle", "1,348", "d = 0.0179 +- 6.3e-05 s, k = 0.2 m/s")]
+    text = harmless(table(rows * 2, ("effect", "evidence [nats]", "its value after the fit")))
+    assert max(map(len, text.splitlines())) <= columns
+    assert "0.0179 +- 6.3e-05 s," in text  # a number keeps its spread and its unit
+    wide = harmless(table([("state", *["0.1234567"] * 9)] * 2, [f"name{k}" for k in range(10)]))
+    assert max(map(len, wide.splitlines())) <= columns and wide.count("state") > 2
+    assert max(map(len, field("gap", "1.5 m off " * 30).splitlines())) <= columns
+
+
+def test_bars_say_their_scale():
+    assert sparkline([-2.0, -1.0]).startswith("▁█  -2.000 to -1.000")
+    assert "logarithmic" in sparkline([-100.0, -1.0, float("-inf")])
+    assert sparkline([-100.0, -1.0, float("-inf")])[2] == "x"
+
+
+def test_colour_means_something_and_takes_no_room():
+    coloured, plain = table([("c1", "crashed")], ("id", "")), "id\nc1  crashed"
+    assert harmless(coloured) == plain and "\033[1;31mcrashed" in harmless(coloured, coloured=True)

@@ -11,6 +11,7 @@ from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.report import Correction, Curve, Diagnosis, Verdict
 from grounded.effects import Library, wrap
 from grounded_trials import Workspace
+from grounded_trials.store.documents import write_document
 
 FEW = ("offset", "delay", "slope")  # families, so that none has a threshold
 
@@ -59,7 +60,7 @@ def kept(folder, **changes):
     left = Correction("v", ("x", "force"), unit="m/s^2", curves=curves, **values)
     found = Diagnosis(Verdict("unknown"), correction=left)
     (folder / "reports").mkdir(exist_ok=True)
-    (folder / "reports" / "diagnosis.json").write_text(json.dumps(found.to_json()))
+    write_document(folder / "reports" / "diagnosis.json", found.to_json())
 
 
 def test_a_correction_is_adopted_as_part_of_the_model(workspace_of):

@@ -135,7 +135,7 @@ def test_slopes_that_trials_have_corrected_pay(mechanisms, monkeypatch):
     task = mechanisms.cart_task("gentle")
 
     def lagged(s, a, p):
-        own = mechanisms.cart_dynamics(s, SimpleNamespace(force=s.sent), p)
+        own = task.model.derivative(s, SimpleNamespace(force=s.sent), p)
         return own | {"sent": (a.force - s.sent) / 0.05}
 
     real = replace(

@@ -32,8 +32,12 @@ from grounded.errors import GroundedError
 from grounded_trials.formats.mcap_walk import MAGIC
 from grounded_trials.logs.inspect_log import inspect_log
 from grounded_trials.logs.recover import recover_log
+from grounded_trials.report.gathering import known_optimum
+from grounded_trials.report.reporting import save_optimum
 from grounded_trials.store.candidate_file import read_candidate
+from grounded_trials.store.documents import StudyStore
 from grounded_trials.store.trial_file import read_trial, trial_bytes
+from grounded_trials.workspace.folder import Folder
 from reliability import MEMORY, a_candidate, a_trial
 from workspaces import CONFIG, MODEL, make
 
@@ -363,6 +367,11 @@ WRITING: tuple[tuple[str, ...], ...] = (
     ("adopt", "input_gain:force"),
     ("report", "--html"),
     ("export", "best", "--format", "json", "-o", "out.json"),
+    ("export", "best", "--runner", "-o", "out.npz"),
+    ("next", "RUN"),
+    ("target", "step", "--to", "x=0.5"),
+    ("discard", "t0001", "--why", "a wheel was loose"),
+    ("restore", "t0001"),
     ("recover", "RUN", "-o", "saved.mcap"),
 )
 
@@ -384,7 +393,7 @@ def words_of(command: tuple[str, ...], where: Path, run: str) -> list[str]:
     ]
     if command[0] == "init":
         return [told[0], str(where.parent / "w2"), *told[2:]]
-    told = [str(where / w) if w in ("out.json", "saved.mcap") else w for w in told]
+    told = [str(where / w) if w in ("out.json", "out.npz", "saved.mcap") else w for w in told]
     return ["-C", str(where), *told]
 
 
@@ -512,13 +521,17 @@ def flips(rng: random.Random, seconds: float) -> Tally:
     """One bit of any file of a workspace: a command ends well, and `verify` finds it.
 
     Texts that are the user's to edit (grounded.toml, model.py, target.csv) carry no checksum: of
-    them a traceback alone counts.
+    them a traceback alone counts. Results of a study are there as they were, or not at all.
     """
     tally = Tally()
+    results = {f"seed {k}": {"utility": -1.5 + k, "errors": [0.25, float("inf")]} for k in range(3)}
     with tempfile.TemporaryDirectory(dir=MEMORY) as folder:
         where, _ = prepared(Path(folder))
         for words in (["diagnose"], ["report"]):
             grounded("-C", where, *words)
+        save_optimum(Folder(where), -1.5)
+        study = StudyStore(where / "study")
+        study.update(results)
         files = [p for p in where.rglob("*") if p.is_file() and p.stat().st_size]
         edited = {"grounded.toml", "target.csv"}
         files = [p for p in files if p.suffix in (".mcap", ".json", ".db") or p.name in edited]
@@ -533,11 +546,16 @@ def flips(rng: random.Random, seconds: float) -> Tally:
             path.chmod(0o644)
             path.write_bytes(bytes(bad))
             what = f"bit {bit} of {path.relative_to(where)}"
+            if path.name == "optimum.json" and known_optimum(path.parent) is not None:
+                tally.add("silent", f"{what}: the report believes it")
             tally.note[path.parent.name if path.suffix == ".mcap" else path.name] += 1
             kept = {p: p.read_bytes() for p in where.rglob("*") if p.is_file()}
             command(tally, what, "-C", where, *READING[k % 2])
             stated = path.suffix == ".mcap" or b"sha256" in source  # a checksum to be proved
-            if (
+            if path.parent == study.folder:
+                if [key for key in study if study[key] != results[key]] or len(study) > 2:
+                    tally.add("silent", f"{what}: {dict(study)}")
+            elif (
                 path.name not in edited
                 and stated
                 and command(tally, what, "-C", where, "verify") == 0

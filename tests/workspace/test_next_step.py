@@ -77,7 +77,7 @@ def test_a_diagnosis_of_another_model_is_made_again(cart, tmp_path):
 def test_nothing_claimed_nothing_to_adopt(cart, tmp_path):
     folder = copied(cart, tmp_path / "w")
     diagnosed(folder, verdict={"kind": "none", "effects": [], "sentence": "None."})
-    assert last(grounded("-C", folder, "status")) == "grounded export best --format npz"
+    assert last(grounded("-C", folder, "status")) == "grounded export best --runner"
 
 
 def test_a_damaged_diagnosis_is_made_again(cart, tmp_path):

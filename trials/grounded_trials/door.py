@@ -363,9 +363,9 @@ class Workspace(Folder):
         A damaged or missing file is left out, and named in `findings.lost`.
 
         Args:
-            html: write reports/report.html.
+            html: write reports/report.html, and layouts for Foxglove and PlotJuggler beside it.
             png: write its figures, reports/*.png.
-            rrd: write reports/recording.rrd for the Rerun viewer.
+            rrd: write reports/recording.rrd for the Rerun viewer, and the layouts.
 
         Raises:
             GroundedError: if an extra is missing that one of them needs; nothing is written then.
@@ -386,6 +386,8 @@ class Workspace(Folder):
             paths += reporting.save_pictures(self, findings)
         if rrd:
             paths.append(reporting.save_recording(self, findings))
+        if html or rrd:
+            paths += reporting.save_layouts(self, findings)
         return reporting.Report(findings, tuple(paths))
 
     def watch(

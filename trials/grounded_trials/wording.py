@@ -5,25 +5,38 @@ from __future__ import annotations
 import math
 import re
 import shlex
+import shutil
 from textwrap import TextWrapper
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from grounded.errors import NextCommand
 
-WIDTH = 80  # columns of a terminal
+NARROW, WIDE = 60, 80  # columns: what every line can do with, and what a reader likes at most
+MARKS = "\ufdd0\ufdd1\ufdd2\ufdd3\ufdd4"  # of colours in a text: they take no column
 _WORD = re.compile(r"""(?:'[^']*'|"[^"]*"|\S)+""")  # of a command; what is quoted stays whole
+_GLUE = re.compile(
+    r"(?<=[<>]) (?=[\d.])| (?=%)| (?=(?:\+-|±) )|(?<= (?:\+-)) |(?<= ±) |^ |(?<=^[ *]) "
+    r"|(?<=\d) (?=(?:m|ms|s|rad|deg|kg|N|Nm|V|A|Hz|nats)\b)"
+)  # blanks where no line is broken
+
+
+def columns() -> int:
+    """How wide a line is: the terminal's width (or COLUMNS) from 60 to 80; 80 in a file."""
+    return min(max(shutil.get_terminal_size((WIDE, 24)).columns, NARROW), WIDE)
 
 
 def figure(value: float | None, digits: int = 4) -> str:
     """`digits` significant digits; "failed" for minus infinity, "-" where there is none."""
     if value is None or math.isnan(value):
         return "-"
+    if value == 0:
+        return "0"
     if value == -math.inf:
         return "failed"
     if value != 0 and not 1e-3 <= abs(value) < 1e6:
         return f"{value:.{digits - 1}e}"
-    decimals = max(digits - 1 - math.floor(math.log10(abs(value))) if value else digits - 1, 0)
+    decimals = max(digits - 1 - math.floor(math.log10(abs(value))), 0)
     return f"{value:,.{decimals}f}"
 
 
@@ -58,19 +71,22 @@ def labelled(name: str, unit: str) -> str:
 
 
 def per_second(unit: str) -> str:
-    """The unit of a rate of change."""
-    return f"{unit} per s" if shown(unit) else "1/s"
+    """The unit of a rate of change: rad/s of rad, m/s^2 of m/s."""
+    if found := re.fullmatch(r"(.*)/s(?:\^(\d))?", unit):
+        return f"{found[1]}/s^{int(found[2] or 1) + 1}"
+    return f"{unit} per s" if set(unit) & set("/ ") else f"{unit}/s"
 
 
 def wrapped(text: str, first: str, rest: str) -> list[str]:
-    """Lines of a terminal's width, the first and the others begun as said.
-
-    A number keeps its %, a bound its number, a path its parts.
-    """
-    whole = re.sub(r"(?<=[<>]) (?=[\d.])| (?=%)", "\xa0", text)
-    wrapper = TextWrapper(WIDTH, initial_indent=first, subsequent_indent=rest)
+    """Lines of a terminal's width, the first and the others begun as said."""
+    wrapper = TextWrapper(columns(), initial_indent=first, subsequent_indent=rest)
     wrapper.break_on_hyphens = wrapper.break_long_words = False
-    return [line.replace("\xa0", " ") for line in wrapper.wrap(whole)]
+    return [line.replace("\xa0", " ") for line in wrapper.wrap(glued(text))]
+
+
+def glued(text: str) -> str:
+    """Text whose numbers keep their %, unit, bound and spread when lines are broken."""
+    return _GLUE.sub("\xa0", text)
 
 
 def rendered(then: NextCommand, folder: str | None = None) -> str:
@@ -88,7 +104,7 @@ def folded(command: str, lead: str = "next: ") -> str:
     """A command after its lead, broken as a shell allows where it is wider than a terminal."""
     lines = [lead]
     for word in _WORD.findall(command):
-        if len(lines[-1]) + len(word) + 3 > WIDTH and lines[-1].strip():
+        if len(lines[-1]) + len(word) + 3 > columns() and lines[-1].strip():
             lines[-1] = lines[-1].rstrip() + " \\"
             lines.append("    ")
         lines[-1] += word + " "

@@ -69,6 +69,7 @@ def weigh(
         if position in guesses and rate in guesses:
             guesses |= _derivative(guesses[position], guesses[rate], signals, units[rate])
     guesses |= _steps(model, guesses, signals)
+    guesses |= _taken_by_inputs(guesses, model)
     guesses = {name: _as_logged(guess, log) for name, guess in guesses.items()}
     return tuple(guesses[g.name] for g in states), tuple(guesses[g.name] for g in inputs)
 
@@ -183,6 +184,20 @@ def unit_of(path: str, joint: bool = True) -> str:
             return unit
     found = re.search(r"\.(position|velocity|effort)\[\d+\]$", path)
     return JOINT_UNITS[found[1]] if found and joint else ""
+
+
+def _taken_by_inputs(guesses: Mapping[str, Guess], model: Model) -> dict[str, Guess]:
+    """States without the rivals that are commands: what an input was found at is no measurement."""
+    commands = {guesses[name].path: name for name in model.input_names if guesses[name].path}
+    found = {}
+    for name in model.state_names:
+        guess = guesses[name]
+        rest = tuple(path for path in guess.others if path not in commands)
+        if rest != guess.others and guess.path not in commands:
+            said = [f"{p} is the command '{commands[p]}'" for p in guess.others if p in commands]
+            reasons = (*guess.reasons, *said)
+            found[name] = replace(guess, others=rest, sure=not rest, reasons=reasons)
+    return found
 
 
 def _as_logged(guess: Guess, log: LogReport) -> Guess:

@@ -43,7 +43,7 @@ _MEANINGS: dict[str, tuple[str, ...]] = {
     "omega": ("angular.z", "angular_velocity.z", "yaw_rate", "omega"),
     "yaw_rate": ("angular.z", "angular_velocity.z", "yaw_rate"),
     "delta": ("steering_angle", "delta", "steering"),
-    "steering": ("steering", "steering_angle", "steer", "delta"),
+    "steering": ("steering", "steering_angle", "steer", "delta", "angular.z"),
     "throttle": ("throttle", "gas", "accelerator", "acceleration", "motor"),
     "thrust": ("thrust", "force.z", "throttle"),
     "brake": ("brake",),

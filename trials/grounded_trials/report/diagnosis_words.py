@@ -171,4 +171,4 @@ def utility_sentence(diagnosis: Diagnosis) -> str:
 
 def sentences(text: str) -> list[str]:
     """A verdict's sentences, for a line each: they say different things."""
-    return re.split(r"(?<=\.) (?=[A-Z`])", text)
+    return re.split(r"(?<=\.) (?=[A-Z`]|[\d.]+ s ahead)", text)

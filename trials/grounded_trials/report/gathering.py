@@ -58,7 +58,7 @@ def gather(workspace: Folder) -> Findings:
         others=len(contents.trials) - len(own) - len(data),
         lost=tuple(lost),
         diagnosis=diagnosis,
-        optimum=_optimum(workspace.reports),
+        optimum=known_optimum(workspace.reports),
         then=next_command(workspace, now, diagnosis, usable),
         better=better,
         since=since_diagnosis(workspace, diagnosis, usable) if diagnosis else Since(),
@@ -131,7 +131,7 @@ def _diagnosis(workspace: Folder, lost: list[Lost]) -> Diagnosis | None:
         return None
 
 
-def _optimum(reports: Path) -> float | None:
+def known_optimum(reports: Path) -> float | None:
     """reports/optimum.json, {"utility": U}: written by studies that know the real system."""
     try:
         value = float(read_document(reports / "optimum.json")["utility"])

@@ -28,7 +28,6 @@ from grounded_trials.report.findings import (
 )
 from grounded_trials.report.forecast import SECONDS, forecast_error
 from grounded_trials.wording import (
-    WIDTH,
     count,
     figure,
     folded,
@@ -95,13 +94,12 @@ def _utilities(findings: Findings, table: Table, bars: Callable[[Sequence[float]
     few, left = _rows(history)
     rows = [_candidate(t, t is history[-1]) for t in few]
     header = ("candidate", "iter.", "alpha", "predicted", "real", "+-", "trials", "")
-    lines = ["utility", table(rows, header), f"  {LEGEND}"]
+    lines = ["utility", table(rows, header), *_wrapped(LEGEND, "  ")]
     if left:
         status = rendered(NextCommand("status"), findings.folder)
         lines += _wrapped(f"({left} more between them: {status} shows all)", "  ")
-    spark = bars(spaced([t.utility for t in history if t.utilities][-WIDTH // 2 :]))
-    if spark:
-        lines.append(f"\n  {spark}  by candidate, higher is better")
+    if spark := bars([t.utility for t in history if t.utilities]):
+        lines += ["", *_wrapped(f"{spark}; by candidate, higher is better", "  ")]
     first, best = findings.first, findings.best
     if first is not None and best is not None:
         text = f"model's policy {figure(first.utility)}, "
@@ -113,14 +111,6 @@ def _utilities(findings: Findings, table: Table, bars: Callable[[Sequence[float]
         lines += _wrapped(text, "  ")
     lines += _wrapped(f"{findings.standing.phase}: {findings.standing.sentence}", "  ")
     return "\n".join(lines)
-
-
-def spaced(utilities: Sequence[float]) -> list[float]:
-    """Utilities for bars: by their logarithm where the worst would flatten all the others."""
-    known = [u for u in utilities if math.isfinite(u)]
-    if not known or max(known) >= 0 or min(known) > 5 * max(known):
-        return list(utilities)
-    return [-math.log(-u) if math.isfinite(u) else u for u in utilities]
 
 
 def _rows(history: Sequence[Tried]) -> tuple[list[Tried], int]:
@@ -160,8 +150,9 @@ def _trajectories(findings: Findings, table: Table) -> str:
     rows = by_state(task.model, columns)
     ids = [run.candidate.id for run in runs]
     header = ("state", "unit", *(f"{i} off" for i in ids), *(f"{i} gap" for i in ids))
-    note = "  off: from the desired path; gap: from what the model predicted for that run"
-    return "trajectories, rms over the run\n" + table(rows, header) + "\n" + note
+    note = "off: from the desired path; gap: from what the model predicted for that run"
+    title = "trajectories, rms over the run"
+    return "\n".join([title, table(rows, header), *_wrapped(note, "  ")])
 
 
 def _biases(findings: Findings, table: Table) -> str:

@@ -50,7 +50,7 @@ class Report(Result):
         """The document of `report --json`, with the figures of the text by state and input."""
         findings, diagnosis = self.findings, self.findings.diagnosis
         document: dict[str, Any] = {
-            "paths": {path.suffix[1:]: str(path) for path in self.paths if path.suffix != ".png"},
+            "paths": {_kind(path): str(path) for path in self.paths if path.suffix != ".png"},
             "utilities": findings.standing.utilities,
             "phase": findings.standing.phase,
             "sentence": findings.standing.sentence,
@@ -68,6 +68,12 @@ class Report(Result):
             document["verdict"] = verdict | {"sentence": diagnosis.sentence}
             document["outdated"] = findings.since.sentence or None
         return document
+
+
+def _kind(path: Path) -> str:
+    """html, rrd, foxglove or plotjuggler."""
+    name, _, layout = path.stem.partition("-")
+    return name if layout else path.suffix[1:]
 
 
 def _measures(task: Task, run: Run | None) -> dict[str, Any] | None:
@@ -92,6 +98,13 @@ def save_recording(workspace: Folder, findings: Findings | None = None) -> Path:
     path = _place(workspace) / RECORDING
     write_recording(findings or gather(workspace), path)
     return path
+
+
+def save_layouts(workspace: Folder, findings: Findings) -> tuple[Path, Path]:
+    """The layouts in reports/ that show a trial in Foxglove and in PlotJuggler."""
+    from grounded_trials.report.layouts import write_layouts
+
+    return write_layouts(_place(workspace), findings.task.model)
 
 
 def save_page(workspace: Folder, findings: Findings, watched: int = 0) -> Path:

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from grounded.errors import GroundedError
+from grounded_trials.plain_file import open_file
 from grounded_trials.store.store import Damaged, Store, write_atomically
 
 _SEALED = re.compile(rb'\{\n "sha256": "([0-9a-f]{64})",(\n.*)', re.DOTALL)
@@ -53,7 +54,8 @@ def read_document(path: Path) -> dict[str, Any]:
         GroundedError: if it can't be read, or is not what was written.
     """
     try:
-        data = path.read_bytes()
+        with open_file(path, follow=False) as stream:
+            data = stream.read()
     except FileNotFoundError:
         raise
     except OSError as error:

@@ -173,7 +173,7 @@ def score_case(
     label = open_label(Path(labels), name, entry)
     task = workspace.task
     latency = np.zeros(task.model.m) if task.latency is None else task.latency
-    known = oracle(task.model, workspace.task_trials(), latency, label)
+    known = oracle(task.model, workspace.task_trials(), latency, label, diagnosis["ranking"])
     return judge(label, diagnosis, known)
 
 

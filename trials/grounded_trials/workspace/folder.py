@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,6 +22,7 @@ from grounded.model import Model
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
+from grounded_trials.plain_file import open_file
 from grounded_trials.store.documents import Notes
 from grounded_trials.store.store import Damaged, Store, Stored, write_atomically
 from grounded_trials.store.trial_file import read_trial
@@ -235,8 +236,8 @@ class Folder:
         Raises:
             GroundedError: if there is none of that name.
         """
-        for source in self._sources(identity):
-            return source
+        for read in self._sources(identity):
+            return read()
         raise GroundedError(
             f"there is no candidate '{identity}': {nearest(identity, self.candidate_ids())}"
         )
@@ -352,9 +353,9 @@ class Folder:
         ran = {t.trial.candidate: (t.stored.id, t.ran) for t in trials if t.ran}
         for identity in self._ids(trials):
             why = GroundedError("its file is gone and no trial carries it")
-            for data in self._sources(identity, trials):
+            for read in self._sources(identity, trials):
                 try:
-                    candidate, meta = candidate_of(data, identity)
+                    candidate, meta = candidate_of(data := read(), identity)
                     trial, known = ran.get(identity, ("", ""))
                     if known and sha256(data) != known:
                         raise GroundedError(
@@ -382,11 +383,16 @@ class Folder:
 
     def _sources(
         self, identity: str, trials: tuple[StoredTrial, ...] | None = None
-    ) -> Iterator[bytes]:
-        """The copies of a candidate: its file, then those in the trials that ran it."""
+    ) -> Iterator[Callable[[], bytes]]:
+        """The copies of a candidate, to be read: its file, then those in the trials that ran it."""
+
+        def own() -> bytes:
+            with open_file(path, follow=False) as stream:
+                return stream.read()
+
         path = self.candidate_path(identity)
         if path.is_file():
-            yield path.read_bytes()
+            yield own
         for one in self.trials() if trials is None else trials:
             if one.trial.candidate == identity and (policy := one.policy) is not None:
-                yield policy
+                yield partial(bytes, policy)

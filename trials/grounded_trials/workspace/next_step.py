@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from grounded.diagnosis.report import Diagnosis, Made
 from grounded.errors import NextCommand
@@ -18,7 +19,7 @@ from grounded_trials.workspace.folder import Folder
 
 PROPOSE = NextCommand("propose")
 DIAGNOSE = NextCommand("diagnose")
-EXPORT = NextCommand("export", ("best", "--format", "npz"))
+EXPORT = NextCommand("export", ("best", "--runner"))
 
 
 def next_command(
@@ -55,8 +56,16 @@ def another_trial(workspace: Folder, now: Standing) -> NextCommand:
     if not waiting and (now.phase == "propose" or now.incumbent is None):
         return PROPOSE
     if not workspace.config.system.reachable:
-        return NextCommand("ingest", ("TRIAL.mcap",))
+        return for_robot(workspace, now.outstanding.id if waiting and now.outstanding else "best")
     return NextCommand("run", () if waiting else ("best",))
+
+
+def for_robot(workspace: Folder, candidate: str) -> NextCommand:
+    """What follows where people run the robot: export for it, or once that is done, its log."""
+    folders = (workspace.folder, Path())
+    if any(any(folder.glob(f"{candidate}.*")) for folder in folders):
+        return NextCommand("next", ("LOG",))
+    return NextCommand("export", (candidate, "--runner"))
 
 
 def after_diagnosis(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:

@@ -95,8 +95,10 @@ def propose_in(workspace: Folder) -> Proposed:
     proposal = replace(proposal, notes=(*proposal.notes, *notes))
     if candidate is None:
         return Proposed(proposal, None, status_of(workspace, proposal.standing).then)
+    from grounded_trials.workspace.next_step import for_robot
+
     here = workspace.config.system.reachable
-    then = NextCommand("run") if here else NextCommand("ingest", ("TRIAL.mcap",))
+    then = NextCommand("run") if here else for_robot(workspace, candidate.id)
     return Proposed(proposal, workspace.candidate_path(candidate.id), then)
 
 

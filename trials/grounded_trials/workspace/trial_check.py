@@ -23,8 +23,9 @@ FAR = 0.1  # of a state's range in the trial: a start this far from s_0 is worth
 LEAST = 10  # steps: less says nothing of who drove
 UNLIKE = 0.25  # of the squared difference of unrelated commands; 1 - UNLIKE: concordance (Lin 1989)
 WINDOWS = 8  # parts of a trial that must each be alike, twice as loosely: somebody may take over
-CLOSER = 1 / 3  # another candidate whose commands differ this much less is the one that ran
+CLOSER = 1 / 2  # another candidate whose commands differ this much less is the one that ran
 BACK = (0.0, 0.5, 1.0, 1.5, 2.0, -0.5, -1.0)  # steps: states of the log older than those acted on
+AGES = 1.0  # steps by which that varies in a run: packets are lost, clocks drift and jitter
 OTHERS = 20  # candidates to compare with, the latest
 
 
@@ -154,7 +155,10 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
     back, late = min(fits, key=lambda key: fits[key][0])
     _, error, asked, sent, size = fits[back, late]
     unmoved = min(fit[1] for key, fit in fits.items() if key[1] == 0)
-    off = (asked - sent) ** 2
+    near = [k for k, other in enumerate(BACK) if abs(other - BACK[back]) <= AGES]
+    start = max(0, -late)
+    within = free[near, start : start + len(sent)]
+    off = (sent - np.clip(sent, within.min(axis=0), within.max(axis=0))) ** 2
     unrelated = asked.var(axis=0) + sent.var(axis=0) + (asked - sent).mean(axis=0) ** 2
     noise = _noise_sent(policy, states[back], free[back])
     room = np.maximum(UNLIKE * unrelated, (0.02 * size) ** 2 + 4 * noise[: len(off)])
@@ -166,7 +170,7 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
     alike, j = bool(share.max() <= 1 and not any(bad)), int(np.argmax(share))
     return Following(
         alike=alike,
-        error=float(np.sqrt(error)),
+        error=float(np.sqrt((off / size**2).mean())),
         input=policy.input_names[j],
         rms=float(np.sqrt(off[:, j].mean())),
         until_s=float(left) * policy.dt,

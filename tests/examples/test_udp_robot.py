@@ -1,0 +1,85 @@
+"""The stand-in for hardware: another process, lost packets, its own recorder, a kill switch."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from cli import grounded
+from grounded_trials import Workspace
+
+HERE = Path(__file__).parents[2] / "examples" / "udp_robot"
+ROOTS = [str(HERE.parents[1] / part) for part in ("", "trials", "cli")]
+PORT = 9310
+
+
+@pytest.fixture
+def robot():
+    process = subprocess.Popen([sys.executable, HERE / "robot.py", "--seed", "3"])
+    time.sleep(0.5)
+    yield process
+    process.terminate()
+    process.wait()
+
+
+def drive(*words):
+    path = os.pathsep.join([*ROOTS, os.environ.get("PYTHONPATH", "")])
+    command = [sys.executable, HERE / "drive.py", *map(str, words)]
+    subprocess.run(command, check=True, env={**os.environ, "PYTHONPATH": path})
+
+
+@pytest.mark.slow
+def test_from_manual_driving_to_trials_of_a_policy(robot, tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(ROOTS))
+    log, w = tmp_path / "bag", tmp_path / "car"
+    drive("--manual", 6, log)
+    made = grounded("init", w, "--from", log, "--model", HERE / "model.py", "--json").json
+    paths = {one["name"]: one["path"] for one in made["signals"]}
+    assert paths["v"] == "/odom.twist.twist.linear.x"
+    assert paths["speed"] == "/drive.twist.linear.x" and paths["steering"].endswith("angular.z")
+    assert grounded("-C", w, "ingest", "--data", log).code == 0
+    assert grounded("-C", w, "target", "circle", "--speed", 1.2, "--size", 0.5).code == 0
+    with (w / "grounded.toml").open("a") as file:
+        file.write(
+            f'\n[system]\ncommand = "{sys.executable} {HERE}/drive.py {{candidate}} {{trial}}"\n'
+        )
+    done = grounded("-C", w, "learn", "--trials", 2, "--json")
+    assert done.code == 0, done.err
+    assert [t.trial.candidate for t in Workspace(w).trials()] == ["", "c0001", "c0002"]
+
+
+def test_the_kill_switch_holds_until_a_reset(robot):
+    line = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    line.bind(("127.0.0.1", PORT + 1))
+    line.settimeout(1)
+
+    def say(seconds, **command):
+        end = time.time() + seconds
+        while time.time() < end:  # a packet may be lost
+            line.sendto(json.dumps(command).encode(), ("127.0.0.1", PORT))
+            state = json.loads(line.recv(4096))
+        return state
+
+    assert say(0.6, speed=1.0, steering=0.0)["v"] > 0.3
+    killed = say(0.8, kill=True)
+    assert killed["killed"] and killed["v"] < 0.1
+    assert say(0.5, speed=1.0, steering=0.0)["v"] < 0.1
+    say(0.1, reset=True)
+    moving = say(0.6, speed=1.0, steering=0.0)
+    assert not moving["killed"] and moving["v"] > 0.3
+    time.sleep(0.9)  # nothing is heard: the watchdog stops it
+    while True:
+        try:
+            line.settimeout(0.05)
+            state = json.loads(line.recv(4096))
+        except TimeoutError:
+            break
+        if time.time() - state["t"] < 0.05:
+            break
+    assert state["v"] < 0.3
+    line.close()
