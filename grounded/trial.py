@@ -148,7 +148,7 @@ def interpolate_gaps(trial: Trial) -> Interpolated:
     states = np.array(trial.states)
     filled, longest, where, at = 0, 0, "", 0.0
     for i, name in enumerate(trial.state_names):
-        for first, last in _gaps(bad[:, i]):
+        for first, last in stretches(bad[:, i]):
             if last == len(states) or (last - first) * trial.dt > MAX_GAP_S:
                 continue
             known = [first - 1, last]
@@ -159,7 +159,7 @@ def interpolate_gaps(trial: Trial) -> Interpolated:
     return Interpolated(replace(trial, states=states), filled, longest * trial.dt, where, at)
 
 
-def _gaps(bad: np.ndarray) -> list[tuple[int, int]]:
+def stretches(true: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """[first, last) of each run of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], bad.astype(int), [0]])))
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], true.astype(int), [0]])))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]

@@ -113,7 +113,7 @@ class Problem:
     @cached_property
     def queue(self) -> Queue:
         """Where the past inputs sit in z, and what of them reaches the actuator."""
-        return _queue(self.system.n, self.delay, self.depths)
+        return queue_of(self.system.n, self.delay, self.depths)
 
     def received(self, z: Array, u: Array, t: int | slice = slice(None)) -> Array:
         """What the model is given at steps t: z (..., nz), u (..., m) -> (..., m)."""
@@ -160,7 +160,8 @@ class Queue:
         return self.after(np.eye(D), np.zeros((D, m))).T, self.after(np.zeros((m, D)), np.eye(m)).T
 
 
-def _queue(n: int, delay: Array, depths: tuple[int, ...]) -> Queue:
+def queue_of(n: int, delay: Array, depths: tuple[int, ...]) -> Queue:
+    """The queue of n states and inputs delayed by `delay` (m,) steps."""
     starts = np.concatenate([[0], np.cumsum(depths)]).astype(int)
     now, past = np.zeros(len(depths)), np.zeros((len(depths), int(starts[-1])))
     for j, steps in enumerate(delay):

@@ -15,6 +15,7 @@ import numpy as np
 
 from grounded.frozen import Array
 from grounded.model import Model
+from grounded.solve.bias import hann_smoothed
 from grounded.task import Task
 from grounded.utility import Reward
 
@@ -67,13 +68,6 @@ def target(name: str, wheelbase: float = 0.15) -> Array:
         s += h * rear
         v = min(v + h * RAMP_UP, float(np.interp(s, s_grid, speed_limit)))
     return np.array(rows)
-
-
-def hann_smoothed(signal: Array, width: int) -> Array:
-    """Weighted mean over `width` + 1 samples; the ends are continued by their last value."""
-    window = np.hanning(width + 3)[1:-1]
-    padded = np.pad(signal, width // 2, mode="edge")
-    return np.convolve(padded, window / window.sum(), mode="valid")
 
 
 def _reachable(limit: Array, step: float) -> Array:

@@ -19,10 +19,10 @@ import math
 
 import numpy as np
 
-from grounded.experiments.car_tasks import hann_smoothed
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.models.aircraft_trim import level_trim
+from grounded.solve.bias import hann_smoothed
 from grounded.task import Task
 from grounded.utility import Reward
 

@@ -27,7 +27,6 @@ import numpy as np
 from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.rollout import simulate
-from grounded.solve.bias import effective_inputs
 from grounded.solve.policy_gradient import adjoint, linearised
 from grounded.task import Task
 from grounded.trial import Trial
@@ -46,7 +45,7 @@ def lifted(task: Task, policy: Policy) -> Lifted:
     problem = task.problem()
     run, gain = simulate(problem, policy), policy.gain
     n, m, H = task.model.n, task.model.m, task.horizon
-    received = effective_inputs(run.z, run.inputs, problem.delay, problem.depths, n)
+    received = problem.queue.effective(run.z[:-1], run.inputs)
     f_x, f_u = problem.system.linearise(
         run.z[:-1, :n], received, problem.p, problem.dt, problem.smoothing
     )
@@ -81,27 +80,11 @@ def update(task: Task, model: Lifted, policy: Policy, trial: Trial) -> Policy:
 def gradient_of(task: Task, policy: Policy) -> tuple[float, Array]:
     """Utility and its gradient (H, m) by the feed-forward when `task.model` is the real system."""
     problem = task.problem()
-    policy = deepened(policy, problem.depths)
+    policy = policy.laid_out(policy.state_names, policy.angles, problem.depths)
     run = simulate(task.problem(exact=True), policy)
     answer = np.zeros((*run.inputs.shape, problem.nz)) if policy.gain is None else policy.gain
     slope, _ = adjoint(linearised(problem, run.z, run.inputs), answer, np.ones_like(run.inputs))
     return run.utility, -slope
-
-
-def deepened(policy: Policy, depths: tuple[int, ...]) -> Policy:
-    """The same policy for a system with longer queues of past inputs; it ignores the new ones."""
-    if policy.gain is None or policy.reference is None or policy.depths == depths:
-        return replace(policy, depths=depths)
-    n = len(policy.state_names)
-    ends = n + np.cumsum(policy.depths)
-    missing = [new - old for new, old in zip(depths, policy.depths, strict=True)]
-    where = np.repeat(ends, missing)
-    return replace(
-        policy,
-        gain=np.insert(policy.gain, where, 0.0, axis=2),
-        reference=np.insert(policy.reference, where, 0.0, axis=1),
-        depths=depths,
-    )
 
 
 def _quadratic(task: Task, model: Lifted, trial: Trial) -> tuple[Array, Array]:

@@ -20,7 +20,7 @@ from grounded.effects.registry import integrated_states, partner
 from grounded.frozen import Array, wrapped
 from grounded.instruments.lag import Lag, lag_between
 from grounded.model import Model
-from grounded.trial import Trial
+from grounded.trial import Trial, stretches
 
 SHORT = 1e-6  # [s], a step that shows the rates
 SAME = 1e-4
@@ -72,10 +72,7 @@ def pieces(trials: Sequence[Trial], columns: Sequence[int]) -> Iterator[Array]:
     for trial in trials:
         some = trial.states[:, list(columns)]
         good = np.isfinite(some).all(axis=1)
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], good.astype(int), [0]])))
-        for a, b in edges.reshape(-1, 2):
-            if b - a > 4:
-                yield some[a:b]
+        yield from (some[a:b] for a, b in stretches(np.asarray(good)) if b - a > 4)
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,6 @@ from numpy.typing import NDArray
 
 from grounded.frozen import Array
 from grounded.rollout import augmented
-from grounded.solve.bias import effective_inputs
 from grounded.solve.levenberg_marquardt import LeastSquares, Minimum, Rows, solve
 from grounded.task import Task
 
@@ -61,7 +60,7 @@ def first_guess(task: Task) -> Guess:
     x, u = filled_target(task)
     problem = task.problem()
     z = augmented(problem, x, u, task.past)
-    received = effective_inputs(z, u, problem.delay, problem.depths, task.model.n)
+    received = problem.queue.effective(z[:-1], u)
     moved = problem.system.step(x[:-1], received, problem.p, problem.dt, problem.smoothing)
     about = dataclasses.replace(problem, bias=x[1:] - moved, start=x[0])
     sweep = problem.system.backward(about, z, u, np.zeros(task.model.m))

@@ -31,6 +31,7 @@ from grounded.frozen import Array
 from grounded.rollout import simulate
 from grounded.search.candidate import Tried
 from grounded.search.planner import Planner
+from grounded.solve.bias import input_span
 from grounded.trial import Trial, mean_trial
 
 SMOOTH = 6.0  # steps: standard deviation of the kernel in time
@@ -111,9 +112,7 @@ class _Gradient:
     def __init__(self, planner: Planner, own: Trial, problem: Problem) -> None:
         self.model, n, H = planner.task.model, planner.task.model.n, problem.horizon
         inputs = own.inputs[:H]
-        reached = np.ptp(inputs, axis=0) + 1e-9
-        limits = problem.high - problem.low
-        self.span = np.where(np.isfinite(limits), limits, reached)
+        self.span = input_span(problem, inputs)
         error = self.model.difference(own.states[: H + 1], problem.target[:, :n])
         weight = problem.state_weight[:, :n]
         self.by_state = np.where(weight > 0, -2 * weight * np.nan_to_num(error), 0.0)

@@ -59,23 +59,6 @@ class Grounding:
         return replace(problem, bias=self.bias, input_shift=self.shift)
 
 
-def effective_inputs(
-    z: Array, inputs: Array, delay: Array, depths: tuple[int, ...], n: int
-) -> Array:
-    """What the actuators receive, (T, m): commands after their transport delay (in steps)."""
-    received = np.empty_like(inputs)
-    first = n
-    for j, depth in enumerate(depths):
-        queue = np.column_stack([inputs[:, j], z[: len(inputs), first : first + depth]])
-        whole = int(np.floor(delay[j] + 1e-9))
-        part = delay[j] - whole
-        received[:, j] = queue[:, whole]
-        if part > 1e-9:
-            received[:, j] = (1 - part) * queue[:, whole] + part * queue[:, whole + 1]
-        first += depth
-    return received
-
-
 def ground(
     task: Task,
     trial: Trial,
@@ -118,8 +101,7 @@ def _along(problem: Problem, trial: Trial) -> tuple[Array, Array]:
     """A trial's z (T + 1, nz), and what the actuators received (T, m)."""
     past = problem.past if trial.start_inputs is None else trial.start_inputs
     z = augmented(problem, trial.states, trial.inputs, past)
-    n = trial.states.shape[1]
-    return z, effective_inputs(z, trial.inputs, problem.delay, problem.depths, n)
+    return z, problem.queue.effective(z[:-1], trial.inputs)
 
 
 def residuals(task: Task, trial: Trial) -> Array:
@@ -143,15 +125,19 @@ def input_shift(problem: Problem, x: Array, received: Array) -> Array:
     best = solve(batch, received, rows, ITERATIONS)
     lost = np.flatnonzero(_without_slope(batch.jacobian(best.w, rows)[:, : x.shape[1]]))
     for part in ELSEWHERE if len(lost) else ():
-        start = received[lost] + part * _span(problem, received)
+        start = received[lost] + part * input_span(problem, received)
         best = best.better_of(solve(batch, start, lost, ITERATIONS), lost)
     rho = received - best.w
     if not np.isfinite(rho).all():
         return np.zeros_like(received)
-    window = np.hanning(WINDOW + 2)[1:-1]
-    padded = np.pad(rho, ((WINDOW // 2, WINDOW // 2), (0, 0)), mode="edge")
-    smooth = [np.convolve(column, window / window.sum(), mode="valid") for column in padded.T]
-    return np.column_stack(smooth)
+    return np.column_stack([hann_smoothed(column, WINDOW - 1) for column in rho.T])
+
+
+def hann_smoothed(signal: Array, width: int) -> Array:
+    """Weighted mean over `width` + 1 samples; the ends are continued by their last value."""
+    window = np.hanning(width + 3)[1:-1]
+    padded = np.pad(signal, width // 2, mode="edge")
+    return np.convolve(padded, window / window.sum(), mode="valid")
 
 
 def _without_slope(J: Array) -> NDArray[np.bool_]:
@@ -160,9 +146,10 @@ def _without_slope(J: Array) -> NDArray[np.bool_]:
     return np.asarray((effect < DEAD * np.median(effect, axis=0)).any(axis=1))
 
 
-def _span(problem: Problem, received: Array) -> Array:
+def input_span(problem: Problem, inputs: Array) -> Array:
+    """The range of each input (m,): of its limits, or that of inputs (T, m) where it has none."""
     limits = problem.high - problem.low
-    used = np.ptp(received, axis=0) + 1e-9
+    used = np.ptp(inputs, axis=0) + 1e-9
     return np.where(np.isfinite(limits), limits, used)
 
 
@@ -171,7 +158,7 @@ def _moves(problem: Problem, x: Array, received: Array) -> LeastSquares:
     settings = (problem.p, problem.dt, problem.smoothing)
     rate = np.diff(x, axis=0) / problem.dt
     scale = np.std(rate, axis=0) + 1e-3 * float(np.abs(rate).max()) + 1e-9
-    pull = PULL / _span(problem, received)
+    pull = PULL / input_span(problem, received)
 
     def residual(w: Array, rows: Rows) -> Array:
         with np.errstate(all="ignore"):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from grounded.compile.problem import queue_of
 from grounded.errors import GroundedError
 from grounded.estimate import (
     NoiseStd,
@@ -30,7 +31,6 @@ from grounded.estimate.steps import ModelSteps
 from grounded.estimate.tracker import nearest_step
 from grounded.model import Model, Param
 from grounded.models.car import model as car
-from grounded.solve.bias import effective_inputs
 from grounded.trial import Trial
 
 DT = 0.05
@@ -252,7 +252,7 @@ def test_received_inputs_are_the_delay_queue_of_the_kernels(delay):
     depth = max(1, int(np.ceil(delay)))
     sent = np.concatenate([np.full(depth, past[0]), u[:, 0]])
     queue = np.stack([sent[depth - 1 - i : depth - 1 - i + 20] for i in range(depth)], axis=1)
-    expected = effective_inputs(queue, u, np.array([delay]), (depth,), 0)
+    expected = queue_of(0, np.array([delay]), (depth,)).effective(queue[: len(u)], u)
     record = record_of(SPRING, trial)
     assert np.allclose(record.received(np.array([delay * DT]))[0], expected)
     h = 1e-5

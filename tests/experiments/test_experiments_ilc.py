@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from grounded.experiments.bench import bench, many_runs, optimum, start_of
-from grounded.experiments.ilc import deepened, gradient_of, lifted
+from grounded.experiments.ilc import gradient_of, lifted
 from grounded.rollout import simulate
 from grounded.search.first_policy import first_policy
 
@@ -38,7 +38,7 @@ def test_the_gradient_of_differences_is_the_real_one(case):
     policy = replace(policy, feedforward=np.clip(policy.feedforward, -0.9, 0.9))
     _, gradient = gradient_of(replace(case.truth, smoothing=0.0), policy)
     truth = case.truth.problem(exact=True)
-    deep = deepened(policy, truth.depths)
+    deep = policy.laid_out(policy.state_names, policy.angles, truth.depths)
     for t, j in ((5, 0), (20, 1)):
         step = np.zeros_like(policy.feedforward)
         step[t, j] = 1e-6
@@ -51,7 +51,7 @@ def test_a_deepened_policy_is_the_same_policy(case):
     case, policy = case
     depths = tuple(d + 1 for d in policy.depths)
     task = replace(case.task, latency=case.task.latency + case.task.dt)
-    deep = deepened(policy, depths)
+    deep = policy.laid_out(policy.state_names, policy.angles, depths)
     assert task.problem().depths == depths
     if policy.gain is not None:
         assert deep.gain.shape[2] == policy.gain.shape[2] + 2

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from facts import holding
+from grounded.compile.problem import queue_of
 from grounded.errors import GroundedError
 from grounded.experiments.car_tasks import car_task
 from grounded.experiments.figure8 import flight_task, perturbed
@@ -17,7 +18,7 @@ from grounded.policy import Policy
 from grounded.rollout import augmented, simulate
 from grounded.search.improve import propose
 from grounded.search.standing import SearchOptions
-from grounded.solve.bias import effective_inputs, ground, residuals
+from grounded.solve.bias import ground, residuals
 from grounded.trial import Trial
 from small_tasks import black_box, cart_task, drive, other, rover_task
 
@@ -153,7 +154,7 @@ def test_effective_inputs_by_hand():
     z = augmented(problem, np.zeros((7, 2)), u, np.array([-1.0]))
     np.testing.assert_array_equal(z[:, 2], [-1, 0, 1, 2, 3, 4, 5])  # u[t-1]
     np.testing.assert_array_equal(z[:, 3], [-1, -1, 0, 1, 2, 3, 4])  # u[t-2]
-    received = effective_inputs(z, u, np.array([1.25]), (2,), 2)
+    received = queue_of(2, np.array([1.25]), (2,)).effective(z[: len(u)], u)
     # over step t: three quarters of it under u[t-1], the first quarter still under u[t-2]
     np.testing.assert_allclose(received[:, 0], [-1.0, -0.25, 0.75, 1.75, 2.75, 3.75])
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import closing
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -117,16 +118,16 @@ def _messages(bag: Any, channels: dict[int, int], path: Path) -> Iterator[Piece]
 
 def _standard(kind: str) -> str:
     """The definition of a standard ROS 2 type, "" for one that Humble doesn't have."""
-    store = _standard_types()
+    store = standard_types()
     return str(store.generate_msgdef(kind, 2)[0]) if kind in store.fielddefs else ""
 
 
-def _standard_types() -> Any:
+@cache
+def standard_types() -> Any:
+    """The types of ROS 2 Humble."""
     from rosbags.typesys import Stores, get_typestore
 
-    if not hasattr(_standard_types, "kept"):
-        _standard_types.kept = get_typestore(Stores.ROS2_HUMBLE)  # type: ignore[attr-defined]
-    return _standard_types.kept  # type: ignore[attr-defined]
+    return get_typestore(Stores.ROS2_HUMBLE)
 
 
 def ros1_records(path: Path) -> Iterator[Record]:

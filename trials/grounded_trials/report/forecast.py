@@ -13,7 +13,6 @@ import numpy as np
 from grounded.frozen import Array
 from grounded.rollout import augmented
 from grounded.search.planner import Planner
-from grounded.solve.bias import effective_inputs
 from grounded.trial import Trial
 
 SECONDS = 1.0
@@ -50,7 +49,7 @@ def forecast(planner: Planner, trial: Trial, seconds: float = SECONDS) -> Foreca
     problem = plan.problem(exact=True)
     past = plan.past if part.start_inputs is None else part.start_inputs
     z = augmented(problem, lifted.states, lifted.inputs, past)
-    received = effective_inputs(z, lifted.inputs, problem.delay, problem.depths, plan.model.n)
+    received = problem.queue.effective(z[:-1], lifted.inputs)
     length = max(1, min(round(seconds / trial.dt), whole))
     starts = np.arange(0, whole, length)
     x = lifted.states[starts]

@@ -26,6 +26,7 @@ import numpy as np
 from grounded.errors import GroundedError, nearest
 from grounded.frozen import Array
 from grounded.model import Model
+from grounded_trials.formats.bags import standard_types
 from grounded_trials.logs.inspect_evidence import rates_of
 from grounded_trials.report.scene import Scene, scene_of
 from grounded_trials.store.store import write_atomically
@@ -70,7 +71,7 @@ def write_bag(
     if path.exists():
         raise GroundedError(f"{path} exists already: name another folder, or remove it first")
     storage = StoragePlugin.MCAP if "mcap" in path.name else StoragePlugin.SQLITE3
-    store = _types()
+    store = standard_types()
     with tempfile.TemporaryDirectory(prefix=".bag-", dir=_parent(path)) as room:
         made = Path(room) / path.name
         with Writer(made, version=9, storage_plugin=storage) as writer:
@@ -93,18 +94,12 @@ def _parent(path: Path) -> Path:
     return path.parent
 
 
-def _types() -> Any:
-    from rosbags.typesys import Stores, get_typestore
-
-    return get_typestore(Stores.ROS2_HUMBLE)
-
-
 class _Run:
     """The messages of one run, in the order of time."""
 
     def __init__(self, model: Model, dt: float, start_ns: int) -> None:
         self.model, self.dt, self.start = model, dt, start_ns
-        self.kinds = _types().types
+        self.kinds = standard_types().types
         scene = scene_of(model)
         self.scene: Scene | None = scene if scene.spatial else None
         self.joints = {q: w for q, w in rates_of(model).items() if model.states[q] == "rad"}
