@@ -204,7 +204,7 @@ def _reach(widths: Sequence[int], gap: int) -> int:
 def _words(cells: Sequence[str]) -> bool:
     """Whether a column holds words rather than numbers."""
     known = [cell for cell in cells if cell]
-    return all(cell[0].isalpha() for cell in known) or any(len(c.split()) > 3 for c in known)
+    return all(cell[0].isalpha() for cell in known) or 2 * sum(len(c.split()) > 3 for c in known) > len(known)
 
 
 def _broken(cell: str, width: int) -> list[str]:
