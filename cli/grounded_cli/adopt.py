@@ -6,7 +6,7 @@ import click
 
 from grounded_cli import completion as complete
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
-from grounded_cli.terminal import field, number, remark, show, show_json
+from grounded_cli.terminal import field, number, remark, sentence, show, show_json
 from grounded_trials.wording import with_unit
 
 UNCLAIMED = (
@@ -40,7 +40,7 @@ def command(effects: tuple[str, ...], effect_only: bool, json_: bool) -> None:
         show_json(done.to_json())
         return
     for name in dict.fromkeys(effects):
-        show(f"{name} is part of the model now ({workspace.config.file})")
+        sentence(f"{name} is part of the model now ({workspace.config.file})")
     if not done.claimed:
         remark("note", f"{effects[0]} {UNCLAIMED}")
     if done.params:

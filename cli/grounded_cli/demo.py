@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -14,6 +14,13 @@ from grounded_cli.options import as_json, next_line
 from grounded_cli.status import summary
 from grounded_cli.terminal import field, number, progress, remark, say, show, show_json
 from grounded_trials.wording import count
+
+if TYPE_CHECKING:
+    from grounded_trials import Workspace
+    from grounded_trials.workspace.proposing import Status
+
+
+STEPS = 6000  # of all trials together: a demo is to end within a minute or two
 
 
 @click.command("demo")
@@ -42,7 +49,7 @@ def command(name: str, folder: str | None, json_: bool) -> None:
         best = optimum(workspace)
     save_optimum(workspace, best)
     with progress("diagnosing the gap"):
-        diagnosed = workspace.diagnose()
+        diagnosed = workspace.diagnose(_few(workspace, status))
     with progress("writing the report"):
         html, rrd = (find_spec(name) is not None for name in ("plotly", "rerun"))
         report = workspace.report(html=html, rrd=rrd)
@@ -64,6 +71,13 @@ def command(name: str, folder: str | None, json_: bool) -> None:
     say("")
     show(summary(status))
     _tell(document)
+
+
+def _few(workspace: Workspace, status: Status) -> list[str]:
+    """The trials to diagnose: of long ones the model's own policy and the best, [] for all."""
+    tried = [one for one in (*status.standing.history[:1], status.standing.incumbent) if one]
+    long = workspace.task.horizon * status.standing.trials > STEPS
+    return list(dict.fromkeys(one.trials[0].id for one in tried if one.trials)) if long else []
 
 
 def _tell(document: dict[str, Any]) -> None:

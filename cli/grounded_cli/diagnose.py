@@ -80,7 +80,7 @@ def command(
         if json_:
             return show_json({"preflight": [one.to_json() for one in findings]})
         _instruments(findings)
-        return None if findings else show("nothing was found of the sensors")
+        return None if findings else show("the sensors show nothing odd")
     families = [name for text in without for name in names_in(text)]
     with stages() as tell:
         found = workspace.diagnose(

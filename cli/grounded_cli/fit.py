@@ -47,7 +47,7 @@ def command(params: str | None, latency: bool, apply_: bool, json_: bool) -> Non
     if apply_:
         show("\nwritten to grounded.toml [model] params")
     else:
-        show("\n--apply writes the values to grounded.toml")
+        show("\nto write the values to grounded.toml, add --apply")
     show(next_line(done.then))
 
 

@@ -8,7 +8,7 @@ import click
 
 from grounded_cli import completion as complete
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
-from grounded_cli.terminal import field, number, progress, remark, show, show_json, table
+from grounded_cli.terminal import field, number, progress, remark, sentence, show, show_json, table
 
 if TYPE_CHECKING:
     from grounded_trials.workspace.ingest import Ingested
@@ -59,7 +59,7 @@ def tell(name: str, one: Ingested) -> None:
     for warning in one.warnings:
         remark("warning", f"{name}: {warning}")
     known = "was stored before as" if one.known else "is stored as"
-    show(f"{name} {known} {one.trial}")
+    sentence(f"{name} {known} {one.trial}")
     if not one.candidate:
         show(field("data", "for fit and diagnose: it ran no candidate", "  "))
     else:

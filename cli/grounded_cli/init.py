@@ -10,7 +10,7 @@ import click
 
 from grounded_cli import completion as complete
 from grounded_cli.options import as_json, next_line
-from grounded_cli.terminal import field, progress, remark, show, show_json
+from grounded_cli.terminal import field, progress, remark, sentence, show, show_json
 
 if TYPE_CHECKING:
     from grounded_trials.logs.inspect_guess import Guess
@@ -93,7 +93,7 @@ def _ask(guess: Guess) -> str:
 
 def _tell(begun: Begun) -> None:
     what = f"skeleton of kind '{begun.kind}': {begun.why}" if begun.kind else begun.why
-    show(f"{begun.workspace} is a workspace for {begun.log}")
+    sentence(f"{begun.workspace} is a workspace for {begun.log}")
     show(field("model", what, "  "))
     show(field("grid", f"{begun.dt:g} s, {begun.horizon} steps", "  "))
     show(field("target", begun.target, "  "))
@@ -108,7 +108,8 @@ def _tell(begun: Begun) -> None:
     for note in begun.notes:
         remark("note", note)
     look = "; look at what is UNSURE in its [log]" if begun.unsure else ""
-    show(f"\nread {begun.workspace}/model.py and grounded.toml{look}, then")
+    show()
+    sentence(f"read {begun.workspace}/model.py and grounded.toml{look}, then")
     show(next_line(begun.then, begun.workspace))
 
 

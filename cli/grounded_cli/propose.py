@@ -59,8 +59,7 @@ def tell_proposed(workspace: Workspace, proposed: Proposed, *, last: bool = True
     if standing.incumbent is not None:
         best = standing.incumbent
         show(field("so far", f"{number(best.utility)} by {best.candidate.id}", "  "))
-    adopted = bool(workspace.config.model.effects)
-    show(field("trust", _trust(standing, adopted), "  "))
+    show(field("trust", _trust(standing, workspace), "  "))
     for name, text in _extent(candidate, workspace.task):
         show(field(name, text, "  "))
     if last:
@@ -88,7 +87,7 @@ def _extent(candidate: Candidate, task: Task) -> list[tuple[str, str]]:
             rows.append((name, with_unit(_span(values), model.states[name])))
     for i, (name, unit) in enumerate(model.inputs.items()):
         low, high = float(task.low[i]), float(task.high[i])
-        limits = f", limits {low:g} to {high:g}" * (high < float("inf"))
+        limits = f", limits {low:.4g} to {high:.4g}" * (high < float("inf"))
         rows.append((name, with_unit(_span(candidate.predicted_inputs[:, i]), unit) + limits))
     return rows
 
@@ -101,15 +100,25 @@ def _span(values: Any) -> str:
     return f"{round(low, digits) + 0.0:.{digits}f} to {round(high, digits) + 0.0:.{digits}f}"
 
 
-def _trust(standing: Standing, adopted: bool) -> str:
-    """How the last prediction came true."""
+def _trust(standing: Standing, workspace: Workspace) -> str:
+    """How the last prediction came true; before that, what the model was compared with."""
     pairs = [
         (tried.candidate.predicted_utility, tried.utility)
         for tried in standing.history
         if tried.utilities
     ]
     if not pairs:
-        model = "model with what was adopted" if adopted else "crude model"
-        return f"unknown: the {model} was never compared with the real system"
+        logs = len(workspace.trials()) - sum(len(tried.trials) for tried in standing.history)
+        if not logs:
+            return "unknown: the crude model was never compared with the real system"
+        config = workspace.config.model
+        done = " and ".join(
+            ["fitted"] * bool(config.params) + ["given effects"] * bool(config.effects)
+        )
+        by = f"was {done} with" if done else "can be judged by"
+        return (
+            f"the model {by} {count(logs, 'log')} of data (`grounded diagnose` says how far it "
+            "predicts), but it was never tried on this manoeuvre"
+        )
     predicted, real = pairs[-1]
     return f"the last prediction was {number(predicted)}, the real run gave {number(real)}"

@@ -134,6 +134,11 @@ def bar(text: str) -> Iterator[Callable[[int, int], None]]:
         yield count
 
 
+def sentence(text: str) -> None:
+    """A sentence on stdout, wrapped to the terminal."""
+    show("\n".join(wrapped(text, "", "  ")))
+
+
 def table(rows: Sequence[Sequence[str]], header: Sequence[str]) -> str:
     """Aligned columns: the first and those of words to the left, numbers to the right.
 
@@ -204,7 +209,9 @@ def _reach(widths: Sequence[int], gap: int) -> int:
 def _words(cells: Sequence[str]) -> bool:
     """Whether a column holds words rather than numbers."""
     known = [cell for cell in cells if cell]
-    return all(cell[0].isalpha() for cell in known) or any(len(c.split()) > 3 for c in known)
+    return all(cell[0].isalpha() for cell in known) or 2 * sum(
+        len(c.split()) > 3 for c in known
+    ) > len(known)
 
 
 def _broken(cell: str, width: int) -> list[str]:

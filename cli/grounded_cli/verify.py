@@ -6,6 +6,7 @@ import click
 
 from grounded_cli.options import as_json, in_workspace, open_workspace
 from grounded_cli.terminal import progress, remark, show, show_json
+from grounded_trials.wording import count
 
 
 @click.command("verify")
@@ -21,6 +22,6 @@ def command(json_: bool) -> None:
     else:
         for one in found.damaged:
             remark("damaged", one.reason)
-        show(f"{found.checked} files checked, {len(found.damaged)} damaged")
+        show(f"{count(found.checked, 'file')} checked, {len(found.damaged)} damaged")
     if found.damaged:
         click.get_current_context().exit(1)

@@ -56,17 +56,16 @@ def _overview(findings: Findings, scene: Scene) -> Any:
         (f"/bias/{n}", labelled(f"bias of {n}", per_second(model.states[n]))) for n in chosen[:2]
     ]
     plots = [_plot(origin, name, legend=False) for origin, name in named]
+    charts = [("/utilities", "Utility by iteration")]
+    if findings.diagnosis is not None and findings.diagnosis.credit:
+        charts.append(("/credit", "Credit: share of what predictions gain [%]"))
+    hidden = rrb.PlotLegend(visible=False)
+    bars = [rrb.BarChartView(origin=at, name=name, plot_legend=hidden) for at, name in charts]
     left = rrb.Vertical(
+        rrb.TextDocumentView(origin="/verdict", name="Why the model was wrong, what to run next"),
         _space(findings, scene, ["/paths/**"], title),
-        rrb.Horizontal(
-            rrb.BarChartView(
-                origin="/utilities",
-                name="Utility by iteration",
-                plot_legend=rrb.PlotLegend(visible=False),
-            ),
-            rrb.TextDocumentView(origin="/summary", name="Summary"),
-        ),
-        row_shares=[3, 2],
+        rrb.Horizontal(*bars, rrb.TextDocumentView(origin="/summary", name="Summary")),
+        row_shares=[2, 4, 2],
     )
     right = rrb.Grid(*plots, grid_columns=2)
     return rrb.Horizontal(left, right, name="Overview", column_shares=[1, 1])
@@ -81,7 +80,7 @@ def _trials(findings: Findings, scene: Scene) -> list[Any]:
         if run.explained is not None:
             names["explained"] = "bias that is left after the diagnosis"
         about = f"{run.label}, utility {run.utility:.4g}"
-        shown.append((f"/trials/{run.trial.id}", about, names, ["path", "predicted", "body"]))
+        shown.append((f"/trials/{run.trial.id}", about, names, ["path", "predicted/**", "body"]))
     for log in findings.logs[-TRIALS:]:
         shown.append((f"/data/{log.trial.id}", f"{log.trial.id}, data", NAMES, ["path", "body"]))
     tabs = []

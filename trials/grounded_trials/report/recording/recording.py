@@ -5,6 +5,7 @@
     /bias/x/...               what the crude model lacks along the run [unit/s], by iteration
     /trials/t0007/...         everything of one trial: path, prediction, body, state, input, bias
     /data/t0003/...           the same of a log that ran no candidate
+    /verdict, /credit         why the model was wrong, cause by cause
     /utilities, /summary      by iteration, and in words (Markdown)
 
 One timeline, `time`, in seconds since the start of a trial. Numbers go in by whole columns, names
@@ -27,10 +28,11 @@ from grounded.figures.figure import COLOURS as PAGE
 from grounded.figures.figure import rgb
 from grounded.frozen import Array
 from grounded.trial import Trial
+from grounded_trials.report.diagnosis_words import sentences
 from grounded_trials.report.findings import Findings, Run, selection, tracked
 from grounded_trials.report.recording.layout import blueprint
 from grounded_trials.report.scene import Scene, scene_of
-from grounded_trials.wording import count, labelled, per_second
+from grounded_trials.wording import count, labelled, per_second, percent
 
 COLOURS = {role: rgb(dark) for role, (_, dark) in PAGE.items()}
 COLOURS |= {"desired": (170, 170, 170), "other": (110, 110, 110), "model_policy": COLOURS["model"]}
@@ -91,6 +93,11 @@ class _Recorder:
         log, findings = self.stream.log, self.findings
         log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         log("summary", rr.TextDocument(summary(findings), media_type="text/markdown"), static=True)
+        log("verdict", rr.TextDocument(verdict(findings), media_type="text/markdown"), static=True)
+        diagnosis = findings.diagnosis
+        if diagnosis is not None and diagnosis.credit:
+            shares = [100 * one.share for one in diagnosis.credit]
+            log("credit", rr.BarChart(shares, color=COLOURS["best"]), static=True)
         values = [u for u in findings.standing.utilities if np.isfinite(u)]
         if values:
             log("utilities", rr.BarChart(values, color=COLOURS["best"]), static=True)
@@ -113,7 +120,7 @@ class _Recorder:
             self.path("paths/predicted", waiting.predicted_states, "predicted", 1.5)
         shown = [("model_policy", first)]
         if best is not None and (first is None or best.candidate is not first.candidate):
-            self.path("paths/predicted", best.candidate.predicted_states, "predicted", 1.0)
+            self.ghost("paths/predicted", best)
             shown.append(("best", best))
         for role, run in shown:
             if run is not None:
@@ -171,7 +178,7 @@ class _Recorder:
             if chosen is not None and run.candidate is chosen.candidate:
                 colour = role
         self.moving(at, run.trial, colour, "/path")
-        self.path(f"{at}/predicted", run.candidate.predicted_states, "predicted", 1.0)
+        self.ghost(f"{at}/predicted", run)
         self.signals(at, run.trial, run.residual)
         if run.explained is not None:
             self.columns(f"{at}/explained", *rate(run.explained, self.dt), self.per_second)
@@ -189,6 +196,15 @@ class _Recorder:
         shown = self.findings.runs or self.findings.logs
         points = self.scene.finite(shown[0].trial.states if shown else self.task.target)
         return 0.07 * (float(np.ptp(points, axis=0).max()) or 1.0) if len(points) else 0.07
+
+    def ghost(self, at: str, run: Run) -> None:
+        """The run as it was predicted, with a body of its own that moves beside the real one."""
+        states, inputs = run.candidate.predicted_states, run.candidate.predicted_inputs
+        names = (run.trial.state_names, run.trial.input_names)
+        if np.isfinite(states).all():
+            self.moving(at, Trial(states, inputs, self.dt, *names), "predicted", width=1.0)
+        else:
+            self.path(at, states, "predicted", 1.0)
 
     def moving(
         self, at: str, trial: Trial, colour: str, path: str = "", width: float = 2.0
@@ -259,8 +275,22 @@ def rate(residual: Array, dt: float) -> tuple[Array, float]:
     return whole.reshape(-1, step, residual.shape[1]).mean(axis=1) / dt, step * dt
 
 
+def verdict(findings: Findings) -> str:
+    """What the diagnosis says, a cause a line with its share, and what to run next."""
+    diagnosis, lines = findings.diagnosis, []
+    if diagnosis is None:
+        lines.append("not diagnosed yet")
+    else:
+        causes, *others = sentences(diagnosis.sentence)
+        lines += [f"- {cause}" for cause in causes.split("; ")]
+        lines += [""] + [f"{other}\n" for other in others]
+        shares = [f"{one.of} {percent(one.share)}" for one in diagnosis.credit]
+        lines += [f"credit, in this order: {', '.join(shares)}\n"] * bool(shares)
+    return "\n".join([*lines, f"next: `{findings.next_command}`"])
+
+
 def summary(findings: Findings) -> str:
-    """What was learnt, what is lost, what to do next."""
+    """What was learnt, and what is left out."""
     task, best, first = findings.task, findings.best, findings.first
     lines = [
         f"# {findings.name}",
@@ -278,8 +308,5 @@ def summary(findings: Findings) -> str:
         lines.append(f"| optimum | | {findings.optimum:.4g} |")
     lines += ["", "grey: desired; orange: model's policy; blue: best so far; pink: its prediction"]
     lines += ["", f"**{findings.standing.phase}**: {findings.standing.sentence}", ""]
-    if findings.diagnosis is not None:
-        lines += [f"**diagnosis**: {findings.diagnosis.sentence}", ""]
     lines += [f"**left out**: {one.file}: {one.reason}\n" for one in findings.lost]
-    lines.append(f"next: `{findings.next_command}`")
     return "\n".join(lines)
