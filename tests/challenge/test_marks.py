@@ -73,15 +73,15 @@ def test_the_simulator_is_the_crude_model_but_for_what_is_withheld(system, built
     for _ in range(10):
         ours = model.system.step(ours[None], u[None], model.values, 0.005)[0]
     plain = after()
-    np.testing.assert_allclose(plain, ours, atol=0.02)
-    for part in ({"friction": {motor: 0.5}}, {"armature": {motor: 0.2}}):
+    np.testing.assert_allclose(plain, ours, atol=5e-3)
+    for part in ({"friction": {motor: 2.0}}, {"armature": {motor: 0.2}}):
         assert np.abs(after(**part) - plain).max() > 0.03
     heavier = {"load": 0.5} if system == "arm" else {"m": 0.5}
     changed = model.with_values(heavier)
     ours = x
     for _ in range(10):
         ours = changed.system.step(ours[None], u[None], changed.values, 0.005)[0]
-    np.testing.assert_allclose(after(true=heavier), ours, atol=0.02)
+    np.testing.assert_allclose(after(true=heavier), ours, atol=5e-3)
 
 
 def test_without_mujoco_its_systems_are_left_out_with_a_word(tmp_path, monkeypatch):
