@@ -143,12 +143,17 @@ def score(folder: str, labels: str | None, engine: Engine, json_: bool) -> None:
     if json_:
         show_json({"summary": found, "cases": marks})
         return
-    rows = [(m["case"], ", ".join(m["truth"]), m["verdict"], ", ".join(m["named"])) for m in marks]
+    rows = [(m["case"], ", ".join(m["truth"]), m["verdict"], _few(m["named"])) for m in marks]
     show(table(rows, ("case", "truth", "verdict", "named")))
     for kind, row in found.items():
         show(f"\n{kind}")
         for key, value in row.items():
             show(f"  {key.replace('_', ' '):<20} {_words(value)}")
+
+
+def _few(names: list[str]) -> str:
+    more = len(names) - 3
+    return ", ".join(names[:3]) + (f" and {more} more" if more > 0 else "")
 
 
 def _labels(folder: str, labels: str | None) -> Path:

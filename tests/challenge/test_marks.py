@@ -1,0 +1,134 @@
+"""The systems of the challenge, and what counts as a mark."""
+
+import numpy as np
+import pytest
+
+from cli import grounded
+from grounded.challenge import judge, make, summary
+from grounded.challenge.cases import _shares
+from grounded.challenge.mechanism import Mechanism, arm_built, cart_built
+from grounded.challenge.score import Oracle
+from grounded.challenge.systems import SYSTEMS
+from grounded.errors import GroundedError
+
+
+def case_of(system, **about):
+    return next(make("none", 1, 7, only=system, noise="white", **about))
+
+
+@pytest.mark.parametrize("system", ["buggy", "lift"])
+def test_kinked_systems_run_closed_loop_at_a_rate_of_theirs(system):
+    case = case_of(system)
+    assert 1 / case.dt == pytest.approx(20) or 1 / case.dt in (50, 100)
+    assert len(case.trials) >= 3 and len(case.fresh) == 2
+    assert all(np.isfinite(t.states).all() for t in case.trials)
+    assert all((t.inputs >= case.low).all() and (t.inputs <= case.high).all() for t in case.trials)
+
+
+def test_noise_grows_with_the_speed():
+    from dataclasses import replace
+
+    from grounded.challenge.truth import Disturbance, Truth
+
+    model = SYSTEMS["lift"]().model
+    still, kicks = np.zeros(2), []
+    for grows in (None, ("w", 0.1)):
+        truth = Truth(model, disturbance=Disturbance({"w": 0.1}, {}, grows=grows))
+        rng, spread = np.random.default_rng(0), []
+        run = truth.run(rng, lambda t, y: np.array([5.0]), still, np.zeros(1), 200, 0.05)
+        quiet = replace(truth, disturbance=Disturbance({}, {}))
+        for k in range(100, 200):
+            one = quiet.run(rng, lambda t, y: np.array([5.0]), run.states[k], [5.0], 1, 0.05)
+            spread.append(run.states[k + 1, 1] - one.states[1, 1])
+        kicks.append(np.std(spread))
+    assert kicks[1] > 5 * kicks[0]
+
+
+def test_own_systems_are_half_of_a_mixture():
+    share = _shares(("own", "kinked", "mujoco"))
+    assert sum(share.values()) == pytest.approx(1.0)
+    assert share["car"] + share["pendulum"] + share["aircraft"] == pytest.approx(0.5)
+    assert set(share) == set(SYSTEMS)
+    with pytest.raises(GroundedError, match="groups of systems: own, kinked, mujoco; got 'others'"):
+        _shares(["others"])
+
+
+@pytest.mark.parametrize(
+    ("system", "built", "motor"), [("arm", arm_built, "tau2"), ("cart_pole", cart_built, "force")]
+)
+def test_the_simulator_is_the_crude_model_but_for_what_is_withheld(system, built, motor):
+    pytest.importorskip("mujoco")
+    model, rng = SYSTEMS[system]().model, np.random.default_rng(1)
+    x, u = rng.normal(size=model.n), 2 * rng.normal(size=model.m)
+
+    def after(**part):
+        kinds = {kind: part.get(kind, {}) for kind in ("friction", "armature", "lag")}
+        true = dict(zip(model.param_names, model.values, strict=True)) | part.get("true", {})
+        plant, at = Mechanism(built, kinds | {"true": true}).plant(0.005), x
+        for _ in range(10):
+            at = plant.advance(at, u)
+        return at
+
+    ours = x
+    for _ in range(10):
+        ours = model.system.step(ours[None], u[None], model.values, 0.005)[0]
+    plain = after()
+    np.testing.assert_allclose(plain, ours, atol=5e-3)
+    for part in ({"friction": {motor: 2.0}}, {"armature": {motor: 0.2}}):
+        assert np.abs(after(**part) - plain).max() > 0.03
+    heavier = {"load": 0.5} if system == "arm" else {"m": 0.5}
+    changed = model.with_values(heavier)
+    ours = x
+    for _ in range(10):
+        ours = changed.system.step(ours[None], u[None], changed.values, 0.005)[0]
+    np.testing.assert_allclose(after(true=heavier), ours, atol=5e-3)
+
+
+def test_without_mujoco_its_systems_are_left_out_with_a_word(tmp_path, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "mujoco", None)
+    words = ["challenge", "make", tmp_path / "c", "--kind", "none", "--cases", "1", "--seed", "5"]
+    done = grounded(*words, "--systems", "kinked,mujoco")
+    assert done.code == 0 and "left out: " in done.err and "mujoco" in done.err
+    config = (tmp_path / "c" / "none-0000" / "grounded.toml").read_text()
+    assert "grounded.models.buggy" in config or "grounded.models.lift" in config
+    alone = grounded(*words[:2], tmp_path / "d", *words[3:], "--systems", "mujoco")
+    assert alone.code == 1 and "mujoco" in alone.err
+
+
+def marks_of(truth, named, *, errors=(1.0, 1.0), kind="single", param_error=0.0, known=None):
+    label = {"effects": [{"effect": truth, "params": {}}] if truth else [], "case": "x"}
+    label |= {"kind": kind, "noise": "white", "system": "car", "param_error": param_error}
+    row = {"whole_trial": False, "crude": {"v": errors[0]}, "with_effects": {"v": errors[1]}}
+    found = {"verdict": {"kind": "effect", "effects": named}, "indistinguishable": []}
+    found["ranking"] = [{"effect": n, "params": {}, "claimed": True} for n in named]
+    found |= {"gap": {"after": 1.0}, "leftover": [], "prediction_error": [row]}
+    return judge(label, found, known)
+
+
+def test_a_second_name_that_nothing_makes_is_counted():
+    assert not marks_of("delay:a", ["delay:a"])["false_second"]
+    assert marks_of("delay:a", ["delay:a", "stall:a"])["false_second"]
+    assert not marks_of("delay:a", ["stall:a"])["false_second"]  # wrong, but no second one
+    assert not marks_of("delay:a", ["delay:a", "parameter:L"], param_error=0.05)["false_second"]
+    assert marks_of("delay:a", ["delay:a", "parameter:L"])["false_second"]
+    assert not marks_of("parameter:L", ["parameter:L"], param_error=0.05)["false_second"]
+
+
+def test_wrong_places_worse_predictions_and_false_effects_are_counted():
+    assert marks_of("delay:a", ["delay:b"])["wrong_place"]
+    assert not marks_of("delay:a", ["stall:a"])["wrong_place"]
+    assert marks_of("delay:a", ["delay:a"], errors=(1.0, 1.2))["worse"]
+    assert not marks_of("delay:a", ["delay:a"], errors=(1.0, 0.9))["worse"]
+    assert marks_of(None, ["parameter:L"], kind="none")["false_effect"]
+    assert not marks_of(None, ["parameter:L"], kind="none", param_error=0.1)["false_effect"]
+
+
+def test_what_a_rival_explains_as_well_is_not_distinguishable():
+    close, ahead = (Oracle(20.0, 1.0, {"delay:a": 20.0}, rival, {"v": 0.5}) for rival in (18, 9))
+    marks = [marks_of("delay:a", ["stall:a"], known=close)]
+    marks.append(marks_of("delay:a", ["delay:a"], errors=(1.0, 0.6), known=ahead))
+    assert [m["distinguishable"] for m in marks] == [False, True]
+    assert marks[1]["units_ratio"] == pytest.approx(1.2)
+    row = summary(marks)["single"]
+    assert (row["detectable"], row["first"]) == (2, 0.5)
+    assert (row["distinguishable"], row["first_of_distinguishable"]) == (1, 1.0)
