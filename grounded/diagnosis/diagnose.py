@@ -55,7 +55,7 @@ from grounded.effects import Library
 from grounded.instruments.preflight import preflight
 from grounded.model import Model
 from grounded.task import Task
-from grounded.threads import one_blas_thread
+from grounded.threads import steady
 from grounded.trial import Trial
 
 
@@ -78,7 +78,7 @@ class DiagnosisOptions:
     but: Collection[str] = ()
 
 
-@one_blas_thread()
+@steady()
 def diagnose(
     subject: Task | Model,
     trials: Sequence[Trial],

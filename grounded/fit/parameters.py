@@ -20,11 +20,11 @@ from grounded.fit.search import SearchEnd, data_of, first_search, search_paramet
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.task import Task
-from grounded.threads import one_blas_thread
+from grounded.threads import steady
 from grounded.trial import Trial
 
 
-@one_blas_thread()
+@steady()
 def fit(
     model: Model | Task,
     trials: Sequence[Trial | Record],
@@ -85,9 +85,10 @@ def _fitted(
     train, test = split_in_time(records, hold_out, horizon_s, measurement)
     first = first_search(data_of(model, train, measurement, unknowns), rng)
     before, after, last = None, None, first
-    if test and np.isfinite(first.climb.at.loglik):
-        before, after = judged(model, test, measurement, unknowns, first, horizon_s)
-        whole = data_of(model, records, measurement, unknowns)
+    whole = data_of(model, records, measurement, unknowns)
+    if first.data.steps < whole.steps and np.isfinite(first.climb.at.loglik):
+        if test:
+            before, after = judged(model, test, measurement, unknowns, first, horizon_s)
         last = search_parameters(whole, first.climb.at.theta, first.noise, rng)
     return report(model, unknowns, last, before, after)
 
