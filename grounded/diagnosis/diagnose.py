@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis.agreement import by_trial, changed
-from grounded.diagnosis.attribution import attribute
+from grounded.diagnosis.attribution import attribute, so_far
 from grounded.diagnosis.claims import Claims
 from grounded.diagnosis.correction import correction
 from grounded.diagnosis.data import prepare
@@ -54,6 +54,7 @@ from grounded.diagnosis.verdict import next_trial, verdict
 from grounded.effects import Library
 from grounded.instruments.preflight import preflight
 from grounded.model import Model
+from grounded.progress import Stages, interruptible
 from grounded.task import Task
 from grounded.threads import steady
 from grounded.trial import Trial
@@ -94,12 +95,13 @@ def diagnose(
         trials: real runs on one time grid, whatever policy they ran.
         options: library, number of effects, horizon.
         compare: a second group of trials; all are diagnosed, and what changed is `changed`.
-        progress: called with a word at every stage, for a display.
+        progress: told of the stage, the share done and the time left, for a display.
 
     Raises:
+        Interrupted: on Ctrl-C, with the best hypothesis so far and what it predicts.
         GroundedError: for trials that don't fit the model, or with nothing in them.
     """
-    options, tick = options or DiagnosisOptions(), progress or (lambda word: None)
+    options, tick = options or DiagnosisOptions(), Stages(progress, USUAL)
     model = subject.model if isinstance(subject, Task) else subject
     latency = subject.latency if isinstance(subject, Task) else None
     past = subject.past if isinstance(subject, Task) else None
@@ -121,7 +123,8 @@ def diagnose(
     search, best = attribute(data, candidates, max_effects=options.max_effects, tick=tick)
     tick("predict")
     used = [trial for trial in trials if trial.known_steps >= 2]
-    with np.errstate(all="ignore"):
+    here = interruptible(lambda: so_far(search, options.max_effects))
+    with np.errstate(all="ignore"), here:
         decision = decide(search, best, ruler := Ruler(search.predictor), options.max_effects)
         tick("leftover")
         task = subject if isinstance(subject, Task) else None
@@ -135,6 +138,7 @@ def diagnose(
         )
 
 
+USUAL = 370  # stages and iterations of a diagnosis
 FIRST_LOOK = 6  # iterations of the fit by whose noise the parameters are found identifiable
 
 

@@ -40,6 +40,7 @@ from grounded.fit.gauss_newton import (
 )
 from grounded.frozen import Array
 from grounded.model import Model
+from grounded.progress import Stages
 
 ROUNDS = 8  # of parameters, thresholds, noise
 STIRRED = 0.5  # [nats] a climb that gains less leaves thresholds and noise where they are
@@ -73,19 +74,24 @@ def data_of(
     return FitData(model.system, tuple(pieces), measurement, unknowns)
 
 
-def first_search(data: FitData, rng: np.random.Generator) -> SearchEnd:
+def first_search(data: FitData, rng: np.random.Generator, tick: Stages) -> SearchEnd:
     """From the start values; of much data on a draw, from where the whole is soon climbed."""
     draw = enough(data.records, rng)
     if 2 * sum(r.steps for r in draw) <= data.steps:
         data = replace(data, records=tuple(draw))
-    return search_parameters(data, data.unknowns.start, None, rng)
+    return search_parameters(data, data.unknowns.start, None, rng, tick)
 
 
 def search_parameters(
-    data: FitData, theta: Array, noise: NoiseStd | None, rng: np.random.Generator
+    data: FitData,
+    theta: Array,
+    noise: NoiseStd | None,
+    rng: np.random.Generator,
+    tick: Stages,
 ) -> SearchEnd:
     """Parameters, thresholds and noise in turn until the likelihood stops rising."""
     new = noise is None
+    tick("noise")
     noise = _noise(data, theta, None, rng) if noise is None else noise
     at, start_noise = point(data, noise, theta), noise
     thresholds = np.zeros(len(theta), dtype=bool)
@@ -95,6 +101,7 @@ def search_parameters(
         at = _delays(data, noise, at)
     status = "still rising"
     for round_ in range(ROUNDS):
+        _tell(tick, data, at)
         before = at.loglik
         slopes = linear(data, at)
         still = quiet(data, slopes) | thresholds
@@ -119,6 +126,14 @@ def search_parameters(
             at, noise = there, later
     found = Climb(at, linear(data, at), 0, status)
     return SearchEnd(data, found, noise, start_noise, thresholds, status)
+
+
+def _tell(tick: Stages, data: FitData, at: Point) -> None:
+    """A round begins; what would be said if it were the last."""
+    values = zip(data.unknowns.names, at.theta, data.unknowns.units, strict=True)
+    told = ", ".join(f"{name} = {value:.5g} {unit}" for name, value, unit in values)
+    tick.so_far = f"so far, not at the top yet: {told}"
+    tick(f"climb, {at.batch.count} samples")
 
 
 def _stopped(at: Point) -> Climb:
