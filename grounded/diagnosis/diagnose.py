@@ -56,7 +56,7 @@ from grounded.instruments.preflight import preflight
 from grounded.model import Model
 from grounded.progress import Stages, interruptible
 from grounded.task import Task
-from grounded.threads import steady
+from grounded.threads import jobs, steady
 from grounded.trial import Trial
 
 
@@ -70,6 +70,7 @@ class DiagnosisOptions:
         horizon: how far ahead predictions are judged [s].
         hidden: states that no sensor has: the memory of effects that were adopted.
         but: effects that are not blamed, by name: adopted ones, whose numbers are parameters now.
+        jobs: threads that fit hypotheses; the same comes out on any number.
     """
 
     library: Library = field(default_factory=Library)
@@ -77,6 +78,7 @@ class DiagnosisOptions:
     horizon: float = 1.0
     hidden: tuple[str, ...] = ()
     but: Collection[str] = ()
+    jobs: int = 1
 
 
 @steady()
@@ -120,11 +122,12 @@ def diagnose(
     offered = options.library.candidates(data.model, data.scales)
     settled = {*options.but, *looked.settled}
     candidates = knowable(data, [e for e in offered if e.name not in settled])
-    search, best = attribute(data, candidates, max_effects=options.max_effects, tick=tick)
+    with jobs(options.jobs):
+        search, best = attribute(data, candidates, max_effects=options.max_effects, tick=tick)
     tick("predict")
     used = [trial for trial in trials if trial.known_steps >= 2]
     here = interruptible(lambda: so_far(search, options.max_effects))
-    with np.errstate(all="ignore"), here:
+    with np.errstate(all="ignore"), here, jobs(options.jobs):
         decision = decide(search, best, ruler := Ruler(search.predictor), options.max_effects)
         tick("leftover")
         task = subject if isinstance(subject, Task) else None

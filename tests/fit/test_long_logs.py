@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from grounded.diagnosis.diagnose import diagnose
+from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.estimate import NoiseStd, of_states, record_of
 from grounded.fit import fit
 from grounded.fit.gauss_newton import point, unknowns_of
@@ -94,3 +94,8 @@ def test_ctrl_c_in_a_fit_says_the_values_so_far(trials):
 
     with pytest.raises(Interrupted, match=r"gain = .* m/s"):
         fit(MODEL, trials, progress=stop)
+
+
+def test_a_diagnosis_is_the_same_on_one_thread_and_on_two(trials):
+    one, two = (diagnose(MODEL, trials, DiagnosisOptions(jobs=n)).to_json() for n in (1, 2))
+    assert one == two

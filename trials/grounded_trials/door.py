@@ -313,6 +313,7 @@ class Workspace(Folder):
         library: Library | None = None,
         compare: Sequence[str] = (),
         probe: bool = False,
+        jobs: int = 1,
         progress: Callable[[str], None] | None = None,
     ) -> Diagnosis:
         """Explains the gap between model and trials; keeps reports/diagnosis.json.
@@ -323,6 +324,7 @@ class Workspace(Folder):
             without: families not to blame.
             compare: a second group of trials; what changed from the first is `changed`.
             probe: write the most instructive candidate also where nothing ties.
+            jobs: threads that fit hypotheses; the same comes out on any number.
             library: the effects that may be blamed; None: those that are installed.
             progress: told of each stage.
         """
@@ -337,6 +339,7 @@ class Workspace(Folder):
             library=library.without(without),
             compare=compare,
             probe=probe,
+            jobs=jobs,
             progress=progress,
         )
 
