@@ -8,7 +8,8 @@
     hundred   diagnose, 100 car trials of 1,000 steps
 
 The systems are those of the blind challenge, with its noise: both inputs of the car lag by
-0.15 s, the aircraft's elevator is a fifth weaker, parameters are off by 5 %. A ratio compares with the budget.
+0.15 s, the aircraft's elevator is a fifth weaker, parameters are off by 5 %. A ratio
+compares with the budget.
 """
 
 from __future__ import annotations
@@ -20,7 +21,12 @@ import time
 
 import numpy as np
 
-BUDGET = {"drive": (20, 1500), "cars": (6, 500), "flights": (20, 500), "hundred": (60, 1500)}  # s, MB
+BUDGET = {
+    "drive": (20, 1500),
+    "cars": (6, 500),
+    "flights": (20, 500),
+    "hundred": (60, 1500),
+}  # s, MB
 
 
 def driving(steps, seed=1):
@@ -54,11 +60,16 @@ def runs(name, trials, steps, seed=1):
     setting = cases._Setting(dt, steps, trials, 1.0, 1.0, False, "white")
     plans = cases._plans(system, crude, setting, rng)[:trials]
     u, x, target, gains = (np.stack([plan[i] for plan in plans]) for i in range(4))
-    noise = [[each.get(n, 0.0) for n in truth.state_names] for each in
-             (system.process, system.measurement)]
+    noise = [
+        [each.get(n, 0.0) for n in truth.state_names]
+        for each in (system.process, system.measurement)
+    ]
     process, measured = np.array(noise[0]) * np.sqrt(dt), np.array(noise[1])
     lag = [round(late / dt) for late in system.latency] or [0] * truth.m
-    oldest, held = max(lag) + 1, u[:, 0] if name == "aircraft" else np.tile(system.held, (trials, 1))
+    oldest, held = (
+        max(lag) + 1,
+        u[:, 0] if name == "aircraft" else np.tile(system.held, (trials, 1)),
+    )
     logged, sent, felt = [x + measured * rng.standard_normal(x.shape)], [held] * oldest, held.copy()
     for t in range(steps):
         error = np.clip(truth.difference(logged[-1], target[:, t]), -2.0, 2.0)
@@ -72,8 +83,10 @@ def runs(name, trials, steps, seed=1):
         logged.append(x + measured * rng.standard_normal(x.shape))
     y, inputs = np.stack(logged, axis=1), np.stack(sent[oldest:], axis=1)
     names = {"state_names": tuple(truth.states), "input_names": tuple(truth.inputs)}
-    found = [Trial(dt=dt, states=a, inputs=b, start_inputs=h, id=f"t{i:04d}", **names)
-             for i, (a, b, h) in enumerate(zip(y, inputs, held, strict=True))]
+    found = [
+        Trial(dt=dt, states=a, inputs=b, start_inputs=h, id=f"t{i:04d}", **names)
+        for i, (a, b, h) in enumerate(zip(y, inputs, held, strict=True))
+    ]
     latency = np.array(system.latency or (0.0,) * truth.m)
     limits = {"low": system.low, "high": system.high, "latency": latency}
     about = {"name": name, "system": name, "dt": dt, "target": target[0], "start": x[0]}
@@ -116,8 +129,11 @@ def one(part):
     seconds = time.process_time() - begin
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     most, memory = BUDGET[part]
-    print(f"{part:8} {seconds:7.1f} s CPU, {seconds / most:5.2f} of {most} s;"
-          f" {peak:6.0f} MB, {peak / memory:5.2f} of {memory} MB\n         {said}", flush=True)
+    print(
+        f"{part:8} {seconds:7.1f} s CPU, {seconds / most:5.2f} of {most} s;"
+        f" {peak:6.0f} MB, {peak / memory:5.2f} of {memory} MB\n         {said}",
+        flush=True,
+    )
 
 
 if __name__ == "__main__":

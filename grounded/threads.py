@@ -1,20 +1,71 @@
-"""One BLAS thread: matrices here are small, and threads that wait for one another burn a core each.
+"""How long computations use the machine: one BLAS thread, and pages that stay with the process.
 
-On two busy cores a diagnosis took three times the CPU with the threads that OpenBLAS starts by
-itself, and sums came out in another order. What runs side by side are whole fits.
+Matrices here are small: the threads that OpenBLAS starts by itself wait for one another and burn a
+core each (three times the CPU of a diagnosis on two busy cores), and sum in another order. Arrays
+are large enough that the C library hands each back to the system, which then clears every page of
+the next one: 40 % of a diagnosis.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import ctypes
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from contextvars import ContextVar
+from functools import cache
+from typing import TypeVar
+
+import numpy as np
+
+T = TypeVar("T")
+_jobs: ContextVar[int] = ContextVar("jobs", default=1)
+
+TRIM, MAP = -1, -3  # M_TRIM_THRESHOLD, M_MMAP_THRESHOLD of the GNU C library
+LARGE = 2**28  # [bytes] blocks up to here are reused
 
 
 @contextmanager
-def one_blas_thread() -> Iterator[None]:
-    """Limits NumPy's and SciPy's BLAS; also a decorator, `@one_blas_thread()`."""
+def steady() -> Iterator[None]:
+    """One BLAS thread for NumPy and SciPy, and pages kept; also a decorator, `@steady()`."""
     import scipy.linalg  # noqa: F401  SciPy's BLAS is another one, loaded with it
     from threadpoolctl import threadpool_limits
 
+    _keep_pages()
     with threadpool_limits(1, user_api="blas"):
         yield
+
+
+@cache
+def _keep_pages() -> None:
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (AttributeError, OSError, TypeError):  # another C library
+        return
+    mallopt(MAP, LARGE)
+    mallopt(TRIM, LARGE)
+
+
+@contextmanager
+def jobs(count: int) -> Iterator[None]:
+    """What `each` is called for runs on so many threads: compiled passes leave Python's lock."""
+    before = _jobs.set(count)
+    try:
+        yield
+    finally:
+        _jobs.reset(before)
+
+
+def each(function: Callable[[T], None], items: Sequence[T]) -> None:
+    """Calls a function for independent items; the same comes out on any number of threads."""
+    if _jobs.get() == 1 or len(items) < 2:
+        for item in items:
+            function(item)
+        return
+
+    def quietly(item: T) -> None:
+        with np.errstate(all="ignore"):  # a thread does not inherit it
+            function(item)
+
+    with ThreadPoolExecutor(_jobs.get()) as pool:
+        list(pool.map(quietly, items))

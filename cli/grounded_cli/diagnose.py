@@ -43,6 +43,9 @@ if TYPE_CHECKING:
     help="Two groups of trials, T1,T2 T3,T4: what changed between them.",
 )
 @click.option("--probe", is_flag=True, help="Write the most instructive next trial, tie or not.")
+@click.option(
+    "--jobs", type=click.IntRange(1), default=1, metavar="N", help="Threads (default: 1)."
+)
 @click.option("--instruments", is_flag=True, help="Judge the sensors alone; takes a second.")
 @in_workspace
 @as_json
@@ -52,6 +55,7 @@ def command(
     without: tuple[str, ...],
     compare: tuple[str, str] | None,
     probe: bool,
+    jobs: int,
     instruments: bool,
     json_: bool,
 ) -> None:
@@ -89,6 +93,7 @@ def command(
             without=families,
             compare=second,
             probe=probe,
+            jobs=jobs,
             progress=tell,
         )
     if json_:

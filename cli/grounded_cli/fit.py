@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import click
 
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
-from grounded_cli.terminal import names_in, number, progress, remark, show, show_json, table
+from grounded_cli.terminal import names_in, number, remark, show, show_json, stages, table
 from grounded_trials.wording import count, shown
 
 if TYPE_CHECKING:
@@ -34,8 +34,8 @@ def command(params: str | None, latency: bool, apply_: bool, json_: bool) -> Non
         raise GroundedError(
             "--params names no parameter: expected some, like a1,L; leave it out to fit all"
         )
-    with progress("fitting"):
-        done = workspace.fit(names, latency=latency, apply=apply_)
+    with stages() as tell:
+        done = workspace.fit(names, latency=latency, apply=apply_, progress=tell)
     if json_:
         show_json(done.to_json())
         return

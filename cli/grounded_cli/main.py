@@ -154,8 +154,9 @@ def _run() -> tuple[int, str]:
         text = StringIO()
         error.show(text)
         return error.exit_code, text.getvalue().rstrip()
-    except (click.Abort, KeyboardInterrupt):
-        return 130, "interrupted; what was stored is safe, run the same command again"
+    except (click.Abort, KeyboardInterrupt) as error:
+        found = str(error.__cause__ or "") and f"{error.__cause__}\n"
+        return 130, f"{found}interrupted; what was stored is safe, run the same command again"
     except SystemExit:
         if sys.stdout is not stdout:  # click has seen a closed pipe, and would end with 1
             raise BrokenPipeError from None

@@ -17,8 +17,10 @@ from grounded.diagnosis.fitted import Fitted
 from grounded.diagnosis.hypotheses import CLAIM
 from grounded.diagnosis.noise import Structure
 from grounded.diagnosis.refine import clean
+from grounded.diagnosis.ruler import Ruler
 from grounded.diagnosis.search import LARGE, SHORTLIST, TO_THE_TOP, HypothesisSearch, tune
 from grounded.effects import Effect
+from grounded.progress import interruptible
 
 HOPEFUL = 4  # larger sets that are fitted to the end
 TUNED = 2  # sets whose constants are set by the data
@@ -40,10 +42,35 @@ def attribute(
         max_effects: at most so many at once.
         tick: called with what is being done, for a progress display.
     """
-    with np.errstate(all="ignore"):  # a hypothesis that diverges scores minus infinity
-        search, best = _searched(HypothesisSearch(data, candidates, tick))
+    search = HypothesisSearch(data, candidates, tick)
+    with (
+        np.errstate(all="ignore"),  # a hypothesis that diverges scores minus infinity
+        interruptible(lambda: so_far(search, max_effects)),
+    ):
+        search, best = _searched(search)
         _grow(search, best, max_effects)
     return search, search.chosen(max_effects)
+
+
+def so_far(search: HypothesisSearch, most: int) -> str:
+    """The best hypothesis that was fitted, and what it predicts, for someone who can't wait."""
+    if not search.of_size(0):
+        return "no hypothesis was fitted yet"
+    with np.errstate(all="ignore"):
+        ruler, best, crude = Ruler(search.predictor), search.chosen(most), search.of_size(0)[0]
+        crude = search.fits.get((Structure(), 0.0, ()), crude)
+        at = len(ruler.steps) - 1
+        before, after = (ruler.errors(fit).rms[at] for fit in (crude, best))
+    model, seconds = search.data.model, ruler.steps[at] * search.data.dt
+    rows = ", ".join(
+        f"{name} by {after[i]:.3g} instead of {before[i]:.3g} {model.states[name]}"
+        for i, name in zip(ruler.shown, ruler.names, strict=True)
+    )
+    causes = [*best.hypothesis.names, *["calibrated parameters"] * (best.hypothesis.spread > 0)]
+    return (
+        f"so far, of {len(search.fits)} hypotheses: {' and '.join(causes) or 'no cause'}; "
+        f"{seconds:.2g} s ahead predictions miss {rows}"
+    )
 
 
 def _searched(search: HypothesisSearch) -> tuple[HypothesisSearch, Fitted]:

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis.agreement import by_trial, changed
-from grounded.diagnosis.attribution import attribute
+from grounded.diagnosis.attribution import attribute, so_far
 from grounded.diagnosis.claims import Claims
 from grounded.diagnosis.correction import correction
 from grounded.diagnosis.data import prepare
@@ -54,8 +54,9 @@ from grounded.diagnosis.verdict import next_trial, verdict
 from grounded.effects import Library
 from grounded.instruments.preflight import preflight
 from grounded.model import Model
+from grounded.progress import Stages, interruptible
 from grounded.task import Task
-from grounded.threads import one_blas_thread
+from grounded.threads import jobs, steady
 from grounded.trial import Trial
 
 
@@ -69,6 +70,7 @@ class DiagnosisOptions:
         horizon: how far ahead predictions are judged [s].
         hidden: states that no sensor has: the memory of effects that were adopted.
         but: effects that are not blamed, by name: adopted ones, whose numbers are parameters now.
+        jobs: threads that fit hypotheses; the same comes out on any number.
     """
 
     library: Library = field(default_factory=Library)
@@ -76,9 +78,10 @@ class DiagnosisOptions:
     horizon: float = 1.0
     hidden: tuple[str, ...] = ()
     but: Collection[str] = ()
+    jobs: int = 1
 
 
-@one_blas_thread()
+@steady()
 def diagnose(
     subject: Task | Model,
     trials: Sequence[Trial],
@@ -94,12 +97,13 @@ def diagnose(
         trials: real runs on one time grid, whatever policy they ran.
         options: library, number of effects, horizon.
         compare: a second group of trials; all are diagnosed, and what changed is `changed`.
-        progress: called with a word at every stage, for a display.
+        progress: told of the stage, the share done and the time left, for a display.
 
     Raises:
+        Interrupted: on Ctrl-C, with the best hypothesis so far and what it predicts.
         GroundedError: for trials that don't fit the model, or with nothing in them.
     """
-    options, tick = options or DiagnosisOptions(), progress or (lambda word: None)
+    options, tick = options or DiagnosisOptions(), Stages(progress, USUAL)
     model = subject.model if isinstance(subject, Task) else subject
     latency = subject.latency if isinstance(subject, Task) else None
     past = subject.past if isinstance(subject, Task) else None
@@ -118,10 +122,12 @@ def diagnose(
     offered = options.library.candidates(data.model, data.scales)
     settled = {*options.but, *looked.settled}
     candidates = knowable(data, [e for e in offered if e.name not in settled])
-    search, best = attribute(data, candidates, max_effects=options.max_effects, tick=tick)
+    with jobs(options.jobs):
+        search, best = attribute(data, candidates, max_effects=options.max_effects, tick=tick)
     tick("predict")
     used = [trial for trial in trials if trial.known_steps >= 2]
-    with np.errstate(all="ignore"):
+    here = interruptible(lambda: so_far(search, options.max_effects))
+    with np.errstate(all="ignore"), here, jobs(options.jobs):
         decision = decide(search, best, ruler := Ruler(search.predictor), options.max_effects)
         tick("leftover")
         task = subject if isinstance(subject, Task) else None
@@ -135,6 +141,7 @@ def diagnose(
         )
 
 
+USUAL = 370  # stages and iterations of a diagnosis
 FIRST_LOOK = 6  # iterations of the fit by whose noise the parameters are found identifiable
 
 

@@ -10,7 +10,7 @@ The very equations that `grounded.effects.wrap` adopts, evaluated on arrays.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -96,6 +96,9 @@ class Hypothesis:
         return replace(self, effects=effects, values=values)
 
 
+MOST_KEPT = 8_000_000  # numbers of inputs that a predictor keeps
+
+
 def param_scale(model: Model) -> Array:
     """Prior standard deviation of each parameter (k,): 0 of a constant."""
     return np.array([param.spread for param in model.params.values()], float)
@@ -110,20 +113,28 @@ class Predictor:
 
     def inputs(self, h: Hypothesis) -> Array:
         """What the actuators receive under a hypothesis, by run (L, B, m)."""
-        acting = self.acting(h)
-        key = tuple((e.name, tuple(sorted(v.items()))) for e, v in acting)
-        if key not in self._inputs:
-            if len(self._inputs) > 64:
-                self._inputs.clear()
-            self._inputs[key] = self.data.runs(self.received(h))
-        return self._inputs[key]
+        return self._kept("runs", h, lambda: self.data.runs(self.received(h)))
 
     def received(self, h: Hypothesis) -> Array:
         """The same on whole trials, (S, T_max, m)."""
-        u = self.data.commands
-        for effect, values in self.acting(h):
-            u = transformed(effect, values, u, self.data)
-        return self.data.delayed(u)
+
+        def found() -> Array:
+            u = self.data.commands
+            for effect, values in self.acting(h):
+                u = transformed(effect, values, u, self.data)
+            return self.data.delayed(u)
+
+        return self._kept("trials", h, found)
+
+    def _kept(self, what: str, h: Hypothesis, make: Callable[[], Array]) -> Array:
+        """Made once for the same values: a memory steps through time in Python."""
+        acting = self.acting(h)
+        key = (what, *((e.name, tuple(sorted(v.items()))) for e, v in acting))
+        if (found := self._inputs.get(key)) is None:
+            if len(self._inputs) > max(64, MOST_KEPT // self.data.commands.size):
+                self._inputs.clear()
+            found = self._inputs[key] = make()
+        return found
 
     @staticmethod
     def acting(h: Hypothesis) -> list[tuple[Effect, Mapping[str, float]]]:

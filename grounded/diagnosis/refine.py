@@ -39,6 +39,7 @@ from grounded.filter import kalman
 from grounded.filter.augmented import Delayed, joined
 from grounded.filter.kalman import LinearSystem
 from grounded.frozen import Array
+from grounded.threads import each
 
 MOST_NUMBERS = 1e5  # of one (L, B, N, N) array: what fits in the cache goes fastest
 SHORTEST = 0.05  # part of a step that is still tried
@@ -193,9 +194,9 @@ def refine(
     wide = n if works[0].noise.structure.tau is None else 2 * n
     size = max(1, int(MOST_NUMBERS / (L * B * wide * wide)))
     for _ in range(iterations):
-        for alike in _of_one_shape([work for work in works if not work.still]):
-            for at in range(0, len(alike), size):
-                _iterate(predictor, alike[at : at + size], fixed_noise)
+        shapes = _of_one_shape([work for work in works if not work.still])
+        blocks = [a[at : at + size] for a in shapes for at in range(0, len(a), size)]
+        each(lambda block: _iterate(predictor, block, fixed_noise), blocks)
         if tick is not None:
             tick()
     return [work.best for work in works if work.best is not None]
@@ -213,7 +214,7 @@ def _of_one_shape(works: list[Work]) -> list[list[Work]]:
 def _iterate(predictor: Predictor, works: list[Work], fixed_noise: bool) -> None:
     data = predictor.data
     B = data.time.shape[1]
-    each = [delays_of(work.h, data) for work in works]
+    late = [delays_of(work.h, data) for work in works]
     parts = [linearise(predictor, work.h, work.track) for work in works]
     width = kalman.whole(max(part[1].shape[-1] for part in parts), data.model.n)
     d, r = (_side_by_side([part[k] for part in parts], width) for k in (1, 2))
@@ -238,10 +239,10 @@ def _iterate(predictor: Predictor, works: list[Work], fixed_noise: bool) -> None
         filtered[0, ..., 0] += started
     steps = [work.noise for work in works]
     if not fixed_noise:
-        steps = _climbed(data, works, each, systems, g, white[..., 0])
+        steps = _climbed(data, works, late, systems, g, white[..., 0])
     for i, work in enumerate(works):
         own = slice(i * B, (i + 1) * B)
-        columns, before, delays = parts[i][1].shape[-1], 0.0, each[i]
+        columns, before, delays = parts[i][1].shape[-1], 0.0, late[i]
         if delays is not None:
             entry, residual = systems[i][0].G, white[:, own, :, 0]
             before = delays.before(work.noise, entry, work.track, residual, g.weight[:, own])
@@ -267,13 +268,13 @@ def _climbed(
     """Each work's noise after one step up the likelihood."""
     B, width = data.time.shape[1], data.model.n
     adjoints = kalman.smoother(g, white).parts(B)
-    each = []
+    columns_each = []
     for work, delays, (own, _), adjoint in zip(works, delays_each, systems, adjoints, strict=True):
         noise = work.noise if delays is None else delays.noise(work.noise)
-        each.append(working(noise, adjoint, own.G, data.dt))
-    K = each[0][0].shape[-1]
+        columns_each.append(working(noise, adjoint, own.G, data.dt))
+    K = columns_each[0][0].shape[-1]
     wide = kalman.whole(K, width)
-    d, r = (_side_by_side([part[k] for part in each], wide) for k in (0, 1))
+    d, r = (_side_by_side([part[k] for part in columns_each], wide) for k in (0, 1))
     columns = kalman.innovations(g, d, r)[0]
     found = []
     for i, (work, delays, adjoint) in enumerate(zip(works, delays_each, adjoints, strict=True)):

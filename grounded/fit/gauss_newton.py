@@ -251,7 +251,12 @@ class FitData:
     records: tuple[Record, ...]
     measurement: Measurement
     unknowns: Unknowns
-    last: dict[bytes, RecordBatch] = field(default_factory=dict, repr=False)  # by latency, one
+    last: dict[bytes, RecordBatch] = field(default_factory=dict, init=False)  # by latency, one
+
+    @property
+    def steps(self) -> int:
+        """Of all records."""
+        return sum(record.steps for record in self.records)
 
     def batch(self, theta: Array) -> RecordBatch:
         """The records side by side, inputs delayed as theta says."""

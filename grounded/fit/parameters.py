@@ -6,7 +6,7 @@ second ahead. Then it joins the rest for the final values.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -19,12 +19,13 @@ from grounded.fit.result import Fit, least_known, report
 from grounded.fit.search import SearchEnd, data_of, first_search, search_parameters
 from grounded.frozen import Array
 from grounded.model import Model
+from grounded.progress import Stages, interruptible
 from grounded.task import Task
-from grounded.threads import one_blas_thread
+from grounded.threads import steady
 from grounded.trial import Trial
 
 
-@one_blas_thread()
+@steady()
 def fit(
     model: Model | Task,
     trials: Sequence[Trial | Record],
@@ -36,6 +37,7 @@ def fit(
     hold_out: float = 0.25,
     horizon_s: float = 1.0,
     rng: np.random.Generator | None = None,
+    progress: Callable[[str], None] | None = None,
 ) -> Fit:
     """Parameters of a model from trials, with intervals.
 
@@ -49,8 +51,10 @@ def fit(
         hold_out: share of the time that judges the fit.
         horizon_s: how far ahead predictions are judged [s].
         rng: draws the trials that the noise is estimated on, if there are very many.
+        progress: told of the stage, the share done and the time left, for a display.
 
     Raises:
+        Interrupted: on Ctrl-C, with the values so far.
         GroundedError: for an unknown name, trials that do not fit the model, or too short ones.
     """
     if isinstance(model, Task):
@@ -63,13 +67,17 @@ def fit(
     if max(r.steps for r in records) < 3:
         raise GroundedError("a fit needs a trial of at least 3 steps")
     rng = np.random.default_rng(0) if rng is None else rng
-    held = unknowns
+    held, tick = unknowns, Stages(progress, USUAL)
     while True:
-        found = _fitted(model, records, measurement, unknowns, hold_out, horizon_s, rng)
+        with interruptible(lambda: tick.so_far):
+            found = _fitted(model, records, measurement, unknowns, hold_out, horizon_s, rng, tick)
         least = least_known(model, found)
         if least is None or unknowns.k == 1:
             return found.beside(held)
         unknowns = unknowns.less(unknowns.names.index(least))
+
+
+USUAL = 25  # rounds and scans of a fit
 
 
 def _fitted(
@@ -80,15 +88,17 @@ def _fitted(
     hold_out: float,
     horizon_s: float,
     rng: np.random.Generator,
+    tick: Stages,
 ) -> Fit:
     """One search on a part of the time, judged on the rest; the values from all of it."""
     train, test = split_in_time(records, hold_out, horizon_s, measurement)
-    first = first_search(data_of(model, train, measurement, unknowns), rng)
+    first = first_search(data_of(model, train, measurement, unknowns), rng, tick)
     before, after, last = None, None, first
-    if test and np.isfinite(first.climb.at.loglik):
-        before, after = judged(model, test, measurement, unknowns, first, horizon_s)
-        whole = data_of(model, records, measurement, unknowns)
-        last = search_parameters(whole, first.climb.at.theta, first.noise, rng)
+    whole = data_of(model, records, measurement, unknowns)
+    if first.data.steps < whole.steps and np.isfinite(first.climb.at.loglik):
+        if test:
+            before, after = judged(model, test, measurement, unknowns, first, horizon_s)
+        last = search_parameters(whole, first.climb.at.theta, first.noise, rng, tick)
     return report(model, unknowns, last, before, after)
 
 

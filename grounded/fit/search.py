@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from grounded.estimate import Measurement, NoiseStd, Record, cut
 from grounded.estimate.likelihood import enough, first_noise, maximum_likelihood
 from grounded.estimate.record import batch_of
+from grounded.estimate.steps import ModelSteps
 from grounded.fit.gauss_newton import (
     Climb,
     FitData,
@@ -39,6 +40,7 @@ from grounded.fit.gauss_newton import (
 )
 from grounded.frozen import Array
 from grounded.model import Model
+from grounded.progress import Stages
 
 ROUNDS = 8  # of parameters, thresholds, noise
 STIRRED = 0.5  # [nats] a climb that gains less leaves thresholds and noise where they are
@@ -72,23 +74,24 @@ def data_of(
     return FitData(model.system, tuple(pieces), measurement, unknowns)
 
 
-def first_search(data: FitData, rng: np.random.Generator) -> SearchEnd:
-    """From the start values; much data are searched on a draw of them first."""
+def first_search(data: FitData, rng: np.random.Generator, tick: Stages) -> SearchEnd:
+    """From the start values; of much data on a draw, from where the whole is soon climbed."""
     draw = enough(data.records, rng)
-    if 2 * sum(r.steps for r in draw) > sum(r.steps for r in data.records):
-        return search_parameters(data, data.unknowns.start, None, rng)
-    rough = search_parameters(replace(data, records=tuple(draw)), data.unknowns.start, None, rng)
-    if not np.isfinite(rough.climb.at.loglik):
-        return rough
-    found = search_parameters(data, rough.climb.at.theta, rough.noise, rng)
-    return replace(found, start_noise=rough.start_noise)
+    if 2 * sum(r.steps for r in draw) <= data.steps:
+        data = replace(data, records=tuple(draw))
+    return search_parameters(data, data.unknowns.start, None, rng, tick)
 
 
 def search_parameters(
-    data: FitData, theta: Array, noise: NoiseStd | None, rng: np.random.Generator
+    data: FitData,
+    theta: Array,
+    noise: NoiseStd | None,
+    rng: np.random.Generator,
+    tick: Stages,
 ) -> SearchEnd:
     """Parameters, thresholds and noise in turn until the likelihood stops rising."""
     new = noise is None
+    tick("noise")
     noise = _noise(data, theta, None, rng) if noise is None else noise
     at, start_noise = point(data, noise, theta), noise
     thresholds = np.zeros(len(theta), dtype=bool)
@@ -98,6 +101,7 @@ def search_parameters(
         at = _delays(data, noise, at)
     status = "still rising"
     for round_ in range(ROUNDS):
+        _tell(tick, data, at)
         before = at.loglik
         slopes = linear(data, at)
         still = quiet(data, slopes) | thresholds
@@ -110,7 +114,8 @@ def search_parameters(
                 thresholds[i] |= moved is not at
                 at = moved
         if at.loglik - before < STIRRED and round_ > 0:
-            promise = marquardt_step(data, at.theta, end.slopes, ~still, 1e-3)[1]
+            both = (end.slopes, linear(data, at))  # at a kink the exact ones can be far off
+            promise = min(marquardt_step(data, at.theta, each, ~still, 1e-3)[1] for each in both)
             status = "converged"
             if at is end.at and promise > STUCK:
                 status = f"no step rises, though slopes promise {promise:.1f} nats"
@@ -121,6 +126,14 @@ def search_parameters(
             at, noise = there, later
     found = Climb(at, linear(data, at), 0, status)
     return SearchEnd(data, found, noise, start_noise, thresholds, status)
+
+
+def _tell(tick: Stages, data: FitData, at: Point) -> None:
+    """A round begins; what would be said if it were the last."""
+    values = zip(data.unknowns.names, at.theta, data.unknowns.units, strict=True)
+    told = ", ".join(f"{name} = {value:.5g} {unit}" for name, value, unit in values)
+    tick.so_far = f"so far, not at the top yet: {told}"
+    tick(f"climb, {at.batch.count} samples")
 
 
 def _stopped(at: Point) -> Climb:
@@ -195,6 +208,11 @@ def profile_of(
     others = np.zeros(data.unknowns.k, dtype=bool) if free is None else free.copy()
     others[i] = False
     profile, best, score = np.full(len(grid), -np.inf), at, at.loglik
+    if free is None:
+        profile = at.loglik - np.array([fall(data, noise, at, i, value) for value in grid])
+        if profile.max() > score:
+            best = _with(data, noise, at, i, grid[np.argmax(profile)])
+        return best, profile
     for g, value in enumerate(grid):
         here = _with(data, noise, at, i, value)
         profile[g] = here.loglik
@@ -228,7 +246,9 @@ def coarse_to_fine(
         low, high = max(low, at.theta[i] - width), min(high, at.theta[i] + width)
     grid, best = np.linspace(low, high, COARSE), at
     for round_ in range(ZOOMS):
-        others = free if round_ == 0 else None  # later steps are too small to matter to them
+        others = (
+            free if round_ == 0 and width is None else None
+        )  # small steps hardly matter to them
         best, profile = profile_of(data, noise, best, i, grid, others)
         top = np.flatnonzero(profile > profile.max() - LEVEL)
         step = grid[1] - grid[0]
@@ -248,9 +268,8 @@ def _centred(data: FitData, noise: NoiseStd, best: Point, i: int, level: Array) 
     """
     beside = level[np.argsort(np.abs(level - np.median(level)))]
     for value in beside:
-        there = _with(data, noise, best, i, value)
-        if there.loglik > best.loglik - LEVEL:
-            return there
+        if fall(data, noise, best, i, value) < LEVEL:
+            return _with(data, noise, best, i, value)
     return best
 
 
@@ -278,30 +297,65 @@ def likelihood_interval(
 def _end(data: FitData, noise: NoiseStd, at: Point, i: int, bound: float, drop: float) -> float:
     best = float(at.theta[i])
     span = abs(bound - best)
-    if span == 0 or _with(data, noise, at, i, bound).loglik > at.loglik - drop:
+    if span == 0 or fall(data, noise, at, i, bound) < drop:
         return bound
     sign, step, good = np.sign(bound - best), 1e-3 * span, 0.0
     while step < span:
-        fallen = at.loglik - _with(data, noise, at, i, best + sign * step).loglik
+        fallen = fall(data, noise, at, i, best + sign * step)
         good = step if fallen < drop else good
         if fallen > 3 * drop:
             break
         step *= 2
     far = min(step, span)
     grid = np.linspace(good, far, GRID + 1)[1:-1]
-    inside = [
-        g for g in grid if _with(data, noise, at, i, best + sign * g).loglik > at.loglik - drop
-    ]
+    inside = [g for g in grid if fall(data, noise, at, i, best + sign * g) < drop]
     width = (far - good) / GRID
     good = max([good, *inside])
     outside = min(far, good + width)
     for _ in range(3):
         middle = 0.5 * (good + outside)
-        if _with(data, noise, at, i, best + sign * middle).loglik > at.loglik - drop:
+        if fall(data, noise, at, i, best + sign * middle) < drop:
             good = middle
         else:
             outside = middle
     return float(best + sign * outside)
+
+
+def fall(data: FitData, noise: NoiseStd, at: Point, i: int, value: float) -> float:
+    """What the log-likelihood loses with another value of unknown i.
+
+    A threshold acts on few samples: only the records that it changes are filtered again.
+    """
+    theta = at.theta.copy()
+    theta[i] = value
+    acts = _acts(data, at, theta)
+    if not acts.any():
+        return 0.0
+    if acts.all():
+        return at.loglik - point(data, noise, theta, at).loglik
+    part = replace(data, records=tuple(r for r, a in zip(data.records, acts, strict=True) if a))
+    f = at.filtered
+    about = replace(f, x=f.x[:, acts], std=f.std[:, acts], x_prior=f.x_prior[:, acts])
+    there = point(part, noise, theta, replace(at, filtered=about))
+    here = np.sum(f.eps[:, acts] ** 2) + f.gains.logdet[:, acts].sum()
+    return -0.5 * float(here + there.batch.count * np.log(2 * np.pi)) - there.loglik
+
+
+def _acts(data: FitData, at: Point, theta: Array) -> NDArray[np.bool_]:
+    """The records (B,) along whose tracks the model at theta is another one."""
+    (p, latency), (here, as_it_is) = data.unknowns.unpack(theta), data.unknowns.unpack(at.theta)
+    if (latency != as_it_is).any():
+        return np.ones(len(data.records), dtype=bool)
+    one, other = (
+        ModelSteps(data.system, values, at.batch, wide=True).along(
+            at.filtered.x[:-1], at.filtered.std[:-1]
+        )
+        for values in (here, p)
+    )
+    apart = [
+        (a != b).reshape(*a.shape[:2], -1).any(axis=(0, 2)) for a, b in zip(one, other, strict=True)
+    ]
+    return np.asarray(np.any(apart, axis=0))
 
 
 def _with(data: FitData, noise: NoiseStd, at: Point, i: int, value: float) -> Point:

@@ -279,7 +279,12 @@ class Workspace(Folder):
         return status_of(self._afresh(), standing_in(self, ahead=True))
 
     def fit(
-        self, params: Sequence[str] | None = None, *, latency: bool = False, apply: bool = False
+        self,
+        params: Sequence[str] | None = None,
+        *,
+        latency: bool = False,
+        apply: bool = False,
+        progress: Callable[[str], None] | None = None,
     ) -> Fitted:
         """Estimates the model's parameters from all trials.
 
@@ -287,10 +292,11 @@ class Workspace(Folder):
             params: only these; None: all of them.
             latency: fit one transport delay of all inputs too.
             apply: write the values to grounded.toml.
+            progress: told of the stage, the share done and the time left.
         """
         from grounded_trials.workspace.fitting import Fitted, apply_fit, fit_trials
 
-        found = fit_trials(self._afresh(), params, latency=latency)
+        found = fit_trials(self._afresh(), params, latency=latency, progress=progress)
         if apply:
             apply_fit(self, found)
             self.forget()
@@ -307,6 +313,7 @@ class Workspace(Folder):
         library: Library | None = None,
         compare: Sequence[str] = (),
         probe: bool = False,
+        jobs: int = 1,
         progress: Callable[[str], None] | None = None,
     ) -> Diagnosis:
         """Explains the gap between model and trials; keeps reports/diagnosis.json.
@@ -317,6 +324,7 @@ class Workspace(Folder):
             without: families not to blame.
             compare: a second group of trials; what changed from the first is `changed`.
             probe: write the most instructive candidate also where nothing ties.
+            jobs: threads that fit hypotheses; the same comes out on any number.
             library: the effects that may be blamed; None: those that are installed.
             progress: told of each stage.
         """
@@ -331,6 +339,7 @@ class Workspace(Folder):
             library=library.without(without),
             compare=compare,
             probe=probe,
+            jobs=jobs,
             progress=progress,
         )
 

@@ -36,6 +36,7 @@ def diagnose_in(
     library: Library | None = None,
     compare: Sequence[str] = (),
     probe: bool = False,
+    jobs: int = 1,
     progress: Callable[[str], None] | None = None,
 ) -> Diagnosis:
     """Diagnoses the gap between the model and the stored trials; keeps reports/diagnosis.json.
@@ -50,6 +51,7 @@ def diagnose_in(
         library: the effects that may be blamed.
         compare: short names of a second group, whose differences from `trials` are told.
         probe: write a candidate also where nothing ties.
+        jobs: threads.
         progress: told of each stage.
 
     Raises:
@@ -66,7 +68,7 @@ def diagnose_in(
     others = _chosen(workspace, compare) if compare else []
     memory = planner.plan.model.state_names[planner.task.model.n :]
     options = DiagnosisOptions(
-        library=library, max_effects=max_effects, hidden=tuple(memory), but=adopted
+        library=library, max_effects=max_effects, hidden=tuple(memory), but=adopted, jobs=jobs
     )
     lifted, second = ([planner.lift(trial) for trial in some] for some in (used, others))
     made = Made(

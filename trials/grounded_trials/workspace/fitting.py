@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -74,7 +74,13 @@ def usable_trials(workspace: Folder) -> list[Trial]:
     return found
 
 
-def fit_trials(workspace: Folder, names: Sequence[str] | None, *, latency: bool = False) -> Fit:
+def fit_trials(
+    workspace: Folder,
+    names: Sequence[str] | None,
+    *,
+    latency: bool = False,
+    progress: Callable[[str], None] | None = None,
+) -> Fit:
     """Parameters of the workspace's model from its trials."""
     from grounded.estimate import of_states, record_of
     from grounded.fit import fit
@@ -89,6 +95,7 @@ def fit_trials(workspace: Folder, names: Sequence[str] | None, *, latency: bool 
         fit_latency="common" if latency else "known",
         measurement=of_states(model, [model.state_names[i] for i in measured]),
         rng=np.random.default_rng(0),
+        progress=progress,
     )
 
 

@@ -1,0 +1,101 @@
+"""Thresholds on the records they act on, progress, and Ctrl-C, in fit and diagnose."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
+from grounded.estimate import NoiseStd, of_states, record_of
+from grounded.fit import fit
+from grounded.fit.gauss_newton import point, unknowns_of
+from grounded.fit.search import data_of, fall
+from grounded.model import Model, Param
+from grounded.progress import Interrupted, Stages
+from grounded.trial import Trial
+
+
+def lag(s, a, p):
+    drive = np.where(a.u > p.dead, a.u, 0.0)
+    return {"v": (p.gain * drive - s.v) / 0.3}
+
+
+MODEL = Model(
+    name="lag",
+    states={"v": "m/s"},
+    inputs={"u": "1"},
+    params={"gain": Param(2.0, "m/s", 0.5, 5.0), "dead": Param(0.3, "1", 0.0, 0.8)},
+    derivative=lag,
+)
+NOISE = NoiseStd(np.array([0.005]), np.array([0.01]), 0.05)
+
+
+@pytest.fixture(scope="module")
+def trials():
+    rng, found = np.random.default_rng(3), []
+    truth = MODEL.with_values({"gain": 2.4, "dead": 0.35})
+    for low in (0.0, 0.6, 0.6, 0.6):  # only the first drives slowly: there the threshold acts
+        u = np.repeat(rng.uniform(low, 1.0, (12, 1)), 10, axis=0)
+        x = np.zeros((len(u) + 1, 1))
+        for t, command in enumerate(u):
+            x[t + 1] = truth.system.step(x[t : t + 1], command[None], truth.values, 0.05)[0]
+            x[t + 1] += 0.005 * rng.standard_normal()
+        y = x + 0.01 * rng.standard_normal(x.shape)
+        found.append(Trial(dt=0.05, states=y, inputs=u, state_names=("v",), input_names=("u",)))
+    return found
+
+
+def test_a_threshold_is_worth_the_same_on_the_records_it_acts_on(trials):
+    records = [record_of(MODEL, trial) for trial in trials]
+    unknowns = unknowns_of(MODEL, None, np.zeros(1), "known")
+    data = data_of(MODEL, records, of_states(MODEL), unknowns)
+    at = point(data, NOISE, np.array([2.4, 0.35]))
+    for value in (0.1, 0.3, 0.36, 0.5):
+        there = point(data, NOISE, np.array([2.4, value]))
+        assert fall(data, NOISE, at, 1, value) == pytest.approx(
+            at.loglik - there.loglik, abs=0.02, rel=1e-4
+        )
+    assert data.batch(at.theta) is at.batch
+    assert replace(data, records=data.records[:1]).batch(at.theta).count < at.batch.count
+
+
+def test_stages_tell_share_and_time_and_never_say_that_all_is_done():
+    told = []
+    stages = Stages(told.append, usual=20)
+    for _ in range(50):
+        stages("refine")
+    share = [int(re.search(r"(\d+) % done", text)[1]) for text in told]
+    assert share == sorted(share) and share[0] == 5 and share[-1] < 100
+    assert "s left" in told[-1]
+
+
+@pytest.mark.parametrize("after", [3, 40])
+def test_ctrl_c_in_a_diagnosis_says_the_best_hypothesis_so_far(trials, after):
+    count = 0
+
+    def stop(stage):
+        nonlocal count
+        count += 1
+        if count == after:
+            raise KeyboardInterrupt
+
+    with pytest.raises(Interrupted) as stopped:
+        diagnose(MODEL, trials, progress=stop)
+    assert "hypothes" in str(stopped.value)
+    if after == 40:
+        assert re.search(r"ahead predictions miss v by \S+ instead of \S+ m/s", str(stopped.value))
+
+
+def test_ctrl_c_in_a_fit_says_the_values_so_far(trials):
+    def stop(stage):
+        if stage.startswith("climb"):
+            raise KeyboardInterrupt
+
+    with pytest.raises(Interrupted, match=r"gain = .* m/s"):
+        fit(MODEL, trials, progress=stop)
+
+
+def test_a_diagnosis_is_the_same_on_one_thread_and_on_two(trials):
+    one, two = (diagnose(MODEL, trials, DiagnosisOptions(jobs=n)).to_json() for n in (1, 2))
+    assert one == two
