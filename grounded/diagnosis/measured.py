@@ -93,7 +93,7 @@ class Measured:
             "with_effects": self.rms(self.best),
             "noise_floor": self.floor,
         }
-        by = "trials" if self.data.count > 1 else "pieces"
+        by = "pieces" if self.ruler.folds.max() >= self.data.count else "trials"
         rows = []
         for k, seconds in self.horizons():
             found = {

@@ -41,9 +41,13 @@ MOMENTS = 20  # at which repeats are compared
 ALIKE = 0.02  # of a command's spread: how much commands of repeats may differ, rms
 
 
+MOST_LEFT_OUT = 1 / 3  # of all steps: without more, the rest would have to extrapolate
+
+
 def folds(data: Data) -> Any:
-    """What each run is held out with, (B,): its trial; one log alone is cut into pieces."""
-    return data.trial_of if data.count > 1 else np.arange(len(data.valid))
+    """What each run is held out with, (B,): its trial; of one that holds most, piece by piece."""
+    share = data.lengths[data.trial_of] / data.lengths.sum()
+    return np.where(share > MOST_LEFT_OUT, data.count + np.arange(len(share)), data.trial_of)
 
 
 @dataclass(frozen=True, eq=False)

@@ -161,7 +161,10 @@ def updated(P: Array, H: Array, R: Array, seen: Array) -> tuple[Array, Array, Ar
     S[:, np.arange(n), np.arange(n)] += np.where(seen > 0, R, 1.0)
     W = np.linalg.inv(np.linalg.cholesky(S))
     k = W @ H @ P
-    return k, W, P - k.swapaxes(1, 2) @ k
+    gain = k.swapaxes(1, 2) @ W
+    left = np.eye(P.shape[-1]) - gain @ H  # Joseph's form: never negative, however vague P was
+    known = gain * np.where(seen > 0, R, 0.0)[:, None, :]
+    return k, W, left @ P @ left.swapaxes(1, 2) + known @ gain.swapaxes(1, 2)
 
 
 def innovations(g: Gains, d: Array, r: Array, *, track: bool = False) -> tuple[Array, Array | None]:
