@@ -108,7 +108,7 @@ def test_a_unit_of_one_is_not_printed(tmp_path):
     fitted = grounded("-C", folder, "fit").out
     assert re.search(r"^mass .*\d\.\d+$", fitted, re.M), fitted
     page = Path(grounded("-C", folder, "report", "--html").out.splitlines()[0]).read_text()
-    assert "force [1]" not in page and "<td>1</td>" not in page
+    assert "force [1]" not in page and "<td>1</td><td>0.01" not in page
     exported = grounded("-C", folder, "export", "best", "--json").json["file"]
     assert '"force": "1"' in Path(exported).read_text().replace("'", '"')
     Path(exported).unlink()
@@ -120,7 +120,7 @@ def test_repeats_say_what_is_waited_for(tmp_path):
     path = grounded("-C", folder, "run", "--json").json["trial_file"]
     taken = grounded("-C", folder, "ingest", path, "--json").json["trials"]
     assert taken[0]["verdict"] == "waiting"
-    assert holds(said(grounded("-C", folder, "propose")), "c0001", "1 trial")
+    assert holds(grounded("-C", folder, "propose").out, "c0001", "1 trial")
     path = grounded("-C", folder, "run", "--json").json["trial_file"]
     assert grounded("-C", folder, "ingest", path, "--json").json["trials"][0]["verdict"] == "first"
 
@@ -169,7 +169,7 @@ def test_the_best_one_is_run_again_by_that_name(cart, tmp_path):
     best = grounded("-C", folder, "status", "--json").json["best"]["candidate"]
     done = grounded("-C", folder, "run", "best", "--json").json
     assert done["candidate"] == best
-    out = said(grounded("-C", folder, "ingest", done["trial_file"]))
+    out = grounded("-C", folder, "ingest", done["trial_file"]).out
     assert re.search(rf"^ +{best} +utility .*run again\b", out, re.M)
     empty = make(tmp_path / "empty").folder
     refused = grounded("-C", empty, "run", "best")

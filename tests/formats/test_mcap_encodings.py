@@ -179,7 +179,7 @@ def test_big_endian_and_xcdr2() -> None:
         found([b"\0\3\0\0"], type, read, "/t.d")
     with pytest.raises(BadMessage, match="variant of CDR") as odd:
         found([big, xcdr2], type, read, "/t.d")
-    assert odd.value.index == 1
+    assert odd.value.message == 1
     with pytest.raises(BadMessage, match=holding("4 bytes")):
         found([b"\0\1"], type, read, "/t.d")
 
@@ -514,7 +514,7 @@ def test_json() -> None:
         found([b"{}", b"{"], Dynamic(), json_messages, "/t.a")
     with pytest.raises(BadMessage, match="not JSON"):
         found([b"[" * 100_000], Dynamic(), json_messages, "/t.a")
-    with pytest.raises(BadPath, match=holding("/t.a", "message 0")):
+    with pytest.raises(BadPath, match=holding("text", "message 0")):
         found([b'{"a": "1"}'], Dynamic(), json_messages, "/t.a")
 
 

@@ -144,7 +144,7 @@ def test_clocks_that_jump_or_differ_are_refused() -> None:
     x = pose(np.sin)
     reset = x.t.copy()
     reset[200:] -= 5_000_000_000
-    with pytest.raises(GroundedError, match=holding("clock", "5.000 s")):
+    with pytest.raises(GroundedError, match=holding("clock", "4.990 s", "sample 199")):
         grid(replace(x, t=reset, log_times=reset))
     simulated = replace(x, t=x.t - EPOCH + 929 * 10**9)
     with pytest.raises(GroundedError, match=holding("clock", "log")):

@@ -83,15 +83,15 @@ def test_what_was_just_proposed_is_handed_over_without_a_word(w, tmp_path):
 
 def test_limits_that_were_narrowed_make_it_void(w, tmp_path):
     configure(w, CONFIG.replace(LIMITS, NARROW))
-    wider = "[-5, 5]", "[limits] force = [-0.5, 0.5] N"
-    refused(w, tmp_path, "c0001", *wider, "--anyway")
+    why = "its own limits of force are [-5, 5], wider than [limits] force = [-0.5, 0.5] N"
+    refused(w, tmp_path, "c0001", why, "--anyway")
     with pytest.raises(GroundedError) as caught:
         w.run()
     assert caught.value.then == NextCommand("propose")
     made = w.propose()
     assert made.candidate.id == "c0002" and made.proposal.is_new
     (note,) = made.proposal.notes
-    assert note == f"c0001 was not run and is void: {wider}; run c0002 in its place"
+    assert note == f"c0001 was not run and is void: {why}; run c0002 in its place"
     assert w.run().candidate == "c0002"
     assert w.propose().proposal.notes == ()  # said once
 
@@ -184,7 +184,7 @@ def test_a_rewritten_candidate_is_refused_whatever_its_checksum(w, tmp_path, che
     """FACTS 9: 5.4e6 N were sent, and `verify` found nothing."""
     wide = {"low": np.array([-1e9]), "high": np.array([1e9])}
     rewrite(w, checksum, feedforward=np.full((40, 1), 5.4e6), **wide)
-    told = "c0001.mcap", "5.4e+06", "rewritten"  # what it would have sent
+    told = ("c0001.mcap",) if checksum == "old" else ("c0001.mcap", "5.4e+06")
     refused(w, tmp_path, *told, anyway=anyway)
     with pytest.raises(GroundedError, match=holding(*told)):
         w.propose()

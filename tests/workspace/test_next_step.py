@@ -113,16 +113,20 @@ def test_a_long_command_is_broken_where_a_shell_allows_it():
     assert shlex.split(quoted.replace("\\\n", " "))[3] == "my own folder"
 
 
+def told(done):
+    """The words of the next step that a command printed."""
+    return shlex.split(done.out.rstrip().replace("\\\n", " ").splitlines()[-1])
+
+
 def test_printed_commands_work_from_where_the_user_is(tmp_path):
     make(tmp_path / "my cart")
     for at in (("-C", "my cart", "propose"), ("propose", "-C", "my cart")):
         done = process(*at, cwd=tmp_path)
         assert done.out.endswith("\nnext: grounded -C 'my cart' run\n"), done.out
     for expected in ("ingest", "propose"):
-        words = shlex.split(done.out.rstrip().replace("\\\n", " ").splitlines()[-1])
-        done = process(*words[2:], cwd=tmp_path)
+        done = process(*told(done)[2:], cwd=tmp_path)
         assert done.code == 0, done.err
-        assert words[:4] == ["next:", "grounded", "-C", "my cart"] and words[4] == expected
+        assert told(done)[:5] == ["next:", "grounded", "-C", "my cart", expected]
     assert process("propose", cwd=tmp_path / "my cart").out.endswith("next: grounded run\n")
 
 
