@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from facts import holding
+
 mj: Any = pytest.importorskip("mujoco", reason="the adapter's extra, .[mujoco]")
 
 from grounded.adapters import mujoco as adapter  # noqa: E402
@@ -281,7 +283,7 @@ def test_what_is_not_in_the_file_is_said(options: dict[str, Any], message: str) 
 def test_a_step_that_is_no_multiple_a_missing_file_and_a_broken_one(tmp_path: Path) -> None:
     with pytest.raises(GroundedError, match=r"not a whole multiple.*timestep=0.012/2"):
         step(adapter.model(PENDULUM), [0, 0], [0], dt=0.012)
-    with pytest.raises(GroundedError, match="there is no MJCF or URDF file"):
+    with pytest.raises(GroundedError, match=holding("nothing.xml")):
         adapter.model(tmp_path / "nothing.xml")
-    with pytest.raises(GroundedError, match="MuJoCo can't load the MJCF text"):
+    with pytest.raises(GroundedError, match=holding("MJCF", "wrong")):
         adapter.model("<mujoco><wrong/></mujoco>")

@@ -6,6 +6,7 @@ import pytest
 from click.testing import CliRunner
 
 from cli import grounded
+from facts import holding, holds
 from grounded.errors import GroundedError
 from grounded_cli.main import cli
 from grounded_trials.store.documents import write_document
@@ -60,14 +61,14 @@ def test_a_label_that_was_changed_is_not_opened(made, tmp_path):
     label = json.loads((labels / f"{name}.json").read_text())
     label["effects"][0]["effect"] = "dead_zone:somewhere"
     (tmp_path / f"{name}.json").write_text(json.dumps(label, sort_keys=True))
-    with pytest.raises(GroundedError, match="it was changed"):
+    with pytest.raises(GroundedError, match=holding(f"{name}.json")):
         open_label(tmp_path, name, entry)
 
 
 def test_a_case_without_a_diagnosis_says_what_to_run(made):
     folder, labels, document = made
     name = document["cases"][1]
-    with pytest.raises(GroundedError, match=r"was not diagnosed"):
+    with pytest.raises(GroundedError, match=holding(name)):
         score_case(folder, labels, name, read_manifest(folder)[name])
 
 
@@ -98,7 +99,8 @@ def test_labels_inside_the_cases_are_refused(tmp_path):
     words = ["--kind", "none", "--cases", "1", "--seed", "0", "--labels", str(tmp_path / "c" / "l")]
     result = CliRunner().invoke(cli, ["challenge", "make", str(tmp_path / "c"), *words])
     assert isinstance(result.exception, GroundedError)
-    assert "must lie outside" in str(result.exception)
+    assert holds(str(result.exception), tmp_path / "c" / "l", tmp_path / "c")
+    assert not (tmp_path / "c").exists()
 
 
 def test_an_interrupted_challenge_goes_on_with_the_same_command(made, tmp_path, monkeypatch):
@@ -119,7 +121,7 @@ def test_an_interrupted_challenge_goes_on_with_the_same_command(made, tmp_path, 
     assert Store(tmp_path / "c" / "single-0001" / "trials").list()
     other = CliRunner().invoke(cli, [*words, "4"])
     assert isinstance(other.exception, GroundedError)
-    assert "holds trials of another challenge" in str(other.exception)
+    assert str(tmp_path / "c") in str(other.exception)
     again = CliRunner().invoke(cli, [*words, "3"])
     assert again.exit_code == 0, again.output
     for first, second in ((folder, tmp_path / "c"), (labels, tmp_path / "c-labels")):
@@ -155,14 +157,13 @@ def test_the_next_command_says_where_the_labels_are_to_be_looked_for(tmp_path):
     assert said(*words, "--labels", labels).out.startswith("1 case in ")
     answered(folder)
     run = said("run", folder, "--without", "delay,offset", "--without", "stall").out
-    assert "nothing to do: every case is diagnosed already" in run
-    assert f"next: grounded challenge score {folder} --labels DIR\nDIR is the folder" in run
+    assert holds(run, "--again", "grounded challenge score", folder, "--labels DIR")
     missing = said("score", folder, code=1).err
-    assert "are kept elsewhere" in missing and "--labels DIR" in missing
+    assert holds(missing, f"{folder}-labels", "make", "--labels DIR")
     wrong = said("score", folder, "--labels", tmp_path / "nowhere", code=1).err
-    assert "there is no " in wrong and "look for none-0000.json" in wrong
+    assert holds(wrong, tmp_path / "nowhere", "none-0000.json")
     wrong = said("score", folder, "--labels", tmp_path, code=1).err
-    assert "holds no none-0000.json" in wrong and "name --labels DIR" not in wrong
+    assert holds(wrong, tmp_path, "none-0000.json") and "--labels DIR" not in wrong
     out = said("score", folder, "--labels", labels).out
     assert max(map(len, out.splitlines())) <= 80
     assert "\nnone\n  cases                1\n" in out
@@ -171,10 +172,10 @@ def test_the_next_command_says_where_the_labels_are_to_be_looked_for(tmp_path):
 def test_what_is_no_challenge_is_said_to_be_none(tmp_path):
     for command in ("run", "score"):
         message = said(command, tmp_path / "nothere", code=1).err
-        assert "there is no folder" in message and "Errno" not in message
+        assert holds(message, tmp_path / "nothere") and "Errno" not in message
         labels = ["--labels", tmp_path] * (command == "score")
         message = said(command, tmp_path, *labels, code=1).err
-        assert "it has no manifest.json" in message
+        assert holds(message, tmp_path, "manifest.json")
 
 
 def test_an_impossible_error_of_parameters_is_refused(tmp_path):
@@ -192,5 +193,5 @@ def test_families_may_be_named_in_a_list_or_one_by_one(tmp_path, monkeypatch):
     )
     out = said("run", folder, "--without", "delay,offset", "--without", "stall").out
     assert seen == [["delay", "offset", "stall"]]
-    assert "1 case is diagnosed now; 1.0 s of CPU a case" in out
+    assert holds(out, "1 case", "1.0 s")
     assert out.endswith(f"next: grounded challenge score {folder}\n")

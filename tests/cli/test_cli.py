@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cli import COMMAND, grounded, process
+from cli import COMMAND, grounded, plain, process
+from facts import holds
 from grounded.policy import load
 from grounded_cli.main import COMMANDS
 from grounded_trials.workspace.examples import EXAMPLES
@@ -54,7 +55,7 @@ def test_the_list_of_commands_is_in_the_order_of_use():
     listed = re.findall(r"^  (\w+)  ", done.out.split("Commands:")[1], re.M)
     assert listed == list(COMMANDS) and done.code == 0
     assert grounded("-h").out == done.out
-    assert "grounded demo car-figure8" in done.out
+    assert re.search("grounded demo +car-figure8", done.out)
 
 
 def test_help_needs_no_numpy():
@@ -79,8 +80,8 @@ def test_version():
     [
         (["propse"], "no command 'propse': did you mean 'propose'"),
         (["propose", "--jsn"], "--json"),
-        (["init"], "give a folder and an example"),
-        (["init", "x"], "give a folder and an example"),
+        (["init"], "--from run1.mcap"),
+        (["init", "x"], "--blank --model"),
         (["ingest"], "Missing argument"),
         (["learn", "--trials", "0"], "0 is not in the range"),
         (["learn", "--trials", "many"], "not a valid integer"),
@@ -101,7 +102,7 @@ def test_wrong_usage_is_exit_2(args, match):
 def test_a_folder_that_is_no_workspace_is_exit_1(name, tmp_path):
     done = grounded("-C", tmp_path, name)
     assert done.code == 1 and not done.out
-    assert done.err.startswith("error: ") and "this is not a workspace" in done.err
+    assert done.err.startswith("error: ") and holds(done.err, tmp_path)
     assert done.err.endswith("\nnext: grounded init DIR --example car-turn\n")
     assert done.err.count("\n") == 2
 
@@ -137,7 +138,7 @@ def test_init_lists_and_makes_workspaces(tmp_path):
     again = grounded("init", tmp_path / "pendulum", "--example", "pendulum")
     assert again.code == 1 and "exists already" in again.err
     wrong = grounded("init", tmp_path / "x", "--example", "car-trun")
-    assert wrong.code == 1 and "did you mean 'car-turn'" in wrong.err
+    assert wrong.code == 1 and holds(wrong.err, "car-trun", "'car-turn'")
     assert not (tmp_path / "x").exists()
 
 
@@ -186,7 +187,7 @@ def test_ingest_of_the_same_file_twice_is_a_success_that_names_the_trial(w):
     assert again.json["trials"][0]["trial"] == first["trials"][0]["trial"] == "t0001"
     assert sorted(p.name for p in (w / "trials").iterdir()) == before
     said = grounded("-C", w, "ingest", run["trial_file"])
-    assert said.code == 0 and "stored before as t0001" in said.out
+    assert said.code == 0 and holds(said.out, Path(run["trial_file"]).name, "t0001")
 
 
 def test_learn_runs_to_the_end_and_says_what_is_next(w):
@@ -206,18 +207,18 @@ def test_learn_runs_to_the_end_and_says_what_is_next(w):
     again = grounded("-C", w, "learn", "--json")
     assert again.json["trials"] == done["trials"] and again.code == 0
     text = grounded("-C", w, "status")
-    assert "better than the model's own policy" in text.out and "next:" in text.out
+    assert re.search(r"^best +c000\d.*\d %", text.out, re.M) and "next:" in text.out
     assert not text.err
 
 
 def test_run_may_name_any_candidate_and_needs_one(w):
     none = grounded("-C", w, "run")
-    assert none.code == 1 and "no candidate is waiting" in none.err
+    assert none.code == 1 and plain(none.err).endswith("next: grounded propose\n")
     step(w)
     again = grounded("-C", w, "run", "c0001", "--json").json
     assert Path(again["trial_file"]).name == "c0001-2.mcap"
     wrong = grounded("-C", w, "run", "c0009")
-    assert wrong.code == 1 and "no candidate 'c0009': did you mean 'c0001'" in wrong.err
+    assert wrong.code == 1 and holds(wrong.err, "'c0009'", "'c0001'")
 
 
 @pytest.mark.parametrize("form", ["json", "npz", "csv"])
@@ -270,11 +271,10 @@ def test_the_three_exports_say_the_same(w, tmp_path):
 
 def test_export_without_a_best_or_into_nowhere(w, tmp_path):
     none = grounded("-C", w, "export", "best")
-    assert none.code == 1 and "no best candidate yet" in none.err
+    assert none.code == 1 and holds(none.err, "best") and not list(w.glob("*.json"))
     step(w)
     nowhere = grounded("-C", w, "export", "c0001", "-o", tmp_path / "no" / "c.json")
-    assert nowhere.code == 1 and "can't be written" in nowhere.err
-    assert "does not exist; make it, or name another place" in nowhere.err
+    assert nowhere.code == 1 and holds(nowhere.err, tmp_path / "no")
     assert not list(tmp_path.glob("**/*.tmp"))
 
 
@@ -282,7 +282,7 @@ def test_verify_names_what_is_damaged_and_fails(w):
     step(w)
     step(w)
     good = grounded("-C", w, "verify", "--json")
-    assert (good.code, good.json["damaged"], good.json["checked"]) == (0, [], 4)
+    assert (good.code, good.json["damaged"], good.json["checked"]) == (0, [], 6)
     path = sorted((w / "trials").glob("t0002*"))[0]
     path.chmod(0o644)
     data = bytearray(path.read_bytes())
@@ -317,12 +317,12 @@ def test_fit_shows_values_with_intervals_and_applies_them(w):
     only = grounded("-C", w, "fit", "--params", "drag", "--json").json
     assert set(only["params"]) == {"drag"}
     wrong = grounded("-C", w, "fit", "--params", "drg")
-    assert wrong.code == 1 and "did you mean 'drag'" in wrong.err
+    assert wrong.code == 1 and holds(wrong.err, "drg", "'drag'")
 
 
 def test_fit_without_trials_says_so(w):
     done = grounded("-C", w, "fit")
-    assert done.code == 1 and "no trial to learn from" in done.err
+    assert done.code == 1 and holds(done.err, "ingest", "--data")
 
 
 def test_narration_is_not_data(w):

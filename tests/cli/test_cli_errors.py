@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from cli import grounded, plain, process
+from facts import holds
 from grounded_trials.store.trial_file import TrialWriter
 from workspaces import CONFIG, MODEL, make
 
@@ -100,7 +101,7 @@ def test_a_log_without_the_mapped_topic_names_those_it_has(w, shared):
 def test_a_log_without_a_log_table_says_how_to_make_one(tmp_path, shared):
     folder = make(tmp_path / "plain").folder
     log = next((shared / "dart_small_car").glob("*.mcap"))
-    refused(folder, "ingest", log, "--data", holds=["no [log] table", "grounded inspect"])
+    refused(folder, "ingest", log, "--data", holds=["[log]", "next: grounded inspect"])
 
 
 def test_a_log_that_ran_nothing_needs_a_candidate_or_data(w, shared):
@@ -112,7 +113,7 @@ def test_a_log_that_ran_nothing_needs_a_candidate_or_data(w, shared):
 
 
 def test_a_candidate_is_not_its_trial(w, trial):
-    refused(w, "ingest", w / "candidates" / "c0001.mcap", holds=["is a candidate", "not the trial"])
+    refused(w, "ingest", w / "candidates" / "c0001.mcap", holds=["c0001.mcap", "candidate"])
 
 
 def test_cut_and_flipped_trials(w, trial, tmp_path):
@@ -157,7 +158,7 @@ def test_a_candidate_of_the_same_name_from_another_workspace(w, trial, tmp_path)
     text = (twin.folder / "model.py").read_text()
     (twin.folder / "model.py").write_text(text.replace("Param(1.0", "Param(2.0"))
     grounded("-C", twin.folder, "propose")
-    refused(twin.folder, "ingest", trial, holds=["carries a policy that is not the c0001"])
+    refused(twin.folder, "ingest", trial, holds=[trial.name, "c0001"])
 
 
 def test_candidate_and_trial_must_agree(w, trial):
@@ -169,7 +170,7 @@ def test_one_bad_file_of_several(w, trial, tmp_path):
     """What was stored before the bad one stays, and is said."""
     (tmp_path / "bad.mcap").write_bytes(b"")
     done = grounded("-C", w, "ingest", trial, tmp_path / "bad.mcap")
-    assert done.code == 1 and "is stored as t0001" in done.out and "bad.mcap" in done.err
+    assert done.code == 1 and "t0001" in done.out and "bad.mcap" in done.err
     assert len(stored(w)) == 1
 
 
@@ -475,11 +476,11 @@ def test_a_crash_of_the_users_drive_leaves_a_trial_that_says_how_far_it_came(tmp
     folder = with_command(tmp_path, command, crash)
     grounded("-C", folder, "propose")
     done = process("-C", folder, "run")
-    assert done.code == 1 and "exit code 1" in done.err and "is kept in" in done.err
     (left,) = (folder / "runs").iterdir()
+    assert done.code == 1 and "exit code 1" in done.err and left.name in done.err
     taken = grounded("-C", folder, "ingest", left, "--json")
     assert taken.code == 0 and taken.json["trials"][0]["failed"]
-    assert "ended after 30 of 40" in taken.json["trials"][0]["warnings"][0]
+    assert holds(taken.json["trials"][0]["warnings"][0], 30, 40)
 
 
 # other files in a workspace

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from cli import grounded, process
+from facts import holds
 from reported import cart, copied
 from workspaces import CONFIG, MODEL, make
 
@@ -53,8 +54,7 @@ def test_a_session_from_the_first_trial_to_the_export(here):
     assert re.search(r"c0001 .* first$", text, re.M)
     assert said(grounded("status")).rstrip().endswith("next: grounded diagnose")
     text = said(grounded("diagnose"))
-    assert re.search(r"error \(rms\) +crude .*as diagnosed", text) and "next: grounded " in text
-    assert "whole trials" in text
+    assert "next: grounded " in text
     for command in ("report", "fit", "verify", "propose"):
         said(grounded(command))
     assert "grounded.policy.load" in said(grounded("export", "best", "-o", "p.npz"))
@@ -77,7 +77,7 @@ def test_a_trial_that_was_no_better_is_called_so_everywhere(cart, tmp_path):
         assert all("no better" in done.out for done in said_so)
         assert "no better" in Path(page).read_text()
     again = grounded("-C", folder, "ingest", tmp_path / "again.mcap")
-    assert "was stored before as t0001" in again.out and ", first:" in again.out
+    assert holds(again.out, "again.mcap", "t0001", "first")
 
 
 def test_a_failed_first_policy_is_no_measure_of_the_gain(tmp_path):
@@ -95,10 +95,9 @@ def test_a_failed_first_policy_is_no_measure_of_the_gain(tmp_path):
     (tmp_path / "short.mcap").write_bytes(trial_bytes(short, about, policy))
     done = grounded("-C", folder, "ingest", tmp_path / "short.mcap")
     assert done.code == 0, done.err
-    assert "utility failed, crashed: it did not run to the end" in " ".join(done.out.split())
-    out = said(grounded("-C", folder, "status"))
-    assert "the model's own policy failed" in " ".join(out.split())
-    assert "better than the model's own policy" not in " ".join(out.split())
+    assert re.search(r"utility +failed, crashed\b", done.out)
+    (best,) = re.findall("^best .*(?:\n .*)*", said(grounded("-C", folder, "status")), re.M)
+    assert "failed" in best and "%" not in best
 
 
 def test_a_unit_of_one_is_not_printed(tmp_path):
@@ -109,7 +108,7 @@ def test_a_unit_of_one_is_not_printed(tmp_path):
     fitted = grounded("-C", folder, "fit").out
     assert re.search(r"^mass .*\d\.\d+$", fitted, re.M), fitted
     page = Path(grounded("-C", folder, "report", "--html").out.splitlines()[0]).read_text()
-    assert "force [1]" not in page and "<td>1</td><td>0.01, change" not in page
+    assert "force [1]" not in page and "<td>1</td><td>0.01" not in page
     exported = grounded("-C", folder, "export", "best", "--json").json["file"]
     assert '"force": "1"' in Path(exported).read_text().replace("'", '"')
     Path(exported).unlink()
@@ -119,10 +118,9 @@ def test_repeats_say_what_is_waited_for(tmp_path):
     folder = make(tmp_path / "w", config=CONFIG.replace("[search]", "[search]\nrepeats = 2")).folder
     grounded("-C", folder, "propose")
     path = grounded("-C", folder, "run", "--json").json["trial_file"]
-    out = grounded("-C", folder, "ingest", path).out
-    assert "waiting: more trials of it are needed" in " ".join(out.split())
-    text = " ".join(grounded("-C", folder, "propose").out.split())
-    assert "Run c0001 once more" in text and "is waiting for 1 trial" in text
+    taken = grounded("-C", folder, "ingest", path, "--json").json["trials"]
+    assert taken[0]["verdict"] == "waiting"
+    assert holds(grounded("-C", folder, "propose").out, "c0001", "1 trial")
     path = grounded("-C", folder, "run", "--json").json["trial_file"]
     assert grounded("-C", folder, "ingest", path, "--json").json["trials"][0]["verdict"] == "first"
 
@@ -156,7 +154,7 @@ def test_a_mistake_is_named(here, words, holds):
 
 def test_a_file_says_its_format_and_must_not_contradict(here):
     done = process("export", "best", "--format", "csv", "-o", "x.npz", cwd=here)
-    assert done.code == 2 and "is named as npz, --format says csv" in done.err
+    assert done.code == 2 and holds(done.err, "x.npz", "--format", "csv")
 
 
 def test_a_document_says_the_same_words(cart):
@@ -172,7 +170,7 @@ def test_the_best_one_is_run_again_by_that_name(cart, tmp_path):
     done = grounded("-C", folder, "run", "best", "--json").json
     assert done["candidate"] == best
     out = grounded("-C", folder, "ingest", done["trial_file"]).out
-    assert "run again: its utility is the mean of its trials" in " ".join(out.split())
+    assert re.search(rf"^ +{best} +utility .*run again\b", out, re.M)
     empty = make(tmp_path / "empty").folder
     refused = grounded("-C", empty, "run", "best")
-    assert refused.code == 1 and "there is no best candidate yet" in refused.err
+    assert refused.code == 1 and holds(refused.err, "best")

@@ -6,6 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 
+from facts import holding
 from grounded.compile import Named
 from grounded.compile.run.differenced import DifferencedSystem
 from grounded.compile.trace.tracing import Signature
@@ -30,9 +31,9 @@ def test_names():
         {"x": 1.0, "v": 2.0},
     )
     for ask in (lambda: s.velocity, lambda: s["velocity"], lambda: s[3]):
-        with pytest.raises(GroundedError, match=r"test_compile_python\.py:\d+: there is no state"):
+        with pytest.raises(GroundedError, match=r"test_compile_python\.py:\d+: .*\bx, v\b"):
             ask()
-    with pytest.raises(GroundedError, match="can't be assigned"):
+    with pytest.raises(GroundedError, match=holding("'x'")):
         s.x = 3.0
     assert not hasattr(s, "__array__")
 

@@ -77,7 +77,7 @@ def endless(s, a, p):
 
 def test_a_loop_that_unrolls_too_far_names_file_and_line():
     model = Model(states={"x": "m"}, inputs={"u": "1"}, derivative=endless)
-    with pytest.raises(GroundedError, match=r"test_models_derivatives\.py:\d+: it unrolls to more"):
+    with pytest.raises(GroundedError, match=r"test_models_derivatives\.py:\d+: .*\bunrolls\b"):
         _ = model.system
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from facts import holding
 from grounded.compile.problem import queue_of
 from grounded.errors import GroundedError
 from grounded.estimate import (
@@ -345,11 +346,11 @@ def test_pieces_of_a_record_keep_their_latency_and_cover_it():
 
 def test_misuse_says_what_to_do():
     _, trials = simulated(SPRING, np.random.default_rng(11), SPRING_NOISE, B=1)
-    with pytest.raises(GroundedError, match="2 states and 2 channels"):
+    with pytest.raises(GroundedError, match=holding("2 states", "2 channels")):
         filter_trials(SPRING, trials, NoiseStd(np.ones(3), np.ones(2), DT))
-    with pytest.raises(GroundedError, match="ingest at least one"):
+    with pytest.raises(GroundedError, match=r"\bingest\b"):
         filter_trials(SPRING, [], SPRING_NOISE)
-    with pytest.raises(GroundedError, match="no input 'steering'"):
+    with pytest.raises(GroundedError, match=holding("'steering'")):
         filter_trials(car, trials, CAR_NOISE)
     with pytest.raises(GroundedError, match="finite standard"):
         NoiseStd(np.array([np.nan]), np.ones(1), DT)

@@ -12,6 +12,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
+from facts import holding
 from grounded.errors import GroundedError, NextCommand
 from grounded.policy import Policy
 from grounded.trial import Trial
@@ -156,7 +157,7 @@ def test_a_live_trial_with_jitter_is_on_the_grid_and_one_with_a_gap_is_not() -> 
         if fine:
             assert read_trial(stream.getvalue())[0].steps == 49
         else:
-            with pytest.raises(GroundedError, match=r"sample 2[01] is stamped"):
+            with pytest.raises(GroundedError, match=r"\bsample 2[01]\b"):
                 read_trial(stream.getvalue())
 
 
@@ -164,11 +165,11 @@ def test_a_live_trial_on_a_full_disk_says_so() -> None:
     class Full(io.BytesIO):
         def write(self, data: object) -> int:
             if self.tell() > 3000:
-                raise OSError(28, "No space left on device")
+                raise OSError(28, "ENOSPC, full disk")
             return super().write(data)  # type: ignore[arg-type]
 
     writer = TrialWriter(Full(), 0.1, {"x": "m"}, {"u": "1"}, {})
-    with pytest.raises(GroundedError, match="No space left on device"):
+    with pytest.raises(GroundedError, match=holding("ENOSPC, full disk")):
         for k in range(1000):
             writer.append(k * 0.1, np.zeros(1), np.zeros(1))
     with pytest.raises(GroundedError, match="expected 1 numbers"):
@@ -184,22 +185,26 @@ def test_a_writer_never_overwrites(tmp_path: Path) -> None:
 
 
 def test_refusals() -> None:
-    with pytest.raises(GroundedError, match="'dt' is written by grounded itself"):
+    with pytest.raises(GroundedError, match=holding("'dt'")):
         trial_bytes(a_trial(), {"dt": "1"})
     policy, x, u = a_policy(), np.zeros((21, 3)), np.zeros((20, 2))
     gain = np.array(policy.gain)
     gain[7, 0, 0] = np.nan
-    with pytest.raises(GroundedError, match="gain is not a finite number at step 7"):
+    with pytest.raises(GroundedError, match=holding("gain", "step 7")):
         candidate_bytes(replace(policy, gain=gain), x, u, {})
-    with pytest.raises(GroundedError, match="expected an array of shape"):
+    with pytest.raises(GroundedError, match=holding("(21, 3)", "(20, 3)")):
         candidate_bytes(policy, x[1:], u, {})
-    with pytest.raises(GroundedError, match="not a 'grounded trial 1' file"):
+    with pytest.raises(
+        GroundedError, match=holding("'grounded trial 1'", "'grounded candidate 1'")
+    ):
         read_trial(candidate_bytes(policy, x, u, {}))
-    with pytest.raises(GroundedError, match="not a 'grounded candidate 1' file"):
+    with pytest.raises(
+        GroundedError, match=holding("'grounded trial 1'", "'grounded candidate 1'")
+    ):
         read_candidate(trial_bytes(a_trial(), {}))
-    with pytest.raises(GroundedError, match="does not exist"):
+    with pytest.raises(GroundedError, match=holding("/nowhere/t.mcap")):
         read_trial("/nowhere/t.mcap")
-    with pytest.raises(GroundedError, match="can't be written"):
+    with pytest.raises(GroundedError, match=holding("/nowhere/t.mcap")):
         write_trial("/nowhere/t.mcap", a_trial(), {})
 
 
@@ -259,13 +264,13 @@ def test_a_file_without_its_checksum_is_refused() -> None:
     writer.start()
     writer.add_metadata("grounded", {"format": "grounded trial 1"})
     writer.finish()
-    with pytest.raises(GroundedError, match="checksum is missing"):
+    with pytest.raises(GroundedError, match=holding("checksum")):
         read_trial(stream.getvalue())
 
 
 def test_a_candidate_that_lost_its_end_is_refused() -> None:
     candidate = candidate_bytes(a_policy(), np.zeros((21, 3)), np.zeros((20, 2)), {})
-    with pytest.raises(GroundedError, match="a policy of 21 steps needs 21 messages"):
+    with pytest.raises(GroundedError, match=holding("21 steps", "21 messages")):
         read_candidate(with_metadata(candidate, "steps", "21"))
 
 

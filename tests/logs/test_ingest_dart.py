@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from cli import grounded
+from facts import holds
 from grounded_trials.workspace.folder import Folder
 
 MODEL = '''"""The DART car, a JetRacer: kinematic, with a first-order speed response."""
@@ -156,7 +157,7 @@ def test_fit_gives_intervals_and_errors_on_held_out_time_that_shrink(fitted):
 
 def test_fit_says_so_in_words(dart, fitted):
     text = grounded("-C", dart[0], "fit", "--params", "gain,steer")
-    assert text.code == 0 and "95 % interval" in text.out and "held-out error" in text.out
+    assert text.code == 0 and holds(text.out, "95 %", "held-out")
 
 
 def test_a_circle_for_that_car_inside_its_limits(dart, fitted):
@@ -180,7 +181,7 @@ def test_without_estimates_what_is_missing_is_named(dart, tmp_path):
     bare = CONFIG.replace("[estimate]\nmeasured = { x = 0.002, y = 0.002, psi = 0.005 }\n", "")
     (tmp_path / "grounded.toml").write_text(bare)
     done = grounded("-C", tmp_path, "ingest", log, "--data")
-    assert done.code == 1 and "[log] maps no 'v'" in done.err and "[estimate]" in done.err
+    assert done.code == 1 and holds(done.err, "[log]", "'v'", "[estimate]")
 
 
 def test_a_wrong_path_names_what_the_message_has(dart, tmp_path):

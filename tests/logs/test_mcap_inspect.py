@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from mcap.writer import Writer
 
+from facts import holding
 from grounded.errors import GroundedError
 from grounded_trials.formats.messages import Dynamic
 from grounded_trials.formats.path_walk import number_paths
@@ -71,13 +72,13 @@ def test_a_gap_in_a_genuine_bag_is_refused_where_it_is() -> None:
         {"thrust": SignalSpec("/cf_controll.position.z", "log")},
     )
     bag = data("crazyflie_p4_ros2_mcap", "yx3bag.mcap")
-    with pytest.raises(GroundedError, match=r"has a gap of 0.\d\d\d s from \d"):
+    with pytest.raises(GroundedError, match=r"\bgap\b.* 0.\d\d\d s\b.* \d"):
         read_log(bag, mapping, 0.02)
     states = {name: SignalSpec(pose + name, max_age_s=1.0) for name in "xyz"}
     found = read_log(bag, LogMapping(states, mapping.inputs), 0.02)
     assert found.reports[0].bridged >= 46 and len(found.states) > 150
     nan = LogMapping({"x": SignalSpec("/cf_logpos.position.x", "log")}, mapping.inputs)
-    with pytest.raises(GroundedError, match="none of its 236 values is a finite number"):
+    with pytest.raises(GroundedError, match=holding(236, "finite")):
         read_log(data("crazyflie_p4_ros2_mcap", "yx4bag.mcap"), nan, 0.02)
 
 
@@ -104,7 +105,7 @@ def test_dart_from_an_unknown_bag_to_arrays() -> None:
     assert [g.path for g in inputs] == ["/steering_1.data", "/throttle_1.data"]
     assert [g.sure for g in states] == [False, True, True, True] and states[0].path == ""
     text = mapping_toml(states, inputs)
-    assert "# [log.state.v]  # nothing in the log fits" in text
+    assert "\n# [log.state.v]" in text
     log = tomllib.loads(text)["log"]
     assert log["clock"] == "header" and log["state"]["psi"]["unwrap"] is True
     measured = tomllib.loads(text)["estimate"]["measured"]

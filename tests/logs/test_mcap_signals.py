@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from mcap.writer import CompressionType, IndexType, Writer
 
+from facts import holding
 from grounded.errors import GroundedError
 from grounded_trials.logs.log_files import log_files
 from grounded_trials.logs.log_table import LogMapping, read_log
@@ -70,11 +71,11 @@ def test_a_folder_of_split_files_is_one_log(tmp_path: Path) -> None:
     )
     assert [p.name for p in log_files(tmp_path)] == ["bag_1.mcap", "bag_0.mcap"]
     (tmp_path / "metadata.yaml").write_text("files:\n  - path: ../../etc/passwd.mcap\n")
-    with pytest.raises(GroundedError, match=r"lists passwd\.mcap, which is not in the folder"):
+    with pytest.raises(GroundedError, match=holding("metadata.yaml", "passwd.mcap")):
         log_files(tmp_path)
     with pytest.raises(GroundedError, match=r"no \*\.mcap"):
         log_files(Path(__file__).parent)
-    with pytest.raises(GroundedError, match="does not exist"):
+    with pytest.raises(GroundedError, match=holding("no.mcap")):
         log_files([tmp_path / "bag_0.mcap", tmp_path / "no.mcap"])
 
 
@@ -82,7 +83,7 @@ def test_a_folder_of_split_files_is_one_log(tmp_path: Path) -> None:
 def test_split_bags_of_rosbag2() -> None:
     parts = files("mcap_format_fixtures/rosbag2/*multiple_files_[012].mcap")
     assert len(parts) == 3
-    with pytest.raises(GroundedError, match="ends at a string, not at a number"):
+    with pytest.raises(GroundedError, match=holding("/chatter.data", "string")):
         read_signals(parts, {"c": SignalSpec("/chatter.data", "log")})
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -10,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from facts import holding, holds
 from grounded.errors import GroundedError
 from grounded_trials.logs.resample import END, START, Crossing, Span, to_grid
 from grounded_trials.logs.signals import Series, SignalSpec
@@ -86,7 +88,7 @@ def test_a_gap_is_refused_where_it_is_and_bridged_where_allowed() -> None:
     x = pose(np.sin)
     keep = (x.t < EPOCH + 1.0e9) | (x.t > EPOCH + 1.9e9)
     gap = replace(x, t=x.t[keep], values=x.values[keep], log_times=x.log_times[keep])
-    with pytest.raises(GroundedError, match=r"gap of 0.9\d\d s from 0.99\d s to 1.9\d\d s") as e:
+    with pytest.raises(GroundedError, match=r"\bgap .*\b0.9\d\d s .*\b0.99\d s .*\b1.9\d\d s") as e:
         grid(gap)
     assert "'x' (/x.data)" in str(e.value)
     found = grid(replace(gap, spec=replace(gap.spec, max_age_s=1.0)))
@@ -100,15 +102,15 @@ def test_held_inputs_grow_old() -> None:
     u = series(np.array([0.0, 0.1, 1.0]), np.arange(3), SignalSpec("/u", "log"))
     assert grid(pose(np.sin), u).inputs.shape[0] > 50  # a command is in force until the next
     strict = replace(u, spec=replace(u.spec, max_age_s=0.5))
-    with pytest.raises(GroundedError, match=r"gap of 0.5\d* s from 0.100 s"):
+    with pytest.raises(GroundedError, match=r"\bgap .*\b0.5\d* s .*\b0.100 s"):
         grid(pose(np.sin), strict)
 
 
 def test_one_shot_topics() -> None:
     u = series(np.array([0.0]), np.array([0.3]), SignalSpec("/u", "log"))
     found = grid(pose(np.sin), u)
-    assert (found.inputs == 0.3).all() and "held from a single sample" in found.warnings[0]
-    with pytest.raises(GroundedError, match="one sample can't be interpolated"):
+    assert (found.inputs == 0.3).all() and holds(found.warnings[0], "'u'")
+    with pytest.raises(GroundedError, match=holding('resample = "hold"')):
         grid(series(np.array([0.0]), np.array([1.0])))
 
 
@@ -121,7 +123,7 @@ def test_values_that_are_no_numbers() -> None:
     t = 0.05 * np.arange(len(found.states))
     np.testing.assert_allclose(found.states[:, 0], np.sin(t), atol=2e-4)
     assert found.reports[0].not_finite == np.sum(~np.isfinite(values))
-    with pytest.raises(GroundedError, match="none of its 340 values is a finite number"):
+    with pytest.raises(GroundedError, match=holding(340, "finite")):
         grid(replace(x, values=np.full(len(values), np.nan)))
 
 
@@ -135,20 +137,20 @@ def test_repeated_and_shuffled_stamps() -> None:
     np.testing.assert_array_equal(found.states, grid(x).states)
     report = found.reports[0]
     assert (report.repeated, report.out_of_order) == (2, 9)
-    assert any("9 stamps out of order, 2 repeated" in w for w in found.warnings)
+    assert any(re.search(r"\b9 stamps\b.*\b2 repeated", w) for w in found.warnings)
 
 
 def test_clocks_that_jump_or_differ_are_refused() -> None:
     x = pose(np.sin)
     reset = x.t.copy()
     reset[200:] -= 5_000_000_000
-    with pytest.raises(GroundedError, match="header clock jumps back by"):
+    with pytest.raises(GroundedError, match=holding("clock", "4.990 s", "sample 199")):
         grid(replace(x, t=reset, log_times=reset))
     simulated = replace(x, t=x.t - EPOCH + 929 * 10**9)
-    with pytest.raises(GroundedError, match="on clocks that differ by"):
+    with pytest.raises(GroundedError, match=holding("clock", "log")):
         grid(simulated)
     zero = replace(x, t=np.zeros_like(x.t))
-    with pytest.raises(GroundedError, match=r"on clocks that differ|stamps are 0"):
+    with pytest.raises(GroundedError, match=r"\bclocks\b|stamps are 0"):
         grid(zero)
     some = x.t.copy()
     some[:3] = 0
@@ -160,7 +162,7 @@ def test_a_skew_that_matters_is_said() -> None:
     skewed = replace(x, log_times=x.log_times + 300_000_000)
     found = grid(skewed)
     assert found.reports[0].skew_s == pytest.approx(-0.3)
-    assert any("clocks that differ by 0.300 s" in w for w in found.warnings)
+    assert any(holds(w, "clocks", "0.300 s") for w in found.warnings)
 
 
 def test_the_span() -> None:
@@ -174,9 +176,7 @@ def test_the_span() -> None:
     assert found.start_ns == EPOCH + 700_000_000 and len(found.inputs) == 10
     assert found.start_inputs is not None and found.start_inputs.tolist() == [13]
     never = Span(Crossing("/armed", above=2))
-    with pytest.raises(
-        GroundedError, match="is never above 2 in this log; its values go from 0 to"
-    ):
+    with pytest.raises(GroundedError, match=holding("/armed", "above 2", 0)):
         to_grid({"x": x, "u": u, START: armed}, 0.05, ["x"], ["u"], never)
     with pytest.raises(GroundedError, match="0 steps"):
         grid(x, u, span=Span(1.0, 0.5))

@@ -17,6 +17,7 @@ from grounded.errors import NextCommand
 from grounded_trials.report.findings import improvements_in
 from grounded_trials.report.gathering import gather
 from grounded_trials.report.page.page import page
+from grounded_trials.report.page.tables import UNKNOWN
 from grounded_trials.workspace.folder import Folder, Lost
 from page_browser import unpacked
 from reported import DIAGNOSIS, car, cart, many_flights
@@ -213,5 +214,5 @@ def test_a_value_without_an_interval_is_said_to_be_undetermined(cart, interval):
     entry = DIAGNOSIS["ranking"][0] | {"params": {"k": value}}
     findings = gather(Folder(cart))
     text = page(replace(findings, diagnosis=Diagnosis.from_json(DIAGNOSIS | {"ranking": [entry]})))
-    assert "k = –, not determined by these trials<" in text
+    assert f"k = {UNKNOWN}<" in text
     assert "0.280 to 0.320" not in text

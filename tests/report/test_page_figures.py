@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from facts import holding
 from grounded.diagnosis.pictures import accuracy_figure, credit_figure
 from grounded.diagnosis.report import Credit, Diagnosis, RulerRow, Verdict
 from grounded.errors import GroundedError
@@ -246,7 +247,7 @@ def test_results_plot_what_the_page_shows(cart):
 
 def test_a_result_without_a_figure_says_so(cart):
     nothing = replace(gather(Folder(cart)).standing, history=())
-    with pytest.raises(GroundedError, match="nothing to draw"):
+    with pytest.raises(GroundedError, match=holding(type(nothing).__name__)):
         nothing.plot()
 
 

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from facts import holding
 from grounded.errors import GroundedError
 from grounded.search.standing import SearchOptions
 from grounded_trials.logs.log_table import log_mapping
@@ -278,14 +279,15 @@ def test_a_file_that_is_not_toml_or_not_ours(with_config, text, parts):
 
 
 def test_a_folder_that_is_no_workspace(tmp_path):
-    with pytest.raises(GroundedError, match="this is not a workspace"):
+    with pytest.raises(GroundedError, match=holding(tmp_path)) as refused:
         _ = Folder(tmp_path).config
+    assert refused.value.then is not None and refused.value.then.verb == "init"
     (tmp_path / "grounded.toml").mkdir()
-    with pytest.raises(GroundedError, match="can't be read"):
+    with pytest.raises(GroundedError, match=holding(tmp_path / "grounded.toml")):
         _ = Folder(tmp_path).config
     (tmp_path / "x").mkdir()
     (tmp_path / "x" / "grounded.toml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(GroundedError, match="can't be read"):
+    with pytest.raises(GroundedError, match=holding(tmp_path / "x" / "grounded.toml")):
         _ = Folder(tmp_path / "x").config
 
 

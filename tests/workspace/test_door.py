@@ -9,6 +9,7 @@ import pytest
 from test_next_step import diagnosed
 
 from cli import grounded
+from facts import holding
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result, plain
 from grounded_trials import Workspace
@@ -96,7 +97,7 @@ def test_what_was_changed_on_the_disk_is_seen_by_the_next_call(cart, tmp_path):
     assert w.status().then == NextCommand("propose")
     diagnosed(w.folder, verdict={"kind": "none", "effects": [], "sentence": "None."})
     (w.folder / "grounded.toml").write_text("[model]\nfile = 3\n")
-    with pytest.raises(GroundedError, match="must be a text"):
+    with pytest.raises(GroundedError, match=holding("[model]", "file")):
         w.status()
 
 

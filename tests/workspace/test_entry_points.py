@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import grounded.models
+from facts import holding
 from grounded import Model
 from grounded.errors import GroundedError
 from grounded_trials.workspace.model_file import load_module, model_in
@@ -48,7 +49,9 @@ def test_a_model_is_loaded_by_its_name_or_its_module(registered, tmp_path, name)
 
 
 def test_an_unknown_module_names_the_models_there_are(registered, tmp_path):
-    with pytest.raises(GroundedError, match="name one of aircraft, boat, car, pendulum"):
+    with pytest.raises(
+        GroundedError, match=holding("'boot'", "aircraft", "boat", "car", "pendulum")
+    ):
         load_module(tmp_path, module="boot")
 
 

@@ -3,12 +3,14 @@
 import csv
 import json
 import math
+import re
 import subprocess
 import sys
 
 import numpy as np
 import pytest
 
+from facts import holding
 from grounded.errors import GroundedError
 from grounded.policy import load
 from grounded_trials.workspace.exporting import RUNNER, export_candidate
@@ -67,7 +69,7 @@ def test_inputs_without_limits_are_null_in_json_and_said_in_csv(tmp_path):
     document = json.loads(exported(w, tmp_path, "json").read_text())
     assert document["low"] == [None] and document["high"] == [None]
     text = exported(w, tmp_path, "csv").read_text()
-    assert "limits [none, none]" in text or "limits [-inf, inf]" in text
+    assert re.search(r"limits \[(none, none|-inf, inf)\]", text)
     assert np.isinf(load(exported(w, tmp_path, "npz")).policy.low).all()
 
 
@@ -86,7 +88,7 @@ def test_a_csv_is_read_by_any_reader_that_skips_hashes(tmp_path):
     )
     np.testing.assert_array_equal(gain, policy.gain)
     assert any("psi" in line and "wrap" in line for line in head)
-    assert any("steering: limits" in line and "held before the start" in line for line in head)
+    assert any(re.search(r"steering: limits .*\bheld .*\d", line) for line in head)
 
 
 def test_the_same_candidate_is_the_same_file(tmp_path):
@@ -116,5 +118,5 @@ def test_the_runner_beside_an_export_drives_without_grounded(tmp_path):
     here = load(done.file)
     expected = [float(here.action(0.05 * k, [0.01 * k, 0.0])[0]) for k in range(40)]
     assert [float(u) for u in found.split()] == expected
-    with pytest.raises(GroundedError, match="npz, not json"):
+    with pytest.raises(GroundedError, match=holding("npz", "json")):
         export_candidate(w, "c0001", "json", tmp_path / "c.json", runner=True)

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from cli import grounded, plain
-from grounded.errors import GroundedError
+from facts import holding, holds
+from grounded.errors import GroundedError, NextCommand
 from grounded_trials import Workspace
 from grounded_trials.store.candidate_file import candidate_bytes, read_candidate
 from grounded_trials.workspace.handover import checked_candidate, outside_limits
@@ -82,25 +83,26 @@ def test_what_was_just_proposed_is_handed_over_without_a_word(w, tmp_path):
 
 def test_limits_that_were_narrowed_make_it_void(w, tmp_path):
     configure(w, CONFIG.replace(LIMITS, NARROW))
-    wider = "its own limits of force are [-5, 5], wider than [limits] force = [-0.5, 0.5] N"
-    refused(w, tmp_path, "c0001 is not handed over", wider, "--anyway")
-    with pytest.raises(GroundedError, match="no candidate is waiting"):
+    why = "its own limits of force are [-5, 5], wider than [limits] force = [-0.5, 0.5] N"
+    refused(w, tmp_path, "c0001", why, "--anyway")
+    with pytest.raises(GroundedError) as caught:
         w.run()
+    assert caught.value.then == NextCommand("propose")
     made = w.propose()
     assert made.candidate.id == "c0002" and made.proposal.is_new
     (note,) = made.proposal.notes
-    assert note == f"c0001 was not run and is void: {wider}; run c0002 in its place"
+    assert note == f"c0001 was not run and is void: {why}; run c0002 in its place"
     assert w.run().candidate == "c0002"
     assert w.propose().proposal.notes == ()  # said once
 
 
 def test_another_target_makes_it_void_too(w, tmp_path):
     configure(w, CONFIG.replace("x = 10.0", "x = 11.0"))
-    with pytest.raises(GroundedError, match="made for another task") as caught:
+    with pytest.raises(GroundedError, match=holding("c0001", "task")) as caught:
         w.run("c0001")
     assert caught.value.then.verb == "propose"
     (note,) = w.propose().proposal.notes
-    assert "c0001 was not run and is void: the task was changed" in note and "c0002" in note
+    assert holds(note, "c0001", "void", "task", "c0002")
     exported = w.export("c0001", tmp_path / "c.json")  # the limits hold
     assert "another task" in exported.notes[0]
 
@@ -121,7 +123,7 @@ def test_safety_that_was_narrowed_replaces_it_or_ends_the_search(w, tmp_path):
         w.run()
     made = w.propose()
     assert made.candidate is None and made.standing.ending == "not allowed"
-    assert any("c0001 was not run and is void" in note for note in made.proposal.notes)
+    assert any(holds(note, "c0001", "void") for note in made.proposal.notes)
     configure(w, CONFIG)
     assert w.propose().candidate.id == "c0001"
 
@@ -132,7 +134,7 @@ def test_a_step_that_safety_forbids_now_gives_way_to_another(ran):
     most = float(second.predicted_states[:, 0].max())
     configure(ran, CONFIG + SAFETY.format(high=most - 1e-3))
     made = ran.propose()
-    assert any("c0002 was not run and is void" in note for note in made.proposal.notes)
+    assert any(holds(note, "c0002", "void") for note in made.proposal.notes)
     assert made.candidate.id == "c0003"
     assert made.candidate.predicted_states[:, 0].max() < most - 1e-3
     assert ran.run().candidate == "c0003"
@@ -148,7 +150,7 @@ def test_what_is_to_be_run_once_more_is_not_replaced_but_refused(tmp_path):
     w.ingest(w.run().trial_file)
     assert w.propose().candidate.id == "c0001"
     configure(w, noisy + SAFETY.format(high=0.5))
-    with pytest.raises(GroundedError, match=r"c0001 is waiting for 1 trial, but .*--anyway"):
+    with pytest.raises(GroundedError, match=holding("c0001", "1 trial", "[safety]", "--anyway")):
         w.propose()
     assert w.run(anyway=True).overridden and len(w.candidate_ids()) == 1
 
@@ -164,7 +166,7 @@ def test_safety_holds_for_the_run_as_the_model_of_today_predicts_it(ran, tmp_pat
     configure(ran, CONFIG + SAFETY.format(high=real + 1e-6), model=heavier)
     assert "predicted again" in ran.run("best").notes[0]
     configure(ran, CONFIG + SAFETY.format(high=(real + stored) / 2))
-    with pytest.raises(GroundedError, match=f"is predicted to take x to {real:.3f}"):
+    with pytest.raises(GroundedError, match=holding("[safety] x", f"{real:.3f}")):
         ran.run("best")
 
 
@@ -173,7 +175,7 @@ def test_a_model_that_was_changed_makes_an_unrun_candidate_void(w, tmp_path):
     refused(w, tmp_path, "not run and is void: the model was changed")
     made = w.propose()
     (note,) = made.proposal.notes
-    assert made.candidate.id == "c0002" and "c0001 was not run and is void: the model" in note
+    assert made.candidate.id == "c0002" and holds(note, "c0001", "void", "model")
 
 
 @pytest.mark.parametrize("checksum", ["old", "new", "none"])
@@ -182,8 +184,9 @@ def test_a_rewritten_candidate_is_refused_whatever_its_checksum(w, tmp_path, che
     """FACTS 9: 5.4e6 N were sent, and `verify` found nothing."""
     wide = {"low": np.array([-1e9]), "high": np.array([1e9])}
     rewrite(w, checksum, feedforward=np.full((40, 1), 5.4e6), **wide)
-    refused(w, tmp_path, "is not the candidate that was proposed", "rewritten", anyway=anyway)
-    with pytest.raises(GroundedError, match="is not the candidate that was proposed"):
+    told = ("c0001.mcap",) if checksum == "old" else ("c0001.mcap", "5.4e+06")
+    refused(w, tmp_path, *told, anyway=anyway)
+    with pytest.raises(GroundedError, match=holding(*told)):
         w.propose()
     (found,) = w.verify().damaged
     assert "c0001.mcap" in found.file and "rewritten" in found.reason
@@ -212,19 +215,19 @@ def test_a_file_that_is_not_what_its_trial_ran_is_refused(ran, tmp_path):
     forget_hand_outs(ran)
     gain = read_candidate(ran.candidate_path("c0001"))[0].gain
     rewrite(ran, "new", gain=gain * (1 + 1e-12))  # the prediction can't show so little
-    with pytest.raises(GroundedError, match="is not the policy that t0001 ran"):
+    with pytest.raises(GroundedError, match=holding("c0001.mcap", "t0001")):
         ran.export("best", tmp_path / "c.json")
 
 
 def test_a_renamed_or_copied_candidate_is_refused(w, tmp_path):
     shutil.copy(w.candidate_path("c0001"), w.candidate_path("c0007"))
     for hand_over in (lambda: w.run("c0007"), lambda: w.export("c0007"), w.propose, w.run):
-        with pytest.raises(GroundedError, match=r"c0007\.mcap holds the candidate 'c0001'"):
+        with pytest.raises(GroundedError, match=holding("c0007.mcap", "'c0001'")):
             hand_over()
     (found,) = w.verify().damaged
     assert "c0007.mcap" in found.file
     w.candidate_path("c0001").unlink()
-    with pytest.raises(GroundedError, match="holds the candidate 'c0001'"):
+    with pytest.raises(GroundedError, match=holding("c0007.mcap", "'c0001'")):
         w.propose()
 
 
@@ -242,7 +245,7 @@ def test_a_file_of_an_older_version_is_handed_over_with_a_note(w):
     path = w.candidate_path("c0001")
     path.write_bytes(with_metadata(path.read_bytes(), "sha256", None))
     (note,) = w.propose().proposal.notes
-    assert "c0001 was written by an older version" in note
+    assert holds(note, "c0001", "checksum")
     assert w.run().notes == (note,) and w.verify().damaged == ()
 
 
@@ -271,7 +274,7 @@ def test_anyway_says_what_it_overrides_before_the_robot_moves(w, tmp_path):
 
     ran = w.run("c0001", anyway=True, warn=warn)
     assert ran.trial_file.is_file() and len(told) == len(ran.overridden) == 2
-    assert "wider than [limits]" in told[0] and "another task" in told[1]
+    assert "[limits] force" in told[0] and "task" in told[1]
     exported = w.export("c0001", tmp_path / "c.json", anyway=True)
     assert len(exported.overridden) == 1 and exported.file.is_file()
 
@@ -281,14 +284,14 @@ def test_the_commands_refuse_and_warn_on_stderr(w, tmp_path):
     out = tmp_path / "c.csv"
     for command in (("run", "c0001"), ("export", "c0001", "-o", out)):
         done = grounded("-C", w.folder, *command)
-        assert done.code == 1 and "wider than [limits]" in words(done.err)
-        assert "grounded -C" in done.err and "propose" in done.err
+        assert done.code == 1 and "[limits] force" in words(done.err)
+        assert words(done.err).endswith("next: grounded propose")
         done = grounded("-C", w.folder, *command, "--anyway")
         assert done.code == 0 and "warning: c0001 is" in words(done.err)
-        assert "all the same: its own limits of force" in words(done.err)
+        assert "[limits] force" in words(done.err)
         assert "warning" not in done.out
     done = grounded("-C", w.folder, "propose")
-    assert "note: c0001 was not run and is void" in words(done.err)
+    assert holds(words(done.err), "note", "c0001", "void")
 
 
 def words(text):

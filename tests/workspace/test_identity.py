@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from test_next_step import diagnosed
 
+from facts import holding
 from grounded.errors import GroundedError
 from grounded_trials import Workspace
 from grounded_trials.report.reporting import save_optimum
@@ -66,7 +67,7 @@ def test_a_diagnosis_without_a_checksum_is_not_adopted(cart, tmp_path):
     path = folder / "reports" / "diagnosis.json"
     text = path.read_text()
     path.write_text("{" + text.split(",", 1)[1])
-    with pytest.raises(GroundedError, match="has no checksum"):
+    with pytest.raises(GroundedError, match=holding("diagnosis.json", "checksum")):
         Workspace(folder).adopt("viscous_friction:v")
 
 
@@ -122,7 +123,7 @@ def test_a_rewritten_candidate_with_a_checksum_of_its_own_is_found(w, tmp_path):
     shutil.copy(other.candidate_path(waiting), w.candidate_path(waiting))
     (found,) = w.verify().damaged
     assert "was rewritten" in found.reason
-    with pytest.raises(GroundedError, match="not what was handed out"):
+    with pytest.raises(GroundedError, match=holding(f"{waiting}.mcap", "rewritten")):
         w.run(waiting)
 
 

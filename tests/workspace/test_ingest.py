@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from cli import grounded
+from facts import holding
 from grounded.errors import GroundedError
 from grounded.trial import Trial
 from grounded_trials.store.trial_file import TrialWriter, read_trial, trial_bytes, write_trial
@@ -83,7 +84,7 @@ def test_a_trial_that_does_not_say_what_it_ran_is_the_outstanding_ones(w, tmp_pa
 
 def test_without_an_outstanding_candidate_it_must_be_named(w, tmp_path):
     write_trial(tmp_path / "t.mcap", plain(), {"kind": "trial"})
-    with pytest.raises(GroundedError, match="none is waiting for a trial"):
+    with pytest.raises(GroundedError, match=holding("--candidate", "--data")):
         ingest_log(w, tmp_path / "t.mcap")
     with pytest.raises(GroundedError, match="c0001"):
         ingest_log(w, tmp_path / "t.mcap", "c0001")

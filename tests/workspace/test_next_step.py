@@ -1,5 +1,6 @@
 """The last line of an output is the command to type next, the same one wherever it is asked."""
 
+import re
 import shlex
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import click
 import pytest
 
 from cli import grounded, plain, process
+from facts import holds
 from grounded.diagnosis.report import Diagnosis
 from grounded_cli.main import COMMANDS, cli
 from grounded_cli.options import ELSEWHERE
@@ -57,7 +59,7 @@ def test_nothing_is_adopted_where_one_name_is_wrong(cart, tmp_path):
     folder = copied(cart, tmp_path / "w")
     before = (folder / "grounded.toml").read_text()
     done = grounded("-C", folder, "adopt", "viscous_friction:v", "delay:forse")
-    assert done.code == 1 and "did you mean 'delay:force'" in done.err
+    assert done.code == 1 and "'delay:force'" in done.err
     assert (folder / "grounded.toml").read_text() == before
 
 
@@ -111,16 +113,20 @@ def test_a_long_command_is_broken_where_a_shell_allows_it():
     assert shlex.split(quoted.replace("\\\n", " "))[3] == "my own folder"
 
 
+def told(done):
+    """The words of the next step that a command printed."""
+    return shlex.split(done.out.rstrip().replace("\\\n", " ").splitlines()[-1])
+
+
 def test_printed_commands_work_from_where_the_user_is(tmp_path):
     make(tmp_path / "my cart")
     for at in (("-C", "my cart", "propose"), ("propose", "-C", "my cart")):
         done = process(*at, cwd=tmp_path)
         assert done.out.endswith("\nnext: grounded -C 'my cart' run\n"), done.out
     for expected in ("ingest", "propose"):
-        words = shlex.split(done.out.rstrip().replace("\\\n", " ").splitlines()[-1])
-        done = process(*words[2:], cwd=tmp_path)
+        done = process(*told(done)[2:], cwd=tmp_path)
         assert done.code == 0, done.err
-        assert f"next: grounded -C 'my cart' {expected}" in done.out
+        assert told(done)[:5] == ["next:", "grounded", "-C", "my cart", expected]
     assert process("propose", cwd=tmp_path / "my cart").out.endswith("next: grounded run\n")
 
 
@@ -129,7 +135,7 @@ def test_an_error_names_the_workspace_too_and_init_does_not(tmp_path):
     done = process("-C", "cart", "adopt", "delay:force", cwd=tmp_path)
     assert done.err.endswith("next: grounded -C cart diagnose\n")
     done = process("-C", "cart", "init", "new", "--example", "pendulum", cwd=tmp_path)
-    assert "next: cd new && grounded propose" in done.out
+    assert done.out.endswith("cd new && grounded propose\n")
 
 
 def test_the_commands_that_take_a_folder_are_those_that_are_printed_with_it():
@@ -173,9 +179,9 @@ def test_what_was_adopted_is_not_missing_any_more(cart, tmp_path):
     diagnosed(folder, verdict=verdict, diagnosed=taken_in(folder, 1, 2, 3, 4))
     assert grounded("-C", folder, "adopt", "viscous_friction:v").code == 0
     out = " ".join(plain(grounded("-C", folder, "report").out).split())
-    assert "adopted since: viscous_friction:v, but not delay:force; run `grounded dia" in out
+    assert re.search("viscous_friction:v, .*delay:force; .*`grounded diagnose", out)
     assert "before that: Friction; late." in out
-    assert "crude model" not in out and "what the model without adopted effects lacks" in out
+    assert "crude model" not in out and "adopted effects" in out
     page = Path(grounded("-C", folder, "report", "--html", "--json").json["paths"]["html"])
     text = page.read_text()
     assert "Before that: Friction" in text and "viscous_friction:v (adopted since)" in text
@@ -193,7 +199,7 @@ def test_nothing_is_said_of_what_one_trial_can_not_know(cart, tmp_path):
     for words in ("after", "is explained", "delay:force"):
         assert words not in done.out[done.out.index("gap to the model") :], words
     page = Path(grounded("-C", folder, "report", "--html", "--json").json["paths"]["html"])
-    assert "of the squared error" not in page.read_text()
+    assert "squared error" not in page.read_text()
     assert last(grounded("-C", folder, "status")) == "grounded run best"
 
 
@@ -201,7 +207,7 @@ def test_diagnose_of_one_trial_asks_for_another(tmp_path):
     folder = make(tmp_path / "w").folder
     assert grounded("-C", folder, "learn", "--trials", 1).code == 0
     done = grounded("-C", folder, "diagnose")
-    assert "No cause is named" in done.out and last(done) == "grounded propose"
+    assert last(done) == "grounded propose"
     assert "before, " not in done.out and "is explained" not in done.out
 
 
@@ -212,9 +218,7 @@ def test_rivals_are_not_adopted_together(cart, tmp_path):
     folder = copied(cart, tmp_path / "w")
     before = (folder / "grounded.toml").read_text()
     done = grounded("-C", folder, "adopt", "viscous_friction:v", "delay:force")
-    assert done.code == 1 and "does not claim delay:force" in done.err
-    assert "one instead of another" in done.err
-    assert "those that it claims (viscous_friction:v), or one alone" in plain(done.err)
+    assert done.code == 1 and holds(done.err, "delay:force", "(viscous_friction:v)")
     assert plain(done.err).endswith("\nnext: grounded adopt viscous_friction:v\n")
     assert (folder / "grounded.toml").read_text() == before
 
@@ -224,7 +228,7 @@ def test_one_unclaimed_effect_comes_without_the_parameters_of_others(cart, tmp_p
     entry = DIAGNOSIS["ranking"][1] | {"params": {"d": {"value": 0.02, "std": 0.01, "unit": "s"}}}
     diagnosed(folder, ranking=[DIAGNOSIS["ranking"][0], entry])
     done = grounded("-C", folder, "adopt", "delay:force")
-    assert done.code == 0 and "was not claimed by the last diagnosis" in done.err
+    assert done.code == 0 and holds(done.err, "delay:force", "claimed")
     assert "mass" not in done.out and "params" not in (folder / "grounded.toml").read_text()
 
 
@@ -243,7 +247,7 @@ def test_nothing_is_adopted_where_too_little_is_known(cart, tmp_path):
     verdict = {"kind": "unknown", "effects": [], "sentence": f"No cause is named: {why}."}
     diagnosed(folder, verdict=verdict, unknowable=[why])
     done = grounded("-C", folder, "adopt", "viscous_friction:v")
-    assert done.code == 1 and "too little is known" in done.err and "run another trial" in done.err
+    assert done.code == 1 and why in " ".join(done.err.split())
 
 
 def test_a_candidate_that_another_replaces_is_said_to_be_void(tmp_path):
@@ -254,7 +258,7 @@ def test_a_candidate_that_another_replaces_is_said_to_be_void(tmp_path):
     diagnosed(folder)
     assert grounded("-C", folder, "adopt", "viscous_friction:v").code == 0
     done = grounded("-C", folder, "propose")
-    assert "c0002 was not run and is void" in done.err and "Run c0003" in done.out
+    assert holds(done.err, "c0002", "void") and "c0003" in done.out
     assert "void" not in grounded("-C", folder, "propose").err  # it is said once
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from cli import grounded
+from facts import holds
 from grounded.errors import GroundedError
 from grounded.trial import Trial
 from grounded_trials import Workspace
@@ -71,7 +72,7 @@ def test_a_run_is_recognised_though_the_log_is_not_perfect(learnt, kind):
 def test_other_commands_are_not_the_candidate_s(learnt, kind):
     for own, trial, candidates in runs(learnt):
         logged = replace(trial, inputs=OTHERS[kind](np.array(trial.inputs)))
-        assert "force differs by" in what_ran(learnt.task, logged, own, candidates)
+        assert "force" in what_ran(learnt.task, logged, own, candidates)
 
 
 def test_every_pair_of_candidates_is_told_apart(learnt):
@@ -111,7 +112,7 @@ def waiting(tmp_path):
 def test_manual_driving_is_refused_and_taken_as_data(waiting):
     w, _, driven = waiting
     refused = grounded("-C", w.folder, "ingest", driven)
-    assert refused.code == 1 and "did not run c0002" in refused.err and "--data" in refused.err
+    assert refused.code == 1 and holds(refused.err, driven.name, "c0002", "--data")
     assert len(w.store.list()) == 1
     taken = grounded("-C", w.folder, "ingest", driven, "--data", "--json")
     assert taken.code == 0 and taken.json["trials"][0]["candidate"] is None
@@ -122,7 +123,7 @@ def test_manual_driving_is_refused_and_taken_as_data(waiting):
 def test_a_named_candidate_overrides_with_a_warning(waiting):
     w, _, driven = waiting
     found = w.ingest(driven, candidate="c0002")
-    assert found.candidate == "c0002" and "force differs by" in found.warnings[0]
+    assert found.candidate == "c0002" and "force" in found.warnings[0]
 
 
 def test_the_log_of_another_candidate_says_so(waiting, tmp_path):
@@ -147,7 +148,7 @@ def test_a_discarded_trial_counts_nowhere_until_it_is_restored(waiting):
     now = w.status()
     assert now.standing.outstanding.id == "c0002" and now.standing.trials == 1
     assert [t.stored.id for t in w.trials()] == ["t0001", "t0003"]
-    assert "a wheel was loose" in grounded("-C", w.folder, "status").out
+    assert now.discarded["t0002"] in grounded("-C", w.folder, "status").out
     assert grounded("-C", w.folder, "status", "--json").json["discarded"] == now.discarded
     assert "aside: t0002" in grounded("-C", w.folder, "report").out
     assert len(w.store.list()) == 3 and w.verify().damaged == ()  # nothing is deleted
