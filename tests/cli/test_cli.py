@@ -79,8 +79,8 @@ def test_version():
     [
         (["propse"], "no command 'propse': did you mean 'propose'"),
         (["propose", "--jsn"], "--json"),
-        (["init"], "give a folder and an example"),
-        (["init", "x"], "give a folder and an example"),
+        (["init"], "give a folder and a log"),
+        (["init", "x"], "give a folder and a log"),
         (["ingest"], "Missing argument"),
         (["learn", "--trials", "0"], "0 is not in the range"),
         (["learn", "--trials", "many"], "not a valid integer"),
