@@ -21,7 +21,7 @@ def test_the_unit_one_is_not_printed():
     assert shown("1") == "" and shown("m/s") == "m/s"
     assert with_unit("0.146", "1") == "0.146" and with_unit("0.3", "m") == "0.3 m"
     assert labelled("throttle", "1") == "throttle" and labelled("v", "m/s") == "v [m/s]"
-    assert per_second("1") == "1/s" and per_second("rad") == "rad per s"
+    assert per_second("1") == "1/s" and per_second("rad") == "rad/s"
 
 
 @pytest.mark.parametrize(
