@@ -37,20 +37,22 @@ def drive(*words):
 def test_from_manual_driving_to_trials_of_a_policy(robot, tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(ROOTS))
     log, w = tmp_path / "bag", tmp_path / "car"
-    drive("--manual", 6, log)
+    drive("--manual", 8, log)
     made = grounded("init", w, "--from", log, "--model", HERE / "model.py", "--json").json
     paths = {one["name"]: one["path"] for one in made["signals"]}
     assert paths["v"] == "/odom.twist.twist.linear.x"
     assert paths["speed"] == "/drive.twist.linear.x" and paths["steering"].endswith("angular.z")
     assert grounded("-C", w, "ingest", "--data", log).code == 0
-    assert grounded("-C", w, "target", "circle", "--speed", 1.2, "--size", 0.5).code == 0
+    assert grounded("-C", w, "target", "circle", "--speed", 1.2, "--size", 1.5).code == 0
     with (w / "grounded.toml").open("a") as file:
         file.write(
             f'\n[system]\ncommand = "{sys.executable} {HERE}/drive.py {{candidate}} {{trial}}"\n'
         )
     done = grounded("-C", w, "learn", "--trials", 2, "--json")
     assert done.code == 0, done.err
-    assert [t.trial.candidate for t in Workspace(w).trials()] == ["", "c0001", "c0002"]
+    ran = [t.trial.candidate for t in Workspace(w).trials()]
+    assert ran[:2] == ["", "c0001"] and len(ran) == 3
+    assert "its commands are not" not in done.err + done.out  # though packets were lost
 
 
 def test_the_kill_switch_holds_until_a_reset(robot):

@@ -19,7 +19,7 @@ from grounded_trials.store.trial_file import read_trial, write_trial
 from grounded_trials.workspace.ingest import ingest_log
 from grounded_trials.workspace.proposing import propose_in, standing_in
 from grounded_trials.workspace.running import run_candidate
-from grounded_trials.workspace.trial_check import what_ran
+from grounded_trials.workspace.trial_check import commands, what_ran
 from workspaces import CONFIG, make
 
 NOISY = CONFIG + "[system.noise.measurement]\nx = 0.002\nv = 0.01\n"
@@ -66,6 +66,24 @@ def test_a_run_is_recognised_though_the_log_is_not_perfect(learnt, kind):
         states, inputs = HONEST[kind](np.array(trial.states), np.array(trial.inputs))
         logged = replace(trial, states=states, inputs=inputs)
         assert what_ran(learnt.task, logged, own, candidates) == ""
+
+
+@pytest.mark.parametrize("share", [0.01, 0.03])
+def test_a_run_on_states_of_varying_age_with_noise_of_its_own_is_recognised(learnt, share):
+    """The robot acted on other samples than the log has: older by 0 to 2 steps, noisy by a sensor."""
+    rng = np.random.default_rng(2)
+    for own, trial, _ in runs(learnt):
+        clean, T = np.array(trial.states), trial.steps
+        noise = share * np.ptp(clean, axis=0)
+        for _ in range(5):
+            age = np.maximum(np.arange(T) - rng.integers(0, 3, T), 0)
+            acted = clean[age] + noise * rng.normal(size=(T, clean.shape[1]))
+            logged = replace(
+                trial,
+                states=clean + noise * rng.normal(size=clean.shape),
+                inputs=commands(own.policy, acted[None], own.policy.past)[0],
+            )
+            assert what_ran(learnt.task, logged, own, [own]) == ""
 
 
 @pytest.mark.parametrize("kind", OTHERS)

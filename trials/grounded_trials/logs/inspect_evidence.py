@@ -311,8 +311,8 @@ def _speed(guesses: Mapping[str, Guess], model: Model, signals: _Signals) -> dic
         return {name: replace(guesses[name], others=())}
     best, slope, path = good[0]
     rivals = tuple(p for value, _, p in good[1:] if best - value < 0.05)
-    why = f"no name says it; it goes with the speed of {' and '.join(position)}, correlation {best:.3f}"
-    why += f", {slope:.3g} times as large"
+    why = f"no name says it; it goes with the speed of {' and '.join(position)}, correlation "
+    why += f"{best:.3f}, {slope:.3g} times as large"
     return {name: replace(guesses[name], path=path, others=rivals[:3], reasons=(why,))}
 
 

@@ -154,6 +154,10 @@ def _begin(
         states, inputs = (tuple(_asked(g, ask) for g in some) for some in (states, inputs))
     step = dt or _interval(report, inputs, states)
     ranges = {g.name: _range(report, g) for g in (*states, *inputs)}
+    if chosen != "drone":  # what is sent after a run must be allowed: rest
+        ranges |= {
+            g.name: (min(r[0], 0.0), max(r[1], 0.0)) for g in inputs if (r := ranges[g.name])
+        }
     table = mapping_toml(states, inputs, simulated=is_simulated(report))
 
     def write(columns: Mapping[str, Array], rows: int) -> None:
@@ -353,7 +357,7 @@ def _write(
         f"state = {_inline(weights)}",
         f"input_change = {_inline(dict.fromkeys(model.input_names, 0.01))}",
         "",
-        "[limits]                      # SEEN in the log: put in what your robot may be given",
+        "[limits]                      # SEEN in the log, and 0: put in what your robot may get",
         *limits,
         "",
         "[search]",

@@ -1,0 +1,99 @@
+"""ROS 2 bags of a car and an arm, written by rosbags, as somebody else's robot records them."""
+
+import numpy as np
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+STORE = get_typestore(Stores.ROS2_HUMBLE)
+STORE.register(
+    get_types_from_msg(
+        "float32 steering_angle\nfloat32 steering_angle_velocity\nfloat32 speed\n"
+        "float32 acceleration\nfloat32 jerk",
+        "ackermann_msgs/msg/AckermannDrive",
+    )
+)
+STORE.register(
+    get_types_from_msg(
+        "std_msgs/Header header\nackermann_msgs/AckermannDrive drive",
+        "ackermann_msgs/msg/AckermannDriveStamped",
+    )
+)
+T = STORE.types
+DT, START = 0.01, 1_760_000_000_000_000_000
+
+
+def header(t):
+    stamp = T["builtin_interfaces/msg/Time"](sec=t // 10**9, nanosec=t % 10**9)
+    return T["std_msgs/msg/Header"](stamp=stamp, frame_id="")
+
+
+def vector(kind, x, y, z):
+    return T[f"geometry_msgs/msg/{kind}"](x=x, y=y, z=z)
+
+
+def odometry(t, x, y, psi, v, rate):
+    turn = T["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=np.sin(psi / 2), w=np.cos(psi / 2))
+    pose = T["geometry_msgs/msg/Pose"](position=vector("Point", x, y, 0.0), orientation=turn)
+    linear, angular = vector("Vector3", v, 0.0, 0.0), vector("Vector3", 0.0, 0.0, rate)
+    twist = T["geometry_msgs/msg/Twist"](linear=linear, angular=angular)
+    return T["nav_msgs/msg/Odometry"](
+        header=header(t),
+        child_frame_id="base",
+        pose=T["geometry_msgs/msg/PoseWithCovariance"](pose=pose, covariance=np.zeros(36)),
+        twist=T["geometry_msgs/msg/TwistWithCovariance"](twist=twist, covariance=np.zeros(36)),
+    )
+
+
+def drive(t, steering, speed):
+    small = {n: np.float32(0) for n in ("steering_angle_velocity", "acceleration", "jerk")}
+    command = T["ackermann_msgs/msg/AckermannDrive"](
+        steering_angle=np.float32(steering), speed=np.float32(speed), **small
+    )
+    return T["ackermann_msgs/msg/AckermannDriveStamped"](header=header(t), drive=command)
+
+
+def joints(t, names, q, w, tau):
+    return T["sensor_msgs/msg/JointState"](
+        header=header(t), name=names, position=q.copy(), velocity=w.copy(), effort=tau.copy()
+    )
+
+
+def bag(folder, topics, messages, storage=StoragePlugin.SQLITE3):
+    with Writer(folder, version=9, storage_plugin=storage) as writer:
+        open_ = {t: writer.add_connection(t, kind, typestore=STORE) for t, kind in topics.items()}
+        for topic, t, message in messages:
+            writer.write(open_[topic], t, STORE.serialize_cdr(message, topics[topic]))
+    return folder
+
+
+def car_bag(folder, storage=StoragePlugin.SQLITE3):
+    """A car with a wheelbase of 0.32 m, driven in curves for 8 s."""
+    topics = {
+        "/odom": "nav_msgs/msg/Odometry",
+        "/drive": "ackermann_msgs/msg/AckermannDriveStamped",
+        "/joint_states": "sensor_msgs/msg/JointState",
+    }
+    messages, v, x, y, psi = [], 0.0, 0.0, 0.0, 0.0
+    for k in range(800):
+        t, steering, speed = START + k * 10**7, 0.3 * np.sin(0.01 * k), 1 + 0.5 * np.sin(0.02 * k)
+        rate = v * np.tan(steering) / 0.32
+        if k % 5 == 0:
+            messages.append(("/drive", t, drive(t, steering, speed)))
+        messages.append(("/odom", t, odometry(t, x, y, psi, v, rate)))
+        wheels = np.array([20 * x, 20 * x])
+        messages.append(("/joint_states", t, joints(t, ["left", "right"], wheels, wheels, wheels)))
+        v, psi = v + DT * (0.9 * speed - v) / 0.35, psi + DT * rate
+        x, y = x + DT * v * np.cos(psi), y + DT * v * np.sin(psi)
+    return bag(folder, topics, messages, storage)
+
+
+def arm_bag(folder, scale=1.0):
+    topics = {"/joint_states": "sensor_msgs/msg/JointState"}
+    messages, q, w = [], np.zeros(2), np.zeros(2)
+    for k in range(600):
+        t, tau = START + k * 10**7, np.array([0.5 * np.sin(0.02 * k), 0.3 * np.cos(0.03 * k)])
+        names = ["shoulder_joint", "elbow_joint"]
+        messages.append(("/joint_states", t, joints(t, names, scale * q, w, tau)))
+        w = w + DT * (tau - 0.2 * w) / np.array([0.3, 0.1])
+        q = q + DT * w
+    return bag(folder, topics, messages)
