@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -12,7 +13,7 @@ from grounded.errors import NextCommand
 from grounded_cli import completion as complete
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace, typed
 from grounded_cli.terminal import field, names_in, number, show, show_json, stages, table
-from grounded_trials.wording import rendered, with_unit
+from grounded_trials.wording import WIDTH, rendered, with_unit
 
 if TYPE_CHECKING:
     from grounded.diagnosis.report import Diagnosis, Ranked, Where
@@ -126,7 +127,7 @@ def _tell(found: Diagnosis, before: dict[str, float]) -> None:
     if not found.no_cause:
         if found.prediction_error:
             show("\n" + table(*error_table(found)))
-            show(f"  open loop, {_held_out(found)}")
+            show(field("open loop", _held_out(found)))
         _effects(found)
     _places(found.where)
     for title, text in error_lines(found, before):
@@ -196,7 +197,13 @@ def _effects(found: Diagnosis) -> None:
         ]
         if share := credit_of(found, "calibration"):
             rows.insert(0, ("  (calibration)", share, "", "the model's own parameters, below"))
-        show("\n" + table(rows, ("effect (*: claimed)", "credit", "evidence [nats]", "value")))
+        room = WIDTH - 24 - max(len(row[0]) for row in rows)
+        lines = [
+            (*(cells if k == 0 else ("", "", "")), line)
+            for *cells, value in rows
+            for k, line in enumerate(textwrap.wrap(value, room) or [""])
+        ]
+        show("\n" + table(lines, ("effect (*: claimed)", "credit", "evidence [nats]", "value")))
         show("  credit: what predictions lose without it, of what they gain in all")
     for group in found.indistinguishable:
         show(field("tied", f"the data can't tell apart: {', '.join(group)}"))
