@@ -31,7 +31,6 @@ from numpy.typing import NDArray
 
 from grounded.frozen import Array
 from grounded.rollout import augmented
-from grounded.solve.bias import effective_inputs
 from grounded.solve.levenberg_marquardt import LeastSquares, Minimum, Rows, solve
 from grounded.task import Task
 
@@ -58,6 +57,8 @@ def first_guess(task: Task) -> Guess:
 
     The cost is infinite when even this run diverges: the model can't follow the target.
     """
+    from grounded.solve.bias import effective_inputs
+
     x, u = filled_target(task)
     problem = task.problem()
     z = augmented(problem, x, u, task.past)

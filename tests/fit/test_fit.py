@@ -210,7 +210,7 @@ def test_a_climb_goes_on_where_only_the_gains_say_which_way_is_up():
         name="lag",
         states={"w": "rad/s"},
         inputs={"u": "rad/s"},
-        params={"rate": Param(5.0, "1/s"), "gain": Param(1.0, "1")},
+        params={"rate": Param(5.0, "1/s", std=5.0), "gain": Param(1.0, "1", std=1.0)},
         derivative=lambda s, a, p: {"w": p.rate * (p.gain * a.u - s.w)},
     )
     noise = NoiseStd(np.array([0.05]), np.array([0.09]), DT)
