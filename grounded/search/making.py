@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,13 +16,14 @@ from grounded.search.candidate import Candidate, Tried, Way
 from grounded.search.first_policy import first_policy
 from grounded.search.planner import Planner
 from grounded.search.safety import objections, spread
-from grounded.search.secants import slope_error, with_slope
 from grounded.search.standing import SearchOptions, Standing, losers_of, wild
 from grounded.search.step_size import Step
 from grounded.solve import ddp
-from grounded.solve.bias import Grounding, ground
 from grounded.task import Task
 from grounded.trial import mean_trial
+
+if TYPE_CHECKING:
+    from grounded.solve.bias import Grounding
 
 PLANNING = DescentOptions(max_iterations=30, tolerance=1e-6)  # a direction needs no more digits
 HALF = 0.5  # of the gain that was promised: less says that the model's slopes are wrong
@@ -43,6 +44,8 @@ class About:
         own = planner.lift(mean_trial(incumbent.trials, planner.task.model.angle_mask))
         plan.model.system.check(own.states[:-1], own.inputs, plan.model.values, plan.dt)
         matched = options.match_inputs and way != "recorded inputs"
+        from grounded.solve.bias import ground
+
         self.grounding = ground(plan, own, match_inputs=matched)
         exact = ground(plan, own, exact=True, shift=self.grounding.shift)
         self.real = exact.on(plan.problem(exact=True))
@@ -52,6 +55,8 @@ class About:
         self.least = options.tolerance * abs(self.already)
         self.slope: Array | None = None
         if options.damps and np.isfinite(already) and make.doubts(incumbent):
+            from grounded.search.secants import slope_error
+
             self.slope = slope_error(planner, incumbent, make.now.history, self.real)
 
     def candidate(self, policy: Policy, step: Step, way: Way) -> Candidate:
@@ -261,6 +266,8 @@ def direction(
     if options.step == "damped":
         problem = damped(problem, grounding.inputs, damping)
     if slope is not None:
+        from grounded.search.secants import with_slope
+
         problem = with_slope(problem, slope)
     gains = ddp.sweep(problem, grounding.z, grounding.inputs).gains
     result = ddp.solve(problem, grounding.inputs, gains.K, grounding.z[:-1], PLANNING)

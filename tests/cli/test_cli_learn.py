@@ -41,6 +41,7 @@ def test_learn_reaches_the_papers_figures_within_40_trials(name, tmp_path):
     assert gain >= PAPER[name] and done["trials"] <= 40
 
 
+@pytest.mark.slow
 @needs("demo")
 def test_demo_prints_utilities_trials_and_the_optimum(tmp_path):
     done = process("demo", "pendulum", "--json", cwd=tmp_path)
@@ -99,6 +100,7 @@ def test_reports_may_be_deleted(w):
     assert grounded("-C", w, "status").code == 0
 
 
+@pytest.mark.slow
 @needs("diagnose")
 def test_diagnose_gives_the_contracts_document(w):
     done = grounded("-C", w, "diagnose", "--json")

@@ -62,6 +62,7 @@ def test_a_car_that_runs_away_ends_its_trial(filmed, policy):
     assert np.isfinite(flown.trial.states).all()
 
 
+@pytest.mark.slow
 def test_the_search_learns_from_estimated_states(monkeypatch):
     for name, value in {"BUDGET": 6, "FRESH": 2, "NAMES": ("circle",)}.items():
         monkeypatch.setattr(estimated, name, value)

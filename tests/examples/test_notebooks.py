@@ -48,6 +48,7 @@ def test_the_papers_loop(tmp_path, monkeypatch):
     assert search.policy is search.best.candidate.policy
 
 
+@pytest.mark.slow
 def test_a_diagnosis(tmp_path, monkeypatch):
     space = run("diagnosis", tmp_path, monkeypatch)
     assert space["found"].effects == ("coulomb_friction:omega",)

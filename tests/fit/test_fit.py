@@ -329,6 +329,7 @@ def emps_trial(name, every=10):
     return Trial(states, inputs, every * 1e-3, ("q", "v"), ("voltage",))
 
 
+@pytest.mark.slow
 def test_the_real_emps_axis_against_its_published_values():
     model = emps()
     found = fit(model, [emps_trial("emps_estimation.npz")])

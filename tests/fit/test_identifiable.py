@@ -31,6 +31,7 @@ def trials(count=3, mass=2.0, gain=3.0, drag=0.5, T=56):
     return found
 
 
+@pytest.mark.slow
 def test_a_constant_is_neither_fitted_nor_blamed_nor_calibrated():
     model = motor(mass=Param(2.0, "kg"), gain=Param(3.0), drag=Param(0.3, "N s/m", 0.0, 2.0))
     found = fit(model, trials())
@@ -47,6 +48,7 @@ def test_a_constant_is_neither_fitted_nor_blamed_nor_calibrated():
         fit(constants, trials())
 
 
+@pytest.mark.slow
 def test_of_a_combination_the_surest_parameter_stays():
     """Only gain / mass and drag / mass are known."""
     model = motor(

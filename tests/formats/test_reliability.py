@@ -31,6 +31,7 @@ def test_what_is_recovered_of_a_truncated_trial_is_right() -> None:
     fine(reliability.recover_damaged(flips=False, stride=1 if FULL else 3))
 
 
+@pytest.mark.slow
 def test_what_is_recovered_of_a_flipped_trial_is_right() -> None:
     fine(reliability.recover_damaged(flips=True, stride=1 if FULL else 13))
 

@@ -197,6 +197,7 @@ def test_noise_in_both_brackets_the_scale():
     assert abs(lag.delay) < 5 * lag.std < 0.02
 
 
+@pytest.mark.slow
 def test_a_late_sensor_is_not_counted_against_the_effects():
     trials = arm(columns(w=lambda x: late(x, 1.0)), friction=0.5, steps=120)
     found = diagnose(ARM, trials)

@@ -140,6 +140,7 @@ def test_the_log_is_stored_as_data_on_the_control_grid(dart):
     assert again["known"] and again["sha256"] == told["sha256"]
 
 
+@pytest.mark.slow
 def test_fit_gives_intervals_and_errors_on_held_out_time_that_shrink(fitted):
     for name in ("steer", "trim", "tau_steer", "latency"):
         found = fitted["params"][name]
@@ -155,11 +156,13 @@ def test_fit_gives_intervals_and_errors_on_held_out_time_that_shrink(fitted):
     assert after["ahead"]["x"] < 0.15 and after["ahead"]["psi"] < 0.3
 
 
+@pytest.mark.slow
 def test_fit_says_so_in_words(dart, fitted):
     text = grounded("-C", dart[0], "fit", "--params", "gain,steer")
     assert text.code == 0 and holds(text.out, "95 %", "held-out")
 
 
+@pytest.mark.slow
 def test_a_circle_for_that_car_inside_its_limits(dart, fitted):
     folder = dart[0]
     done = grounded("-C", folder, "propose", "--json")

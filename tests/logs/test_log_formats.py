@@ -168,6 +168,7 @@ def test_tables_that_are_none(tmp_path, text, holds):
     assert all(part in str(error.value) for part in holds), error.value
 
 
+@pytest.mark.slow
 def test_a_million_zeros_in_a_small_file_are_refused(tmp_path):
     """Compressed files are bounded by what they expand to."""
     path = tmp_path / "bomb.npz"

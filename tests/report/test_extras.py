@@ -44,6 +44,7 @@ def test_a_picture_names_the_extra_that_it_needs(monkeypatch):
         png(Figure("utility", "Utility", "", ()))
 
 
+@pytest.mark.slow
 def test_the_demo_does_without_a_recording(tmp_path, monkeypatch):
     monkeypatch.setattr("grounded_cli.demo.find_spec", lambda name: None)
     done = grounded("demo", "pendulum", "--dir", tmp_path / "d", "--json")

@@ -123,6 +123,7 @@ def test_roles_become_colours_light_and_dark():
     assert coloured(trace, dark=True)["line"] == {"color": "#56b4e9"}
 
 
+@pytest.mark.slow
 @pytest.mark.extra("png")
 def test_pictures_are_drawn_in_their_colours(cart):
     from PIL import Image

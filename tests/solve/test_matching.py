@@ -54,6 +54,7 @@ def test_a_model_that_is_right_needs_no_shift(trial):
     assert np.abs(ground(still, run, match_inputs=True).shift).max() < 1e-6
 
 
+@pytest.mark.slow
 def test_one_trial_closes_most_of_the_gap_of_a_miscalibrated_car():
     shares = {True: [], False: []}
     for seed in range(4):

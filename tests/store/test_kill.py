@@ -85,6 +85,7 @@ def test_run_killed_leaves_nothing_that_is_taken_for_a_trial(tmp_path):
     assert grounded("-C", folder, "learn", "--trials", "1").code == 0
 
 
+@pytest.mark.slow
 def test_caches_reports_and_the_place_do_not_matter(tmp_path, undisturbed):
     """Reports deleted, compile cache gone or unwritable, folder moved: the same next candidate."""
     part = make(tmp_path / "w", config=NOISY).folder

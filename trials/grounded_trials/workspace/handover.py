@@ -27,7 +27,6 @@ from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.workspace.folder import Contents, Folder
 from grounded_trials.workspace.identity import candidate_of, sha256
-from grounded_trials.workspace.trial_check import commands
 
 AGREES = 1e-6  # of an input's size: how well a policy repeats its own predicted inputs
 
@@ -93,6 +92,8 @@ def intact(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]:
     Raises:
         GroundedError: if it is damaged, rewritten or renamed.
     """
+    from grounded_trials.workspace.trial_check import commands
+
     candidate, meta = candidate_of(data, identity)
     predicted, policy = candidate.predicted_inputs, candidate.policy
     with np.errstate(all="ignore"):
