@@ -70,7 +70,7 @@ def test_a_run_is_recognised_though_the_log_is_not_perfect(learnt, kind):
 
 @pytest.mark.parametrize("share", [0.01, 0.03])
 def test_a_run_on_states_of_varying_age_with_noise_of_its_own_is_recognised(learnt, share):
-    """The robot acted on other samples than the log has: older by 0 to 2 steps, noisy by a sensor."""
+    """The robot acted on other samples than the log has: up to 2 steps older, another noise."""
     rng = np.random.default_rng(2)
     for own, trial, _ in runs(learnt):
         clean, T = np.array(trial.states), trial.steps
