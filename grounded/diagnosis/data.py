@@ -26,7 +26,7 @@ from grounded.trial import Trial
 
 LONGEST_RUN = 200  # steps
 PIECES, SHORTEST_PIECE = 5, 50  # one log alone is held out by pieces; steps of a piece at least
-MOST_NUMBERS = 1.8e6  # of one (L, B, N, N) array: above it, the liveliest runs are used
+MOST_NUMBERS = 1.8e6  # of one (L, B, N, N) array: above it, evenly spaced runs are used
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +149,7 @@ def prepare(
     states = np.concatenate([trial.states[: T + 1] for trial, T in used])
     steps = np.concatenate([trial.inputs[:T] for trial, T in used])
     state_at, step_at, valid, trial_of = _cut(lengths)
-    keep = _liveliest(states[state_at], steps[step_at], step_at.shape[1] * model.n**2 * 4)
+    keep = _spread(len(step_at), step_at.shape[1] * model.n**2 * 4)
     return Data(
         model=model,
         dt=dt,
@@ -208,20 +208,10 @@ def _cut(lengths: Any) -> tuple[Any, Any, Array, Any]:
     return state_at, step_at, valid, np.array([i for i, *_ in pieces])
 
 
-def _liveliest(states: Array, inputs: Array, numbers: float) -> Any:
-    """Of many runs (B, ...) as many as may be used: from equal parts of the log, the liveliest.
-
-    A run tells as much as it moves: the sum over states and inputs of its variance, in their own.
-    """
-    count, most = len(states), max(1, int(MOST_NUMBERS / numbers))
-    if count <= most:
-        return np.arange(count)
-    lively = np.zeros(count)
-    for each in (np.diff(states, axis=1), inputs):
-        within = np.nan_to_num(np.nanvar(each, axis=1))
-        lively += np.sum(within / np.maximum(within.mean(axis=0), 1e-300), axis=-1)
-    parts = np.array_split(np.arange(count), most)
-    return np.array([part[np.argmax(lively[part])] for part in parts])
+def _spread(count: int, numbers: float) -> Any:
+    """Evenly spaced runs, as many as fit in memory."""
+    most = max(1, int(MOST_NUMBERS / numbers))
+    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(int))
 
 
 def _filled(states: Array) -> Array:
