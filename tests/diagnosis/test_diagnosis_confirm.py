@@ -97,6 +97,9 @@ class Said:
     def __init__(self, error):
         self.error = error
 
+    def beside(self, crude):
+        pass
+
     def gain(self, before, after):
         mean = np.log(self.error(causes(before)) / self.error(causes(after)))
         return Gain(mean, 0.02, mean)

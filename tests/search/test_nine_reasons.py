@@ -97,7 +97,7 @@ def test_an_unstable_loop_gets_gentler_gains(late_arm):
 def test_an_end_says_what_it_is(late_arm, monkeypatch):
     """Reason 5: 0.1 said "promises less than 0.1 %" where the grounded model diverges."""
     monkeypatch.setattr(making, "GENTLER_TIMES", 0)
-    monkeypatch.setattr(making, "slope_error", lambda *_: None)
+    monkeypatch.setattr(secants, "slope_error", lambda *_: None)
     standing = learn(late_arm.task, late_arm.run).standing
     assert standing.ending in ("model diverges", "every step loses", "no step improved")
     if standing.ending != "no step improved":

@@ -33,7 +33,7 @@ def test_every_model_of_the_package_has_an_entry_point():
         for name in modules
         if isinstance(getattr(importlib.import_module(f"{GROUP}.{name}"), "model", None), Model)
     }
-    assert with_model == {point.name for point in declared()} == {"aircraft", "car", "pendulum"}
+    assert with_model == {point.name for point in declared()} != set()
     assert all(isinstance(point.load(), Model) for point in declared())
 
 
