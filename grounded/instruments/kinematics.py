@@ -115,7 +115,8 @@ class Course:
     Args:
         agrees: 0 to 1, how well they point the same way but for a constant angle.
         offset: that angle [rad].
-        mirrored, degrees: how well they agree with the heading's sign changed, taken for degrees.
+        mirrored: how well they agree with the heading's sign changed.
+        degrees: how well they agree with the heading taken for degrees.
         speed: how the model's speed stands to the travelled one.
     """
 

@@ -37,7 +37,8 @@ class Lag:
         std: its standard deviation [s].
         filtered: b follows a through a first-order filter of the time constant `delay`.
         sign: 1 or -1.
-        low, high: brackets of the scale.
+        low: lower bracket of the scale.
+        high: upper bracket of the scale.
         coherence: 0 to 1, how much of both is the same.
     """
 
