@@ -116,16 +116,24 @@ class TrialIndex:
             if _proof(*row) == proof:
                 self._worth.setdefault(row[0], {})[row[1]] = float(row[2])
 
+    def __del__(self) -> None:
+        if file := getattr(self, "_file", None):
+            file.close()
+
     def _opened(self) -> sqlite3.Connection:
         """The file; where it can't be used, an empty one in memory."""
         for path in (self._path, self._path, ":memory:"):
             with suppress(sqlite3.Error, OSError):
                 file = sqlite3.connect(path, timeout=2.0)
-                if file.execute("PRAGMA user_version").fetchone()[0] == _VERSION:
-                    file.execute("SELECT 1 FROM trials, numbers, worth LIMIT 1")
+                try:
+                    if file.execute("PRAGMA user_version").fetchone()[0] == _VERSION:
+                        file.execute("SELECT 1 FROM trials, numbers, worth LIMIT 1")
+                    else:
+                        file.executescript(f"BEGIN;{_TABLES}PRAGMA user_version={_VERSION};COMMIT;")
                     return file
-                file.executescript(f"BEGIN;{_TABLES}PRAGMA user_version={_VERSION};COMMIT;")
-                return file
+                except sqlite3.Error:
+                    file.close()
+                    raise
             with suppress(OSError):  # damaged, or of another version
                 self._path.unlink(missing_ok=True)
         raise AssertionError("a database in memory can always be made")
