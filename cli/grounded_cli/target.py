@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from grounded.frozen import Array
     from grounded_trials import Workspace
 
-SHAPES = ("line", "circle", "figure-8", "step", "swing-up")
-
 
 @click.command("target")
 @click.argument("shape", metavar="SHAPE|FILE")
@@ -85,5 +83,6 @@ def _values(pairs: tuple[str, ...]) -> dict[str, float]:
 def _recorded(workspace: Workspace, file: str) -> dict[str, Array]:
     """A run of a log, or the columns of a CSV of states."""
     from grounded_trials.starting.begin import recorded_run
+    from grounded_trials.starting.shapes import SHAPES
 
     return recorded_run(workspace, file, SHAPES)

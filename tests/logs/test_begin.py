@@ -9,7 +9,7 @@ from rosbags.rosbag2 import StoragePlugin
 from cli import grounded
 from grounded.errors import GroundedError
 from grounded_trials import Workspace
-from grounded_trials.logs.inspect_evidence import rates_of
+from grounded_trials.logs.inspect_evidence import velocities
 from grounded_trials.starting.begin import begin
 from grounded_trials.starting.kinds import KINDS
 from grounded_trials.starting.shapes import Drive, path_target
@@ -124,7 +124,7 @@ def test_nothing_is_overwritten_and_nothing_half_made_is_left(tmp_path, mine):
 
 def test_rates_are_found_in_any_model(mine, tmp_path):
     begin(tmp_path / "w", arm_bag(tmp_path / "bag"), model=mine)
-    assert rates_of(Workspace(tmp_path / "w").base_model) == {"q1": "w1", "q2": "w2"}
+    assert velocities(Workspace(tmp_path / "w").base_model) == {"q1": "w1", "q2": "w2"}
 
 
 def test_the_real_car_of_a_laboratory(tmp_path):

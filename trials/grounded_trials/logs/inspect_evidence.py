@@ -24,6 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from grounded.errors import GroundedError
+from grounded.instruments.kinematics import integrals
 from grounded.model import Model
 from grounded_trials.formats.mcap_records import Channel, Messages, Schema
 from grounded_trials.formats.messages import Floats
@@ -41,14 +42,18 @@ UNITS = (  # what the end of a path measures, in ROS's conventions (REP 103)
     (r"linear\.[xyz]$|drive\.speed$", "m/s"),
 )
 JOINT_UNITS = {"position": "rad", "velocity": "rad/s", "effort": "N m"}
-SAME, DEGREE = 0.15, 180 / np.pi
+SAME, DEGREE, SLOPE = 0.15, 180 / np.pi, 0.01
 FOLLOWS = 0.8  # correlation of a rate with the derivative of its position
 BETTER = 0.9  # of the rival's error: less decides
 COMBINATIONS, SPAN, LONGEST = 64, 5, 20_000  # tried at most; samples a slope is taken over; grid
 
 
 def weigh(
-    log: LogReport, model: Model, states: Sequence[Guess], inputs: Sequence[Guess]
+    log: LogReport,
+    model: Model,
+    states: Sequence[Guess],
+    inputs: Sequence[Guess],
+    joints: Mapping[str, tuple[str, ...]] | None = None,
 ) -> tuple[tuple[Guess, ...], tuple[Guess, ...]]:
     """The guesses, with what the log's numbers say for and against them.
 
@@ -57,9 +62,10 @@ def weigh(
         model: whose states and inputs are sought.
         states: one guess for each state, in order; `inputs` likewise.
         inputs: see `states`.
+        joints: what `joint_names` says of the log, where it was asked already.
     """
     units = {**model.states, **model.inputs}
-    joints = joint_names(log)
+    joints = joint_names(log) if joints is None else joints
     guesses = {guess.name: guess for guess in (*states, *inputs)}
     guesses = {name: _joint(guess, units[name], joints) for name, guess in guesses.items()}
     guesses |= _in_order(guesses, units, joints, log)
@@ -67,7 +73,7 @@ def weigh(
     guesses |= _speed_asked(guesses, model, log)
     signals = _Signals(log, guesses.values())
     guesses |= _speed(guesses, model, signals)
-    for position, rate in rates_of(model).items():
+    for position, rate in velocities(model).items():
         if position in guesses and rate in guesses:
             guesses |= _derivative(guesses[position], guesses[rate], signals, units[rate])
     guesses |= _steps(model, guesses, signals)
@@ -316,18 +322,11 @@ def _speed(guesses: Mapping[str, Guess], model: Model, signals: _Signals) -> dic
     return {name: replace(guesses[name], path=path, others=rivals[:3], reasons=(why,))}
 
 
-def rates_of(model: Model) -> dict[str, str]:
-    """Which state's derivative is another state, whatever the inputs and parameters: {q: w}."""
-    rng, dt = np.random.default_rng(0), 1e-4
-    x, u = rng.normal(size=(4, model.n)), rng.normal(size=(4, model.m))
-    with np.errstate(all="ignore"):
-        change = (model.system.step(x, u, model.values, dt) - x) / dt
-    found = {}
-    for i, q in enumerate(model.state_names):
-        for j, w in enumerate(model.state_names):
-            if i != j and np.allclose(change[:, i], x[:, j], rtol=0.01, atol=0.05):
-                found[q] = w
-    return found
+def velocities(model: Model) -> dict[str, str]:
+    """Which state's rate is another state, as the model has it: {q: w}."""
+    names = model.state_names
+    own = [r for r in integrals(model) if r.exact and abs(r.c - 1) < SLOPE]
+    return {names[r.i]: names[r.j] for r in own}
 
 
 @dataclass(frozen=True)

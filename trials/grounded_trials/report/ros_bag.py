@@ -27,7 +27,7 @@ from grounded.errors import GroundedError, nearest
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded_trials.formats.bags import standard_types
-from grounded_trials.logs.inspect_evidence import rates_of
+from grounded_trials.logs.inspect_evidence import velocities
 from grounded_trials.report.scene import Scene, scene_of
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.exporting import Exported
@@ -102,7 +102,7 @@ class _Run:
         self.kinds = standard_types().types
         scene = scene_of(model)
         self.scene: Scene | None = scene if scene.spatial else None
-        self.joints = {q: w for q, w in rates_of(model).items() if model.states[q] == "rad"}
+        self.joints = {q: w for q, w in velocities(model).items() if model.states[q] == "rad"}
 
     def messages(self, states: Array, inputs: Array, target: Array | None) -> Iterator[Message]:
         """All of them; a state that is not finite is left out."""

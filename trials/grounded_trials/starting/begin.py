@@ -19,7 +19,7 @@ from grounded.errors import GroundedError, NextCommand, nearest
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.result import Result
-from grounded_trials.logs.inspect_evidence import weigh
+from grounded_trials.logs.inspect_evidence import joint_names, weigh
 from grounded_trials.logs.inspect_guess import Guess, guess_mapping, is_simulated, mapping_toml
 from grounded_trials.logs.inspect_log import LogReport, inspect_log
 from grounded_trials.logs.log_files import kind_of, log_files
@@ -141,11 +141,12 @@ def _begin(
     if report.damage:
         raise GroundedError(report.damage, NextCommand("recover", (str(log),)))
     report, notes = _one_run(report)
-    chosen, why = (kind, "as you said") if kind else kind_in(report)
-    text = Path(model).read_text("utf-8") if model else skeleton(chosen, report).source()
+    joints = joint_names(report)
+    chosen, why = (kind, "as you said") if kind else kind_in(report, joints)
+    text = Path(model).read_text("utf-8") if model else skeleton(chosen, report, joints).source()
     found = _model_in(folder, text)
     states, inputs = guess_mapping(report, found.state_names, found.input_names)
-    states, inputs = weigh(report, found, states, inputs)
+    states, inputs = weigh(report, found, states, inputs, joints)
     if chosen == "generic" and not model:
         states, inputs = (
             tuple(_only_named(g, of) for g in s) for s, of in ((states, "state"), (inputs, "input"))

@@ -10,9 +10,9 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from grounded_trials.logs.inspect_evidence import joint_names
 from grounded_trials.logs.inspect_log import LogReport, TopicReport
 
+Joints = Mapping[str, tuple[str, ...]]  # of each topic, see `joint_names`
 MOST = 6  # states of a generic model
 COMMANDED = re.compile(
     "cmd|command|desired|setpoint|target|input|throttle|torque|tau|effort|volt|pwm|duty|motor|steer"
@@ -225,9 +225,8 @@ def _word(path: str) -> str:
 KINDS = ("car", "rover", "drone", "arm", "pendulum", "generic")
 
 
-def kind_in(log: LogReport) -> tuple[str, str]:
+def kind_in(log: LogReport, joints: Joints) -> tuple[str, str]:
     """The kind of robot that a log was probably recorded on, and what says so."""
-    joints = joint_names(log)
     steered = next((t.topic for t in log.topics if "Ackermann" in t.type), None)
     if steered is not None:
         return "car", f"{steered} holds Ackermann commands"
@@ -267,10 +266,9 @@ def _says(topic: TopicReport, words: Sequence[str]) -> bool:
     return any(word in everything for word in words)
 
 
-def skeleton(kind: str, log: LogReport) -> Skeleton:
+def skeleton(kind: str, log: LogReport, joints: Joints) -> Skeleton:
     """The skeleton of a kind, named after what is in the log."""
     if kind == "arm":
-        joints = joint_names(log)
         return arm(next(iter(joints.values())) if joints else ("joint1", "joint2"))
     ackermann = any("Ackermann" in topic.type for topic in log.topics)
     if kind == "car" and not ackermann and any(_says(t, ("throttle",)) for t in log.topics):
