@@ -221,7 +221,7 @@ class Workspace(Folder):
             columns: what each state is to do, (H + 1,) each, a row a control step; see `starting`.
         """
         from grounded_trials.workspace.config import set_target
-        from grounded_trials.workspace.task_file import write_target
+        from grounded_trials.workspace.task_file import equal_weights, write_target
 
         here = self._afresh()
         name = here.config.task.target or "target.csv"
@@ -229,8 +229,7 @@ class Workspace(Folder):
         if path.is_file():
             path.replace(path.with_name(path.name + ".bak"))
         write_target(path, here.config.task.dt, dict(columns))
-        ranges = {state: float(values.max() - values.min()) for state, values in columns.items()}
-        weights = {state: round(max(size, 0.1) ** -2, 6) for state, size in ranges.items()}
+        weights = {state: round(w, 6) for state, w in equal_weights(columns).items()}
         steps = len(next(iter(columns.values()))) - 1
         set_target(here.config.file, name, steps, weights)
         self.forget()

@@ -27,11 +27,13 @@ from grounded_trials.logs.log_table import LogMapping, log_mapping, read_log
 from grounded_trials.starting.kinds import KINDS, kind_in, skeleton
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.config import FILE
+from grounded_trials.workspace.examples import fresh_folder, refuse_existing
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.model_file import load_module
-from grounded_trials.workspace.task_file import write_target
+from grounded_trials.workspace.model_file import load_module, model_in
+from grounded_trials.workspace.task_file import equal_weights, write_target
 
 STEPS = (0.001, 0.002, 0.0025, 0.004, 0.005, 0.008, 0.01, 0.02, 0.025, 0.04, 0.05, 0.1, 0.2, 0.5)
+WRITTEN = (FILE, "model.py", "target.csv")
 HORIZON = 200  # steps of a target that is a recorded run, at most
 Ask = Callable[[Guess], str]
 
@@ -120,7 +122,7 @@ def begin(
     try:
         return _begin(folder, log, model, kind, dt, ask)
     except BaseException:
-        written = [folder] if new else [folder / name for name in (FILE, "model.py", "target.csv")]
+        written = [folder] if new else [folder / name for name in WRITTEN]
         for path in written:
             shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
         raise
@@ -192,11 +194,7 @@ def _one_run(report: LogReport) -> tuple[LogReport, tuple[str, ...]]:
 
 
 def _check(folder: Path, model: str | Path | None, kind: str | None) -> None:
-    for file in (FILE, "model.py", "target.csv"):
-        if (folder / file).exists():
-            raise GroundedError(
-                f"{folder / file} exists already: name another folder, or remove it first"
-            )
+    refuse_existing(folder, WRITTEN)
     if kind is not None and kind not in KINDS:
         raise GroundedError(f"there is no kind '{kind}': {nearest(kind, KINDS)}")
     if model is not None and not Path(model).is_file():
@@ -205,16 +203,9 @@ def _check(folder: Path, model: str | Path | None, kind: str | None) -> None:
 
 def _model_in(folder: Path, text: str) -> Model:
     """Writes model.py and loads it."""
-    try:
-        for part in ("trials", "candidates"):
-            (folder / part).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise GroundedError(f"{folder} can't be made: {error.strerror}") from None
+    fresh_folder(folder, WRITTEN)
     write_atomically(folder / "model.py", text.encode())
-    found = getattr(load_module(folder, "model.py"), "model", None)
-    if not isinstance(found, Model):
-        raise GroundedError("model.py has no `model = grounded.Model(...)`")
-    return found
+    return model_in(load_module(folder, "model.py"))
 
 
 def _only_named(guess: Guess, of: str) -> Guess:
@@ -334,7 +325,7 @@ def _write(
     why: str,
 ) -> None:
     write_target(folder / "target.csv", dt, dict(columns))
-    weights = {name: 1.0 / max(float(np.ptp(values)), 0.1) ** 2 for name, values in columns.items()}
+    weights = equal_weights(columns)
     limits = [
         f"{name} = [{found[0]:.6g}, {found[1]:.6g}]"
         for name in model.input_names

@@ -128,7 +128,7 @@ def write_example(folder: Path, name: str) -> None:
     import importlib
 
     chosen = example(name)
-    _refuse(folder, [FILE])
+    refuse_existing(folder, [FILE])
     task, module = chosen.task(), importlib.import_module(chosen.model)
     columns = {
         state: task.target[:, i]
@@ -137,13 +137,20 @@ def write_example(folder: Path, name: str) -> None:
     }
     files = {"target.csv": target_text(task.dt, columns), "model.py": _source(module)}
     files |= {"real.py": chosen.real, FILE: toml_of(task, name)}
-    _refuse(folder, [file for file, text in files.items() if not _holds(folder / file, text)])
+    refuse_existing(
+        folder, [file for file, text in files.items() if not _holds(folder / file, text)]
+    )
     fresh_folder(folder, ())
     for file, text in files.items():
         write_atomically(folder / file, text.encode())
 
 
-def _refuse(folder: Path, names: Iterable[str]) -> None:
+def refuse_existing(folder: Path, names: Iterable[str]) -> None:
+    """Refuses to write where a file is.
+
+    Raises:
+        GroundedError: naming the first that exists.
+    """
     for path in (folder / name for name in names):
         if path.exists():
             raise GroundedError(f"{path} exists already: name another folder, or remove it first")
@@ -159,7 +166,7 @@ def fresh_folder(folder: Path, files: Iterable[str]) -> None:
     Raises:
         GroundedError: if one does, or the folder can't be made.
     """
-    _refuse(folder, files)
+    refuse_existing(folder, files)
     try:
         for made in (folder, folder / "trials", folder / "candidates"):
             made.mkdir(parents=True, exist_ok=True)

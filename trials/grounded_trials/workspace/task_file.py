@@ -6,6 +6,7 @@ target.csv says what the states are to do, a row a control step; a state without
 from __future__ import annotations
 
 import csv
+from collections.abc import Mapping
 from io import TextIOWrapper
 from pathlib import Path
 
@@ -196,6 +197,11 @@ def target_arrays(
         return target, None
     columns = [given.get(name, np.zeros(horizon + 1))[:horizon] for name in inputs]
     return target, np.stack(columns, axis=1)
+
+
+def equal_weights(columns: Mapping[str, Array]) -> dict[str, float]:
+    """Weights by which an error as large as a column's range, at least 0.1, costs 1."""
+    return {name: max(float(np.ptp(v)), 0.1) ** -2 for name, v in columns.items()}
 
 
 def write_target(path: Path, dt: float, columns: dict[str, Array]) -> None:
