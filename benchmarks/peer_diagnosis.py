@@ -30,9 +30,9 @@ from pathlib import Path
 import numpy as np
 
 from grounded.challenge import make, task_of
-from grounded.diagnosis.data import prepare
 from grounded.diagnosis.diagnose import diagnose
-from grounded.diagnosis.hypothesis import Hypothesis, Predictor
+from grounded.diagnosis.likelihood.data import prepare
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis, Predictor
 from grounded.effects import Library
 from grounded.fit import fit
 

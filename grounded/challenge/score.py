@@ -20,13 +20,13 @@ from typing import Any
 import numpy as np
 
 from grounded.challenge.cases import Case, Kind, make
-from grounded.diagnosis.data import prepare
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
-from grounded.diagnosis.held_out import held_out_errors
-from grounded.diagnosis.hypothesis import Hypothesis
-from grounded.diagnosis.prediction_error import horizon, normalised
-from grounded.diagnosis.ruler import Ruler
-from grounded.diagnosis.search import HypothesisSearch
+from grounded.diagnosis.hypotheses.search import HypothesisSearch
+from grounded.diagnosis.likelihood.data import prepare
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.validation.held_out import held_out_errors
+from grounded.diagnosis.validation.prediction_error import horizon, normalised
+from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Library
 from grounded.frozen import Array
 from grounded.model import Model

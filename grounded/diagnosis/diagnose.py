@@ -24,20 +24,14 @@ from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis.agreement import by_trial, changed
-from grounded.diagnosis.attribution import attribute, so_far
-from grounded.diagnosis.claims import Claims
-from grounded.diagnosis.correction import correction
-from grounded.diagnosis.data import prepare
-from grounded.diagnosis.decide import Decision, decide
-from grounded.diagnosis.delays import delays_of
-from grounded.diagnosis.fitted import Fitted
-from grounded.diagnosis.held_out import shrinkage, utility_prediction
-from grounded.diagnosis.hypothesis import Hypothesis, Predictor, param_scale
-from grounded.diagnosis.leftover import whiteness
-from grounded.diagnosis.limits import Limits, held, identifiable, knowable, limits
-from grounded.diagnosis.measured import Measured, root_mean_square
-from grounded.diagnosis.prediction_error import by_region, by_time, explained, horizon
+from grounded.diagnosis.hypotheses.attribution import attribute, so_far
+from grounded.diagnosis.hypotheses.correction import correction
+from grounded.diagnosis.hypotheses.leftover import whiteness
+from grounded.diagnosis.hypotheses.search import HypothesisSearch
+from grounded.diagnosis.likelihood.data import prepare
+from grounded.diagnosis.likelihood.delays import delays_of
+from grounded.diagnosis.likelihood.fitted import Fitted
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis, Predictor, param_scale
 from grounded.diagnosis.report import (
     Change,
     ChannelShare,
@@ -48,8 +42,14 @@ from grounded.diagnosis.report import (
     UtilityPrediction,
     Where,
 )
-from grounded.diagnosis.ruler import Ruler
-from grounded.diagnosis.search import HypothesisSearch
+from grounded.diagnosis.validation.agreement import by_trial, changed
+from grounded.diagnosis.validation.claims import Claims
+from grounded.diagnosis.validation.decide import Decision, decide
+from grounded.diagnosis.validation.held_out import shrinkage, utility_prediction
+from grounded.diagnosis.validation.limits import Limits, held, identifiable, knowable, limits
+from grounded.diagnosis.validation.measured import Measured, root_mean_square
+from grounded.diagnosis.validation.prediction_error import by_region, by_time, explained, horizon
+from grounded.diagnosis.validation.ruler import Ruler
 from grounded.diagnosis.verdict import next_trial, verdict
 from grounded.effects import Library
 from grounded.instruments.preflight import preflight

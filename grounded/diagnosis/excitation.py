@@ -23,11 +23,11 @@ from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis.data import prepare, shifted
-from grounded.diagnosis.fitted import calibrated
-from grounded.diagnosis.hypothesis import Hypothesis, Predictor, param_scale
-from grounded.diagnosis.noise import NoiseModel, Structure
-from grounded.diagnosis.refine import refine
+from grounded.diagnosis.likelihood.data import prepare, shifted
+from grounded.diagnosis.likelihood.fitted import calibrated
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis, Predictor, param_scale
+from grounded.diagnosis.likelihood.noise import NoiseModel, Structure
+from grounded.diagnosis.likelihood.refine import refine
 from grounded.diagnosis.report import Diagnosis
 from grounded.effects import Library, Scales, memory_start, scales_of, wrap, wrapping_order
 from grounded.frozen import Array

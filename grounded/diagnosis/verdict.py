@@ -6,8 +6,7 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 
-from grounded.diagnosis.claims import Claims
-from grounded.diagnosis.leftover import Leftover
+from grounded.diagnosis.hypotheses.leftover import Leftover
 from grounded.diagnosis.report import (
     Credit,
     Estimate,
@@ -19,6 +18,7 @@ from grounded.diagnosis.report import (
     number,
     quantity,
 )
+from grounded.diagnosis.validation.claims import Claims
 from grounded.effects import Effect, ParamFamily, places
 from grounded.model import Model
 

@@ -3,7 +3,8 @@
     s' = model + sum_k w_k g_k(r) / sum_k g_k(r)   (s<-r)
 
 with bells g_k at KNOTS places from lo to hi, flat beyond them. A diagnosis fits it to what no
-effect explains (`grounded.diagnosis.correction`); adopted, it is part of the model like any effect.
+effect explains (`grounded.diagnosis.hypotheses.correction`); adopted, it is part of the model
+like any effect.
 """
 
 from __future__ import annotations

@@ -6,5 +6,5 @@
 
 Nothing here knows a model or a trial: a linear system goes in, arrays come out. Who linearises,
 and about what, is the caller's: `grounded.estimate.extended` (the extended Kalman filter),
-`grounded.diagnosis.linearise` (a hypothesis along its own track).
+`grounded.diagnosis.likelihood.linearise` (a hypothesis along its own track).
 """

@@ -9,13 +9,13 @@ import pytest
 
 from grounded import GroundedError, Model, Param, Trial
 from grounded.challenge import judge, make, oracle, sealed, summary
-from grounded.diagnosis.claims import loss
-from grounded.diagnosis.data import prepare, shifted
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.excitation import probe
-from grounded.diagnosis.leftover import whiteness
-from grounded.diagnosis.prediction_error import _stump
+from grounded.diagnosis.hypotheses.leftover import whiteness
+from grounded.diagnosis.likelihood.data import prepare, shifted
 from grounded.diagnosis.report import Credit, Estimate, Ranked, Remainder, RulerRow
+from grounded.diagnosis.validation.claims import loss
+from grounded.diagnosis.validation.prediction_error import _stump
 from grounded.diagnosis.verdict import meaning, sentence, verdict
 from grounded.effects import Library
 from grounded.filter import kalman

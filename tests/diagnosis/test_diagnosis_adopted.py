@@ -10,10 +10,10 @@ from test_diagnosis import DT, cart
 
 from cli import grounded
 from grounded import Trial
-from grounded.diagnosis.data import prepare
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
-from grounded.diagnosis.limits import limits
-from grounded.diagnosis.search import HypothesisSearch
+from grounded.diagnosis.hypotheses.search import HypothesisSearch
+from grounded.diagnosis.likelihood.data import prepare
+from grounded.diagnosis.validation.limits import limits
 from grounded.effects import Library, memory_of, wrap
 from grounded.errors import NextCommand
 from grounded_trials.store.documents import write_document

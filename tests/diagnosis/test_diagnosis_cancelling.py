@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from grounded import Trial
-from grounded.diagnosis.data import prepare
-from grounded.diagnosis.hypotheses import FittedHypotheses
-from grounded.diagnosis.hypothesis import Hypothesis
+from grounded.diagnosis.hypotheses.explored import FittedHypotheses
+from grounded.diagnosis.likelihood.data import prepare
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.effects import Library
 from grounded.models.car import model as car
 

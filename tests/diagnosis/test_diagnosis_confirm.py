@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from grounded import Model, Param, Trial
-from grounded.diagnosis.attribution import attribute
-from grounded.diagnosis.data import prepare
-from grounded.diagnosis.decide import causes, decide, shares
 from grounded.diagnosis.diagnose import diagnose
-from grounded.diagnosis.ruler import Gain, Ruler, folds
+from grounded.diagnosis.hypotheses.attribution import attribute
+from grounded.diagnosis.likelihood.data import prepare
+from grounded.diagnosis.validation.decide import causes, decide, shares
+from grounded.diagnosis.validation.ruler import Gain, Ruler, folds
 from grounded.effects import Library
 
 DT = 0.02

@@ -9,11 +9,11 @@ from test_diagnosis import DT, cart
 from test_diagnosis_split import task_of
 
 from grounded import Trial
-from grounded.diagnosis import data as diagnosis_data
-from grounded.diagnosis.data import prepare
-from grounded.diagnosis.held_out import utility_prediction
-from grounded.diagnosis.hypothesis import Hypothesis, Predictor
-from grounded.diagnosis.ruler import Ruler, folds, repeated
+from grounded.diagnosis.likelihood import data as diagnosis_data
+from grounded.diagnosis.likelihood.data import prepare
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis, Predictor
+from grounded.diagnosis.validation.held_out import utility_prediction
+from grounded.diagnosis.validation.ruler import Ruler, folds, repeated
 
 STEPS = 450  # three runs of 150 steps
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from grounded.challenge.cases import make
-from grounded.diagnosis.data import prepare
-from grounded.diagnosis.hypotheses import price
-from grounded.diagnosis.hypothesis import Hypothesis, Predictor
-from grounded.diagnosis.linearise import sensitivities, step_jacobian
-from grounded.diagnosis.search import HypothesisSearch
+from grounded.diagnosis.hypotheses.explored import price
+from grounded.diagnosis.hypotheses.search import HypothesisSearch
+from grounded.diagnosis.likelihood.data import prepare
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis, Predictor
+from grounded.diagnosis.likelihood.linearise import sensitivities, step_jacobian
 from grounded.effects import Library
 
 

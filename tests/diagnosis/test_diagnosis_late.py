@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from grounded.diagnosis.data import prepare
-from grounded.diagnosis.delays import delays_of
-from grounded.diagnosis.held_out import held_out_errors
-from grounded.diagnosis.hypothesis import Hypothesis
-from grounded.diagnosis.noise import NoiseModel, Structure
-from grounded.diagnosis.prediction_error import horizon, normalised
-from grounded.diagnosis.search import HypothesisSearch
+from grounded.diagnosis.hypotheses.search import HypothesisSearch
+from grounded.diagnosis.likelihood.data import prepare
+from grounded.diagnosis.likelihood.delays import delays_of
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.likelihood.noise import NoiseModel, Structure
+from grounded.diagnosis.validation.held_out import held_out_errors
+from grounded.diagnosis.validation.prediction_error import horizon, normalised
 from grounded.effects import Library
 from grounded.filter import kernels
 from grounded.filter.augmented import Delayed, coloured

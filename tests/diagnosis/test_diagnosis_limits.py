@@ -7,10 +7,10 @@ import pytest
 from test_diagnosis_unmeasured import swings
 
 from grounded import GroundedError, Model, Param, Trial
-from grounded.diagnosis.data import prepare
 from grounded.diagnosis.diagnose import diagnose
-from grounded.diagnosis.limits import knowable, still_states
-from grounded.diagnosis.search import HypothesisSearch
+from grounded.diagnosis.hypotheses.search import HypothesisSearch
+from grounded.diagnosis.likelihood.data import prepare
+from grounded.diagnosis.validation.limits import knowable, still_states
 from grounded.effects import Library
 from grounded.models.pendulum import model as pendulum
 

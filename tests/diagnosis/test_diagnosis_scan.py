@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from grounded import Model, Param
-from grounded.diagnosis.data import prepare
-from grounded.diagnosis.scan import elsewhere, faint
-from grounded.diagnosis.search import HypothesisSearch
+from grounded.diagnosis.hypotheses.scan import elsewhere, faint
+from grounded.diagnosis.hypotheses.search import HypothesisSearch
+from grounded.diagnosis.likelihood.data import prepare
 from grounded.effects import Library
 from grounded.models.car import model as car
 from grounded.models.pendulum import model as pendulum

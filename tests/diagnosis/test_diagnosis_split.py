@@ -7,7 +7,7 @@ import pytest
 from test_diagnosis import DT, cart
 
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
-from grounded.diagnosis.split import shares
+from grounded.diagnosis.validation.split import shares
 from grounded.effects import Library
 from grounded.task import Task
 from grounded.utility import Reward

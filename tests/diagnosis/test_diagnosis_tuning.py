@@ -5,10 +5,10 @@ import pytest
 from test_diagnosis import cart
 
 from grounded import Trial
-from grounded.diagnosis.attribution import attribute
-from grounded.diagnosis.data import prepare
 from grounded.diagnosis.diagnose import diagnose
-from grounded.diagnosis.hypotheses import price
+from grounded.diagnosis.hypotheses.attribution import attribute
+from grounded.diagnosis.hypotheses.explored import price
+from grounded.diagnosis.likelihood.data import prepare
 from grounded.effects import Library
 
 DT, FRICTION, WIDTH = 0.05, 0.4, 0.15

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from grounded import Trial
-from grounded.diagnosis.data import prepare
 from grounded.diagnosis.diagnose import diagnose
-from grounded.diagnosis.linearise import prior, smoothed
-from grounded.diagnosis.search import HypothesisSearch
+from grounded.diagnosis.hypotheses.search import HypothesisSearch
+from grounded.diagnosis.likelihood.data import prepare
+from grounded.diagnosis.likelihood.linearise import prior, smoothed
 from grounded.filter import kalman
 from grounded.models.pendulum import model as pendulum
 

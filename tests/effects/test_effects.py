@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from grounded import GroundedError, Model, Param, Trial
-from grounded.diagnosis.data import prepare
-from grounded.diagnosis.hypothesis import Hypothesis, Predictor
+from grounded.diagnosis.likelihood.data import prepare
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis, Predictor
 from grounded.effects import (
     InputFamily,
     Library,

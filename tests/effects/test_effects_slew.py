@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from grounded import Model, Param, Trial
-from grounded.diagnosis.data import prepare
-from grounded.diagnosis.hypothesis import Hypothesis, Predictor
-from grounded.diagnosis.linearise import linearise
+from grounded.diagnosis.likelihood.data import prepare
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis, Predictor
+from grounded.diagnosis.likelihood.linearise import linearise
 from grounded.effects import Library, wrap
 from grounded.models.aircraft import model as aircraft
 from grounded.models.car import model as car

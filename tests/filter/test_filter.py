@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from grounded.diagnosis.noise import (
+from grounded.diagnosis.likelihood.noise import (
     NoiseModel,
     Structure,
     average,

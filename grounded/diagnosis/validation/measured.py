@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis.decide import Decision, ordered, plain, shares
-from grounded.diagnosis.fitted import Fitted
-from grounded.diagnosis.leftover import Leftover, leftovers
-from grounded.diagnosis.prediction_error import by_region, horizon
+from grounded.diagnosis.hypotheses.leftover import Leftover, leftovers
+from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.report import Credit, Remainder, RulerRow, RunChange, Split
-from grounded.diagnosis.ruler import Errors, Ruler, repeated
-from grounded.diagnosis.split import split
+from grounded.diagnosis.validation.decide import Decision, ordered, plain, shares
+from grounded.diagnosis.validation.prediction_error import by_region, horizon
+from grounded.diagnosis.validation.ruler import Errors, Ruler, repeated
+from grounded.diagnosis.validation.split import split
 from grounded.frozen import Array
 from grounded.trial import Trial
 

@@ -20,9 +20,9 @@ from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis.data import Data
-from grounded.diagnosis.hypothesis import Hypothesis
-from grounded.diagnosis.noise import NoiseModel
+from grounded.diagnosis.likelihood.data import Data
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.likelihood.noise import NoiseModel
 from grounded.effects import SensorDelayFamily
 from grounded.filter.augmented import Delayed
 from grounded.filter.kalman import Adjoint

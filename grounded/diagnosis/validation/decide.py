@@ -20,11 +20,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from grounded.diagnosis.fitted import Fitted
-from grounded.diagnosis.hypotheses import CLAIM
-from grounded.diagnosis.noise import Structure
-from grounded.diagnosis.ruler import Ruler
-from grounded.diagnosis.search import TO_THE_TOP, HypothesisSearch
+from grounded.diagnosis.hypotheses.explored import CLAIM
+from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch
+from grounded.diagnosis.likelihood.fitted import Fitted
+from grounded.diagnosis.likelihood.noise import Structure
+from grounded.diagnosis.validation.ruler import Ruler
 
 CALIBRATION = "calibration"
 RIVALS = 8  # likeliest hypotheses that are measured

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis.data import Data
-from grounded.diagnosis.hypothesis import Hypothesis, param_scale
-from grounded.diagnosis.noise import NoiseModel
+from grounded.diagnosis.likelihood.data import Data
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
+from grounded.diagnosis.likelihood.noise import NoiseModel
 from grounded.frozen import Array
 
 

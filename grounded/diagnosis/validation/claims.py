@@ -19,17 +19,17 @@ from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis.data import Data
-from grounded.diagnosis.decide import Decision, ordered
-from grounded.diagnosis.fitted import Fitted, calibrated, standard_deviations
-from grounded.diagnosis.held_out import gaps_of, held_out_errors
-from grounded.diagnosis.hypotheses import TIE, parametric
-from grounded.diagnosis.hypothesis import param_scale
-from grounded.diagnosis.limits import Limits
-from grounded.diagnosis.lookalike import lookalikes, of_parameters
-from grounded.diagnosis.prediction_error import normalised
+from grounded.diagnosis.hypotheses.explored import TIE, parametric
+from grounded.diagnosis.hypotheses.lookalike import lookalikes, of_parameters
+from grounded.diagnosis.likelihood.data import Data
+from grounded.diagnosis.likelihood.fitted import Fitted, calibrated, standard_deviations
+from grounded.diagnosis.likelihood.hypothesis import param_scale
 from grounded.diagnosis.report import Estimate, Likeness, Ranked
-from grounded.diagnosis.ruler import folds
+from grounded.diagnosis.validation.decide import Decision, ordered
+from grounded.diagnosis.validation.held_out import gaps_of, held_out_errors
+from grounded.diagnosis.validation.limits import Limits
+from grounded.diagnosis.validation.prediction_error import normalised
+from grounded.diagnosis.validation.ruler import folds
 from grounded.frozen import Array
 
 ENOUGH = 3.0  # nats that the parameters that are not named may still hold

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from grounded.compile import Named
-from grounded.diagnosis.data import Data, shifted
+from grounded.diagnosis.likelihood.data import Data, shifted
 from grounded.effects import (
     Effect,
     InputFamily,

@@ -11,13 +11,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from grounded.diagnosis.data import Data
-from grounded.diagnosis.fitted import Fitted
-from grounded.diagnosis.hypotheses import FittedHypotheses, parametric
-from grounded.diagnosis.hypothesis import Hypothesis, Predictor, param_scale
-from grounded.diagnosis.noise import NoiseModel, Structure, noise_guess
-from grounded.diagnosis.refine import refine
-from grounded.diagnosis.scan import Look, scan_candidates
+from grounded.diagnosis.hypotheses.explored import FittedHypotheses, parametric
+from grounded.diagnosis.hypotheses.scan import Look, scan_candidates
+from grounded.diagnosis.likelihood.data import Data
+from grounded.diagnosis.likelihood.fitted import Fitted
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis, Predictor, param_scale
+from grounded.diagnosis.likelihood.noise import NoiseModel, Structure, noise_guess
+from grounded.diagnosis.likelihood.refine import refine
 from grounded.effects import Effect, ParamFamily
 from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import Array

@@ -12,13 +12,19 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from grounded.diagnosis.data import Data
-from grounded.diagnosis.fitted import Fitted
-from grounded.diagnosis.hypotheses import CLAIM
-from grounded.diagnosis.noise import Structure
-from grounded.diagnosis.refine import clean
-from grounded.diagnosis.ruler import Ruler
-from grounded.diagnosis.search import LARGE, SHORTLIST, TO_THE_TOP, HypothesisSearch, tune
+from grounded.diagnosis.hypotheses.explored import CLAIM
+from grounded.diagnosis.hypotheses.search import (
+    LARGE,
+    SHORTLIST,
+    TO_THE_TOP,
+    HypothesisSearch,
+    tune,
+)
+from grounded.diagnosis.likelihood.data import Data
+from grounded.diagnosis.likelihood.fitted import Fitted
+from grounded.diagnosis.likelihood.noise import Structure
+from grounded.diagnosis.likelihood.refine import clean
+from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Effect
 from grounded.progress import interruptible
 

@@ -32,11 +32,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from grounded.diagnosis.data import Data
-from grounded.diagnosis.delays import delays_of
-from grounded.diagnosis.fitted import Fitted, calibrated
-from grounded.diagnosis.hypothesis import Hypothesis, Predictor, limits_of, param_scale, rates_of
-from grounded.diagnosis.noise import NoiseModel
+from grounded.diagnosis.likelihood.data import Data
+from grounded.diagnosis.likelihood.delays import delays_of
+from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
+from grounded.diagnosis.likelihood.hypothesis import (
+    Hypothesis,
+    Predictor,
+    limits_of,
+    param_scale,
+    rates_of,
+)
+from grounded.diagnosis.likelihood.noise import NoiseModel
 from grounded.effects import ParamFamily
 from grounded.filter import kalman
 from grounded.filter.augmented import Delayed, coloured

@@ -18,13 +18,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from grounded.diagnosis.delays import delays_of
-from grounded.diagnosis.fitted import Fitted
-from grounded.diagnosis.hypothesis import Hypothesis, Predictor
-from grounded.diagnosis.leftover import filter_of
-from grounded.diagnosis.linearise import base_columns
+from grounded.diagnosis.hypotheses.leftover import filter_of
+from grounded.diagnosis.hypotheses.scan import scan_candidates
+from grounded.diagnosis.likelihood.delays import delays_of
+from grounded.diagnosis.likelihood.fitted import Fitted
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis, Predictor
+from grounded.diagnosis.likelihood.linearise import base_columns
 from grounded.diagnosis.report import Likeness
-from grounded.diagnosis.scan import scan_candidates
 from grounded.effects import Effect, ParamFamily
 from grounded.filter import kalman
 

@@ -24,10 +24,10 @@ from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis.data import Data
-from grounded.diagnosis.delays import delays_of
-from grounded.diagnosis.fitted import Fitted, leave_one_out, moved
-from grounded.diagnosis.hypothesis import Hypothesis, Predictor
+from grounded.diagnosis.likelihood.data import Data
+from grounded.diagnosis.likelihood.delays import delays_of
+from grounded.diagnosis.likelihood.fitted import Fitted, leave_one_out, moved
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis, Predictor
 from grounded.frozen import Array
 from grounded.trial import Trial
 

@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from grounded.diagnosis.data import PIECES, Data
-from grounded.diagnosis.fitted import Fitted, calibrated
-from grounded.diagnosis.hypothesis import Predictor
-from grounded.diagnosis.leftover import filter_of
-from grounded.diagnosis.linearise import base_columns
+from grounded.diagnosis.hypotheses.leftover import filter_of
+from grounded.diagnosis.likelihood.data import PIECES, Data
+from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
+from grounded.diagnosis.likelihood.hypothesis import Predictor
+from grounded.diagnosis.likelihood.linearise import base_columns
 from grounded.diagnosis.report import Identifiable
 from grounded.effects import (
     Effect,

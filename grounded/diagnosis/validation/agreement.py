@@ -22,11 +22,11 @@ from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis.data import Data
-from grounded.diagnosis.fitted import Fitted, calibrated
-from grounded.diagnosis.hypothesis import param_scale
+from grounded.diagnosis.hypotheses.search import HypothesisSearch
+from grounded.diagnosis.likelihood.data import Data
+from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
+from grounded.diagnosis.likelihood.hypothesis import param_scale
 from grounded.diagnosis.report import Agreement, Changed, Estimate, TrialValue
-from grounded.diagnosis.search import HypothesisSearch
 from grounded.frozen import Array
 
 CHANCE = 1e-3  # of all trials sharing a value: below it they don't

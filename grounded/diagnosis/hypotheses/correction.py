@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis.fitted import Fitted
-from grounded.diagnosis.hypothesis import Hypothesis, Predictor
-from grounded.diagnosis.leftover import CLAIM, Leftover, held_out_columns
-from grounded.diagnosis.prediction_error import Horizon, errors
+from grounded.diagnosis.hypotheses.leftover import CLAIM, Leftover, held_out_columns
+from grounded.diagnosis.likelihood.fitted import Fitted
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis, Predictor
 from grounded.diagnosis.report import Correction, Curve
+from grounded.diagnosis.validation.prediction_error import Horizon, errors
 from grounded.effects import Library
 from grounded.effects.correction import KNOTS, bells
 from grounded.effects.family import per

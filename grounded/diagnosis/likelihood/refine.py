@@ -21,12 +21,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from grounded.diagnosis.data import Data
-from grounded.diagnosis.delays import Delays, delays_of
-from grounded.diagnosis.fitted import Fitted, calibrated, moved, shift_precision
-from grounded.diagnosis.hypothesis import Hypothesis, Predictor, param_scale
-from grounded.diagnosis.linearise import filter_system, gains_of, linearise, smoothed, step_sizes
-from grounded.diagnosis.noise import (
+from grounded.diagnosis.likelihood.data import Data
+from grounded.diagnosis.likelihood.delays import Delays, delays_of
+from grounded.diagnosis.likelihood.fitted import Fitted, calibrated, moved, shift_precision
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis, Predictor, param_scale
+from grounded.diagnosis.likelihood.linearise import (
+    filter_system,
+    gains_of,
+    linearise,
+    smoothed,
+    step_sizes,
+)
+from grounded.diagnosis.likelihood.noise import (
     NoiseModel,
     average,
     cleaned,

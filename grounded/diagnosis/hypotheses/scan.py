@@ -23,10 +23,10 @@ from typing import Any
 import numpy as np
 
 from grounded.compile import Named
-from grounded.diagnosis.delays import delays_of
-from grounded.diagnosis.fitted import Fitted
-from grounded.diagnosis.hypothesis import Predictor, sensor_offset
-from grounded.diagnosis.linearise import base_columns, filter_system, sensitivities_of
+from grounded.diagnosis.likelihood.delays import delays_of
+from grounded.diagnosis.likelihood.fitted import Fitted
+from grounded.diagnosis.likelihood.hypothesis import Predictor, sensor_offset
+from grounded.diagnosis.likelihood.linearise import base_columns, filter_system, sensitivities_of
 from grounded.effects import (
     Effect,
     InputFamily,

@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis.data import Data
-from grounded.diagnosis.delays import delays_of
-from grounded.diagnosis.fitted import Fitted
-from grounded.diagnosis.hypothesis import Hypothesis, Predictor
-from grounded.diagnosis.leftover import filter_of
+from grounded.diagnosis.hypotheses.leftover import filter_of
+from grounded.diagnosis.likelihood.data import Data
+from grounded.diagnosis.likelihood.delays import delays_of
+from grounded.diagnosis.likelihood.fitted import Fitted
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis, Predictor
 from grounded.diagnosis.report import Region, TimeShare
 from grounded.filter import kalman
 from grounded.frozen import Array

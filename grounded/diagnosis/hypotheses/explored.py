@@ -20,10 +20,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from grounded.diagnosis.data import Data
-from grounded.diagnosis.fitted import Fitted
-from grounded.diagnosis.hypothesis import Hypothesis, Predictor, rates_of
-from grounded.diagnosis.noise import Structure
+from grounded.diagnosis.likelihood.data import Data
+from grounded.diagnosis.likelihood.fitted import Fitted
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis, Predictor, rates_of
+from grounded.diagnosis.likelihood.noise import Structure
 from grounded.effects import Effect, ParamFamily
 from grounded.filter.tempering import Tempering, tempering
 

@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from grounded.diagnosis.fitted import Fitted, leave_one_out, moved
-from grounded.diagnosis.hypothesis import Hypothesis, Predictor
-from grounded.diagnosis.prediction_error import Horizon, errors, normalised
+from grounded.diagnosis.likelihood.fitted import Fitted, leave_one_out, moved
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis, Predictor
 from grounded.diagnosis.report import UtilityPrediction
-from grounded.diagnosis.ruler import folds
+from grounded.diagnosis.validation.prediction_error import Horizon, errors, normalised
+from grounded.diagnosis.validation.ruler import folds
 from grounded.frozen import Array
 from grounded.task import Task
 from grounded.trial import Trial
