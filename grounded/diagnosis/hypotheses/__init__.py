@@ -1,10 +1,12 @@
 """Which effect? Hypotheses are made, fitted and weighed against each other.
 
-attribution   START HERE: the question, from the first look to the last candidate
-scan          a first look at every candidate effect
-explored      what was fitted, and what it is worth
-search        what to try next
-lookalike     what acts nearly the same on these data
-leftover      what no effect explains
-correction    a curve that predicts what no effect explains
+From the question to what remains:
+
+    attribution   START HERE: the question, from the first look to the last candidate
+    scan          a first look at every candidate effect
+    explored      what was fitted, and what it is worth
+    search        what to try next
+    lookalike     what acts nearly the same on these data
+    leftover      what no effect explains
+    correction    a curve that predicts what no effect explains
 """
