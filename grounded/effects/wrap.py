@@ -320,17 +320,13 @@ def _kicked(s: Named, rate: Values, dt: Any) -> Named:
 def _sensor_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str, str]]:
     model, family = effect.site.model, effect.family
     assert isinstance(family, SensorFamily)
-    base = plain_step(model)
+    base, seen = plain_step(model), effect.site.targets
 
     def step(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
         c = _quantities(effect, p)
-        true = [
-            family.recover(s[n], c) if n in effect.site.targets else s[n] for n in model.state_names
-        ]
+        true = [family.recover(s[n], c) if n in seen else s[n] for n in model.state_names]
         after = base(Named("state", model.state_names, true), a, p, dt)
-        return {
-            n: family.measure(v, c) if n in effect.site.targets else v for n, v in after.items()
-        }
+        return {n: family.measure(v, c) if n in seen else v for n, v in after.items()}
 
     return step, {}
 
