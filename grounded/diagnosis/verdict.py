@@ -54,7 +54,7 @@ def verdict(
         if remainder:
             return Verdict("unknown", (), f"A gap remains that no known effect explains: {left}.")
         return Verdict("none", (), f"The model explains the data down to the noise{floor(row)}.")
-    words = [sentence(_causes(claims, ranking, credit)), improvement(row)]
+    words = [sentence(_causes(claims, ranking, credit)), improvement(row), worsened(rows)]
     words += [f"The data can't tell {tied(group)}." for group in groups[:1]]
     if remainder:
         words.append(f"Something is left that no known effect explains: {left}.")
@@ -110,6 +110,22 @@ def improvement(row: RulerRow | None) -> str:
     held = "" if row.held_out != "no" else ", not held out"
     ahead = f"{number(row.horizon_s)} s ahead{held} predictions"
     return f"{ahead} miss {' and '.join(parts)}." if parts else f"{ahead} hardly change."
+
+
+def worsened(rows: Sequence[RulerRow]) -> str:
+    """What predictions lose in the channel that loses most, "" where none loses over SHOWS."""
+    losses = [
+        (row.with_effects[name] / max(error, row.noise_floor.get(name, 0.0)), row, name)
+        for row in rows
+        for name, error in row.crude.items()
+        if error > 0 and math.isfinite(row.with_effects[name])
+    ]
+    ratio, row, name = max(losses, key=lambda loss: loss[0], default=(0.0, None, ""))
+    if row is None or not ratio > 1 + SHOWS:
+        return ""
+    ahead = "Whole trials" if row.whole_trial else f"{number(row.horizon_s)} s ahead predictions"
+    value = _measured(row, name, row.with_effects[name])
+    return f"{ahead} miss {name} by {value} instead of {number(row.crude[name])}: that is worse."
 
 
 def floor(row: RulerRow | None) -> str:
