@@ -23,7 +23,12 @@ if TYPE_CHECKING:
 @click.option("--model", metavar="FILE", help="Your model.py, beside --from or --blank.")
 @click.option("--blank", is_flag=True, help="No log yet: a workspace of --model, to fill in.")
 @click.option("--kind", help="Of the model skeleton: car, rover, drone, arm, pendulum, generic.")
-@click.option("--dt", type=float, metavar="SECONDS", help="Control interval (the log's).")
+@click.option(
+    "--dt",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="SECONDS",
+    help="Control interval (the log's; 0.05 with --blank).",
+)
 @click.option("--yes", is_flag=True, help="Ask nothing: take the best guesses, marked as such.")
 @click.option(
     "--example",
@@ -61,8 +66,12 @@ def command(
             "init DIR --example car-turn (`grounded init --list` names them), or a model alone, "
             "grounded init DIR --blank --model model.py"
         )
+    elif foreign := [key for key, given in (("--kind", kind), ("--yes", yes)) if given and not log]:
+        raise click.UsageError(f"{foreign[0]} belongs to --from LOG")
+    elif name is not None and (model or dt):
+        raise click.UsageError("an example brings its own model and dt: edit its files afterwards")
     elif blank:
-        _blank(folder, model, json_)
+        _blank(folder, model, dt, json_)
     elif log is not None:
         from pathlib import Path
 
@@ -122,12 +131,12 @@ def _list(json_: bool) -> None:
         show("\n".join(f"{key:15} {value.text}" for key, value in EXAMPLES.items()))
 
 
-def _blank(folder: str, model: str | None, json_: bool) -> None:
+def _blank(folder: str, model: str | None, dt: float | None, json_: bool) -> None:
     if model is None:
         raise click.UsageError("--blank needs your model: grounded init DIR --blank --model FILE")
     from grounded_trials import Workspace
 
-    Workspace.create(folder, model=model)
+    Workspace.create(folder, model=model, dt=dt)
     if json_:
         show_json({"workspace": folder, "model": model})
         return

@@ -97,3 +97,26 @@ def test_nothing_is_overwritten(blank, tmp_path):
     with pytest.raises(GroundedError, match="exists already"):
         Workspace.create(blank.folder, model=tmp_path / "sled.py")
     assert (blank.folder / "drive.py").read_bytes() == before
+
+
+def test_a_blank_workspace_takes_the_control_interval(tmp_path):
+    (tmp_path / "sled.py").write_text(MODEL)
+    made = Workspace.create(tmp_path / "w", model=tmp_path / "sled.py", dt=0.02)
+    assert tomllib.loads((made.folder / "grounded.toml").read_text())["task"]["dt"] == 0.02
+    assert made.propose().candidate.policy.dt == 0.02
+
+
+def test_a_model_that_needs_its_neighbours_leaves_nothing_behind(tmp_path):
+    (tmp_path / "masses.csv").write_text("1.0\n")
+    (tmp_path / "sled.py").write_text(
+        "from pathlib import Path\n(Path(__file__).parent / 'masses.csv').read_text()\n" + MODEL
+    )
+    with pytest.raises(GroundedError) as refused:
+        Workspace.create(tmp_path / "w", model=tmp_path / "sled.py")
+    assert "masses.csv" in str(refused.value) and str(tmp_path / "w") in str(refused.value)
+    assert not (tmp_path / "w").exists()
+    (tmp_path / "w").mkdir()
+    (tmp_path / "w" / "masses.csv").write_text("1.0\n")
+    (tmp_path / "w" / "model.py").write_text((tmp_path / "sled.py").read_text())
+    made = Workspace.create(tmp_path / "w", model=tmp_path / "w" / "model.py")
+    assert (made.folder / "drive.py").is_file()

@@ -102,6 +102,7 @@ class Workspace(Folder):
         example: str | None = None,
         log: str | Path | None = None,
         model: str | Path | None = None,
+        dt: float | None = None,
     ) -> Self:
         """Makes a workspace from an example, a log or a model; nothing is ever overwritten.
 
@@ -111,6 +112,7 @@ class Workspace(Folder):
             log: of your robot, any format; `starting.begin.begin` says what it found.
             model: your model.py, beside `log`, where None writes a skeleton; or alone: target,
                 weights and drive.py are to be filled in then.
+            dt: control interval [s]; None: the log's, 0.05 for a model alone.
 
         Raises:
             GroundedError: if there is no such example, the log can't be read, or the folder holds
@@ -121,11 +123,11 @@ class Workspace(Folder):
         if log is None and model is not None:
             from grounded_trials.starting.blank import write_blank
 
-            write_blank(Path(folder), model)
+            write_blank(Path(folder), model, dt)
         elif log is not None:
             from grounded_trials.starting.begin import begin
 
-            begin(Path(folder), log, model=model)
+            begin(Path(folder), log, model=model, dt=dt)
         elif example is not None:
             from grounded_trials.workspace.examples import write_example
 

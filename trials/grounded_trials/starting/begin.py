@@ -7,7 +7,6 @@ marked.
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,7 +27,11 @@ from grounded_trials.logs.log_table import LogMapping, log_mapping, read_log
 from grounded_trials.starting.kinds import KINDS, kind_in, skeleton
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.config import FILE
-from grounded_trials.workspace.examples import fresh_folder, refuse_existing
+from grounded_trials.workspace.examples import (
+    fresh_folder,
+    refuse_existing,
+    undone_on_failure,
+)
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.model_file import load_module, model_in
 from grounded_trials.workspace.task_file import equal_weights, write_target
@@ -119,14 +122,8 @@ def begin(
             name is unknown.
     """
     _check(folder, model, kind)
-    new = not folder.exists()
-    try:
+    with undone_on_failure(folder, WRITTEN):
         return _begin(folder, log, model, kind, dt, ask)
-    except BaseException:
-        written = [folder] if new else [folder / name for name in WRITTEN]
-        for path in written:
-            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
-        raise
 
 
 def _begin(

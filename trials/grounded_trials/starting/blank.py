@@ -17,7 +17,12 @@ from grounded.task import Task
 from grounded.utility import Reward
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.config import FILE
-from grounded_trials.workspace.examples import fresh_folder, toml_of
+from grounded_trials.workspace.examples import (
+    fresh_folder,
+    refuse_existing,
+    toml_of,
+    undone_on_failure,
+)
 from grounded_trials.workspace.model_file import load_module, model_in
 from grounded_trials.workspace.task_file import write_target
 
@@ -70,15 +75,17 @@ if __name__ == "__main__":
 '''
 
 
-def write_blank(folder: Path, file: str | Path) -> None:
+def write_blank(folder: Path, file: str | Path, dt: float | None = None) -> None:
     """Writes a workspace for the model of a file; an existing file is never overwritten.
 
     Args:
         folder: where it is made.
-        file: holds `model`; it is copied to model.py, files that it imports are not.
+        file: holds `model`; it is copied to model.py, files that it reads or imports are not.
+        dt: control interval [s]; None: 0.05.
 
     Raises:
-        GroundedError: if the file holds no model, or the folder a workspace already.
+        GroundedError: if the file holds no model, or needs its neighbours, or the folder a
+            workspace already.
     """
     file = Path(file)
     model = model_in(load_module(file.resolve().parent, file.name, key="--blank"))
@@ -87,30 +94,43 @@ def write_blank(folder: Path, file: str | Path) -> None:
     except OSError as error:
         raise GroundedError(f"{file} can't be read: {error.strerror}") from None
     own = file.resolve() == (folder / "model.py").resolve()
-    fresh_folder(folder, (FILE, "target.csv", "drive.py") if own else FILES)
-    if not own:
-        write_atomically(folder / "model.py", source)
-    task = _task(model)
-    columns = {name: task.target[:, i] for i, name in enumerate(model.state_names)}
-    write_target(folder / "target.csv", task.dt, columns)
-    drive = DRIVE.format(states=dict(model.states), inputs=dict(model.inputs))
-    write_atomically(folder / "drive.py", drive.encode())
-    text = toml_of(
-        task, f"{model.name or file.stem}: target, weights and limits are yours", COMMAND
-    )
-    write_atomically(folder / FILE, text.encode())
+    written = (FILE, "target.csv", "drive.py") if own else FILES
+    refuse_existing(folder, written)
+    with undone_on_failure(folder, written):
+        fresh_folder(folder, written)
+        if not own:
+            write_atomically(folder / "model.py", source)
+            _loads_alone(folder, file)
+        task = _task(model, dt or DT)
+        columns = {name: task.target[:, i] for i, name in enumerate(model.state_names)}
+        write_target(folder / "target.csv", task.dt, columns)
+        drive = DRIVE.format(states=dict(model.states), inputs=dict(model.inputs))
+        write_atomically(folder / "drive.py", drive.encode())
+        name = f"{model.name or file.stem}: target, weights and limits are yours"
+        write_atomically(folder / FILE, toml_of(task, name, COMMAND).encode())
+
+
+def _loads_alone(folder: Path, file: Path) -> None:
+    try:
+        load_module(folder, "model.py")
+    except GroundedError as error:
+        raise GroundedError(
+            f"{file} loads where it lies, but not as a copy in {folder}: {error}. Make {folder} "
+            f"yourself, put {file.name} there as model.py and beside it the files that it reads, "
+            f"then give --model {folder / 'model.py'}"
+        ) from None
 
 
 FILES = (FILE, "model.py", "target.csv", "drive.py")
 
 
-def _task(model: Model) -> Task:
-    """Hold every state at zero for five seconds."""
+def _task(model: Model, dt: float) -> Task:
+    """Hold every state at zero for a hundred steps."""
     n, m = model.n, model.m
     free = np.full(m, np.inf)
     return Task(
         model=model,
-        dt=DT,
+        dt=dt,
         target=np.zeros((HORIZON + 1, n)),
         reward=Reward(np.ones(n), np.zeros(n), np.full(m, 0.01), np.full(m, 0.01)),
         start=np.zeros(n),

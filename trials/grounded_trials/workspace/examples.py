@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable, Mapping
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -158,6 +160,21 @@ def refuse_existing(folder: Path, names: Iterable[str]) -> None:
 
 def _holds(path: Path, text: str) -> bool:
     return path.is_file() and path.stat().st_size < 10**7 and path.read_bytes() == text.encode()
+
+
+@contextmanager
+def undone_on_failure(folder: Path, files: Iterable[str]) -> Iterator[None]:
+    """Removes what was made if making it fails: the folder if it is new, or else these files."""
+    new = not folder.exists()
+    try:
+        yield
+    except BaseException:
+        for path in [folder] if new else [folder / name for name in files]:
+            if path.is_dir():
+                shutil.rmtree(path)
+            else:
+                path.unlink(missing_ok=True)
+        raise
 
 
 def fresh_folder(folder: Path, files: Iterable[str]) -> None:
