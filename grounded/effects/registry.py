@@ -127,7 +127,7 @@ class Library:
                     continue
                 if isinstance(family, RateFamily) and family.needs_own and target in outright:
                     continue
-                if driven[2] and integrals.get(driven[0]) == driven[2]:
+                if driven[2] and integrals.get(driven[0], ("",))[0] == driven[2]:
                     continue  # it would be rate_gain under another name
                 if same.get(f"{family.name}:{target}", "").partition(":")[0] in offered:
                     continue
@@ -154,14 +154,26 @@ def derived_states(model: Model) -> set[str]:
     return {named[0]} if float(np.abs(others).max()) < 1e-12 else set()
 
 
-def integrated_states(model: Model) -> dict[str, str]:
-    """States whose rate is another state, times a constant: an angle and its angular velocity."""
+def integrated_states(model: Model) -> dict[str, tuple[str, float]]:
+    """States whose rate is c times another state: {angle: (angular velocity, c)}.
+
+    A simulator that can't make a short step adds the velocity that it has after its own step.
+    """
     (x, u), dt = places.samples(model), places.probe(model, 1e-6)
+    after = model.system.step(x, u, model.values, dt)
+    moved, names, found = (after - x) / dt, model.state_names, {}
+    if dt > SHORT:
+        for i, name in enumerate(names):
+            with np.errstate(divide="ignore", invalid="ignore"):
+                ratio = moved[:, [i]] / after
+            same = np.isfinite(ratio).all(axis=0) & (np.ptp(ratio, axis=0) < 1e-6 * abs(ratio[0]))
+            for j in map(int, np.flatnonzero(same)):
+                if j != i:
+                    found[name] = names[j], float(ratio[0, j])
+        return found
     f_x, f_u = model.system.linearise(x, u, model.values, dt)
     rates = (f_x - np.eye(model.n)) / dt
-    moved = (model.system.step(x, u, model.values, dt) - x) / dt
-    found = {}
-    for i, name in enumerate(model.state_names):
+    for i, name in enumerate(names):
         j = int(np.argmax(np.abs(rates[0, i])))
         c = rates[0, i, j]
         small = 1e-4 * abs(c)
@@ -169,7 +181,7 @@ def integrated_states(model: Model) -> dict[str, str]:
         steady = np.abs(rates[:, i, j] - c).max() < small and np.abs(f_u[:, i]).max() / dt < small
         straight = np.allclose(moved[:, i], c * x[:, j], rtol=1e-4)
         if i != j and c != 0 and alone and steady and straight:
-            found[name] = model.state_names[j]
+            found[name] = names[j], float(np.mean(moved[:, i] / x[:, j]))
     return found
 
 
