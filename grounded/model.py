@@ -26,6 +26,7 @@ from grounded.frozen import Array, readonly, wrapped
 
 Function = Callable[..., Mapping[str, Any]]
 MAX_SUBSTEPS = 1000
+MAX_SIZE = 200  # states and inputs: a step costs their cube, and minutes from here on
 
 
 @dataclass(frozen=True)
@@ -134,6 +135,12 @@ class Model:
             raise GroundedError("jacobian= goes beside step=; a derivative= finds its own")
         if not self.states or not self.inputs:
             raise GroundedError(f"model '{self.name}' needs at least one state and one input")
+        if self.n + self.m > MAX_SIZE:
+            raise GroundedError(
+                f"model '{self.name}' has {self.n} states and {self.m} inputs; at most {MAX_SIZE} "
+                "of both together can be planned with and fitted: model those that the reward and "
+                "the inputs act on, and leave the rest out"
+            )
         self._check_names()
 
     def _check_names(self) -> None:

@@ -46,6 +46,7 @@ __all__ = [
     "system_of",
 ]
 MAX_COMPILED = 10_000  # operations of a model and its derivatives, about 4 s of compiling
+MAX_STEPS = 4_000  # of a model alone, where its derivatives are too many
 
 
 def system_of(
@@ -75,7 +76,7 @@ def system_of(
         GroundedError: if the function can't be a model of these names, naming its file and line.
     """
     from grounded.compile.run import jit
-    from grounded.compile.run.compiled import MAX_PLACES, CompiledSystem
+    from grounded.compile.run.compiled import MAX_PLACES, CompiledSteps, CompiledSystem
 
     signature = Signature(function, kind, tuple(states), tuple(inputs), tuple(params))
     if kind == "derivative" and substeps > 1:
@@ -97,6 +98,9 @@ def system_of(
         return _differenced(signature, integrator, note)
     if operations > MAX_COMPILED or system.n * (system.n + system.m) > MAX_PLACES:
         size = f"{system.n} states and {operations:,} operations"
+        if len(found.graph.live(found.outputs)) <= MAX_STEPS:
+            note = f"compiled but for its derivatives, {where(function)}: {size} would take too long"
+            return CompiledSteps(signature, found, integrator, note)
         note = f"not compiled, {where(function)}: {size} would take too long"
         return TracedSystem(signature, found, integrator, note)
     return system
