@@ -99,7 +99,9 @@ def system_of(
     if operations > MAX_COMPILED or system.n * (system.n + system.m) > MAX_PLACES:
         size = f"{system.n} states and {operations:,} operations"
         if len(found.graph.live(found.outputs)) <= MAX_STEPS:
-            note = f"compiled but for its derivatives, {where(function)}: {size} would take too long"
+            note = (
+                f"compiled but for its derivatives, {where(function)}: {size} would take too long"
+            )
             return CompiledSteps(signature, found, integrator, note)
         note = f"not compiled, {where(function)}: {size} would take too long"
         return TracedSystem(signature, found, integrator, note)

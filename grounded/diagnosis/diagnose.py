@@ -52,6 +52,7 @@ from grounded.diagnosis.ruler import Ruler
 from grounded.diagnosis.search import HypothesisSearch
 from grounded.diagnosis.verdict import next_trial, verdict
 from grounded.effects import Library
+from grounded.errors import GroundedError
 from grounded.instruments.preflight import preflight
 from grounded.model import Model
 from grounded.progress import Stages, interruptible
@@ -105,6 +106,12 @@ def diagnose(
     """
     options, tick = options or DiagnosisOptions(), Stages(progress, USUAL)
     model = subject.model if isinstance(subject, Task) else subject
+    if model.n + model.m > MOST_NAMES:
+        raise GroundedError(
+            f"model '{model.name}' has {model.n} states and {model.m} inputs; a diagnosis takes at "
+            f"most {MOST_NAMES} of both together, each may be blamed for each: diagnose a model of "
+            "the part where the gap is (`grounded learn` shows how far trials are off)"
+        )
     latency = subject.latency if isinstance(subject, Task) else None
     past = subject.past if isinstance(subject, Task) else None
     tick("instruments")
@@ -141,6 +148,7 @@ def diagnose(
         )
 
 
+MOST_NAMES = 50  # of 36 and 12 come 1,649 effects, of 20 and 100 as many; each is filtered
 USUAL = 370  # stages and iterations of a diagnosis
 FIRST_LOOK = 6  # iterations of the fit by whose noise the parameters are found identifiable
 

@@ -60,6 +60,12 @@ def fit(
     if isinstance(model, Task):
         latency = model.latency if latency is None else latency
         model = model.model
+    if model.n > MOST_STATES:
+        raise GroundedError(
+            f"model '{model.name}' has {model.n} states; a fit filters the trials with at most "
+            f"{MOST_STATES}, each step costs their cube: fit the parameters in a model of the part "
+            "that they belong to, and write them into this one"
+        )
     delay = np.zeros(model.m) if latency is None else np.asarray(latency, float)
     measurement = of_states(model) if measurement is None else measurement
     unknowns = unknowns_of(model, names, delay, fit_latency)
@@ -78,6 +84,7 @@ def fit(
 
 
 USUAL = 25  # rounds and scans of a fit
+MOST_STATES = 50  # 200 steps of twice as many take minutes
 
 
 def _fitted(
