@@ -17,8 +17,8 @@ never comes back. So the target itself is made a nominal run, in three moves:
 
 The trim is Levenberg-Marquardt on many steps at once, inputs inside their limits. It starts from
 several inputs, because a stalled motor has no slope to follow; then every step tries again with one
-input set back (of few: many share what one could do), and tries the solutions of its neighbours, because a manoeuvre is continuous and a
-bad local minimum seldom is.
+input set back (of few: what one of many could do, the others do), and tries the solutions of its
+neighbours, because a manoeuvre is continuous and a bad local minimum seldom is.
 """
 
 from __future__ import annotations

@@ -11,8 +11,9 @@ import pytest
 
 import experiment_jobs
 from facts import holding
+from grounded.engine import Engine
 from grounded.errors import GroundedError
-from grounded.experiments.jobs import Engine, Job, run_jobs
+from grounded.experiments.jobs import Job, run_jobs
 from shared_data import SUPPORT
 
 joblib = pytest.importorskip("joblib", reason="joblib is not installed")
@@ -148,6 +149,6 @@ def test_a_cluster_that_loses_a_worker_half_way_gives_the_same_bits(cluster):
 @pytest.mark.filterwarnings("ignore")
 def test_no_cluster_is_said_so(monkeypatch):
     pytest.importorskip("distributed", reason="dask is not installed")
-    monkeypatch.setattr("grounded.experiments.jobs.CONNECT_S", 1.0)
+    monkeypatch.setattr("grounded.engine.CONNECT_S", 1.0)
     with pytest.raises(GroundedError, match=holding("Dask", "tcp://127.0.0.1:9")):
         run_jobs(draws(1), Engine(name="dask", address="tcp://127.0.0.1:9"))
