@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, field, fields
+from functools import cached_property, partial
 from types import MappingProxyType
 from typing import Any, Literal
 
@@ -142,6 +142,12 @@ class Model:
                 "the inputs act on, and leave the rest out"
             )
         self._check_names()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Another process makes it again from what it was made of."""
+        given = {f.name: getattr(self, f.name) for f in fields(self)}
+        given |= {key: dict(given[key]) for key in ("states", "inputs", "params", "roles")}
+        return partial(Model, **given), ()
 
     def _check_names(self) -> None:
         names = [*self.states, *self.inputs, *self.params]

@@ -150,7 +150,7 @@ def diagnose(
 
 
 MOST_NAMES = 50  # of 36 and 12 come 1,649 effects, of 20 and 100 as many; each is filtered
-USUAL = 370  # stages and iterations of a diagnosis
+USUAL = 160  # stages of a diagnosis, and hypotheses that are refined together
 FIRST_LOOK = 6  # iterations of the fit by whose noise the parameters are found identifiable
 
 
