@@ -25,7 +25,7 @@ WINDOWS = (1, 2, 4, 8, 16, 32, 64)  # half lengths of the smoothing window, samp
 SHORTEST = 24  # samples of a pair that counts
 CLEAR = 0.9  # of the coherence: windows below it don't count
 BLOCKS = 16  # at least: the scatter over them is the uncertainty
-SCREENED, MAYBE = 4, 0.5  # half window and correlation from which two signals may be one
+SCREENED, MAYBE = 4, 0.7  # half window and correlation from which two signals may be one
 FILTER = 0.9  # of the misfit of a delay: below it a filter is what it is
 
 
