@@ -55,7 +55,8 @@ __version__ = "0.2.0"
 
 __all__ = [
     "Diagnosis", "Engine", "GroundedError", "Model", "NextCommand", "Param", "Policy", "Reward",
-    "Search", "SearchOptions", "Task", "Trial", "__version__", "diagnose", "fit", "learn", "propose",
+    "Search", "SearchOptions", "Task", "Trial", "__version__", "diagnose", "fit", "learn",
+    "propose",
 ]  # fmt: skip
 
 _HOMES = {
