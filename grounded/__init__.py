@@ -14,6 +14,7 @@ model, task, utility    the crude model, the manoeuvre, its quadratic reward
 trial, rollout, plant   a real run, a simulated one, a simulated real system
 policy, onboard         what a robot runs, and the one file that runs it with numpy alone
 result, errors, frozen  what results, mistakes and arrays have in common; `figures`, what they show
+engine                  where independent pieces of work run: here, on threads, on a cluster
 
 Its rooms, from the paper's loop down:
 
@@ -38,6 +39,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from grounded.diagnosis.diagnose import diagnose
     from grounded.diagnosis.report import Diagnosis
+    from grounded.engine import Engine
     from grounded.errors import GroundedError, NextCommand
     from grounded.fit import fit
     from grounded.model import Model, Param
@@ -52,13 +54,15 @@ if TYPE_CHECKING:
 __version__ = "0.2.0"
 
 __all__ = [
-    "Diagnosis", "GroundedError", "Model", "NextCommand", "Param", "Policy", "Reward", "Search",
-    "SearchOptions", "Task", "Trial", "__version__", "diagnose", "fit", "learn", "propose",
+    "Diagnosis", "Engine", "GroundedError", "Model", "NextCommand", "Param", "Policy", "Reward",
+    "Search", "SearchOptions", "Task", "Trial", "__version__", "diagnose", "fit", "learn",
+    "propose",
 ]  # fmt: skip
 
 _HOMES = {
     "grounded.diagnosis.diagnose": ("diagnose",),
     "grounded.diagnosis.report": ("Diagnosis",),
+    "grounded.engine": ("Engine",),
     "grounded.errors": ("GroundedError", "NextCommand"),
     "grounded.fit": ("fit",),
     "grounded.model": ("Model", "Param"),

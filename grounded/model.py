@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, field, fields
+from functools import cached_property, partial
 from types import MappingProxyType
 from typing import Any, Literal
 
@@ -26,6 +26,7 @@ from grounded.frozen import Array, readonly, wrapped
 
 Function = Callable[..., Mapping[str, Any]]
 MAX_SUBSTEPS = 1000
+MAX_SIZE = 200  # states and inputs: a step costs their cube, and minutes from here on
 
 
 @dataclass(frozen=True)
@@ -134,7 +135,19 @@ class Model:
             raise GroundedError("jacobian= goes beside step=; a derivative= finds its own")
         if not self.states or not self.inputs:
             raise GroundedError(f"model '{self.name}' needs at least one state and one input")
+        if self.n + self.m > MAX_SIZE:
+            raise GroundedError(
+                f"model '{self.name}' has {self.n} states and {self.m} inputs; at most {MAX_SIZE} "
+                "of both together can be planned with and fitted: model those that the reward and "
+                "the inputs act on, and leave the rest out"
+            )
         self._check_names()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Another process makes it again from what it was made of."""
+        given = {f.name: getattr(self, f.name) for f in fields(self)}
+        given |= {key: dict(given[key]) for key in ("states", "inputs", "params", "roles")}
+        return partial(Model, **given), ()
 
     def _check_names(self) -> None:
         names = [*self.states, *self.inputs, *self.params]

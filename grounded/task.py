@@ -22,7 +22,6 @@ from grounded.trial import Trial
 from grounded.utility import Reward, step_rewards
 
 MAX_HORIZON = 200_000  # a control step is a few kB of gains: a bound against nonsense
-MAX_SIZE = 200  # states and inputs: a step costs their cube, and minutes from here on
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,12 +69,6 @@ class Task:
         H = len(self.target) - 1
         if not 1 <= H <= MAX_HORIZON:
             raise GroundedError(f"task: the horizon must be 1 to {MAX_HORIZON} steps, got {H}")
-        if n + m > MAX_SIZE:
-            raise GroundedError(
-                f"the model has {n} states and {m} inputs; planning takes at most {MAX_SIZE} of "
-                "both together: model those that the reward and the inputs act on, and leave the "
-                "rest to the trials"
-            )
         defaults = {
             "latency": np.zeros(m),
             "input_target": np.zeros((H, m)),

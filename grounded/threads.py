@@ -9,17 +9,9 @@ the next one: 40 % of a diagnosis.
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator
 from contextlib import contextmanager
-from contextvars import ContextVar
 from functools import cache
-from typing import TypeVar
-
-import numpy as np
-
-T = TypeVar("T")
-_jobs: ContextVar[int] = ContextVar("jobs", default=1)
 
 TRIM, MAP = -1, -3  # M_TRIM_THRESHOLD, M_MMAP_THRESHOLD of the GNU C library
 LARGE = 2**28  # [bytes] blocks up to here are reused
@@ -44,28 +36,3 @@ def _keep_pages() -> None:
         return
     mallopt(MAP, LARGE)
     mallopt(TRIM, LARGE)
-
-
-@contextmanager
-def jobs(count: int) -> Iterator[None]:
-    """What `each` is called for runs on so many threads: compiled passes leave Python's lock."""
-    before = _jobs.set(count)
-    try:
-        yield
-    finally:
-        _jobs.reset(before)
-
-
-def each(function: Callable[[T], None], items: Sequence[T]) -> None:
-    """Calls a function for independent items; the same comes out on any number of threads."""
-    if _jobs.get() == 1 or len(items) < 2:
-        for item in items:
-            function(item)
-        return
-
-    def quietly(item: T) -> None:
-        with np.errstate(all="ignore"):  # a thread does not inherit it
-            function(item)
-
-    with ThreadPoolExecutor(_jobs.get()) as pool:
-        list(pool.map(quietly, items))

@@ -13,7 +13,7 @@ from grounded_cli.terminal import bar, names_in, number, say, show, show_json, t
 from grounded_trials.wording import count
 
 if TYPE_CHECKING:
-    from grounded.experiments.jobs import Engine
+    from grounded.engine import Engine
 
 
 @click.group("challenge")

@@ -10,12 +10,20 @@ import click
 
 from grounded.errors import NextCommand
 from grounded_cli import completion as complete
-from grounded_cli.options import as_json, in_workspace, next_line, open_workspace, typed
+from grounded_cli.options import (
+    as_json,
+    in_workspace,
+    next_line,
+    open_workspace,
+    parallel,
+    typed,
+)
 from grounded_cli.terminal import field, names_in, number, show, show_json, stages, table, tinted
 from grounded_trials.wording import rendered, with_unit, wrapped
 
 if TYPE_CHECKING:
     from grounded.diagnosis.report import Diagnosis, Ranked, Where
+    from grounded.engine import Engine
     from grounded.instruments.finding import Finding
     from grounded_trials import Workspace
 
@@ -43,9 +51,7 @@ if TYPE_CHECKING:
     help="Two groups of trials, T1,T2 T3,T4: what changed between them.",
 )
 @click.option("--probe", is_flag=True, help="Write the most instructive next trial, tie or not.")
-@click.option(
-    "--jobs", type=click.IntRange(1), default=1, metavar="N", help="Threads (default: 1)."
-)
+@parallel
 @click.option("--instruments", is_flag=True, help="Judge the sensors alone; takes a second.")
 @in_workspace
 @as_json
@@ -55,7 +61,7 @@ def command(
     without: tuple[str, ...],
     compare: tuple[str, str] | None,
     probe: bool,
-    jobs: int,
+    engine: Engine,
     instruments: bool,
     json_: bool,
 ) -> None:
@@ -93,7 +99,7 @@ def command(
             without=families,
             compare=second,
             probe=probe,
-            jobs=jobs,
+            engine=engine,
             progress=tell,
         )
     if json_:

@@ -12,7 +12,7 @@ from grounded_cli.options import as_json, parallel
 from grounded_cli.terminal import bar, show, show_json, table
 
 if TYPE_CHECKING:
-    from grounded.experiments.jobs import Engine
+    from grounded.engine import Engine
 
 # name -> (module, function, what --seeds is: "seeds", "count" of runs, or none, one line)
 STUDIES = {

@@ -6,11 +6,12 @@ from typing import TYPE_CHECKING
 
 import click
 
-from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
+from grounded_cli.options import as_json, in_workspace, next_line, open_workspace, parallel
 from grounded_cli.terminal import names_in, number, remark, show, show_json, stages, table
 from grounded_trials.wording import count, shown
 
 if TYPE_CHECKING:
+    from grounded.engine import Engine
     from grounded.fit import Fit
     from grounded.model import Model
 
@@ -19,9 +20,10 @@ if TYPE_CHECKING:
 @click.option("--params", metavar="A,B,...", help="Fit only these; the others keep their values.")
 @click.option("--latency", is_flag=True, help="Fit one transport delay of all inputs too.")
 @click.option("--apply", "apply_", is_flag=True, help="Write the values to grounded.toml.")
+@parallel
 @in_workspace
 @as_json
-def command(params: str | None, latency: bool, apply_: bool, json_: bool) -> None:
+def command(params: str | None, latency: bool, apply_: bool, engine: Engine, json_: bool) -> None:
     """Estimate parameters by maximum likelihood of the trials, noise included.
 
     Prediction errors are measured on a quarter of the time that the fit has not seen.
@@ -35,7 +37,7 @@ def command(params: str | None, latency: bool, apply_: bool, json_: bool) -> Non
             "--params names no parameter: expected some, like a1,L; leave it out to fit all"
         )
     with stages() as tell:
-        done = workspace.fit(names, latency=latency, apply=apply_, progress=tell)
+        done = workspace.fit(names, latency=latency, apply=apply_, engine=engine, progress=tell)
     if json_:
         show_json(done.to_json())
         return

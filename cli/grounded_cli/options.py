@@ -58,11 +58,11 @@ def anyway(function: F) -> F:
 
 
 def parallel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Adds the options of a command that is a list of independent jobs; passed as `engine`."""
+    """Adds the options of a command with independent pieces; passed as `engine`."""
 
     @functools.wraps(function)
     def call(*args: Any, jobs: int, engine: str, address: str | None, **others: Any) -> Any:
-        from grounded.experiments.jobs import Engine
+        from grounded.engine import Engine
 
         return function(*args, engine=Engine(jobs=jobs, name=engine, address=address), **others)
 
@@ -72,14 +72,14 @@ def parallel(function: Callable[..., Any]) -> Callable[..., Any]:
             "--engine",
             type=click.Choice(["local", "dask"]),
             default="local",
-            help="Where jobs run: here (default) or on a Dask cluster that sees this disk.",
+            help="Where: on this machine (default) or on a Dask cluster that sees this disk.",
         ),
         click.option(
             "--jobs",
             type=click.IntRange(1),
             metavar="N",
             default=1,
-            help="Processes on this machine.",
+            help="Workers on this machine (default: 1).",
         ),
     ):
         call = option(call)

@@ -46,6 +46,7 @@ __all__ = [
     "system_of",
 ]
 MAX_COMPILED = 10_000  # operations of a model and its derivatives, about 4 s of compiling
+MAX_STEPS = 4_000  # of a model alone, where its derivatives are too many
 
 
 def system_of(
@@ -74,15 +75,20 @@ def system_of(
     Raises:
         GroundedError: if the function can't be a model of these names, naming its file and line.
     """
-    from grounded.compile.run import jit
-    from grounded.compile.run.compiled import MAX_PLACES, CompiledSystem
-
     signature = Signature(function, kind, tuple(states), tuple(inputs), tuple(params))
     if kind == "derivative" and substeps > 1:
         signature = replace(signature, kind="step", within=(integrator, substeps))
-    if jacobian is not None:
+    return system_from(replace(signature, jacobian=jacobian), integrator)
+
+
+def system_from(signature: Signature, integrator: Integrator) -> System:
+    """The System of a function that is called so; also in another process, see `Interpreted`."""
+    from grounded.compile.run import jit
+    from grounded.compile.run.compiled import MAX_PLACES, CompiledSteps, CompiledSystem
+
+    if signature.jacobian is not None:
         note = "not compiled: it is run as it is, with the derivatives that come with it"
-        return _differenced(replace(signature, jacobian=jacobian), integrator, note)
+        return _differenced(signature, integrator, note)
     found = trace(signature, None, 1.0)
     if isinstance(found, str):
         return _differenced(signature, integrator, f"not compiled, {found}")
@@ -93,12 +99,15 @@ def system_of(
         system = CompiledSystem(signature, found, integrator)
         operations = system.operations
     except TooLong as error:
-        note = f"not compiled, {where(function)}: its derivatives take {error}"
+        note = f"not compiled, {where(signature.function)}: its derivatives take {error}"
         return _differenced(signature, integrator, note)
     if operations > MAX_COMPILED or system.n * (system.n + system.m) > MAX_PLACES:
-        size = f"{system.n} states and {operations:,} operations"
-        note = f"not compiled, {where(function)}: {size} would take too long"
-        return TracedSystem(signature, found, integrator, note)
+        size = f"{system.n} states and {operations:,} operations would take too long"
+        place = where(signature.function)
+        if len(found.graph.live(found.outputs)) > MAX_STEPS:
+            return TracedSystem(signature, found, integrator, f"not compiled, {place}: {size}")
+        note = f"compiled but for its derivatives, {place}: {size}"
+        return CompiledSteps(signature, found, integrator, note)
     return system
 
 

@@ -230,7 +230,7 @@ class System(ABC):
     n: int
     m: int
     k: int  # number of parameters
-    how: str  # "compiled", "traced" or "differenced"
+    how: str  # "compiled", "compiled steps", "traced" or "differenced"
     note: str  # why it is not compiled, naming the line; empty when it is
     source: str  # file:line of the user's function
     states: tuple[str, ...]  # names, for messages

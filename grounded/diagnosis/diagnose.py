@@ -52,11 +52,13 @@ from grounded.diagnosis.validation.prediction_error import by_region, by_time, e
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.diagnosis.verdict import next_trial, verdict
 from grounded.effects import Library
+from grounded.engine import Engine, running
+from grounded.errors import GroundedError
 from grounded.instruments.preflight import preflight
 from grounded.model import Model
 from grounded.progress import Stages, interruptible
 from grounded.task import Task
-from grounded.threads import jobs, steady
+from grounded.threads import steady
 from grounded.trial import Trial
 
 
@@ -70,7 +72,6 @@ class DiagnosisOptions:
         horizon: how far ahead predictions are judged [s].
         hidden: states that no sensor has: the memory of effects that were adopted.
         but: effects that are not blamed, by name: adopted ones, whose numbers are parameters now.
-        jobs: threads that fit hypotheses; the same comes out on any number.
     """
 
     library: Library = field(default_factory=Library)
@@ -78,7 +79,6 @@ class DiagnosisOptions:
     horizon: float = 1.0
     hidden: tuple[str, ...] = ()
     but: Collection[str] = ()
-    jobs: int = 1
 
 
 @steady()
@@ -88,6 +88,7 @@ def diagnose(
     options: DiagnosisOptions | None = None,
     *,
     compare: Sequence[Trial] = (),
+    engine: Engine | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Diagnosis:
     """Where the gap between model and trials lies, which effect makes it, how far it shrinks.
@@ -97,6 +98,7 @@ def diagnose(
         trials: real runs on one time grid, whatever policy they ran.
         options: library, number of effects, horizon.
         compare: a second group of trials; all are diagnosed, and what changed is `changed`.
+        engine: workers that fit hypotheses; the same comes out on any number.
         progress: told of the stage, the share done and the time left, for a display.
 
     Raises:
@@ -105,6 +107,12 @@ def diagnose(
     """
     options, tick = options or DiagnosisOptions(), Stages(progress, USUAL)
     model = subject.model if isinstance(subject, Task) else subject
+    if model.n + model.m > MOST_NAMES:
+        raise GroundedError(
+            f"model '{model.name}' has {model.n} states and {model.m} inputs; a diagnosis takes at "
+            f"most {MOST_NAMES} of both together, each may be blamed for each: diagnose a model of "
+            "the part where the gap is"
+        )
     latency = subject.latency if isinstance(subject, Task) else None
     past = subject.past if isinstance(subject, Task) else None
     tick("instruments")
@@ -122,12 +130,12 @@ def diagnose(
     offered = options.library.candidates(data.model, data.scales)
     settled = {*options.but, *looked.settled}
     candidates = knowable(data, [e for e in offered if e.name not in settled])
-    with jobs(options.jobs):
+    with running(engine):
         search, best = attribute(data, candidates, max_effects=options.max_effects, tick=tick)
     tick("predict")
     used = [trial for trial in trials if trial.known_steps >= 2]
     here = interruptible(lambda: so_far(search, options.max_effects))
-    with np.errstate(all="ignore"), here, jobs(options.jobs):
+    with np.errstate(all="ignore"), here, running(engine):
         decision = decide(search, best, ruler := Ruler(search.predictor), options.max_effects)
         tick("leftover")
         task = subject if isinstance(subject, Task) else None
@@ -141,7 +149,8 @@ def diagnose(
         )
 
 
-USUAL = 370  # stages and iterations of a diagnosis
+MOST_NAMES = 50  # of 36 and 12 come 1,649 effects, of 20 and 100 as many; each is filtered
+USUAL = 160  # stages of a diagnosis, and hypotheses that are refined together
 FIRST_LOOK = 6  # iterations of the fit by whose noise the parameters are found identifiable
 
 

@@ -46,12 +46,18 @@ ENOUGH = 0.05  # [nats] and then this is enough after SWEEPS
 
 
 @dataclass(frozen=True, eq=False)
-class Filtered:
-    """Arrays time first; `loglik` is minus infinity when the pass did not get through."""
+class Track:
+    """Where a pass went, and where the next one may begin."""
 
     x: Array  # (T + 1, B, n) filtered
     std: Array  # (T + 1, B, n) of x
     x_prior: Array  # (T + 1, B, n) predicted
+
+
+@dataclass(frozen=True, eq=False)
+class Filtered(Track):
+    """Arrays time first; `loglik` is minus infinity when the pass did not get through."""
+
     e: Array  # (T + 1, B, ny) innovations, zero where not seen
     eps: Array  # (T + 1, B, ny) the same whitened
     more: Array  # (T, B, n) variance added to the process noise, see `steps`
@@ -77,7 +83,7 @@ def filter_batch(
     measurement: Measurement,
     noise: NoiseStd,
     steps: ModelSteps,
-    about: Filtered | None = None,
+    about: Track | None = None,
 ) -> Filtered:
     """One pass over a batch. Never raises for numbers that run away: see `Filtered.status`.
 

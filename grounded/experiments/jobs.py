@@ -2,8 +2,7 @@
 
 A job is a module-level function called with plain numbers and names, and returns plain JSON values.
 It draws all its randomness from its own seed, so the same seeds give the same results bit for bit
-on one worker or on fifty. The engine is joblib: processes on this machine, or an existing cluster
-through Dask's own joblib backend (extra `cluster`); there is no scheduler of ours.
+on one worker or on fifty. Where they run, `grounded.engine` says; there is no scheduler of ours.
 
     finished    a mapping from the job's key to its result; jobs found in it are not run again. The
                 caller may keep it on disk: a study that was cut off goes on where it was. The key
@@ -23,7 +22,6 @@ import importlib
 import json
 import math
 from collections.abc import Callable, Iterable, Iterator, MutableMapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from itertools import product
@@ -32,10 +30,10 @@ from typing import Any, TypedDict, TypeVar, Unpack
 
 import numpy as np
 
-from grounded.errors import GroundedError, needs
+from grounded.engine import Engine
+from grounded.errors import GroundedError
 
 Progress = Callable[[int, int], None]  # jobs done, jobs in all
-CONNECT_S = 10.0  # for a cluster's scheduler to answer
 ROUNDS = 5  # times that jobs of lost workers are handed out again
 R = TypeVar("R")
 
@@ -62,31 +60,6 @@ class Job:
         """What identifies its result: the code, the function's name and its arguments."""
         name = f"{code()} {self.function.__module__}.{self.function.__name__}"
         return f"{name}:{json.dumps(self.arguments, sort_keys=True)}"
-
-
-@dataclass(frozen=True)
-class Engine:
-    """Where jobs run.
-
-    Args:
-        jobs: processes on this machine; 1 runs them in this one.
-        name: "local", or "dask" for a running cluster.
-        address: the cluster's scheduler, such as "tcp://10.0.0.1:8786".
-    """
-
-    jobs: int = 1
-    name: str = "local"
-    address: str | None = None
-
-    def __post_init__(self) -> None:
-        if self.jobs < 1:
-            raise GroundedError(f"--jobs must be 1 or more, got {self.jobs}")
-        if self.name not in ("local", "dask"):
-            raise GroundedError(f"--engine must be 'local' or 'dask', got '{self.name}'")
-        if (self.name == "dask") != (self.address is not None):
-            raise GroundedError(
-                "--engine dask needs the scheduler's --address (tcp://host:8786), and only it does"
-            )
 
 
 class Running(TypedDict, total=False):
@@ -192,40 +165,12 @@ def _results(jobs: Sequence[Job], engine: Engine) -> Iterator[tuple[str, dict[st
     """Results as they come, in any order."""
     if not jobs:
         return
-    if engine.name == "local" and engine.jobs == 1:
+    if engine.alone:
         yield from map(_call, jobs)
         return
-    joblib = needs("joblib", "studies")
-    with _backend(engine, joblib):
-        parallel = joblib.Parallel(
-            n_jobs=-1 if engine.name == "dask" else engine.jobs,
-            return_as="generator_unordered",
-            batch_size=1,
-            pre_dispatch="all" if engine.name == "dask" else "2*n_jobs",
-        )
-        yield from parallel(joblib.delayed(_call)(job) for job in jobs)
-
-
-@contextmanager
-def _backend(engine: Engine, joblib: Any) -> Iterator[None]:
-    """Sets where joblib runs; a connection to a Dask cluster is closed at the end, it stays."""
-    if engine.name == "local":
-        # One BLAS thread a worker: results don't depend on how many workers share the machine.
-        with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
-            yield
-        return
-    distributed = needs("distributed", "cluster")
-    try:
-        client = distributed.Client(engine.address, timeout=CONNECT_S)
-    except OSError as error:
-        raise GroundedError(
-            f"no Dask scheduler answers at {engine.address}: is it running? ({error})"
-        ) from error
-    try:
-        with joblib.parallel_config(backend="dask", client=client):
-            yield
-    finally:
-        client.close()
+    together = "all" if engine.name == "dask" else "2*n_jobs"
+    with engine.pool(return_as="generator_unordered", batch_size=1, pre_dispatch=together) as pool:
+        yield from pool((_call, (job,), {}) for job in jobs)
 
 
 def _lost() -> tuple[type[BaseException], ...]:

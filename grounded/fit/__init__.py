@@ -4,8 +4,8 @@
     prediction_error   one step and a second ahead, open loop
 
 Read `parameters` first (the front door), then `search` (what is moved in turn), `gauss_newton` (the
-climb), `result` (values and intervals), `prediction`. The likelihood is that of
-`grounded.estimate`.
+climb), `point` (the likelihood and its slopes), `unknowns`, `result` (values and intervals),
+`prediction`. The likelihood is that of `grounded.estimate`.
 """
 
 from __future__ import annotations

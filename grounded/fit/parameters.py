@@ -10,13 +10,14 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from grounded.engine import Engine, running
 from grounded.errors import GroundedError
 from grounded.estimate import Measurement, NoiseStd, Record, of_states
 from grounded.estimate.record import part, records_of
-from grounded.fit.gauss_newton import Latency, Unknowns, unknowns_of
 from grounded.fit.prediction import PredictionError, prediction_error
 from grounded.fit.result import Fit, least_known, report
 from grounded.fit.search import SearchEnd, data_of, first_search, search_parameters
+from grounded.fit.unknowns import Latency, Unknowns, unknowns_of
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.progress import Stages, interruptible
@@ -37,6 +38,7 @@ def fit(
     hold_out: float = 0.25,
     horizon_s: float = 1.0,
     rng: np.random.Generator | None = None,
+    engine: Engine | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Fit:
     """Parameters of a model from trials, with intervals.
@@ -51,6 +53,7 @@ def fit(
         hold_out: share of the time that judges the fit.
         horizon_s: how far ahead predictions are judged [s].
         rng: draws the trials that the noise is estimated on, if there are very many.
+        engine: workers for the records' likelihoods; the same comes out on any number.
         progress: told of the stage, the share done and the time left, for a display.
 
     Raises:
@@ -60,6 +63,12 @@ def fit(
     if isinstance(model, Task):
         latency = model.latency if latency is None else latency
         model = model.model
+    if model.n > MOST_STATES:
+        raise GroundedError(
+            f"model '{model.name}' has {model.n} states; a fit filters the trials with at most "
+            f"{MOST_STATES}, each step costs their cube: fit the parameters in a model of the part "
+            "that they belong to, and write them into this one"
+        )
     delay = np.zeros(model.m) if latency is None else np.asarray(latency, float)
     measurement = of_states(model) if measurement is None else measurement
     unknowns = unknowns_of(model, names, delay, fit_latency)
@@ -68,16 +77,17 @@ def fit(
         raise GroundedError("a fit needs a trial of at least 3 steps")
     rng = np.random.default_rng(0) if rng is None else rng
     held, tick = unknowns, Stages(progress, USUAL)
-    while True:
-        with interruptible(lambda: tick.so_far):
+    with interruptible(lambda: tick.so_far), running(engine):
+        while True:
             found = _fitted(model, records, measurement, unknowns, hold_out, horizon_s, rng, tick)
-        least = least_known(model, found)
-        if least is None or unknowns.k == 1:
-            return found.beside(held)
-        unknowns = unknowns.less(unknowns.names.index(least))
+            least = least_known(model, found)
+            if least is None or unknowns.k == 1:
+                return found.beside(held)
+            unknowns = unknowns.less(unknowns.names.index(least))
 
 
 USUAL = 25  # rounds and scans of a fit
+MOST_STATES = 50  # 200 steps of twice as many take minutes
 
 
 def _fitted(

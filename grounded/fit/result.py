@@ -22,9 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from grounded.estimate import NoiseStd
-from grounded.fit.gauss_newton import Linear, Unknowns
+from grounded.fit.point import Linear
 from grounded.fit.prediction import PredictionError
 from grounded.fit.search import SearchEnd, likelihood_interval, quiet
+from grounded.fit.unknowns import Unknowns
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.result import Result, document
@@ -152,7 +153,7 @@ def report(
         sentence=_sentence(unknowns, params, wide, last),
         before=before,
         after=after,
-        samples=at.batch.count,
+        samples=at.count,
         covariance=wide.covariance,
     )
 
@@ -172,7 +173,7 @@ def _estimates(unknowns: Unknowns, found: SearchEnd) -> tuple[dict[str, FittedVa
         value, std = float(at.theta[i]), float(wide.std[i])
         low, high = value - 1.96 * std, value + 1.96 * std
         if scanned[i]:
-            low, high = likelihood_interval(found.data, found.noise, at, i, worth)
+            low, high = likelihood_interval(found.data, at, i, worth)
             std = (high - low) / (2 * 1.96)
         range_ = unknowns.high[i] - unknowns.low[i]
         std = np.inf if high - low >= range_ else std
@@ -224,8 +225,8 @@ def uncertainty(slopes: Linear, free: NDArray[np.bool_]) -> Uncertainty:
         slopes: there.
         free: unknowns that slopes speak about, (k,); the others get an infinite std.
     """
-    k = slopes.W.shape[1]
-    N = slopes.W.T @ slopes.W
+    N = slopes.N
+    k = len(N)
     use = np.flatnonzero(free & (np.diag(N) > 0))
     std, covariance = np.full(k, np.inf), np.zeros((k, k))
     if len(use) == 0:
@@ -255,10 +256,10 @@ def inflation(slopes: Linear, free: NDArray[np.bool_]) -> float:
     log-likelihoods differ by more than they should; an interval read off them must drop further
     (Kent, Biometrika 69, 1982).
     """
-    use = np.flatnonzero(free & (np.sum(slopes.W**2, axis=0) > 0))
+    use = np.flatnonzero(free & (np.diag(slopes.N) > 0))
     if len(use) == 0:
         return 1.0
-    N = (slopes.W.T @ slopes.W)[np.ix_(use, use)]
+    N = slopes.N[np.ix_(use, use)]
     inverse = np.linalg.pinv(N, rcond=NULL, hermitian=True)
     each = float(np.trace(inverse @ _meat(slopes, use))) / int(np.linalg.matrix_rank(N))
     return max(1.0, each)
@@ -266,11 +267,7 @@ def inflation(slopes: Linear, free: NDArray[np.bool_]) -> float:
 
 def _meat(slopes: Linear, use: NDArray[np.int64]) -> Array:
     """The sum over blocks of g_b g_b', with the correction for few blocks."""
-    count = int(slopes.block.max()) + 1
-    scores = np.stack(
-        [np.bincount(slopes.block, slopes.W[:, i] * slopes.eps, minlength=count) for i in use],
-        axis=1,
-    )
+    count, scores = len(slopes.scores), slopes.scores[:, use]
     return np.asarray(scores.T @ scores * count / max(count - 1, 1))
 
 

@@ -26,18 +26,9 @@ from numpy.typing import NDArray
 from grounded.estimate import Measurement, NoiseStd, Record, cut
 from grounded.estimate.likelihood import enough, first_noise, maximum_likelihood
 from grounded.estimate.record import batch_of
-from grounded.estimate.steps import ModelSteps
-from grounded.fit.gauss_newton import (
-    Climb,
-    FitData,
-    Linear,
-    Point,
-    Unknowns,
-    climb,
-    linear,
-    marquardt_step,
-    point,
-)
+from grounded.fit.gauss_newton import Climb, climb, marquardt_step
+from grounded.fit.point import FitData, Linear, Point, fall, linear, point
+from grounded.fit.unknowns import Unknowns
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.progress import Stages
@@ -96,9 +87,9 @@ def search_parameters(
     at, start_noise = point(data, noise, theta), noise
     thresholds = np.zeros(len(theta), dtype=bool)
     if not np.isfinite(at.loglik):
-        return SearchEnd(data, _stopped(at), noise, noise, thresholds, at.filtered.status)
+        return SearchEnd(data, _stopped(at), noise, noise, thresholds, at.status)
     if new:
-        at = _delays(data, noise, at)
+        at = _delays(data, at)
     status = "still rising"
     for round_ in range(ROUNDS):
         _tell(tick, data, at)
@@ -110,7 +101,7 @@ def search_parameters(
         if round_ == 0 or at.loglik - before > STIRRED:
             for i in np.flatnonzero(still & np.isfinite(data.unknowns.scale)):
                 width = None if new and round_ == 0 else 0.05 * data.unknowns.scale[i]
-                moved = coarse_to_fine(data, noise, at, int(i), ~still, width)
+                moved = coarse_to_fine(data, at, int(i), ~still, width)
                 thresholds[i] |= moved is not at
                 at = moved
         if at.loglik - before < STIRRED and round_ > 0:
@@ -133,13 +124,13 @@ def _tell(tick: Stages, data: FitData, at: Point) -> None:
     values = zip(data.unknowns.names, at.theta, data.unknowns.units, strict=True)
     told = ", ".join(f"{name} = {value:.5g} {unit}" for name, value, unit in values)
     tick.so_far = f"so far, not at the top yet: {told}"
-    tick(f"climb, {at.batch.count} samples")
+    tick(f"climb, {at.count} samples")
 
 
 def _stopped(at: Point) -> Climb:
     k = len(at.theta)
-    nothing = Linear(np.zeros((0, k)), np.zeros(0), np.zeros(0, dtype=np.int64))
-    return Climb(at, nothing, 0, at.filtered.status)
+    nothing = Linear(np.zeros((k, k)), np.zeros(k), np.zeros((0, k)))
+    return Climb(at, nothing, 0, at.status)
 
 
 def _noise(
@@ -162,13 +153,13 @@ def _noise(
     return found.noise
 
 
-def _delays(data: FitData, noise: NoiseStd, at: Point) -> Point:
+def _delays(data: FitData, at: Point) -> Point:
     """Each fitted latency from a scan over whole steps: it may begin far off."""
     first = len(data.unknowns.columns)
     free = ~quiet(data, linear(data, at))
     for i in range(first, data.unknowns.k):
-        grid = np.arange(0.0, data.unknowns.high[i] + 1e-9, max(noise.dt, 0.02))
-        at = profile_of(data, noise, at, i, grid, free)[0]
+        grid = np.arange(0.0, data.unknowns.high[i] + 1e-9, max(at.noise.dt, 0.02))
+        at = profile_of(data, at, i, grid, free)[0]
     return at
 
 
@@ -181,13 +172,12 @@ QUIET = 1e-2  # information over the whole range below which a slope says nothin
 
 def quiet(data: FitData, slopes: Linear) -> NDArray[np.bool_]:
     """Unknowns (k,) on which the innovations do not depend to first order."""
-    information = np.sum(slopes.W**2, axis=0) * data.unknowns.scale**2
+    information = np.diag(slopes.N) * data.unknowns.scale**2
     return np.asarray(information < QUIET)
 
 
 def profile_of(
     data: FitData,
-    noise: NoiseStd,
     at: Point,
     i: int,
     grid: Array,
@@ -199,7 +189,6 @@ def profile_of(
 
     Args:
         data: the records.
-        noise: held fixed.
         at: where the others are.
         i: the unknown that is scanned.
         grid: its values.
@@ -209,12 +198,12 @@ def profile_of(
     others[i] = False
     profile, best, score = np.full(len(grid), -np.inf), at, at.loglik
     if free is None:
-        profile = at.loglik - np.array([fall(data, noise, at, i, value) for value in grid])
+        profile = at.loglik - np.array([fall(data, at, i, value) for value in grid])
         if profile.max() > score:
-            best = _with(data, noise, at, i, grid[np.argmax(profile)])
+            best = _with(data, at, i, grid[np.argmax(profile)])
         return best, profile
     for g, value in enumerate(grid):
-        here = _with(data, noise, at, i, value)
+        here = _with(data, at, i, value)
         profile[g] = here.loglik
         if not np.isfinite(here.loglik):
             continue
@@ -224,14 +213,13 @@ def profile_of(
         if profile[g] > score:
             best, score = here, float(profile[g])
             if others.any():
-                moved = point(data, noise, here.theta + delta, here)
+                moved = point(data, at.noise, here.theta + delta, here)
                 best = moved if moved.loglik > here.loglik else here
     return best, profile
 
 
 def coarse_to_fine(
     data: FitData,
-    noise: NoiseStd,
     at: Point,
     i: int,
     free: NDArray[np.bool_],
@@ -249,7 +237,7 @@ def coarse_to_fine(
         others = (
             free if round_ == 0 and width is None else None
         )  # small steps hardly matter to them
-        best, profile = profile_of(data, noise, best, i, grid, others)
+        best, profile = profile_of(data, best, i, grid, others)
         top = np.flatnonzero(profile > profile.max() - LEVEL)
         step = grid[1] - grid[0]
         if len(top) > 2:
@@ -258,23 +246,23 @@ def coarse_to_fine(
         grid = np.linspace(low, high, 2 * FINE + 1)
     if best.loglik < at.loglik + LEVEL:
         return at
-    return _centred(data, noise, best, i, grid[top])
+    return _centred(data, best, i, grid[top])
 
 
-def _centred(data: FitData, noise: NoiseStd, best: Point, i: int, level: Array) -> Point:
+def _centred(data: FitData, best: Point, i: int, level: Array) -> Point:
     """The middle of the values that are as good as the best: the likelihood is flat between them.
 
     An end of the level is where the next sample lies, and nothing says that it is the threshold.
     """
     beside = level[np.argsort(np.abs(level - np.median(level)))]
     for value in beside:
-        if fall(data, noise, best, i, value) < LEVEL:
-            return _with(data, noise, best, i, value)
+        if fall(data, best, i, value) < LEVEL:
+            return _with(data, best, i, value)
     return best
 
 
 def likelihood_interval(
-    data: FitData, noise: NoiseStd, at: Point, i: int, inflation: float = 1.0
+    data: FitData, at: Point, i: int, inflation: float = 1.0
 ) -> tuple[float, float]:
     """The values of unknown i around the best whose log-likelihood is within DROP of it.
 
@@ -283,83 +271,45 @@ def likelihood_interval(
 
     Args:
         data: the records.
-        noise: held fixed.
         at: the best point.
         i: the unknown.
         inflation: what DROP is multiplied by where innovations are correlated.
     """
     drop = DROP * inflation
     ends = (float(data.unknowns.low[i]), float(data.unknowns.high[i]))
-    low, high = (_end(data, noise, at, i, bound, drop) for bound in ends)
+    low, high = (_end(data, at, i, bound, drop) for bound in ends)
     return low, high
 
 
-def _end(data: FitData, noise: NoiseStd, at: Point, i: int, bound: float, drop: float) -> float:
+def _end(data: FitData, at: Point, i: int, bound: float, drop: float) -> float:
     best = float(at.theta[i])
     span = abs(bound - best)
-    if span == 0 or fall(data, noise, at, i, bound) < drop:
+    if span == 0 or fall(data, at, i, bound) < drop:
         return bound
     sign, step, good = np.sign(bound - best), 1e-3 * span, 0.0
     while step < span:
-        fallen = fall(data, noise, at, i, best + sign * step)
+        fallen = fall(data, at, i, best + sign * step)
         good = step if fallen < drop else good
         if fallen > 3 * drop:
             break
         step *= 2
     far = min(step, span)
     grid = np.linspace(good, far, GRID + 1)[1:-1]
-    inside = [g for g in grid if fall(data, noise, at, i, best + sign * g) < drop]
+    inside = [g for g in grid if fall(data, at, i, best + sign * g) < drop]
     width = (far - good) / GRID
     good = max([good, *inside])
     outside = min(far, good + width)
     for _ in range(3):
         middle = 0.5 * (good + outside)
-        if fall(data, noise, at, i, best + sign * middle) < drop:
+        if fall(data, at, i, best + sign * middle) < drop:
             good = middle
         else:
             outside = middle
     return float(best + sign * outside)
 
 
-def fall(data: FitData, noise: NoiseStd, at: Point, i: int, value: float) -> float:
-    """What the log-likelihood loses with another value of unknown i.
-
-    A threshold acts on few samples: only the records that it changes are filtered again.
-    """
-    theta = at.theta.copy()
-    theta[i] = value
-    acts = _acts(data, at, theta)
-    if not acts.any():
-        return 0.0
-    if acts.all():
-        return at.loglik - point(data, noise, theta, at).loglik
-    part = replace(data, records=tuple(r for r, a in zip(data.records, acts, strict=True) if a))
-    f = at.filtered
-    about = replace(f, x=f.x[:, acts], std=f.std[:, acts], x_prior=f.x_prior[:, acts])
-    there = point(part, noise, theta, replace(at, filtered=about))
-    here = np.sum(f.eps[:, acts] ** 2) + f.gains.logdet[:, acts].sum()
-    return -0.5 * float(here + there.batch.count * np.log(2 * np.pi)) - there.loglik
-
-
-def _acts(data: FitData, at: Point, theta: Array) -> NDArray[np.bool_]:
-    """The records (B,) along whose tracks the model at theta is another one."""
-    (p, latency), (here, as_it_is) = data.unknowns.unpack(theta), data.unknowns.unpack(at.theta)
-    if (latency != as_it_is).any():
-        return np.ones(len(data.records), dtype=bool)
-    one, other = (
-        ModelSteps(data.system, values, at.batch, wide=True).along(
-            at.filtered.x[:-1], at.filtered.std[:-1]
-        )
-        for values in (here, p)
-    )
-    apart = [
-        (a != b).reshape(*a.shape[:2], -1).any(axis=(0, 2)) for a, b in zip(one, other, strict=True)
-    ]
-    return np.asarray(np.any(apart, axis=0))
-
-
-def _with(data: FitData, noise: NoiseStd, at: Point, i: int, value: float) -> Point:
+def _with(data: FitData, at: Point, i: int, value: float) -> Point:
     """The same point but for unknown i."""
     theta = at.theta.copy()
     theta[i] = value
-    return point(data, noise, theta, at)
+    return point(data, at.noise, theta, at)

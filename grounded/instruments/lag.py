@@ -25,6 +25,7 @@ WINDOWS = (1, 2, 4, 8, 16, 32, 64)  # half lengths of the smoothing window, samp
 SHORTEST = 24  # samples of a pair that counts
 CLEAR = 0.9  # of the coherence: windows below it don't count
 BLOCKS = 16  # at least: the scatter over them is the uncertainty
+SCREENED, MAYBE = 4, 0.7  # half window and correlation from which two signals may be one
 FILTER = 0.9  # of the misfit of a delay: below it a filter is what it is
 
 
@@ -62,7 +63,7 @@ def lag_between(pairs: Pairs, dt: float) -> Lag | None:
         None where too little of both is seen.
     """
     longest = max((len(a) for a, _ in pairs), default=0)
-    reach = max(3, min(int(np.ceil(max(MOST / dt, FEW))), longest // 8))
+    reach = reach_of(longest, dt)
     found = [_smoothed(pairs, h, reach) for h in WINDOWS if 2 * h + 2 * reach < longest / 2]
     lags = [one for p in found if (one := _measured(p, reach, dt)) is not None]
     clear = [one for one in lags if one.coherence > CLEAR]
@@ -71,6 +72,32 @@ def lag_between(pairs: Pairs, dt: float) -> Lag | None:
     best = min(clear, key=lambda lag: lag.std)
     apart = float(np.median([abs(one.delay - best.delay) for one in clear]))
     return replace(best, std=float(np.hypot(best.std, apart)))
+
+
+def reach_of(steps: int, dt: float) -> int:
+    """Samples that a signal of so many steps is moved by at most."""
+    return max(3, min(int(np.ceil(max(MOST / dt, FEW))), steps // 8))
+
+
+def alike(signals: Array, reach: int) -> list[tuple[int, int]]:
+    """Pairs i < j of signals (T, m) that may be one, a little later or noisier, by j, then i.
+
+    By the correlations of smoothed ones, all pairs at a time; `lag_between` judges what is left.
+    """
+    T, m = signals.shape
+    window = np.hanning(2 * SCREENED + 3)[1:-1]
+    if m < 2 or len(window) >= T:
+        return [(i, j) for j in range(m) for i in range(j)]
+    smooth = np.stack([np.convolve(x, window, "valid") for x in signals.T])
+    smooth = smooth - smooth.mean(axis=1, keepdims=True)
+    smooth /= np.sqrt((smooth**2).sum(axis=1, keepdims=True))
+    waves = np.fft.rfft(smooth, T + reach)
+    found = []
+    for j in range(m):
+        shared = np.fft.irfft(waves[:j] * waves[j].conj(), T + reach)
+        near = np.abs(np.concatenate([shared[:, : reach + 1], shared[:, -reach:]], axis=1))
+        found += [(int(i), j) for i in np.flatnonzero(~(near.max(axis=1, initial=0.0) < MAYBE))]
+    return found
 
 
 @dataclass(frozen=True)

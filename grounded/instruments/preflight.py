@@ -27,7 +27,7 @@ from grounded.instruments.kinematics import (
     lag_of,
     turned,
 )
-from grounded.instruments.lag import Lag, at_samples, lag_between
+from grounded.instruments.lag import Lag, alike, at_samples, lag_between, reach_of
 from grounded.instruments.single import Signal, judge_signal
 from grounded.model import Model
 from grounded.task import Task
@@ -238,13 +238,13 @@ def _inputs(subject: Task | Model, trials: Sequence[Trial]) -> Iterator[Finding]
                 yield Finding(
                     name, f"at its limits {100 * share:.0f} % of the time", "saturated", share=share
                 )
-    for j, name in enumerate(names):
-        for i in range(j):
-            if fixed[i] or fixed[j]:
-                continue
-            lag = lag_between(list(zip(columns[i], columns[j], strict=True)), trials[0].dt)
-            if lag is not None and lag.coherence > 0.95 and 0.9 < lag.sign * lag.low < 1.1:
-                yield _copy(names[i], name, lag)
+    longest = max(trials, key=lambda trial: trial.steps).inputs
+    for i, j in alike(longest, reach_of(len(longest), trials[0].dt)):
+        if fixed[i] or fixed[j]:
+            continue
+        lag = lag_between(list(zip(columns[i], columns[j], strict=True)), trials[0].dt)
+        if lag is not None and lag.coherence > 0.95 and 0.9 < lag.sign * lag.low < 1.1:
+            yield _copy(names[i], names[j], lag)
 
 
 def _copy(first: str, second: str, lag: Lag) -> Finding:

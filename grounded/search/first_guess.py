@@ -17,8 +17,8 @@ never comes back. So the target itself is made a nominal run, in three moves:
 
 The trim is Levenberg-Marquardt on many steps at once, inputs inside their limits. It starts from
 several inputs, because a stalled motor has no slope to follow; then every step tries again with one
-input set back, and tries the solutions of its neighbours, because a manoeuvre is continuous and a
-bad local minimum seldom is.
+input set back (of few: what one of many could do, the others do), and tries the solutions of its
+neighbours, because a manoeuvre is continuous and a bad local minimum seldom is.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ from grounded.task import Task
 STARTS = (0.0, 0.35, 0.7, -0.35)  # fractions of the way from the held input to its limit
 ITERATIONS, MORE = 30, 12  # of Levenberg-Marquardt: from the starts, from a solution nearby
 ROUNDS = 3
+FEW = 8  # inputs that are set back one by one
 FREE_WEIGHT = 0.3  # what is prescribed goes first where both can't be had
 KNOTS = 250  # steps that are solved from scratch; those between start from their neighbours
 EXACT = 1e-12  # of the mean squared rate: a trim this good is not tried again
@@ -184,7 +185,7 @@ def _from_scratch(task: Task, batch: LeastSquares, states: Array, knots: Rows) -
 
     for start in starts[1:]:
         best = again(np.hstack([states, start]), ITERATIONS)
-    for j in range(task.model.m):
+    for j in range(task.model.m if task.model.m <= FEW else 0):
         for start in starts:
             w = best.w.copy()
             w[:, states.shape[1] + j] = start[:, j]

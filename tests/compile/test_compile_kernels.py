@@ -176,6 +176,8 @@ def test_too_many_operations_are_not_compiled(monkeypatch):
 
     monkeypatch.setattr(package, "MAX_COMPILED", 20)
     monkeypatch.setattr("grounded.compile.run.compiled.SMALL", 0)
+    assert problem("car").system.how == "compiled steps"
+    monkeypatch.setattr(package, "MAX_STEPS", 20)
     task = problem("car")
     assert task.system.how == "traced" and "operations" in task.system.note
     with pytest.raises(TooLong):

@@ -7,12 +7,18 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import experiment_jobs
 from facts import holding
+from grounded.diagnosis.diagnose import diagnose
+from grounded.engine import Engine
 from grounded.errors import GroundedError
-from grounded.experiments.jobs import Engine, Job, run_jobs
+from grounded.experiments.jobs import Job, run_jobs
+from grounded.fit import fit
+from grounded.trial import Trial
+from grounded_trials.workspace.model_file import load_module
 from shared_data import SUPPORT
 
 joblib = pytest.importorskip("joblib", reason="joblib is not installed")
@@ -148,6 +154,57 @@ def test_a_cluster_that_loses_a_worker_half_way_gives_the_same_bits(cluster):
 @pytest.mark.filterwarnings("ignore")
 def test_no_cluster_is_said_so(monkeypatch):
     pytest.importorskip("distributed", reason="dask is not installed")
-    monkeypatch.setattr("grounded.experiments.jobs.CONNECT_S", 1.0)
+    monkeypatch.setattr("grounded.engine.CONNECT_S", 1.0)
     with pytest.raises(GroundedError, match=holding("Dask", "tcp://127.0.0.1:9")):
         run_jobs(draws(1), Engine(name="dask", address="tcp://127.0.0.1:9"))
+
+
+LAG = """
+import numpy as np
+from grounded import Model, Param
+
+LIMIT = 0.1
+
+
+def rate(s, a, p):
+    return {"v": (p.gain * np.where(np.abs(a.u) > LIMIT, a.u, 0.0) - s.v) / p.tau}
+
+
+model = Model(
+    states={"v": "m/s"},
+    inputs={"u": "1"},
+    params={"gain": Param(2.0, "m/s", 0.5, 5.0), "tau": Param(0.3, "s", 0.05, 2.0)},
+    derivative=rate,
+)
+"""
+
+
+def runs_of(model, count, steps):
+    """Trials of a model whose gain is another, its input a step late."""
+    rng, found = np.random.default_rng(3), []
+    truth = model.with_values({"gain": 2.4})
+    for _ in range(count):
+        u = np.clip(np.cumsum(rng.normal(0, 0.2, (steps, 1)), axis=0), -1.0, 1.0)
+        x = np.zeros((steps + 1, 1))
+        for t in range(steps):
+            late = u[max(t - 1, 0)][None]
+            x[t + 1] = truth.system.step(x[t : t + 1], late, truth.values, 0.05)[0]
+        x += 0.01 * rng.standard_normal(x.shape)
+        found.append(Trial(dt=0.05, states=x, inputs=u, state_names=("v",), input_names=("u",)))
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")  # of Dask and tornado, about themselves
+def test_a_fit_and_a_diagnosis_on_a_cluster_give_the_same_bits(cluster, tmp_path, monkeypatch):
+    (tmp_path / "lag.py").write_text(LAG)  # as in a workspace: no worker can import it
+    model = load_module(tmp_path, "lag.py").model
+    trials, engine = runs_of(model, 20, 150), Engine(name="dask", address=cluster[0])
+    monkeypatch.setattr(sys.modules["grounded.fit.point"], "SMALL", 0)
+    one, many = (fit(model, trials, engine=e) for e in (None, engine))
+    assert one.to_json() == many.to_json() and one.loglik == many.loglik
+    assert np.array_equal(one.covariance, many.covariance)
+    assert one.params["gain"].value == pytest.approx(2.4, abs=0.1)
+    few = trials[:2]
+    one, many = (diagnose(model, few, engine=e).to_json() for e in (None, engine))
+    assert one == many and one["verdict"]

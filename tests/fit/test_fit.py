@@ -10,8 +10,12 @@ import pytest
 from facts import holding, holds
 from grounded.errors import GroundedError
 from grounded.estimate import NoiseStd, of_states, record_of
+from grounded.estimate.extended import filter_batch
+from grounded.estimate.steps import ModelSteps
 from grounded.fit import fit, prediction_error
-from grounded.fit.gauss_newton import FitData, climb, exact, linear, point, unknowns_of
+from grounded.fit.gauss_newton import climb
+from grounded.fit.point import FitData, exact, linear, point, whitened
+from grounded.fit.unknowns import unknowns_of
 from grounded.model import Model, Param
 from grounded.models.pendulum import model as pendulum
 from grounded.trial import Trial
@@ -195,13 +199,26 @@ def test_slopes_of_the_problem_are_what_differences_say():
     unknowns = unknowns_of(SPRING, None, np.array([0.06]), "each")
     records = tuple(record_of(SPRING, t) for t in trials)
     data = FitData(SPRING.system, records, measurement, unknowns)
-    at = point(data, NOISE, unknowns.start)
-    W = linear(data, at).W
+
+    def filtered(theta):
+        batch, p = data.batch(theta), unknowns.unpack(theta)[0]
+        return filter_batch(batch, measurement, NOISE, ModelSteps(SPRING.system, p, batch, True))
+
+    start, seen = unknowns.start, data.batch(unknowns.start).seen
+    at = filtered(start)
+    W, slopes = (
+        whitened(data, data.batch(start), start, at)[seen],
+        linear(data, point(data, NOISE, start)),
+    )
+    assert np.allclose(slopes.N, W.T @ W)
+    assert np.allclose(slopes.g, -W.T @ at.eps[seen]) and np.allclose(
+        -slopes.scores.sum(0), slopes.g
+    )
     for i, h in enumerate((1e-4, 1e-4, 1e-5)):
-        up, down = (point(data, NOISE, unknowns.start + s * np.eye(3)[i]) for s in (h, -h))
+        up, down = (filtered(start + s * np.eye(3)[i]) for s in (h, -h))
         # S depends on k and d, eps = C e through C as well: compare the innovations themselves
-        e = (up.filtered.e - down.filtered.e) / (2 * h)
-        moved = (at.filtered.gains.whitener @ e[..., None])[..., 0][at.batch.seen]
+        e = (up.e - down.e) / (2 * h)
+        moved = (at.gains.whitener @ e[..., None])[..., 0][seen]
         assert np.corrcoef(moved, W[:, i])[0, 1] > 0.97
 
 

@@ -1,16 +1,19 @@
 """Thresholds on the records they act on, progress, and Ctrl-C, in fit and diagnose."""
 
 import re
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
+from grounded.diagnosis.diagnose import diagnose
+from grounded.engine import Engine
 from grounded.estimate import NoiseStd, of_states, record_of
 from grounded.fit import fit
-from grounded.fit.gauss_newton import point, unknowns_of
-from grounded.fit.search import data_of, fall
+from grounded.fit.point import fall, point
+from grounded.fit.search import data_of
+from grounded.fit.unknowns import unknowns_of
 from grounded.model import Model, Param
 from grounded.progress import Interrupted, Stages
 from grounded.trial import Trial
@@ -53,11 +56,12 @@ def test_a_threshold_is_worth_the_same_on_the_records_it_acts_on(trials):
     at = point(data, NOISE, np.array([2.4, 0.35]))
     for value in (0.1, 0.3, 0.36, 0.5):
         there = point(data, NOISE, np.array([2.4, value]))
-        assert fall(data, NOISE, at, 1, value) == pytest.approx(
+        assert fall(data, at, 1, value) == pytest.approx(
             at.loglik - there.loglik, abs=0.02, rel=1e-4
         )
-    assert data.batch(at.theta) is at.batch
-    assert replace(data, records=data.records[:1]).batch(at.theta).count < at.batch.count
+    batch = data.batch(at.theta)
+    assert data.batch(at.theta) is batch and batch.count == at.count
+    assert replace(data, records=data.records[:1]).batch(at.theta).count < at.count
 
 
 def test_stages_tell_share_and_time_and_never_say_that_all_is_done():
@@ -70,7 +74,7 @@ def test_stages_tell_share_and_time_and_never_say_that_all_is_done():
     assert "s left" in told[-1]
 
 
-@pytest.mark.parametrize("after", [3, 40])
+@pytest.mark.parametrize("after", [3, 25])
 def test_ctrl_c_in_a_diagnosis_says_the_best_hypothesis_so_far(trials, after):
     count = 0
 
@@ -83,7 +87,7 @@ def test_ctrl_c_in_a_diagnosis_says_the_best_hypothesis_so_far(trials, after):
     with pytest.raises(Interrupted) as stopped:
         diagnose(MODEL, trials, progress=stop)
     assert "hypothes" in str(stopped.value)
-    if after == 40:
+    if after == 25:
         assert re.search(r"ahead predictions miss v by \S+ instead of \S+ m/s", str(stopped.value))
 
 
@@ -97,5 +101,19 @@ def test_ctrl_c_in_a_fit_says_the_values_so_far(trials):
 
 
 def test_a_diagnosis_is_the_same_on_one_thread_and_on_two(trials):
-    one, two = (diagnose(MODEL, trials, DiagnosisOptions(jobs=n)).to_json() for n in (1, 2))
+    one, two = (diagnose(MODEL, trials, engine=Engine(n)).to_json() for n in (1, 2))
     assert one == two
+
+
+def test_a_fit_is_the_same_on_one_thread_and_on_three(trials, monkeypatch):
+    parts = sys.modules["grounded.fit.point"]
+    monkeypatch.setattr(parts, "PART", 2)
+    monkeypatch.setattr(parts, "SMALL", 0)
+    one, three = (fit(MODEL, trials, engine=Engine(n)) for n in (1, 3))
+    assert one.to_json() == three.to_json() and one.loglik == three.loglik
+    assert np.array_equal(one.covariance, three.covariance)
+    monkeypatch.setattr(parts, "SMALL", 1_000_000)
+    whole = fit(MODEL, trials)
+    for name, value in whole.params.items():
+        assert one.params[name].value == pytest.approx(value.value, abs=0.1 * value.std)
+        assert one.params[name].std == pytest.approx(value.std, rel=0.05)

@@ -25,6 +25,7 @@ from grounded_trials.workspace.folder import Folder
 if TYPE_CHECKING:
     from grounded.diagnosis.report import Diagnosis
     from grounded.effects import Library
+    from grounded.engine import Engine
     from grounded.frozen import Array
     from grounded.instruments.finding import Finding
     from grounded.search.candidate import Candidate
@@ -285,6 +286,7 @@ class Workspace(Folder):
         *,
         latency: bool = False,
         apply: bool = False,
+        engine: Engine | None = None,
         progress: Callable[[str], None] | None = None,
     ) -> Fitted:
         """Estimates the model's parameters from all trials.
@@ -293,11 +295,14 @@ class Workspace(Folder):
             params: only these; None: all of them.
             latency: fit one transport delay of all inputs too.
             apply: write the values to grounded.toml.
+            engine: workers for the trials' likelihoods; the same comes out on any number.
             progress: told of the stage, the share done and the time left.
         """
         from grounded_trials.workspace.fitting import Fitted, apply_fit, fit_trials
 
-        found = fit_trials(self._afresh(), params, latency=latency, progress=progress)
+        found = fit_trials(
+            self._afresh(), params, latency=latency, engine=engine, progress=progress
+        )
         if apply:
             apply_fit(self, found)
             self.forget()
@@ -314,7 +319,7 @@ class Workspace(Folder):
         library: Library | None = None,
         compare: Sequence[str] = (),
         probe: bool = False,
-        jobs: int = 1,
+        engine: Engine | None = None,
         progress: Callable[[str], None] | None = None,
     ) -> Diagnosis:
         """Explains the gap between model and trials; keeps reports/diagnosis.json.
@@ -325,7 +330,7 @@ class Workspace(Folder):
             without: families not to blame.
             compare: a second group of trials; what changed from the first is `changed`.
             probe: write the most instructive candidate also where nothing ties.
-            jobs: threads that fit hypotheses; the same comes out on any number.
+            engine: workers that fit hypotheses; the same comes out on any number.
             library: the effects that may be blamed; None: those that are installed.
             progress: told of each stage.
         """
@@ -340,7 +345,7 @@ class Workspace(Folder):
             library=library.without(without),
             compare=compare,
             probe=probe,
-            jobs=jobs,
+            engine=engine,
             progress=progress,
         )
 

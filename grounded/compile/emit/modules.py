@@ -25,6 +25,7 @@ class Source:
     sizes: tuple[int, int, int]
     kind: Kind
     integrator: Integrator
+    derivatives: bool = True  # else steps and rollouts alone
 
     def text(self, which: Layout | str, width: int) -> str:
         """LLVM IR of a module, for vectors of `width` doubles.
@@ -35,9 +36,12 @@ class Source:
             width: doubles in the widest vector of the machine.
         """
         n, m, k = self.sizes
-        d = self._dynamics(n + m + (k if which == "full" else 0))
+        columns = n + m + (k if which == "full" else 0)
+        d = self._dynamics(columns if self.derivatives else 0)
         if isinstance(which, Layout):
             return self._search(d, which, width)
+        if not self.derivatives:
+            return _start(d, width) + step_kernel(d, width)
         columns = k if which == "full" else 0
         text = _start(d, width) + jacobian_function(d, width) + linearise_kernel(d, width, columns)
         return text if which == "full" else text + step_kernel(d, width)
@@ -48,7 +52,7 @@ class Source:
 
     def _search(self, d: Dynamics, layout: Layout, width: int) -> str:
         text = _start(d, width) + rollout_kernel(d, layout)
-        if layout.m > MAX_INPUTS:
+        if layout.m > MAX_INPUTS or not self.derivatives:
             return text
         text += sweep_tables(d, width) + box_functions(layout.m) + sweep_kernel(d, layout, width)
         return text + descent_kernel(layout.m, layout.nz)

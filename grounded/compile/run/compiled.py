@@ -66,20 +66,23 @@ class Kernels:
     def __init__(self, variant: Variant, system: CompiledSystem) -> None:
         n, m, k = self.sizes = (system.n, system.m, system.k)
         self._variant, self._kind, self._integrator = variant, system.kind, system.integrator
+        self._derivatives = system.derivatives
         graph = variant.trace.graph.digest(variant.trace.outputs)  # its derivatives follow from it
         self._key = (
-            f"{FORMAT} {jit.writers()} {graph} {n} {m} {k} {system.kind} {system.integrator}"
+            f"{FORMAT} {jit.writers()} {graph} {n} {m} {k} {system.kind} {system.integrator} "
+            f"{system.derivatives}"
         )
         self._libraries: dict[Any, jit.Library] = {}
         self._lock = threading.RLock()
 
     def batch(self) -> jit.Library:
-        """Step and linearise, of many samples."""
-        return self._library("batch", ("step", "linearise", "jacobian"))
+        """Step and, unless derivatives are left out, linearise, of many samples."""
+        more = ("linearise", "jacobian") if self._derivatives else ()
+        return self._library("batch", ("step", *more))
 
     def search(self, layout: Layout) -> jit.Library:
         """Rollout and, for few enough inputs, sweep and descent; about a layout of z."""
-        small = layout.m <= MAX_INPUTS
+        small = layout.m <= MAX_INPUTS and self._derivatives
         names = ("rollout", "sweep", "descent") if small else ("rollout",)
         return self._library(layout, names)
 
@@ -100,17 +103,20 @@ class Kernels:
     def _text(self, which: Layout | str) -> str:
         from grounded.compile.emit import modules  # only what no cache holds is written
 
-        source = modules.Source(self._variant, self.sizes, self._kind, self._integrator)
-        return source.text(which, jit.lanes())
+        about = (self._variant, self.sizes, self._kind, self._integrator)
+        return modules.Source(*about, self._derivatives).text(which, jit.lanes())
 
 
 class CompiledSystem(TracedSystem):
     """A traced function, compiled."""
 
     how = "compiled"
+    derivatives = True
 
-    def __init__(self, signature: Signature, first: Trace, integrator: Integrator) -> None:
-        super().__init__(signature, first, integrator, "")
+    def __init__(
+        self, signature: Signature, first: Trace, integrator: Integrator, note: str = ""
+    ) -> None:
+        super().__init__(signature, first, integrator, note)
         self._kernels: dict[int, Kernels] = {}
 
     @property
@@ -251,9 +257,21 @@ class CompiledSystem(TracedSystem):
         if self not in known.kernels:
             kernels = self._compiled(problem.p, problem.dt)
             search = kernels.search(known.layout)
-            known.kernels[self] = search, kernels.batch().addresses["jacobian"]
+            known.kernels[self] = search, kernels.batch().addresses.get("jacobian", 0)
         found: tuple[jit.Library, int] = known.kernels[self]
         return found
+
+
+class CompiledSteps(CompiledSystem):
+    """Steps and rollouts compiled, derivatives traced: those of a wide model fill the stack."""
+
+    how = "compiled steps"
+    derivatives = False
+
+    linearise = TracedSystem.linearise
+    sensitivities = TracedSystem.sensitivities
+    backward = TracedSystem.backward
+    descend = TracedSystem.descend
 
 
 def _policy(ubar: Array, K: Array | None, zbar: Array | None, k: Array | None) -> dict[str, Any]:

@@ -29,6 +29,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,6 +67,12 @@ class Interpreted(System):
         self.kind, self.states = signature.kind, signature.states
         self.source = where(signature.function)
         self.n, self.m, self.k = self.sizes = signature.sizes
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """In another process it is made again from the function: code and caches stay here."""
+        from grounded.compile import system_from
+
+        return system_from, (self.signature, self.integrator)
 
     @abstractmethod
     def evaluate(self, x: Array, u: Array, p: Array, dt: float, smoothing: float) -> Array:

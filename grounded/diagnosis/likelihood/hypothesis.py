@@ -34,6 +34,7 @@ from grounded.effects.family import braked, coupled
 from grounded.effects.joint import Loads, loads, solved
 from grounded.effects.registry import partner
 from grounded.effects.sensor import lagging
+from grounded.engine import SentOnce
 from grounded.frozen import Array
 from grounded.model import Model
 
@@ -105,7 +106,7 @@ def param_scale(model: Model) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Predictor:
+class Predictor(SentOnce):
     """Evaluates hypotheses on one Data. Shapes: tracks (L + 1, B, n), inputs (L, B, m)."""
 
     data: Data

@@ -41,11 +41,11 @@ from grounded.diagnosis.likelihood.noise import (
     working,
 )
 from grounded.effects import SensorDelayFamily
+from grounded.engine import each
 from grounded.filter import kalman
 from grounded.filter.augmented import Delayed, joined
 from grounded.filter.kalman import LinearSystem
 from grounded.frozen import Array
-from grounded.threads import each
 
 MOST_NUMBERS = 1e5  # of one (L, B, N, N) array: what fits in the cache goes fastest
 SHORTEST = 0.05  # part of a step that is still tried
@@ -187,33 +187,43 @@ def refine(
         predictor: the data.
         starts: fits to go on from, or (hypothesis, noise, track).
         iterations: at most; a hypothesis that stopped rising is left alone.
-        tick: called after each iteration.
+        tick: called as one or a few of them are done.
         fixed_noise: keep the noise as it is.
     """
-    data = predictor.data
     works = [
         Work(s.hypothesis, s.noise, s.track) if isinstance(s, Fitted) else Work(*s) for s in starts
     ]
     if not works:
         return []
-    L, B, n = predictor.data.time.shape[0], data.time.shape[1], data.model.n
+    (L, B), n = predictor.data.time.shape, predictor.data.model.n
     wide = n if works[0].noise.structure.tau is None else 2 * n
     size = max(1, int(MOST_NUMBERS / (L * B * wide * wide)))
+    shapes = _of_one_shape(works)
+    blocks = [a[at : at + size] for a in shapes for at in range(0, len(a), size)]
+    many, some = len(blocks), [[works[i] for i in block] for block in blocks]
+    found = each(_climb, [predictor] * many, some, [(iterations, fixed_noise)] * many, done=tick)
+    fits: dict[int, Fitted | None] = {}
+    for block, part in zip(blocks, found, strict=True):
+        fits.update(zip(block, part, strict=True))
+    return [fit for _, fit in sorted(fits.items()) if fit is not None]
+
+
+def _climb(predictor: Predictor, works: list[Work], how: tuple[int, bool]) -> list[Fitted | None]:
+    """Refines hypotheses of one shape, side by side."""
+    iterations, fixed_noise = how
+    works = [replace(work) for work in works]
     for _ in range(iterations):
-        shapes = _of_one_shape([work for work in works if not work.still])
-        blocks = [a[at : at + size] for a in shapes for at in range(0, len(a), size)]
-        each(lambda block: _iterate(predictor, block, fixed_noise), blocks)
-        if tick is not None:
-            tick()
-    return [work.best for work in works if work.best is not None]
+        if moving := [work for work in works if not work.still]:
+            _iterate(predictor, moving, fixed_noise)
+    return [work.best for work in works]
 
 
-def _of_one_shape(works: list[Work]) -> list[list[Work]]:
-    """Works whose filters have states of one size: as many sensors are delayed."""
-    groups: dict[int, list[Work]] = {}
-    for work in works:
+def _of_one_shape(works: list[Work]) -> list[list[int]]:
+    """Indices of works whose filters have states of one size: as many sensors are delayed."""
+    groups: dict[int, list[int]] = {}
+    for i, work in enumerate(works):
         count = sum(isinstance(e.family, SensorDelayFamily) for e in work.h.effects)
-        groups.setdefault(count, []).append(work)
+        groups.setdefault(count, []).append(i)
     return [groups[count] for count in sorted(groups)]
 
 

@@ -139,7 +139,7 @@ class DoublesEncoder:
     """
 
     def __init__(self, count: int) -> None:
-        tags = [_varint(number << 3 | 1) for number in range(1, count + 1)]
+        tags = [varint(number << 3 | 1) for number in range(1, count + 1)]
         self._form = struct.Struct("<" + "".join(f"{len(tag)}sd" for tag in tags))
         self._parts: list[bytes | float] = [0.0] * (2 * count)
         self._parts[::2] = tags
@@ -152,7 +152,7 @@ class DoublesEncoder:
 
 def encode_doubles(values: Array) -> list[bytes]:
     """The messages of `DoublesEncoder` for many rows, (N, count)."""
-    tags = [_varint(number << 3 | 1) for number in range(1, values.shape[1] + 1)]
+    tags = [varint(number << 3 | 1) for number in range(1, values.shape[1] + 1)]
     return _encoded(list(zip(tags, values.T[:, :, None], strict=True)), len(values))
 
 
@@ -162,7 +162,7 @@ def encode_lists(lists: Sequence[Array]) -> list[bytes]:
     Each list has a row for each message, (N, count).
     """
     fields = [
-        (_varint(number << 3 | 2) + _varint(8 * values.shape[1]), values)
+        (varint(number << 3 | 2) + varint(8 * values.shape[1]), values)
         for number, values in enumerate(lists, start=1)
         if values.shape[1]
     ]
@@ -179,14 +179,15 @@ def _encoded(fields: Sequence[tuple[bytes, Array]], count: int) -> list[bytes]:
 
 
 def _bytes(number: int, data: bytes) -> bytes:
-    return _varint(number << 3 | 2) + _varint(len(data)) + data
+    return varint(number << 3 | 2) + varint(len(data)) + data
 
 
 def _integer(number: int, value: int) -> bytes:
-    return _varint(number << 3) + _varint(value)
+    return varint(number << 3) + varint(value)
 
 
-def _varint(value: int) -> bytes:
+def varint(value: int) -> bytes:
+    """Seven bits a byte, lowest first; all bytes but the last have their top bit set."""
     parts = bytearray()
     while value > 0x7F:
         parts.append(value & 0x7F | 0x80)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from grounded_trials.formats.budget import room, step
 from grounded_trials.formats.mcap_records import windows
+from grounded_trials.formats.mcap_writer import varint
 from grounded_trials.formats.messages import (
     ROW_BYTES,
     ROW_LIMIT,
@@ -123,17 +124,19 @@ def uniform_doubles(buffer: bytes, start: Ints, end: Ints, numbers: list[int]) -
 
     It is how `mcap_writer` writes; reading it this way is ten times as fast as field by field.
     """
-    if not len(start) or max(numbers) > 15:
+    if not len(start):
         return None
-    size = 9 * len(numbers)
-    if (end - start != size).any():
+    tags = [varint(number << 3 | FIXED64) for number in numbers]
+    first = np.cumsum([0, *(len(tag) + 8 for tag in tags)])  # of each tag; then the size
+    if (end - start != first[-1]).any():
         return None
-    form = np.dtype([("tag", "u1"), ("value", "<f8")])
-    block = windows(buffer, f"V{size}")[start].view(np.uint8).reshape(len(start), -1)
-    pairs = block.reshape(-1).view(form).reshape(len(start), len(numbers))
-    if (pairs["tag"] != np.array([n << 3 | FIXED64 for n in numbers], dtype=np.uint8)).any():
+    block = windows(buffer, f"V{first[-1]}")[start].view(np.uint8).reshape(len(start), -1)
+    within = np.arange(first[-1]) - np.repeat(first[:-1], np.diff(first))
+    is_tag = within < np.repeat(np.diff(first) - 8, np.diff(first))
+    if (block[:, is_tag] != np.frombuffer(b"".join(tags), dtype=np.uint8)).any():
         return None
-    return pairs["value"].astype(np.float64)
+    values = np.ascontiguousarray(block[:, ~is_tag])
+    return values.view("<f8").astype(np.float64)
 
 
 def _occurrences(node: _ProtobufNode, number: int) -> tuple[Ints, Ints, Ints, Ints]:

@@ -34,7 +34,8 @@ from grounded_trials.workspace.task_file import write_target
 
 if TYPE_CHECKING:
     from grounded.challenge import Case
-    from grounded.experiments.jobs import Engine, Progress
+    from grounded.engine import Engine
+    from grounded.experiments.jobs import Progress
 
 MANIFEST, TIMES = "manifest.json", "times.json"
 

@@ -20,6 +20,7 @@ from grounded_trials.wording import rendered
 
 if TYPE_CHECKING:
     from grounded.effects import Library
+    from grounded.engine import Engine
     from grounded.instruments.finding import Finding
     from grounded.trial import Trial
     from grounded_trials.workspace.folder import Folder
@@ -36,7 +37,7 @@ def diagnose_in(
     library: Library | None = None,
     compare: Sequence[str] = (),
     probe: bool = False,
-    jobs: int = 1,
+    engine: Engine | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Diagnosis:
     """Diagnoses the gap between the model and the stored trials; keeps reports/diagnosis.json.
@@ -51,7 +52,7 @@ def diagnose_in(
         library: the effects that may be blamed.
         compare: short names of a second group, whose differences from `trials` are told.
         probe: write a candidate also where nothing ties.
-        jobs: threads.
+        engine: workers that fit hypotheses.
         progress: told of each stage.
 
     Raises:
@@ -68,7 +69,7 @@ def diagnose_in(
     others = _chosen(workspace, compare) if compare else []
     memory = planner.plan.model.state_names[planner.task.model.n :]
     options = DiagnosisOptions(
-        library=library, max_effects=max_effects, hidden=tuple(memory), but=adopted, jobs=jobs
+        library=library, max_effects=max_effects, hidden=tuple(memory), but=adopted
     )
     lifted, second = ([planner.lift(trial) for trial in some] for some in (used, others))
     made = Made(
@@ -77,7 +78,9 @@ def diagnose_in(
         params=dict(workspace.config.model.params),
         nominal={name: p.value for name, p in planner.plan.model.params.items()},
     )
-    found = diagnose(planner.plan, lifted, options, compare=second, progress=progress)
+    found = diagnose(
+        planner.plan, lifted, options, compare=second, engine=engine, progress=progress
+    )
     found = replace(found, made=made)
     _keep(workspace, found)
     identity, words = _probe(workspace, found, lifted + second, library, write=probe)

@@ -15,6 +15,7 @@ from grounded_trials.workspace.config import set_in_model, set_latency
 from grounded_trials.workspace.folder import Folder
 
 if TYPE_CHECKING:
+    from grounded.engine import Engine
     from grounded.fit import Fit
 
 
@@ -79,6 +80,7 @@ def fit_trials(
     names: Sequence[str] | None,
     *,
     latency: bool = False,
+    engine: Engine | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Fit:
     """Parameters of the workspace's model from its trials."""
@@ -95,6 +97,7 @@ def fit_trials(
         fit_latency="common" if latency else "known",
         measurement=of_states(model, [model.state_names[i] for i in measured]),
         rng=np.random.default_rng(0),
+        engine=engine,
         progress=progress,
     )
 

@@ -1,0 +1,148 @@
+"""Engine: where independent pieces of work run; how many workers there are changes no bit.
+
+One pool for all of it, joblib's. The jobs of a study are processes on this machine, or run on an
+existing Dask cluster through Dask's own joblib backend (extra `cluster`). The pieces of one
+computation (`each`: records of a fit, hypotheses of a diagnosis) are many and short and share their
+data: on this machine they are threads, because compiled passes leave Python's lock; on a cluster
+what all of them read is sent once (`SentOnce`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+
+from grounded.errors import GroundedError, needs
+from grounded.threads import steady
+
+CONNECT_S = 10.0  # for a cluster's scheduler to answer
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Engine:
+    """Where pieces of work run.
+
+    Args:
+        jobs: workers on this machine; 1 runs all in this process.
+        name: "local", or "dask" for a running cluster.
+        address: the cluster's scheduler, such as "tcp://10.0.0.1:8786".
+    """
+
+    jobs: int = 1
+    name: str = "local"
+    address: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.jobs < 1:
+            raise GroundedError(f"--jobs must be 1 or more, got {self.jobs}")
+        if self.name not in ("local", "dask"):
+            raise GroundedError(f"--engine must be 'local' or 'dask', got '{self.name}'")
+        if (self.name == "dask") != (self.address is not None):
+            raise GroundedError(
+                "--engine dask needs the scheduler's --address (tcp://host:8786), and only it does"
+            )
+
+    @property
+    def alone(self) -> bool:
+        """Whether all runs in this process, one after the other."""
+        return self.name == "local" and self.jobs == 1
+
+    @contextmanager
+    def pool(self, *, threads: bool = False, **settings: Any) -> Iterator[Any]:
+        """A `joblib.Parallel` on these workers; the cluster stays, the connection is closed.
+
+        Args:
+            threads: on this machine, threads instead of processes.
+            settings: of joblib's.
+
+        Raises:
+            GroundedError: if joblib or Dask is missing, or no scheduler answers.
+        """
+        joblib = needs("joblib", "studies")
+        if self.name == "local":
+            # One BLAS thread a worker: results don't depend on how many share the machine.
+            backend = {"backend": "loky", "inner_max_num_threads": 1}
+            here = joblib.parallel_config(**({"backend": "threading"} if threads else backend))
+            with here, joblib.Parallel(n_jobs=self.jobs, **settings) as pool:
+                yield pool
+            return
+        distributed = needs("distributed", "cluster")
+        try:
+            client = distributed.Client(self.address, timeout=CONNECT_S)
+        except OSError as error:
+            raise GroundedError(
+                f"no Dask scheduler answers at {self.address}: is it running? ({error})"
+            ) from error
+        try:
+            there = joblib.parallel_config(backend="dask", client=client)
+            with there, joblib.Parallel(n_jobs=-1, **settings) as pool:
+                yield pool
+        finally:
+            client.close()
+
+
+_pool: ContextVar[Any] = ContextVar("pool", default=None)
+
+
+@contextmanager
+def running(engine: Engine | None) -> Iterator[None]:
+    """What `each` is called for inside runs on this engine; None: in this process.
+
+    Raises:
+        GroundedError: as `Engine.pool`.
+    """
+    if engine is None or engine.alone:
+        yield
+        return
+    with engine.pool(threads=True, batch_size=1, return_as="generator") as pool:
+        before = _pool.set((pool, _quietly if engine.name == "local" else _steadily))
+        try:
+            yield
+        finally:
+            _pool.reset(before)
+
+
+def each(
+    function: Callable[..., T], *columns: Sequence[Any], done: Callable[[], None] | None = None
+) -> list[T]:
+    """[function(*row) for row in zip(*columns)], wherever `running` says.
+
+    Args:
+        function: of a module, so that a cluster knows it; it changes nothing that is shared.
+        columns: its arguments, of one length each.
+        done: called as pieces end, in their order.
+    """
+    rows, results = list(zip(*columns, strict=True)), []
+    if _pool.get() is None or len(rows) < 2:
+        found: Iterable[T] = (function(*row) for row in rows)
+    else:
+        pool, call = _pool.get()
+        found = pool((call, (function, *row), {}) for row in rows)
+    for result in found:
+        results.append(result)
+        if done is not None:
+            done()
+    return results
+
+
+def _quietly(function: Callable[..., T], *row: Any) -> T:
+    with np.errstate(all="ignore"):  # a worker does not inherit it
+        return function(*row)
+
+
+@steady()
+def _steadily(function: Callable[..., T], *row: Any) -> T:
+    return _quietly(function, *row)  # another process has settings of its own
+
+
+class SentOnce:
+    """What many pieces read: Dask's backend sends arguments that look large to a worker once."""
+
+    def __sizeof__(self) -> int:
+        return 2**20

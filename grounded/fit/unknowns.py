@@ -1,0 +1,124 @@
+"""What is fitted: parameters of the model and delays of its inputs, as one vector theta."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from grounded.errors import GroundedError, nearest
+from grounded.frozen import Array
+from grounded.model import Model
+
+Latency = Literal["known", "common", "each"]
+LONGEST = 0.5  # [s] no latency is sought beyond
+STDS = 3.0  # prior standard deviations that a parameter without bounds may move
+BOUNDS = (
+    "what may move has bounds, Param(value, unit, low, high), or a prior, Param(value, unit, std=s)"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Unknowns:
+    """theta = [parameters, latencies]: names, bounds, scales, and the way back to the model.
+
+    The scale is a natural size of a change: the width of the bounds where both are given.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    start: Array  # (k,)
+    low: Array  # (k,) may be -inf
+    high: Array  # (k,) may be inf
+    scale: Array  # (k,)
+    columns: tuple[int, ...]  # of the model's parameters that are fitted
+    delayed: tuple[tuple[int, ...], ...]  # inputs that each fitted latency delays
+    values: Array  # all parameters of the model
+    latency: Array  # (m,) [s] of all inputs
+
+    @property
+    def k(self) -> int:
+        """Number of unknowns."""
+        return len(self.names)
+
+    def unpack(self, theta: Array) -> tuple[Array, Array]:
+        """All parameter values and all latencies [s] at theta."""
+        p, latency = self.values.copy(), self.latency.copy()
+        p[list(self.columns)] = theta[: len(self.columns)]
+        for value, inputs in zip(theta[len(self.columns) :], self.delayed, strict=True):
+            latency[list(inputs)] = value
+        return p, latency
+
+    def less(self, index: int) -> Unknowns:
+        """The same without one unknown, which stays at its start."""
+        kept = np.delete(np.arange(self.k), index)
+        names, units = (tuple(each[i] for i in kept) for each in (self.names, self.units))
+        columns = tuple(c for i, c in enumerate(self.columns) if i != index)
+        first = len(self.columns)
+        delayed = tuple(d for i, d in enumerate(self.delayed, first) if i != index)
+        arrays = {key: getattr(self, key)[kept] for key in ("start", "low", "high", "scale")}
+        return replace(self, names=names, units=units, columns=columns, delayed=delayed, **arrays)
+
+    def clipped(self, theta: Array) -> Array:
+        """Theta within the bounds."""
+        return np.asarray(np.clip(theta, self.low, self.high))
+
+
+def unknowns_of(
+    model: Model, names: Sequence[str] | None, latency: Array, fit_latency: Latency
+) -> Unknowns:
+    """Checks the names and gathers bounds.
+
+    Args:
+        model: gives values and bounds.
+        names: parameters to fit; None: all uncertain ones.
+        latency: of each input [s], known or where to begin, (m,).
+        fit_latency: "known" (not fitted), "common" (one for all inputs), or "each".
+
+    Raises:
+        GroundedError: for a name that is not an uncertain parameter, or nothing to fit.
+    """
+    names = model.uncertain if names is None else tuple(names)
+    for name in names:
+        if name not in model.params:
+            raise GroundedError(
+                f"'{name}' is not a parameter of model '{model.name}': "
+                + nearest(name, model.params)
+            )
+        if not model.params[name].uncertain:
+            raise GroundedError(f"'{name}' is a constant of model '{model.name}': {BOUNDS}")
+    if fit_latency not in ("known", "common", "each"):
+        raise GroundedError(f"fit_latency must be known, common or each, got '{fit_latency}'")
+    params = [model.params[name] for name in names]
+    choices: dict[str, list[tuple[int, ...]]] = {
+        "known": [],
+        "common": [tuple(range(model.m))],
+        "each": [(j,) for j in range(model.m)],
+    }
+    delayed = choices[fit_latency]
+    labels = ["latency"] if fit_latency == "common" else []
+    if fit_latency == "each":
+        labels = [f"latency:{name}" for name in model.input_names]
+    if not names and not labels:
+        raise GroundedError(f"model '{model.name}' has no uncertain parameter to fit: {BOUNDS}")
+    far = [np.inf if p.std is None else STDS * p.std for p in params]  # where no bound is given
+    low = [p.value - f if p.low is None else p.low for p, f in zip(params, far, strict=True)]
+    high = [p.value + f if p.high is None else p.high for p, f in zip(params, far, strict=True)]
+    low, high = low + [0.0] * len(delayed), high + [LONGEST] * len(delayed)
+    start = [p.value for p in params] + [float(latency[inputs[0]]) for inputs in delayed]
+    width = np.array(high) - np.array(low)
+    size = np.maximum(np.abs(start), 1e-3)
+    return Unknowns(
+        names=(*names, *labels),
+        units=(*(p.unit for p in params), *("s" for _ in delayed)),
+        start=np.array(start, float),
+        low=np.array(low, float),
+        high=np.array(high, float),
+        scale=np.where(np.isfinite(width), width, size),
+        columns=tuple(model.param_names.index(name) for name in names),
+        delayed=tuple(delayed),
+        values=np.array(model.values),
+        latency=np.array(latency, float),
+    )

@@ -1,0 +1,141 @@
+"""Models of many states or inputs: an answer, or one clear refusal; never a silence."""
+
+import numpy as np
+import pytest
+
+from facts import holding
+from grounded.diagnosis.diagnose import diagnose
+from grounded.errors import GroundedError
+from grounded.fit import fit
+from grounded.instruments.lag import alike
+from grounded.instruments.preflight import preflight
+from grounded.model import Model, Param
+from grounded.trial import Trial
+from grounded_trials import Workspace
+from grounded_trials.formats.mcap_writer import encode_doubles
+from grounded_trials.formats.protobuf import uniform_doubles
+
+RING = """
+import numpy as np
+from grounded import Model, Param
+
+N, M = {n}, {m}
+
+
+def rate(s, a, p):
+    x, u = [s[f"x{{i}}"] for i in range(N)], [a[f"u{{j}}"] for j in range(M)]
+    return {{
+        f"x{{i}}": p.k * (x[i - 1] - x[i]) - p.c * np.sin(x[i]) + sum(u[i % M :: N])
+        for i in range(N)
+    }}
+
+
+def step(s, a, p, dt):
+    x = np.array([float(s[f"x{{i}}"]) for i in range(N)])
+    u = np.array([float(a[f"u{{j}}"]) for j in range(M)])
+    push = np.array([u[i % M :: N].sum() for i in range(N)])
+    x = x + dt * (p.k * (np.roll(x, 1) - x) - p.c * np.sin(x) + push)
+    return {{f"x{{i}}": x[i] for i in range(N)}}
+
+
+model = Model(
+    states={{f"x{{i}}": "m" for i in range(N)}},
+    inputs={{f"u{{j}}": "1" for j in range(M)}},
+    params={{"k": Param(1.0, "1/s", 0.1, 3.0), "c": Param(0.5, "1/s", 0.1, 2.0)}},
+    {how},
+)
+"""
+
+
+def ring(n, m, how="derivative=rate"):
+    names = {}
+    exec(RING.format(n=n, m=m, how=how), names)
+    return names["model"]
+
+
+def logged(model, steps=60):
+    rng = np.random.default_rng(1)
+    u = np.cumsum(rng.standard_normal((steps, model.m)), axis=0) / 10
+    x = rng.standard_normal((steps + 1, model.n))
+    names = {"state_names": model.state_names, "input_names": model.input_names}
+    return Trial(dt=0.05, states=x, inputs=u, **names)
+
+
+@pytest.mark.parametrize("n, m", [(1000, 1), (5, 200), (101, 100)])
+def test_more_than_200_names_are_refused_before_anything_is_computed(n, m, tmp_path):
+    with pytest.raises(GroundedError, match=holding(f"{n} states", f"{m} inputs", "200")):
+        ring(n, m)
+    file = tmp_path / "ring.py"
+    file.write_text(RING.format(n=n, m=m, how="derivative=rate"))
+    with pytest.raises(GroundedError, match=holding("200")):
+        Workspace.create(tmp_path / "w", model=file)
+    assert not (tmp_path / "w").exists()
+
+
+def test_a_fit_says_how_many_states_it_takes():
+    model = ring(51, 2)
+    with pytest.raises(GroundedError, match=holding("51 states", "50")):
+        fit(model, [logged(model)])
+
+
+def test_a_diagnosis_says_how_many_names_it_takes():
+    model = ring(20, 31)
+    with pytest.raises(GroundedError, match=holding("20 states", "31 inputs", "50")):
+        diagnose(model, [logged(model)])
+
+
+def test_steps_are_compiled_where_derivatives_are_too_many():
+    model = ring(100, 20)
+    assert model.system.how == "compiled steps" and "100 states" in model.system.note
+    trial = logged(model)
+    at = (trial.states[:-1], trial.inputs, model.values, 0.05)
+    slow = super(type(model.system).__mro__[1], model.system)
+    assert np.allclose(model.system.step(*at), slow.step(*at), rtol=0, atol=1e-12)
+    f_x, f_u = model.system.linearise(*at)
+    moved = np.array(trial.states[:-1])
+    moved[:, 7] += 1e-6
+    change = (model.system.step(moved, *at[1:]) - model.system.step(*at)) / 1e-6
+    assert np.allclose(change, f_x[:, :, 7], atol=1e-6) and f_u.shape == (60, 100, 20)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", ["derivative=rate", "step=step"])
+@pytest.mark.parametrize("n, m", [(20, 100), (100, 20)])
+def test_a_wide_model_gets_a_candidate(n, m, how, tmp_path):
+    (tmp_path / "ring.py").write_text(RING.format(n=n, m=m, how=how))
+    workspace = Workspace.create(tmp_path / "w", model=tmp_path / "ring.py")
+    candidate = workspace.propose().candidate
+    assert candidate.policy.gain.shape == (100, m, n + m)
+    assert np.abs(candidate.predicted_states).max() < 1e-3  # the target is rest
+
+
+def test_messages_of_many_numbers_are_read_in_one_piece():
+    values = np.random.default_rng(0).standard_normal((5, 300))
+    messages = encode_doubles(values)
+    buffer, lengths = b"".join(messages), [len(message) for message in messages]
+    end = np.cumsum(lengths)
+    numbers = list(range(1, 301))
+    assert np.array_equal(uniform_doubles(buffer, end - lengths, end, numbers), values)
+    assert uniform_doubles(buffer, end - lengths, end, [*numbers[1:], 1]) is None
+    assert uniform_doubles(buffer, end - lengths, end, numbers[:-1]) is None
+
+
+def test_of_many_commands_a_late_noisy_copy_is_found():
+    model = Model(
+        states={"x": "m"},
+        inputs={f"u{j}": "1" for j in range(40)},
+        params={"k": Param(1.0, "1/s", 0.1, 3.0)},
+        derivative=lambda s, a, p: {"x": -p.k * s.x + a.u0},
+    )
+    rng = np.random.default_rng(2)
+    u = np.cumsum(rng.standard_normal((603, 40)), axis=0)
+    u[3:, 31] = u[:-3, 4]
+    u = u[3:]
+    u[:, 31] += 0.02 * u[:, 31].std() * rng.standard_normal(600)
+    pairs = alike(u, 6)
+    assert (4, 31) in pairs and len(pairs) < 780
+    names = {"state_names": ("x",), "input_names": model.input_names}
+    trial = Trial(dt=0.05, states=rng.standard_normal((601, 1)), inputs=u, **names)
+    (copy,) = [f for f in preflight(model, [trial], ()).findings if f.kind == "copy"]
+    assert copy.signal == "u31" and "u4," in copy.finding
+    assert copy.delay_s == pytest.approx(0.15, abs=0.02)
