@@ -13,7 +13,7 @@ from mcap.writer import Writer
 from facts import holding
 from grounded.errors import GroundedError
 from grounded_trials.formats.messages import Dynamic
-from grounded_trials.formats.path_walk import number_paths
+from grounded_trials.formats.path_walk import FIELD_LIMIT, number_paths
 from grounded_trials.formats.schemas import parse_ros
 from grounded_trials.logs.inspect_guess import Guess, guess_mapping, is_simulated, mapping_toml
 from grounded_trials.logs.inspect_log import find_twins, inspect_log
@@ -175,3 +175,14 @@ def test_twins() -> None:
     (twins,) = find_twins(samples)
     assert (twins.first, twins.second) == ("/a.q.@rpy.pitch", "/b.q.@rpy.pitch")
     assert twins.opposite and twins.correlation < -0.999
+
+
+def test_a_table_wider_than_the_list_says_so(tmp_path):
+    for columns, said in ((150, False), (206, True)):
+        path = tmp_path / f"{columns}.csv"
+        rows = [",".join(["t", *(f"u{i}" for i in range(columns))])]
+        rows += [",".join(f"{k * 0.01 + i:.3f}" for i in range(columns + 1)) for k in range(40)]
+        path.write_text("\n".join(rows) + "\n")
+        found = inspect_log(path)
+        assert len(found.topics[0].fields) == min(columns, FIELD_LIMIT)
+        assert any(str(FIELD_LIMIT) in remark for remark in found.remarks) == said

@@ -28,7 +28,13 @@ from grounded_trials.formats.messages import (
     Floats,
     Ints,
 )
-from grounded_trials.formats.path_walk import Bound, bind, evaluate, number_paths
+from grounded_trials.formats.path_walk import (
+    FIELD_LIMIT,
+    Bound,
+    bind,
+    evaluate,
+    number_paths,
+)
 from grounded_trials.logs.log_files import log_records, reading
 from grounded_trials.logs.signals import Decoder, decoder_of
 
@@ -104,6 +110,11 @@ def _remarks(log: LogReport) -> tuple[str, ...]:
             found.append(
                 f"{topic.topic} is stamped {topic.skew_s:.3f} s from the log's clock "
                 "(simulation time, or an unset clock?)"
+            )
+        if len(topic.fields) >= FIELD_LIMIT:
+            found.append(
+                f"{topic.topic} is listed with its first {FIELD_LIMIT} numbers; "
+                "[log] may name any other by its path"
             )
         bad = [f.path for f in topic.fields if f.not_finite]
         if bad:
