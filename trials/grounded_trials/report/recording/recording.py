@@ -28,10 +28,10 @@ from grounded.figures.figure import COLOURS as PAGE
 from grounded.figures.figure import rgb
 from grounded.frozen import Array
 from grounded.trial import Trial
-from grounded_trials.report.diagnosis_words import sentences
 from grounded_trials.report.findings import Findings, Run, selection, tracked
 from grounded_trials.report.recording.layout import blueprint
 from grounded_trials.report.scene import Scene, scene_of
+from grounded_trials.report.three_lines import three_lines
 from grounded_trials.wording import count, labelled, per_second, percent
 
 COLOURS = {role: rgb(dark) for role, (_, dark) in PAGE.items()}
@@ -276,14 +276,12 @@ def rate(residual: Array, dt: float) -> tuple[Array, float]:
 
 
 def verdict(findings: Findings) -> str:
-    """What the diagnosis says, a cause a line with its share, and what to run next."""
+    """What the diagnosis says in three lines, each cause's share, and what to run next."""
     diagnosis, lines = findings.diagnosis, []
     if diagnosis is None:
-        lines.append("not diagnosed yet")
+        lines.append("not diagnosed yet\n")
     else:
-        causes, *others = sentences(diagnosis.sentence)
-        lines += [f"- {cause}" for cause in causes.split("; ")]
-        lines += [""] + [f"{other}\n" for other in others]
+        lines += [f"{line}\n" for line in three_lines(diagnosis, findings.task)]
         shares = [f"{one.of} {percent(one.share)}" for one in diagnosis.credit]
         lines += [f"credit, in this order: {', '.join(shares)}\n"] * bool(shares)
     return "\n".join([*lines, f"next: `{findings.next_command}`"])
