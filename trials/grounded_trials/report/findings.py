@@ -180,7 +180,7 @@ def measured(value: float, unit: str) -> str:
     if unit == "m" and SMALL <= value < 1.0:
         return f"{figure(100 * value, 2)} cm"
     if unit.startswith(SCALED) and 0 < value < SMALL:
-        step = 1 if value >= 1e-6 else 2
+        step = 1 if value >= 1e-5 else 2
         return f"{figure(value * 1e3**step, 2)} {PREFIXES[step]}{unit}"
     return with_unit(figure(value, 2), unit)
 

@@ -33,6 +33,18 @@ class Forecast:
         gap = np.full((len(values), 1), np.nan)
         return np.maximum.accumulate(steps) * dt, np.hstack([values, gap]).reshape(-1)
 
+    def along(self, trial: Trial) -> Array:
+        """States (T + 1, n) of the trial as it was forecast; NaN where it was not.
+
+        Where a window ends and the next one starts, it is the end that counts.
+        """
+        found = np.full_like(trial.states, np.nan)
+        found[self.steps[:, 0]] = self.states[:, 0]
+        for k in range(1, self.steps.shape[1]):
+            known = self.steps[:, k] >= 0
+            found[self.steps[known, k]] = self.states[known, k]
+        return found
+
 
 def forecast(planner: Planner, trial: Trial, seconds: float = SECONDS) -> Forecast | None:
     """The planner's model along a trial, started anew every `seconds`; None for less than a step.

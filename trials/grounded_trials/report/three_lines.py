@@ -15,7 +15,6 @@ from grounded_trials.wording import count, shown
 CAUSES = 2  # that the first line names
 SMALL = 0.05  # of the gain: a cause below it is only counted
 FEW = 2  # states in the second line
-NEAR = 1.3  # times the noise: an error below it is noise
 
 
 def three_lines(diagnosis: Diagnosis, task: Task) -> list[str]:
@@ -54,9 +53,8 @@ def _gained(diagnosis: Diagnosis, task: Task) -> list[str]:
         return []
     for names, what in gained_most(diagnosis, task):
         unit = shown(row.unit_by_channel[names[0]])
-        now, then, noise = (_together(getattr(row, key), names) for key in _KEYS)
-        floor = ", which is noise" if now <= NEAR * noise else ""
-        parts.append(f"{what} by {measured(now, unit)} instead of {measured(then, unit)}{floor}")
+        now, then = (_together(errors, names) for errors in (row.with_effects, row.crude))
+        parts.append(f"{what} by {measured(now, unit)} instead of {measured(then, unit)}")
     held = "" if row.held_out != "no" else ", not held out"
     ahead = f"{row.horizon_s:.3g} s ahead{held}"
     return [f"{ahead} it now misses {' and '.join(parts)}."] if parts else []
@@ -73,9 +71,6 @@ def gained_most(diagnosis: Diagnosis, task: Task) -> list[tuple[list[str], str]]
 
 def _ahead(diagnosis: Diagnosis) -> RulerRow | None:
     return next((r for r in reversed(diagnosis.prediction_error) if not r.whole_trial), None)
-
-
-_KEYS = ("with_effects", "crude", "noise_floor")
 
 
 def _ratio(row: RulerRow, names: list[str]) -> float:
