@@ -100,6 +100,7 @@ def _hash(script: str) -> str:
 def _data(panel: Panel | Bars) -> dict[str, Any]:
     kind = "bars" if isinstance(panel, Bars) else panel.kind
     found: dict[str, Any] = _plain(plotted(panel))
+    found["layout"].pop("annotations", None)  # a note stands in the caption
     return found | {"kind": kind}
 
 
@@ -132,7 +133,7 @@ def _sections(findings: Findings) -> list[tuple[str, list[Block]]]:
     """Titles and parts, in reading order."""
     paths = drawn(path_figure(findings), wide=True)
     return [
-        ("Paths", [*paths, Block("run")] if paths and findings.runs else paths),
+        ("Paths", [Block("run"), *paths] if paths and findings.runs else paths),
         ("States", drawn(state_figure(findings))),
         ("Tracking error", drawn(error_figure(findings)) + error_table(findings)),
         ("Inputs", drawn(input_figure(findings))),
