@@ -173,7 +173,8 @@ def test_light_and_dark_wide_and_narrow(window, car_page, width, dark):
     window.open(car_page)
     window.draw_all()
     assert window.run("return document.documentElement.scrollWidth") <= width
-    for heading in ("What improved", "Why the model was wrong", "What to run next", "Paths", "Gap"):
+    gap = "Gap: model against reality"
+    for heading in ("What improved", "Why the model was wrong", "What to run next", "Paths", gap):
         found = window.run(
             "return [...document.querySelectorAll('h2')].filter(h => h.textContent === arguments[0]"
             " && h.getBoundingClientRect().height > 10).length",
