@@ -95,6 +95,6 @@ def _tell(document: dict[str, Any], verdict: list[str]) -> None:
         show(field("gap" if k == 0 else "", line))
     for kind, path in document["paths"].items():
         if kind in ("html", "rrd"):
-            show(field(kind, path))
+            show(field(kind, path + ": open it in a browser" * (kind == "html")))
     verb = "view" if "rrd" in document["paths"] else "report"
     show(f"\n{next_line(NextCommand(verb), document['workspace'])}")
