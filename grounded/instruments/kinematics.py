@@ -41,8 +41,8 @@ class Integral:
 def integrals(model: Model) -> list[Integral]:
     """A position and its velocity, an angle and its rate; a carried heading rate as well."""
     names = model.state_names
-    (x, u), dt = places.samples(model), places.probe(model, SHORT)
-    rates = (model.system.step(x, u, model.values, dt) - x) / dt
+    x, u = places.samples(model)
+    rates = (model.system.step(x, u, model.values, SHORT) - x) / SHORT
     found = []
     for name, other in integrated_states(model).items():
         i, j = names.index(name), names.index(other)
@@ -87,10 +87,10 @@ class Turned:
 
 def turned(model: Model) -> Turned | None:
     """The plane in which a model moves; None where it has none."""
-    (x, u), n, dt = places.samples(model, 8), model.n, places.probe(model, SHORT)
-    f_x, f_u = model.system.linearise(x, u, model.values, dt)
-    rates = (model.system.step(x, u, model.values, dt) - x) / dt
-    slopes = (f_x - np.eye(n)) / dt
+    (x, u), n = places.samples(model, 8), model.n
+    f_x, f_u = model.system.linearise(x, u, model.values, SHORT)
+    rates = (model.system.step(x, u, model.values, SHORT) - x) / SHORT
+    slopes = (f_x - np.eye(n)) / SHORT
     free = [i for i in range(n) if np.abs(f_u[:, i]).max() < 1e-9 and np.abs(rates[:, i]).max() > 0]
     for i in free:
         for j in free:
@@ -130,7 +130,7 @@ class Course:
 def course(model: Model, relation: Turned, trials: Sequence[Trial]) -> Course | None:
     """How the logged positions move, and how the logged heading and speed say they do."""
     dt, columns = trials[0].dt, range(model.n)
-    xy, short = [relation.i, relation.j], places.probe(model, SHORT)
+    xy = [relation.i, relation.j]
     ways = [(one, np.diff(one[:, xy], axis=0) / dt) for one in pieces(trials, columns)]
     if not ways:
         return None
@@ -147,7 +147,7 @@ def course(model: Model, relation: Turned, trials: Sequence[Trial]) -> Course | 
             middle = 0.5 * (piece[1:] + piece[:-1])
             middle[:, relation.k] *= factor
             u = np.zeros((len(middle), model.m))
-            rates = (model.system.step(middle, u, model.values, short) - middle) / short
+            rates = (model.system.step(middle, u, model.values, SHORT) - middle) / SHORT
             found.append(rates[:, xy])
         return found
 

@@ -17,9 +17,7 @@ from grounded.adapters import mujoco as adapter  # noqa: E402
 from grounded.adapters.stepper import Stepper  # noqa: E402
 from grounded.adapters.tangent import Coordinates  # noqa: E402
 from grounded.errors import GroundedError  # noqa: E402
-from grounded.instruments.preflight import preflight  # noqa: E402
 from grounded.model import Model  # noqa: E402
-from grounded.trial import Trial  # noqa: E402
 
 PENDULUM = """
 <mujoco model="pendulum">
@@ -289,16 +287,3 @@ def test_a_step_that_is_no_multiple_a_missing_file_and_a_broken_one(tmp_path: Pa
         adapter.model(tmp_path / "nothing.xml")
     with pytest.raises(GroundedError, match=holding("MJCF", "wrong")):
         adapter.model("<mujoco><wrong/></mujoco>")
-
-
-def test_its_sensors_are_judged_whatever_its_timestep() -> None:
-    arm = adapter.model(ARM.format(**NOMINAL))
-    inputs = 0.3 * np.random.default_rng(0).normal(size=(200, 2))
-    states = np.zeros((201, arm.n))
-    for t in range(200):
-        states[t + 1] = step(arm, states[t], inputs[t], dt=0.02)[0]
-    logged = states.copy()
-    logged[60:140, 1] = logged[60, 1]  # a sensor that hangs
-    made = [Trial(s, inputs, 0.02, arm.state_names, arm.input_names) for s in (states, logged)]
-    assert [f.signal for f in preflight(arm, made[:1]).findings if f.kind == "stuck"] == []
-    assert [f.signal for f in preflight(arm, made[1:]).findings if f.kind == "stuck"] == ["elbow"]
