@@ -54,6 +54,12 @@ def test_causes_gain_and_what_is_left(diagnosis):
     assert "v" in left and "0.020 m/s" in left and "0.0050 m/s" in left and "x > 0.2" in left
 
 
+def test_what_became_worse_is_not_kept_back(diagnosis):
+    worse = "Whole trials miss x by 3.8 m instead of 2.1: that is worse."
+    verdict = replace(diagnosis.verdict, sentence=f"{SENTENCE} {worse}")
+    assert three_lines(replace(diagnosis, verdict=verdict), cart_task())[1].endswith(worse)
+
+
 def test_what_is_weighed_is_spoken_of(diagnosis):
     names = [names for names, _ in gained_most(diagnosis, cart_task())]
     assert names == [["x"]]  # v has no weight

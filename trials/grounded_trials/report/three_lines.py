@@ -15,6 +15,7 @@ from grounded_trials.wording import count, shown
 CAUSES = 2  # that the first line names
 SMALL = 0.05  # of the gain: a cause below it is only counted
 FEW = 2  # states in the second line
+WORSE = "that is worse."  # how the verdict ends a sentence on what predictions lose
 
 
 def three_lines(diagnosis: Diagnosis, task: Task) -> list[str]:
@@ -57,7 +58,9 @@ def _gained(diagnosis: Diagnosis, task: Task) -> list[str]:
         parts.append(f"{what} by {measured(now, unit)} instead of {measured(then, unit)}")
     held = "" if row.held_out != "no" else ", not held out"
     ahead = f"{row.horizon_s:.3g} s ahead{held}"
-    return [f"{ahead} it now misses {' and '.join(parts)}."] if parts else []
+    told = [f"{ahead} it now misses {' and '.join(parts)}."] if parts else []
+    told += [one for one in sentences(diagnosis.sentence) if one.endswith(WORSE)]
+    return [" ".join(told)] if told else []
 
 
 def gained_most(diagnosis: Diagnosis, task: Task) -> list[tuple[list[str], str]]:
