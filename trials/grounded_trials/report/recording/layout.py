@@ -77,9 +77,12 @@ def _effects(findings: Findings, space: Space) -> list[Any]:
         for key, words in (("off", findings.plain), ("on", f"model {better.name}"))
     ]
     units = findings.task.model.states
-    plots = [_plot(f"/ahead/{n}", labelled(n, u)) for n, u in units.items()]
+    plots = [
+        _plot(f"/ahead/{n}", labelled(n, u), legend=k == 0)
+        for k, (n, u) in enumerate(units.items())
+    ]
     both = rrb.Horizontal(*views)
-    return [rrb.Vertical(both, rrb.Grid(*plots), name="Effects off and on")]
+    return [rrb.Vertical(both, rrb.Grid(*plots, grid_columns=3), name="Effects off and on")]
 
 
 def _trials(findings: Findings, space: Space) -> list[Any]:
