@@ -41,7 +41,7 @@ class Result:
         return ()
 
     def plot(self) -> Any:
-        """A Plotly figure of it, for a notebook (extra `report`).
+        """A Plotly figure of it, for a notebook (extra `notebook`).
 
         Raises:
             GroundedError: if it has nothing to draw, or Plotly is not installed.

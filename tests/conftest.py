@@ -14,7 +14,8 @@ from shared_data import DATA
 
 EXTRAS = {
     "view": "rerun",
-    "report": "plotly",
+    "report": "jinja2",
+    "notebook": "plotly",
     "png": "matplotlib",
     "studies": "joblib",
     "cluster": "distributed",

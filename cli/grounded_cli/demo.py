@@ -35,6 +35,7 @@ def command(name: str, folder: str | None, json_: bool) -> None:
     """
     from grounded_trials import Workspace
     from grounded_trials.report.reporting import save_optimum
+    from grounded_trials.report.three_lines import three_lines
     from grounded_trials.workspace.examples import example
     from grounded_trials.workspace.running import optimum
 
@@ -51,7 +52,7 @@ def command(name: str, folder: str | None, json_: bool) -> None:
     with progress("diagnosing the gap"):
         diagnosed = workspace.diagnose(_few(workspace, status))
     with progress("writing the report"):
-        html, rrd = (find_spec(name) is not None for name in ("plotly", "rerun"))
+        html, rrd = (find_spec(name) is not None for name in ("jinja2", "rerun"))
         report = workspace.report(html=html, rrd=rrd)
     for made, what, extra in ((html, "page", "report"), (rrd, "recording", "view")):
         if not made:
@@ -70,7 +71,7 @@ def command(name: str, folder: str | None, json_: bool) -> None:
         return
     say("")
     show(summary(status))
-    _tell(document)
+    _tell(document, three_lines(diagnosed, workspace.task))
 
 
 def _few(workspace: Workspace, status: Status) -> list[str]:
@@ -80,7 +81,7 @@ def _few(workspace: Workspace, status: Status) -> list[str]:
     return list(dict.fromkeys(one.trials[0].id for one in tried if one.trials)) if long else []
 
 
-def _tell(document: dict[str, Any]) -> None:
+def _tell(document: dict[str, Any], verdict: list[str]) -> None:
     first, last = document["utilities"][0], document["utilities"][-1]
     gain = f"{100 * (1 - last / first):.1f} % better after {count(document['trials'], 'trial')}"
     show(
@@ -90,9 +91,10 @@ def _tell(document: dict[str, Any]) -> None:
     if document["optimum"] is not None:
         known = "planned with the true model, which the search never saw"
         show(field("optimum", f"{number(document['optimum'])}, {known}"))
-    show(field("gap", document["verdict"]["sentence"]))
+    for k, line in enumerate(verdict):
+        show(field("gap" if k == 0 else "", line))
     for kind, path in document["paths"].items():
         if kind in ("html", "rrd"):
-            show(field(kind, path))
+            show(field(kind, path + ": open it in a browser" * (kind == "html")))
     verb = "view" if "rrd" in document["paths"] else "report"
     show(f"\n{next_line(NextCommand(verb), document['workspace'])}")

@@ -29,6 +29,7 @@ from typing import Any
 
 import numpy as np
 
+from grounded.adapters.mujoco_body import MujocoBody
 from grounded.adapters.mujoco_names import (
     BALL,
     FREE,
@@ -215,6 +216,13 @@ class MujocoStepper(Stepper):
     def timestep(self) -> float:
         """The simulation's own step [s]; a control step is a whole multiple of it."""
         return float(self._model.opt.timestep)
+
+    @property
+    def body(self) -> MujocoBody:
+        """What it looks like, for pictures."""
+        mj = library("mujoco")
+        compiled = copy.deepcopy(self._model)
+        return MujocoBody(compiled, mj.MjData(compiled), self.coordinates, mj.mj_kinematics)
 
     def advance(self, x: Array, u: Array, p: Array, dt: float) -> Array:
         """The next states (N, n); NaN where a sample is unstable."""

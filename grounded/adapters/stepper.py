@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from grounded.errors import needs
+from grounded.figures.body import Body
 from grounded.frozen import Array
 from grounded.model import Model
 
@@ -22,6 +23,11 @@ class Stepper:
 
     def __init__(self, states: Iterable[str], inputs: Iterable[str], params: Iterable[str]) -> None:
         self.states, self.inputs, self.params = tuple(states), tuple(inputs), tuple(params)
+
+    @property
+    def body(self) -> Body | None:
+        """What it looks like, for pictures; None where it doesn't know."""
+        return None
 
     def __call__(
         self, s: Mapping[str, Any], a: Mapping[str, Any], p: Mapping[str, Any], dt: float

@@ -150,10 +150,8 @@ def _teaching(
     name = list(spreads)[k]
     unit = f" {spreads[name][1]}" * (spreads[name][1] != "1")
     now = float(std[k]) * sizes.get(name, 1.0)
-    sentence = (
-        f"{words}: expected to take the standard deviation of {name} from {now:.2g} to "
-        f"{now * float(shrunk[k]):.2g}{unit}, and to teach {gain:.1f} nats in all"
-    )
+    then = now * float(shrunk[k])
+    sentence = f"{words}: would tell {name} to +- {then:.2g}{unit} (now +- {now:.2g})"
     return Probe(chosen, gain, (name,), sentence)
 
 

@@ -83,24 +83,44 @@ def credit_figure(diagnosis: Diagnosis, channels: int = 1) -> Figure | None:
         channels: so many states show by how much predictions are off without each, in their unit;
             first those that predictions improved most.
     """
-    credit = diagnosis.credit
+    credit, known = diagnosis.credit, _second_ahead(diagnosis)
     if not credit:
         return None
     bars = tuple(Bar(c.of, c.share, f"{100 * c.share:.0f} %") for c in credit[:MOST])
     panels = [Bars("Share of what predictions gain", bars)]
-    known = [
-        e for e in diagnosis.prediction_error if math.isclose(e.horizon_s, CREDIT_S, rel_tol=0.1)
-    ]
-    for name in _improved(known[0])[:channels] if known else ():
-        error, unit = known[0], known[0].unit_by_channel.get(name, "")
-        rows = [(MODELS["crude"], error.crude)]
-        rows += [(("limit", f"without {c.of}"), c.without_it) for c in credit[:MOST]]
-        rows += [(MODELS["with_effects"], error.with_effects)]
-        rows += [(MODELS["noise_floor"], error.noise_floor)]
-        found = [(look, values[name]) for look, values in rows if name in values]
-        bars = tuple(Bar(n, v, _with_unit(v, unit), role) for (role, n), v in found)
-        panels.append(Bars(f"{name}: error {error.horizon_s:g} s ahead", bars))
+    for name in _improved(known)[:channels] if known else ():
+        panels += worth_of([name], name, diagnosis)
     return Figure("credit", "What each is worth", "", tuple(panels))
+
+
+def worth_of(names: Sequence[str], what: str, diagnosis: Diagnosis) -> list[Bars]:
+    """How far states together are mispredicted a second ahead without each cause, and with all.
+
+    Args:
+        names: of states in one unit, such as a position's.
+        what: they are called.
+        diagnosis: what was found.
+
+    Returns:
+        One panel, none where an error is not known.
+    """
+    error = _second_ahead(diagnosis)
+    if error is None or not set(names) <= set(error.crude):
+        return []
+    unit = error.unit_by_channel.get(names[0], "")
+    rows = [(MODELS["crude"], error.crude)]
+    rows += [(("limit", f"without {c.of}"), c.without_it) for c in diagnosis.credit[:MOST]]
+    rows += [(MODELS["with_effects"], error.with_effects)]
+    rows += [(MODELS["noise_floor"], error.noise_floor)]
+    found = [(look, math.hypot(*(v[n] for n in names))) for look, v in rows if set(names) <= set(v)]
+    bars = tuple(Bar(n, v, _with_unit(v, unit), role) for (role, n), v in found)
+    title = what.removeprefix("the ").capitalize() if len(names) > 1 else what
+    return [Bars(f"{title}: error {error.horizon_s:g} s ahead", bars)]
+
+
+def _second_ahead(diagnosis: Diagnosis) -> RulerRow | None:
+    errors = diagnosis.prediction_error
+    return next((e for e in errors if math.isclose(e.horizon_s, CREDIT_S, rel_tol=0.1)), None)
 
 
 def _improved(error: RulerRow) -> list[str]:
@@ -135,7 +155,8 @@ def where_figure(diagnosis: Diagnosis) -> Figure | None:
     if not panels:
         return None
     caption = (
-        "Evidence is the gain in log-likelihood less its price; an effect is claimed from 3 nats."
+        "Evidence is the gain in log-likelihood less its price. Blue: what it loses without a "
+        "claimed effect, from 3 nats on. Grey: what an effect would gain alone, in their place."
     )
     return Figure("gap", "Where the gap lies", caption, tuple(panels))
 

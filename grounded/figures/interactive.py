@@ -40,7 +40,6 @@ PAPER = {
 SYMBOLS = {"disc": "circle", "ring": "circle-open", "cross": "x-thin", "dash": "line-ew"}
 FONT = 12
 LETTER = 0.035  # of a bar's text, as a share of the longest bar
-EXTRA = "report"  # that brings Plotly
 
 
 def plotted(panel: Panel | Bars, axis: str = "") -> dict[str, Any]:
@@ -234,7 +233,7 @@ def notebook_figure(figures: Sequence[Figure], height: int = 300) -> Any:
     Raises:
         GroundedError: if Plotly is not installed.
     """
-    needs("plotly", EXTRA)
+    needs("plotly", "notebook")
     from plotly.graph_objects import Figure as Drawn
     from plotly.subplots import make_subplots
 

@@ -43,5 +43,6 @@ model = Model(
         "b1": Param(0.0, "N m s/rad", 0.0, 2.0),
         "b2": Param(0.0, "N m s/rad", 0.0, 2.0),
     },
+    roles={"level": ("q1", "q2")},
     derivative=dynamics,
 )

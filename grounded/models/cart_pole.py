@@ -36,5 +36,6 @@ model = Model(
         "b": Param(0.0, "N s/m", 0.0, 5.0),
     },
     angles=("theta",),
+    roles={"rail": "x", "upright": "theta"},
     derivative=dynamics,
 )

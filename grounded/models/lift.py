@@ -31,5 +31,6 @@ model = Model(
         "b": Param(2.0, "1/s", 0.1, 10.0),
         "c": Param(0.8, "m/s^2", 0.0, 5.0),
     },
+    roles={"altitude": "z"},
     derivative=dynamics,
 )

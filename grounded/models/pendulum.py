@@ -32,6 +32,6 @@ model = Model(
         "g": Param(9.81, "m/s^2", 9.7, 9.9),
     },
     angles=(),  # swing-ups count full turns: theta is not wrapped
-    roles={"heading": "theta"},
+    roles={"heading": "theta", "hanging": "theta"},
     derivative=dynamics,
 )

@@ -19,7 +19,6 @@ from workspaces import make
     [
         ("rerun", ("report", "--rrd"), "view"),
         ("rerun", ("view",), "view"),
-        ("plotly", ("report", "--html"), "report"),
         ("jinja2", ("report", "--html"), "report"),
     ],
 )

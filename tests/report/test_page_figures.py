@@ -228,7 +228,7 @@ def test_what_is_cut_off_is_marked(cart):
     assert plotted(panel)["layout"]["annotations"][0]["text"] == panel.note
 
 
-@pytest.mark.extra("report")
+@pytest.mark.extra("notebook")
 def test_results_plot_what_the_page_shows(cart):
     findings = gather(Folder(cart))
     assert findings.diagnosis is not None and findings.best is not None

@@ -14,11 +14,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cli import grounded
 from facts import holding
 from grounded_trials.report.gathering import gather
 from grounded_trials.report.recording.recording import rate, write_recording
 from grounded_trials.workspace.folder import Folder
 from reported import car, cart, many_flights
+from workspaces import make
 
 __all__ = ["car", "cart"]
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")
@@ -52,6 +54,11 @@ def test_rerun_accepts_the_recording_and_finds_all_of_it(cart, tmp_path):
         "/input/force/low",
         "/bias/v/iteration_0",
         "/bias/v/left_as_diagnosed",
+        "/ahead/real/body",
+        "/ahead/off/body",
+        "/ahead/on/body",
+        "/ahead/v/off",
+        "/ahead/v/on",
         "/utilities",
         "/summary",
     ):
@@ -68,6 +75,19 @@ def test_car_and_aircraft(car, tmp_path):
         write_recording(findings, path)
         assert _rerun("rrd", "verify", path).returncode == 0
         assert "/paths/desired " in _entities(path)
+
+
+@needs_tool
+def test_a_pendulum_is_drawn_as_a_link_that_turns(tmp_path):
+    make(tmp_path / "p", "pendulum")
+    assert grounded("-C", tmp_path / "p", "learn", "--trials", 1).code == 0
+    path = tmp_path / "pendulum.rrd"
+    write_recording(gather(Folder(tmp_path / "p")), path)
+    assert _rerun("rrd", "verify", path).returncode == 0
+    found = _entities(path)
+    assert (
+        "/paths/model_policy/body/link1 " in found and "/trials/t0001/predicted/body/link1" in found
+    )
 
 
 @needs_tool

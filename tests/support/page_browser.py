@@ -102,14 +102,25 @@ class Browser:
             )
         time.sleep(0.5)
 
-    def key(self, identity: str, key: str) -> None:
-        """A key, as if typed while a plot has the focus."""
-        self.run(
-            "document.getElementById(arguments[0]).dispatchEvent("
-            "new KeyboardEvent('keydown', { key: arguments[1], bubbles: true }))",
-            identity,
-            key,
+    def click(self, selector: str) -> None:
+        """Presses and releases the mouse in the middle of an element."""
+        self.point(selector, 0.5, 0.5)
+        left, top, width, height = self.run(
+            "const b = document.querySelector(arguments[0]).getBoundingClientRect();"
+            "return [b.left, b.top, b.width, b.height];",
+            selector,
         )
+        at = {"x": left + width / 2, "y": top + height / 2, "button": "left", "clickCount": 1}
+        for kind in ("mousePressed", "mouseReleased"):
+            self.devtools("Input.dispatchMouseEvent", {"type": kind, **at})
+        time.sleep(0.2)
+
+    def key(self, identity: str, key: str) -> None:
+        """Types a key while a plot has the focus."""
+        self.run("document.getElementById(arguments[0]).focus()", identity)
+        typed = {"key": key} | ({"text": key} if len(key) == 1 else {})
+        for kind in ("keyDown", "keyUp"):
+            self.devtools("Input.dispatchKeyEvent", {"type": kind, **typed})
         time.sleep(0.3)
 
     def draw_all(self) -> None:

@@ -389,9 +389,11 @@ class Workspace(Folder):
         from grounded_trials.report import reporting
         from grounded_trials.report.gathering import gather
 
-        known = {"jinja2": (html, "report"), "plotly": (html, "report")}
-        known |= {"matplotlib": (png, "png"), "rerun": (rrd, "view")}
-        for module, (asked, extra) in known.items():
+        for module, asked, extra in (
+            ("jinja2", html, "report"),
+            ("matplotlib", png, "png"),
+            ("rerun", rrd, "view"),
+        ):
             if asked:
                 needs(module, extra)
         findings, paths = gather(self._afresh()), []
@@ -423,8 +425,7 @@ class Workspace(Folder):
         from grounded.errors import needs
         from grounded_trials.report.reporting import watched
 
-        for module in ("jinja2", "plotly"):
-            needs(module, "report")
+        needs("jinja2", "report")
         return watched(self, every, trouble)
 
     def export(

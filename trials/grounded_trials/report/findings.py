@@ -26,6 +26,10 @@ from grounded_trials.workspace.adopting import Better
 from grounded_trials.workspace.folder import Lost
 from grounded_trials.workspace.next_step import Since
 
+SCALED = ("m", "rad", "s")  # units, and their rates, of which thousandths have a name
+SMALL = 1e-3  # below which they are used
+PREFIXES = ("", "m", "µ")
+
 
 @dataclass(frozen=True, eq=False)
 class Run:
@@ -164,18 +168,36 @@ class Improved:
     @property
     def text(self) -> str:
         """`17 cm → 0.5 cm`: lengths in mm or cm where they are small."""
-        parts = [_length(v) if self.unit == "m" else (v, self.unit) for v in self._known]
-        return " → ".join(with_unit(figure(v, 2), unit) for v, unit in parts)
+        return " → ".join(measured(value, self.unit) for value in self._known)
 
     @property
     def _known(self) -> list[float]:
         return [v for v in (self.before, self.after) if np.isfinite(v)]
 
 
-def _length(metres: float) -> tuple[float, str]:
-    if metres >= 1.0:
-        return metres, "m"
-    return (1e2 * metres, "cm") if metres >= 1e-3 else (1e3 * metres, "mm")
+def measured(value: float, unit: str) -> str:
+    """An error in two digits: in cm, mm, mrad ... where it is small in its own unit."""
+    if unit == "m" and SMALL <= value < 1.0:
+        return f"{figure(100 * value, 2)} cm"
+    if unit.startswith(SCALED) and 0 < value < SMALL:
+        step = 1 if value >= 1e-5 else 2
+        return f"{figure(value * 1e3**step, 2)} {PREFIXES[step]}{unit}"
+    return with_unit(figure(value, 2), unit)
+
+
+def weighed_groups(task: Task) -> list[tuple[list[str], str]]:
+    """The states that the reward weighs and that have a target, with what their error is called.
+
+    The position comes first, as one distance.
+    """
+    scene, names, known = scene_of(task.model), task.model.state_names, set(tracked(task))
+    reward = task.reward
+    weighed = [i for i in sorted(known) if reward.state[i] or reward.terminal[i]]
+    position = [i for i in scene.axes if i in known] if scene.spatial else []
+    if len(position) < 2:
+        position = []
+    found = [([names[i] for i in position], "the position")] if position else []
+    return found + [([names[i]], names[i]) for i in weighed if i not in position]
 
 
 def improvements_in(findings: Findings) -> list[Improved]:
@@ -183,16 +205,9 @@ def improvements_in(findings: Findings) -> list[Improved]:
 
     The position comes first, as one distance; then the other weighted states that have a target.
     """
-    task, scene = findings.task, scene_of(findings.task.model)
-    runs, names = compared(findings), list(task.model.states.items())
-    known = set(tracked(task))
-    weighed = {i for i in known if task.reward.state[i] or task.reward.terminal[i]}
-    position = [i for i in scene.axes if i in known] if scene.spatial else []
-    groups = [(position, "distance from the desired position")] if len(position) > 1 else []
-    rest = sorted(weighed - set(position if groups else ()))
-    groups += [([i], f"{names[i][0]}, off its target") for i in rest]
-    found = []
-    for states, what in groups:
+    task, runs, found = findings.task, compared(findings), []
+    for names, what in weighed_groups(task):
+        states = [task.model.state_names.index(name) for name in names]
         missed = [
             float(np.linalg.norm(rms(tracking_error(task, r.trial)[:, states]))) for _, r in runs
         ]
@@ -200,8 +215,13 @@ def improvements_in(findings: Findings) -> list[Improved]:
             short = [r.label for _, r in runs if r.trial.finite_steps < task.horizon]
             note = f"; {', '.join(short)} ended early" if short else ""
             before = missed[0] if len(missed) > 1 else float("nan")
-            unit = shown(names[states[0]][1])
-            found.append(Improved(f"{what}, rms{note}", unit, before, missed[-1]))
+            unit = shown(task.model.states[names[0]])
+            off = (
+                "distance from the desired position"
+                if len(names) > 1
+                else f"{what}, off its target"
+            )
+            found.append(Improved(f"{off}, rms{note}", unit, before, missed[-1]))
     return found
 
 

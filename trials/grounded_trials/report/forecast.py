@@ -13,6 +13,7 @@ import numpy as np
 from grounded.frozen import Array
 from grounded.rollout import augmented
 from grounded.search.planner import Planner
+from grounded.solve.bias import residuals
 from grounded.trial import Trial
 
 SECONDS = 1.0
@@ -32,6 +33,18 @@ class Forecast:
         gap = np.full((len(values), 1), np.nan)
         return np.maximum.accumulate(steps) * dt, np.hstack([values, gap]).reshape(-1)
 
+    def along(self, trial: Trial) -> Array:
+        """States (T + 1, n) of the trial as it was forecast; NaN where it was not.
+
+        Where a window ends and the next one starts, it is the end that counts.
+        """
+        found = np.full_like(trial.states, np.nan)
+        found[self.steps[:, 0]] = self.states[:, 0]
+        for k in range(1, self.steps.shape[1]):
+            known = self.steps[:, k] >= 0
+            found[self.steps[known, k]] = self.states[known, k]
+        return found
+
 
 def forecast(planner: Planner, trial: Trial, seconds: float = SECONDS) -> Forecast | None:
     """The planner's model along a trial, started anew every `seconds`; None for less than a step.
@@ -45,7 +58,7 @@ def forecast(planner: Planner, trial: Trial, seconds: float = SECONDS) -> Foreca
     if whole < 1:
         return None
     part = replace(trial, states=trial.states[: whole + 1], inputs=trial.inputs[:whole])
-    lifted, plan = planner.lift(part), planner.plan
+    lifted, plan = anchored(planner, part), planner.plan
     problem = plan.problem(exact=True)
     past = plan.past if part.start_inputs is None else part.start_inputs
     z = augmented(problem, lifted.states, lifted.inputs, past)
@@ -61,6 +74,26 @@ def forecast(planner: Planner, trial: Trial, seconds: float = SECONDS) -> Foreca
             states.append(x[:, :n])
             steps.append(np.where(starts + k + 1 <= whole, starts + k + 1, -1))
     return Forecast(np.stack(states, axis=1), np.stack(steps, axis=1))
+
+
+def anchored(planner: Planner, trial: Trial) -> Trial:
+    """A finite trial with the planning model's memory, which keeps to the log where it can.
+
+    The true value behind an old or lagging log is carried on by the model alone and drifts. What
+    the model then misses of the log is that drift: it is added to the memory.
+    """
+    lifted, n = planner.lift(trial), planner.task.model.n
+    names = planner.plan.model.state_names
+    behind = [
+        (i, [k for k in range(n, len(names)) if names[k].startswith(f"{names[i]}_true")])
+        for i in range(n)
+    ]
+    if not any(memory for _, memory in behind):
+        return lifted
+    drift, states = residuals(planner.plan, lifted), np.array(lifted.states)
+    for i, memory in behind:
+        states[1:, memory] += drift[:, [i]]
+    return replace(lifted, states=states)
 
 
 def forecast_error(planner: Planner, trial: Trial, seconds: float = SECONDS) -> Array:

@@ -21,6 +21,7 @@ from grounded.solve.bias import residuals
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.report.findings import Findings, Log, Run
+from grounded_trials.report.forecast import anchored
 from grounded_trials.store.documents import read_document
 from grounded_trials.workspace.adopting import Better, better_model
 from grounded_trials.workspace.diagnosing import LEAST_STEPS, read_diagnosis
@@ -119,7 +120,7 @@ def _residual(planner: Planner, trial: Trial) -> Array:
     residual = np.full((trial.steps, n), np.nan)
     if whole > 0:
         part = replace(trial, states=trial.states[: whole + 1], inputs=trial.inputs[:whole])
-        residual[:whole] = residuals(planner.plan, planner.lift(part))[:, :n]
+        residual[:whole] = residuals(planner.plan, anchored(planner, part))[:, :n]
     return residual
 
 

@@ -179,7 +179,7 @@ def _diagnosis(findings: Findings, table: Table) -> str:
     for title, text in error_lines(diagnosis, before):
         lines += _wrapped(f"{title}: {text}", "  ")
     if diagnosis.prediction_error and not diagnosis.no_cause:
-        lines.append(table(*error_table(diagnosis)))
+        lines += ["", table(*error_table(diagnosis))]
     if diagnosis.ranking and not diagnosis.no_cause:
         rows = [
             (
@@ -190,7 +190,7 @@ def _diagnosis(findings: Findings, table: Table) -> str:
             )
             for r in diagnosis.ranking[:EFFECTS]
         ]
-        lines.append(table(rows, ("effect", "nats", "credit", "parameters".ljust(VALUES))))
+        lines.append("\n" + table(rows, ("effect", "nats", "credit", "parameters".ljust(VALUES))))
     return "\n".join(lines)
 
 

@@ -165,6 +165,7 @@ PENDULUM = Skeleton(
         '"theta": s.omega',
         '"omega": (a.torque - p.damping * s.omega - p.weight * np.sin(s.theta)) / p.inertia',
     ),
+    roles={"hanging": "theta"},
 )
 
 
@@ -188,6 +189,7 @@ def arm(joints: Sequence[str]) -> Skeleton:
                 for n in names
             ),
         ],
+        roles={"level": tuple(f"{n}_position" for n in names)},
     )
 
 

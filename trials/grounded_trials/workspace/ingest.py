@@ -50,7 +50,7 @@ class Ingested(Result):
     def then(self) -> NextCommand:
         """The command to type next."""
         after_run = "diagnose" if self.verdict == "probe" else "propose"
-        return NextCommand(after_run if self.candidate else "fit")
+        return NextCommand(after_run if self.candidate else "diagnose")
 
     def summary(self) -> str:
         """The trial, what it ran and what became of that."""

@@ -36,7 +36,8 @@ def next_command(
     if now.phase == "await-trial":
         return another_trial(workspace, now)
     if diagnosis is None:
-        return now.then or (PROPOSE if now.phase == "propose" else DIAGNOSE)
+        logs = usable and not now.history  # what they show comes before the first candidate
+        return now.then or (PROPOSE if now.phase == "propose" and not logs else DIAGNOSE)
     since = since_diagnosis(workspace, diagnosis, usable)
     follow = after_diagnosis(workspace, diagnosis)
     if now.phase == "propose":  # what logs have shown is adopted before the first candidate

@@ -16,7 +16,7 @@ from grounded.frozen import Array
 from grounded.trial import Trial
 from grounded_trials.report.findings import Findings, Run
 from grounded_trials.report.forecast import SECONDS, forecast
-from grounded_trials.wording import labelled, per_second, shown
+from grounded_trials.wording import labelled, per_second, percent, shown
 
 SPAN_S = 30.0  # of a long log that is drawn: the part with the largest errors
 LOGS = 2  # that are drawn; the table has all
@@ -217,7 +217,10 @@ def _autocorrelation(
     shown_ = [(residual, "model", findings.plain)]
     if explained is not None and findings.better is not None:
         shown_.append((explained, "best", f"model {findings.better.name}"))
-    curves = []
+    curves, note = [], ""
+    if explained is not None:
+        left = float(np.std(explained[:, state]) / (np.std(residual[:, state]) or 1.0))
+        note = f"{percent(left)} of its size is left"
     for values, role, name in shown_:
         y = values[:, state] - values[:, state].mean()
         power = float(y @ y) or 1.0
@@ -230,5 +233,5 @@ def _autocorrelation(
     name = findings.task.model.state_names[state]
     return Panel(
         f"{name}: autocorrelation of the residual", "lag [s]", "", tuple(curves), bands=(band,),
-        y_range=(-1.05, 1.05),
+        y_range=(-1.05, 1.05), note=note,
     )  # fmt: skip

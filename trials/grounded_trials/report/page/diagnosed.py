@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from grounded.diagnosis.pictures import accuracy_figure, credit_figure, where_figure
-from grounded.diagnosis.report import ChannelParts, Diagnosis, Parts, Split
+from grounded.diagnosis.report import ChannelParts, Diagnosis, Parts, Split, TrialValue
 from grounded_trials.report.diagnosis_words import (
     gap_sentence,
     sentences,
@@ -21,7 +21,7 @@ from grounded_trials.report.page.tables import (
     leftover_table,
     table,
 )
-from grounded_trials.wording import figure, percent, rendered
+from grounded_trials.wording import figure, percent, rendered, with_unit
 from grounded_trials.workspace.next_step import DIAGNOSE, Since
 
 MOST = 6  # states whose error without each effect is drawn
@@ -38,7 +38,9 @@ def gap_section(findings: Findings) -> list[Block]:
         words = "Not diagnosed yet. This says where the model is wrong, and what makes it so:"
         command = Block("command", rendered(DIAGNOSE), "c-diagnose")
         return [Block("text", words), command, *ahead, *forecast_table(findings), *lacking]
-    verdict = Block("verdict", lines=verdict_lines(diagnosis, findings.since))
+    verdict = Block(
+        "verdict", lines=told_since(sentences(diagnosis.sentence or diagnosis.kind), findings.since)
+    )
     if diagnosis.no_cause:  # with too little data, what was fitted is no finding
         return [verdict, *ahead, *forecast_table(findings), *lacking]
     proof = drawn(accuracy_figure(diagnosis), title=True)
@@ -47,12 +49,11 @@ def gap_section(findings: Findings) -> list[Block]:
     return [verdict, *proof, *lacking, *_details(diagnosis, findings.since)]
 
 
-def verdict_lines(diagnosis: Diagnosis, since: Since, most: int = 99) -> list[str]:
-    """The verdict, a line for each of its sentences; what happened since stands before it."""
-    texts = sentences(diagnosis.sentence or diagnosis.kind)[:most]
-    if since.adopted:
-        texts[0] = f"Before that: {texts[0]}"
-    return [f"{_begun(since.sentence)}."] * bool(since.sentence) + texts
+def told_since(lines: list[str], since: Since) -> list[str]:
+    """A verdict's lines; what happened since stands before them."""
+    before = "Before that: " * bool(since.adopted)
+    told = [f"{_begun(since.sentence)}."] if since.sentence else []
+    return [line.replace("->", "→") for line in [*told, before + lines[0], *lines[1:]]]
 
 
 def _details(diagnosis: Diagnosis, since: Since) -> list[Block]:
@@ -78,15 +79,23 @@ def _by_trial(diagnosis: Diagnosis) -> list[Block]:
     rows = [
         (
             p.effect,
+            p.quantity,
             p.trial,
-            f"{figure(p.value, 3)} ± {figure(p.std, 2)}",
+            with_unit(f"{figure(p.value, 3)} ± {figure(p.std, 2)}", _unit(diagnosis, p)),
             "yes" if p.agrees else "no",
         )
         for p in found
     ]
-    header = ("effect", "trial ", "value", "agrees with the others")
+    header = ("effect", "quantity ", "trial ", "value", "agrees with the others")
     strong = [i for i, p in enumerate(found) if not p.agrees]
-    return [Block("heading", "Trial by trial"), table("per-trial", header, rows, strong)]
+    each = table("per-trial", header, rows, strong)
+    return [Block("folded", "Trial by trial", blocks=[each], wide=bool(strong))]
+
+
+def _unit(diagnosis: Diagnosis, value: TrialValue) -> str:
+    row = diagnosis.ranked(value.effect)
+    known = {} if row is None else row.params
+    return known[value.quantity].unit if value.quantity in known else ""
 
 
 def _alike(diagnosis: Diagnosis) -> list[Block]:

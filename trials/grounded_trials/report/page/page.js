@@ -49,7 +49,8 @@
   const looks = (plot) => {
     const { data, layout, kind } = known(plot);
     const gone = off(plot);
-    const traces = coloured(data).map((trace) => {
+    const shown = data.filter((trace) => trace.meta.style !== "ghost"); // those move marks alone
+    const traces = coloured(shown).map((trace) => {
       const name = trace.name || trace.meta.trial;
       return gone.has(name) || gone.has(trace.meta.trial) ? { ...trace, visible: false } : trace;
     });

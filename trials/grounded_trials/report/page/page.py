@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis.pictures import credit_figure
+from grounded.diagnosis.pictures import credit_figure, worth_of
 from grounded.errors import needs
-from grounded.figures.figure import Bars, Panel
-from grounded.figures.interactive import EXTRA, packed, palette, plotted
+from grounded.figures.figure import Bars, Figure, Panel
+from grounded.figures.interactive import packed, palette, plotted
 from grounded.search.pictures import search_figure
 from grounded_trials.report.diagnosis_words import error_lines, instrument_lines
 from grounded_trials.report.figures.paths import crash, path_figure
@@ -31,7 +31,7 @@ from grounded_trials.report.figures.runs import (
     state_figure,
 )
 from grounded_trials.report.findings import Findings, improvements_in
-from grounded_trials.report.page.diagnosed import gap_section, verdict_lines
+from grounded_trials.report.page.diagnosed import gap_section, told_since
 from grounded_trials.report.page.tables import (
     Block,
     candidate_table,
@@ -40,9 +40,9 @@ from grounded_trials.report.page.tables import (
     error_table,
     parameter_table,
 )
+from grounded_trials.report.three_lines import gained_most, three_lines
 from grounded_trials.wording import count, figure
 
-LINES = 2  # of the verdict, at the top
 OPEN = 12  # candidates whose table is open
 
 
@@ -54,14 +54,13 @@ def page(findings: Findings, watched: int = 0) -> str:
         watched: the revision that the page is of, where `report --watch` keeps it current.
 
     Raises:
-        GroundedError: if Jinja2 or Plotly is not installed.
+        GroundedError: if Jinja2 is not installed.
     """
-    needs("jinja2", EXTRA)
-    needs("plotly", EXTRA)
+    needs("jinja2", "report")
     from jinja2 import Environment
 
     jinja = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    scripts = [_plotly(), _own("page.js")]
+    scripts = [_own("plotly-basic.min.js"), _own("page.js")]
     panels: list[dict[str, Any]] = []
 
     def number(panel: Panel | Bars) -> int:
@@ -89,15 +88,9 @@ def page(findings: Findings, watched: int = 0) -> str:
     )
 
 
+@cache
 def _own(name: str) -> str:
     return files(__package__).joinpath(name).read_text(encoding="utf-8")
-
-
-@cache
-def _plotly() -> str:
-    from plotly.offline import get_plotlyjs
-
-    return str(get_plotlyjs()).replace("</script", "<\\/script")
 
 
 def _hash(script: str) -> str:
@@ -107,6 +100,7 @@ def _hash(script: str) -> str:
 def _data(panel: Panel | Bars) -> dict[str, Any]:
     kind = "bars" if isinstance(panel, Bars) else panel.kind
     found: dict[str, Any] = _plain(plotted(panel))
+    found["layout"].pop("annotations", None)  # a note stands in the caption
     return found | {"kind": kind}
 
 
@@ -139,13 +133,13 @@ def _sections(findings: Findings) -> list[tuple[str, list[Block]]]:
     """Titles and parts, in reading order."""
     paths = drawn(path_figure(findings), wide=True)
     return [
-        ("Paths", [*paths, Block("run")] if paths and findings.runs else paths),
+        ("Paths", [Block("run"), *paths] if paths and findings.runs else paths),
         ("States", drawn(state_figure(findings))),
         ("Tracking error", drawn(error_figure(findings)) + error_table(findings)),
         ("Inputs", drawn(input_figure(findings))),
         ("Utility", _utility(findings)),
         ("Bias", drawn(bias_figure(findings))),
-        ("Gap", gap_section(findings)),
+        ("Gap: model against reality", gap_section(findings)),
         ("Task and model", _task(findings)),
     ]
 
@@ -192,11 +186,13 @@ def _why(findings: Findings) -> dict[str, Any]:
     if diagnosis is None:
         return {}
     before = {} if findings.since.changed else findings.values
-    credit = credit_figure(diagnosis)
+    groups = gained_most(diagnosis, findings.task)
+    worth = [p for g in groups for p in worth_of(*g, diagnosis)]
+    credit = Figure("credit", "", "", tuple(worth)) if worth else credit_figure(diagnosis)
     told = [] if credit else error_lines(diagnosis, before)
     lines = [(title, text) for title, text in told if title == "parameters"]
     return {
-        "verdict": verdict_lines(diagnosis, findings.since, LINES),
+        "verdict": told_since(three_lines(diagnosis, findings.task), findings.since),
         "preflight": instrument_lines(diagnosis.preflight),
         "lines": lines,
         "credit": credit,

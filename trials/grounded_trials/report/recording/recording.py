@@ -3,9 +3,10 @@
     /paths/...                desired, the model's own policy, the best so far and its prediction
     /state/x/...              the same over time, a plot a state;  /input/u/...  with their limits
     /bias/x/...               what the crude model lacks along the run [unit/s], by iteration
+    /ahead/...                the best run, and the model set on it every second: effects off, on
     /trials/t0007/...         everything of one trial: path, prediction, body, state, input, bias
     /data/t0003/...           the same of a log that ran no candidate
-    /verdict, /credit         why the model was wrong, cause by cause
+    /verdict                  why the model was wrong, what each cause is worth, what to run next
     /utilities, /summary      by iteration, and in words (Markdown)
 
 One timeline, `time`, in seconds since the start of a trial. Numbers go in by whole columns, names
@@ -17,38 +18,34 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from functools import cached_property
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from grounded.errors import GroundedError, needs
+from grounded.figures.body import Body
 from grounded.figures.figure import COLOURS as PAGE
 from grounded.figures.figure import rgb
 from grounded.frozen import Array
 from grounded.trial import Trial
-from grounded_trials.report.diagnosis_words import sentences
+from grounded_trials.report.bodies import body_of
 from grounded_trials.report.findings import Findings, Run, selection, tracked
+from grounded_trials.report.forecast import forecast
+from grounded_trials.report.recording.drawing import drawn
 from grounded_trials.report.recording.layout import blueprint
+from grounded_trials.report.recording.space import Space
 from grounded_trials.report.scene import Scene, scene_of
+from grounded_trials.report.three_lines import three_lines
 from grounded_trials.wording import count, labelled, per_second, percent
 
 COLOURS = {role: rgb(dark) for role, (_, dark) in PAGE.items()}
 COLOURS |= {"desired": (170, 170, 170), "other": (110, 110, 110), "model_policy": COLOURS["model"]}
 SERIES = [COLOURS[role] for role in ("best", "limit", "accepted", "step2", "predicted", "model")]
-CAR = (
-    [(-0.5, -0.25, 0), (0.5, -0.25, 0), (0.5, 0.25, 0), (-0.5, 0.25, 0), (-0.5, -0.25, 0)],
-    [(0.5, -0.25, 0), (0.85, 0, 0), (0.5, 0.25, 0)],
-)
-AIRCRAFT = (
-    [(-0.6, 0, 0), (0.5, 0, 0)],
-    [(-0.1, 0.8, 0), (0.2, 0, 0), (-0.1, -0.8, 0), (-0.1, 0.8, 0)],
-    [(-0.6, 0.25, 0), (-0.6, -0.25, 0)],
-    [(-0.4, 0, 0), (-0.65, 0, 0.25), (-0.6, 0, 0)],
-)
 ITERATIONS = 4  # of the bias, in one plot
 FINE = 600  # steps; the bias of longer trials is averaged over a few steps, or files get large
+BAR = 24  # letters of a credit of 100 %
 FRAMES = 600  # poses of a body in an animation
 VERTICES = 1000  # of a path in space
 
@@ -64,11 +61,12 @@ def write_recording(findings: Findings, path: Path) -> None:
     identity = hashlib.sha256(f"{findings.name} {findings.task.hash}".encode()).hexdigest()[:32]
     stream = rr.RecordingStream("grounded", recording_id=identity)
     scene = scene_of(findings.task.model)
+    body = body_of(findings.task.model, scene, _size(findings, scene))
     temporary = path.with_name(f".{path.name}.tmp")
     try:
-        stream.save(temporary, default_blueprint=blueprint(findings, scene))
+        stream.save(temporary, default_blueprint=blueprint(findings, Space(findings, scene, body)))
         stream.send_recording_name(findings.name)
-        _Recorder(stream, findings, scene).everything()
+        _Recorder(stream, findings, body).everything()
         stream.flush()
         stream.disconnect()
         temporary.replace(path)
@@ -78,11 +76,18 @@ def write_recording(findings: Findings, path: Path) -> None:
         temporary.unlink(missing_ok=True)
 
 
+def _size(findings: Findings, scene: Scene) -> float:
+    """The length of a body that can be seen beside the path."""
+    shown = findings.runs or findings.logs
+    points = scene.finite(shown[0].trial.states if shown else findings.task.target)
+    return 0.07 * (float(np.ptp(points, axis=0).max()) or 1.0) if len(points) else 0.07
+
+
 class _Recorder:
     """Findings on their way into a stream: first what is recorded, then how."""
 
-    def __init__(self, stream: Any, findings: Findings, scene: Scene) -> None:
-        self.stream, self.findings, self.scene = stream, findings, scene
+    def __init__(self, stream: Any, findings: Findings, body: Body) -> None:
+        self.stream, self.findings, self.body = stream, findings, body
         self.task, self.dt = findings.task, findings.task.dt
         self.compared = {"model_policy": findings.first, "best": findings.best}
         self.per_second = {n: per_second(u) for n, u in findings.task.model.states.items()}
@@ -94,16 +99,13 @@ class _Recorder:
         log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         log("summary", rr.TextDocument(summary(findings), media_type="text/markdown"), static=True)
         log("verdict", rr.TextDocument(verdict(findings), media_type="text/markdown"), static=True)
-        diagnosis = findings.diagnosis
-        if diagnosis is not None and diagnosis.credit:
-            shares = [100 * one.share for one in diagnosis.credit]
-            log("credit", rr.BarChart(shares, color=COLOURS["best"]), static=True)
         values = [u for u in findings.standing.utilities if np.isfinite(u)]
         if values:
             log("utilities", rr.BarChart(values, color=COLOURS["best"]), static=True)
         self.paths()
         self.over_time()
         self.biases()
+        self.forecasts()
         for run in findings.runs:
             self.trial(run)
         for one in findings.logs:
@@ -113,7 +115,7 @@ class _Recorder:
     def paths(self) -> None:
         """The paths that one wants to see first, with a body on each that was really run."""
         task, first, best = self.task, self.findings.first, self.findings.best
-        if all(np.isfinite(task.target[:, i]).all() for i in self.scene.axes):
+        if np.isfinite(self.body.path(task.target)).all():
             self.path("paths/desired", task.target, "desired", 2.0)
         waiting = self.findings.standing.outstanding
         if first is None and waiting is not None:
@@ -163,6 +165,27 @@ class _Recorder:
         if best is not None and best.explained is not None and better is not None:
             self.rates(f"left, {better.name}", best.explained, "limit")
 
+    def forecasts(self) -> None:
+        """The best run beside the model without effects, and with them, set on it every second."""
+        run = self.findings.best or self.findings.latest
+        if run is None or self.findings.better is None:
+            return
+        self.moving("ahead/real", run.trial, "best")
+        for i, name in enumerate(self.task.model.state_names):
+            self.line(f"ahead/{name}/real", run.trial.states[:, i], self.dt, "best", "real")
+        for key, planner, colour in (
+            ("off", self.findings.crude, "model_policy"),
+            ("on", self.findings.better.planner, "predicted"),
+        ):
+            found = forecast(planner, run.trial)
+            if found is None:
+                continue
+            states = found.along(run.trial)
+            self.moving(f"ahead/{key}", replace(run.trial, states=states), colour, width=1.5)
+            words = self.findings.plain if key == "off" else f"model {self.findings.better.name}"
+            for i, name in enumerate(self.task.model.state_names):
+                self.line(f"ahead/{name}/{key}", states[:, i], self.dt, colour, words)
+
     def rates(self, key: str, residual: Array, colour: str) -> None:
         rates, dt = rate(residual, self.dt)
         for i, name in enumerate(self.task.model.state_names):
@@ -190,13 +213,6 @@ class _Recorder:
         self.columns(f"{at}/input", trial.inputs, self.dt, model.inputs)
         self.columns(f"{at}/bias", *rate(residual, self.dt), self.per_second)
 
-    @cached_property
-    def size(self) -> float:
-        """The length of a body that can be seen beside the path."""
-        shown = self.findings.runs or self.findings.logs
-        points = self.scene.finite(shown[0].trial.states if shown else self.task.target)
-        return 0.07 * (float(np.ptp(points, axis=0).max()) or 1.0) if len(points) else 0.07
-
     def ghost(self, at: str, run: Run) -> None:
         """The run as it was predicted, with a body of its own that moves beside the real one."""
         states, inputs = run.candidate.predicted_states, run.candidate.predicted_inputs
@@ -214,27 +230,25 @@ class _Recorder:
 
         self.path(at + path, trial.states, colour, width)
         rows = np.flatnonzero(np.isfinite(trial.states).all(axis=1))
-        rows = rows[:: max(1, len(rows) // FRAMES)]
-        if self.scene.spatial:
-            strips = [self.size * np.array(s) for s in (AIRCRAFT if self.scene.volume else CAR)]
-            thin = rr.Radius.ui_points(2)
-            body: Any = rr.LineStrips3D(strips, colors=COLOURS[colour], radii=thin)
-        else:
-            thick = rr.Radius.ui_points(6)
-            body = rr.Points3D([[0, 0, 0]], colors=COLOURS[colour], radii=thick)
-        self.stream.log(f"{at}/body", body, static=True)
-        pose = rr.Transform3D.columns(
-            translation=self.scene.points(trial.states[rows]),
-            mat3x3=self.scene.rotations(trial.states[rows]),
-        )
+        parts = self.body.parts
+        rows = rows[:: max(1, len(rows) * len(parts) // FRAMES)]
+        if not len(rows):
+            return
         times = [rr.TimeColumn("time", duration=rows * self.dt)]
-        self.stream.send_columns(f"{at}/body", times, pose)
+        poses = self.body.poses(trial.states[rows])
+        for part, (origin, turned) in zip(parts, poses, strict=True):
+            entity = f"{at}/body/{part.name}" if part.name else f"{at}/body"
+            look = drawn(part, COLOURS[colour], ghost=colour == "predicted")
+            self.stream.log(entity, look, static=True)
+            pose = rr.Transform3D.columns(translation=origin, mat3x3=turned)
+            self.stream.send_columns(entity, times, pose)
 
     def path(self, at: str, states: Array, colour: str, width: float) -> None:
         """A path in space, all of it at once."""
         import rerun as rr
 
-        points = self.scene.finite(states)
+        points = self.body.path(states)
+        points = points[np.isfinite(points).all(axis=1)]
         if not len(points):
             return
         points = points[np.unique(np.linspace(0, len(points) - 1, VERTICES).astype(int))]
@@ -276,16 +290,18 @@ def rate(residual: Array, dt: float) -> tuple[Array, float]:
 
 
 def verdict(findings: Findings) -> str:
-    """What the diagnosis says, a cause a line with its share, and what to run next."""
+    """What the diagnosis says in three lines, each cause's share, and what to run next."""
     diagnosis, lines = findings.diagnosis, []
     if diagnosis is None:
-        lines.append("not diagnosed yet")
+        lines.append("not diagnosed yet\n")
     else:
-        causes, *others = sentences(diagnosis.sentence)
-        lines += [f"- {cause}" for cause in causes.split("; ")]
-        lines += [""] + [f"{other}\n" for other in others]
-        shares = [f"{one.of} {percent(one.share)}" for one in diagnosis.credit]
-        lines += [f"credit, in this order: {', '.join(shares)}\n"] * bool(shares)
+        lines += [f"{line}\n" for line in three_lines(diagnosis, findings.task)]
+        if diagnosis.credit:
+            lines += ["| credit | | of what predictions gain |", "|---|---|---|"]
+        for one in diagnosis.credit:
+            bar = "█" * max(1, round(BAR * one.share)) if one.share > 0 else ""
+            lines.append(f"| {one.of} | {percent(one.share)} | {bar} |")
+        lines.append("")
     return "\n".join([*lines, f"next: `{findings.next_command}`"])
 
 
@@ -293,19 +309,18 @@ def summary(findings: Findings) -> str:
     """What was learnt, and what is left out."""
     task, best, first = findings.task, findings.best, findings.first
     lines = [
-        f"# {findings.name}",
-        f"{task.model.name}: {task.horizon} steps of {task.dt:g} s, "
+        f"**{findings.name}**, {task.model.name}: {task.horizon} steps of {task.dt:g} s, "
         f"{count(len(findings.runs), 'trial')}, {count(len(findings.logs), 'log')} of data",
         "",
-        "| | candidate | utility |",
-        "|---|---|---|",
     ]
+    known = []
     if first is not None:
-        lines.append(f"| the model's policy | {first.candidate.id} | {first.utility:.4g} |")
+        known.append(f"{first.utility:.4g} by the model's policy ({first.candidate.id})")
     if best is not None:
-        lines.append(f"| best so far | {best.candidate.id} | {best.utility:.4g} |")
+        known.append(f"{best.utility:.4g} best so far ({best.candidate.id})")
     if findings.optimum is not None:
-        lines.append(f"| optimum | | {findings.optimum:.4g} |")
+        known.append(f"{findings.optimum:.4g} at the optimum")
+    lines.append(f"utility {', '.join(known)}" if known else "no candidate was run yet")
     lines += ["", "grey: desired; orange: model's policy; blue: best so far; pink: its prediction"]
     lines += ["", f"**{findings.standing.phase}**: {findings.standing.sentence}", ""]
     lines += [f"**left out**: {one.file}: {one.reason}\n" for one in findings.lost]

@@ -1,0 +1,98 @@
+"""Bodies: links, carriages and cabins where the angles say; a MuJoCo file's own geometry."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from grounded.models import arm, buggy, cart_pole, lift, pendulum
+from grounded_trials.report.bodies import body_of, is_mechanism, reach
+from grounded_trials.report.scene import scene_of
+
+
+def _body(model):
+    return body_of(model, scene_of(model), 0.1)
+
+
+@pytest.mark.parametrize(
+    ("model", "state", "tip"),
+    [
+        (pendulum.model, [0.0, 0.0], (0.0, -0.5)),  # hangs
+        (pendulum.model, [np.pi / 2, 0.0], (0.5, 0.0)),
+        (cart_pole.model, [2.0, 0.0, 0.0, 0.0], (2.0, 0.5)),  # stands
+        (cart_pole.model, [2.0, np.pi / 2, 0.0, 0.0], (2.5, 0.0)),  # a pole that falls to +x
+        (arm.model, [0.0, 0.0, 0.0, 0.0], (2.0, 0.0)),
+        (arm.model, [np.pi / 2, -np.pi / 2, 0.0, 0.0], (1.0, 1.0)),
+        (lift.model, [3.0, 0.0], (0.0, 3.0)),
+    ],
+)
+def test_the_tip_is_where_the_angles_say(model, state, tip):
+    body = _body(model)
+    assert is_mechanism(body)
+    np.testing.assert_allclose(body.path(np.array([state]))[0], [tip[0], 0.0, tip[1]], atol=1e-12)
+
+
+@pytest.mark.parametrize("model", [pendulum.model, cart_pole.model, arm.model])
+def test_links_hang_together(model):
+    body, states = _body(model), np.random.default_rng(0).normal(size=(5, model.n))
+    ends = []
+    for part, (origin, turned) in zip(body.parts, body.poses(states), strict=True):
+        np.testing.assert_allclose(
+            turned @ turned.transpose(0, 2, 1), np.tile(np.eye(3), (5, 1, 1)), atol=1e-12
+        )
+        np.testing.assert_allclose(np.linalg.det(turned), 1.0)
+        if part.shape == "capsule":
+            ends.append((origin, origin + part.size[1] * turned[:, :, 2]))
+    for (_, end), (start, _) in pairwise(ends):
+        np.testing.assert_allclose(end, start, atol=1e-12)
+    np.testing.assert_allclose(ends[-1][1], body.path(states), atol=1e-12)
+
+
+def test_a_mark_along_a_path_and_a_state_that_is_unknown():
+    body = _body(buggy.model)
+    assert not is_mechanism(body) and len(body.parts) == 1
+    states = np.zeros((3, 2))
+    states[1] = np.nan
+    assert len(reach(_body(pendulum.model), states)) == 4  # two tips, two joints
+
+
+MJCF = """
+<mujoco>
+  <worldbody>
+    <geom type="plane" size="1 1 1"/>
+    <body name="cart">
+      <joint name="x" type="slide" axis="1 0 0"/>
+      <geom type="box" size="0.2 0.1 0.05" mass="1"/>
+      <geom type="sphere" size="9" mass="0" group="4"/>
+      <body name="pole" pos="0 0 0.05">
+        <joint name="theta" axis="0 1 0"/>
+        <geom type="capsule" fromto="0 0 0 0 0 1" size="0.03" mass="0.2"/>
+        <body name="weight" pos="0 0 1">
+          <inertial pos="0 0 0.5" mass="0.3" diaginertia="0.1 0.1 0.1"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor name="force" joint="x"/></actuator>
+</mujoco>"""
+
+
+def test_a_mujoco_model_looks_as_its_file_says():
+    pytest.importorskip("mujoco", reason="the adapter's extra, .[mujoco]")
+    from grounded.adapters import mujoco
+
+    body = _body(mujoco.model(MJCF))
+    shapes = [part.shape for part in body.parts]
+    assert shapes == ["box", "capsule", "box", "capsule"]  # cart, pole; the weight and its rod
+    states = np.array([[0.7, np.pi / 2, 0.0, 0.0]])  # the pole lies along +x
+    poses = body.poses(states)
+    np.testing.assert_allclose(poses[0][0][0], [0.7, 0, 0], atol=1e-9)
+    start, along = poses[1][0][0], poses[1][1][0, :, 2] * body.parts[1].size[1]
+    ends = np.sort([start, start + along], axis=0)
+    np.testing.assert_allclose(ends, [[0.7, 0, 0.05], [1.7, 0, 0.05]], atol=1e-9)
+    np.testing.assert_allclose(poses[3][0][0], [1.7, 0, 0.05], atol=1e-9)
+    np.testing.assert_allclose(poses[3][1][0, :, 2], [1, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(body.path(states)[0], [2.2, 0, 0.05], atol=1e-9)
+    assert np.isnan(body.path(np.full((1, 4), np.nan))).all()

@@ -1,0 +1,94 @@
+"""The verdict in three lines: what was wrong, what predictions gain, what is open."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from grounded.diagnosis.report import Diagnosis
+from grounded_trials.report.findings import measured
+from grounded_trials.report.three_lines import gained_most, three_lines
+from reported import DIAGNOSIS
+from small_tasks import cart_task
+
+ROW = {
+    "horizon_s": 1.0,
+    "unit_by_channel": {"x": "m", "v": "m/s"},
+    "crude": {"x": 0.25, "v": 0.31},
+    "with_effects": {"x": 0.012, "v": 0.0004},
+    "noise_floor": {"x": 0.01, "v": 0.0003},
+}
+CREDIT = [
+    {"of": "calibration", "share": 0.7, "without_it": {"x": 0.2}},
+    {"of": "viscous_friction:v", "share": 0.28, "without_it": {"x": 0.1}},
+    {"of": "delay:force", "share": 0.02, "without_it": {"x": 0.013}},
+]
+SENTENCE = (
+    "The model's own parameters are off: mass should be 1.4 kg (+40%) (70 % of the gain); "
+    "the speed v is opposed by a friction of 0.3 1/s (28 % of the gain); the force arrives 0.02 s "
+    "later than modelled (2 % of the gain). 1 s ahead predictions miss v by 0.0004 m/s."
+)
+
+
+@pytest.fixture
+def diagnosis():
+    made = {"trials": ["t0001"], "adopted": [], "nominal": {"mass": 1.0}}
+    verdict = {"kind": "several", "effects": ["viscous_friction:v"], "sentence": SENTENCE}
+    more = {"prediction_error": [ROW], "credit": CREDIT, "diagnosed": made, "verdict": verdict}
+    left = DIAGNOSIS["leftover"][0] | {
+        "error": 0.02,
+        "floor": 0.005,
+        "error_unit": "m/s",
+        "horizon_s": 1.0,
+    }
+    plain = DIAGNOSIS | {"indistinguishable": []} | more | {"leftover": [left]}
+    return Diagnosis.from_json(plain)
+
+
+def test_causes_gain_and_what_is_left(diagnosis):
+    wrong, gained, left = three_lines(diagnosis, cart_task())
+    assert "mass +40 %" in wrong and "a friction of 0.3 1/s" in wrong and "1 smaller cause" in wrong
+    assert "of the gain" not in wrong and "force arrives" not in wrong
+    assert "x by 1.2 cm instead of 25 cm" in gained
+    assert "v" in left and "0.020 m/s" in left and "0.0050 m/s" in left and "x > 0.2" in left
+
+
+def test_what_became_worse_is_not_kept_back(diagnosis):
+    worse = "Whole trials miss x by 3.8 m instead of 2.1: that is worse."
+    verdict = replace(diagnosis.verdict, sentence=f"{SENTENCE} {worse}")
+    assert three_lines(replace(diagnosis, verdict=verdict), cart_task())[1].endswith(worse)
+
+
+def test_what_is_weighed_is_spoken_of(diagnosis):
+    names = [names for names, _ in gained_most(diagnosis, cart_task())]
+    assert names == [["x"]]  # v has no weight
+
+
+def test_ties_are_named_and_nothing_left_is_said(diagnosis):
+    tied = replace(diagnosis, indistinguishable=(("a:v", "b:v"),), leftover=())
+    assert "a:v from b:v" in three_lines(tied, cart_task())[-1]
+    clean = replace(diagnosis, leftover=())
+    assert "above the noise" in three_lines(clean, cart_task())[-1]
+
+
+def test_without_a_known_cause_the_verdict_speaks_for_itself(diagnosis):
+    verdict = replace(diagnosis.verdict, kind="unknown", sentence="No cause is named: one trial.")
+    unknown = replace(diagnosis, verdict=verdict, credit=())
+    assert three_lines(unknown, cart_task()) == ["No cause is named: one trial."]
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "text"),
+    [
+        (0.17, "m", "17 cm"),
+        (2.0, "m", "2.0 m"),
+        (4e-4, "m", "0.40 mm"),
+        (3e-6, "rad", "3.0 µrad"),
+        (0.3, "rad/s", "0.30 rad/s"),
+        (3e-4, "V", "3.0e-04 V"),
+        (0.0, "m", "0 m"),
+    ],
+)
+def test_an_error_is_given_in_a_unit_that_fits(value, unit, text):
+    assert measured(value, unit) == text

@@ -1,0 +1,182 @@
+"""Bodies: what a robot looks like in each of its states, from the roles of its model.
+
+    position                    a car from above, or an aircraft, along its path
+    hanging, upright, level     links in a vertical plane, one on the other: the angles of their
+                                joints, the first of which is zero downwards, upwards, along x
+    rail                        the place of a carriage that such links stand on
+    altitude, without position  a cabin that goes up and down
+    a MuJoCo model              the geometry of its file
+    nothing of these            a dot in the plane of the first two states
+
+Links are as long as the parameters l, l1, l2 ... say, or all alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from grounded.adapters.stepper import Stepper
+from grounded.figures.body import Body, Part, Pose
+from grounded.frozen import Array
+from grounded.model import Model
+from grounded_trials.report.scene import Scene
+
+CAR = (
+    [(-0.5, -0.25, 0), (0.5, -0.25, 0), (0.5, 0.25, 0), (-0.5, 0.25, 0), (-0.5, -0.25, 0)],
+    [(0.5, -0.25, 0), (0.85, 0, 0), (0.5, 0.25, 0)],
+)
+AIRCRAFT = (
+    [(-0.6, 0, 0), (0.5, 0, 0)],
+    [(-0.1, 0.8, 0), (0.2, 0, 0), (-0.1, -0.8, 0), (-0.1, 0.8, 0)],
+    [(-0.6, 0.25, 0), (-0.6, -0.25, 0)],
+    [(-0.4, 0, 0), (-0.65, 0, 0.25), (-0.6, 0, 0)],
+)
+ZEROS = {"hanging": (-np.pi / 2, 1), "upright": (np.pi / 2, -1), "level": (0.0, 1)}
+SLIM = 0.06  # of a link's length: its radius
+CARRIAGE = (0.25, 0.12, 0.1)  # of the links' length: half its edges
+
+
+def body_of(model: Model, scene: Scene, size: float) -> Body:
+    """The body of a model.
+
+    Args:
+        model: its roles and parameters are used.
+        scene: where it stands.
+        size: the length of a body that has none of its own.
+    """
+    if isinstance(model.step, Stepper) and model.step.body is not None:
+        return model.step.body
+    for role, (zero, sign) in ZEROS.items():
+        if angles := _columns(model, role):
+            return Links(angles, _lengths(model, len(angles)), zero, sign, _columns(model, "rail"))
+    if not scene.spatial and (height := _columns(model, "altitude")):
+        return Cabin(height[0], size)
+    return Vehicle(scene, size)
+
+
+def is_mechanism(body: Body) -> bool:
+    """Whether it is seen from the side, as it stands; else it is a mark along a path."""
+    return not isinstance(body, Vehicle)
+
+
+def _columns(model: Model, role: str) -> tuple[int, ...]:
+    named = model.roles.get(role, ())
+    names = (named,) if isinstance(named, str) else named
+    return tuple(model.state_names.index(name) for name in names if name in model.states)
+
+
+def _lengths(model: Model, count: int) -> tuple[float, ...]:
+    params = model.params
+    named = [params.get(f"l{i}", params.get("l")) for i in range(1, count + 1)]
+    return tuple(1.0 if one is None or one.unit != "m" else one.value for one in named)
+
+
+@dataclass(frozen=True, eq=False)
+class Vehicle:
+    """A mark along a path, drawn as a car, an aircraft, or a dot."""
+
+    scene: Scene
+    size: float
+
+    @property
+    def parts(self) -> Sequence[Part]:
+        """One."""
+        if not self.scene.spatial:
+            return (Part("", "dot"),)
+        drawn = AIRCRAFT if self.scene.volume else CAR
+        return (Part("", "lines", strips=tuple(self.size * np.array(s) for s in drawn)),)
+
+    def poses(self, states: Array) -> list[Pose]:
+        """At the position, turned as the heading or the attitude says."""
+        return [(self.scene.points(states), self.scene.rotations(states))]
+
+    def path(self, states: Array) -> Array:
+        """The position."""
+        return self.scene.points(states)
+
+
+@dataclass(frozen=True, eq=False)
+class Links:
+    """Links in the plane of x and z, one on the other, perhaps on a carriage along x."""
+
+    angles: tuple[int, ...]  # states
+    lengths: tuple[float, ...]
+    zero: float  # [rad] from x towards z, where the first angle is zero
+    sign: int
+    rail: tuple[int, ...] = ()  # a state, or none
+
+    @property
+    def parts(self) -> Sequence[Part]:
+        """The links, then the carriage."""
+        links = [
+            Part(f"link{i}", "capsule", (SLIM * max(self.lengths), length))
+            for i, length in enumerate(self.lengths, 1)
+        ]
+        size = tuple(sum(self.lengths) * part for part in CARRIAGE)
+        return links + [Part("carriage", "box", size)] * bool(self.rail)
+
+    def poses(self, states: Array) -> list[Pose]:
+        """Of each link at its joint, z along it."""
+        joints, along = self._chain(states)
+        found: list[Pose] = []
+        for joint, angle in zip(joints, along, strict=False):
+            cos, sin, no = np.cos(angle), np.sin(angle), np.zeros(len(angle))
+            columns = [(sin, no, -cos), (no, no + 1, no), (cos, no, sin)]
+            turned = np.stack([np.stack(c, axis=-1) for c in columns], axis=-1)
+            found.append((joint, turned))
+        still = np.tile(np.eye(3), (len(states), 1, 1))
+        return found + [(joints[0], still)] * bool(self.rail)
+
+    def path(self, states: Array) -> Array:
+        """The tip."""
+        return self._chain(states)[0][-1]
+
+    def _chain(self, states: Array) -> tuple[list[Array], list[Array]]:
+        """Where the joints and the tip are (T, 3), and each link's angle from x towards z (T,)."""
+        base = np.zeros((len(states), 3))
+        if self.rail:
+            base[:, 0] = states[:, self.rail[0]]
+        turned = self.zero + self.sign * np.cumsum(states[:, list(self.angles)], axis=1)
+        joints = [base]
+        for length, angle in zip(self.lengths, turned.T, strict=True):
+            step = np.stack([np.cos(angle), 0 * angle, np.sin(angle)], axis=1)
+            joints.append(joints[-1] + length * step)
+        return joints, list(turned.T)
+
+
+@dataclass(frozen=True, eq=False)
+class Cabin:
+    """What goes up and down."""
+
+    height: int  # a state
+    size: float
+
+    @property
+    def parts(self) -> Sequence[Part]:
+        """A box."""
+        return (Part("cabin", "box", (self.size, self.size, 1.4 * self.size)),)
+
+    def poses(self, states: Array) -> list[Pose]:
+        """At its height."""
+        return [(self.path(states), np.tile(np.eye(3), (len(states), 1, 1)))]
+
+    def path(self, states: Array) -> Array:
+        """Its middle."""
+        found = np.zeros((len(states), 3))
+        found[:, 2] = states[:, self.height]
+        return found
+
+
+def reach(body: Body, states: Array) -> Array:
+    """Points (k, 3) that a body reaches in those of some states that are known."""
+    path = body.path(states)
+    known = states[np.isfinite(path).all(axis=1)]
+    filled = np.where(np.isfinite(known), known, 0.0)
+    if not len(known) or not is_mechanism(body):
+        return path[np.isfinite(path).all(axis=1)]
+    chosen = filled[np.unique(np.linspace(0, len(filled) - 1, 60).astype(int))]
+    origins = [origin for origin, _ in body.poses(chosen)]
+    return np.vstack([path[np.isfinite(path).all(axis=1)], *origins])

@@ -1,0 +1,104 @@
+"""The diagnosis in three lines: what was wrong, what predictions gain, what is still open."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from grounded.diagnosis.report import Diagnosis, Remainder, RulerRow
+from grounded.diagnosis.verdict import tied
+from grounded.task import Task
+from grounded_trials.report.diagnosis_words import moved_parameters, sentences
+from grounded_trials.report.findings import measured, weighed_groups
+from grounded_trials.wording import count, shown
+
+CAUSES = 2  # that the first line names
+SMALL = 0.05  # of the gain: a cause below it is only counted
+FEW = 2  # states in the second line
+WORSE = "that is worse."  # how the verdict ends a sentence on what predictions lose
+
+
+def three_lines(diagnosis: Diagnosis, task: Task) -> list[str]:
+    """What was wrong, what predictions gain, what is still open; fewer where no cause is known.
+
+    Args:
+        diagnosis: what was found.
+        task: whose weighed states the second line speaks of.
+    """
+    clauses = sentences(diagnosis.sentence or diagnosis.kind)[0].rstrip(".").split("; ")
+    if diagnosis.no_cause or not diagnosis.credit or len(clauses) != len(diagnosis.credit):
+        return sentences(diagnosis.sentence or diagnosis.kind)
+    return [_wrong(diagnosis, clauses), *_gained(diagnosis, task), _open(diagnosis)]
+
+
+def _wrong(diagnosis: Diagnosis, clauses: list[str]) -> str:
+    """The largest causes without their shares, which the bars show; the others are counted."""
+    told: list[str] = []
+    small = 0
+    for clause, credit in zip(clauses, diagnosis.credit, strict=True):
+        if told and (len(told) == CAUSES or credit.share < SMALL):
+            small += 1
+        elif credit.of == "calibration":
+            named = moved_parameters(diagnosis, brief=True)
+            told.append("the model's own parameters are off" + f": {named}" * bool(named))
+        else:
+            told.append(clause.rsplit(" (", 1)[0] if len(clauses) > 1 else clause)
+    text = "; ".join(told) + f"; {count(small, 'smaller cause')}" * bool(small)
+    return f"{text[:1].upper()}{text[1:]}."
+
+
+def _gained(diagnosis: Diagnosis, task: Task) -> list[str]:
+    """How far predictions are off now, and were: position first, in the units of the states."""
+    row, parts = _ahead(diagnosis), []
+    if row is None:
+        return []
+    for names, what in gained_most(diagnosis, task):
+        unit = shown(row.unit_by_channel[names[0]])
+        now, then = (_together(errors, names) for errors in (row.with_effects, row.crude))
+        parts.append(f"{what} by {measured(now, unit)} instead of {measured(then, unit)}")
+    held = "" if row.held_out != "no" else ", not held out"
+    ahead = f"{row.horizon_s:.3g} s ahead{held}"
+    told = [f"{ahead} it now misses {' and '.join(parts)}."] if parts else []
+    told += [one for one in sentences(diagnosis.sentence) if one.endswith(WORSE)]
+    return [" ".join(told)] if told else []
+
+
+def gained_most(diagnosis: Diagnosis, task: Task) -> list[tuple[list[str], str]]:
+    """The weighed states that a verdict speaks of: the position, then what improved most."""
+    row = _ahead(diagnosis)
+    if row is None:
+        return []
+    groups = [g for g in weighed_groups(task) if all(row.crude.get(n, 0.0) > 0 for n in g[0])]
+    return sorted(groups, key=lambda g: (len(g[0]) < 2, _ratio(row, g[0])))[:FEW]
+
+
+def _ahead(diagnosis: Diagnosis) -> RulerRow | None:
+    return next((r for r in reversed(diagnosis.prediction_error) if not r.whole_trial), None)
+
+
+def _ratio(row: RulerRow, names: list[str]) -> float:
+    return _together(row.with_effects, names) / _together(row.crude, names)
+
+
+def _together(errors: Mapping[str, float], names: list[str]) -> float:
+    return math.hypot(*(errors.get(name, math.nan) for name in names))
+
+
+def _open(diagnosis: Diagnosis) -> str:
+    """What ties, and what no known effect explains."""
+    found = [f"the data can't tell {tied(group)}" for group in diagnosis.indistinguishable[:1]]
+    if diagnosis.leftover:
+        found.append(_left(diagnosis.leftover[0], len(diagnosis.leftover) - 1))
+    text = "; ".join(found) or "nothing is left above the noise"
+    return f"{text[:1].upper()}{text[1:]}."
+
+
+def _left(one: Remainder, others: int) -> str:
+    if not math.isfinite(one.error):
+        text = one.sentence()
+    else:
+        unit = shown(one.error_unit)
+        noise = f" (noise: {measured(one.floor, unit)})" if math.isfinite(one.floor) else ""
+        where = "" if one.region is None else f", mostly where {one.region.when}"
+        text = f"{one.channel} is off by {measured(one.error, unit)}{noise}{where}"
+    return f"still unexplained: {text}" + f"; {count(others, 'more state')}" * bool(others)
