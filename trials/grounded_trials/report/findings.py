@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 
@@ -25,6 +26,8 @@ from grounded_trials.wording import figure, rendered, shown, with_unit
 from grounded_trials.workspace.adopting import Better
 from grounded_trials.workspace.folder import Lost
 from grounded_trials.workspace.next_step import Since
+
+One = TypeVar("One")
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,8 +65,8 @@ class Findings:
     effects: tuple[str, ...]  # adopted
     method: str  # the [search] table in a few words
     standing: Standing
-    runs: tuple[Run, ...]  # trials of this task's candidates, in order of arrival
-    logs: tuple[Log, ...]  # data of this robot that ran no candidate
+    runs: tuple[Run, ...]  # trials of this task's candidates, in order of arrival; see `left_runs`
+    logs: tuple[Log, ...]  # data of this robot that ran no candidate; the latest of many
     others: int  # stored trials of earlier tasks or other robots
     lost: tuple[Lost, ...]
     diagnosis: Diagnosis | None
@@ -72,6 +75,8 @@ class Findings:
     better: Better | None = None  # the model as diagnosed, or with adopted effects
     since: Since = field(default_factory=Since)  # the diagnosis
     discarded: tuple[str, ...] = ()  # trials that were set aside
+    left_runs: int = 0  # that are counted, but not read: there are too many to show
+    left_logs: int = 0
     folder: str | None = None  # as the user named it, None where it is the current one
 
     @property
@@ -246,9 +251,9 @@ def rms(values: Array) -> Array:
     )
 
 
-def selection(runs: tuple[Run, ...], most: int) -> tuple[Run, ...]:
+def selection(runs: Sequence[One], most: int) -> tuple[One, ...]:
     """At most `most` of them: the first, the last, and those between that are evenly spread."""
     if len(runs) <= most:
-        return runs
+        return tuple(runs)
     index = np.unique(np.rint(np.linspace(0, len(runs) - 1, most)).astype(int))
     return tuple(runs[i] for i in index)

@@ -26,7 +26,7 @@ from grounded.errors import GroundedError
 from grounded_trials.plain_file import open_file
 from grounded_trials.store.store import Damaged, Store, Stored, write_atomically
 
-Known = Callable[[Path, Callable[[], dict[str, Any]]], dict[str, Any]]
+Known = Callable[[str, Path, Callable[[], dict[str, Any]]], dict[str, Any]]
 _SEALED = re.compile(rb'\{\n "sha256": "([0-9a-f]{64})",(\n.*)', re.DOTALL)
 
 
@@ -152,7 +152,7 @@ class Notes:
         for entry in self.store.list():
             try:
                 learn = partial(self._of, entry)
-                note = known(entry.path, learn) if known else learn()
+                note = known(entry.path.name, entry.path, learn) if known else learn()
             except GroundedError as error:
                 if lost is None:
                     raise

@@ -45,13 +45,9 @@ class Index:
 
     def __init__(self, folder: Path, read: Reader) -> None:
         self._path, self._read = folder / ".index.sqlite", read
-        self._file = self._opened()
-        rows = self._file.execute("SELECT name, stamp, about, proof FROM files")
-        self._rows = {name: (stamp, about, proof) for name, stamp, about, proof in rows}
+        self._rows: dict[str, tuple[str, dict[str, Any]]] = {}
         self._worth: dict[str, dict[str, float]] = {}
-        for *row, proof in self._file.execute("SELECT name, task, utility, proof FROM worth"):
-            if _proof(*row) == proof:
-                self._worth.setdefault(row[0], {})[row[1]] = float(row[2])
+        self._file = self._opened()
 
     def __del__(self) -> None:
         if file := getattr(self, "_file", None):
@@ -63,10 +59,9 @@ class Index:
             with suppress(sqlite3.Error, OSError):
                 file = sqlite3.connect(path, timeout=2.0)
                 try:
-                    if file.execute("PRAGMA user_version").fetchone()[0] == _VERSION:
-                        file.execute("SELECT 1 FROM files, numbers, worth LIMIT 1")
-                    else:
+                    if file.execute("PRAGMA user_version").fetchone()[0] != _VERSION:
                         file.executescript(f"BEGIN;{_TABLES}PRAGMA user_version={_VERSION};COMMIT;")
+                    self._load(file)
                     return file
                 except sqlite3.Error:
                     file.close()
@@ -75,16 +70,27 @@ class Index:
                 self._path.unlink(missing_ok=True)
         raise AssertionError("a database in memory can always be made")
 
+    def _load(self, file: sqlite3.Connection) -> None:
+        """Takes in the rows that prove themselves; one parse of all texts is the quickest."""
+        query = "SELECT name, stamp, about, proof FROM files"
+        rows = [row for row in file.execute(query) if _proof(row[1], row[2]) == row[3]]
+        abouts = json.loads(f"[{','.join(row[2] for row in rows)}]")
+        self._rows = {row[0]: (row[1], about) for row, about in zip(rows, abouts, strict=True)}
+        for *row, proof in file.execute("SELECT name, task, utility, proof FROM worth"):
+            if _proof(*row) == proof:
+                self._worth.setdefault(row[0], {})[row[1]] = float(row[2])
+        file.execute("SELECT 1 FROM numbers LIMIT 1")
+
     def of_trial(self, stored: Stored) -> dict[str, Any]:
         """What is known of a trial: its metadata, names, steps, and the hash of what it ran.
 
         Raises:
             GroundedError: if the file is damaged.
         """
+        name = stored.path.name
 
         def learn() -> dict[str, Any]:
             trial, meta, policy = self._read(stored)
-            name = stored.path.name
             self._write("DELETE FROM worth WHERE name = ?", (name,))
             self._worth.pop(name, None)
             if trial.states.nbytes + trial.inputs.nbytes < KEPT:
@@ -93,25 +99,25 @@ class Index:
                 self._write("INSERT OR REPLACE INTO numbers VALUES (?, ?, ?, ?)", numbers)
             return _about(trial, meta, policy)
 
-        return self.known(stored.path, learn)
+        return self.known(name, stored.path, learn)
 
-    def known(self, path: Path, learn: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    def known(self, name: str, path: Path, learn: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         """What was learnt of a file when it was read and proven, as it is now.
 
         Args:
-            path: the file; its name says which it is.
+            name: the file's, which no other file of the workspace has.
+            path: where it is.
             learn: reads it, where it is new or has changed.
         """
-        name, stamp = path.name, _stamp(path)
-        row = self._rows.get(name)
-        if row is not None and row[0] == stamp and _proof(row[0], row[1]) == row[2]:
-            known: dict[str, Any] = json.loads(row[1])
-            return known
+        stamp, row = _stamp(path), self._rows.get(name)
+        if row is not None and row[0] == stamp:
+            return row[1]
         about = learn()
         text = json.dumps(about)
-        self._rows[name] = row = (stamp, text, _proof(stamp, text))
-        self._write("INSERT OR REPLACE INTO files VALUES (?, ?, ?, ?)", (name, *row))
-        return about
+        self._rows[name] = stamp, json.loads(text)
+        values = (name, stamp, text, _proof(stamp, text))
+        self._write("INSERT OR REPLACE INTO files VALUES (?, ?, ?, ?)", values)
+        return self._rows[name][1]
 
     def trial(self, stored: Stored, about: dict[str, Any], *, bridged: bool) -> Trial:
         """A trial whose numbers are read when they are asked for.
@@ -199,5 +205,5 @@ def _stamp(path: Path) -> str:
 def _proof(*parts: str | bytes) -> bytes:
     digest = hashlib.sha256()
     for part in parts:
-        digest.update(part.encode() if isinstance(part, str) else part)
+        digest.update(part if isinstance(part, bytes) else str(part).encode())
     return digest.digest()

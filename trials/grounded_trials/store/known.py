@@ -1,4 +1,4 @@
-"""Trials and candidates of which an index knows all but the numbers, which are read when asked for."""
+"""Trials and candidates known but for their numbers, which are read when they are asked for."""
 
 from __future__ import annotations
 

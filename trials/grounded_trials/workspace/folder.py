@@ -328,7 +328,7 @@ class Folder:
 
     def _indexed(self, stored: Stored) -> StoredTrial:
         index, made = self._index
-        if (known := made.get(stored.path.name)) is not None:
+        if (known := made.get(name := stored.path.name)) is not None:
             return known
         about = index.of_trial(stored)
         trial = index.trial(stored, about, bridged=True)
@@ -336,7 +336,7 @@ class Folder:
         found = StoredTrial(
             stored, trial, about["meta"], measured, about["ran"], lambda: self._read_one(stored)[2]
         )
-        made[stored.path.name] = found
+        made[name] = found
         return found
 
     def save_index(self) -> None:
@@ -392,7 +392,8 @@ class Folder:
         """A candidate from one of its copies; a file that the index knows is not read again."""
         if place is None or "_index" not in vars(self):
             return stored_candidate(read(), identity)
-        about = self._index[0].known(place, lambda: stored_candidate(read(), identity).about())
+        learn = lambda: stored_candidate(read(), identity).about()  # noqa: E731
+        about = self._index[0].known(place.name, place, learn)
         return StoredCandidate.known(about, lambda: candidate_of(read(), identity)[0])
 
     def _ids(self, trials: tuple[StoredTrial, ...]) -> list[str]:
