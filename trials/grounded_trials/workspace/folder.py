@@ -247,8 +247,12 @@ class Folder:
 
     def names(self) -> frozenset[str]:
         """The names of all trials and candidates."""
-        places = ((self.folder / "trials", "t"), (self.folder / "candidates", "c"))
-        return frozenset(path.name for place, first in places for path in place.glob(f"{first}*"))
+        found: set[str] = set()
+        for place, first in (("trials", "t"), ("candidates", "c")):
+            with suppress(FileNotFoundError):
+                names = os.listdir(self.folder / place)  # noqa: PTH208 (many times quicker)
+                found.update(name for name in names if name.startswith(first))
+        return frozenset(found)
 
     def bring_back(self, identity: str) -> Path:
         """A candidate's file, taken from a trial that ran it where it got lost."""
