@@ -63,6 +63,7 @@ def _watch(workspace: Workspace) -> None:
             (path,), findings = report.paths, report.findings
             best = findings.best
             known = "" if best is None else f", best {best.candidate.id} {number(best.utility)}"
-            show(f"{path}: {count(len(findings.runs), 'trial')}{known}")
+            trials = count(len(findings.runs) + findings.left_runs, "trial")
+            show(f"{path}: {trials}{known}")
     except KeyboardInterrupt:
         say("the page is as it was written last")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -75,12 +76,12 @@ class Tried(Result):
     accepted: bool | None  # None: not decided, trials are missing
     in_doubt: bool = False  # its own trials are there: the incumbent's are missing
 
-    @property
+    @cached_property
     def utility(self) -> float:
         """Mean utility of the trials; nan without a trial, -inf when one of them failed."""
         return float(np.mean(self.utilities)) if self.utilities else float("nan")
 
-    @property
+    @cached_property
     def standard_error(self) -> float:
         """Of the mean; nan for fewer than two trials, or where one of them failed."""
         if len(self.utilities) < 2 or not np.isfinite(self.utilities).all():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from grounded.search.certainty import utility_noise
 from grounded.search.standing import Standing
 
 STEEP = 8.0  # worst over best utility from which on the axis is logarithmic
+MOST = 300  # candidates that are drawn
 NEAR = 4  # candidates from which on the better half has a panel of its own
 
 
@@ -23,14 +25,15 @@ def search_figure(now: Standing, optimum: float | None = None) -> Figure | None:
         now: where the search stands.
         optimum: of the real system, where it is known.
     """
-    tried = [t for t in now.history if t.utilities]
+    shown, left = few(now.history, MOST)
+    tried = [t for t in shown if t.utilities]
     if not tried:
         return None
     number = {t.candidate.id: k + 1 for k, t in enumerate(now.history)}
     noise = utility_noise(now.history)[0]
     whole = _utility(now, tried, number, optimum, noise)
     near = (_near(whole),) if whole.loss and len(tried) > NEAR else ()
-    panels = (whole, *near, _steps(now, number))
+    panels = (whole, *near, _steps(shown, number))
     key = [
         Key("best", "first or better", "disc"),
         Key("other", "no better", "ring"),
@@ -47,8 +50,26 @@ def search_figure(now: Standing, optimum: float | None = None) -> Figure | None:
         "Each candidate is run on the real system; it becomes the best so far when its utility, a "
         "sum of rewards, is higher. A dash is what the model, made to replay the trial before, "
         "promised for it."
-    )
+    ) + f" {left} candidates between them are not drawn." * bool(left)
     return Figure("utility", "Utility", caption, panels, tuple(key))
+
+
+def few(history: Sequence[Tried], most: int) -> tuple[list[Tried], int]:
+    """At most so many candidates, and how many are left out.
+
+    The first, then improvements, evenly spread where there are too many, then the latest ones.
+    """
+    if len(history) <= most:
+        return list(history), 0
+    keep = {0, len(history) - 1}
+    accepted = [k for k, t in enumerate(history) if t.accepted]
+    if len(accepted) > most - 2:
+        index = np.unique(np.rint(np.linspace(0, len(accepted) - 1, most - 2)).astype(int))
+        accepted = [accepted[i] for i in index]
+    keep |= set(accepted)
+    others = [k for k in reversed(range(len(history))) if k not in keep]
+    keep |= set(others[: most - len(keep)])
+    return [history[k] for k in sorted(keep)], len(history) - len(keep)
 
 
 def _utility(
@@ -70,7 +91,7 @@ def _utility(
         title="Utility of each candidate" + (", logarithmic" if loss else ""),
         x_name="candidate",
         y_name="utility",
-        curves=_record(tried, number),
+        curves=_record(now.history, number),
         dots=tuple(dots),
         rules=tuple(rules),
         bands=tuple(bands),
@@ -115,7 +136,7 @@ def _said(value: float, digits: int = 4) -> str:
     return "failed" if value == -math.inf else f"{value:.{digits}g}"
 
 
-def _record(tried: list[Tried], number: dict[str, int]) -> tuple[Curve, ...]:
+def _record(tried: Sequence[Tried], number: dict[str, int]) -> tuple[Curve, ...]:
     """The best utility so far, as steps."""
     best, steps = -math.inf, []
     for t in tried:
@@ -129,9 +150,9 @@ def _record(tried: list[Tried], number: dict[str, int]) -> tuple[Curve, ...]:
     return (Curve(x, np.repeat(values, 2), "best", "", 1.2),)
 
 
-def _steps(now: Standing, number: dict[str, int]) -> Panel:
+def _steps(shown: list[Tried], number: dict[str, int]) -> Panel:
     dots = []
-    for t in now.history:
+    for t in shown:
         c = t.candidate
         shape, role = ("disc", "best") if t.accepted else ("ring", "other")
         note = f"{c.id}: α = {c.alpha:g}, damping {c.damping:.2g}"

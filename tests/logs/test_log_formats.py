@@ -126,7 +126,7 @@ def test_every_format_gives_the_same_signal(tmp_path, kind):
 
 
 @pytest.mark.parametrize("kind", LOGS)
-def test_a_damaged_log_is_refused_or_ends_early(tmp_path, kind):
+def test_a_damaged_log_is_refused_or_ends_early(tmp_path, kind, capsys):
     """Cut in the middle, or with its middle overwritten: a clear error or fewer samples."""
     make, path = LOGS[kind]
     source = file_of(make(tmp_path / "log"))
@@ -141,6 +141,7 @@ def test_a_damaged_log_is_refused_or_ends_early(tmp_path, kind):
             assert copy.name.removesuffix(".zstd") in str(error) or "'r'" in str(error)
         else:
             assert (len(found.values) < N and np.isin(found.t, STAMPS).all()) or "csv" in kind
+    assert capsys.readouterr() == ("", "")  # pyulog prints; stdout is for the data of --json
 
 
 def test_tables_with_holes_and_texts(tmp_path):

@@ -4,11 +4,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.stats import ttest_ind
+from scipy.stats import t, ttest_ind
 
 from facts import holds
 from grounded.search.candidate import Tried
-from grounded.search.certainty import last_improvement, utility_noise
+from grounded.search.certainty import last_improvement, student, utility_noise
 
 
 def tried(*utilities, accepted=True):
@@ -32,6 +32,12 @@ def test_the_probability_is_the_t_tests():
     p = ttest_ind(b, a, alternative="less", equal_var=False).pvalue
     assert holds(found, f"probability {p:.2f}")
     assert utility_noise([tried(*a), tried(*b)])[1] == 4
+
+
+@pytest.mark.parametrize("freedom", [1.0, 1.7, 4.0, 30.5, 7500.0])
+@pytest.mark.parametrize("x", [-1e6, -2.5, -0.3, 0.0, 0.01, 1.0, 4.0])
+def test_student_s_t_is_scipy_s(x, freedom):
+    assert student(x, freedom) == pytest.approx(t.cdf(x, freedom), abs=2e-5)
 
 
 def test_noise_of_a_repeated_candidate_stands_in_for_the_others():

@@ -9,9 +9,11 @@ import pytest
 
 from grounded.errors import GroundedError
 from grounded_trials import Workspace
-from grounded_trials.store.index import KnownTrial
+from grounded_trials.store import documents as documents_module
+from grounded_trials.store.known import KnownCandidate, KnownTrial
 from grounded_trials.store.trial_file import trial_bytes
 from grounded_trials.workspace import folder as folder_module
+from grounded_trials.workspace import identity as identity_module
 from workspaces import CONFIG, make
 
 COUNT = 240
@@ -119,6 +121,59 @@ def test_a_trial_that_was_damaged_behind_the_index_is_found(indexed):
     finally:
         path.write_bytes(data)
     assert Workspace(w.folder).status().standing.trials > 100
+
+
+def read_again(*_):
+    raise AssertionError("the index knows this file")
+
+
+def test_known_candidates_and_notes_are_not_read_again(indexed, monkeypatch):
+    w, _ = indexed
+    first = Workspace(w.folder)
+    first.propose()
+    answer, numbers = first.status().to_json(), [c.policy for c in first.read().candidates]
+    for module, name in ((identity_module, "read_candidate"), (documents_module.Notes, "_of")):
+        monkeypatch.setattr(module, name, read_again)
+    again = Workspace(w.folder)
+    assert again.status().to_json() == answer and again.noted.handed == first.noted.handed
+    monkeypatch.undo()
+    monkeypatch.setattr(folder_module, "MANY", 100)
+    for candidate, policy in zip(again.read().candidates, numbers, strict=True):
+        assert isinstance(candidate, KnownCandidate)
+        np.testing.assert_array_equal(candidate.policy.feedforward, policy.feedforward)
+        assert len(candidate.predicted_states) == len(candidate.predicted_inputs) + 1
+
+
+@pytest.mark.parametrize("how", ["flipped", "another's", "gone"])
+def test_a_candidate_that_was_changed_behind_the_index_is_found(indexed, how):
+    w, _ = indexed
+    answer = Workspace(w.folder).status().to_json()
+    path, other = (w.candidate_path(name) for name in ("c0002", "c0003"))
+    data = path.read_bytes()
+    path.unlink()
+    if how != "gone":
+        flipped = data[:900] + bytes([data[900] ^ 1]) + data[901:]
+        path.write_bytes(flipped if how == "flipped" else other.read_bytes())
+    try:
+        if how == "gone":  # a trial carries it
+            assert Workspace(w.folder).status().to_json() == answer
+        else:
+            with pytest.raises(GroundedError, match="c0002"):
+                Workspace(w.folder).status()
+            assert Workspace(w.folder).verify().damaged
+    finally:
+        path.write_bytes(data)
+    assert Workspace(w.folder).status().to_json() == answer
+
+
+def test_no_flipped_byte_of_a_small_index_changes_an_answer(indexed):
+    """Types, lengths and pages of the database too: what can't be believed is made again."""
+    w, file = indexed
+    answer = Workspace(w.folder).status().to_json()
+    data, rng = file.read_bytes(), np.random.default_rng(1)
+    for place in rng.integers(0, 4096, 6).tolist():  # the first page: the tables' own description
+        file.write_bytes(data[:place] + bytes([data[place] ^ 0xFF]) + data[place + 1 :])
+        assert Workspace(w.folder).status().to_json() == answer, place
 
 
 def test_a_second_reading_is_much_quicker(indexed):

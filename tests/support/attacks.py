@@ -42,6 +42,7 @@ from reliability import MEMORY, a_candidate, a_trial
 from workspaces import CONFIG, MODEL, make
 
 HANG_S = 10.0
+LONGEST = 60  # [s of CPU] of a command: other processes may have the cores
 KINDS = ("silent", "traceback", "hang", "memory")
 
 
@@ -412,21 +413,33 @@ def _proved(tally: Tally, what: str, where: Path, before: set[str]) -> None:
 
 def _starved(words: list[str], how: Callable[[], None] | None = None, kill: float = 0) -> str:
     """Runs a command with limits, or kills it after a time; what is wrong with its end."""
+
+    def limited() -> None:
+        resource.setrlimit(resource.RLIMIT_CPU, (LONGEST, LONGEST))
+        if how is not None:
+            how()
+
     child = subprocess.Popen(
         [*COMMAND, *words],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
-        preexec_fn=how,
+        preexec_fn=limited,
     )
     try:
-        out, _ = child.communicate(timeout=kill or 60)
+        out, _ = child.communicate(timeout=kill or 20 * LONGEST)
     except subprocess.TimeoutExpired:
         child.kill()
         child.communicate()
         return "" if kill else "hang"
+    if child.returncode in (-signal.SIGXCPU, -signal.SIGKILL):
+        return "hang"
     wrong = "Traceback" in out or child.returncode not in (0, 1, 3, -signal.SIGXFSZ)
     return f"exit {child.returncode}: {out}" if wrong else ""
+
+
+def _kind(wrong: str) -> str:
+    return "hang" if wrong == "hang" else "traceback"
 
 
 def _attacked(
@@ -450,7 +463,7 @@ def _attacked(
             shutil.rmtree(copy / "saved.mcap", ignore_errors=True)
             (copy / "w" / "saved.mcap").unlink(missing_ok=True)
             if wrong := _starved(words):
-                tally.add("traceback", f"{command[0]} {k}, again: {wrong}")
+                tally.add(_kind(wrong), f"{command[0]} {k}, again: {wrong}")
             _proved(tally, f"{command[0]} {k}", copy / "w", before)
             shutil.rmtree(copy)
     return tally
@@ -461,7 +474,7 @@ def kills(rng: random.Random, seconds: float) -> Tally:
 
     def attack(tally: Tally, words: list[str], what: str) -> None:
         if wrong := _starved(words, kill=rng.uniform(0.1, 2.0)):
-            tally.add("traceback", f"{what}: {wrong}")
+            tally.add(_kind(wrong), f"{what}: {wrong}")
 
     return _attacked(rng, seconds, attack)
 
@@ -477,7 +490,7 @@ def short_writes(rng: random.Random, seconds: float) -> Tally:
             resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
 
         if wrong := _starved(words, how=limited):
-            tally.add("hang" if wrong == "hang" else "traceback", f"{what}, {size} bytes: {wrong}")
+            tally.add(_kind(wrong), f"{what}, {size} bytes: {wrong}")
 
     return _attacked(rng, seconds, attack)
 

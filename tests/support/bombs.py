@@ -277,9 +277,9 @@ except GroundedError as error:
 
 
 def measured(
-    words: Sequence[str], code: str = _CLI, timeout_s: float = 60, env: Mapping[str, str] = {}
+    words: Sequence[str], code: str = _CLI, timeout_s: float = 600, env: Mapping[str, str] = {}
 ) -> Cost:
-    """Runs `grounded WORDS` (or other code) in a process and measures it."""
+    """Runs `grounded WORDS` (or other code) in a process and measures it; the clock says little."""
     with tempfile.TemporaryDirectory() as folder:
         output, peak = Path(folder, "output"), Path(folder, "peak")
         with output.open("wb") as out:

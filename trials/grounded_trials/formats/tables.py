@@ -9,10 +9,12 @@ digits and underscores; a unit in brackets or after the last comma is left out.
 from __future__ import annotations
 
 import csv
+import io
 import re
 import warnings
 import zipfile
 from collections.abc import Iterator, Mapping
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -152,8 +154,9 @@ def ulog_records(path: Path) -> Iterator[Record]:
     needs("pyulog", "px4")
     from pyulog import ULog
 
-    try:
-        log = ULog(str(path))
+    try:  # it prints what it finds wrong, and left a file open that it had opened itself
+        with path.open("rb") as stream, redirect_stdout(io.StringIO()):
+            log = ULog(stream)
     except Exception as error:  # pyulog raises whatever a damaged file leads to
         raise GroundedError(f"{path} can't be read as a PX4 log: {error}") from None
     tables: dict[str, Columns] = {}

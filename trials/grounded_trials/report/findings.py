@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 
@@ -29,6 +30,7 @@ from grounded_trials.workspace.next_step import Since
 SCALED = ("m", "rad", "s")  # units, and their rates, of which thousandths have a name
 SMALL = 1e-3  # below which they are used
 PREFIXES = ("", "m", "µ")
+One = TypeVar("One")
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,8 +68,8 @@ class Findings:
     effects: tuple[str, ...]  # adopted
     method: str  # the [search] table in a few words
     standing: Standing
-    runs: tuple[Run, ...]  # trials of this task's candidates, in order of arrival
-    logs: tuple[Log, ...]  # data of this robot that ran no candidate
+    runs: tuple[Run, ...]  # trials of this task's candidates, in order of arrival; see `left_runs`
+    logs: tuple[Log, ...]  # data of this robot that ran no candidate; the latest of many
     others: int  # stored trials of earlier tasks or other robots
     lost: tuple[Lost, ...]
     diagnosis: Diagnosis | None
@@ -76,6 +78,8 @@ class Findings:
     better: Better | None = None  # the model as diagnosed, or with adopted effects
     since: Since = field(default_factory=Since)  # the diagnosis
     discarded: tuple[str, ...] = ()  # trials that were set aside
+    left_runs: int = 0  # that are counted, but not read: there are too many to show
+    left_logs: int = 0
     folder: str | None = None  # as the user named it, None where it is the current one
 
     @property
@@ -266,9 +270,9 @@ def rms(values: Array) -> Array:
     )
 
 
-def selection(runs: tuple[Run, ...], most: int) -> tuple[Run, ...]:
+def selection(runs: Sequence[One], most: int) -> tuple[One, ...]:
     """At most `most` of them: the first, the last, and those between that are evenly spread."""
     if len(runs) <= most:
-        return runs
+        return tuple(runs)
     index = np.unique(np.rint(np.linspace(0, len(runs) - 1, most)).astype(int))
     return tuple(runs[i] for i in index)

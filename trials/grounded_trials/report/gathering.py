@@ -20,7 +20,7 @@ from grounded.search.standing import Standing
 from grounded.solve.bias import residuals
 from grounded.task import Task
 from grounded.trial import Trial
-from grounded_trials.report.findings import Findings, Log, Run
+from grounded_trials.report.findings import Findings, Log, Run, selection
 from grounded_trials.report.forecast import anchored
 from grounded_trials.store.documents import read_document
 from grounded_trials.workspace.adopting import Better, better_model
@@ -29,6 +29,9 @@ from grounded_trials.workspace.folder import Contents, Folder, Lost
 from grounded_trials.workspace.next_step import Since, next_command, since_diagnosis
 from grounded_trials.workspace.proposing import standing_in
 
+MOST = 200  # runs that are read; of more, the latest and those of what is compared
+LOGS = 50  # that are read, the latest
+KEPT = 5  # improvements whose runs are among them
 RUNAWAY = 1e15  # in any unit: the number of a run that diverged
 
 
@@ -42,8 +45,9 @@ def gather(workspace: Folder) -> Findings:
     known, lost = {c.id for c in contents.candidates}, list(contents.lost)
     fitting = [t.trial for t in contents.trials if workspace.fits(t.trial)]
     own = [t for t in fitting if t.candidate in known]
-    data = [_drawable(t) for t in fitting if not t.candidate]
+    data = [t for t in fitting if not t.candidate]
     now = _standing(workspace, contents)
+    shown, logs = _shown(now, own), [_drawable(t) for t in data[-LOGS:]]
     diagnosis = _diagnosis(workspace, lost)
     better = _better(workspace, diagnosis, lost)
     usable = [t.id for t in fitting if t.known_steps >= LEAST_STEPS]
@@ -54,8 +58,8 @@ def gather(workspace: Folder) -> Findings:
         effects=tuple(str(e["name"]) for e in workspace.config.model.effects),
         method=_method(workspace),
         standing=now,
-        runs=tuple(_runs(task, now, own, better, lost)),
-        logs=tuple(Log(t, _residual(Planner(task, task), t)) for t in data),
+        runs=tuple(_runs(task, now, shown, better, lost)),
+        logs=tuple(Log(t, _residual(Planner(task, task), t)) for t in logs),
         others=len(contents.trials) - len(own) - len(data),
         lost=tuple(lost),
         diagnosis=diagnosis,
@@ -64,8 +68,21 @@ def gather(workspace: Folder) -> Findings:
         better=better,
         since=since_diagnosis(workspace, diagnosis, usable) if diagnosis else Since(),
         discarded=tuple(workspace.discarded()),
+        left_runs=len(own) - len(shown),
+        left_logs=len(data) - len(logs),
         folder=workspace.address,
     )
+
+
+def _shown(now: Standing, trials: list[Trial]) -> list[Trial]:
+    """The trials that are read: all, or of many the latest, and those of what is compared."""
+    if len(trials) <= MOST:
+        return trials
+    compared = [t for t in now.history if t.trials][:1]
+    compared += selection([t for t in now.history if t.accepted], KEPT)
+    names = {t.candidate.id for t in compared}
+    latest = {t.id for t in trials[-MOST:]}
+    return [t for t in trials if t.id in latest or t.candidate in names]
 
 
 def _standing(workspace: Folder, contents: Contents) -> Standing:

@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 
-import numpy as np
-
 from grounded.diagnosis.report import Estimate
 from grounded.errors import NextCommand
 from grounded.search.candidate import Tried
+from grounded.search.pictures import few
 from grounded_trials.report.diagnosis_words import (
     credit_of,
     error_lines,
@@ -72,14 +71,13 @@ def report_text(findings: Findings, table: Table, bars: Callable[[Sequence[float
 
 def _head(findings: Findings) -> str:
     task = findings.task
-    runs = len(findings.runs)
     text = (
         f"{findings.name}: {task.model.name}, {task.horizon} steps of {task.dt:g} s "
         f"({task.horizon * task.dt:g} s), {'closed loop' if task.feedback else 'open loop'}; "
-        f"{count(runs, 'trial')}"
+        f"{count(len(findings.runs) + findings.left_runs, 'trial')}"
     )
     if findings.logs:
-        text += f", {count(len(findings.logs), 'log')} of data"
+        text += f", {count(len(findings.logs) + findings.left_logs, 'log')} of data"
     if findings.discarded:
         text += f", set aside: {', '.join(findings.discarded)}"
     if findings.effects:
@@ -91,8 +89,8 @@ def _utilities(findings: Findings, table: Table, bars: Callable[[Sequence[float]
     history = findings.history
     if not history:
         return "utility\n  no candidate was proposed yet"
-    few, left = _rows(history)
-    rows = [_candidate(t, t is history[-1]) for t in few]
+    shown, left = few(history, ROWS)
+    rows = [_candidate(t, t is history[-1]) for t in shown]
     header = ("candidate", "iter.", "alpha", "predicted", "real", "+-", "trials", "")
     lines = ["utility", table(rows, header), *_wrapped(LEGEND, "  ")]
     if left:
@@ -111,21 +109,6 @@ def _utilities(findings: Findings, table: Table, bars: Callable[[Sequence[float]
         lines += _wrapped(text, "  ")
     lines += _wrapped(f"{findings.standing.phase}: {findings.standing.sentence}", "  ")
     return "\n".join(lines)
-
-
-def _rows(history: Sequence[Tried]) -> tuple[list[Tried], int]:
-    """At most ROWS candidates: the first, then improvements, then the latest ones."""
-    if len(history) <= ROWS:
-        return list(history), 0
-    keep = {0, len(history) - 1}
-    accepted = [k for k, t in enumerate(history) if t.accepted]
-    if len(accepted) > ROWS - 2:
-        index = np.unique(np.rint(np.linspace(0, len(accepted) - 1, ROWS - 2)).astype(int))
-        accepted = [accepted[i] for i in index]
-    keep |= set(accepted)
-    others = [k for k in reversed(range(len(history))) if k not in keep]
-    keep |= set(others[: ROWS - len(keep)])
-    return [history[k] for k in sorted(keep)], len(history) - len(keep)
 
 
 def _candidate(tried: Tried, last: bool) -> tuple[str, ...]:

@@ -38,7 +38,8 @@ class Report(Result):
 
     def summary(self) -> str:
         """How much it shows, and its files."""
-        return ", ".join([f"{len(self.findings.runs)} trials", *map(str, self.paths)])
+        trials = len(self.findings.runs) + self.findings.left_runs
+        return ", ".join([f"{trials} trials", *map(str, self.paths)])
 
     def figures(self) -> Sequence[Figure]:
         """All that the page shows."""

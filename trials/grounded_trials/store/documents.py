@@ -17,14 +17,16 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Iterator, Mapping, MutableMapping
+from collections.abc import Callable, Iterator, Mapping, MutableMapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from grounded.errors import GroundedError
 from grounded_trials.plain_file import open_file
-from grounded_trials.store.store import Damaged, Store, write_atomically
+from grounded_trials.store.store import Damaged, Store, Stored, write_atomically
 
+Known = Callable[[str, Path, Callable[[], dict[str, Any]]], dict[str, Any]]
 _SEALED = re.compile(rb'\{\n "sha256": "([0-9a-f]{64})",(\n.*)', re.DOTALL)
 
 
@@ -135,21 +137,29 @@ class Notes:
         text = json.dumps(dict(note), sort_keys=True)
         self.store.add(text.encode(), ".json", again=again)
 
-    def read(self, lost: list[Damaged] | None = None) -> Iterator[dict[str, str]]:
+    def read(
+        self, lost: list[Damaged] | None = None, known: Known | None = None
+    ) -> Iterator[dict[str, str]]:
         """All notes in the order in which they were made.
 
         Args:
             lost: gets those that are damaged; None: they are complained about.
+            known: what an index knows of a file, or learns by reading it.
 
         Raises:
             GroundedError: for a damaged one, naming it.
         """
         for entry in self.store.list():
             try:
-                note: dict[str, str] = json.loads(self.store.read(entry))
+                learn = partial(self._of, entry)
+                note = known(entry.path.name, entry.path, learn) if known else learn()
             except GroundedError as error:
                 if lost is None:
                     raise
                 lost.append(Damaged(entry.path, str(error)))
                 continue
             yield note
+
+    def _of(self, entry: Stored) -> dict[str, str]:
+        note: dict[str, str] = json.loads(self.store.read(entry))
+        return note

@@ -1,4 +1,4 @@
-"""What the trials of a large store hold, in one file, so that not each is read at every command.
+"""What the files of a large workspace hold, in one file, so that not each is read at every command.
 
 trials/.index.sqlite is derived: it may be deleted, and is made again where it is missing, damaged
 or of another version. A row stands for a file as it was read and proven; it is believed while the
@@ -10,111 +10,44 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import sqlite3
 from collections.abc import Callable
 from contextlib import suppress
-from functools import cached_property
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
-from grounded.frozen import Array, readonly
 from grounded.trial import Trial, interpolate_gaps
+from grounded_trials.store.known import KnownTrial, Worth
 from grounded_trials.store.store import Stored
 
 KEPT = 2**20  # [bytes] numbers of a longer trial are read from its own file
-_VERSION = 1  # of the tables, and of what `_about` says
+_VERSION = 2  # of the tables, and of what `_about` says
 _TABLES = """
-CREATE TABLE trials (name TEXT PRIMARY KEY, stamp TEXT, about TEXT, proof BLOB);
+CREATE TABLE files (name TEXT PRIMARY KEY, stamp TEXT, about TEXT, proof BLOB);
 CREATE TABLE numbers (name TEXT PRIMARY KEY, states BLOB, inputs BLOB, proof BLOB);
 CREATE TABLE worth (name TEXT, task TEXT, utility TEXT, proof BLOB, PRIMARY KEY (name, task));
 """
 _KNOWN = ("steps", "finite_steps", "known_steps")
 
-
-class KnownTrial(Trial):
-    """A trial whose numbers are read when they are asked for."""
-
-    @classmethod
-    def of(cls, load: Callable[[], Trial], about: dict[str, Any], worth: Worth) -> KnownTrial:
-        """A trial of which `about` is known; `load` reads it, `worth` keeps its utility."""
-        made = object.__new__(cls)
-        held = about["start_inputs"]
-        vars(made).update(
-            dt=about["dt"],
-            state_names=tuple(about["states"]),
-            input_names=tuple(about["inputs"]),
-            id=about["id"],
-            candidate=about["candidate"],
-            start_inputs=None if held is None else readonly(held),
-            _known=about,
-            _load=load,
-            _worth=worth,
-        )
-        return made
-
-    @cached_property
-    def states(self) -> Array:
-        """(T + 1, n), read now."""
-        return cast(Array, vars(self)["_load"]().states)
-
-    @cached_property
-    def inputs(self) -> Array:
-        """(T, m), read now."""
-        return cast(Array, vars(self)["_load"]().inputs)
-
-    @property
-    def steps(self) -> int:
-        """T, without reading the numbers."""
-        return self._of("steps")
-
-    @property
-    def finite_steps(self) -> int:
-        """As a trial's, without reading the numbers."""
-        return self._of("finite_steps")
-
-    @property
-    def known_steps(self) -> int:
-        """As a trial's, without reading the numbers."""
-        return self._of("known_steps")
-
-    def _of(self, name: str) -> int:
-        known = vars(self).get("_known")  # a changed copy has none
-        return int(known[name] if known else getattr(Trial, name).fget(self))
-
-    def repeats(self, other: Trial) -> bool:
-        """As a trial's, by the hash of finite states."""
-        mine, its = (vars(one).get("_known", {}).get("print") for one in (self, other))
-        return bool(mine == its) if mine and its else super().repeats(other)
-
-    def worth(self, task: str, compute: Callable[[], float]) -> float:
-        """The utility in a task, computed once."""
-        worth = vars(self).get("_worth")
-        return compute() if worth is None else worth(task, compute)
-
-
-Worth = Callable[[str, Callable[[], float]], float]
 Reader = Callable[[Stored], tuple[Trial, dict[str, str], bytes | None]]
 
 
-class TrialIndex:
-    """The index of a store's trials.
+class Index:
+    """The index of a workspace's trials and candidates.
 
     Args:
-        folder: where the trials lie.
-        read: reads and proves one, `.id` its short name.
+        folder: where the trials lie, and the index.
+        read: reads and proves a trial, `.id` its short name.
     """
 
     def __init__(self, folder: Path, read: Reader) -> None:
         self._path, self._read = folder / ".index.sqlite", read
-        self._file = self._opened()
-        rows = self._file.execute("SELECT name, stamp, about, proof FROM trials")
-        self._rows = {name: (stamp, about, proof) for name, stamp, about, proof in rows}
+        self._rows: dict[str, tuple[str, dict[str, Any]]] = {}
         self._worth: dict[str, dict[str, float]] = {}
-        for *row, proof in self._file.execute("SELECT name, task, utility, proof FROM worth"):
-            if _proof(*row) == proof:
-                self._worth.setdefault(row[0], {})[row[1]] = float(row[2])
+        self._file = self._opened()
 
     def __del__(self) -> None:
         if file := getattr(self, "_file", None):
@@ -126,10 +59,9 @@ class TrialIndex:
             with suppress(sqlite3.Error, OSError):
                 file = sqlite3.connect(path, timeout=2.0)
                 try:
-                    if file.execute("PRAGMA user_version").fetchone()[0] == _VERSION:
-                        file.execute("SELECT 1 FROM trials, numbers, worth LIMIT 1")
-                    else:
+                    if file.execute("PRAGMA user_version").fetchone()[0] != _VERSION:
                         file.executescript(f"BEGIN;{_TABLES}PRAGMA user_version={_VERSION};COMMIT;")
+                    self._load(file)
                     return file
                 except sqlite3.Error:
                     file.close()
@@ -138,37 +70,61 @@ class TrialIndex:
                 self._path.unlink(missing_ok=True)
         raise AssertionError("a database in memory can always be made")
 
-    def about(self, stored: Stored) -> dict[str, Any]:
-        """What is known of a file: its metadata, names, steps, and the hash of what it ran.
+    def _load(self, file: sqlite3.Connection) -> None:
+        """Takes in the rows that prove themselves; one parse of all texts is the quickest."""
+        query = "SELECT name, stamp, about, proof FROM files"
+        rows = [row for row in file.execute(query) if _proof(row[1], row[2]) == row[3]]
+        abouts = json.loads(f"[{','.join(row[2] for row in rows)}]")
+        self._rows = {row[0]: (row[1], about) for row, about in zip(rows, abouts, strict=True)}
+        for *row, proof in file.execute("SELECT name, task, utility, proof FROM worth"):
+            if _proof(*row) == proof:
+                self._worth.setdefault(row[0], {})[row[1]] = float(row[2])
+        file.execute("SELECT 1 FROM numbers LIMIT 1")
+
+    def of_trial(self, stored: Stored) -> dict[str, Any]:
+        """What is known of a trial: its metadata, names, steps, and the hash of what it ran.
 
         Raises:
             GroundedError: if the file is damaged.
         """
-        name, stamp = stored.path.name, _stamp(stored.path)
-        row = self._rows.get(name)
-        if row is not None and row[0] == stamp and _proof(row[0], row[1]) == row[2]:
-            known: dict[str, Any] = json.loads(row[1])
-            return known
-        trial, meta, policy = self._read(stored)
-        about = _about(trial, meta, policy)
+        name = stored.path.name
+
+        def learn() -> dict[str, Any]:
+            trial, meta, policy = self._read(stored)
+            self._write("DELETE FROM worth WHERE name = ?", (name,))
+            self._worth.pop(name, None)
+            if trial.states.nbytes + trial.inputs.nbytes < KEPT:
+                blobs = (trial.states.tobytes(), trial.inputs.tobytes())
+                numbers = (name, *blobs, _proof(_stamp(stored.path), *blobs))
+                self._write("INSERT OR REPLACE INTO numbers VALUES (?, ?, ?, ?)", numbers)
+            return _about(trial, meta, policy)
+
+        return self.known(name, stored.path, learn)
+
+    def known(self, name: str, path: Path, learn: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        """What was learnt of a file when it was read and proven, as it is now.
+
+        Args:
+            name: the file's, which no other file of the workspace has.
+            path: where it is.
+            learn: reads it, where it is new or has changed.
+        """
+        stamp, row = _stamp(path), self._rows.get(name)
+        if row is not None and row[0] == stamp:
+            return row[1]
+        about = learn()
         text = json.dumps(about)
-        row = (stamp, text, _proof(stamp, text))
-        self._rows[name] = row
-        self._write("INSERT OR REPLACE INTO trials VALUES (?, ?, ?, ?)", (name, *row))
-        self._write("DELETE FROM worth WHERE name = ?", (name,))
-        self._worth.pop(name, None)
-        if trial.states.nbytes + trial.inputs.nbytes < KEPT:
-            blobs = (trial.states.tobytes(), trial.inputs.tobytes())
-            numbers = (name, *blobs, _proof(stamp, *blobs))
-            self._write("INSERT OR REPLACE INTO numbers VALUES (?, ?, ?, ?)", numbers)
-        return about
+        self._rows[name] = stamp, json.loads(text)
+        values = (name, stamp, text, _proof(stamp, text))
+        self._write("INSERT OR REPLACE INTO files VALUES (?, ?, ?, ?)", values)
+        return self._rows[name][1]
 
     def trial(self, stored: Stored, about: dict[str, Any], *, bridged: bool) -> Trial:
         """A trial whose numbers are read when they are asked for.
 
         Args:
             stored: its file.
-            about: what `about` said.
+            about: what `of_trial` said.
             bridged: short gaps are interpolated.
         """
         if bridged and about["gaps"]:
@@ -240,7 +196,7 @@ def _about(trial: Trial, meta: dict[str, str], policy: bytes | None) -> dict[str
 def _stamp(path: Path) -> str:
     """What changes with a file: size, times, place."""
     try:
-        found = path.stat()
+        found = os.stat(path)  # noqa: PTH116 (quicker)
     except OSError:
         return ""
     return f"{found.st_size}-{found.st_mtime_ns}-{found.st_ctime_ns}-{found.st_ino}"
@@ -249,5 +205,5 @@ def _stamp(path: Path) -> str:
 def _proof(*parts: str | bytes) -> bytes:
     digest = hashlib.sha256()
     for part in parts:
-        digest.update(part.encode() if isinstance(part, str) else part)
+        digest.update(part if isinstance(part, bytes) else str(part).encode())
     return digest.digest()

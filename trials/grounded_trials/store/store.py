@@ -21,6 +21,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 
 from grounded.errors import GroundedError
@@ -81,6 +82,7 @@ class Store:
     def __init__(self, folder: str | Path, prefix: str = "t") -> None:
         self.folder, self.prefix = Path(folder), prefix
         self._seen: dict[str, Stored | None] = {}  # what a name says
+        self._listed: tuple[list[str], tuple[Stored, ...]] = ([], ())  # names, and their files
 
     def list(self) -> tuple[Stored, ...]:
         """The files in the order of their arrival; nothing is read but the folder.
@@ -94,13 +96,16 @@ class Store:
             return ()
         except OSError as error:
             raise GroundedError(f"{self.folder} can't be read: {error.strerror}") from None
+        if names == self._listed[0]:
+            return self._listed[1]
         for name in names:
             if name not in self._seen:
                 match, self._seen[name] = _NAME.match(name), None
                 if match and match[1] == self.prefix:
                     self._seen[name] = Stored(self.folder / name, int(match[2]), match[3])
         found = (entry for name in names if (entry := self._seen[name]) is not None)
-        return tuple(sorted(found, key=lambda s: (s.number, s.digest)))
+        self._listed = names, tuple(sorted(found, key=attrgetter("number", "digest")))
+        return self._listed[1]
 
     def digests(self) -> set[str]:
         """The hashes of all files, as their names have them."""

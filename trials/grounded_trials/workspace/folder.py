@@ -12,6 +12,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -29,19 +30,21 @@ from grounded_trials.store.trial_file import read_trial
 from grounded_trials.workspace.config import Config, read_config
 from grounded_trials.workspace.identity import (
     Noted,
+    StoredCandidate,
     StoredTrial,
     candidate_of,
     encoded,
     named_apart,
     noted,
     sha256,
+    stored_candidate,
 )
 from grounded_trials.workspace.model_file import check_names, load_module, model_in
 from grounded_trials.workspace.task_file import build_task
 
 if TYPE_CHECKING:
     from grounded.search.planner import Planner
-    from grounded_trials.store.index import TrialIndex
+    from grounded_trials.store.index import Index
 
 MANY = 200  # trials: fewer are all read, more are indexed
 _ID = re.compile(r"c\d{4,}")
@@ -122,7 +125,7 @@ class Folder:
         Raises:
             GroundedError: if one is damaged.
         """
-        return noted(self.notes.read())
+        return self._read_notes(None)
 
     def note_handed(self, identity: str, data: bytes) -> None:
         """Keeps that a candidate was handed out, as these bytes, after the trials there are.
@@ -236,7 +239,7 @@ class Folder:
         Raises:
             GroundedError: if there is none of that name.
         """
-        for read in self._sources(identity):
+        for _, read in self._sources(identity):
             return read()
         raise GroundedError(
             f"there is no candidate '{identity}': {nearest(identity, self.candidate_ids())}"
@@ -244,8 +247,12 @@ class Folder:
 
     def names(self) -> frozenset[str]:
         """The names of all trials and candidates."""
-        places = ((self.folder / "trials", "t"), (self.folder / "candidates", "c"))
-        return frozenset(path.name for place, first in places for path in place.glob(f"{first}*"))
+        found: set[str] = set()
+        for place, first in (("trials", "t"), ("candidates", "c")):
+            with suppress(FileNotFoundError):
+                names = os.listdir(self.folder / place)  # noqa: PTH208 (many times quicker)
+                found.update(name for name in names if name.startswith(first))
+        return frozenset(found)
 
     def bring_back(self, identity: str) -> Path:
         """A candidate's file, taken from a trial that ran it where it got lost."""
@@ -283,9 +290,9 @@ class Folder:
     def _read_trials(self, lost: list[Lost] | None) -> tuple[StoredTrial, ...]:
         """The stored trials; those that are damaged or gone are put into `lost` if it is there."""
         broken: list[Damaged] = []
-        known, found = noted(self.notes.read(None if lost is None else broken)), []
+        known, found = self.noted if lost is None else self._read_notes(broken), []
         entries = [e for e in self.store.list() if e.digest not in known.aside]
-        read = self._indexed if len(entries) >= MANY else self._whole
+        read = self._indexed if self._many else self._whole
         for stored in entries:
             try:
                 found.append(read(stored))
@@ -297,6 +304,13 @@ class Folder:
         if lost is not None:
             lost += [Lost(one.path.name, one.reason) for one in (*broken, *self.gone(known))]
         return named_apart(found, known, self.candidate_path)
+
+    @property
+    def _many(self) -> bool:
+        return len(self.store.list()) >= MANY
+
+    def _read_notes(self, broken: list[Damaged] | None) -> Noted:
+        return noted(self.notes.read(broken, self._index[0].known if self._many else None))
 
     def _read_one(self, stored: Stored) -> tuple[Trial, dict[str, str], bytes | None]:
         """A trial as it was logged, its metadata and the policy that it carries."""
@@ -310,23 +324,23 @@ class Folder:
         return StoredTrial(stored, bridged, meta, trial, ran, lambda: policy)
 
     @cached_property
-    def _index(self) -> tuple[TrialIndex, dict[str, StoredTrial]]:
+    def _index(self) -> tuple[Index, dict[str, StoredTrial]]:
         """The index, and the trials that were made of it."""
-        from grounded_trials.store.index import TrialIndex
+        from grounded_trials.store.index import Index
 
-        return TrialIndex(self.store.folder, self._read_one), {}
+        return Index(self.store.folder, self._read_one), {}
 
     def _indexed(self, stored: Stored) -> StoredTrial:
         index, made = self._index
-        if (known := made.get(stored.path.name)) is not None:
+        if (known := made.get(name := stored.path.name)) is not None:
             return known
-        about = index.about(stored)
+        about = index.of_trial(stored)
         trial = index.trial(stored, about, bridged=True)
         measured = index.trial(stored, about, bridged=False) if about["gaps"] else trial
         found = StoredTrial(
             stored, trial, about["meta"], measured, about["ran"], lambda: self._read_one(stored)[2]
         )
-        made[stored.path.name] = found
+        made[name] = found
         return found
 
     def save_index(self) -> None:
@@ -353,11 +367,11 @@ class Folder:
         ran = {t.trial.candidate: (t.stored.id, t.ran) for t in trials if t.ran}
         for identity in self._ids(trials):
             why = GroundedError("its file is gone and no trial carries it")
-            for read in self._sources(identity, trials):
+            for place, read in self._sources(identity, trials):
                 try:
-                    candidate, meta = candidate_of(data := read(), identity)
+                    found = self._proven(identity, place, read)
                     trial, known = ran.get(identity, ("", ""))
-                    if known and sha256(data) != known:
+                    if known and found.sha256 != known:
                         raise GroundedError(
                             f"candidates/{identity}.mcap is not the policy that {trial} ran: it "
                             "was rewritten, or comes from another workspace; delete the file, the "
@@ -368,22 +382,33 @@ class Folder:
                         raise
                     why = error
                     continue
-                if meta.get("kind") == "search" and meta.get("task") == self.task.hash:
-                    yield candidate
+                if (found.kind, found.task) == ("search", self.task.hash):
+                    yield found.candidate
                 break
             else:
                 if lost is None:
                     raise GroundedError(f"candidates/{identity}.mcap can't be read: {why}")
                 lost.append(Lost(f"{identity}.mcap", str(why)))
 
+    def _proven(
+        self, identity: str, place: Path | None, read: Callable[[], bytes]
+    ) -> StoredCandidate:
+        """A candidate from one of its copies; a file that the index knows is not read again."""
+        if place is None or "_index" not in vars(self):
+            return stored_candidate(read(), identity)
+        learn = lambda: stored_candidate(read(), identity).about()  # noqa: E731
+        about = self._index[0].known(place.name, place, learn)
+        return StoredCandidate.known(about, lambda: candidate_of(read(), identity)[0])
+
     def _ids(self, trials: tuple[StoredTrial, ...]) -> list[str]:
-        ids = {path.stem for path in (self.folder / "candidates").glob("c*.mcap") if path.is_file()}
-        ids |= {t.trial.candidate for t in trials}
+        ids = {t.trial.candidate for t in trials}
+        with suppress(FileNotFoundError), os.scandir(self.folder / "candidates") as entries:
+            ids |= {e.name[:-5] for e in entries if e.name.endswith(".mcap") and e.is_file()}
         return sorted(filter(_ID.fullmatch, ids), key=lambda name: int(name[1:]))
 
     def _sources(
         self, identity: str, trials: tuple[StoredTrial, ...] | None = None
-    ) -> Iterator[Callable[[], bytes]]:
+    ) -> Iterator[tuple[Path | None, Callable[[], bytes]]]:
         """The copies of a candidate, to be read: its file, then those in the trials that ran it."""
 
         def own() -> bytes:
@@ -392,7 +417,7 @@ class Folder:
 
         path = self.candidate_path(identity)
         if path.is_file():
-            yield own
+            yield path, own
         for one in self.trials() if trials is None else trials:
             if one.trial.candidate == identity and (policy := one.policy) is not None:
-                yield partial(bytes, policy)
+                yield None, partial(bytes, policy)

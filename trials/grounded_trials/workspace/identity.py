@@ -19,6 +19,7 @@ from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.store.candidate_file import candidate_bytes, read_candidate
+from grounded_trials.store.known import KnownCandidate
 from grounded_trials.store.store import Stored
 
 if TYPE_CHECKING:
@@ -56,6 +57,27 @@ class StoredTrial:
     def policy(self) -> bytes | None:
         """The file of the candidate that it ran."""
         return self.policy_of() if self.ran else None
+
+
+@dataclass(frozen=True, eq=False)
+class StoredCandidate:
+    """A candidate with what its file says of it."""
+
+    candidate: Candidate
+    kind: str  # search or probe
+    task: str  # the hash of its task
+    sha256: str  # of its file
+
+    def about(self) -> dict[str, Any]:
+        """All but the numbers, for an index."""
+        fields = {key: getattr(self.candidate, key) for key in _FIELDS if key != "task"}
+        return {"kind": self.kind, "task": self.task, "sha256": self.sha256, "candidate": fields}
+
+    @classmethod
+    def known(cls, about: dict[str, Any], load: Callable[[], Candidate]) -> StoredCandidate:
+        """The same from what `about` said; `load` reads the numbers when they are asked for."""
+        fields = KnownCandidate.of(load, about["candidate"])
+        return cls(fields, about["kind"], about["task"], about["sha256"])
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,3 +186,9 @@ def candidate_of(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]
             "candidate. Give it its own name again, or delete it if that one is there"
         )
     return Candidate(policy=policy, predicted_states=states, predicted_inputs=inputs, **about), meta
+
+
+def stored_candidate(data: bytes, identity: str) -> StoredCandidate:
+    """As `candidate_of`, with the kind, the task and the hash of the file."""
+    candidate, meta = candidate_of(data, identity)
+    return StoredCandidate(candidate, meta.get("kind", ""), meta.get("task", ""), sha256(data))

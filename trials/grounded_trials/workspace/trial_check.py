@@ -23,7 +23,9 @@ FAR = 0.1  # of a state's range in the trial: a start this far from s_0 is worth
 LEAST = 10  # steps: less says nothing of who drove
 UNLIKE = 0.25  # of the squared difference of unrelated commands; 1 - UNLIKE: concordance (Lin 1989)
 WINDOWS = 8  # parts of a trial that must each be alike, twice as loosely: somebody may take over
-CLOSER = 1 / 3  # another candidate whose commands differ this much less is the one that ran
+DECISIVE = 12.0  # [nats] of evidence that another candidate ran: luck gives it to 1 run in 10^6
+ROUGH = 4.0  # steps over which noise keeps its sign: what strays for longer, somebody steers
+FINE = 1e-4  # of an input's size: how finely commands are logged at best
 BACK = (0.0, 0.5, 1.0, 1.5, 2.0, -0.5, -1.0)  # steps: states of the log older than those acted on
 AGES = 1.0  # steps by which that varies in a run: packets are lost, clocks drift and jitter
 OTHERS = 20  # candidates to compare with, the latest
@@ -122,6 +124,8 @@ class Following:
     until_s: float  # the commands are alike up to here
     late: int  # steps by which the log is late
     moved: float  # the squared difference at `late` over that without moving
+    off: Array  # (T, m) what was sent less what was asked; NaN: not compared
+    fine: Array  # (m,) how finely that is known
 
 
 def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
@@ -154,6 +158,8 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
             fits[back, late] = (float(score), float(mean[back]), a[back], b, size[back])
     back, late = min(fits, key=lambda key: fits[key][0])
     _, error, asked, sent, size = fits[back, late]
+    apart = np.full(policy.feedforward[:T].shape, np.nan)
+    apart[max(0, late) :][: len(sent)] = sent - asked
     unmoved = min(fit[1] for key, fit in fits.items() if key[1] == 0)
     near = [k for k, other in enumerate(BACK) if abs(other - BACK[back]) <= AGES]
     start = max(0, -late)
@@ -164,7 +170,8 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
     room = np.maximum(UNLIKE * unrelated, (0.02 * size) ** 2 + 4 * noise[: len(off)])
     parts = np.array_split(np.arange(len(off)), min(WINDOWS, len(off) // LEAST))
     bad = [bool((off[k].mean(axis=0) > 2 * room[k].mean(axis=0)).any()) for k in parts]
-    share = off.mean(axis=0) / room.mean(axis=0)
+    drawn_out = np.array([max(1.0, _steps_alike(column) / ROUGH) for column in (sent - asked).T])
+    share = off.mean(axis=0) / room.mean(axis=0) * drawn_out
     first = parts[bad.index(True)] if any(bad) else parts[0][:1]
     left = first[int(np.argmax((off[first] > 2 * room[first]).any(axis=1)))]
     alike, j = bool(share.max() <= 1 and not any(bad)), int(np.argmax(share))
@@ -176,7 +183,35 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
         until_s=float(left) * policy.dt,
         late=late,
         moved=error / unmoved if unmoved > 1e-4 else 1.0,
+        off=apart,
+        fine=FINE * size,
     )
+
+
+def evidence(own: Following, other: Following) -> float:
+    """The log likelihood ratio of another policy over the own one [nats], given the commands.
+
+    What the other leaves is taken for noise, Gaussian, as large and as coloured as it is. If the
+    own policy ran, noise gives the other more than z^2/2 nats no more often than a normal number
+    exceeds z, however close the two are. But where the robot acted on other samples than the log
+    has, lower gains leave less, whichever ran: down to half the squares, which count for nothing.
+    """
+    known = np.isfinite(own.off + other.off).all(axis=1)
+    a, b = own.off[known], other.off[known]
+    noise = (b**2).mean(axis=0) + own.fine**2
+    return float(((a**2 / 2 - b**2) / (2 * noise)).sum()) / max(
+        _steps_alike(column) for column in b.T
+    )
+
+
+def _steps_alike(noise: Array) -> float:
+    """How many successive samples say as much as one: the autocorrelation, summed to its zero."""
+    noise = noise - noise.mean()
+    power = np.correlate(noise, noise, "full")[len(noise) - 1 :]
+    if not power[0] > 0:
+        return 1.0
+    end = int(np.argmax(power <= 0)) or len(power)
+    return float(2 * power[:end].sum() / power[0] - 1)
 
 
 def what_ran(task: Task, trial: Trial, own: Candidate, others: Sequence[Candidate]) -> str:
@@ -193,9 +228,9 @@ def what_ran(task: Task, trial: Trial, own: Candidate, others: Sequence[Candidat
     if found is None or (found.alike and found.error < 1e-5):
         return ""
     rivals = [(follows(c.policy, trial, latest), c.id) for c in others[-OTHERS:] if c.id != own.id]
-    alike = [(f.error, name) for f, name in rivals if f is not None and f.alike]
-    error, name = min(alike, default=(np.inf, ""))
-    if error < CLOSER * found.error:
+    alike = [(evidence(found, f), name) for f, name in rivals if f is not None and f.alike]
+    nats, name = max(alike, default=(-np.inf, ""))
+    if nats > DECISIVE:
         looks = f"they are those of {name}"
     elif found.alike:
         return ""

@@ -168,7 +168,7 @@ def _improved(findings: Findings) -> list[tuple[str, str]]:
 
 
 def _tiles(findings: Findings) -> list[str]:
-    now, logs = findings.standing, len(findings.logs)
+    now, logs = findings.standing, len(findings.logs) + findings.left_logs
     found = []
     if findings.history or not logs:
         found.append(f"{count(now.trials, 'trial')}, {count(now.iteration, 'improvement')}")
@@ -176,6 +176,12 @@ def _tiles(findings: Findings) -> list[str]:
         found.append(f"{count(logs, 'log')} of data")
     if findings.optimum is not None:
         found.append(f"optimum of the real system {figure(findings.optimum)}")
+    for left, shown, kind in (
+        (findings.left_runs, len(findings.runs), "trials"),
+        (findings.left_logs, len(findings.logs), "logs"),
+    ):
+        if left:
+            found.append(f"{left} of {left + shown} {kind} are not drawn: there are too many")
     early = [run.trial.id for run in findings.runs if crash(run) is not None]
     return [*found, f"ended early: {', '.join(early)}"] if early else found
 
@@ -201,7 +207,7 @@ def _why(findings: Findings) -> dict[str, Any]:
 
 def _utility(findings: Findings) -> list[Block]:
     if not findings.history:
-        logs = count(len(findings.logs), "log")
+        logs = count(len(findings.logs) + findings.left_logs, "log")
         return [Block("text", f"No candidate was proposed yet; {logs} of data.")]
     from grounded.search.certainty import last_improvement
 
@@ -211,7 +217,7 @@ def _utility(findings: Findings) -> list[Block]:
     return [
         *drawn(search_figure(findings.standing, findings.optimum)),
         *([Block("text", f"{begun}.")] if sure else []),
-        Block("folded", "All candidates", blocks=[candidate_table(findings)], wide=few),
+        Block("folded", "All candidates", blocks=candidate_table(findings), wide=few),
     ]
 
 

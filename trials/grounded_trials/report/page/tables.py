@@ -10,7 +10,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from grounded.diagnosis.report import Diagnosis, Estimate, Ranked
+from grounded.errors import NextCommand
 from grounded.figures.figure import Figure
+from grounded.search.pictures import MOST, few
 from grounded_trials.report.findings import (
     Findings,
     by_state,
@@ -21,7 +23,7 @@ from grounded_trials.report.findings import (
     tracking_error,
 )
 from grounded_trials.report.forecast import SECONDS, forecast_error
-from grounded_trials.wording import figure, shown, with_unit
+from grounded_trials.wording import figure, rendered, shown, with_unit
 from grounded_trials.workspace.next_step import Since
 
 WIDEST = 1e6  # an interval so many times its value, or so wide, says nothing
@@ -68,10 +70,11 @@ def table(
     return Block("table", name=name, header=header, rows=rows, strong=frozenset(strong))
 
 
-def candidate_table(findings: Findings) -> Block:
-    """Every candidate with its trials."""
+def candidate_table(findings: Findings) -> list[Block]:
+    """The candidates with their trials; of many not all, and how many are left out."""
     rows, best = [], findings.standing.incumbent
-    for tried in findings.history:
+    kept, left = few(findings.history, MOST)
+    for tried in kept:
         c = tried.candidate
         cells = {
             "candidate": c.id,
@@ -85,8 +88,11 @@ def candidate_table(findings: Findings) -> Block:
             "trials ": " ".join(t.id for t in tried.trials) or "none",
         }
         rows.append(cells)
-    strong = {k for k, t in enumerate(findings.history) if best and t.candidate is best.candidate}
-    return table("candidates", list(rows[0]), [list(cells.values()) for cells in rows], strong)
+    strong = {k for k, t in enumerate(kept) if best and t.candidate is best.candidate}
+    made = table("candidates", list(rows[0]), [list(cells.values()) for cells in rows], strong)
+    words = f"{left} candidates between them are left out; this shows all:"
+    more = [Block("text", words), Block("command", rendered(NextCommand("status")), "c-status")]
+    return [made, *more] if left else [made]
 
 
 def error_table(findings: Findings) -> list[Block]:

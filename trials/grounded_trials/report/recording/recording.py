@@ -308,9 +308,12 @@ def verdict(findings: Findings) -> str:
 def summary(findings: Findings) -> str:
     """What was learnt, and what is left out."""
     task, best, first = findings.task, findings.best, findings.first
+    left = findings.left_runs + findings.left_logs
     lines = [
         f"**{findings.name}**, {task.model.name}: {task.horizon} steps of {task.dt:g} s, "
-        f"{count(len(findings.runs), 'trial')}, {count(len(findings.logs), 'log')} of data",
+        f"{count(len(findings.runs), 'trial')}, {count(len(findings.logs), 'log')} of data"
+        + f" (not shown: {left})"
+        * bool(left),
         "",
     ]
     known = []
