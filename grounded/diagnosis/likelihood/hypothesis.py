@@ -127,7 +127,7 @@ class Predictor:
         return self._kept("trials", h, found)
 
     def _kept(self, what: str, h: Hypothesis, make: Callable[[], Array]) -> Array:
-        """Made once for the same values: a memory steps through time in Python."""
+        """Made once for the same values."""
         acting = self.acting(h)
         key = (what, *((e.name, tuple(sorted(v.items()))) for e, v in acting))
         if (found := self._inputs.get(key)) is None:
@@ -373,7 +373,6 @@ def transformed(effect: Effect, values: Mapping[str, float], u: Array, data: Dat
             if family.name == "delay":  # the same as its queue, at once
                 out[:, :, j] = shifted(u[:, :, j], data.held[:, j], values["d"] / data.dt)
                 continue
-            z = tuple([data.held[:, j]] * family.depth(values, data.dt))
-            for k in range(u.shape[1]):
-                out[:, k, j], z = family.advance(u[:, k, j], z, values, data.dt)
+            before = family.along(u[:, :, j], data.held[:, j], values, data.dt)
+            out[:, :, j], _ = family.advance(u[:, :, j], (before,), values, data.dt)
     return out
