@@ -53,10 +53,20 @@ class HypothesisSearch(FittedHypotheses):
         self.most = SHORTLIST // 2 if large else SHORTLIST
         self.beside = BESIDE // 2 if large else BESIDE
 
-    def refined(self, starts: Sequence[Fitted | tuple], iterations: int = 6) -> list[Fitted]:  # type: ignore[type-arg]
-        """Refines, remembers, returns."""
+    def refined(
+        self,
+        starts: Sequence[Fitted | tuple],  # type: ignore[type-arg]
+        iterations: int = 6,
+        *,
+        rivals: bool = False,
+    ) -> list[Fitted]:
+        """Refines, remembers, returns; of rivals the worse half only part of the way."""
         fits = refine(
-            self.predictor, starts, iterations=iterations, tick=lambda: self.tick("refine")
+            self.predictor,
+            starts,
+            iterations=iterations,
+            tick=lambda: self.tick("refine"),
+            worth=self.score if rivals else None,
         )
         self.keep(fits)
         return fits
@@ -219,7 +229,7 @@ class HypothesisSearch(FittedHypotheses):
                 (h.plus(look.effect, values), fit.noise, fit.track)
                 for values in (look.values, *look.others)
             ]
-        return self.refined(starts, iterations)[1:]
+        return self.refined(starts, iterations, rivals=True)[1:]
 
     def without(self, fit: Fitted, name: str) -> Fitted:
         """The fit with one effect taken out, its noise and track kept: where rivals are sought."""

@@ -26,7 +26,7 @@ from grounded.trial import Trial
 
 LONGEST_RUN = 200  # steps
 PIECES, SHORTEST_PIECE = 5, 50  # one log alone is held out by pieces; steps of a piece at least
-MOST_NUMBERS = 1.8e6  # of one (L, B, N, N) array: above it, evenly spaced runs are used
+MOST_NUMBERS = 1.2e6  # of one (L, B, N, N) array: above it, the most informative runs are used
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +149,8 @@ def prepare(
     states = np.concatenate([trial.states[: T + 1] for trial, T in used])
     steps = np.concatenate([trial.inputs[:T] for trial, T in used])
     state_at, step_at, valid, trial_of = _cut(lengths)
-    keep = _spread(len(step_at), step_at.shape[1] * model.n**2 * 4)
+    most = max(1, int(MOST_NUMBERS / (step_at.shape[1] * model.n**2 * 4)))
+    keep = _informative([_filled(states)[state_at], steps[step_at]], most)
     return Data(
         model=model,
         dt=dt,
@@ -208,10 +209,19 @@ def _cut(lengths: Any) -> tuple[Any, Any, Array, Any]:
     return state_at, step_at, valid, np.array([i for i, *_ in pieces])
 
 
-def _spread(count: int, numbers: float) -> Any:
-    """Evenly spaced runs, as many as fit in memory."""
-    most = max(1, int(MOST_NUMBERS / numbers))
-    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(int))
+def _informative(signals: Sequence[Array], most: int) -> Any:
+    """Of each of `most` groups of neighbouring runs the one in which signals (B, any, k) vary most.
+
+    Every signal counts by its variance within the run, in units of its variance over all: what
+    stands still tells of nothing. Groups, so that all trials and all of their time have a say.
+    """
+    count = len(signals[0])
+    if count <= most:
+        return np.arange(count)
+    parts = [x.var(axis=1) / np.maximum(x.var(axis=(0, 1)), 1e-300) for x in signals]
+    moves = np.concatenate(parts, axis=1).mean(axis=1)
+    edges = np.linspace(0, count, most + 1).astype(int)
+    return np.array([a + int(np.argmax(moves[a:b])) for a, b in itertools.pairwise(edges)])
 
 
 def _filled(states: Array) -> Array:

@@ -193,6 +193,13 @@ class Predictor:
             result[..., j] = x[..., j] + found[1] - found[0]
         return result
 
+    def stepper(self, h: Hypothesis) -> Callable[[Array, Array, Array], Array]:
+        """`advance` of many steps one after the other: from x (M, n) with u (M, m) at t (M,)."""
+        if rates_of(h) or limits_of(h) or losses_of(h):
+            return lambda x, u, t: self.advance(h, x, u, t)
+        step, p, dt = self.data.model.system.step, self.params(h), self.data.dt
+        return lambda x, u, t: step(x, u, p, dt)
+
     def moved(self, h: Hypothesis, x: Array, u: Array, dt: float | None = None) -> Array:
         """The model's step with what its motion takes off the inputs, without further rates."""
         return self.step(x, self.left(h, x, u, dt), self.params(h), dt)

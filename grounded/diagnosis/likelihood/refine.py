@@ -49,6 +49,8 @@ from grounded.threads import each
 
 MOST_NUMBERS = 1e5  # of one (L, B, N, N) array: what fits in the cache goes fastest
 SHORTEST = 0.05  # part of a step that is still tried
+HALVED = 4  # iterations after which only the better half of rivals goes on
+CLOSE = 10.0  # nats behind the best within which all go on
 
 
 @dataclass(eq=False)
@@ -180,6 +182,7 @@ def refine(
     iterations: int = 6,
     tick: Callable[[], None] | None = None,
     fixed_noise: bool = False,
+    worth: Callable[[Fitted], float] | None = None,
 ) -> list[Fitted]:
     """Refines hypotheses that share a noise structure; the result has the same order.
 
@@ -189,6 +192,7 @@ def refine(
         iterations: at most; a hypothesis that stopped rising is left alone.
         tick: called after each iteration.
         fixed_noise: keep the noise as it is.
+        worth: of rivals, by which the worse half is given up on the way; None: all go on.
     """
     data = predictor.data
     works = [
@@ -199,13 +203,25 @@ def refine(
     L, B, n = predictor.data.time.shape[0], data.time.shape[1], data.model.n
     wide = n if works[0].noise.structure.tau is None else 2 * n
     size = max(1, int(MOST_NUMBERS / (L * B * wide * wide)))
-    for _ in range(iterations):
+    for iteration in range(iterations):
+        if worth is not None and iteration == HALVED:
+            _halve(works, worth)
         shapes = _of_one_shape([work for work in works if not work.still])
         blocks = [a[at : at + size] for a in shapes for at in range(0, len(a), size)]
         each(lambda block: _iterate(predictor, block, fixed_noise), blocks)
         if tick is not None:
             tick()
     return [work.best for work in works if work.best is not None]
+
+
+def _halve(works: list[Work], worth: Callable[[Fitted], float]) -> None:
+    """The worse half stays where it is: who is that far behind by now does not overtake."""
+    value = {id(work): worth(work.best) for work in works if work.best is not None}
+    ranked = sorted(value.values(), reverse=True)
+    for work in works:
+        mine = value.get(id(work), -np.inf)
+        if mine < ranked[len(ranked) // 2] and mine < ranked[0] - CLOSE:
+            work.still = True
 
 
 def _of_one_shape(works: list[Work]) -> list[list[Work]]:
