@@ -40,6 +40,7 @@ from grounded.effects import (
 )
 from grounded.filter import kalman
 from grounded.frozen import Array
+from grounded.threads import each
 
 BLOCK = 160  # columns filtered at once
 MOST_NUMBERS = 1e6  # of one block of whitened columns
@@ -72,17 +73,24 @@ def scan_candidates(predictor: Predictor, fit: Fitted, candidates: Sequence[Effe
     """Every candidate beside what `fit` already holds; same order as the candidates."""
     context = _Context(predictor, fit)
     results: _Results = {}
-    pending: list[_Column] = []
     size = max(8, min(BLOCK, int(MOST_NUMBERS / fit.white.size)))
+    blocks: list[list[tuple[int, int, Effect, dict[str, float]]]] = [[]]
+    held = 0
     for i, effect in enumerate(candidates):
+        together = max(1, sum(not q.grid for q in effect.free))
         for point, grid in enumerate(grid_points(effect)):
-            together = context.columns(i, point, effect, grid)
-            if pending and len(pending) + len(together) > size:
-                context.filter(pending, results)
-                pending = []
-            pending += together
-    if pending:
-        context.filter(pending, results)
+            if held + together > size and blocks[-1]:
+                blocks.append([])
+                held = 0
+            blocks[-1].append((i, point, effect, grid))
+            held += together
+
+    def looked(block: list[tuple[int, int, Effect, dict[str, float]]]) -> None:
+        columns = [column for point in block for column in context.columns(*point)]
+        if columns:
+            context.filter(columns, results)
+
+    each(looked, blocks)
     return [context.best(i, effect, results) for i, effect in enumerate(candidates)]
 
 

@@ -51,6 +51,7 @@ MOST_NUMBERS = 1e5  # of one (L, B, N, N) array: what fits in the cache goes fas
 SHORTEST = 0.05  # part of a step that is still tried
 HALVED = 4  # iterations after which only the better half of rivals goes on
 CLOSE = 10.0  # nats behind the best within which all go on
+LITTLE = 0.05  # nats that a step must promise to be tried in part where it fails
 
 
 @dataclass(eq=False)
@@ -60,6 +61,7 @@ class ProposedStep:
     delta: Array  # (C,) of the values, then of the shifts in units of param_scale
     track: Array
     noise: NoiseModel
+    promise: float  # nats that the quadratic model expects of it
 
 
 @dataclass(eq=False)
@@ -81,7 +83,7 @@ class Work:
             self.moving = False
         else:
             self.part *= 0.4
-        if self.best is None or self.part < SHORTEST:
+        if self.step is None or self.part < SHORTEST or self.step.promise < LITTLE:
             self.still = True
         else:
             self.go(data)
@@ -98,8 +100,13 @@ class Work:
         self.track = best.track + step.track if self.moving else best.track
 
 
-def proposed(data: Data, fit: Fitted, filtered: Array, noise: NoiseModel) -> ProposedStep:
-    """Gauss-Newton in values and shifts, scoring in the noise, the filtered track as the track."""
+def proposed(
+    data: Data, fit: Fitted, filtered: Array, noise: NoiseModel, promise: float
+) -> ProposedStep:
+    """Gauss-Newton in values and shifts, scoring in the noise, the filtered track as the track.
+
+    `promise` is what the noise's part of the step is expected to gain [nats].
+    """
     h = fit.hypothesis
     G = fit.gram.sum(axis=0) + np.diag(fit.prior)
     slope = fit.score.sum(axis=0) + fit.prior_pull(data)
@@ -110,7 +117,8 @@ def proposed(data: Data, fit: Fitted, filtered: Array, noise: NoiseModel) -> Pro
         delta[k:] = np.clip(delta[k:], -0.3, 0.3)
         by = delta != 0
         track = track + filtered[..., 1:][..., by] @ delta[by]
-    return ProposedStep(delta, track, noise)
+    promise -= float(slope @ delta + 0.5 * delta @ G @ delta)
+    return ProposedStep(delta, track, noise, promise)
 
 
 def _bounded(G: Array, slope: Array, low: Array, high: Array) -> Array:
@@ -259,7 +267,7 @@ def _iterate(predictor: Predictor, works: list[Work], fixed_noise: bool) -> None
     started = smoothed(data, g, np.concatenate([part[0] for part in parts], axis=1), white[..., 0])
     if started is not None:
         filtered[0, ..., 0] += started
-    steps = [work.noise for work in works]
+    steps = [(work.noise, 0.0) for work in works]
     if not fixed_noise:
         steps = _climbed(data, works, late, systems, g, white[..., 0])
     for i, work in enumerate(works):
@@ -286,8 +294,8 @@ def _climbed(
     systems: list[tuple[LinearSystem, Delayed | None]],
     g: kalman.Gains,
     white: Array,
-) -> list[NoiseModel]:
-    """Each work's noise after one step up the likelihood."""
+) -> list[tuple[NoiseModel, float]]:
+    """Each work's noise after one step up the likelihood, and what it promises [nats]."""
     B, width = data.time.shape[1], data.model.n
     adjoints = kalman.smoother(g, white).parts(B)
     columns_each = []
@@ -303,7 +311,9 @@ def _climbed(
         info = average(columns[:, i * B : (i + 1) * B, :, :K])
         in_log = adjoint if delays is None else delays.restored(adjoint)
         slope = likelihood_slopes(work.noise, in_log, data.dt)
-        found.append(climbed(work.noise, slope, info, int(data.valid.sum())))
+        noise = climbed(work.noise, slope, info, int(data.valid.sum()))
+        pairs = zip(slope, noise.logs, work.noise.logs, strict=False)
+        found.append((noise, 0.5 * sum(float(s @ (a - b)) for s, a, b in pairs)))
     return found
 
 
@@ -347,7 +357,7 @@ def _update(
     white: Array,
     logdet: Array,
     filtered: Array,
-    climbed: NoiseModel,
+    climbed: tuple[NoiseModel, float],
     before: float,
 ) -> None:
     """Scores the point where the work stands, keeps it if it is the best, and moves on."""
@@ -362,7 +372,7 @@ def _update(
     work.moving = work.moving or rise > 1.0
     work.part = min(1.0, 2 * work.part)
     work.best = fit
-    work.step = proposed(data, fit, filtered, climbed)
+    work.step = proposed(data, fit, filtered, *climbed)
     work.go(data)
 
 
