@@ -27,6 +27,7 @@ from grounded.trial import Trial
 LONGEST_RUN = 200  # steps
 PIECES, SHORTEST_PIECE = 5, 50  # one log alone is held out by pieces; steps of a piece at least
 MOST_NUMBERS = 1.2e6  # of one (L, B, N, N) array: above it, the most informative runs are used
+BEGINNINGS = 8  # runs among them at most that are kept because a trial begins with them
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +151,8 @@ def prepare(
     steps = np.concatenate([trial.inputs[:T] for trial, T in used])
     state_at, step_at, valid, trial_of = _cut(lengths)
     most = max(1, int(MOST_NUMBERS / (step_at.shape[1] * model.n**2 * 4)))
-    keep = _informative([_filled(states)[state_at], steps[step_at]], most)
+    begins = np.flatnonzero(np.diff(trial_of, prepend=-1))
+    keep = _informative([_filled(states)[state_at], steps[step_at]], begins, most)
     return Data(
         model=model,
         dt=dt,
@@ -209,19 +211,23 @@ def _cut(lengths: Any) -> tuple[Any, Any, Array, Any]:
     return state_at, step_at, valid, np.array([i for i, *_ in pieces])
 
 
-def _informative(signals: Sequence[Array], most: int) -> Any:
-    """Of each of `most` groups of neighbouring runs the one in which signals (B, any, k) vary most.
+def _informative(signals: Sequence[Array], begins: Any, most: int) -> Any:
+    """Which runs to keep: of groups of neighbours the one in which signals (B, any, k) vary most.
 
     Every signal counts by its variance within the run, in units of its variance over all: what
-    stands still tells of nothing. Groups, so that all trials and all of their time have a say.
+    stands still tells of nothing. Groups, so that all trials and all of their time have a say. Some
+    are runs that a trial begins with, `begins`: whole trials are predicted from there.
     """
     count = len(signals[0])
     if count <= most:
         return np.arange(count)
+    some = np.linspace(0, len(begins) - 1, min(len(begins), BEGINNINGS, max(1, most // 2)))
+    first = begins[some.astype(int)]
     parts = [x.var(axis=1) / np.maximum(x.var(axis=(0, 1)), 1e-300) for x in signals]
     moves = np.concatenate(parts, axis=1).mean(axis=1)
-    edges = np.linspace(0, count, most + 1).astype(int)
-    return np.array([a + int(np.argmax(moves[a:b])) for a, b in itertools.pairwise(edges)])
+    others, left = np.setdiff1d(np.arange(count), first), most - len(first)
+    groups = np.array_split(others, left) if left else []
+    return np.sort([*first, *(group[np.argmax(moves[group])] for group in groups)])
 
 
 def _filled(states: Array) -> Array:
