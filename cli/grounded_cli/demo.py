@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -49,7 +50,7 @@ def command(name: str, folder: str | None, json_: bool) -> None:
         best = optimum(workspace)
     save_optimum(workspace, best)
     with progress("diagnosing the gap"):
-        diagnosed = workspace.diagnose(_few(workspace, status))
+        diagnosed = workspace.diagnose(_few(workspace, status), jobs=os.cpu_count() or 1)
     with progress("writing the report"):
         html, rrd = (find_spec(name) is not None for name in ("plotly", "rerun"))
         report = workspace.report(html=html, rrd=rrd)

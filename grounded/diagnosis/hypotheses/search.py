@@ -71,10 +71,11 @@ class HypothesisSearch(FittedHypotheses):
         self.keep(fits)
         return fits
 
-    def finished(self, fits: Sequence[Fitted], iterations: int) -> None:
+    def finished(self, fits: Sequence[Fitted], iterations: int, *, rivals: bool = False) -> None:
         """Goes on with fits of any noise structure, those of one structure together."""
         for structure in dict.fromkeys(fit.noise.structure for fit in fits):
-            self.refined([f for f in fits if f.noise.structure == structure], iterations)
+            of_one = [f for f in fits if f.noise.structure == structure]
+            self.refined(of_one, iterations, rivals=rivals)
 
     # -- without effects ------------------------------------------------------------------------
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -85,6 +85,16 @@ class Data:
         """Time since the trial began at the start of each step, (L, B) [s]."""
         flat = np.concatenate([np.arange(T) * self.dt for T in self.lengths])
         return np.ascontiguousarray(flat[self.step_at].T)
+
+    @cached_property
+    def used(self) -> Any:
+        """Trials of which a run is kept, as indices."""
+        return np.unique(self.trial_of)
+
+    @cached_property
+    def in_use(self) -> Data:
+        """The same with the commands of these trials alone."""
+        return replace(self, commands=self.commands[self.used], held=self.held[self.used])
 
     def runs(self, per_step: Array) -> Array:
         """Per-step values on whole trials (S, T_max, m) -> by run (L, B, m)."""

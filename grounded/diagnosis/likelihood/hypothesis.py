@@ -116,13 +116,15 @@ class Predictor:
         return self._kept("runs", h, lambda: self.data.runs(self.received(h)))
 
     def received(self, h: Hypothesis) -> Array:
-        """The same on whole trials, (S, T_max, m)."""
+        """The same on whole trials, (S, T_max, m); zeros of those of which no run is kept."""
 
         def found() -> Array:
-            u = self.data.commands
+            data, whole = self.data.in_use, np.zeros_like(self.data.commands)
+            u = data.commands
             for effect, values in self.acting(h):
-                u = transformed(effect, values, u, self.data)
-            return self.data.delayed(u)
+                u = transformed(effect, values, u, data)
+            whole[data.used] = data.delayed(u)
+            return whole
 
         return self._kept("trials", h, found)
 
