@@ -1,18 +1,20 @@
 """Engine: where independent pieces of work run; how many workers there are changes no bit.
 
-One pool for all of it, joblib's. The jobs of a study are processes on this machine, or run on an
+The jobs of a study are joblib's: processes on this machine (extra `studies`), or tasks of an
 existing Dask cluster through Dask's own joblib backend (extra `cluster`). The pieces of one
 computation (`each`: records of a fit, hypotheses of a diagnosis) are many and short and share their
-data: on this machine they are threads, because compiled passes leave Python's lock; on a cluster
-what all of them read is sent once (`SentOnce`).
+data: on this machine they are threads, which need no extra, because compiled passes leave Python's
+lock; on a cluster what all of them read is sent once (`SentOnce`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -54,11 +56,10 @@ class Engine:
         return self.name == "local" and self.jobs == 1
 
     @contextmanager
-    def pool(self, *, threads: bool = False, **settings: Any) -> Iterator[Any]:
+    def pool(self, **settings: Any) -> Iterator[Any]:
         """A `joblib.Parallel` on these workers; the cluster stays, the connection is closed.
 
         Args:
-            threads: on this machine, threads instead of processes.
             settings: of joblib's.
 
         Raises:
@@ -67,8 +68,7 @@ class Engine:
         joblib = needs("joblib", "studies")
         if self.name == "local":
             # One BLAS thread a worker: results don't depend on how many share the machine.
-            backend = {"backend": "loky", "inner_max_num_threads": 1}
-            here = joblib.parallel_config(**({"backend": "threading"} if threads else backend))
+            here = joblib.parallel_config(backend="loky", inner_max_num_threads=1)
             with here, joblib.Parallel(n_jobs=self.jobs, **settings) as pool:
                 yield pool
             return
@@ -100,12 +100,23 @@ def running(engine: Engine | None) -> Iterator[None]:
     if engine is None or engine.alone:
         yield
         return
-    with engine.pool(threads=True, batch_size=1, return_as="generator") as pool:
-        before = _pool.set((pool, _quietly if engine.name == "local" else _steadily))
+    with ExitStack() as stack:
+        if engine.name == "local":
+            threads = stack.enter_context(ThreadPoolExecutor(engine.jobs))
+            call: Callable[..., Iterable[Any]] = partial(threads.map, _quietly)
+        else:
+            pool = stack.enter_context(engine.pool(batch_size=1, return_as="generator"))
+            call = partial(_sent, pool)
+        before = _pool.set(call)
         try:
             yield
         finally:
             _pool.reset(before)
+
+
+def _sent(pool: Any, functions: Iterable[Any], *columns: Iterable[Any]) -> Iterable[Any]:
+    """What a cluster makes of each row."""
+    return pool((_steadily, row, {}) for row in zip(functions, *columns, strict=True))  # type: ignore[no-any-return]
 
 
 def each(
@@ -118,12 +129,11 @@ def each(
         columns: its arguments, of one length each.
         done: called as pieces end, in their order.
     """
-    rows, results = list(zip(*columns, strict=True)), []
-    if _pool.get() is None or len(rows) < 2:
-        found: Iterable[T] = (function(*row) for row in rows)
+    results, many, call = list[T](), len(columns[0]), _pool.get()
+    if call is None or many < 2:
+        found: Iterable[T] = map(function, *columns)
     else:
-        pool, call = _pool.get()
-        found = pool((call, (function, *row), {}) for row in rows)
+        found = call([function] * many, *columns)
     for result in found:
         results.append(result)
         if done is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -33,6 +34,7 @@ def command(name: str, folder: str | None, json_: bool) -> None:
     `grounded init --list` lists the examples. The optimum is found afterwards with the TRUE model,
     which the search never sees.
     """
+    from grounded.engine import Engine
     from grounded_trials import Workspace
     from grounded_trials.report.reporting import save_optimum
     from grounded_trials.report.three_lines import three_lines
@@ -50,7 +52,7 @@ def command(name: str, folder: str | None, json_: bool) -> None:
         best = optimum(workspace)
     save_optimum(workspace, best)
     with progress("diagnosing the gap"):
-        diagnosed = workspace.diagnose(_few(workspace, status))
+        diagnosed = workspace.diagnose(_few(workspace, status), engine=Engine(os.cpu_count() or 1))
     with progress("writing the report"):
         html, rrd = (find_spec(name) is not None for name in ("jinja2", "rerun"))
         report = workspace.report(html=html, rrd=rrd)

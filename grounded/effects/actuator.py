@@ -178,6 +178,16 @@ def _advance_lag(u: Any, z: tuple[Any, ...], c: Any, dt: Any) -> tuple[Any, tupl
     return u + behind * (1 - e) * tau / dt, (u + behind * e,)
 
 
+def _along_lag(u: Any, z: Any, c: Any, dt: float) -> Any:
+    """1 / (1 - e B) = (1 + e B) (1 + e^2 B^2) (1 + e^4 B^4) ..., B a step back."""
+    e, back = float(np.exp(-dt / max(c["tau"], 1e-6))), 1
+    path = np.concatenate([z[:, None], (1 - e) * u[:, :-1]], axis=1)
+    while back < u.shape[1] and e > 1e-18:
+        path[:, back:] += e * path[:, :-back]
+        e, back = e * e, 2 * back
+    return path
+
+
 def _advance_rate(u: Any, z: tuple[Any, ...], c: Any, dt: Any) -> tuple[Any, tuple[Any, ...]]:
     most = np.maximum(c["r"] * dt, 1e-12)
     missing = u - z[0]
@@ -186,10 +196,32 @@ def _advance_rate(u: Any, z: tuple[Any, ...], c: Any, dt: Any) -> tuple[Any, tup
     return z[0] + moved * (1 - 0.5 * reached), (z[0] + moved,)
 
 
+def _along_rate(u: Any, z: Any, c: Any, dt: float) -> Any:
+    most, path = max(c["r"] * dt, 1e-12), np.empty(u.shape[::-1])
+    for now, command in zip(path, u.T, strict=True):
+        now[:] = z
+        z = now + np.minimum(np.maximum(command - now, -most), most)
+    return path.T
+
+
 def _advance_backlash(u: Any, z: tuple[Any, ...], c: Any, dt: Any) -> tuple[Any, tuple[Any, ...]]:
     half = 0.5 * c["b"]
     held = np.minimum(np.maximum(z[0], u - half), u + half)
     return held, (held,)
+
+
+def _along_backlash(u: Any, z: Any, c: Any, dt: float) -> Any:
+    """One clip after another is a clip: of twice as many steps each time."""
+    half, back = 0.5 * c["b"], 1
+    low, high = (u[:, :-1] + side for side in (-half, half))
+    while back < low.shape[1]:
+        within = low[:, back:].copy(), high[:, back:].copy()
+        low[:, back:], high[:, back:] = (
+            np.minimum(np.maximum(end[:, :-back], within[0]), within[1]) for end in (low, high)
+        )
+        back *= 2
+    held = np.minimum(np.maximum(z[:, None], low), high)
+    return np.concatenate([z[:, None], held], axis=1)
 
 
 delay = MemoryFamily(
@@ -212,6 +244,7 @@ first_order_lag = MemoryFamily(
     quantities=_lag,
     lookalikes=("delay", "rate_limit", "slew_limit", "parameter"),
     advance=_advance_lag,
+    along=_along_lag,
 )
 
 rate_limit = MemoryFamily(
@@ -222,6 +255,7 @@ rate_limit = MemoryFamily(
     quantities=lambda site: speed_limit(site, f"{site.unit(site.target)}/s"),
     lookalikes=("slew_limit", "first_order_lag", "delay", "saturation"),
     advance=_advance_rate,
+    along=_along_rate,
 )
 
 backlash = MemoryFamily(
@@ -232,6 +266,7 @@ backlash = MemoryFamily(
     quantities=_backlash,
     lookalikes=("dead_zone", "delay", "first_order_lag"),
     advance=_advance_backlash,
+    along=_along_backlash,
 )
 
 FAMILIES = (

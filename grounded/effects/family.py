@@ -192,7 +192,8 @@ class MemoryFamily(Family):
     """advance(u, z, c, dt) -> (mean input over the step, next memory); z has `depth` entries.
 
     `depth(values, dt)`: how many memory states the effect needs, all starting at the input that
-    was held before t = 0. `transport`: a pure delay, which acts after all others.
+    was held before t = 0. `transport`: a pure delay, which acts after all others. `along(u, z, c,
+    dt)`: where `depth` is one, z before each step of the commands u (S, T) that begin at z (S,).
     """
 
     advance: Callable[[Any, tuple[Any, ...], Any, Any], tuple[Any, tuple[Any, ...]]] = (
@@ -200,6 +201,7 @@ class MemoryFamily(Family):
     )
     depth: Callable[[Mapping[str, float], float], int] = lambda values, dt: 1
     transport: bool = False
+    along: Callable[[Any, Any, Mapping[str, float], float], Any] = lambda u, z, c, dt: z[:, None]
 
 
 @dataclass(frozen=True)

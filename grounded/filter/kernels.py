@@ -9,6 +9,7 @@ as the text stays short.
 from __future__ import annotations
 
 import hashlib
+import threading
 from collections.abc import Iterator, Mapping
 from functools import cache
 from pathlib import Path
@@ -23,6 +24,7 @@ from grounded.compile.run import jit
 LARGEST = 16  # channels; beyond, NumPy
 WIDEST = 48  # states
 UNROLLED = 12  # entries of a row
+_LOCK = threading.Lock()
 INTEGERS = ("L", "B", "blocks")
 NAMES = {
     "gains": ("A", "Q", "R", "seen", "start", "G", "H", "L", "B", "k", "weight", "P"),
@@ -74,8 +76,14 @@ def run(
         call(_library(*sizes, through, general)[name], NAMES[name], words)
 
 
-@cache
 def _library(n: int, N: int, through: bool, general: bool) -> jit.Library:
+    """Made once, whatever thread asks first: of two, one would be freed while its code runs."""
+    with _LOCK:
+        return _made(n, N, through, general)
+
+
+@cache
+def _made(n: int, N: int, through: bool, general: bool) -> jit.Library:
     lanes, columns = jit.lanes(), columns_together(n)
 
     def text() -> str:

@@ -394,7 +394,6 @@ def test_a_probe_tells_two_explanations_apart():
     assert (best.policy.feedforward <= 1).all()
     alone = probe(task, base, replace(found, indistinguishable=()), trials)
     assert alone is not None and alone.expected > 0 and len(alone.about) == 1
-    assert "standard deviation" in alone.sentence
     assert (np.abs(alone.policy.feedforward) <= 1).all()
     none = replace(found, verdict=replace(found.verdict, effects=()), parameters={})
     assert probe(task, base, replace(none, indistinguishable=()), trials) is None

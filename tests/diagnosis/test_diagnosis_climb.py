@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from grounded.diagnosis.diagnose import diagnose
-from grounded.diagnosis.likelihood.refine import _bounded
+from grounded.diagnosis.likelihood.step import _bounded
 from grounded.effects import Library
 from grounded.experiments.pendulum import FRICTION, HEAVIER, pendulum_task
 from grounded.experiments.pendulum import model as real_pendulum

@@ -20,11 +20,12 @@ STEPS = 450  # three runs of 150 steps
 
 @pytest.fixture
 def known(monkeypatch):
-    """A predictor of four trials without noise, of 12 runs 0 1 3 5 7 9 11 are kept; its fit."""
+    """A predictor of four trials without noise, of whose 12 runs 7 are kept; its fit."""
     model, _ = cart(trials=1)
     found = []
     for k in range(4):
         u = np.sin((1 + 0.2 * (k % 2)) * np.arange(STEPS) * DT)[:, None]  # 0 and 2, 1 and 3 repeat
+        u = u * np.linspace(1, 2, STEPS)[:, None]  # so that more happens later
         x = [np.zeros(2)]
         for a in u:
             x.append(model.system.step(x[-1][None], a[None], model.values, DT)[0])
@@ -32,7 +33,8 @@ def known(monkeypatch):
         found.append(Trial(np.array(x), u, DT, *names, start_inputs=np.zeros(1)))
     monkeypatch.setattr(diagnosis_data, "MOST_NUMBERS", 7.5 * 150 * model.n**2 * 4)
     predictor = Predictor(prepare(model, found))
-    assert predictor.data.trial_of.tolist() == [0, 0, 1, 1, 2, 3, 3]
+    assert predictor.data.time[0, :].tolist().count(0.0) == 3  # the beginnings of 0, 1 and 3
+    assert len(predictor.data.valid) == 7
     return predictor, SimpleNamespace(hypothesis=Hypothesis(), track=predictor.data.y), found
 
 
@@ -83,3 +85,22 @@ def test_a_trial_that_holds_most_is_left_out_piece_by_piece(known):
     one = folds(data)
     assert len(set(one[data.trial_of == 0])) == (data.trial_of == 0).sum()
     assert set(one[data.trial_of == 1]) == {1}
+
+
+def test_of_long_data_the_runs_are_kept_in_which_most_happens(monkeypatch):
+    model, _ = cart(trials=1)
+    monkeypatch.setattr(diagnosis_data, "MOST_NUMBERS", 6.5 * 200 * model.n**2 * 4)
+    busy = {3, 7, 11, 15, 19}  # of twenty runs of 200 steps, of four trials
+    found = []
+    for k in range(4):
+        u = np.zeros((1000, 1))
+        for run in range(5):
+            if 5 * k + run in busy:
+                u[200 * run : 200 * run + 200, 0] = np.sin(np.arange(200) * DT)
+        x = np.vstack([np.zeros((1, 2)), np.cumsum(np.hstack([u, u]), axis=0)])
+        found.append(Trial(x, u, DT, model.state_names, model.input_names))
+    data = prepare(model, found)
+    number = 5 * data.trial_of + np.rint(data.time[0] / (200 * DT)).astype(int)
+    assert data.skipped == 14
+    beginnings, busiest = {0, 5, 15}, {3, 11, 19}  # the busiest of each group of neighbours
+    assert set(number.tolist()) == beginnings | busiest

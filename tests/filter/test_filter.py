@@ -1,5 +1,7 @@
 """The filter's likelihood has the slopes that the smoother says, compiled or not."""
 
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -236,3 +238,23 @@ def test_nats_of_correlated_innovations_are_worth_as_many_as_are_news():
     assert tempering(3 * white, seen).factor == pytest.approx(1 / 9, rel=0.1)
     seen[: T // 2, :, 0] = 0.0
     assert tempering(np.where(seen > 0, coloured_, 99.0), seen).factor < 0.2
+
+
+def test_threads_that_ask_at_once_get_one_library(monkeypatch):
+    """Of two, one would be freed while its code runs."""
+    made = []
+
+    def slowly(key, write, names):
+        time.sleep(0.05)
+        made.append(key)
+        return object()
+
+    monkeypatch.setattr(kernels.jit, "library", slowly)
+    kernels._made.cache_clear()
+    try:
+        with ThreadPoolExecutor(4) as pool:
+            found = list(pool.map(lambda _: kernels._library(3, 5, False, False), range(4)))
+    finally:
+        kernels._made.cache_clear()
+    assert len(made) == 1
+    assert all(one is found[0] for one in found)

@@ -40,6 +40,7 @@ from grounded.compile.problem import (
 )
 from grounded.compile.run import jit
 from grounded.compile.run.arguments import (
+    address,
     call,
     empty,
     packed,
@@ -47,6 +48,7 @@ from grounded.compile.run.arguments import (
     run,
     side_by_side,
     table,
+    word,
     zeros,
 )
 from grounded.compile.run.traced import TracedSystem
@@ -167,8 +169,10 @@ class CompiledSystem(TracedSystem):
         x, u, p, dt, eps = point
         if len(x) == 0:
             return
-        words = dict.fromkeys(BATCH, 0) | {"x": plain(x), "u": plain(u), "p": plain(p)}
-        call(kernel, BATCH, words | {"dt": float(dt), "eps": float(eps), "N": len(x)} | out)
+        kept = {"x": plain(x), "u": plain(u), "p": plain(p), **out}
+        at = {name: address(array) for name, array in kept.items()}
+        at |= {"dt": word(float(dt)), "eps": word(float(eps)), "N": len(x)}
+        run(kernel, (ctypes.c_int64 * len(BATCH))(*[at.get(name, 0) for name in BATCH]))
 
     def rollout(
         self,

@@ -98,7 +98,8 @@ def _explore(search: HypothesisSearch) -> Fitted:
     singles = search.of_size(1)
     if not singles:
         return null
-    search.finished(singles[:SHORTLIST], 8)  # a large effect has a long way from its first look
+    # a large effect has a long way from its first look
+    search.finished(singles[:SHORTLIST], 8, rivals=True)
     search.again(search.of_size(1)[: RESTARTED if search.data.model.n <= LARGE else 2])
     search.beside_parameters()
     best = search.of_size(1)[0]

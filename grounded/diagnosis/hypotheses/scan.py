@@ -39,6 +39,7 @@ from grounded.effects import (
     SensorFamily,
     SensorLagFamily,
 )
+from grounded.engine import SentOnce, each
 from grounded.filter import kalman
 from grounded.frozen import Array
 
@@ -66,6 +67,7 @@ class _Column:
     r: Array  # (L + 1, B, n) or empty
 
 
+_Point = tuple[int, int, Effect, dict[str, float]]  # candidate, grid point, effect, its values
 # by candidate and grid point: of each column its name and its products with residual, base, mates
 _Results = dict[tuple[int, int], list[tuple[str, float, Array, Array]]]
 
@@ -74,21 +76,33 @@ def scan_candidates(predictor: Predictor, fit: Fitted, candidates: Sequence[Effe
     """Every candidate beside what `fit` already holds; same order as the candidates."""
     context = _Context(predictor, fit)
     results: _Results = {}
-    pending: list[_Column] = []
     size = max(8, min(BLOCK, int(MOST_NUMBERS / fit.white.size)))
+    blocks: list[list[_Point]] = [[]]
+    held = 0
     for i, effect in enumerate(candidates):
+        together = max(1, sum(not q.grid for q in effect.free))
         for point, grid in enumerate(grid_points(effect)):
-            together = context.columns(i, point, effect, grid)
-            if pending and len(pending) + len(together) > size:
-                context.filter(pending, results)
-                pending = []
-            pending += together
-    if pending:
-        context.filter(pending, results)
+            if held + together > size and blocks[-1]:
+                blocks.append([])
+                held = 0
+            blocks[-1].append((i, point, effect, grid))
+            held += together
+
+    for found in each(_looked, [context] * len(blocks), blocks):
+        results |= found
     return [context.best(i, effect, results) for i, effect in enumerate(candidates)]
 
 
-class _Context:
+def _looked(context: _Context, block: Sequence[_Point]) -> _Results:
+    """The products of a block of columns; all those of a grid point lie in one block."""
+    results: _Results = {}
+    columns = [column for point in block for column in context.columns(*point)]
+    if columns:
+        context.filter(columns, results)
+    return results
+
+
+class _Context(SentOnce):
     """What all candidates share: the fit's track, Jacobian and gains."""
 
     def __init__(self, predictor: Predictor, fit: Fitted) -> None:

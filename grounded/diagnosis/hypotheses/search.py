@@ -53,18 +53,29 @@ class HypothesisSearch(FittedHypotheses):
         self.most = SHORTLIST // 2 if large else SHORTLIST
         self.beside = BESIDE // 2 if large else BESIDE
 
-    def refined(self, starts: Sequence[Fitted | tuple], iterations: int = 6) -> list[Fitted]:  # type: ignore[type-arg]
-        """Refines, remembers, returns."""
+    def refined(
+        self,
+        starts: Sequence[Fitted | tuple],  # type: ignore[type-arg]
+        iterations: int = 6,
+        *,
+        rivals: bool = False,
+    ) -> list[Fitted]:
+        """Refines, remembers, returns; of rivals the worse half only part of the way."""
         fits = refine(
-            self.predictor, starts, iterations=iterations, tick=lambda: self.tick("refine")
+            self.predictor,
+            starts,
+            iterations=iterations,
+            tick=lambda: self.tick("refine"),
+            worth=self.score if rivals else None,
         )
         self.keep(fits)
         return fits
 
-    def finished(self, fits: Sequence[Fitted], iterations: int) -> None:
+    def finished(self, fits: Sequence[Fitted], iterations: int, *, rivals: bool = False) -> None:
         """Goes on with fits of any noise structure, those of one structure together."""
         for structure in dict.fromkeys(fit.noise.structure for fit in fits):
-            self.refined([f for f in fits if f.noise.structure == structure], iterations)
+            of_one = [f for f in fits if f.noise.structure == structure]
+            self.refined(of_one, iterations, rivals=rivals)
 
     # -- without effects ------------------------------------------------------------------------
 
@@ -219,7 +230,7 @@ class HypothesisSearch(FittedHypotheses):
                 (h.plus(look.effect, values), fit.noise, fit.track)
                 for values in (look.values, *look.others)
             ]
-        return self.refined(starts, iterations)[1:]
+        return self.refined(starts, iterations, rivals=True)[1:]
 
     def without(self, fit: Fitted, name: str) -> Fitted:
         """The fit with one effect taken out, its noise and track kept: where rivals are sought."""

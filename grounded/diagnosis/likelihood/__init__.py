@@ -7,6 +7,7 @@ Read from the data upwards (the Kalman filter itself is `grounded.filter`):
     delays        a sensor that shows an earlier state
     noise         the noise, estimated beside everything else
     linearise     a hypothesis to first order: the columns that are filtered
+    step          the step that is proposed at the best point
     refine        many hypotheses up their likelihood at once
     fitted        where each ended
 """

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -26,7 +26,8 @@ from grounded.trial import Trial
 
 LONGEST_RUN = 200  # steps
 PIECES, SHORTEST_PIECE = 5, 50  # one log alone is held out by pieces; steps of a piece at least
-MOST_NUMBERS = 1.8e6  # of one (L, B, N, N) array: above it, evenly spaced runs are used
+MOST_NUMBERS = 1.2e6  # of one (L, B, N, N) array: above it, the most informative runs are used
+BEGINNINGS = 8  # runs among them at most that are kept because a trial begins with them
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +85,16 @@ class Data:
         """Time since the trial began at the start of each step, (L, B) [s]."""
         flat = np.concatenate([np.arange(T) * self.dt for T in self.lengths])
         return np.ascontiguousarray(flat[self.step_at].T)
+
+    @cached_property
+    def used(self) -> Any:
+        """Trials of which a run is kept, as indices."""
+        return np.unique(self.trial_of)
+
+    @cached_property
+    def in_use(self) -> Data:
+        """The same with the commands of these trials alone."""
+        return replace(self, commands=self.commands[self.used], held=self.held[self.used])
 
     def runs(self, per_step: Array) -> Array:
         """Per-step values on whole trials (S, T_max, m) -> by run (L, B, m)."""
@@ -149,7 +160,9 @@ def prepare(
     states = np.concatenate([trial.states[: T + 1] for trial, T in used])
     steps = np.concatenate([trial.inputs[:T] for trial, T in used])
     state_at, step_at, valid, trial_of = _cut(lengths)
-    keep = _spread(len(step_at), step_at.shape[1] * model.n**2 * 4)
+    most = max(1, int(MOST_NUMBERS / (step_at.shape[1] * model.n**2 * 4)))
+    begins = np.flatnonzero(np.diff(trial_of, prepend=-1))
+    keep = _informative([_filled(states)[state_at], steps[step_at]], begins, most)
     return Data(
         model=model,
         dt=dt,
@@ -208,10 +221,23 @@ def _cut(lengths: Any) -> tuple[Any, Any, Array, Any]:
     return state_at, step_at, valid, np.array([i for i, *_ in pieces])
 
 
-def _spread(count: int, numbers: float) -> Any:
-    """Evenly spaced runs, as many as fit in memory."""
-    most = max(1, int(MOST_NUMBERS / numbers))
-    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(int))
+def _informative(signals: Sequence[Array], begins: Any, most: int) -> Any:
+    """Which runs to keep: of groups of neighbours the one in which signals (B, any, k) vary most.
+
+    Every signal counts by its variance within the run, in units of its variance over all: what
+    stands still tells of nothing. Groups, so that all trials and all of their time have a say. Some
+    are runs that a trial begins with, `begins`: whole trials are predicted from there.
+    """
+    count = len(signals[0])
+    if count <= most:
+        return np.arange(count)
+    some = np.linspace(0, len(begins) - 1, min(len(begins), BEGINNINGS, max(1, most // 2)))
+    first = begins[some.astype(int)]
+    parts = [x.var(axis=1) / np.maximum(x.var(axis=(0, 1)), 1e-300) for x in signals]
+    moves = np.concatenate(parts, axis=1).mean(axis=1)
+    others, left = np.setdiff1d(np.arange(count), first), most - len(first)
+    groups = np.array_split(others, left) if left else []
+    return np.sort([*first, *(group[np.argmax(moves[group])] for group in groups)])
 
 
 def _filled(states: Array) -> Array:

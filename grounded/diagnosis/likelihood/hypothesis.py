@@ -117,18 +117,20 @@ class Predictor(SentOnce):
         return self._kept("runs", h, lambda: self.data.runs(self.received(h)))
 
     def received(self, h: Hypothesis) -> Array:
-        """The same on whole trials, (S, T_max, m)."""
+        """The same on whole trials, (S, T_max, m); zeros of those of which no run is kept."""
 
         def found() -> Array:
-            u = self.data.commands
+            data, whole = self.data.in_use, np.zeros_like(self.data.commands)
+            u = data.commands
             for effect, values in self.acting(h):
-                u = transformed(effect, values, u, self.data)
-            return self.data.delayed(u)
+                u = transformed(effect, values, u, data)
+            whole[data.used] = data.delayed(u)
+            return whole
 
         return self._kept("trials", h, found)
 
     def _kept(self, what: str, h: Hypothesis, make: Callable[[], Array]) -> Array:
-        """Made once for the same values: a memory steps through time in Python."""
+        """Made once for the same values."""
         acting = self.acting(h)
         key = (what, *((e.name, tuple(sorted(v.items()))) for e, v in acting))
         if (found := self._inputs.get(key)) is None:
@@ -193,6 +195,13 @@ class Predictor(SentOnce):
                 found.append(rate[..., i] + self.added_rate(rates, s, u, when, own)[..., i])
             result[..., j] = x[..., j] + found[1] - found[0]
         return result
+
+    def stepper(self, h: Hypothesis) -> Callable[[Array, Array, Array], Array]:
+        """`advance` of many steps one after the other: from x (M, n) with u (M, m) at t (M,)."""
+        if rates_of(h) or limits_of(h) or losses_of(h):
+            return lambda x, u, t: self.advance(h, x, u, t)
+        step, p, dt = self.data.model.system.step, self.params(h), self.data.dt
+        return lambda x, u, t: step(x, u, p, dt)
 
     def moved(self, h: Hypothesis, x: Array, u: Array, dt: float | None = None) -> Array:
         """The model's step with what its motion takes off the inputs, without further rates."""
@@ -374,7 +383,6 @@ def transformed(effect: Effect, values: Mapping[str, float], u: Array, data: Dat
             if family.name == "delay":  # the same as its queue, at once
                 out[:, :, j] = shifted(u[:, :, j], data.held[:, j], values["d"] / data.dt)
                 continue
-            z = tuple([data.held[:, j]] * family.depth(values, data.dt))
-            for k in range(u.shape[1]):
-                out[:, k, j], z = family.advance(u[:, k, j], z, values, data.dt)
+            before = family.along(u[:, :, j], data.held[:, j], values, data.dt)
+            out[:, :, j], _ = family.advance(u[:, :, j], (before,), values, data.dt)
     return out

@@ -70,6 +70,11 @@ class NoiseModel:
     weight_w: Array | float = 1.0
     weight_v: Array | float = 1.0
 
+    @property
+    def logs(self) -> tuple[Array, Array, Array]:
+        """All log variances, the coloured part's last."""
+        return self.log_q, self.log_r, self.log_c
+
     def process(self, dt: float) -> Array:
         """Q for the filter: (L, B, N) or (N,)."""
         q = np.asarray(np.exp(self.log_q) / self.weight_w)
@@ -168,7 +173,7 @@ def climbed(noise: NoiseModel, slope: Array, info: Array, count: int) -> NoiseMo
         info: (K, K) of all log variances.
         count: time steps in all.
     """
-    logs = np.stack([noise.log_q, noise.log_r, noise.log_c][: len(slope)])
+    logs = np.stack(noise.logs[: len(slope)])
     free = ((logs > noise.floor) | (slope > 0)).reshape(-1)
     size, axes = np.linalg.eigh(info[np.ix_(free, free)])
     along = axes.T @ slope.reshape(-1)[free] / np.maximum(size, 2e-5 * count)

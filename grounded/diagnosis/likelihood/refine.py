@@ -30,7 +30,6 @@ from grounded.diagnosis.likelihood.linearise import (
     gains_of,
     linearise,
     smoothed,
-    step_sizes,
 )
 from grounded.diagnosis.likelihood.noise import (
     NoiseModel,
@@ -40,6 +39,7 @@ from grounded.diagnosis.likelihood.noise import (
     likelihood_slopes,
     working,
 )
+from grounded.diagnosis.likelihood.step import ProposedStep, inside, proposed
 from grounded.effects import SensorDelayFamily
 from grounded.engine import each
 from grounded.filter import kalman
@@ -49,15 +49,9 @@ from grounded.frozen import Array
 
 MOST_NUMBERS = 1e5  # of one (L, B, N, N) array: what fits in the cache goes fastest
 SHORTEST = 0.05  # part of a step that is still tried
-
-
-@dataclass(eq=False)
-class ProposedStep:
-    """A step proposed at the best point: of values, shifts, track; the noise it leads to."""
-
-    delta: Array  # (C,) of the values, then of the shifts in units of param_scale
-    track: Array
-    noise: NoiseModel
+HALVED = 4  # iterations after which only the better half of rivals goes on
+CLOSE = 10.0  # nats behind the best within which all go on
+LITTLE = 0.05  # nats that a step must promise to be tried in part where it fails
 
 
 @dataclass(eq=False)
@@ -79,7 +73,7 @@ class Work:
             self.moving = False
         else:
             self.part *= 0.4
-        if self.best is None or self.part < SHORTEST:
+        if self.step is None or self.part < SHORTEST or self.step.promise < LITTLE:
             self.still = True
         else:
             self.go(data)
@@ -91,86 +85,9 @@ class Work:
         best, step, part = self.best, self.step, self.part
         self.h = moved(data, best.hypothesis, part * step.delta)
         if len(step.delta) > len(self.h.theta) and self.h.shift is not None:
-            self.h = replace(self.h, shift=_inside(data, self.h.shift))
+            self.h = replace(self.h, shift=inside(data, self.h.shift))
         self.noise = best.noise.towards(step.noise, part)
         self.track = best.track + step.track if self.moving else best.track
-
-
-def proposed(data: Data, fit: Fitted, filtered: Array, noise: NoiseModel) -> ProposedStep:
-    """Gauss-Newton in values and shifts, scoring in the noise, the filtered track as the track."""
-    h = fit.hypothesis
-    G = fit.gram.sum(axis=0) + np.diag(fit.prior)
-    slope = fit.score.sum(axis=0) + fit.prior_pull(data)
-    k, track, delta = len(h.theta), filtered[..., 0], np.zeros(len(slope))
-    if len(slope):
-        delta = _bounded(G, slope, *_room(data, h, k, len(slope)))
-        delta[:k] = _limited(h, delta[:k])
-        delta[k:] = np.clip(delta[k:], -0.3, 0.3)
-        by = delta != 0
-        track = track + filtered[..., 1:][..., by] @ delta[by]
-    return ProposedStep(delta, track, noise)
-
-
-def _bounded(G: Array, slope: Array, low: Array, high: Array) -> Array:
-    """The Gauss-Newton step -G^-1 slope within low <= step <= high, (K,) each.
-
-    An unknown that would leave its bounds stops there, and the others step as is best with it
-    there: clipped afterwards, they would rely on a move that is not made. One whose slope is no
-    number (a value at which the effect overflows) does not move.
-    """
-    delta, free = np.zeros(len(slope)), np.isfinite(np.diag(G)) & np.isfinite(slope)
-    G, slope = np.where(np.outer(free, free), G, 0.0), np.where(free, slope, 0.0)
-    scale = 1 / np.sqrt(np.maximum(np.diag(G), 1e-300))
-    while free.any():
-        left = slope[free] + G[np.ix_(free, ~free)] @ delta[~free]
-        scaled = G[np.ix_(free, free)] * np.outer(scale[free], scale[free])
-        step = -scale[free] * np.linalg.lstsq(scaled, scale[free] * left, rcond=1e-10)[0]
-        delta[free] = np.clip(step, low[free], high[free])
-        stopped = delta[free] != step
-        if not stopped.any():
-            break
-        free[np.flatnonzero(free)[stopped]] = False
-    return delta
-
-
-def _room(data: Data, h: Hypothesis, k: int, size: int) -> tuple[Array, Array]:
-    """How far each unknown may step down and up: values freely, shifts inside their bounds."""
-    low, high = np.full(size, -np.inf), np.full(size, np.inf)
-    if size > k:
-        which = calibrated(data)
-        shift = np.zeros(data.model.system.k) if h.shift is None else h.shift
-        lowest, highest = _bounds(data)
-        at, unit = data.model.values + shift, np.maximum(param_scale(data.model), 1e-300)
-        low[k:] = np.minimum((lowest - at) / unit, 0.0)[which]
-        high[k:] = np.maximum((highest - at) / unit, 0.0)[which]
-    return low, high
-
-
-def _limited(h: Hypothesis, delta: Array) -> Array:
-    """Scanned values move by at most two grid gaps at once: between grid points anything may be."""
-    limits = [
-        20 * s if q.grid else np.inf
-        for s, q in zip(step_sizes(h), [q for e in h.effects for q in e.free], strict=True)
-    ]
-    return np.clip(delta, -np.array(limits), np.array(limits))
-
-
-def _inside(data: Data, shift: Array) -> Array:
-    """Keeps parameters inside their bounds."""
-    values = data.model.values
-    return np.asarray(np.clip(values + shift, *_bounds(data)) - values)
-
-
-def _bounds(data: Data) -> tuple[Array, Array]:
-    """Bounds of the model's parameters, (k,) each; where none is given the sign stays."""
-    params = data.model.params.values()
-    low = [
-        p.low if p.low is not None else 0.2 * p.value if p.value > 0 else -np.inf for p in params
-    ]
-    high = [
-        p.high if p.high is not None else 0.2 * p.value if p.value < 0 else np.inf for p in params
-    ]
-    return np.array(low), np.array(high)
 
 
 def refine(
@@ -180,6 +97,7 @@ def refine(
     iterations: int = 6,
     tick: Callable[[], None] | None = None,
     fixed_noise: bool = False,
+    worth: Callable[[Fitted], float] | None = None,
 ) -> list[Fitted]:
     """Refines hypotheses that share a noise structure; the result has the same order.
 
@@ -189,6 +107,7 @@ def refine(
         iterations: at most; a hypothesis that stopped rising is left alone.
         tick: called as one or a few of them are done.
         fixed_noise: keep the noise as it is.
+        worth: of rivals, by which the worse half is given up on the way; None: all go on.
     """
     works = [
         Work(s.hypothesis, s.noise, s.track) if isinstance(s, Fitted) else Work(*s) for s in starts
@@ -198,30 +117,60 @@ def refine(
     (L, B), n = predictor.data.time.shape, predictor.data.model.n
     wide = n if works[0].noise.structure.tau is None else 2 * n
     size = max(1, int(MOST_NUMBERS / (L * B * wide * wide)))
+    if worth is not None and iterations > HALVED:
+        works = _after(predictor, works, HALVED, size, fixed_noise, tick)
+        _halve(works, worth)
+        iterations -= HALVED
+    works = _after(predictor, works, iterations, size, fixed_noise, tick)
+    return [work.best for work in works if work.best is not None]
+
+
+def _after(
+    predictor: Predictor,
+    works: list[Work],
+    iterations: int,
+    size: int,
+    fixed_noise: bool,
+    tick: Callable[[], None] | None,
+) -> list[Work]:
+    """The works after some iterations, blocks of at most `size` of one shape side by side."""
     shapes = _of_one_shape(works)
     blocks = [a[at : at + size] for a in shapes for at in range(0, len(a), size)]
     many, some = len(blocks), [[works[i] for i in block] for block in blocks]
     found = each(_climb, [predictor] * many, some, [(iterations, fixed_noise)] * many, done=tick)
-    fits: dict[int, Fitted | None] = {}
+    after = list(works)
     for block, part in zip(blocks, found, strict=True):
-        fits.update(zip(block, part, strict=True))
-    return [fit for _, fit in sorted(fits.items()) if fit is not None]
+        for i, work in zip(block, part, strict=True):
+            after[i] = work
+    return after
 
 
-def _climb(predictor: Predictor, works: list[Work], how: tuple[int, bool]) -> list[Fitted | None]:
+def _climb(predictor: Predictor, works: list[Work], how: tuple[int, bool]) -> list[Work]:
     """Refines hypotheses of one shape, side by side."""
     iterations, fixed_noise = how
     works = [replace(work) for work in works]
     for _ in range(iterations):
         if moving := [work for work in works if not work.still]:
             _iterate(predictor, moving, fixed_noise)
-    return [work.best for work in works]
+    return works
+
+
+def _halve(works: list[Work], worth: Callable[[Fitted], float]) -> None:
+    """The worse half stays where it is: who is that far behind by now does not overtake."""
+    value = {id(work): worth(work.best) for work in works if work.best is not None}
+    ranked = sorted(value.values(), reverse=True)
+    for work in works:
+        mine = value.get(id(work), -np.inf)
+        if mine < ranked[len(ranked) // 2] and mine < ranked[0] - CLOSE:
+            work.still = True
 
 
 def _of_one_shape(works: list[Work]) -> list[list[int]]:
-    """Indices of works whose filters have states of one size: as many sensors are delayed."""
+    """Indices of works that go on, by the size of their filters' states: so many late sensors."""
     groups: dict[int, list[int]] = {}
     for i, work in enumerate(works):
+        if work.still:
+            continue
         count = sum(isinstance(e.family, SensorDelayFamily) for e in work.h.effects)
         groups.setdefault(count, []).append(i)
     return [groups[count] for count in sorted(groups)]
@@ -253,7 +202,7 @@ def _iterate(predictor: Predictor, works: list[Work], fixed_noise: bool) -> None
     started = smoothed(data, g, np.concatenate([part[0] for part in parts], axis=1), white[..., 0])
     if started is not None:
         filtered[0, ..., 0] += started
-    steps = [work.noise for work in works]
+    steps = [(work.noise, 0.0) for work in works]
     if not fixed_noise:
         steps = _climbed(data, works, late, systems, g, white[..., 0])
     for i, work in enumerate(works):
@@ -280,8 +229,8 @@ def _climbed(
     systems: list[tuple[LinearSystem, Delayed | None]],
     g: kalman.Gains,
     white: Array,
-) -> list[NoiseModel]:
-    """Each work's noise after one step up the likelihood."""
+) -> list[tuple[NoiseModel, float]]:
+    """Each work's noise after one step up the likelihood, and what it promises [nats]."""
     B, width = data.time.shape[1], data.model.n
     adjoints = kalman.smoother(g, white).parts(B)
     columns_each = []
@@ -297,7 +246,9 @@ def _climbed(
         info = average(columns[:, i * B : (i + 1) * B, :, :K])
         in_log = adjoint if delays is None else delays.restored(adjoint)
         slope = likelihood_slopes(work.noise, in_log, data.dt)
-        found.append(climbed(work.noise, slope, info, int(data.valid.sum())))
+        noise = climbed(work.noise, slope, info, int(data.valid.sum()))
+        pairs = zip(slope, noise.logs, work.noise.logs, strict=False)
+        found.append((noise, 0.5 * sum(float(s @ (a - b)) for s, a, b in pairs)))
     return found
 
 
@@ -341,7 +292,7 @@ def _update(
     white: Array,
     logdet: Array,
     filtered: Array,
-    climbed: NoiseModel,
+    climbed: tuple[NoiseModel, float],
     before: float,
 ) -> None:
     """Scores the point where the work stands, keeps it if it is the best, and moves on."""
@@ -356,7 +307,7 @@ def _update(
     work.moving = work.moving or rise > 1.0
     work.part = min(1.0, 2 * work.part)
     work.best = fit
-    work.step = proposed(data, fit, filtered, climbed)
+    work.step = proposed(data, fit, filtered, *climbed)
     work.go(data)
 
 

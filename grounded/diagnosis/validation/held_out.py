@@ -129,12 +129,10 @@ def _again(predictor: Predictor, h: Hypothesis, trial: Trial, start: Array, i: i
     """The trial as a hypothesis predicts it, from its start, with its commands."""
     data = predictor.data
     received = predictor.received(h)[i]
-    x = start[None]
-    path = [x]
+    advance, path = predictor.stepper(h), [start[None]]
     for t in range(trial.steps):
-        x = predictor.advance(h, x, received[t][None], np.array([t * data.dt]))
-        x = np.clip(x, -FAR, FAR)
-        path.append(x)
+        x = advance(path[-1], received[t][None], np.array([t * data.dt]))
+        path.append(np.minimum(np.maximum(x, -FAR), FAR))
     states = np.stack(path)
     logged = states + predictor.offset(h, states)
     return replace(trial, states=logged[:, 0])

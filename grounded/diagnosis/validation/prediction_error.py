@@ -97,10 +97,10 @@ def errors(predictor: Predictor, h: Hypothesis, track: Array, where: Horizon) ->
     delays = delays_of(h, data)
     oldest = 0 if delays is None else max(delays.whole) + 1  # what delayed sensors may still show
     path = [track[np.maximum(where.at - j, 0), where.run] for j in range(oldest, -1, -1)]
+    advance = predictor.stepper(h)
     for j in range(where.steps):
         index = (where.at + j, where.run)
-        x = predictor.advance(h, x, u[index], t[index])
-        x = np.clip(x, -1e6, 1e6)
+        x = np.clip(advance(x, u[index], t[index]), -1e6, 1e6)
         path.append(x)
     offset = predictor.offset(h, np.stack(path))
     last = x if isinstance(offset, float) else x + offset[-1]

@@ -34,6 +34,8 @@ from grounded.trial import Trial
 SECONDS = (0.1, 0.5, 1.0)
 MOST_STARTS = 400
 MOST_WHOLE = 8  # trials that are predicted from beginning to end
+WHOLE_STEPS = 4000  # of them together, where that leaves LEAST_WHOLE
+LEAST_WHOLE = 3
 FINE = 2e-3  # of a channel's spread: errors below it do not matter
 SLIGHT = 1e-2  # nor below this part of the crude model's, or of the spread where that is less
 FAR = 1e6  # a state beyond it has diverged
@@ -42,12 +44,17 @@ ALIKE = 0.02  # of a command's spread: how much commands of repeats may differ, 
 
 
 MOST_LEFT_OUT = 1 / 3  # of all steps: without more, the rest would have to extrapolate
+MOST_FOLDS = 20
 
 
 def folds(data: Data) -> Any:
-    """What each run is held out with, (B,): its trial; of one that holds most, piece by piece."""
+    """What each run is held out with, (B,): its trial; of one that holds most, piece by piece.
+
+    Of very many trials several together: the rest tells as much without them.
+    """
     share = data.lengths[data.trial_of] / data.lengths.sum()
-    return np.where(share > MOST_LEFT_OUT, data.count + np.arange(len(share)), data.trial_of)
+    whole = data.trial_of * min(data.count, MOST_FOLDS) // data.count
+    return np.where(share > MOST_LEFT_OUT, data.count + np.arange(len(share)), whole)
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +119,8 @@ class Ruler:
         """The first runs of the trials that are predicted whole."""
         data = self.data
         first = np.flatnonzero(data.step_at[:, 0] == self.step0[data.trial_of])
-        return first[np.unique(np.linspace(0, len(first) - 1, MOST_WHOLE).astype(int))]
+        most = int(np.clip(WHOLE_STEPS // data.lengths.max(), LEAST_WHOLE, MOST_WHOLE))
+        return first[np.unique(np.linspace(0, len(first) - 1, most).astype(int))]
 
     @cached_property
     def fine(self) -> Array:
@@ -189,14 +197,14 @@ class Ruler:
         received, delays = predictor.received(h), delays_of(h, data)
         oldest = 0 if delays is None else max(delays.whole) + 1  # what sensors may still show
         path = [track[np.maximum(at - j, 0), run] for j in range(oldest, -1, -1)]
-        last = data.lengths[trial]
-        for j in range(steps):
-            t = np.minimum(step + j, last - 1)
-            x = predictor.advance(h, path[-1], received[trial, t], t * data.dt)
+        last, advance = data.lengths[trial], predictor.stepper(h)
+        t = np.minimum(step + np.arange(steps)[:, None], last - 1)
+        for j, (u, now) in enumerate(zip(received[trial, t], t * data.dt, strict=True)):
+            x = advance(path[-1], u, now)
             if added is not None:
                 inside = (at + j < len(added))[:, None]
                 x = x + np.where(inside, added[np.minimum(at + j, len(added) - 1), run], 0.0)
-            path.append(np.clip(np.nan_to_num(x, nan=FAR), -FAR, FAR))
+            path.append(np.fmax(np.fmin(x, FAR), -FAR))  # what is no number is far too
         states = np.stack(path)
         logged = (states + predictor.offset(h, states))[oldest:]
         ahead = step + np.arange(steps + 1)[:, None]

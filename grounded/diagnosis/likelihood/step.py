@@ -1,0 +1,111 @@
+"""The step that is proposed at a hypothesis' best point: its values, shifts, track and noise.
+
+Gauss-Newton within bounds: parameters keep their sign or their user's limits, scanned values move
+by a few grid gaps at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from grounded.diagnosis.likelihood.data import Data
+from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
+from grounded.diagnosis.likelihood.linearise import step_sizes
+from grounded.diagnosis.likelihood.noise import NoiseModel
+from grounded.frozen import Array
+
+
+@dataclass(eq=False)
+class ProposedStep:
+    """A step proposed at the best point: of values, shifts, track; the noise it leads to."""
+
+    delta: Array  # (C,) of the values, then of the shifts in units of param_scale
+    track: Array
+    noise: NoiseModel
+    promise: float  # nats that the quadratic model expects of it
+
+
+def proposed(
+    data: Data, fit: Fitted, filtered: Array, noise: NoiseModel, promise: float
+) -> ProposedStep:
+    """Gauss-Newton in values and shifts, scoring in the noise, the filtered track as the track.
+
+    `promise` is what the noise's part of the step is expected to gain [nats].
+    """
+    h = fit.hypothesis
+    G = fit.gram.sum(axis=0) + np.diag(fit.prior)
+    slope = fit.score.sum(axis=0) + fit.prior_pull(data)
+    k, track, delta = len(h.theta), filtered[..., 0], np.zeros(len(slope))
+    if len(slope):
+        delta = _bounded(G, slope, *_room(data, h, k, len(slope)))
+        delta[:k] = _limited(h, delta[:k])
+        delta[k:] = np.clip(delta[k:], -0.3, 0.3)
+        by = delta != 0
+        track = track + filtered[..., 1:][..., by] @ delta[by]
+    promise -= float(slope @ delta + 0.5 * delta @ G @ delta)
+    return ProposedStep(delta, track, noise, promise)
+
+
+def _bounded(G: Array, slope: Array, low: Array, high: Array) -> Array:
+    """The Gauss-Newton step -G^-1 slope within low <= step <= high, (K,) each.
+
+    An unknown that would leave its bounds stops there, and the others step as is best with it
+    there: clipped afterwards, they would rely on a move that is not made. One whose slope is no
+    number (a value at which the effect overflows) does not move.
+    """
+    delta, free = np.zeros(len(slope)), np.isfinite(np.diag(G)) & np.isfinite(slope)
+    G, slope = np.where(np.outer(free, free), G, 0.0), np.where(free, slope, 0.0)
+    scale = 1 / np.sqrt(np.maximum(np.diag(G), 1e-300))
+    while free.any():
+        left = slope[free] + G[np.ix_(free, ~free)] @ delta[~free]
+        scaled = G[np.ix_(free, free)] * np.outer(scale[free], scale[free])
+        step = -scale[free] * np.linalg.lstsq(scaled, scale[free] * left, rcond=1e-10)[0]
+        delta[free] = np.clip(step, low[free], high[free])
+        stopped = delta[free] != step
+        if not stopped.any():
+            break
+        free[np.flatnonzero(free)[stopped]] = False
+    return delta
+
+
+def _room(data: Data, h: Hypothesis, k: int, size: int) -> tuple[Array, Array]:
+    """How far each unknown may step down and up: values freely, shifts inside their bounds."""
+    low, high = np.full(size, -np.inf), np.full(size, np.inf)
+    if size > k:
+        which = calibrated(data)
+        shift = np.zeros(data.model.system.k) if h.shift is None else h.shift
+        lowest, highest = _bounds(data)
+        at, unit = data.model.values + shift, np.maximum(param_scale(data.model), 1e-300)
+        low[k:] = np.minimum((lowest - at) / unit, 0.0)[which]
+        high[k:] = np.maximum((highest - at) / unit, 0.0)[which]
+    return low, high
+
+
+def _limited(h: Hypothesis, delta: Array) -> Array:
+    """Scanned values move by at most two grid gaps at once: between grid points anything may be."""
+    limits = [
+        20 * s if q.grid else np.inf
+        for s, q in zip(step_sizes(h), [q for e in h.effects for q in e.free], strict=True)
+    ]
+    return np.clip(delta, -np.array(limits), np.array(limits))
+
+
+def inside(data: Data, shift: Array) -> Array:
+    """Keeps parameters inside their bounds."""
+    values = data.model.values
+    return np.asarray(np.clip(values + shift, *_bounds(data)) - values)
+
+
+def _bounds(data: Data) -> tuple[Array, Array]:
+    """Bounds of the model's parameters, (k,) each; where none is given the sign stays."""
+    params = data.model.params.values()
+    low = [
+        p.low if p.low is not None else 0.2 * p.value if p.value > 0 else -np.inf for p in params
+    ]
+    high = [
+        p.high if p.high is not None else 0.2 * p.value if p.value < 0 else np.inf for p in params
+    ]
+    return np.array(low), np.array(high)
