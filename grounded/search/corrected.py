@@ -2,10 +2,10 @@
 
     x_{t+1} = f(x_t, u_t) + bias_t + y_t,      y_t = C_t [dx_t, du_t, du_{t-1}, y_{t-1}]
 
-with dx, du what a run has moved away from the incumbent's trial, along which y is zero: the trial is
-still replayed exactly. y and the input before are memory that no sensor knows, so the state is
-[x, y, u before]; a policy's gains on them are dropped, their part of the feed-forward stays. f stays
-the compiled model; the sweep and the rollouts are NumPy's (`interpreted`).
+with dx, du what a run has moved away from the incumbent's trial, along which y is zero: the trial
+is still replayed exactly. y and the input before are memory that no sensor knows, so the state is
+[x, y, u before]; a policy's gains on them are dropped, their part of the feed-forward stays. f
+stays the compiled model; the sweep and the rollouts are NumPy's (`interpreted`).
 """
 
 from __future__ import annotations

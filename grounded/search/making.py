@@ -17,7 +17,7 @@ from grounded.search.first_policy import first_policy
 from grounded.search.planner import Planner
 from grounded.search.safety import objections, spread
 from grounded.search.standing import SearchOptions, Standing, losers_of, wild
-from grounded.search.step_size import Step
+from grounded.search.step_size import KEPT, Step
 from grounded.solve import ddp
 from grounded.task import Task
 from grounded.trial import mean_trial
@@ -50,23 +50,35 @@ class About:
         exact = ground(plan, own, exact=True, shift=self.grounding.shift)
         self.real = exact.on(plan.problem(exact=True))
         self.theta = planner.widened(incumbent.candidate.policy)
-        already = simulate(self.real, self.theta).utility
+        self.corrected = self._corrected() if options.damps else None
+        if self.corrected is not None:
+            self.real = self.corrected.on(self.real)
+        already = make.predicted(self.real, incumbent.candidate.policy).utility
         self.already = already if np.isfinite(already) else incumbent.utility
         self.least = options.tolerance * abs(self.already)
-        self.corrected: Corrected | None = None
-        if options.damps and np.isfinite(already):
-            self._correct()
 
-    def _correct(self) -> None:
-        """Takes the slopes that other trials have corrected, where these are to be believed."""
+    def _corrected(self) -> Corrected | None:
+        """The model with slopes that other trials have corrected, where it is to be believed.
+
+        Not where the crude slopes are good enough: asked about the step that made the incumbent,
+        the model that replays the incumbent knows what that step has brought.
+        """
+        make, history, own = self.make, self.make.now.history, self.incumbent.candidate
+        lost = losers_of(history, own.id, make.fingerprint)
+        base = next((t for t in history if t.candidate.id == own.base), None)
+        if not lost and (base is None or self._knows(base)):
+            return None
         from grounded.search.mispredictions import SURE, corrected
 
-        make, own = self.make, self.incumbent.candidate.id
-        found = corrected(make.planner, self.incumbent, make.now.history, self.real)
-        lost = losers_of(make.now.history, own, make.fingerprint)
-        if found is not None and (found[1] < SURE or lost):
-            self.corrected = found[0]
-            self.real = self.corrected.on(self.real)
+        found = corrected(make.planner, self.incumbent, history, self.real)
+        return found[0] if found and (found[1] < SURE or lost) else None
+
+    def _knows(self, base: Tried) -> bool:
+        """Whether the model would have told by how much the incumbent is better than its base."""
+        expected = self.make.predicted(self.real, base.candidate.policy).utility
+        real = self.incumbent.utility - base.utility
+        off = abs(self.incumbent.utility - expected - real)
+        return bool(off <= (1 - KEPT) * abs(real))
 
     def candidate(self, policy: Policy, step: Step, way: Way) -> Candidate:
         """A candidate with what this model promises of it."""
@@ -144,7 +156,7 @@ class Maker:
             caution = base.candidate.caution if base and follows else self.now.caution
         if caution and base is not None:
             policy = self._gently(policy, problem, caution)
-        predicted = self._run(problem, policy)
+        predicted = self.predicted(problem, policy)
         return Candidate(
             id=self.identity,
             policy=policy,
@@ -181,7 +193,7 @@ class Maker:
         """The same run with the gains of a regulator whose inputs cost GENTLER ** caution more."""
         if policy.gain is None:
             return policy
-        run = self._run(problem, policy)
+        run = self.predicted(problem, policy)
         factor = GENTLER**caution
         weight = factor * problem.input_weight + (factor - 1) * problem.change_weight
         found = ddp.sweep(replace(problem, input_weight=weight), run.z, run.inputs)
@@ -191,7 +203,7 @@ class Maker:
         gains, about = found.gains.K[:, :, columns], run.z[:-1, columns]
         return self.planner.narrowed(plan.policy(run.inputs, gains, about))
 
-    def _run(self, problem: Problem, policy: Policy) -> Rollout:
+    def predicted(self, problem: Problem, policy: Policy) -> Rollout:
         """A robot's policy in a model that may have more states than it measures."""
         angles = tuple(map(bool, problem.angles))
         return simulate(problem, policy.laid_out(problem.system.states, angles, problem.depths))

@@ -1,8 +1,8 @@
 """What earlier trials say about the SLOPES of the model that replays the incumbent's.
 
-The grounded model is right along the incumbent's trial; its slopes there are the crude model's. Every
-other trial j left that trial by x_j - x and u_j - u, and what the grounded model then mispredicts
-over one step,
+The grounded model is right along the incumbent's trial; its slopes there are the crude model's.
+Every other trial j left that trial by x_j - x and u_j - u, and what the grounded model then
+mispredicts over one step,
 
     y_jt = x_j,t+1 - (f(x_jt, u_jt) + bias_t),        zero for the incumbent itself,
 
@@ -10,9 +10,9 @@ is, to first order, what its slopes lack. One trial gives H such vectors, far mo
 number of its utility. Two laws are fitted to them, each the same at all times of the run, the
 second one to what the first leaves:
 
-    1. y_t = f_u,t D [dx_t, du_t, du_t-1, v_t-1]     what acts where the inputs act: a motor's lag, a
-                                                     gain, a load; v is y in units of the inputs
-    2. y_t = E [dx_t, du_t]                          what acts elsewhere
+    1. y_t = f_u,t D [dx_t, du_t, du_t-1, v_t-1]   what acts where the inputs act: a lag, a gain, a
+                                                   load; v is y in units of the inputs
+    2. y_t = E [dx_t, du_t]                        what acts elsewhere
 
 Each is a ridge regression. Its price, and how much less trials count the farther they are from the
 incumbent, are chosen by leaving out parts of the run in turn (Stone, "Cross-validatory choice and
@@ -49,7 +49,7 @@ DEAD = 1e-4  # of the mean square effect of the inputs: less explains nothing
 
 @dataclass(frozen=True, eq=False)
 class Slopes:
-    """What the slopes lack: for H steps, n states, m inputs, features [x, u, u before, y before]."""
+    """What the slopes lack, by the features [x, u, u before, y before] of n states, m inputs."""
 
     law: Array  # (H, n, 2 n + 2 m)
     missed: float  # share of the nearest trial's mispredictions that the first law leaves
