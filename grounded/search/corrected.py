@@ -13,10 +13,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from grounded.compile import Backward, Problem, Swarm, System
 from grounded.compile.run.interpreted import linearised, rolled_out, sweep
 from grounded.frozen import Array, wrapped
+
+Flags = NDArray[np.bool_]
 
 
 class Corrected(System):
@@ -54,7 +57,7 @@ class Corrected(System):
             bias=padded(problem.bias),
             target=padded(problem.target),
             state_weight=padded(problem.state_weight),
-            angles=padded(problem.angles).astype(bool),
+            angles=np.append(problem.angles, np.zeros(self.n - self.base.n, bool)),
         )
 
     def along(self, z: Array) -> Array:
@@ -118,7 +121,7 @@ class Corrected(System):
 
         return rolled_out(problem, step, ubar, K, zbar, k, alphas)
 
-    def _next(self, moved: Array, x: Array, u: Array, t: int | slice, angles: Array) -> Array:
+    def _next(self, moved: Array, x: Array, u: Array, t: int | slice, angles: Flags) -> Array:
         """[x, y, u before] a step later: base states `moved` (N, n), x (N, 2 n + m), u (N, m)."""
         n = self.base.n
         away = wrapped(x[:, :n] - self.x[t], angles)
