@@ -1,7 +1,8 @@
 """What the search of 0.1 did wrong on simulators that others wrote, and what has come of it since.
 
-Nine reasons were read in its source. Two have their tests elsewhere: 1 (`learn` never ended on a
-deterministic system) in tests/workspace/test_deterministic_system.py, 8 (float32) in
+Nine reasons were read in its source. Three have their tests elsewhere: 1 (`learn` never ended on a
+deterministic system) in tests/workspace/test_deterministic_system.py, 6 (a joint's friction is a
+torque) in tests/effects/test_effects_joint.py, 8 (float32) in
 tests/compile/test_substeps_and_jacobians.py. The crude models are those of benchmarks/foreign.
 """
 
