@@ -17,7 +17,7 @@ from grounded.search.first_policy import first_policy
 from grounded.search.planner import Planner
 from grounded.search.safety import objections, spread
 from grounded.search.standing import SearchOptions, Standing, losers_of, wild
-from grounded.search.step_size import KEPT, Step
+from grounded.search.step_size import Step
 from grounded.solve import ddp
 from grounded.task import Task
 from grounded.trial import mean_trial
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from grounded.solve.bias import Grounding
 
 PLANNING = DescentOptions(max_iterations=30, tolerance=1e-6)  # a direction needs no more digits
+FORETOLD = 0.3  # share of a step's gain by which crude slopes that are good enough may be off
 GENTLER = 1e3  # factor on the price of inputs from which gentler gains are designed
 GENTLER_TIMES = 2  # they are tried
 
@@ -78,7 +79,7 @@ class About:
         expected = self.make.predicted(self.real, base.candidate.policy).utility
         real = self.incumbent.utility - base.utility
         off = abs(self.incumbent.utility - expected - real)
-        return bool(off <= (1 - KEPT) * abs(real))
+        return bool(off <= FORETOLD * abs(real))
 
     def candidate(self, policy: Policy, step: Step, way: Way) -> Candidate:
         """A candidate with what this model promises of it."""
