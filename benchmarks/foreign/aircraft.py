@@ -8,6 +8,7 @@ Inputs are deflections (of 1) from the trim, elevator positive nose down, as in 
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -40,7 +41,7 @@ class Cessna:
     def reset(self) -> None:
         """A new aircraft each time: a trim that starts from another one differs in the digits."""
         self.jsbsim.FGJSBBase().debug_lvl = 0
-        f = self.f = self.jsbsim.FGFDMExec(None)
+        f = self.f = self.jsbsim.FGFDMExec(str(Path(self.jsbsim.__file__).parent))  # its data
         f.set_debug_level(0)
         f.load_model("c172p")
         f.disable_output()

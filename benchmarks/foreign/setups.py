@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from benchmarks.foreign import aircraft, cars
 from benchmarks.foreign import mechanisms as mech
 from benchmarks.foreign.robots import Robot
+from grounded.challenge.mechanism import arm_xml, cart_xml
 from grounded.policy import Policy
 from grounded.search.candidate import Candidate
 from grounded.task import Task
@@ -38,12 +39,12 @@ class Setup:
 
 def cart(name: str, withheld: str, kind: str = "gentle", **what: object) -> Setup:
     task = mech.cart_task(kind)
-    return Setup(name, withheld, task, *mech.mujoco_setup(task, mech.cart_xml(**what)))
+    return Setup(name, withheld, task, *mech.mujoco_setup(task, cart_xml(**what)))
 
 
 def arm(name: str, withheld: str, delay: float = 0.0, **what: object) -> Setup:
     task = mech.arm_task()
-    return Setup(name, withheld, task, *mech.mujoco_setup(task, mech.arm_xml(**what), delay))
+    return Setup(name, withheld, task, *mech.mujoco_setup(task, arm_xml(**what), delay))
 
 
 def arm7(name: str, withheld: str, **what: float) -> Setup:

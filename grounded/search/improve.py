@@ -12,7 +12,7 @@ true states.
 | 1, 2 | optimal policy of the crude model              | `first_policy` (`first_guess`, `ddp`)   |
 | 3    | run it, record the trial                       | people, robots: `run`, `ingest`         |
 | 4    | add a bias to the ORIGINAL model               | `bias.ground`                           |
-| 5    | direction d from algorithm A in that model     | `making.direction` (`ddp`, `secants`)   |
+| 5    | direction d from algorithm A in that model     | `making.direction` (`mispredictions`)   |
 | 6    | theta + alpha d, line search on the real system| `Policy.toward`, `step_size`            |
 | 7    | none improves: return the current policy       | `standing`                              |
 

@@ -11,7 +11,7 @@ from grounded.compile import DescentOptions, Problem
 from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.result import Result, document
-from grounded.rollout import simulate
+from grounded.rollout import Rollout, simulate
 from grounded.search.candidate import Candidate, Tried, Way
 from grounded.search.first_policy import first_policy
 from grounded.search.planner import Planner
@@ -23,10 +23,11 @@ from grounded.task import Task
 from grounded.trial import mean_trial
 
 if TYPE_CHECKING:
+    from grounded.search.corrected import Corrected
     from grounded.solve.bias import Grounding
 
 PLANNING = DescentOptions(max_iterations=30, tolerance=1e-6)  # a direction needs no more digits
-HALF = 0.5  # of the gain that was promised: less says that the model's slopes are wrong
+FORETOLD = 0.3  # share of a step's gain by which crude slopes that are good enough may be off
 GENTLER = 1e3  # factor on the price of inputs from which gentler gains are designed
 GENTLER_TIMES = 2  # they are tried
 
@@ -50,27 +51,39 @@ class About:
         exact = ground(plan, own, exact=True, shift=self.grounding.shift)
         self.real = exact.on(plan.problem(exact=True))
         self.theta = planner.widened(incumbent.candidate.policy)
-        already = simulate(self.real, self.theta).utility
+        self.corrected = self._corrected() if options.damps else None
+        if self.corrected is not None:
+            self.real = self.corrected.on(self.real)
+        already = make.predicted(self.real, incumbent.candidate.policy).utility
         self.already = already if np.isfinite(already) else incumbent.utility
         self.least = options.tolerance * abs(self.already)
-        self.slope: Array | None = None
-        if options.damps and np.isfinite(already) and make.doubts(incumbent):
-            from grounded.search.secants import slope_error
 
-            self.slope = slope_error(planner, incumbent, make.now.history, self.real)
+    def _corrected(self) -> Corrected | None:
+        """The model with slopes that other trials have corrected, where it is to be believed.
+
+        Not where the crude slopes are good enough: asked about the step that made the incumbent,
+        the model that replays the incumbent knows what that step has brought.
+        """
+        make, history, own = self.make, self.make.now.history, self.incumbent.candidate
+        lost = losers_of(history, own.id, make.fingerprint)
+        base = next((t for t in history if t.candidate.id == own.base), None)
+        if not lost and (base is None or self._knows(base)):
+            return None
+        from grounded.search.mispredictions import SURE, corrected
+
+        found = corrected(make.planner, self.incumbent, history, self.real)
+        return found[0] if found and (found[1] < SURE or lost) else None
+
+    def _knows(self, base: Tried) -> bool:
+        """Whether the model would have told by how much the incumbent is better than its base."""
+        expected = self.make.predicted(self.real, base.candidate.policy).utility
+        real = self.incumbent.utility - base.utility
+        off = abs(self.incumbent.utility - expected - real)
+        return bool(off <= FORETOLD * abs(real))
 
     def candidate(self, policy: Policy, step: Step, way: Way) -> Candidate:
-        """A candidate with what is promised of it, mispredictions of earlier trials included."""
-        made = self.make.candidate(policy, self.real, step, self.already, way)
-        if self.slope is None:
-            return made
-        moved = made.predicted_inputs - self.grounding.inputs[: len(self.slope)]
-        more = float(np.sum(self.slope * moved))
-        return replace(
-            made,
-            predicted_gain=made.predicted_gain + more,
-            predicted_utility=made.predicted_utility + more,
-        )
+        """A candidate with what this model promises of it."""
+        return self.make.candidate(policy, self.real, step, self.already, way)
 
     def step_from(self, first: Step, promised: list[float]) -> Proposal | None:
         """The first step worth a trial; one that is not allowed, or None; adds to the promises."""
@@ -85,7 +98,7 @@ class About:
                 continue
             if step.damping not in directions:
                 directions[step.damping] = direction(
-                    plan, self.theta, self.grounding, options, step.damping, self.slope
+                    plan, self.theta, self.grounding, options, step.damping, self.corrected
                 )
             policy = self.theta.toward(directions[step.damping], step.alpha)
             made = self.candidate(policy, step, self.way)
@@ -144,7 +157,7 @@ class Maker:
             caution = base.candidate.caution if base and follows else self.now.caution
         if caution and base is not None:
             policy = self._gently(policy, problem, caution)
-        predicted = simulate(problem, self.planner.widened(policy))
+        predicted = self.predicted(problem, policy)
         return Candidate(
             id=self.identity,
             policy=policy,
@@ -160,15 +173,6 @@ class Maker:
             caution=caution,
             way=way,
         )
-
-    def doubts(self, incumbent: Tried) -> bool:
-        """Whether the model's slopes have failed here: a step lost, or gave half its promise."""
-        own = incumbent.candidate
-        if losers_of(self.now.history, own.id, self.fingerprint):
-            return True
-        before = [t.utility for t in self.now.history if t.candidate.id == own.base]
-        gained = incumbent.utility - before[0] if before else np.inf
-        return bool(gained < HALF * own.predicted_gain)
 
     def gentler(self, incumbent: Tried) -> Candidate | None:
         """The model's own plan with gentler gains, where its loop was unstable on the robot.
@@ -190,14 +194,20 @@ class Maker:
         """The same run with the gains of a regulator whose inputs cost GENTLER ** caution more."""
         if policy.gain is None:
             return policy
-        run = simulate(problem, self.planner.widened(policy))
+        run = self.predicted(problem, policy)
         factor = GENTLER**caution
         weight = factor * problem.input_weight + (factor - 1) * problem.change_weight
         found = ddp.sweep(replace(problem, input_weight=weight), run.z, run.inputs)
         if not (found.ok and np.isfinite(run.z).all()):
             return policy
-        plan = self.planner.plan
-        return self.planner.narrowed(plan.policy(run.inputs, found.gains.K, run.z[:-1]))
+        plan, columns = self.planner.plan, _columns(problem, self.planner.plan)
+        gains, about = found.gains.K[:, :, columns], run.z[:-1, columns]
+        return self.planner.narrowed(plan.policy(run.inputs, gains, about))
+
+    def predicted(self, problem: Problem, policy: Policy) -> Rollout:
+        """A robot's policy in a model that may have more states than it measures."""
+        angles = tuple(map(bool, problem.angles))
+        return simulate(problem, policy.laid_out(problem.system.states, angles, problem.depths))
 
     def checked(self, made: Candidate) -> Proposal:
         """A candidate that is finite, inside the limits and predicted to stay safe; or none."""
@@ -246,7 +256,7 @@ def direction(
     grounding: Grounding,
     options: SearchOptions,
     damping: float = 1.0,
-    slope: Array | None = None,
+    corrected: Corrected | None = None,
 ) -> Policy:
     """Step 5: theta' such that d = theta' - theta improves the policy in the biased model.
 
@@ -256,7 +266,7 @@ def direction(
         grounding: the trial as the biased model replays it (step 4).
         options: which algorithm A.
         damping: lambda of `step_size`, the share of mu that leaving the trial's inputs costs.
-        slope: what the utility's slope by the inputs is more than the model's, see `secants`.
+        corrected: the model with slopes that trials have corrected; None: with its own.
     """
     if options.method == "policy-gradient":
         from grounded.solve.policy_gradient import ascent
@@ -265,13 +275,19 @@ def direction(
     problem = grounding.on(task.problem())
     if options.step == "damped":
         problem = damped(problem, grounding.inputs, damping)
-    if slope is not None:
-        from grounded.search.secants import with_slope
+    z = grounding.z
+    if corrected is not None:
+        problem, z = corrected.on(problem), corrected.along(z)
+    gains = ddp.sweep(problem, z, grounding.inputs).gains
+    found = ddp.solve(problem, grounding.inputs, gains.K, z[:-1], PLANNING)
+    columns = _columns(problem, task)
+    return task.policy(found.u, found.K[:, :, columns], found.z[:-1, columns])
 
-        problem = with_slope(problem, slope)
-    gains = ddp.sweep(problem, grounding.z, grounding.inputs).gains
-    result = ddp.solve(problem, grounding.inputs, gains.K, grounding.z[:-1], PLANNING)
-    return task.policy(result.u, result.K, result.z[:-1])
+
+def _columns(problem: Problem, task: Task) -> list[int]:
+    """The columns of the problem's z that are the task's too."""
+    own = map(problem.system.states.index, task.model.state_names)
+    return [*own, *range(problem.system.n, problem.nz)]
 
 
 def damped(problem: Problem, inputs: Array, factor: float = 1.0) -> Problem:

@@ -28,6 +28,7 @@ one.
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -123,22 +124,11 @@ class Interpreted(System):
         alphas: Array | None = None,
     ) -> Swarm:
         """See `System.rollout`."""
-        alphas = np.ones(1) if alphas is None else np.asarray(alphas, float)
-        queue, n, runs = problem.queue, self.n, len(alphas)
-        z = np.empty((runs, problem.horizon + 1, problem.nz))
-        u = np.empty((runs, problem.horizon, self.m))
-        z[:, 0] = problem.z_start()
-        with np.errstate(all="ignore"):
-            for t in range(problem.horizon):
-                u[:, t] = ubar[t] if k is None else ubar[t] + alphas[:, None] * k[t]
-                if K is not None and zbar is not None:
-                    u[:, t] += wrapped(z[:, t] - zbar[t], problem.angles) @ K[t].T
-                u[:, t] = np.clip(u[:, t], problem.low, problem.high)
-                sent = problem.received(z[:, t], u[:, t], t)
-                x = self.step(z[:, t, :n], sent, problem.p, problem.dt, problem.smoothing)
-                z[:, t + 1, :n] = x + problem.bias[t]
-                z[:, t + 1, n:] = queue.after(z[:, t, n:], u[:, t])
-        return Swarm(z, u, trajectory_cost(problem, z, u))
+
+        def step(x: Array, sent: Array, t: int) -> Array:
+            return self.step(x, sent, problem.p, problem.dt, problem.smoothing)
+
+        return rolled_out(problem, step, ubar, K, zbar, k, alphas)
 
     def backward(
         self, problem: Problem, z: Array, u: Array, damping: Array, into: Backward | None = None
@@ -146,6 +136,33 @@ class Interpreted(System):
         """See `System.backward`."""
         with np.errstate(all="ignore"):
             return sweep(problem, u, linearised(self, problem, z, u), damping)
+
+
+def rolled_out(
+    problem: Problem,
+    step: Callable[[Array, Array, int], Array],
+    ubar: Array,
+    K: Array | None,
+    zbar: Array | None,
+    k: Array | None,
+    alphas: Array | None,
+) -> Swarm:
+    """`System.rollout` with a step from x (A, n), received inputs (A, m) and t to the next x."""
+    alphas = np.ones(1) if alphas is None else np.asarray(alphas, float)
+    queue, n, runs = problem.queue, problem.system.n, len(alphas)
+    z = np.empty((runs, problem.horizon + 1, problem.nz))
+    u = np.empty((runs, problem.horizon, problem.system.m))
+    z[:, 0] = problem.z_start()
+    with np.errstate(all="ignore"):
+        for t in range(problem.horizon):
+            u[:, t] = ubar[t] if k is None else ubar[t] + alphas[:, None] * k[t]
+            if K is not None and zbar is not None:
+                u[:, t] += wrapped(z[:, t] - zbar[t], problem.angles) @ K[t].T
+            u[:, t] = np.clip(u[:, t], problem.low, problem.high)
+            sent = problem.received(z[:, t], u[:, t], t)
+            z[:, t + 1, :n] = step(z[:, t, :n], sent, t) + problem.bias[t]
+            z[:, t + 1, n:] = queue.after(z[:, t, n:], u[:, t])
+    return Swarm(z, u, trajectory_cost(problem, z, u))
 
 
 @dataclass(frozen=True, eq=False)

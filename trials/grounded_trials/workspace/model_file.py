@@ -12,12 +12,15 @@ import sys
 import traceback
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from grounded.errors import GroundedError, nearest
 from grounded.model import Model
 from grounded.trusted import check_own
 from grounded_trials.workspace.config import FILE
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 
 def load_module(
@@ -62,11 +65,13 @@ def load_module(
 
 def _installed(name: str) -> ModuleType:
     """A module by its import name, or a model by its name among the entry points."""
-    from importlib.metadata import entry_points
-
-    registered = {point.name: point for point in entry_points(group="grounded.models")}
+    registered: dict[str, EntryPoint] = {}
     try:
-        if name in registered and importlib.util.find_spec(name) is None:
+        if not _importable(name):  # reading what is installed takes longer than a plan
+            from importlib.metadata import entry_points
+
+            registered = {point.name: point for point in entry_points(group="grounded.models")}
+        if name in registered:
             found = ModuleType(name)
             vars(found)["model"] = registered[name].load()
             return found
@@ -78,6 +83,13 @@ def _installed(name: str) -> ModuleType:
         ) from None
     except Exception as error:
         raise GroundedError(_where(error, name)) from None
+
+
+def _importable(name: str) -> bool:
+    try:
+        return importlib.util.find_spec(name) is not None
+    except ModuleNotFoundError:  # the package that it should be in
+        return False
 
 
 def _forget_neighbours(folder: Path, before: set[str]) -> None:

@@ -1,0 +1,138 @@
+"""A model whose slopes about a trial are corrected (`mispredictions`), as a System of its own.
+
+    x_{t+1} = f(x_t, u_t) + bias_t + y_t,      y_t = C_t [dx_t, du_t, du_{t-1}, y_{t-1}]
+
+with dx, du what a run has moved away from the incumbent's trial, along which y is zero: the trial
+is still replayed exactly. y and the input before are memory that no sensor knows, so the state is
+[x, y, u before]; a policy's gains on them are dropped, their part of the feed-forward stays. f
+stays the compiled model; the sweep and the rollouts are NumPy's (`interpreted`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from grounded.compile import Backward, Problem, Swarm, System
+from grounded.compile.run.interpreted import linearised, rolled_out, sweep
+from grounded.frozen import Array, wrapped
+
+Flags = NDArray[np.bool_]
+
+
+class Corrected(System):
+    """A system of n states and m inputs, with 2 n + m states.
+
+    Rows of `step`, `linearise` and `sensitivities` are the steps of the horizon, in order.
+
+    Args:
+        base: f.
+        law: C (H, n, 2 n + 2 m).
+        x: states of the incumbent's trial (H, n).
+        u: what its actuators received (H, m).
+        before: the same, one step earlier (H, m).
+    """
+
+    how, note = "corrected", ""
+
+    def __init__(self, base: System, law: Array, x: Array, u: Array, before: Array) -> None:
+        self.base, self.law, self.x, self.u, self.before = base, law, x, u, before
+        n, m = base.n, base.m
+        self.n, self.m, self.k, self.source = 2 * n + m, m, base.k, base.source
+        missed = (f"{name} mispredicted" for name in base.states)
+        self.states = (*base.states, *missed, *(f"input {i} before" for i in range(m)))
+
+    def on(self, problem: Problem) -> Problem:
+        """The grounded problem of the base, in this system."""
+
+        def padded(a: Array) -> Array:
+            return np.concatenate([a, np.zeros((*a.shape[:-1], self.n - self.base.n))], axis=-1)
+
+        return replace(
+            problem,
+            system=self,
+            start=np.concatenate([problem.start, np.zeros(self.base.n), self.before[0]]),
+            bias=padded(problem.bias),
+            target=padded(problem.target),
+            state_weight=padded(problem.state_weight),
+            angles=np.append(problem.angles, np.zeros(self.n - self.base.n, bool)),
+        )
+
+    def along(self, z: Array) -> Array:
+        """The incumbent's trial in this system: z (H + 1, nz) of the base to (H + 1, nz)."""
+        n = self.base.n
+        before = np.vstack([self.before, self.u[-1:]])
+        return np.hstack([z[:, :n], np.zeros((len(z), n)), before, z[:, n:]])
+
+    def step(self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0) -> Array:
+        """See `System.step`; u is taken as received, without a shift."""
+        moved = self.base.step(np.ascontiguousarray(x[:, : self.base.n]), u, p, dt, smoothing)
+        return self._next(moved, x, u, slice(None), np.zeros(self.base.n, bool))
+
+    def check(self, x: Array, u: Array, p: Array, dt: float) -> None:
+        """See `System.check`."""
+        self.base.check(np.ascontiguousarray(x[:, : self.base.n]), u, p, dt)
+
+    def linearise(
+        self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
+    ) -> tuple[Array, Array]:
+        """See `System.linearise`."""
+        n, m = self.base.n, self.m
+        f_x, f_u = self.base.linearise(np.ascontiguousarray(x[:, :n]), u, p, dt, smoothing)
+        F, G = np.zeros((len(x), self.n, self.n)), np.zeros((len(x), self.n, m))
+        by_x, by_u, by_before, by_y = np.split(self.law, np.cumsum([n, m, m]), axis=2)
+        F[:, n : 2 * n] = np.concatenate([by_x, by_y, by_before], axis=2)
+        G[:, n : 2 * n] = by_u
+        F[:, :n], G[:, :n] = F[:, n : 2 * n], by_u + f_u
+        F[:, :n, :n] += f_x
+        G[:, 2 * n :] = np.eye(m)
+        return F, G
+
+    def sensitivities(
+        self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
+    ) -> tuple[Array, Array, Array]:
+        """See `System.sensitivities`."""
+        f_p = self.base.sensitivities(
+            np.ascontiguousarray(x[:, : self.base.n]), u, p, dt, smoothing
+        )[2]
+        by_p = np.zeros((len(x), self.n, self.k))
+        by_p[:, : self.base.n] = f_p
+        return *self.linearise(x, u, p, dt, smoothing), by_p
+
+    def rollout(
+        self,
+        problem: Problem,
+        ubar: Array,
+        K: Array | None = None,
+        zbar: Array | None = None,
+        k: Array | None = None,
+        alphas: Array | None = None,
+    ) -> Swarm:
+        """See `System.rollout`."""
+        n, angles = self.base.n, problem.angles[: self.base.n]
+
+        def step(x: Array, sent: Array, t: int) -> Array:
+            state, settings = np.ascontiguousarray(x[:, :n]), (problem.dt, problem.smoothing)
+            moved = self.base.step(state, np.ascontiguousarray(sent), problem.p, *settings)
+            shift = 0.0 if problem.input_shift is None else problem.input_shift[t]
+            return self._next(moved, x, sent + shift, t, angles)
+
+        return rolled_out(problem, step, ubar, K, zbar, k, alphas)
+
+    def _next(self, moved: Array, x: Array, u: Array, t: int | slice, angles: Flags) -> Array:
+        """[x, y, u before] a step later: base states `moved` (N, n), x (N, 2 n + m), u (N, m)."""
+        n = self.base.n
+        away = wrapped(x[:, :n] - self.x[t], angles)
+        before = x[:, 2 * n :] - self.before[t]
+        d = np.concatenate([away, u - self.u[t], before, x[:, n : 2 * n]], axis=1)
+        y = np.einsum("...nq,...q->...n", self.law[t], d)
+        return np.concatenate([moved + y, y, u], axis=1)
+
+    def backward(
+        self, problem: Problem, z: Array, u: Array, damping: Array, into: Backward | None = None
+    ) -> Backward:
+        """See `System.backward`."""
+        with np.errstate(all="ignore"):
+            return sweep(problem, u, linearised(self, problem, z, u), damping)

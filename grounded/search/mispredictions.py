@@ -1,0 +1,192 @@
+"""What earlier trials say about the SLOPES of the model that replays the incumbent's.
+
+The grounded model is right along the incumbent's trial; its slopes there are the crude model's.
+Every other trial j left that trial by x_j - x and u_j - u, and what the grounded model then
+mispredicts over one step,
+
+    y_jt = x_j,t+1 - (f(x_jt, u_jt) + bias_t),        zero for the incumbent itself,
+
+is, to first order, what its slopes lack. One trial gives H such vectors, far more than the one
+number of its utility. Two laws are fitted to them, each the same at all times of the run, the
+second one to what the first leaves:
+
+    1. y_t = f_u,t D [dx_t, du_t, du_t-1, v_t-1]   what acts where the inputs act: a lag, a gain, a
+                                                   load; v is y in units of the inputs
+    2. y_t = E [dx_t, du_t]                        what acts elsewhere
+
+Each is a ridge regression. Its price, and how much less trials count the farther they are from the
+incumbent, are chosen by leaving out parts of the run in turn (Stone, "Cross-validatory choice and
+assessment of statistical predictions", J. R. Stat. Soc. B 36, 1974): a law that does not hold in
+parts of the run that it was not fitted to is not used. `Slopes.missed` is the share that the first
+law leaves there, by the trial nearest to the incumbent. Below SURE the corrected slopes are better
+than the crude ones from the second trial on; above it they are asked only after a step has lost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from grounded.compile import Problem
+from grounded.frozen import Array, wrapped
+from grounded.rollout import augmented
+from grounded.search.candidate import Tried
+from grounded.search.corrected import Corrected
+from grounded.search.planner import Planner
+from grounded.solve.bias import input_span
+from grounded.trial import mean_trial
+
+SURE = 0.1  # share of the mispredictions that a law may leave where it was not fitted
+PRICES = (1e-4, 1e-3, 1e-2, 0.1, 1.0, 10.0)  # of the ridge
+FADING = (0.0, 2.0)  # powers of the distance with which a trial's squares lose weight
+PARTS = 8  # of the run, left out in turn
+NEAREST = 12  # trials that count
+LATEST = 100  # of which they are chosen
+DEAD = 1e-4  # of the mean square effect of the inputs: less explains nothing
+
+
+@dataclass(frozen=True, eq=False)
+class Slopes:
+    """What the slopes lack, by the features [x, u, u before, y before] of n states, m inputs."""
+
+    law: Array  # (H, n, 2 n + 2 m)
+    missed: float  # share of the nearest trial's mispredictions that the first law leaves
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """A trial as the grounded model sees it; u is what the actuators received."""
+
+    x: Array  # (H, n)
+    u: Array  # (H, m)
+    before: Array  # (H, m) u one step earlier
+    y: Array  # (H, n) what was mispredicted
+
+
+def corrected(
+    planner: Planner, incumbent: Tried, history: Sequence[Tried], grounded: Problem
+) -> tuple[Corrected, float] | None:
+    """The grounded model with slopes that other trials have corrected, and `Slopes.missed`.
+
+    Args:
+        planner: the task, and the task as it is planned.
+        incumbent: whose trial the model replays.
+        history: all candidates with their trials.
+        grounded: the exact model with the incumbent's bias.
+
+    Returns:
+        None where there is no other whole trial.
+    """
+    own = seen(planner, incumbent, grounded)
+    told = [t for t in history[-LATEST:] if t is not incumbent and t.trials]
+    others = [seen(planner, t, grounded) for t in told if np.isfinite(t.utility)]
+    found = None if own is None else slopes(own, [o for o in others if o is not None], grounded)
+    if own is None or found is None:
+        return None
+    return Corrected(grounded.system, found.law, own.x, own.u, own.before), found.missed
+
+
+def seen(planner: Planner, tried: Tried, grounded: Problem) -> Seen | None:
+    """The mean trial of a candidate in the grounded model; None where it is not whole."""
+    H, mask = grounded.horizon, planner.task.model.angle_mask
+    trial = planner.lift(mean_trial(tried.trials, mask))
+    if trial.finite_steps < H:
+        return None
+    trial = trial.until(H)
+    past = grounded.past if trial.start_inputs is None else trial.start_inputs
+    z = augmented(grounded, trial.states, trial.inputs, past)
+    u = grounded.queue.effective(z[:-1], trial.inputs)
+    x = np.ascontiguousarray(trial.states[:-1])
+    predicted = grounded.system.step(x, _sent(grounded, u), grounded.p, grounded.dt)
+    y = wrapped(trial.states[1:] - predicted - grounded.bias, grounded.angles)
+    return Seen(x, u, np.vstack([u[:1], u[:-1]]), y)
+
+
+def _sent(problem: Problem, u: Array) -> Array:
+    return np.ascontiguousarray(u if problem.input_shift is None else u - problem.input_shift)
+
+
+def slopes(own: Seen, others: Sequence[Seen], grounded: Problem) -> Slopes | None:
+    """Both laws.
+
+    Args:
+        own: the incumbent's trial.
+        others: trials that moved away from it.
+        grounded: the exact model with the incumbent's bias.
+    """
+    span = input_span(grounded, own.u)
+    reach = np.ptp(own.x, axis=0) + 1e-9
+    moves = [_features(own, other, grounded) for other in others]
+    n, m = own.x.shape[1], own.u.shape[1]
+    far = np.array([_rms(d[:, :n] / reach) + _rms(d[:, n : n + m] / span) for d in moves])
+    near = [int(j) for j in np.argsort(far, kind="stable")[:NEAREST] if far[j] > 1e-9]
+    if not near:
+        return None
+    d, y, far = np.array([moves[j] for j in near]), np.array([others[j].y for j in near]), far[near]
+    f_u, by_input = _matching(own, y / far[:, None, None], grounded, span)
+    v = np.einsum("tmn,jtn->jtm", by_input, y)
+    v_before = np.concatenate([np.zeros_like(v[:, :1]), v[:, :-1]], axis=1)
+    D, missed = shared(np.concatenate([d[:, :, : n + 2 * m], v_before], axis=2), v, far)
+    law = np.zeros((len(own.x), n, 2 * n + 2 * m))
+    law[:, :, : n + 2 * m] = f_u @ D[:, : n + 2 * m]
+    law[1:, :, n + 2 * m :] = f_u[1:] @ D[:, n + 2 * m :] @ by_input[:-1]
+    left = y - np.einsum("tnq,jtq->jtn", law, d)
+    law[:, :, : n + m] += shared(d[:, :, : n + m], left, far)[0]
+    return Slopes(law, missed)
+
+
+def _features(own: Seen, other: Seen, grounded: Problem) -> Array:
+    """How a trial moved away from the incumbent's, [x, u, u before, y before] (H, 2 n + 2 m)."""
+    y_before = np.vstack([np.zeros_like(other.y[:1]), other.y[:-1]])
+    x = wrapped(other.x - own.x, grounded.angles)
+    return np.hstack([x, other.u - own.u, other.before - own.before, y_before])
+
+
+def _rms(a: Array) -> float:
+    return float(np.sqrt(np.mean(a**2)))
+
+
+def _matching(own: Seen, y: Array, grounded: Problem, span: Array) -> tuple[Array, Array]:
+    """f_u (H, n, m) along the incumbent, and the inputs (H, m, n) that make up best for y."""
+    scale = np.sqrt(np.mean(y**2, axis=(0, 1)))
+    scale = np.maximum(scale, 1e-6 * scale.max()) + 1e-300
+    _, f_u = grounded.system.linearise(own.x, _sent(grounded, own.u), grounded.p, grounded.dt)
+    B = f_u * span / scale[:, None]
+    gram = np.einsum("tni,tnj->tij", B, B)
+    dead = DEAD * float(np.trace(gram, axis1=1, axis2=2).mean()) / len(span) + 1e-300
+    back = np.linalg.solve(gram + dead * np.eye(len(span)), B.transpose(0, 2, 1))
+    return f_u, span[:, None] * back / scale
+
+
+def shared(d: Array, y: Array, far: Array) -> tuple[Array, float]:
+    """The law y_t = C d_t that holds at all times, C (k, q), and the share of y that it leaves.
+
+    Args:
+        d: features of trials (j, H, q).
+        y: what they are to explain (j, H, k).
+        far: (j,) distance of each trial from the incumbent.
+
+    Returns:
+        Zeros, and 1, where no law predicts parts of the run that it was not fitted to.
+    """
+    d, y = d / far[:, None, None], y / far[:, None, None]
+    scale = np.sqrt(np.mean(d**2, axis=(0, 1))) + 1e-12
+    d = d / scale
+    near = (far / far[0]) ** -2.0
+    size = np.einsum("j,jtk->k", near, y**2) * y.shape[2] + 1e-300
+    parts, best = np.array_split(np.arange(d.shape[1]), PARTS), 1.0
+    law = np.zeros((d.shape[2], y.shape[2]))
+    for fading in FADING:
+        weight = (far / far[0]) ** -fading
+        M = np.array([np.einsum("j,jtp,jtq->pq", weight, d[:, t], d[:, t]) for t in parts])
+        N = np.array([np.einsum("j,jtp,jtk->pk", weight, d[:, t], y[:, t]) for t in parts])
+        for price in PRICES:
+            ridge = price * np.eye(len(law))
+            each = np.linalg.solve(M.sum(axis=0) - M + ridge, N.sum(axis=0) - N)
+            off = [y[:, t] - d[:, t] @ C for t, C in zip(parts, each, strict=True)]
+            left = float(sum(np.einsum("j,jtk,k->", near, e**2, 1 / size) for e in off))
+            if left < best:
+                best, law = left, np.linalg.solve(M.sum(axis=0) + ridge, N.sum(axis=0))
+    return (law / scale[:, None]).T, best
