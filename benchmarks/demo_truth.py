@@ -2,11 +2,11 @@
 
     python benchmarks/demo_truth.py FOLDER ...
 
-Each FOLDER is what `grounded demo car-turn` (car-circle, car-figure8) left. Its trials are predicted
-open loop, as the diagnosis' ruler does it, by the true car and by true cars that lack one of their
-declared differences from the crude model (`grounded.experiments.real_car`). Credit is what the
-predictions lose without it, of what all of them gain together, as in a diagnosis; the rest is not
-fitted again.
+Each FOLDER is what `grounded demo car-turn` (car-circle, car-figure8) left. Its trials are
+predicted open loop, as the diagnosis' ruler does it, by the true car and by true cars that lack one
+of their declared differences from the crude model (`grounded.experiments.real_car`). Credit is what
+the predictions lose without it, of what all of them gain together, as in a diagnosis; the rest is
+not fitted again.
 """
 
 from __future__ import annotations
