@@ -236,7 +236,7 @@ def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
         return f"{number(abs(value))} % {more if value >= 0 else less}"
 
     def kept(found: re.Match[str]) -> str:  # of a quantity that is estimated, or [left out]
-        return found[1] if set(re.findall(r"\{(\w)\}", found[1])) <= set(params) else ""
+        return found[1] if set(re.findall(r"\{(\w)[%}]", found[1])) <= set(params) else ""
 
     text = re.sub(r"\[([^]]*)\]", kept, effect.family.sentence)
     return re.sub(r"\{(\w+)(%)?(?:([^{}|]+)\|([^{}|]+))?\}", filled, text)

@@ -26,6 +26,7 @@ from grounded.model import Model
 
 LONGEST_DELAY = 0.5  # [s] that a scan considers, where steps are not longer than usual
 LONGEST_LAG = 2.0  # [s] the same
+ONE_SIDED = 0.05  # of an input's peak: what it reached the other way is no second side
 
 
 def _threshold(site: Site) -> tuple[Quantity, ...]:
@@ -59,9 +60,13 @@ def _one_or_alike(model: Model) -> list[str]:
 
 
 def _curve(site: Site) -> tuple[Quantity, ...]:
-    peak = site.scales.peak(site.target)
-    whole = Quantity("U", site.unit(site.target), fixed=True, start=peak)
-    return (Quantity("a", low=-0.9, high=0.9), Quantity("b", low=-1.8, high=1.8), whole)
+    """Sides differ only where both were seen: of one side alone `a` is a gain, which has a name."""
+    scales, name = site.scales, site.target
+    peak = scales.peak(name)
+    weaker = min(scales.high.get(name, 1.0), -scales.low.get(name, -1.0))
+    whole = Quantity("U", site.unit(name), fixed=True, start=peak)
+    sides = Quantity("a", low=-0.9, high=0.9, fixed=weaker < ONE_SIDED * peak)
+    return (sides, Quantity("b", low=-1.8, high=1.8), whole)
 
 
 input_bias = InputFamily(
@@ -118,8 +123,8 @@ saturation = InputFamily(
 input_curve = InputFamily(
     name="input_curve",
     equation="u_eff = (1 + a sign(u) + b (|u| / U - 1/2)) u",
-    sentence="{target} acts {a%more|less} to its positive side, and {b%more|less} at its end than "
-    "about zero",
+    sentence="{target} acts[ {a%more|less} to its positive side, and] {b%more|less} at its end "
+    "than about zero",
     targets=places.inputs,
     quantities=_curve,
     lookalikes=("input_gain", "input_bias", "saturation", "dead_zone"),

@@ -58,11 +58,14 @@ def dynamics(s: Any, a: Any, p: Any) -> dict[str, Any]:
     braking = np.maximum((v_ss - s.v) / car.TAU_BRAKE, p.a4)
     v_dot = np.where(v_ss >= s.v, (v_ss - s.v) / p.tau_v, braking)
     grip = 1 / (p.L * (1 + p.understeer * s.v**2))
-    thread = np.sin(2 * (s.psi - p.thread))
-    yaw = s.v * np.sin(s.delta) * grip + p.thread_yaw * s.v * thread
+    twice = 2 * (s.psi - p.thread)
+    yaw = s.v * np.sin(s.delta) * grip + p.thread_yaw * s.v * np.sin(twice)
     slide = p.drift * s.v * np.cos(s.psi - p.thread)
     rear = s.v * np.cos(s.delta)
-    yaw_dot = (v_dot * np.sin(s.delta) + s.v * np.cos(s.delta) * delta_dot) * grip
+    # a gyro shows all that turns the car: yaw by the chain rule, thread and understeer too
+    yaw_dot = s.v * np.cos(s.delta) * delta_dot * grip
+    yaw_dot += v_dot * np.sin(s.delta) * grip * (1 - 2 * p.understeer * s.v**2 * grip * p.L)
+    yaw_dot += p.thread_yaw * (v_dot * np.sin(twice) + 2 * s.v * np.cos(twice) * yaw)
     return {
         "delta": delta_dot,
         "v": v_dot,

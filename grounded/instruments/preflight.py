@@ -51,16 +51,16 @@ class Preflight:
 
     findings: tuple[Finding, ...]
     trials: tuple[Trial, ...]
+    in_step: frozenset[str] = frozenset()  # states whose sensors were seen to show one moment
 
     @property
     def settled(self) -> frozenset[str]:
-        """Sensor effects that need not be blamed any more, by name."""
-        kinds = {"delay": ("sensor_delay", "sensor_lag"), "lag": ("sensor_delay", "sensor_lag")}
+        """Sensor effects that can't be blamed any more, by name: corrected, or refuted."""
+        mended = {f.signal for f in self.findings if f.corrected and f.kind in ("delay", "lag")}
         return frozenset(
-            f"{family}:{one.signal}"
-            for one in self.findings
-            if one.corrected
-            for family in kinds.get(one.kind, ())
+            f"{family}:{name}"
+            for name in self.in_step | mended
+            for family in ("sensor_delay", "sensor_lag")
         )
 
 
@@ -82,7 +82,7 @@ def preflight(
     bench = _Bench(model, [t.until(t.known_steps) for t in used], set(hidden))
     with np.errstate(all="ignore"):
         found = [*bench.singles(), *bench.pairs(), *bench.plane(), *_inputs(subject, bench.trials)]
-    return Preflight(tuple(found), tuple(bench.trials))
+    return Preflight(tuple(found), tuple(bench.trials), frozenset(bench.in_step))
 
 
 class _Bench:
@@ -91,6 +91,7 @@ class _Bench:
     def __init__(self, model: Model, trials: list[Trial], hidden: set[str]) -> None:
         self.model, self.trials = model, trials
         self.shown = [i for i, n in enumerate(model.state_names) if n not in hidden]
+        self.in_step: set[str] = set()
 
     @property
     def dt(self) -> float:
@@ -154,10 +155,12 @@ class _Bench:
 
     def late(self, relation: Integral, lag: Lag) -> Iterator[Finding]:
         """A delay: no sensor is early, so it is the later one's."""
-        d = float(abs(lag.delay))
-        if d < max(SURE * lag.std, LEAST_STEPS * self.dt, LEAST_S):
-            return
+        d, least = float(abs(lag.delay)), max(LEAST_STEPS * self.dt, LEAST_S)
         q, w = (self.model.state_names[k] for k in (relation.i, relation.j))
+        if d + SURE * lag.std < least:  # neither can be late alone by what counts
+            self.in_step |= {q, w}
+        if d < max(SURE * lag.std, least):
+            return
         i, name, other = (relation.i, q, f"{w} says")
         if lag.delay > 0:
             i, name, other = (relation.j, w, f"the derivative of {q}")

@@ -3,7 +3,10 @@
 import numpy as np
 import pytest
 
+from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import diagnose
+from grounded.diagnosis.hypotheses.search import HypothesisSearch
+from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.step import _bounded
 from grounded.effects import Library
 from grounded.experiments.pendulum import FRICTION, HEAVIER, pendulum_task
@@ -30,6 +33,26 @@ def test_a_bounded_step_is_the_best_one_inside(seed):
     np.testing.assert_allclose(
         _bounded(G, slope, low - np.inf, high + np.inf), -np.linalg.solve(G, slope)
     )
+
+
+def test_a_parameter_is_believed_within_three_of_its_standard_deviations():
+    """A log that no length explains: thousands of nats carry it to its limit and no further."""
+    t = 0.02 * np.arange(150)
+    trials = []
+    for k in range(4):
+        q = (1 + 0.2 * k) * np.sin((2.0 + 0.3 * k) * t)  # swings as of a length of 0.9 to 2 m
+        states = np.column_stack([q, np.gradient(q, 0.02)])
+        trials.append(Trial(states, np.zeros((149, 1)), 0.02, ("q", "w"), ("u",)))
+    crude = Model(
+        states={"q": "rad", "w": "rad/s"},
+        inputs={"u": "rad/s^2"},
+        params={"l": Param(0.5, "m", std=0.02)},
+        derivative=lambda s, a, p: {"q": s.w, "w": a.u - 9.81 / p.l * np.sin(s.q)},
+    )
+    search = HypothesisSearch(prepare(crude, trials), ())
+    search.nulls()
+    shifts = [f.hypothesis.shift[0] for (_, w, _), f in search.fits.items() if w > 0]
+    assert max(shifts) == pytest.approx(0.06)
 
 
 def test_an_unknown_whose_slope_is_no_number_stays_where_it_is():

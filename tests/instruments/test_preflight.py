@@ -86,9 +86,17 @@ def test_sound_sensors_are_left_alone():
     for seed in range(6):
         trials = arm(seed=seed)
         found = preflight(ARM, trials)
-        assert found.findings == () and not found.settled
+        assert found.findings == ()
+        assert found.in_step == {"q", "w"}
+        assert found.settled == {f"sensor_{of}:{n}" for of in ("delay", "lag") for n in "qw"}
         for before, after in zip(trials, found.trials, strict=True):
             np.testing.assert_array_equal(before.states, after.states)
+
+
+def test_sensors_too_noisy_to_be_held_against_each_other_may_still_be_late():
+    rng = np.random.default_rng(1)
+    found = preflight(ARM, arm(lambda y: y + rng.standard_normal(y.shape) * [0.03, 0.3]))
+    assert not found.in_step and not found.settled
 
 
 def stuck(x):

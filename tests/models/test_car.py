@@ -131,6 +131,15 @@ def test_without_its_effects_and_errors_it_is_the_model():
         np.testing.assert_allclose(a[name], b[name], atol=1e-12)
 
 
+def test_the_gyro_shows_all_that_turns_the_real_car():
+    real, p = real_car(), real_car().params
+    run = simulate(0.5, 0.7, 4.0, of=real)
+    grip = 1 + p["understeer"].value * run["v"] ** 2
+    yaw = run["v"] * np.sin(run["delta"]) / (p["L"].value * grip)
+    yaw += p["thread_yaw"].value * run["v"] * np.sin(2 * (run["psi"] - p["thread"].value))
+    np.testing.assert_allclose(run["psi_rate"], yaw, atol=2e-3)
+
+
 def test_the_carpet_drifts_a_tenth_of_a_metre_a_circle():
     """Section 5.2: up to 0.10 m a circle of 1 m radius."""
     run = simulate(0.45, 0.75, 12.0, of=real_car())

@@ -129,6 +129,20 @@ def _bam(speed: bool) -> Callable[[], list[Trial]]:
     return read
 
 
+def _bam_servo() -> list[Trial]:
+    """All runs as the servo was told: goal, its gain kp, whether its torque is on."""
+    log = np.load(data("bam_xl330_servo", "bam_xl330_pendulum.npz"))
+    about = json.loads(data("bam_xl330_servo", "runs.json").read_text())
+    trials = []
+    for i, run in enumerate(about):
+        rows, t = log[f"run{i:02d}"].astype(float), log[f"run{i:02d}_t"]
+        x, told = _resampled(t, rows[:, :2], 0.01), _resampled(t, rows[:, 5:7], 0.01, hold=True)
+        u = np.column_stack([told[:, 0], np.full(len(told), float(run["kp"])), told[:, 1]])
+        names = (("q", "w"), ("goal", "kp", "torque_enable"))
+        trials.append(Trial(x, u[:-1], 0.01, *names, start_inputs=u[0]))
+    return trials
+
+
 def _double(name: str, dt: float, most: int) -> Callable[[], list[Trial]]:
     def read() -> list[Trial]:
         log = np.load(data("dfki_double_pendulum", f"{name}.npz"), allow_pickle=True)
@@ -237,6 +251,16 @@ model = Model(
 """
 BAM_Q = RealSystem(_BAM_TEXT, _bam(speed=False))
 BAM_QW = RealSystem(_BAM_TEXT, _bam(speed=True))
+
+# The same as a position servo, its goal in place of the volts; without torque its motor is open.
+BAM_KP = RealSystem(
+    _BAM_TEXT.replace(
+        "    torque = p.kt / p.R * (a.volts - p.kt * s.w)\n",
+        "    duty = np.clip((a.goal - s.q) * a.kp * 4096 / (2 * np.pi) / (256 * 885), -1, 1)\n"
+        "    torque = a.torque_enable * p.kt / p.R * (7.4 * duty - p.kt * s.w)\n",
+    ).replace('{"volts": "V"}', '{"goal": "rad", "kp": "1", "torque_enable": "1"}'),
+    _bam_servo,
+)
 
 # Two links, relative elbow angle, no friction; numbers of the authors' model 1.0 of design C.1.
 _DOUBLE_TEXT = """import numpy as np

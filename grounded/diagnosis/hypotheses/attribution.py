@@ -15,6 +15,7 @@ import numpy as np
 from grounded.diagnosis.hypotheses.explored import CLAIM
 from grounded.diagnosis.hypotheses.search import (
     LARGE,
+    LARGE_GAIN,
     SHORTLIST,
     TO_THE_TOP,
     HypothesisSearch,
@@ -30,6 +31,7 @@ from grounded.progress import interruptible
 
 HOPEFUL = 4  # larger sets that are fitted to the end
 TUNED = 2  # sets whose constants are set by the data
+FORETOLD = (2.0, 0.05)  # scatters, and least gain, from which what predicts better is grown too
 RESTARTED = 3  # large effects that are also fitted from a start of their own
 
 
@@ -133,9 +135,10 @@ def outliers(fit: Fitted) -> bool:
 
 
 def _starts(search: HypothesisSearch, size: int, best: Fitted) -> list[Fitted]:
-    """What a further effect is sought beside: the likeliest, and the same under plain noise.
+    """What a further effect is sought beside: the likeliest, the same under plain noise, one more.
 
-    What the further effect does may so far have passed for coloured noise or for parameters.
+    What the further effect does may so far have passed for coloured noise or for parameters; and
+    one that predicts clearly better may need it to be likelier.
     """
     likely = [
         f
@@ -147,6 +150,25 @@ def _starts(search: HypothesisSearch, size: int, best: Fitted) -> list[Fitted]:
         plain = search.fits.get((Structure(), 0.0, tuple(sorted(fit.hypothesis.names))))
         if plain is not None and plain is not fit:
             found.append(plain)
+    foretold = _foretold(search, size, best)
+    return found if foretold in found else [*found, foretold]
+
+
+def _foretold(search: HypothesisSearch, size: int, best: Fitted) -> Fitted:
+    """What predicts best of the likely sets: far from the noise, evidence favours what acts often.
+
+    (A friction that grows with the load predicts a second ahead what a constant one, hundreds of
+    nats likelier step by step, does not.)
+    """
+    ruler, floor = Ruler(search.predictor), search.score(search.best_null()) + LARGE_GAIN
+    rivals = [fit for fit in search.of_size(size)[:HOPEFUL] if search.score(fit) > floor]
+    if not rivals or not ruler.held_out:
+        return best
+    ruler.beside(search.exact_null())
+    found = best
+    for fit in rivals:
+        if fit is not best and ruler.gain(found, fit).beyond(*FORETOLD):
+            found = fit
     return found
 
 

@@ -17,6 +17,8 @@ from grounded.diagnosis.likelihood.linearise import step_sizes
 from grounded.diagnosis.likelihood.noise import NoiseModel
 from grounded.frozen import Array
 
+BELIEVED = 3.0  # standard deviations, as the user gave them, that a parameter may be off
+
 
 @dataclass(eq=False)
 class ProposedStep:
@@ -100,7 +102,11 @@ def inside(data: Data, shift: Array) -> Array:
 
 
 def _bounds(data: Data) -> tuple[Array, Array]:
-    """Bounds of the model's parameters, (k,) each; where none is given the sign stays."""
+    """Bounds of the model's parameters, (k,) each; where none is given the sign stays.
+
+    Nor does one go further than three of its own standard deviations: thousands of nats of a model
+    that is wrong elsewhere would carry a measured length to a fifth of itself.
+    """
     params = data.model.params.values()
     low = [
         p.low if p.low is not None else 0.2 * p.value if p.value > 0 else -np.inf for p in params
@@ -108,4 +114,6 @@ def _bounds(data: Data) -> tuple[Array, Array]:
     high = [
         p.high if p.high is not None else 0.2 * p.value if p.value < 0 else np.inf for p in params
     ]
-    return np.array(low), np.array(high)
+    far = np.array([np.inf if p.std is None else BELIEVED * p.std for p in params])
+    values = data.model.values
+    return np.maximum(low, values - far), np.minimum(high, values + far)

@@ -9,6 +9,7 @@ likeliest of every other structure of noise, are held against the `ruler`:
 
     a rival takes the place of the likeliest only where it predicts clearly better
     a cause without which predictions are as good, within their scatter, is dropped
+    what is left then must be likelier than none by itself
     what predicts no better than the crude model is not claimed at all
 
 A cause is an effect or the calibration of the model's own parameters. Its credit is what is lost
@@ -20,7 +21,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from grounded.diagnosis.hypotheses.explored import CLAIM
+from grounded.diagnosis.hypotheses.explored import CLAIM, parametric
 from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.noise import Structure
@@ -70,9 +71,17 @@ def decide(search: HypothesisSearch, best: Fitted, ruler: Ruler, most: int) -> D
     ruler.beside(crude)
     search, fit = _proposed(search, best, crude, ruler, most)
     fit, without = _pruned(search, fit, ruler)
+    if not _likely(search, fit):
+        fit, without = _pruned(search, search.best_null(), ruler)
     if causes(fit) and not _pays(ruler, crude, fit, PAYS):
         fit, without = crude, {}
     return Decision(search, fit if causes(fit) else _quiet(search, fit, crude), crude, without)
+
+
+def _likely(search: HypothesisSearch, fit: Fitted) -> bool:
+    """Whether evidence still asks for the effects that are left: others may have carried them."""
+    null = search.exact_null() if parametric(fit) else search.best_null()
+    return not fit.hypothesis.effects or search.score(fit) > search.score(null) + CLAIM
 
 
 def _quiet(search: HypothesisSearch, fit: Fitted, crude: Fitted) -> Fitted:
