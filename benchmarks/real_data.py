@@ -56,12 +56,12 @@ PUBLISHED = {
     ),
     "ACROBOT": (
         "joint friction",
-        ("coulomb_friction", "viscous_friction", "joint_friction"),
+        ("coulomb_friction", "viscous_friction", "joint_friction", "load_friction"),
         [(0.1, "q1", 0.065), (0.5, "q1", 0.400)],
     ),
     "SYSID": (
         "joint friction",
-        ("coulomb_friction", "viscous_friction", "joint_friction"),
+        ("coulomb_friction", "viscous_friction", "joint_friction", "load_friction"),
         [(0.1, "q1", 0.069), (0.5, "q1", 0.675)],
     ),
 }
