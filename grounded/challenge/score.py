@@ -37,6 +37,7 @@ from grounded.utility import Reward
 DETECTABLE = 3.0  # nats
 WORSE = 1.01  # ratio of errors in units from which names predict worse than none
 RIVALS = 2
+LATE = {"delay": "sensor_delay", "lag": "sensor_lag"}  # what instruments find, as effects
 
 
 @dataclass(frozen=True)
@@ -133,8 +134,8 @@ def judge(
 ) -> dict[str, Any]:
     """One case's marks."""
     truth = [e["effect"] for e in label["effects"]]
-    late = [f for f in diagnosis.get("preflight", ()) if f["kind"] == "delay" and f["corrected"]]
-    sensors = [f"sensor_delay:{f['signal']}" for f in late]  # found before any physics
+    mended = [f for f in diagnosis.get("preflight", ()) if f["corrected"] and f["kind"] in LATE]
+    sensors = [f"{LATE[f['kind']]}:{f['signal']}" for f in mended]  # found before any physics
     named = sensors + list(diagnosis["verdict"]["effects"])
     order = sensors + [r["effect"] for r in diagnosis["ranking"]]
     group = set(order[:1])

@@ -119,6 +119,7 @@ class Library:
         found, offered = [], [family.name for family in self.families]
         idle, outright = derived_states(model), outright_states(model)
         integrals = integrated_states(model)
+        geometric = set(integrals) - set(places.velocities(model))
         same = aliases(model, idle | outright) | joint.renamed(model)
         for family in self.families:
             for target in family.targets(model):
@@ -129,6 +130,8 @@ class Library:
                     continue
                 if driven[2] and integrals.get(driven[0]) == driven[2]:
                     continue  # it would be rate_gain under another name
+                if family in rate.ADDED and driven[0] in geometric:
+                    continue
                 if same.get(f"{family.name}:{target}", "").partition(":")[0] in offered:
                     continue
                 found.append(_build(family, target, model, scales or Scales()))
@@ -156,7 +159,7 @@ def derived_states(model: Model) -> set[str]:
 
 def integrated_states(model: Model) -> dict[str, str]:
     """States whose rate is another state, times a constant: an angle and its angular velocity."""
-    (x, u), dt = places.samples(model), places.probe(model, 1e-6)
+    (x, u), dt = places.samples(model), places.probe(model, 1e-8)
     f_x, f_u = model.system.linearise(x, u, model.values, dt)
     rates = (f_x - np.eye(model.n)) / dt
     moved = (model.system.step(x, u, model.values, dt) - x) / dt

@@ -132,3 +132,13 @@ def test_what_a_rival_explains_as_well_is_not_distinguishable():
     row = summary(marks)["single"]
     assert (row["detectable"], row["first"]) == (2, 0.5)
     assert (row["distinguishable"], row["first_of_distinguishable"]) == (1, 1.0)
+
+
+def test_what_instruments_found_counts_as_the_sensor_that_it_is():
+    label = {"effects": [{"effect": "sensor_lag:w", "params": {}}], "case": "x", "kind": "single"}
+    label |= {"noise": "white", "system": "lift", "param_error": 0.0}
+    found = {"verdict": {"kind": "none", "effects": []}, "indistinguishable": [], "ranking": []}
+    found |= {"gap": {"after": 1.0}, "leftover": []}
+    for kind, first in (("lag", True), ("delay", False)):
+        finding = {"kind": kind, "signal": "w", "corrected": True}
+        assert judge(label, found | {"preflight": [finding]}, None)["first"] is first
