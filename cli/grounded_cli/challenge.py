@@ -180,9 +180,19 @@ def _scored(folder: str) -> str:
 
 
 def _words(value: Any) -> str:
+    if isinstance(value, dict) and "of" in value:
+        return _share(**value)
     if isinstance(value, dict):
-        return ", ".join(f"{key} {_figure(one)}" for key, one in value.items())
+        return ", ".join(f"{key} {_words(one)}" for key, one in value.items())
     return _figure(value)
+
+
+def _share(count: int, of: int, share: float | None, interval: list[float] | None) -> str:
+    """`17 of 18 (94 %; 74 to 99 %)`, the interval behind the semicolon."""
+    if share is None or interval is None:
+        return "none of that kind"
+    low, high = (100 * end for end in interval)
+    return f"{count} of {of} ({100 * share:.3g} %; {low:.0f} to {high:.0f} %)"
 
 
 def _figure(value: Any) -> str:

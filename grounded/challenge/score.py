@@ -6,14 +6,16 @@ also 3 nats ahead of the likeliest others that the diagnosis ranked, fitted in t
 diagnosis predicts, held out and in units, is compared with what the oracle predicts.
 
 Besides a first name that is wrong there are a second one that nothing makes (`false_second`), the
-right family at the wrong place (`wrong_place`), and names that predict worse than the model without
-them (`worse`). `study` makes, diagnoses and judges cases in memory, without files.
+right family at the wrong place (`wrong_place`), names that predict worse than the model without
+them (`worse`), and how much of the error in units is gone (`units_shrinkage`). `summary` gives each
+share with its count and Wilson's 95 % interval. `study` makes, diagnoses and judges cases in
+memory, without files.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -34,9 +36,12 @@ from grounded.task import Task
 from grounded.trial import Trial
 from grounded.utility import Reward
 
+Marks = Sequence[Mapping[str, Any]]
 DETECTABLE = 3.0  # nats
 WORSE = 1.01  # ratio of errors in units from which names predict worse than none
+WITHIN, LEAVES = 1.15, 1.3  # of the oracle's error; of the noise, from which a claim misleads
 RIVALS = 2
+LATE = {"delay": "sensor_delay", "lag": "sensor_lag"}  # what instruments find, as effects
 
 
 @dataclass(frozen=True)
@@ -133,8 +138,8 @@ def judge(
 ) -> dict[str, Any]:
     """One case's marks."""
     truth = [e["effect"] for e in label["effects"]]
-    late = [f for f in diagnosis.get("preflight", ()) if f["kind"] == "delay" and f["corrected"]]
-    sensors = [f"sensor_delay:{f['signal']}" for f in late]  # found before any physics
+    mended = [f for f in diagnosis.get("preflight", ()) if f["corrected"] and f["kind"] in LATE]
+    sensors = [f"{LATE[f['kind']]}:{f['signal']}" for f in mended]  # found before any physics
     named = sensors + list(diagnosis["verdict"]["effects"])
     order = sensors + [r["effect"] for r in diagnosis["ranking"]]
     group = set(order[:1])
@@ -159,6 +164,7 @@ def judge(
         "false_second": bool(truth) and _spare(truth, named, label) > 0,
         "wrong_place": _misplaced(truth, order),
         "worse": bool(named) and _ratio(diagnosis, _without(diagnosis)) > WORSE,
+        "units_shrinkage": 1 - _ratio(diagnosis, _row(diagnosis).get("crude", {})),
     }
     if known is not None:
         marks["evidence"] = known.evidence
@@ -226,7 +232,7 @@ def _values(label: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> dict[str,
     return {"covered": covered, "errors": errors}
 
 
-def summary(marks: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def summary(marks: Marks) -> dict[str, Any]:
     """Figures of a set of judged cases, by kind."""
     found: dict[str, Any] = {}
     for kind in sorted({m["kind"] for m in marks}):
@@ -237,53 +243,86 @@ def summary(marks: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
             for v in ("effect", "several", "none", "unknown")
         }
         row["worse"] = _part(some, "worse")
-        if kind == "single":
-            seen = [m for m in some if m.get("detectable")]
-            apart = [m for m in seen if m["distinguishable"]]
-            row |= {
-                "detectable": len(seen),
-                "first": _part(seen, "first"),
-                "distinguishable": len(apart),
-                "first_of_distinguishable": _part(apart, "first"),
-                "in_group": _part(seen, "in_group"),
-                "top3": _part(seen, "top3"),
-                "first_of_all": _part(some, "first"),
-                "leftover": _part(seen, "leftover"),
-                "wrong_place": _part(seen, "wrong_place"),
-            }
-        if kind == "double":
-            seen = [m for m in some if m.get("each_detectable")]
-            row |= {"both_detectable": len(seen), "both": _part(seen, "both")}
-        if kind in ("single", "double"):
-            covered = [c for m in some for c in m["covered"]]
-            ratios = [m["gap_ratio"] for m in some if m.get("detectable")]
-            row["false_second"] = _part(some, "false_second")
-            row["coverage"] = float(np.mean(covered)) if covered else None
-            row["gap_ratio_median"] = float(np.median(ratios)) if ratios else None
-            row["gap_within_1.15"] = float(np.mean(np.array(ratios) < 1.15)) if ratios else None
-            units = [m["units_ratio"] for m in some if np.isfinite(m.get("units_ratio", np.nan))]
-            row["units_ratio_median"] = float(np.median(units)) if units else None
-            row["units_within_1.15"] = float(np.mean(np.array(units) < 1.15)) if units else None
-            errors = [e for m in some for e in m["errors"]]
-            row["param_error_median"] = float(np.median(errors)) if errors else None
-        if kind == "none":
-            row["false"] = {
-                noise: _part([m for m in some if m["noise"] == noise], "false_effect")
-                for noise in sorted({m["noise"] for m in some})
-            }
-        if kind == "withheld":
-            bad = [m["false_effect"] and m["gap_after"] > 1.3 and not m["leftover"] for m in some]
-            row["misleading"] = float(np.mean(bad))
-            row["claimed"] = _part(some, "false_effect")
-            row["leftover"] = _part(some, "leftover")
+        row |= OF_KIND[kind](some)
         times = [m["cpu_s"] for m in some if "cpu_s" in m]
         row["cpu_s_mean"] = float(np.mean(times)) if times else None
         found[kind] = row
     return found
 
 
-def _part(marks: Sequence[Mapping[str, Any]], key: str) -> float | None:
-    return float(np.mean([bool(m[key]) for m in marks])) if marks else None
+def _single(some: Marks) -> dict[str, Any]:
+    seen = [m for m in some if m.get("detectable")]
+    apart = [m for m in seen if m["distinguishable"]]
+    return {
+        "first": _part(seen, "first"),
+        "first_of_distinguishable": _part(apart, "first"),
+        "in_group": _part(seen, "in_group"),
+        "top3": _part(seen, "top3"),
+        "first_of_all": _part(some, "first"),
+        "leftover": _part(seen, "leftover"),
+        "wrong_place": _part(seen, "wrong_place"),
+        **_of_effects(some),
+    }
+
+
+def _double(some: Marks) -> dict[str, Any]:
+    seen = [m for m in some if m.get("each_detectable")]
+    return {"both": _part(seen, "both"), **_of_effects(some)}
+
+
+def _of_effects(some: Marks) -> dict[str, Any]:
+    """Of cases with effects: names to spare, intervals, predictions beside the oracle's."""
+    gaps = [m["gap_ratio"] for m in some if m.get("detectable")]
+    units = [m["units_ratio"] for m in some if np.isfinite(m.get("units_ratio", np.nan))]
+    return {
+        "false_second": _part(some, "false_second"),
+        "coverage": share(c for m in some for c in m["covered"]),
+        "gap_ratio_median": _median(gaps),
+        "gap_within_1.15": share(r < WITHIN for r in gaps),
+        "units_ratio_median": _median(units),
+        "units_within_1.15": share(r < WITHIN for r in units),
+        "units_shrinkage_median": _median([m["units_shrinkage"] for m in some]),
+        "param_error_median": _median([e for m in some for e in m["errors"]]),
+    }
+
+
+def _none(some: Marks) -> dict[str, Any]:
+    kinds = sorted({m["noise"] for m in some})
+    by = {n: _part([m for m in some if m["noise"] == n], "false_effect") for n in kinds}
+    return {"false": by, "leftover": _part(some, "leftover")}
+
+
+def _withheld(some: Marks) -> dict[str, Any]:
+    bad = (m["false_effect"] and m["gap_after"] > LEAVES and not m["leftover"] for m in some)
+    return {
+        "misleading": share(bad),
+        "claimed": _part(some, "false_effect"),
+        "leftover": _part(some, "leftover"),
+    }
+
+
+OF_KIND = {"single": _single, "double": _double, "none": _none, "withheld": _withheld}
+
+
+def _median(values: Sequence[float]) -> float | None:
+    known = [v for v in values if np.isfinite(v)]
+    return float(np.median(known)) if known else None
+
+
+def _part(marks: Marks, key: str) -> dict[str, Any]:
+    return share(bool(m[key]) for m in marks)
+
+
+def share(said: Iterable[bool]) -> dict[str, Any]:
+    """How many of how many, their share and its 95 % interval (Wilson 1927)."""
+    each = list(said)
+    n, k, z = len(each), sum(each), 1.96
+    if not n:
+        return {"count": 0, "of": 0, "share": None, "interval": None}
+    middle = (k + z**2 / 2) / (n + z**2)
+    half = z / (n + z**2) * float(np.sqrt(k * (n - k) / n + z**2 / 4))
+    interval = [max(middle - half, 0.0), min(middle + half, 1.0)]
+    return {"count": k, "of": n, "share": k / n, "interval": interval}
 
 
 def task_of(case: Case) -> Task:

@@ -9,6 +9,9 @@ input by themselves: their rate depends on themselves and on inputs alone and fa
 It acts on the mean rate of each quarter of a step: the limit ends within a step where the target is
 near, and a lag much shorter than a step is no trouble. A step that it does not touch is the
 model's own.
+
+Nothing is added to the rate of a position or an angle whose rate is another state by definition: no
+force does that. What its sensors say of it is the instruments' matter, and `rate_gain` a gear's.
 """
 
 from __future__ import annotations
@@ -126,3 +129,4 @@ slew_limit = RateFamily(
 )
 
 FAMILIES = (offset, rate_gain, trend, coupling, periodic, slew_limit)
+ADDED = (offset, trend, coupling, periodic)  # to a state's rate: not where that is another state

@@ -119,6 +119,7 @@ class Library:
         found, offered = [], [family.name for family in self.families]
         idle, outright = derived_states(model), outright_states(model)
         integrals = integrated_states(model)
+        geometric = set(integrals) - set(places.velocities(model))
         same = aliases(model, idle | outright) | joint.renamed(model)
         for family in self.families:
             for target in family.targets(model):
@@ -129,6 +130,8 @@ class Library:
                     continue
                 if driven[2] and integrals.get(driven[0], ("",))[0] == driven[2]:
                     continue  # it would be rate_gain under another name
+                if family in rate.ADDED and driven[0] in geometric:
+                    continue
                 if same.get(f"{family.name}:{target}", "").partition(":")[0] in offered:
                     continue
                 found.append(_build(family, target, model, scales or Scales()))
@@ -159,7 +162,7 @@ def integrated_states(model: Model) -> dict[str, tuple[str, float]]:
 
     A simulator that can't make a short step adds the velocity that it has after its own step.
     """
-    (x, u), dt = places.samples(model), places.probe(model, 1e-6)
+    (x, u), dt = places.samples(model), places.probe(model, 1e-8)
     after = model.system.step(x, u, model.values, dt)
     moved, names, found = (after - x) / dt, model.state_names, {}
     if dt > SHORT:

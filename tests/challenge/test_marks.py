@@ -7,7 +7,7 @@ from cli import grounded
 from grounded.challenge import judge, make, summary
 from grounded.challenge.cases import _shares
 from grounded.challenge.mechanism import Mechanism, arm_built, cart_built
-from grounded.challenge.score import Oracle
+from grounded.challenge.score import Oracle, share
 from grounded.challenge.systems import SYSTEMS
 from grounded.errors import GroundedError
 
@@ -130,5 +130,23 @@ def test_what_a_rival_explains_as_well_is_not_distinguishable():
     assert [m["distinguishable"] for m in marks] == [False, True]
     assert marks[1]["units_ratio"] == pytest.approx(1.2)
     row = summary(marks)["single"]
-    assert (row["detectable"], row["first"]) == (2, 0.5)
-    assert (row["distinguishable"], row["first_of_distinguishable"]) == (1, 1.0)
+    assert row["first"]["of"] == 2 and row["first"]["share"] == 0.5
+    assert row["first_of_distinguishable"] == share([True])
+    assert row["units_shrinkage_median"] == pytest.approx(0.2)  # of 0 and 40 %
+
+
+def test_shares_have_the_interval_of_wilson():
+    found = share([True] * 17 + [False])
+    assert (found["count"], found["of"]) == (17, 18)
+    assert found["interval"] == pytest.approx([0.742, 0.990], abs=1e-3)
+    assert share([])["share"] is None
+
+
+def test_what_instruments_found_counts_as_the_sensor_that_it_is():
+    label = {"effects": [{"effect": "sensor_lag:w", "params": {}}], "case": "x", "kind": "single"}
+    label |= {"noise": "white", "system": "lift", "param_error": 0.0}
+    found = {"verdict": {"kind": "none", "effects": []}, "indistinguishable": [], "ranking": []}
+    found |= {"gap": {"after": 1.0}, "leftover": []}
+    for kind, first in (("lag", True), ("delay", False)):
+        finding = {"kind": kind, "signal": "w", "corrected": True}
+        assert judge(label, found | {"preflight": [finding]}, None)["first"] is first

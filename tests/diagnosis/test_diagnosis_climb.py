@@ -11,6 +11,7 @@ from grounded.diagnosis.likelihood.step import _bounded
 from grounded.effects import Library
 from grounded.experiments.pendulum import FRICTION, HEAVIER, pendulum_task
 from grounded.experiments.pendulum import model as real_pendulum
+from grounded.models.arm import model as arm
 from grounded.models.car import model as car
 from grounded.models.pendulum import model as pendulum
 from grounded.plant import Noise, Plant
@@ -104,3 +105,9 @@ def test_a_rate_that_is_another_state_has_one_name():
     offered = {effect.name for effect in Library().candidates(pendulum)}
     assert "rate_gain:theta" in offered and "coupling:theta<-omega" not in offered
     assert any(effect.name.startswith("coupling:") for effect in Library().candidates(car))
+
+
+def test_no_force_moves_an_angle_beside_its_own_rate():
+    added = ("offset", "trend", "coupling", "periodic")
+    names = [e.name for e in Library().candidates(arm) if e.family.name in added]
+    assert {n.partition(":")[2].partition("<-")[0] for n in names} == {"q1_vel", "q2_vel"}

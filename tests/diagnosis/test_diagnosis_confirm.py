@@ -102,7 +102,7 @@ class Said:
 
     def gain(self, before, after):
         mean = np.log(self.error(causes(before)) / self.error(causes(after)))
-        return Gain(mean, 0.02, mean)
+        return Gain(mean, 0.02, mean, np.array([mean]), np.array([0.02]))
 
 
 def test_what_predicts_no_better_is_not_claimed(wavy):
@@ -135,3 +135,13 @@ def test_one_long_log_is_held_out_by_pieces():
     assert found.prediction_error[0].held_out == "pieces" and found.effects
     short = diagnose(model, [trials[0].until(60)])
     assert short.no_cause and short.prediction_error[0].held_out == "no"
+
+
+def test_an_effect_of_one_channel_pays_there():
+    noisy = {"mean": 0.015, "scatter": 0.014, "largest": 0.3}
+    clear = Gain(**noisy, channels=np.array([0.09, -0.05]), scatters=np.array([0.025, 0.055]))
+    assert clear.pays(2.0, 0.01) and not clear.beyond(2.0, 0.01) and not clear.pays(3.0, 0.01)
+    vague = Gain(**noisy, channels=np.array([0.06, -0.03]), scatters=np.array([0.025, 0.055]))
+    assert not vague.pays(2.0, 0.01)
+    worse = Gain(-0.01, 0.014, 0.3, clear.channels, clear.scatters)
+    assert not worse.pays(1.0, 0.01)

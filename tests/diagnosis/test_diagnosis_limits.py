@@ -36,7 +36,7 @@ def test_what_acts_on_a_state_that_never_moved_is_not_offered():
     data = prepare(pendulum, list(stuck(swings(), 1)))
     assert still_states(data) == ["omega"]
     offered = {e.name for e in knowable(data, Library().candidates(pendulum, data.scales))}
-    assert "offset:theta" in offered and "sensor_scale:theta" in offered
+    assert "rate_gain:theta" in offered and "sensor_scale:theta" in offered
     assert not {"viscous_friction:omega", "sensor_delay:omega", "sensor_bias:omega"} & offered
 
 

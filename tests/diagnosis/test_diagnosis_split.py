@@ -7,6 +7,7 @@ import pytest
 from test_diagnosis import DT, cart
 
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
+from grounded.diagnosis.likelihood.noise import DOF, NoiseModel, Structure
 from grounded.diagnosis.validation.split import shares
 from grounded.effects import Library
 from grounded.task import Task
@@ -94,3 +95,16 @@ def test_shares_are_of_what_there_was():
     np.testing.assert_allclose(found[:, 1], [0.0, 0.6, 0.4])
     by_trials = shares(before, after, np.array([1.0, 0.4]))
     np.testing.assert_allclose(by_trials[:, 0], [0.75, 0.0, 0.25])
+
+
+def test_noise_with_its_outliers_comes_to_its_variance():
+    rng, n = np.random.default_rng(0), 1
+    v = rng.standard_t(3, (2000, 3, n))
+    r, weight = 1.0, np.ones_like(v)
+    for _ in range(20):  # Student of 4 degrees of freedom, by expectation and maximisation
+        weight = (DOF + 1) / (DOF + v**2 / r)
+        r = float((weight * v**2).mean())
+    logs = np.full(n, np.log(r))
+    noise = NoiseModel(Structure(), logs, logs, logs, logs - 20, weight, weight)
+    assert noise.plain.measurement(1)[0, 0, 0] == pytest.approx((v**2).mean(), rel=0.05)
+    assert r < 0.6 * (v**2).mean() and noise.plain.weight_v == 1.0

@@ -176,9 +176,9 @@ def _grow(search: HypothesisSearch, best: Fitted, most: int) -> None:
     """Second and further effects: add, then swap each for what goes better with the others."""
     size = len(best.hypothesis.effects)
     while 1 <= size < most:
-        for start in _starts(search, size, best):
-            search.extended(start, 8)
-        search.finished(search.of_size(size + 1)[:HOPEFUL], 10)
+        grown = [search.extended(start, 8) for start in _starts(search, size, best)]
+        firsts = [max(fits, key=search.score) for fits in grown if fits]  # each has its own noise
+        search.finished(list(dict.fromkeys([*search.of_size(size + 1)[:HOPEFUL], *firsts])), 10)
         search.again(search.of_size(size + 1)[:2])
         search.finished(search.of_size(size + 1)[:TUNED], TO_THE_TOP)
         tune(search, search.of_size(size + 1)[:TUNED])

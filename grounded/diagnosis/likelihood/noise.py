@@ -91,6 +91,18 @@ class NoiseModel:
             return np.broadcast_to(r, (steps + 1, 1, len(r)))
         return np.concatenate([np.broadcast_to(np.exp(self.log_r), r[:1].shape), r])
 
+    @property
+    def plain(self) -> NoiseModel:
+        """Without weights, its variances what w and v come to with their outliers."""
+        if isinstance(self.weight_w, float) or isinstance(self.weight_v, float):
+            return self
+        w, v = ((DOF + 1) / weight - DOF for weight in (self.weight_w, self.weight_v))
+        log_q, log_r = (
+            log + np.log(np.maximum(size.mean(axis=(0, 1)), 1e-12))
+            for log, size in ((self.log_q, w), (self.log_r, v))
+        )
+        return replace(self, log_q=log_q, log_r=log_r, weight_w=1.0, weight_v=1.0)
+
     def start(self, runs: int) -> Array:
         """Variance of the coloured part at t = 0, (B, 0 or n)."""
         if self.structure.tau is None:

@@ -30,7 +30,7 @@ from grounded.diagnosis.validation.ruler import Ruler
 CALIBRATION = "calibration"
 RIVALS = 8  # likeliest hypotheses that are measured
 PAYS = (1.0, 0.01)  # scatters that a cause must gain, and the least gain in one channel
-FURTHER = (2.0, 0.01)  # the same where there are several causes
+FURTHER = (2.0, 0.01)  # the same where there are several effects
 BETTER = (2.0, 0.05)  # the same for a rival to take the place of a likelier hypothesis
 OVERRULES = (3.0, 0.1)  # and for a claim that is likely under another noise only
 SLIGHT = 0.02  # of what all causes gain: one that makes less is not named
@@ -90,7 +90,7 @@ def _quiet(search: HypothesisSearch, fit: Fitted, crude: Fitted) -> Fitted:
 
 
 def _pays(ruler: Ruler, before: Fitted, after: Fitted, bar: tuple[float, float]) -> bool:
-    return ruler.gain(before, after).beyond(*bar)
+    return ruler.gain(before, after).pays(*bar)
 
 
 def _overrules(
@@ -141,8 +141,8 @@ def _pruned(
             return fit, without
         gains = {name: ruler.gain(less, fit) for name, less in without.items()}
         least = SLIGHT * ruler.gain(search.exact_null(), fit).mean
-        bar = PAYS if len(gains) == 1 else FURTHER
-        idle = [n for n, gain in gains.items() if not gain.beyond(*bar) or gain.mean < least]
+        bar = PAYS if len(fit.hypothesis.effects) < 2 else FURTHER
+        idle = [n for n, gain in gains.items() if not gain.pays(*bar) or gain.mean < least]
         if not idle:
             return fit, without
         fit = without[min(idle, key=lambda name: gains[name].mean)]

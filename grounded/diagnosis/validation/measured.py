@@ -54,24 +54,27 @@ class Measured:
     def noise_floor(self) -> tuple[Array, str]:
         """Rms error that no model undercuts, by horizon and shown state, and where it is from.
 
-        Noise that seems coloured counts as such where no flexible model finds anything in it.
+        Noise that seems coloured counts as such in channels where no flexible model finds anything.
         """
         repeats = repeated(self.trials, self.data)
         found, source = self.ruler.scatter(self.best, repeats), "repeats"
         if found is None:
-            source = "short horizon"
-            fit = self.best if not self.left else plain(self.search, self.best)
-            starts = (horizon(self.predictor, fit, k * self.data.dt) for k in self.ruler.steps)
-            rows = [
-                root_mean_square(
-                    np.where(self.data.seen[w.at + w.steps, w.run] > 0, w.spread, np.nan)
-                )
-                for w in starts
-            ]
-            found = np.array([*rows, np.full_like(rows[0], np.nan)])
+            found, source = self.carried(self.best), "short horizon"
+            off = [self.data.model.state_names.index(left.channel) for left in self.left]
+            if off:
+                found[:, off] = self.carried(plain(self.search, self.best))[:, off]
         reached = [e.rms for _, e in self.ruler.measured]
         reached += [errors.rms for _, errors in self.flexible.values()]
         return np.fmin(found, np.fmin.reduce(reached))[:, self.ruler.shown], source
+
+    def carried(self, fit: Fitted) -> Array:
+        """What one step's noise comes to, carried on by the model, (K, n); NaN for whole trials."""
+        rows = []
+        for steps in self.ruler.steps:
+            w = horizon(self.predictor, fit, steps * self.data.dt)
+            seen = self.data.seen[w.at + w.steps, w.run] > 0
+            rows.append(root_mean_square(np.where(seen, w.spread, np.nan)))
+        return np.array([*rows, np.full_like(rows[0], np.nan)])
 
     def corrections(self) -> dict[str, tuple[Leftover, Errors]]:
         """By channel, what a flexible model corrects where predictions gain by it."""

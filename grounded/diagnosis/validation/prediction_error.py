@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -64,8 +64,12 @@ def horizon(predictor: Predictor, fit: Fitted, seconds: float) -> Horizon:
 
 
 def _spread(predictor: Predictor, fit: Fitted, at: Any, run: Any, steps: int) -> Array:
-    """Standard deviation that noise alone gives the log `steps` after the moments (M,), (M, n)."""
-    data, noise = predictor.data, fit.noise
+    """Standard deviation that noise alone gives the log `steps` after the moments (M,), (M, n).
+
+    With its outliers, as the errors that are compared with it have them.
+    """
+    data, fit = predictor.data, replace(fit, noise=fit.noise.plain)
+    noise = fit.noise
     (L, B), n = data.time.shape, data.model.n
     g, delays = filter_of(predictor, fit, covariances=True), delays_of(fit.hypothesis, data)
     R, Q = np.broadcast_to(noise.measurement(L), (L + 1, B, n)), g.system.Q

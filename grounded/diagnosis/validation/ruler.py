@@ -78,10 +78,20 @@ class Gain:
     mean: float
     scatter: float
     largest: float  # of a single channel and horizon
+    channels: Array  # (n',) the mean over horizons by shown state
+    scatters: Array  # (n',) of these
 
     def beyond(self, scatters: float, least: float) -> bool:
-        """Whether it is worth a claim."""
+        """Whether it is more than its scatter in all."""
         return self.mean > scatters * self.scatter and self.largest > least
+
+    def pays(self, scatters: float, least: float) -> bool:
+        """Whether it is worth a claim: in all, or by a scatter more in a channel that it acts on.
+
+        An effect of one channel is lost in the mean over a dozen, and in their scatter.
+        """
+        one = (self.channels > (scatters + 1) * self.scatters) & (self.channels > least)
+        return self.beyond(scatters, least) or (self.mean > 0 and bool(one.any()))
 
 
 class Ruler:
@@ -247,11 +257,15 @@ class Ruler:
             return np.asarray(np.maximum(x.sum(axis=1, keepdims=True) - x, 0.0))
 
         whole = ratio(a.sum(axis=1, keepdims=True), b.sum(axis=1, keepdims=True))
-        each = ratio(without(a), without(b)).sum(axis=(0, 2)) / max(int(seen.sum()), 1)
-        B = len(each)
-        scatter = np.sqrt((B - 1) / B * ((each - each.mean()) ** 2).sum()) if B > 1 else np.inf
+        counts = np.maximum(seen.sum(axis=(0, 1)), 1)
+        by = ratio(without(a), without(b)).sum(axis=0)
+        each = by.sum(axis=-1) / max(int(seen.sum()), 1)
         return Gain(
-            float(whole.sum() / max(int(seen.sum()), 1)), float(scatter), float(whole.max())
+            float(whole.sum() / max(int(seen.sum()), 1)),
+            float(_jackknife(each)),
+            float(whole.max()),
+            whole.sum(axis=(0, 1)) / counts,
+            _jackknife(by / counts),
         )
 
     # -- the floor ----------------------------------------------------------------------------
@@ -284,6 +298,14 @@ class Ruler:
         if not (count[:-1][:, self.shown] > 0).all():
             return None
         return np.where(count > 0, np.sqrt(total / np.maximum(count, 1)), np.nan)
+
+
+def _jackknife(each: Array) -> Array:
+    """Scatter of a mean from the means without each run, (B, ...) -> (...)."""
+    B = len(each)
+    if B < 2:
+        return np.full(each.shape[1:], np.inf)
+    return np.asarray(np.sqrt((B - 1) / B * ((each - each.mean(axis=0)) ** 2).sum(axis=0)))
 
 
 def repeated(trials: Sequence[Trial], data: Data) -> list[list[int]]:
