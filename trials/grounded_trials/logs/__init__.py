@@ -2,7 +2,7 @@
 
 Read `log_table.py` first (the [log] table and how it is followed), then `log_files.py` (which files
 a log is), `signals.py`, `samples.py` and `resample.py`. `inspect_log.py` looks at an unknown log,
-`inspect_guess.py` guesses its table,
+`twins.py` for signals of one motion in it, `inspect_guess.py` guesses its table,
 `inspect_evidence.py` weighs the guesses by the log's own numbers, `joint_names.py` by its joints;
 `recover.py` saves what a damaged one still holds, which `salvage.py` finds.
 """

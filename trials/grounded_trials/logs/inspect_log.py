@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +36,7 @@ from grounded_trials.formats.path_walk import (
 )
 from grounded_trials.logs.log_files import log_records, reading
 from grounded_trials.logs.signals import Decoder, decoder_of
+from grounded_trials.logs.twins import Twins, find_twins, measured_kind
 
 NOISE_SAMPLES = 10  # in a batch, to tell a signal's noise
 DECODED = 20_000  # messages of a topic whose numbers are looked at
@@ -126,71 +126,6 @@ def _remarks(log: LogReport) -> tuple[str, ...]:
                 f"(correlation {twins.correlation:.3f})"
             )
     return tuple(found)
-
-
-SAME = 0.95  # correlation from which two signals show the same motion
-LEAST = 30  # samples
-KINDS = (
-    *(f"@rpy.{angle}" for angle in ("roll", "pitch", "yaw")),
-    *(f"{place}.{axis}" for place in ("position", "translation") for axis in "xyz"),
-    *(f"{rate}.{axis}" for rate in ("linear", "angular") for axis in "xyz"),
-)
-
-
-@dataclass(frozen=True)
-class Twins:
-    """Two signals with one motion; a negative correlation says that a sign differs."""
-
-    first: str  # message paths
-    second: str
-    correlation: float
-
-    @property
-    def opposite(self) -> bool:
-        """Whether one of them has the other's sign reversed."""
-        return self.correlation < 0
-
-
-def kind_of(path: str) -> str:
-    """What a path measures, such as position.x; "" if that can't be told from its name."""
-    return next((kind for kind in KINDS if path.endswith("." + kind)), "")
-
-
-def find_twins(samples: Mapping[str, tuple[Ints, Floats]]) -> tuple[Twins, ...]:
-    """Compares signals of the same kind.
-
-    Args:
-        samples: by message path, stamps [ns] and values.
-    """
-    found = []
-    for first, second in combinations(samples, 2):
-        if kind_of(first) == kind_of(second) != "":
-            correlation = _correlation(samples[first], samples[second])
-            if abs(correlation) >= SAME:
-                found.append(Twins(first, second, correlation))
-    return tuple(found)
-
-
-def _correlation(a: tuple[Ints, Floats], b: tuple[Ints, Floats]) -> float:
-    """Of the rarer signal with the other at its stamps."""
-    (ta, ya), (tb, yb) = sorted((_clean(*a), _clean(*b)), key=lambda s: len(s[0]))
-    inside = (ta >= tb[0]) & (ta <= tb[-1]) if len(tb) else np.zeros(len(ta), dtype=np.bool_)
-    if inside.sum() < LEAST:
-        return 0.0
-    other = np.interp((ta[inside] - ta[0]) * 1e-9, (tb - ta[0]) * 1e-9, yb)
-    one = ya[inside]
-    if min(one.std(), other.std()) < 1e-3 * max(one.std(), other.std(), 1e-9):
-        return 0.0
-    return float(np.corrcoef(one, other)[0, 1])
-
-
-def _clean(t: Ints, y: Floats) -> tuple[Ints, Floats]:
-    finite = np.isfinite(y)
-    t, y = t[finite], y[finite]
-    order = np.argsort(t, kind="stable")
-    t, y = t[order], y[order]
-    keep = np.append(True, np.diff(t) > 0) if len(t) else finite[:0]
-    return t[keep], y[keep]
 
 
 def inspect_log(paths: str | Path | Sequence[str | Path]) -> LogReport:
@@ -355,7 +290,7 @@ class _Topic:
             try:
                 path = parse_path(topic + rest)
                 found = _Range(bind(path, self.decoder.type))
-                found.samples = [] if kind_of(path.text) else None
+                found.samples = [] if measured_kind(path.text) else None
                 self.ranges[path.text] = found
             except BadPath:
                 continue
