@@ -22,7 +22,7 @@ from grounded.diagnosis.validation.split import split
 from grounded.frozen import Array
 from grounded.trial import Trial
 
-ABOVE = 1.3  # times the noise floor: what is left is stated
+ABOVE, FAR = 1.3, 3.0  # times the noise floor: what is left is stated; whatever the doubt
 COUNTS = (2.0, 0.03)  # scatters, and least gain, of a flexible correction that is stated
 
 
@@ -145,7 +145,8 @@ class Measured:
         k, data, ruler = len(self.ruler.steps) - 1, self.data, self.ruler
         now, fine = self.rms(self.best), ruler.fine[ruler.shown]
         short = slice(0, len(ruler.steps))
-        least = np.maximum(np.log(ABOVE), 2 * ruler.doubt(self.best))
+        doubt = np.minimum(2 * ruler.doubt(self.best), np.log(FAR))
+        least = np.maximum(np.log(ABOVE), doubt)
         above = (np.log(now / self.floor) > least) & (now > 2 * fine)
         found = []
         for i, name in enumerate(ruler.names):
