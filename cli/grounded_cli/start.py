@@ -2,10 +2,9 @@
 
 import gc
 import signal
-from typing import NoReturn
 
 
-def main() -> NoReturn:
+def main() -> None:
     """Imports the command line and runs it."""
     gc.set_threshold(100_000, 50, 100)  # a command ends soon: looking for garbage costs more
     handler = signal.signal(signal.SIGINT, signal.SIG_DFL)
