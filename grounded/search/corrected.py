@@ -68,19 +68,19 @@ class Corrected(System):
 
     def step(self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0) -> Array:
         """See `System.step`; u is taken as received, without a shift."""
-        moved = self.base.step(np.ascontiguousarray(x[:, : self.base.n]), u, p, dt, smoothing)
+        moved = self.base.step(self._own(x), u, p, dt, smoothing)
         return self._next(moved, x, u, slice(None), np.zeros(self.base.n, bool))
 
     def check(self, x: Array, u: Array, p: Array, dt: float) -> None:
         """See `System.check`."""
-        self.base.check(np.ascontiguousarray(x[:, : self.base.n]), u, p, dt)
+        self.base.check(self._own(x), u, p, dt)
 
     def linearise(
         self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
     ) -> tuple[Array, Array]:
         """See `System.linearise`."""
         n, m = self.base.n, self.m
-        f_x, f_u = self.base.linearise(np.ascontiguousarray(x[:, :n]), u, p, dt, smoothing)
+        f_x, f_u = self.base.linearise(self._own(x), u, p, dt, smoothing)
         F, G = np.zeros((len(x), self.n, self.n)), np.zeros((len(x), self.n, m))
         by_x, by_u, by_before, by_y = np.split(self.law, np.cumsum([n, m, m]), axis=2)
         F[:, n : 2 * n] = np.concatenate([by_x, by_y, by_before], axis=2)
@@ -94,9 +94,7 @@ class Corrected(System):
         self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
     ) -> tuple[Array, Array, Array]:
         """See `System.sensitivities`."""
-        f_p = self.base.sensitivities(
-            np.ascontiguousarray(x[:, : self.base.n]), u, p, dt, smoothing
-        )[2]
+        f_p = self.base.sensitivities(self._own(x), u, p, dt, smoothing)[2]
         by_p = np.zeros((len(x), self.n, self.k))
         by_p[:, : self.base.n] = f_p
         return *self.linearise(x, u, p, dt, smoothing), by_p
@@ -111,15 +109,19 @@ class Corrected(System):
         alphas: Array | None = None,
     ) -> Swarm:
         """See `System.rollout`."""
-        n, angles = self.base.n, problem.angles[: self.base.n]
+        angles = problem.angles[: self.base.n]
 
         def step(x: Array, sent: Array, t: int) -> Array:
-            state, settings = np.ascontiguousarray(x[:, :n]), (problem.dt, problem.smoothing)
+            state, settings = self._own(x), (problem.dt, problem.smoothing)
             moved = self.base.step(state, np.ascontiguousarray(sent), problem.p, *settings)
             shift = 0.0 if problem.input_shift is None else problem.input_shift[t]
             return self._next(moved, x, sent + shift, t, angles)
 
         return rolled_out(problem, step, ubar, K, zbar, k, alphas)
+
+    def _own(self, x: Array) -> Array:
+        """The base's states (N, n) of x (N, 2 n + m)."""
+        return np.ascontiguousarray(x[:, : self.base.n])
 
     def _next(self, moved: Array, x: Array, u: Array, t: int | slice, angles: Flags) -> Array:
         """[x, y, u before] a step later: base states `moved` (N, n), x (N, 2 n + m), u (N, m)."""

@@ -56,8 +56,11 @@ def test_causes_gain_and_what_is_left(diagnosis):
 
 def test_what_became_worse_is_not_kept_back(diagnosis):
     worse = "Whole trials miss x by 3.8 m instead of 2.1: that is worse."
+    (row,) = diagnosis.prediction_error
+    whole = replace(row, whole_trial=True, crude={"x": 2.1}, with_effects={"x": 3.8})
     verdict = replace(diagnosis.verdict, sentence=f"{SENTENCE} {worse}")
-    assert three_lines(replace(diagnosis, verdict=verdict), cart_task())[1].endswith(worse)
+    found = replace(diagnosis, verdict=verdict, prediction_error=(row, whole))
+    assert three_lines(found, cart_task())[1].endswith(worse)
 
 
 def test_what_is_weighed_is_spoken_of(diagnosis):

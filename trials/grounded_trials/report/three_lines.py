@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 
 from grounded.diagnosis.report import Diagnosis, Remainder, RulerRow
-from grounded.diagnosis.verdict import tied
+from grounded.diagnosis.verdict import tied, worsened
 from grounded.task import Task
 from grounded_trials.report.diagnosis_words import moved_parameters, sentences
 from grounded_trials.report.findings import measured, weighed_groups
@@ -15,7 +15,6 @@ from grounded_trials.wording import count, shown
 CAUSES = 2  # that the first line names
 SMALL = 0.05  # of the gain: a cause below it is only counted
 FEW = 2  # states in the second line
-WORSE = "that is worse."  # how the verdict ends a sentence on what predictions lose
 
 
 def three_lines(diagnosis: Diagnosis, task: Task) -> list[str]:
@@ -59,7 +58,8 @@ def _gained(diagnosis: Diagnosis, task: Task) -> list[str]:
     held = "" if row.held_out != "no" else ", not held out"
     ahead = f"{row.horizon_s:.3g} s ahead{held}"
     told = [f"{ahead} it now misses {' and '.join(parts)}."] if parts else []
-    told += [one for one in sentences(diagnosis.sentence) if one.endswith(WORSE)]
+    if worse := worsened(diagnosis.prediction_error):
+        told.append(worse)
     return [" ".join(told)] if told else []
 
 

@@ -27,11 +27,7 @@ from grounded_trials.logs.log_table import LogMapping, log_mapping, read_log
 from grounded_trials.starting.kinds import KINDS, kind_in, skeleton
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.config import FILE
-from grounded_trials.workspace.examples import (
-    fresh_folder,
-    refuse_existing,
-    undone_on_failure,
-)
+from grounded_trials.workspace.examples import fresh_folder
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.model_file import load_module, model_in
 from grounded_trials.workspace.task_file import equal_weights, write_target
@@ -121,8 +117,8 @@ def begin(
         GroundedError: if the log can't be read or is ours, the folder holds a workspace, or a
             name is unknown.
     """
-    _check(folder, model, kind)
-    with undone_on_failure(folder, WRITTEN):
+    _check(model, kind)
+    with fresh_folder(folder, WRITTEN):
         return _begin(folder, log, model, kind, dt, ask)
 
 
@@ -191,8 +187,7 @@ def _one_run(report: LogReport) -> tuple[LogReport, tuple[str, ...]]:
     return replace(report, topics=(same[0],)), (note,)
 
 
-def _check(folder: Path, model: str | Path | None, kind: str | None) -> None:
-    refuse_existing(folder, WRITTEN)
+def _check(model: str | Path | None, kind: str | None) -> None:
     if kind is not None and kind not in KINDS:
         raise GroundedError(f"there is no kind '{kind}': {nearest(kind, KINDS)}")
     if model is not None and not Path(model).is_file():
@@ -201,7 +196,6 @@ def _check(folder: Path, model: str | Path | None, kind: str | None) -> None:
 
 def _model_in(folder: Path, text: str) -> Model:
     """Writes model.py and loads it."""
-    fresh_folder(folder, WRITTEN)
     write_atomically(folder / "model.py", text.encode())
     return model_in(load_module(folder, "model.py"))
 

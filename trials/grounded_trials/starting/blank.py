@@ -17,12 +17,7 @@ from grounded.task import Task
 from grounded.utility import Reward
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.config import FILE
-from grounded_trials.workspace.examples import (
-    fresh_folder,
-    refuse_existing,
-    toml_of,
-    undone_on_failure,
-)
+from grounded_trials.workspace.examples import fresh_folder, toml_of
 from grounded_trials.workspace.model_file import load_module, model_in
 from grounded_trials.workspace.task_file import write_target
 
@@ -95,9 +90,7 @@ def write_blank(folder: Path, file: str | Path, dt: float | None = None) -> None
         raise GroundedError(f"{file} can't be read: {error.strerror}") from None
     own = file.resolve() == (folder / "model.py").resolve()
     written = (FILE, "target.csv", "drive.py") if own else FILES
-    refuse_existing(folder, written)
-    with undone_on_failure(folder, written):
-        fresh_folder(folder, written)
+    with fresh_folder(folder, written):
         if not own:
             write_atomically(folder / "model.py", source)
             _loads_alone(folder, file)

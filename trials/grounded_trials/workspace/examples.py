@@ -142,9 +142,9 @@ def write_example(folder: Path, name: str) -> None:
     refuse_existing(
         folder, [file for file, text in files.items() if not _holds(folder / file, text)]
     )
-    fresh_folder(folder, ())
-    for file, text in files.items():
-        write_atomically(folder / file, text.encode())
+    with fresh_folder(folder, ()):
+        for file, text in files.items():
+            write_atomically(folder / file, text.encode())
 
 
 def refuse_existing(folder: Path, names: Iterable[str]) -> None:
@@ -163,10 +163,22 @@ def _holds(path: Path, text: str) -> bool:
 
 
 @contextmanager
-def undone_on_failure(folder: Path, files: Iterable[str]) -> Iterator[None]:
-    """Removes what was made if making it fails: the folder if it is new, or else these files."""
+def fresh_folder(folder: Path, files: Iterable[str]) -> Iterator[None]:
+    """Makes the folders of a workspace in which none of these files exists yet, to be written now.
+
+    If that fails, what was made goes again: the folder if it is new, or else these files.
+
+    Raises:
+        GroundedError: if one of the files exists, or the folder can't be made.
+    """
+    refuse_existing(folder, files)
     new = not folder.exists()
     try:
+        try:
+            for made in (folder, folder / "trials", folder / "candidates"):
+                made.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise GroundedError(f"{folder} can't be made: {error.strerror}") from None
         yield
     except BaseException:
         for path in [folder] if new else [folder / name for name in files]:
@@ -175,20 +187,6 @@ def undone_on_failure(folder: Path, files: Iterable[str]) -> Iterator[None]:
             else:
                 path.unlink(missing_ok=True)
         raise
-
-
-def fresh_folder(folder: Path, files: Iterable[str]) -> None:
-    """Makes the folders of a workspace in which none of these files exists yet.
-
-    Raises:
-        GroundedError: if one does, or the folder can't be made.
-    """
-    refuse_existing(folder, files)
-    try:
-        for made in (folder, folder / "trials", folder / "candidates"):
-            made.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise GroundedError(f"{folder} can't be made: {error.strerror}") from None
 
 
 def _source(module: ModuleType) -> str:
