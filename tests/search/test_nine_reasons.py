@@ -24,7 +24,7 @@ from grounded.search.improve import propose
 from grounded.search.planner import planner_for
 from grounded.search.standing import SearchOptions
 from grounded.solve import ddp
-from small_tasks import drive
+from small_tasks import cart_task, drive, other
 
 
 @pytest.fixture
@@ -95,14 +95,22 @@ def test_an_unstable_loop_gets_gentler_gains(late_arm):
     assert wild < -1e3 and search.best.utility > -2.0
 
 
-def test_an_end_says_what_it_is(late_arm, monkeypatch):
-    """Reason 5: 0.1 said "promises less than 0.1 %" where the grounded model diverges."""
-    monkeypatch.setattr(making, "GENTLER_TIMES", 0)
-    monkeypatch.setattr(mispredictions, "corrected", lambda *_: None)
-    standing = learn(late_arm.task, late_arm.run).standing
-    assert standing.ending in ("model diverges", "every step loses", "no step improved")
-    if standing.ending != "no step improved":
-        assert standing.phase == "stopped" and standing.then.verb == "diagnose"
+@pytest.mark.parametrize(
+    ("gain", "ending"), [(np.nan, "model diverges"), (-1e6, "every step loses")]
+)
+def test_an_end_says_what_it_is(monkeypatch, gain, ending):
+    """Reason 5: 0.1 called both converged, "the model promises less than 0.1 %"."""
+    made = making.Maker.candidate
+    monkeypatch.setattr(
+        making.Maker, "candidate", lambda *a, **k: replace(made(*a, **k), predicted_gain=gain)
+    )
+    task = cart_task()
+    real = Plant(other(task.model))
+    search = Search(task)
+    search.tell(drive(task, real, search.ask()))
+    assert search.ask() is None
+    assert (search.standing.phase, search.standing.ending) == ("stopped", ending)
+    assert search.standing.then.verb == "diagnose"
 
 
 def test_smaller_steps_hold_a_stiff_friction():
@@ -124,7 +132,7 @@ def test_smaller_steps_hold_a_stiff_friction():
 def test_exact_repeats_end_all_reruns(mechanisms):
     """Reason 9: 0.1 went on running incumbents again after repeats had agreed to the last bit."""
     task = mechanisms.cart_task("gentle")
-    real = task.model.with_values({"b": 0.8})
+    real = task.model.with_values({"b": 2.0})  # 0.1: 30 runs of 26 candidates
     found = learn(task, lambda candidate: drive(task, Plant(real, substeps=4), candidate))
     ran = [trial.candidate for trial in found.trials]
     assert len(ran) - len(set(ran)) <= 1

@@ -39,7 +39,12 @@ def workspace(tmp_path):
     return Workspace(folder)
 
 
-def test_learn_ends(workspace):
+@pytest.mark.parametrize("repeats", [1, 2])
+def test_learn_ends(workspace, repeats):
+    """FACTS 7, reason 1: with two repeats 0.1 ran the first candidate again and again."""
+    config = workspace.folder / "grounded.toml"
+    more = f"max_trials = 12\nrepeats = {repeats}"
+    config.write_text(config.read_text().replace("max_trials = 12", more))
     status = workspace.learn()
     assert status.standing.phase == "converged" and status.standing.ending
     assert status.standing.trials < 12
