@@ -22,7 +22,7 @@ from grounded_cli.terminal import field, names_in, number, show, show_json, stag
 from grounded_trials.wording import rendered, with_unit, wrapped
 
 if TYPE_CHECKING:
-    from grounded.diagnosis.report import Diagnosis, Ranked, Where
+    from grounded.diagnosis.report import Diagnosis, Ranked
     from grounded.engine import Engine
     from grounded.instruments.finding import Finding
     from grounded_trials import Workspace
@@ -139,7 +139,7 @@ def _tell(found: Diagnosis, before: dict[str, float]) -> None:
             show("\n" + table(*error_table(found)))
             _note(f"open loop, {_held_out(found)}")
         _effects(found)
-    _places(found.where)
+    _places(found)
     for title, text in error_lines(found, before):
         show(field(title, text))
     if found.correction is not None:
@@ -186,7 +186,8 @@ def _verdict(kind: str, text: str) -> str:
     return "\n".join(lines)
 
 
-def _places(where: Where) -> None:
+def _places(found: Diagnosis) -> None:
+    where = found.where
     channels = [
         (c.name, f"{100 * c.share:.0f} %", with_unit(number(c.rms, 3), c.unit))
         for c in where.channels
@@ -194,6 +195,10 @@ def _places(where: Where) -> None:
     ]
     if channels:
         show("\n" + table(channels, ("where", "share of the gap", "rms")))
+        _note(
+            "share: of the squared errors of single steps, in units of the noise, that causes and "
+            f"leftover make; rms: {found.gap.horizon_s:g} s ahead"
+        )
     for region in where.regions[:3]:
         share, time = 100 * region.share, 100 * region.occupancy
         show(field("", f"{region.when}: {share:.0f} % of the gap in {time:.0f} % of the time"))

@@ -76,26 +76,19 @@ class CarResult:
 
     def tables(self) -> list[StudyTable]:
         """Improvement and trials beside the paper's, quiet and with scatter."""
-        rows = []
-        for name in dict.fromkeys(run.manoeuvre for run in self.runs):
-            quiet, noisy = self.of(name, False), self.of(name, True)
-            rows.append((name, *_cells(quiet), *_cells(noisy), f"{PAPER[name]:.0%}"))
-        head = (
-            "manoeuvre",
-            "quiet: improvement",
-            "its optimum",
-            "trials",
-            "with scatter: true improvement",
-            "optimum under scatter",
-            "trials an iteration",
-            "paper",
-        )
-        return [StudyTable(f"RC car, up to {ITERATIONS} iterations", head, tuple(rows))]
+        found = []
+        for noisy, title in ((False, "RC car that repeats itself"), (True, "RC car with scatter")):
+            some = [run for run in self.runs if run.noisy == noisy]
+            names = dict.fromkeys(run.manoeuvre for run in some)
+            rows = tuple((n, *_cells(self.of(n, noisy)), f"{PAPER[n]:.0%}") for n in names)
+            trials = "trials an iteration" if noisy else "trials"
+            head = ("manoeuvre", "improvement", "the optimum's", trials, "the paper's car")
+            title = f"{title}, up to {ITERATIONS} iterations"
+            found += [StudyTable(title, head, rows)] if rows else []
+        return found
 
 
 def _cells(runs: list[CarRun]) -> tuple[str, str, str]:
-    if not runs:
-        return "", "", ""
     best = np.mean([improvement(run.true[0], run.optimum) for run in runs])
     shown = mean_text([run.improvement for run in runs])
     if not runs[0].noisy:

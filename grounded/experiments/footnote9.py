@@ -63,9 +63,9 @@ class Footnote9Result:
             "b",
             "model-based",
             "solved, 1 iteration",
-            "trials",
+            "trials of solved",
             "policy gradient",
-            "its trials",
+            "trials of policy gradient",
         )
         rows = tuple(
             (

@@ -119,7 +119,7 @@ class Theorem1Result:
         title = f"Theorem 1: medians of {seeds} seeds" if seeds > 1 else "Theorem 1: one seed"
         return [
             StudyTable(title, head, tuple(rows)),
-            StudyTable("Slopes (± one standard error)", ("", "here", "theorem"), slopes),
+            StudyTable("Slopes (± one standard error)", ("", "here", "of the bound"), slopes),
         ]
 
 

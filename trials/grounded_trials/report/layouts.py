@@ -13,6 +13,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 from grounded.model import Model
+from grounded_trials.report.scene import scene_of
 from grounded_trials.store.store import write_atomically
 
 FOXGLOVE, PLOTJUGGLER = "foxglove-layout.json", "plotjuggler-layout.xml"
@@ -69,7 +70,7 @@ def foxglove_layout(model: Model) -> dict[str, Any]:
         "second": _stacked(names[half:]),
         "direction": "row",
     }
-    if "position" in model.roles:
+    if scene_of(model).spatial:
         topics = {topic: {"visible": True} for topic in ("/pose", "/target", "/tf")}
         panels["3D!grounded"] = {"followMode": "follow-none", "topics": topics}
         layout = {"first": "3D!grounded", "second": layout, "direction": "row"}

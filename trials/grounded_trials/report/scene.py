@@ -5,8 +5,8 @@
     attitude             roll, pitch, yaw of an aircraft (z down, Euler angles as in aviation)
     heading              the angle from the first axis towards the second
 
-Without a position the plane is the phase plane of the first two states: something moves in any
-model. Coordinates are right-handed with z up.
+Without a position the plane is the phase plane of the first two states, and of a position along one
+axis that of it and its speed: something moves in any model. Coordinates are right-handed with z up.
 """
 
 from __future__ import annotations
@@ -70,7 +70,8 @@ def scene_of(model: Model) -> Scene:
     }
     position = roles.get("position", [])
     spatial = len(position) >= 2
-    axes = position[:3] if spatial else list(range(min(2, model.n)))
+    first = [*position, *(roles.get("speed", []) if position else []), *range(model.n)]
+    axes = position[:3] if spatial else list(dict.fromkeys(first))[:2]
     is_map = spatial and [model.state_names[i] for i in axes[:2]] == ["north", "east"]
     if is_map:
         axes[:2] = axes[1::-1]

@@ -240,7 +240,7 @@ def toml_of(task: Task, name: str, system: str = SIMULATED) -> str:
         "",
         "[search]",
         'method = "ddp"                # or "policy-gradient"',
-        'step = "damped"               # or "full": the paper\'s, DDP to convergence',
+        'step = "damped"               # "full" and match_inputs = false: the paper\'s own',
         "repeats = 1                   # trials a candidate, averaged",
         "rerun_incumbent = true        # after a loss that may be luck",
         "max_trials = 40",

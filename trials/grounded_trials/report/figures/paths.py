@@ -28,7 +28,7 @@ def path_figure(findings: Findings) -> Figure | None:
     if scene.volume:
         panels.append(_plane(findings, scene, scene.axes[0], scene.axes[2], plan=False))
     panels += _enlarged(findings, scene) + _shaded(findings, scene)
-    caption = "" if scene.spatial else "The model names no position: its first two states."
+    caption = "" if scene.spatial else f"No plane among the roles: {' and '.join(scene.names)}."
     if any(crash(run) for run in findings.runs):
         caption += " A cross marks where a run ended early."
     return Figure("paths", "Paths", caption.strip(), tuple(panels), legend(panels[:1]))
@@ -126,17 +126,19 @@ def _enlarged(findings: Findings, scene: Scene) -> list[Panel]:
     factor = enlarging(best, desired)
     if factor < SEEN:
         return []
-    curves = []
+    curves, cut = [], []
     for role, name, states in named_paths(findings):
         near = desired[: len(states)]
         path = near + factor * (states[:, axes] - near)
         off = np.abs(path - near).max(axis=1) > FAR * np.ptp(desired, axis=0).max()
         path[off] = np.nan
+        cut += [name] * bool(off.any())
         width = WIDTHS.get(role, 1.5)
         curves.append(Curve(path[:, 0], path[:, 1], role, name, width))
     x_name, y_name, *_ = (labelled(*one) for one in zip(scene.names, scene.units, strict=True))
     title = f"Deviations {factor:g} times as large"
-    return [Panel(title, x_name, y_name, tuple(curves), equal=True, kind="path")]
+    note = f"not drawn where it leaves the frame: {', '.join(cut)}" if cut else ""
+    return [Panel(title, x_name, y_name, tuple(curves), equal=True, note=note, kind="path")]
 
 
 def _shaded(findings: Findings, scene: Scene) -> list[Panel]:

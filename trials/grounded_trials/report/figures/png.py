@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import textwrap
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from grounded.figures.figure import (
 WIDE, HIGH, SQUARE, ROW = 4.8, 2.7, 4.4, 0.27  # [inch] of a panel; a bar's row
 DPI = 200
 MARKERS = {"disc": "o", "ring": "o", "cross": "x", "dash": "_"}
+TITLE = 52  # letters of a panel's title in a line
 OTHERS = 3  # single trials that a legend names
 STYLE: Any = {
     "font.size": 9.0, "axes.titlesize": 9.5, "axes.titleweight": "bold",
@@ -54,7 +56,7 @@ def png(figure: Figure) -> bytes:
         for i, row in enumerate(rows):
             for j, panel in enumerate(row):
                 axes = sheet.add_subplot(grid[i, j])
-                axes.set_title(panel.title)
+                axes.set_title(textwrap.fill(panel.title, TITLE))
                 _bars(axes, panel) if isinstance(panel, Bars) else _panel(axes, panel)
         handles = [_handle(key) for key in _keys(figure)]
         if handles:
@@ -84,7 +86,8 @@ def _bars(axes: Any, panel: Bars) -> None:
     drawn = axes.barh(range(len(values)), values, color=[_colour(bar.role) for bar in panel.bars])
     axes.bar_label(drawn, [bar.text for bar in panel.bars], padding=3)
     axes.set_yticks(range(len(values)), [bar.label for bar in panel.bars])
-    axes.set_xlim(1.3 * min([*values, 0.0]), 1.4 * (max([abs(v) for v in values], default=0) or 1))
+    low, high = min([*values, 0.0]), max([abs(v) for v in values], default=0) or 1
+    axes.set_xlim(low - 0.25 * (high - low) * (low < 0), 1.4 * high)
     axes.invert_yaxis()
     axes.xaxis.set_visible(False)
     axes.grid(False)

@@ -68,9 +68,12 @@ def flight_figure(result: FlightResult) -> Figure:
         Panel("Figure 1: altitude above the start", "time [s]", "m", tuple(height)),
         _utilities(result),
     )
-    more = {"other": "utilities of the other runs", "accepted": "optimum with the true parameters"}
+    more, of = {"accepted": "optimum with the true parameters"}, ""
+    if len(result.flown) > 1:
+        more["other"] = "utilities of the other runs"
+        of = f"the median of {len(result.flown)} runs, "
     key = (*legend(panels[:1]), *(Key(role, name) for role, name in more.items()))
-    title = f"The aircraft’s figure-8: the median of {len(result.flown)} runs, seed {shown.seed}"
+    title = f"The aircraft’s figure-8: {of}seed {shown.seed}"
     return Figure("flight", title, "", panels, key)
 
 
@@ -94,11 +97,14 @@ def _utilities(result: FlightResult) -> Panel:
         curves.append(Curve(x, y, role, f"run {run.seed}", width))
     title, x_name = "Utility of every run, logarithmic", "iteration (0: the model’s controller)"
     rules = (Rule(result.optimum, "accepted", "optimum"),)
-    return Panel(title, x_name, "utility", tuple(curves), rules=rules, loss=True)
+    return Panel(title, x_name, "utility", tuple(curves), rules=rules, loss=True, whole=True)
 
 
 def car_figure(result: CarResult) -> Figure:
-    """Figure 4, the turn through its iterations; Figure 5, circle and figure-8; improvements."""
+    """Figure 4, the turn through its iterations; Figure 5, circle and figure-8; improvements.
+
+    Paths are those of the car with scatter, where it was run, and of its first seed.
+    """
     names = list(dict.fromkeys(run.manoeuvre for run in result.runs))
     shown = [(result.of(name, True) or result.of(name, False))[0] for name in names]
     panels = [_manoeuvre(run, stages=run.manoeuvre == "turn") for run in shown]
@@ -106,7 +112,9 @@ def car_figure(result: CarResult) -> Figure:
     if "turn" in names:
         key += [Key(role, f"iteration {i + 1}") for i, role in enumerate(STEPS)]
     key.append(Key("best", LAST))
-    return Figure("car", "The RC car", "", (*panels, _improvements(result, names)), tuple(key))
+    whose = f"with scatter, seed {shown[0].seed}" if shown and shown[0].noisy else "quiet"
+    title = f"The RC car; the paths are of the car {whose}"
+    return Figure("car", title, "", (*panels, _improvements(result, names)), tuple(key))
 
 
 def _manoeuvre(run: CarRun, stages: bool) -> Panel:
@@ -142,10 +150,16 @@ def theorem1_figure(result: Theorem1Result) -> Figure:
     """Gradient error and squared gradient over epsilon, log-log, with the theorem's slopes."""
     slopes = result.slopes()
     panels = (
-        _trend(result, "Gradient error", lambda row: row.error, slopes["gradient_error"], 1),
         _trend(
             result,
-            "Squared gradient at the end",
+            ("Gradient’s error", "log₁₀ |∇Û − ∇U|"),
+            lambda row: row.error,
+            slopes["gradient_error"],
+            1,
+        ),
+        _trend(
+            result,
+            ("|∇U|² at the end", "log₁₀ |∇U|²"),
             lambda row: row.squared,
             slopes["squared_gradient"],
             2,
@@ -155,7 +169,7 @@ def theorem1_figure(result: Theorem1Result) -> Figure:
     key = (
         Key("best", "median of the seeds"),
         Key("best", "each seed", "ring"),
-        Key("desired", "the theorem’s slope through it"),
+        Key("desired", "the slope of the theorem’s bound, through it"),
         Key("model", "the theorem’s bound, at its lowest"),
     )
     return Figure("theorem1", "Theorem 1: a model wrong by epsilon", "", panels, key)
@@ -163,13 +177,13 @@ def theorem1_figure(result: Theorem1Result) -> Figure:
 
 def _trend(
     result: Theorem1Result,
-    name: str,
+    names: tuple[str, str],
     value: Callable[[Theorem1Row], float],
     slope: tuple[float, float],
     theory: int,
     bound: Callable[[Theorem1Row], float] | None = None,
 ) -> Panel:
-    """A quantity by epsilon: a ring a seed, the median, a line of the theorem's slope."""
+    """A quantity (its title, its axis) by epsilon: a ring a seed, the median, the bound's slope."""
     rows = result.rows
     dots = tuple(
         Dot(_log(r.epsilon), _log(value(r)), "best", f"seed {r.seed}: {value(r):.3g}", "ring")
@@ -185,8 +199,8 @@ def _trend(
         lowest = np.array([_log(min(bound(row) for row in own)) for own in groups])
         curves.append(Curve(x, lowest, "model", "bound"))
     error = f" ± {slope[1]:.3f}" if np.isfinite(slope[1]) else ""
-    title = f"{name}: slope {slope[0]:.3f}{error}, theorem {theory}"
-    return Panel(title, "log₁₀ epsilon", "log₁₀ of it", tuple(curves), dots)
+    title = f"{names[0]}: slope {slope[0]:.3f}{error}, bound {theory}"
+    return Panel(title, "log₁₀ epsilon", names[1], tuple(curves), dots)
 
 
 def _log(value: float) -> float:
