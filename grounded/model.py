@@ -90,7 +90,8 @@ class Model:
         inputs: name -> unit.
         params: name -> Param.
         angles: states whose differences wrap to [-pi, pi].
-        roles: optional meaning of states (position, heading, speed ...), for effects and pictures.
+        roles: optional meaning of states (position, heading, speed ...), for effects and pictures;
+            a position is one state along an axis, two in a plane, or three.
         derivative: ds/dt, integrated over a control step by `integrator` under a zero-order hold.
         step: the next state itself, any Python callable; instead of `derivative`.
         integrator: "rk4" or "euler".
@@ -117,8 +118,10 @@ class Model:
 
     def __post_init__(self) -> None:
         for attribute in ("states", "inputs", "params", "roles"):
-            value = MappingProxyType(dict(getattr(self, attribute)))
-            object.__setattr__(self, attribute, value)
+            value = dict(getattr(self, attribute))
+            if attribute == "roles" and isinstance(value.get("position"), str):
+                value["position"] = (value["position"],)
+            object.__setattr__(self, attribute, MappingProxyType(value))
         object.__setattr__(self, "angles", tuple(self.angles))
         if (self.derivative is None) == (self.step is None):
             raise GroundedError(
@@ -169,6 +172,12 @@ class Model:
         for name in self.angles:
             if name not in self.states:
                 raise GroundedError(f"angle '{name}' is not a state: {nearest(name, self.states)}")
+        place = self.roles.get("position", ())
+        if len(place) > 3:
+            raise GroundedError(
+                f"role 'position' names {len(place)} states: {', '.join(place)}; expected one "
+                "along an axis, two in a plane (horizontal first), or three"
+            )
         for role, targets in self.roles.items():
             for name in (targets,) if isinstance(targets, str) else targets:
                 if name not in self.states and name not in self.inputs:

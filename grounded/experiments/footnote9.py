@@ -59,22 +59,13 @@ class Footnote9Result:
 
     def tables(self) -> list[StudyTable]:
         """Shares of the optimum by b."""
-        head = (
-            "b",
-            "model-based",
-            "solved, 1 iteration",
-            "trials of solved",
-            "policy gradient",
-            "trials of policy gradient",
-        )
+        head = ("b", "model-based", "solved (trials)", "policy gradient (trials)")
         rows = tuple(
             (
                 f"{row.b:g}",
                 f"{row.model_based:.3g}",
-                f"{row.solved:.6f}",
-                str(row.solved_trials),
-                f"{row.gradient:.3g}",
-                str(row.gradient_trials),
+                f"{row.solved:.6f} ({row.solved_trials})",
+                f"{row.gradient:.3g} ({row.gradient_trials})",
             )
             for row in self.rows
         )

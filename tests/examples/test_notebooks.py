@@ -67,8 +67,9 @@ def test_a_diagnosis_of_a_real_machine(tmp_path, monkeypatch):
     assert machine.values("viscous_friction:v")["k"] == pytest.approx(2.14, rel=0.05)
 
 
+@pytest.mark.slow
 def test_table_1(tmp_path, monkeypatch):
     result = run("table1", tmp_path, monkeypatch)["result"]
-    assert [one.seed for one in result.flown] == [0, 1]
+    assert [one.seed for one in result.flown] == [0]
     for one in result.flown:
         assert one.utilities[-1] > 1.01 * result.optimum and one.improvement > 0.5

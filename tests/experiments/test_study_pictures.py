@@ -117,10 +117,27 @@ def test_flight_enlarges_what_is_too_small_to_see():
 
 def test_the_turn_shows_its_iterations_and_the_circle_its_ends():
     turn, circle, figure8, _ = PICTURES["car"](results()["car"]).panels
+    assert "with scatter" in turn.title and "quiet" in circle.title
     roles = [curve.role for curve in turn.curves]
     assert roles == ["model", "step1", "step2", "step3", "other", "best", "desired"]
     assert [curve.role for curve in circle.curves] == ["model", "best", "desired"]
     assert [curve.role for curve in figure8.curves] == ["model", "desired"]  # nothing learned
+
+
+def test_one_flight_has_no_standard_error_and_no_others():
+    many = results()["flight"]
+    one = FlightResult(many.runs[:1], many.optimum, many.desired)
+    cells = [cell for table in one.tables() for row in table.rows for cell in row[:2]]
+    assert not [cell for cell in cells if "nan" in cell or "±" in cell]
+    assert any("±" in cell for table in many.tables() for row in table.rows for cell in row[:2])
+    assert "other" not in {key.role for key in PICTURES["flight"](one).key}
+
+
+def test_the_car_that_repeats_itself_and_the_one_with_scatter_have_a_table_each():
+    quiet, scattered = results()["car"].tables()
+    assert [row[0] for row in quiet.rows] == ["circle"]
+    assert [row[0] for row in scattered.rows] == ["turn", "figure8"]
+    assert all(len(name) < 22 for table in (quiet, scattered) for name in table.head)
 
 
 def test_methods_that_need_too_many_trials_are_cut_and_say_so():

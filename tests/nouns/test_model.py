@@ -51,6 +51,7 @@ def test_differences_of_angles_wrap_and_the_arguments_stay():
         ({"angles": ("psi",)}, holding("angle", "'psi'", "x, v")),
         ({"angles": ("vv",)}, holding("angle", "'vv'", "'v'")),
         ({"roles": {"position": ("x", "y")}}, holding("position", "'y'")),
+        ({"roles": {"position": ("x", "x", "x", "x")}}, holding("position", "4")),
     ],
     ids=lambda v: str(v)[:40],
 )

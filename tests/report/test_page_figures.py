@@ -17,6 +17,8 @@ from grounded.errors import GroundedError
 from grounded.experiments.pendulum import pendulum_task
 from grounded.figures.figure import (
     Band,
+    Bar,
+    Bars,
     Curve,
     Dot,
     Panel,
@@ -26,6 +28,7 @@ from grounded.figures.figure import (
     without_astray,
 )
 from grounded.figures.interactive import coloured, packed, plotted
+from grounded.model import Model
 from grounded.models import pendulum
 from grounded.rollout import simulate
 from grounded.search.first_policy import first_policy
@@ -33,10 +36,11 @@ from grounded.search.planner import Planner
 from grounded.trial import Trial
 from grounded_trials.report.figures.gap import residual_figures
 from grounded_trials.report.figures.paths import path_figure
-from grounded_trials.report.figures.png import png
+from grounded_trials.report.figures.png import _bars, png
 from grounded_trials.report.figures.runs import all_figures, error_figure
 from grounded_trials.report.forecast import forecast, forecast_error
 from grounded_trials.report.gathering import gather
+from grounded_trials.report.layouts import foxglove_layout
 from grounded_trials.report.scene import scene_of
 from grounded_trials.workspace.folder import Folder
 from page_browser import unpacked
@@ -157,6 +161,48 @@ def test_scenes_of_car_aircraft_and_cart(cart, car):
     air = scene_of(many_flights(1).task.model)
     assert air.names == ("east", "north", "altitude") and air.map and len(air.attitude) == 3
     assert not scene_of(gather(Folder(cart)).task.model).spatial
+
+
+@pytest.mark.parametrize(
+    ("roles", "axes"),
+    [
+        ({"position": ("x",), "speed": "v"}, ("x", "v")),
+        ({"position": "x", "speed": "v"}, ("x", "v")),
+        ({"position": ("v",)}, ("v", "theta")),
+        ({}, ("theta", "x")),
+    ],
+)
+def test_a_position_along_one_axis_is_drawn_over_its_speed(roles, axes):
+    model = Model(
+        states={"theta": "rad", "x": "m", "v": "m/s"},
+        inputs={"force": "N"},
+        roles=roles,
+        derivative=lambda s, a, p: {"theta": s.v, "x": s.v, "v": a.force},
+    )
+    scene = scene_of(model)
+    assert scene.names == axes and not scene.spatial
+    assert "3D!grounded" not in foxglove_layout(model)["configById"]
+
+
+@pytest.mark.extra("png")
+def test_the_text_of_a_negative_bar_stays_clear_of_the_labels():
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure as Sheet
+
+    sheet = Sheet(figsize=(4.8, 2.0), dpi=100)
+    canvas, axes = FigureCanvasAgg(sheet), sheet.add_subplot()
+    _bars(axes, Bars("evidence", tuple(Bar(f"{v:g}", v, f"{v:.3g}") for v in (444.9, -3.21))))
+    canvas.draw()
+    edge = axes.get_window_extent().x0
+    assert all(text.get_window_extent().x0 > edge for text in axes.texts)
+
+
+@pytest.mark.slow
+def test_an_enlarged_path_that_leaves_the_frame_is_named(car):
+    findings = gather(Folder(car))
+    large = next(p for p in path_figure(findings).panels if p.title.startswith("Deviations"))
+    cut = [curve.name for curve in large.curves if np.isnan(curve.x).any()]
+    assert cut and all(name in large.note for name in cut)
 
 
 def test_rotations_are_right_handed_and_point_along_the_heading():

@@ -179,7 +179,9 @@ def utility_sentence(diagnosis: Diagnosis) -> str:
         for value in (found.before, found.after)
     )
     whole = count(found.trials, "whole trial")
-    text = f"with the commands of {whole} replayed open loop, the model misses their utility {without}"
+    text = (
+        f"with the commands of {whole} replayed open loop, the model misses their utility {without}"
+    )
     if diagnosis.effects:
         text += f", the diagnosed one {better}"
     if found.trials < 2:

@@ -103,7 +103,7 @@ def _utilities(result: FlightResult) -> Panel:
 def car_figure(result: CarResult) -> Figure:
     """Figure 4, the turn through its iterations; Figure 5, circle and figure-8; improvements.
 
-    Paths are those of the car with scatter, where it was run, and of its first seed.
+    Paths are those of the first seed, with scatter where that was run.
     """
     names = list(dict.fromkeys(run.manoeuvre for run in result.runs))
     shown = [(result.of(name, True) or result.of(name, False))[0] for name in names]
@@ -112,9 +112,7 @@ def car_figure(result: CarResult) -> Figure:
     if "turn" in names:
         key += [Key(role, f"iteration {i + 1}") for i, role in enumerate(STEPS)]
     key.append(Key("best", LAST))
-    whose = f"with scatter, seed {shown[0].seed}" if shown and shown[0].noisy else "quiet"
-    title = f"The RC car; the paths are of the car {whose}"
-    return Figure("car", title, "", (*panels, _improvements(result, names)), tuple(key))
+    return Figure("car", "The RC car", "", (*panels, _improvements(result, names)), tuple(key))
 
 
 def _manoeuvre(run: CarRun, stages: bool) -> Panel:
@@ -129,7 +127,9 @@ def _manoeuvre(run: CarRun, stages: bool) -> Panel:
             curves.append(Curve(x, y, role, role, WIDTHS.get(role, 1.5)))
     number = PAPER_FIGURE.get(run.manoeuvre)
     ending = f"{len(every) - 1} iterations" if len(every) != 2 else "1 iteration"
-    title = f"Figure {number}: {run.manoeuvre}, {ending}"
+    title = (
+        f"Figure {number}: {run.manoeuvre}, {'with scatter' if run.noisy else 'quiet'}, {ending}"
+    )
     return Panel(title, "x [m]", "y [m]", tuple(curves), equal=True)
 
 
