@@ -126,19 +126,19 @@ def _enlarged(findings: Findings, scene: Scene) -> list[Panel]:
     factor = enlarging(best, desired)
     if factor < SEEN:
         return []
-    curves, cut = [], []
+    curves, cut = [], False
     for role, name, states in named_paths(findings):
         near = desired[: len(states)]
         path = near + factor * (states[:, axes] - near)
         off = np.abs(path - near).max(axis=1) > FAR * np.ptp(desired, axis=0).max()
         path[off] = np.nan
-        cut += [name] * bool(off.any())
+        cut |= bool(off.any())
         width = WIDTHS.get(role, 1.5)
         curves.append(Curve(path[:, 0], path[:, 1], role, name, width))
     x_name, y_name, *_ = (labelled(*one) for one in zip(scene.names, scene.units, strict=True))
     title = f"Deviations {factor:g} times as large"
-    note = f"not drawn where it leaves the frame: {', '.join(cut)}" if cut else ""
-    return [Panel(title, x_name, y_name, tuple(curves), equal=True, note=note, kind="path")]
+    title += ", where they fit" * cut
+    return [Panel(title, x_name, y_name, tuple(curves), equal=True, kind="path")]
 
 
 def _shaded(findings: Findings, scene: Scene) -> list[Panel]:
