@@ -527,7 +527,7 @@ def test_a_loss_by_several_times_the_best_utility_is_no_luck():
 
 
 def test_what_another_model_gained_ends_no_search():
-    """Seen after `adopt`: "the last 4 candidates gained 0.0044", and the better model went unused."""
+    """Seen after `adopt`: "the last 4 candidates gained 0.0044", and nothing was tried."""
     story = Story().add().add()
     for _ in range(4):
         story.add(bad)
@@ -539,7 +539,7 @@ def test_what_another_model_gained_ends_no_search():
 
 @pytest.mark.parametrize(("times", "made"), [(12, "gentler gains"), (2, "")])
 def test_gains_are_cut_only_where_the_loop_swung_to_and_fro(times, made):
-    """Seen at a robot: a trial a thousand times worse than promised, with a loop that was stable."""
+    """Seen at a robot: a thousand times worse than promised, with a loop that was stable."""
     story = Story(TASK, PLANT)
     plan = story.propose().candidate.predicted_inputs
     wave = np.ptp(plan) * np.sign(np.sin(np.pi * times * (np.arange(len(plan)) + 0.5) / len(plan)))
