@@ -10,7 +10,7 @@ import click
 from grounded.search.step_size import Step
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
 from grounded_cli.terminal import field, number, progress, remark, show, show_json
-from grounded_trials.wording import count, with_unit
+from grounded_trials.wording import count, percent, with_unit
 
 if TYPE_CHECKING:
     from grounded.search.candidate import Candidate
@@ -54,7 +54,7 @@ def tell_proposed(workspace: Workspace, proposed: Proposed, *, last: bool = True
     show(f"Run {candidate.id}{' once more' if ran else waiting}: {proposed.file}")
     if ran:
         show(field("why", standing.sentence, "  "))
-    show(field("what", _what(candidate, workspace.task), "  "))
+    show(field("what", _what(candidate, standing, workspace.task), "  "))
     show(field("predicted", f"utility {number(candidate.predicted_utility)}", "  "))
     if standing.incumbent is not None:
         best = standing.incumbent
@@ -66,15 +66,31 @@ def tell_proposed(workspace: Workspace, proposed: Proposed, *, last: bool = True
         show(f"\n{next_line(proposed.then)}")
 
 
-def _what(candidate: Candidate, task: Task) -> str:
+def _what(candidate: Candidate, standing: Standing, task: Task) -> str:
     """Where a candidate comes from."""
     seconds = f"{task.horizon * task.dt:g} s"
+    if candidate.way == "own plan":
+        return f"the changed model's own plan, in place of a step from {candidate.base}, {seconds}"
+    if candidate.way == "gentler gains":
+        share = _gain(candidate) / next(
+            _gain(t.candidate) for t in standing.history if t.candidate.id == candidate.base
+        )
+        return (
+            f"{candidate.base} with gains of {percent(share)}: its feedback swung the inputs to "
+            f"and fro, {seconds}"
+        )
     if candidate.base:
         step = Step(candidate.damping, candidate.alpha)
         return f"iteration {candidate.iteration}: {step} from {candidate.base}, {seconds}"
     crashes = candidate.caution
     gently = f", designed more gently after {count(crashes, 'crash', 'crashes')}" * bool(crashes)
     return f"the model's own policy{gently}, {seconds}"
+
+
+def _gain(candidate: Candidate) -> float:
+    """The mean size of the feedback's gains."""
+    gain = candidate.policy.gain
+    return 0.0 if gain is None else float(abs(gain).mean())
 
 
 def _extent(candidate: Candidate, task: Task) -> list[tuple[str, str]]:

@@ -58,7 +58,7 @@ def summary(status: Status) -> str:
         lines.append(field("best", text))
     if certainty := last_improvement(standing.history):
         lines.append(field("certainty", certainty))
-    lines.append(field("phase", f"{standing.phase}: {standing.sentence}"))
+    lines.append(field("phase", f"{standing.outcome}: {standing.sentence}"))
     return "\n".join(lines)
 
 

@@ -17,8 +17,8 @@ from grounded.trial import Trial
 Way = Literal[
     "",  # a step along the direction of the model that replays the incumbent's trial
     "recorded inputs",  # the same, the bias as the paper has it (`bias`: no matched inputs)
-    "gentler gains",  # the model's own plan with gains designed more gently, see `rivals`
-    "own plan",  # of a model that was changed since the incumbent was planned, see `rivals`
+    "gentler gains",  # the incumbent's plan with gains designed more gently (`Maker.gentler`)
+    "own plan",  # of a model that was changed since the incumbent was planned (`About.own_plan`)
 ]
 
 if TYPE_CHECKING:
@@ -42,6 +42,11 @@ class Candidate(Result):
     predicted_gain: float = float("nan")  # over the mean trial of its base
     caution: int = 0  # how often the first policy, or its gains, were designed more gently
     way: Way = ""  # how it was made
+
+    @property
+    def grounded(self) -> bool:
+        """Whether a model that replays a trial has predicted it: a step along a direction."""
+        return bool(self.base) and self.way in ("", "recorded inputs")
 
     def summary(self) -> str:
         """Its name, its step and what the model predicts."""

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 PLANNING = DescentOptions(max_iterations=30, tolerance=1e-6)  # a direction needs no more digits
 FORETOLD = 0.3  # share of a step's gain by which crude slopes that are good enough may be off
 GENTLER = 1e3  # factor on the price of inputs from which gentler gains are designed
-GENTLER_TIMES = 2  # they are tried
+SWINGS = 6  # of an input about its plan, each as large as the plan's own range: a limit cycle
 
 
 class About:
@@ -175,20 +175,19 @@ class Maker:
         )
 
     def gentler(self, incumbent: Tried) -> Candidate | None:
-        """The model's own plan with gentler gains, where its loop was unstable on the robot.
+        """The incumbent's plan with gentler gains, where its loop was unstable on the robot.
 
         High gains and a delay that the model lacks make a limit cycle, which no step along a
         direction leaves: the grounded model replays it, and has no delay to blame.
         """
         own = incumbent.candidate
         lost = losers_of(self.now.history, own.id, self.fingerprint, "gentler gains")
-        if not wild(incumbent) or own.policy.gain is None or len(lost) >= GENTLER_TIMES:
+        if lost or own.policy.gain is None or own.model != self.fingerprint:
             return None
-        if own.model != self.fingerprint:
+        if not limit_cycle(incumbent, self.planner.task):
             return None
         problem, real = self.planner.plan.problem(exact=True), incumbent.utility
-        caution = own.caution + len(lost) + 1
-        return self.candidate(own.policy, problem, Step(), real, "gentler gains", caution)
+        return self.candidate(own.policy, problem, Step(), real, "gentler gains", own.caution + 1)
 
     def _gently(self, policy: Policy, problem: Problem, caution: int) -> Policy:
         """The same run with the gains of a regulator whose inputs cost GENTLER ** caution more."""
@@ -212,11 +211,33 @@ class Maker:
     def checked(self, made: Candidate) -> Proposal:
         """A candidate that is finite, inside the limits and predicted to stay safe; or none."""
         task = self.planner.task
-        found = objections(task, made, spread(task, self.now.history))
+        found = objections(task, made, spread(task, self.now.history, self.fingerprint))
         if not found:
             return Proposal(self.now, made, is_new=True)
         stopped = replace(self.now, phase="stopped", sentence=found[0], ending="not allowed")
         return Proposal(stopped, None, is_new=False, notes=tuple(found))
+
+
+def limit_cycle(tried: Tried, task: Task) -> bool:
+    """Whether feedback swung an input to and fro about its plan, each time by the plan's range."""
+    made = tried.candidate
+    range_ = np.minimum(np.ptp(made.predicted_inputs, axis=0), task.high - task.low)
+    for trial in tried.trials:
+        off = trial.inputs - made.predicted_inputs[: trial.steps]
+        if any(_swings(off[:, i], size) >= SWINGS for i, size in enumerate(range_) if size > 0):
+            return True
+    return False
+
+
+def _swings(values: Array, size: float) -> int:
+    """How often a signal moves by `size` or more, each time against the time before."""
+    found, way, last = 0, 0.0, values[0]
+    for value in values:
+        if (value - last) * way > 0:
+            last = value
+        elif abs(value - last) >= size:
+            found, way, last = found + 1, np.sign(value - last), value
+    return found
 
 
 @dataclass(frozen=True, eq=False, repr=False)

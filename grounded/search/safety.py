@@ -18,12 +18,12 @@ from grounded.task import Task
 MAX_GAIN = 1e6  # input units per state unit: beyond it a gain is a numerical accident
 
 
-def spread(task: Task, history: Sequence[Tried]) -> Array:
+def spread(task: Task, history: Sequence[Tried], model: str) -> Array:
     """How far real runs strayed from what was expected of them, (H + 1, n); zero before the first.
 
     Two standard deviations between repeated runs of one candidate, or the error of the latest
-    prediction that was grounded on a trial, whichever is larger. The first candidate's error says
-    what the crude model lacks, not what the next run will do, and doesn't count.
+    prediction that this model, grounded on a trial, made of a step, whichever is larger. What
+    another model or a plan of the bare model missed says nothing of the next step.
     """
     found = np.zeros((task.horizon + 1, task.model.n))
     assert task.safety_low is not None and task.safety_high is not None
@@ -39,7 +39,8 @@ def spread(task: Task, history: Sequence[Tried]) -> Array:
         (tried.candidate.predicted_states, trial.states)
         for tried in history
         for trial in tried.trials
-        if tried.candidate.base and trial.finite_steps == task.horizon
+        if tried.candidate.grounded and tried.candidate.model == model
+        if trial.finite_steps == task.horizon
     ]
     if grounded:
         predicted, real = grounded[-1]

@@ -151,11 +151,18 @@ class Standing(Result):
         """Utility of the model's policy, then after each accepted improvement."""
         return [t.utility for t in self.history if t.accepted]
 
+    @property
+    def outcome(self) -> str:
+        """The phase in words: only a search whose model promises nothing more has converged."""
+        if self.ending in ("", "nothing promised"):
+            return {"propose": "going on", "await-trial": "waiting"}.get(self.phase, self.phase)
+        return self.ending
+
     def summary(self) -> str:
         """Its phase and the best candidate."""
         best = self.incumbent
         known = f"best {best.candidate.id}, utility {best.utility:.4g}" if best else "none yet"
-        return f"{self.phase}: trials {self.trials}, {known}"
+        return f"{self.outcome}: trials {self.trials}, {known}"
 
     def to_json(self) -> dict[str, Any]:
         """The document of `grounded status --json`, with the whole history."""
@@ -243,7 +250,7 @@ def standing(
             f"{own} is the result (step 7)"
         )
         return replace(now, phase="converged", sentence=sentence, ending="no step improved")
-    if options.damps and (hardly := _hardly(history, options.tolerance)):
+    if options.damps and (hardly := _hardly(history, options.tolerance, model)):
         ending, why = hardly
         why = f"{why}: {own} is the result"
         return replace(now, phase="converged", sentence=why, ending=ending)
@@ -254,11 +261,11 @@ def standing(
     return replace(now, step=step, way=way, sentence=sentence)
 
 
-def _hardly(history: tuple[Tried, ...], tolerance: float) -> tuple[Ending, str] | None:
-    """The ending where the last candidates gained too little for what they cost."""
+def _hardly(history: tuple[Tried, ...], tolerance: float, model: str) -> tuple[Ending, str] | None:
+    """The ending where the last candidates of this model gained too little for what they cost."""
     before = [t.utility for t in history[:-PATIENCE] if t.accepted]
     last = history[-PATIENCE:]
-    if not before or any(t.candidate.model != last[0].candidate.model for t in last):
+    if not before or any(t.candidate.model != model for t in last):
         return None
     best = max(t.utility for t in history if t.accepted)
     gained = best - max(before)

@@ -3,7 +3,6 @@
 import json
 import subprocess
 import sys
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -117,15 +116,7 @@ def test_fit_stays_the_function_after_its_room_was_imported():
 
 
 def test_the_front_door_opens_at_once():
-    """`import grounded` costs no more than 0.15 s over bare Python, and loads no numbers."""
+    """`import grounded` loads no numbers; `benchmarks/run.py` says what it takes."""
     code = "import sys, grounded; print(' '.join(m for m in sys.modules if '.' not in m))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert not {"numpy", "scipy", "llvmlite"} & set(done.stdout.split())
-
-    def spent(code):
-        start = time.perf_counter()
-        subprocess.run([sys.executable, "-c", code], check=True)
-        return time.perf_counter() - start
-
-    extra = [spent("import grounded") - spent("pass") for _ in range(5)]
-    assert min(extra) < 0.15

@@ -116,7 +116,7 @@ def test_trials_that_do_not_improve_raise_the_damping_until_nothing_is_promised(
 
 
 def test_a_system_that_repeats_itself_exactly_is_not_asked_again():
-    story = Story(rerun_incumbent=True).add().add(bad)
+    story = Story(rerun_incumbent=True).add().add(lambda trial: bad(trial, 0.05))
     assert story.now.history[-1].in_doubt and story.now.outstanding.id == "c0001"
     story.add()  # the same policy on a deterministic system: the same trial to the last bit
     again = [t for t in story.trials if t.candidate == "c0001"]
@@ -175,7 +175,7 @@ def worse(by):
 
 
 def test_a_loss_sends_the_incumbent_out_again_before_it_is_believed():
-    story = Story(rerun_incumbent=True, tolerance=0.0).add().add(worse(0.3))
+    story = Story(rerun_incumbent=True, tolerance=0.0).add().add(worse(0.05))
     now = story.now
     assert now.phase == "await-trial" and now.outstanding.id == "c0001" and now.missing == 1
     assert now.history[-1].accepted is None and now.history[-1].in_doubt
@@ -183,7 +183,7 @@ def test_a_loss_sends_the_incumbent_out_again_before_it_is_believed():
     story.add()  # the same again: it was no luck
     now = story.now
     assert now.history[-1].accepted is False and now.phase == "propose"
-    story.add(worse(0.3))  # scatter is known to be none now: the next loss is believed at once
+    story.add(worse(0.05))  # scatter is known to be none now: the next loss is believed at once
     assert story.now.history[-1].accepted is False and len(story.trials) == 4
 
 
@@ -193,7 +193,8 @@ def test_a_lucky_winner_loses_its_luck():
     honest = [story.task.utility(t) for t in story.trials]
     assert honest[1] > honest[0]
     lucky = replace(story.trials[1], candidate="c0001")
-    lucky = replace(lucky, states=np.nan_to_num(TASK.target), inputs=0.0 * lucky.inputs)
+    nearly = 0.2 * lucky.states + 0.8 * np.nan_to_num(TASK.target)
+    lucky = replace(lucky, states=nearly)
     story.trials[0] = lucky
     assert story.task.utility(lucky) > honest[1]
     assert story.now.outstanding.id == "c0001"
@@ -223,7 +224,7 @@ def test_losses_are_not_checked_for_ever():
 def test_a_crash_and_the_last_trial_are_believed_at_once():
     story = Story(rerun_incumbent=True).add().add(cut)
     assert story.now.history[-1].accepted is False and story.now.phase == "propose"
-    story = Story(rerun_incumbent=True, max_trials=2).add().add(worse(0.3))
+    story = Story(rerun_incumbent=True, max_trials=2).add().add(worse(0.05))
     assert story.now.history[-1].accepted is False and story.now.phase == "stopped"
 
 
@@ -517,3 +518,36 @@ def test_odd_tasks_are_searched_or_ended_with_a_sentence(name, options):
     assert now.utilities == sorted(now.utilities) and all(np.isfinite(now.utilities))
     for trial in found.trials:
         assert (trial.inputs >= task.low).all() and (trial.inputs <= task.high).all()
+
+
+def test_a_loss_by_several_times_the_best_utility_is_no_luck():
+    """Seen at a robot: -6.4 after -1.1, and the best one was sent out again to make sure."""
+    story = Story(rerun_incumbent=True).add().add(bad)
+    assert story.now.history[-1].accepted is False and story.now.phase == "propose"
+
+
+def test_what_another_model_gained_ends_no_search():
+    """Seen after `adopt`: "the last 4 candidates gained 0.0044", and nothing was tried."""
+    story = Story().add().add()
+    for _ in range(4):
+        story.add(bad)
+    ending = story.now.ending
+    other_model = standing(story.task, story.candidates, story.trials, story.options, "another")
+    assert ending == "no step improved"
+    assert (other_model.phase, other_model.ending) == ("propose", "")
+
+
+@pytest.mark.parametrize(("times", "made"), [(12, "gentler gains"), (2, "")])
+def test_gains_are_cut_only_where_the_loop_swung_to_and_fro(times, made):
+    """Seen at a robot: a thousand times worse than promised, with a loop that was stable."""
+    story = Story(TASK, PLANT)
+    plan = story.propose().candidate.predicted_inputs
+    wave = np.ptp(plan) * np.sign(np.sin(np.pi * times * (np.arange(len(plan)) + 0.5) / len(plan)))
+    story.add(lambda trial: bad(replace(trial, inputs=plan + wave[:, None])))
+    second = story.propose().candidate
+    assert second.way == made
+    if made:
+        first = story.candidates[0].policy.gain
+        assert np.abs(second.policy.gain).mean() < 0.5 * np.abs(first).mean()
+        story.add(lambda trial: bad(trial, 60.0)).propose()  # it lost: not again
+        assert [c.way for c in story.candidates].count("gentler gains") == 1

@@ -107,7 +107,7 @@ def _utilities(findings: Findings, table: Table, bars: Callable[[Sequence[float]
         if findings.optimum is not None:
             text += f", optimum {figure(findings.optimum)}"
         lines += _wrapped(text, "  ")
-    lines += _wrapped(f"{findings.standing.phase}: {findings.standing.sentence}", "  ")
+    lines += _wrapped(f"{findings.standing.outcome}: {findings.standing.sentence}", "  ")
     return "\n".join(lines)
 
 

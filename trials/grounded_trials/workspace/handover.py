@@ -238,7 +238,7 @@ class _Check:
             trials = [t.trial for t in self.contents.trials if workspace.fits(t.trial)]
             candidates, options = self.contents.candidates, workspace.config.search
             now = standing(workspace.task, candidates, trials, options, self.fingerprint)
-            strays = spread(workspace.task, now.history)
+            strays = spread(workspace.task, now.history, made.model)
         return objections(workspace.task, made, strays)
 
     def _predicted(self) -> Candidate:

@@ -325,6 +325,6 @@ def summary(findings: Findings) -> str:
         known.append(f"{findings.optimum:.4g} at the optimum")
     lines.append(f"utility {', '.join(known)}" if known else "no candidate was run yet")
     lines += ["", "grey: desired; orange: model's policy; blue: best so far; pink: its prediction"]
-    lines += ["", f"**{findings.standing.phase}**: {findings.standing.sentence}", ""]
+    lines += ["", f"**{findings.standing.outcome}**: {findings.standing.sentence}", ""]
     lines += [f"**left out**: {one.file}: {one.reason}\n" for one in findings.lost]
     return "\n".join(lines)
