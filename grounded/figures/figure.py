@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from grounded.figures.body import Motion
 from grounded.frozen import Array
 
 # Okabe & Ito (2008), told apart by colour-blind people too: role -> (on white, on black)
@@ -34,6 +35,7 @@ STEPS = ("step1", "step2", "step3")  # roles of iterations, in order
 WIDTHS = {"best": 2.5, "desired": 1.0}  # of paths; 1.5 for the other roles
 DASHES = {"desired": (6.0, 3.0), "predicted": (2.0, 2.0), "limit": (8.0, 2.0, 2.0, 2.0)}
 LEAST = 1e-12  # a range below which differences are rounding
+LETTER = 0.035  # of a bar's text, as a share of the longest bar
 FACTORS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)  # by which deviations are enlarged
 
 
@@ -49,6 +51,7 @@ class Curve:
     times: [s] of each point of a path.
     shade: a value for each point, shown as its colour; `shade_name` says what it is.
     trial: whose path it is, so that an animation finds a trial's parts.
+    motion: the body that moves along a path.
     """
 
     x: Array
@@ -61,6 +64,12 @@ class Curve:
     shade_name: str = ""
     trial: str = ""
     style: str = "line"  # line, points, or ghost: not drawn, for the animation alone
+    motion: Motion | None = None
+
+    def spread(self, axis: int) -> list[Array]:
+        """What must fit along x (0) or y (1)."""
+        moved = [] if self.motion is None else [self.motion.reached[:, axis]]
+        return [(self.x, self.y)[axis], *moved]
 
 
 @dataclass(frozen=True)
@@ -97,7 +106,11 @@ class Band:
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """Axes with curves and marks. `loss`: y by the logarithm of its distance from 0."""
+    """Axes with curves and marks.
+
+    loss: y by the logarithm of its distance from 0.
+    log: x and y by their logarithms.
+    """
 
     title: str
     x_name: str
@@ -108,14 +121,17 @@ class Panel:
     bands: tuple[Band, ...] = ()
     equal: bool = False  # one scale for both axes
     loss: bool = False
+    log: bool = False
     whole: bool = False  # x counts
     y_range: tuple[float, float] | None = None
     note: str = ""  # inside, top right
     kind: str = ""  # time: x is the time of a run; path: where a run was
 
     def height(self, y: float | Array) -> Array:
-        """Where a value lies on the y axis: itself, or -log10(-y) of a loss."""
+        """Where a value lies on the y axis: itself, log10(y), or -log10(-y) of a loss."""
         y = np.asarray(y, float)
+        if self.log:
+            return _log10(y)
         if not self.loss:
             return y
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -127,14 +143,17 @@ class Panel:
         return max((float(v.max()) for v in known if len(v)), default=-1.0)
 
     def _heights(self) -> list[Array]:
-        seen = [c for c in self.curves if c.name] or list(self.curves)
         marks = [d.y for d in self.dots] + [rule.y for rule in self.rules]
-        return [*(c.y for c in seen if c.style != "ghost"), np.array(marks)]
+        return [*(y for c in self._seen for y in c.spread(1)), np.array(marks)]
+
+    @property
+    def _seen(self) -> list[Curve]:
+        named = [c for c in self.curves if c.name] or list(self.curves)
+        return [c for c in named if c.style != "ghost"]
 
     def ranges(self) -> tuple[tuple[float, float], tuple[float, float]]:
         """Of x, and of y in `height`: they hold all that has a name, with some room."""
-        seen = [c for c in self.curves if c.name] or list(self.curves)
-        xs = [c.x for c in seen if c.style != "ghost"] + [np.array([d.x for d in self.dots])]
+        xs = [_log10(x) if self.log else x for c in self._seen for x in c.spread(0)] + [np.array([d.x for d in self.dots])]
         margin = 0.06 if self.equal else 0.03 if self.dots or self.kind != "time" else 0.0
         low, high = fitted(xs, margin)
         if self.whole:
@@ -160,6 +179,19 @@ class Bars:
     title: str
     bars: tuple[Bar, ...]
 
+    @property
+    def values(self) -> Array:
+        """How long each is."""
+        return np.array([bar.value if np.isfinite(bar.value) else 0.0 for bar in self.bars])
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """What the axis holds: the bars, and the text behind each."""
+        most = float(np.abs(self.values).max(initial=0.0)) or 1.0
+        room = np.array([most * (0.05 + LETTER * len(bar.text)) for bar in self.bars])
+        ends = self.values + np.where(self.values < 0, -room, room)
+        return float(ends.min(initial=0.0)), float(ends.max(initial=0.0)) or most
+
 
 @dataclass(frozen=True)
 class Key:
@@ -180,6 +212,11 @@ class Figure:
     caption: str
     panels: tuple[Panel | Bars, ...]
     key: tuple[Key, ...] = ()
+
+
+def _log10(values: Array) -> Array:
+    """NaN where a value has no logarithm."""
+    return np.log10(np.where(values > 0, values, np.nan))
 
 
 def legend(panels: Sequence[Panel | Bars]) -> tuple[Key, ...]:

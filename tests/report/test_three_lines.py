@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from grounded.diagnosis.report import Diagnosis
-from grounded_trials.report.findings import measured
+from grounded.diagnosis.report import Diagnosis, measured
 from grounded_trials.report.three_lines import gained_most, three_lines
 from reported import DIAGNOSIS
 from small_tasks import cart_task

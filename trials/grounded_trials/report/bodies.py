@@ -22,7 +22,8 @@ from grounded.adapters.stepper import Stepper
 from grounded.figures.body import Body, Part, Pose
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded_trials.report.scene import Scene
+from grounded_trials.report.findings import Findings
+from grounded_trials.report.scene import Scene, scene_of
 
 CAR = (
     [(-0.5, -0.25, 0), (0.5, -0.25, 0), (0.5, 0.25, 0), (-0.5, 0.25, 0), (-0.5, -0.25, 0)],
@@ -35,8 +36,18 @@ AIRCRAFT = (
     [(-0.4, 0, 0), (-0.65, 0, 0.25), (-0.6, 0, 0)],
 )
 ZEROS = {"hanging": (-np.pi / 2, 1), "upright": (np.pi / 2, -1), "level": (0.0, 1)}
+LENGTH = 0.07  # of the paths' size: a body that has no length of its own
 SLIM = 0.06  # of a link's length: its radius
 CARRIAGE = (0.25, 0.12, 0.1)  # of the links' length: half its edges
+
+
+def body_in(findings: Findings) -> Body:
+    """The body of a workspace's model, of a length that can be seen beside the path."""
+    model = findings.task.model
+    scene, shown = scene_of(model), findings.runs or findings.logs
+    points = scene.finite(shown[0].trial.states if shown else findings.task.target)
+    size = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
+    return body_of(model, scene, LENGTH * (size or 1.0))
 
 
 def body_of(model: Model, scene: Scene, size: float) -> Body:

@@ -80,11 +80,11 @@ def _keys(figure: Figure) -> list[Key]:
 
 
 def _bars(axes: Any, panel: Bars) -> None:
-    values = [bar.value if np.isfinite(bar.value) else 0.0 for bar in panel.bars]
-    drawn = axes.barh(range(len(values)), values, color=[_colour(bar.role) for bar in panel.bars])
+    rows = range(len(panel.bars))
+    drawn = axes.barh(rows, panel.values, color=[_colour(bar.role) for bar in panel.bars])
     axes.bar_label(drawn, [bar.text for bar in panel.bars], padding=3)
-    axes.set_yticks(range(len(values)), [bar.label for bar in panel.bars])
-    axes.set_xlim(1.3 * min([*values, 0.0]), 1.4 * (max([abs(v) for v in values], default=0) or 1))
+    axes.set_yticks(rows, [bar.label for bar in panel.bars])
+    axes.set_xlim(panel.ends)
     axes.invert_yaxis()
     axes.xaxis.set_visible(False)
     axes.grid(False)
@@ -104,6 +104,9 @@ def _panel(axes: Any, panel: Panel) -> None:
     for dot in panel.dots:
         _dot(axes, panel, dot, up)
     axes.set(xlabel=panel.x_name, ylabel=panel.y_name)
+    if panel.log:
+        axes.set(xscale="log", yscale="log")
+        across, up = ((10.0**low, 10.0**high) for low, high in (across, up))
     axes.set_xlim(across, auto=panel.equal)
     axes.set_ylim(up, auto=panel.equal)
     if panel.equal:
@@ -122,7 +125,7 @@ def _panel(axes: Any, panel: Panel) -> None:
 
 
 def _curve(axes: Any, panel: Panel, curve: Curve) -> None:
-    y = panel.height(curve.y)
+    y = curve.y if panel.log else panel.height(curve.y)
     if curve.style == "ghost":
         return
     if curve.style == "points":

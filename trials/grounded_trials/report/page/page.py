@@ -19,6 +19,7 @@ import numpy as np
 
 from grounded.diagnosis.pictures import credit_figure, worth_of
 from grounded.errors import needs
+from grounded.figures.body import Motion
 from grounded.figures.figure import Bars, Figure, Panel
 from grounded.figures.interactive import packed, palette, plotted
 from grounded.search.pictures import search_figure
@@ -41,8 +42,9 @@ from grounded_trials.report.page.tables import (
     parameter_table,
 )
 from grounded_trials.report.three_lines import gained_most, three_lines
-from grounded_trials.wording import count, figure
+from grounded_trials.wording import count, figure, glued
 
+TYPESET = {"^2": "²", "^3": "³", "->": "→", "+-": "±"}
 OPEN = 12  # candidates whose table is open
 
 
@@ -59,7 +61,8 @@ def page(findings: Findings, watched: int = 0) -> str:
     needs("jinja2", "report")
     from jinja2 import Environment
 
-    jinja = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    jinja = Environment(autoescape=True, finalize=_typeset, trim_blocks=True, lstrip_blocks=True)
+    jinja.filters["glued"] = glued
     scripts = [_own("plotly-basic.min.js"), _own("page.js")]
     panels: list[dict[str, Any]] = []
 
@@ -101,7 +104,25 @@ def _data(panel: Panel | Bars) -> dict[str, Any]:
     kind = "bars" if isinstance(panel, Bars) else panel.kind
     found: dict[str, Any] = _plain(plotted(panel))
     found["layout"].pop("annotations", None)  # a note stands in the caption
+    if not isinstance(panel, Bars) and any(curve.motion for curve in panel.curves):
+        found["motions"] = [_motion(curve.motion) for curve in panel.curves]
     return found | {"kind": kind}
+
+
+def _motion(motion: Motion | None) -> dict[str, Any] | None:
+    """What moves as the script draws it; of each part, eight numbers over time."""
+    if motion is None:
+        return None
+    rows = motion.poses.reshape(*motion.poses.shape[:2], 8)
+    parts = [
+        {
+            "strips": [strip.tolist() for strip in strips],
+            "thick": thick,
+            "pose": [packed(v) if np.ptp(v) else float(v[0]) for v in rows[:, k].T],
+        }
+        for k, (strips, thick) in enumerate(motion.wires)
+    ]
+    return {"t": packed(motion.times), "parts": parts}
 
 
 def _plain(value: Any) -> Any:
@@ -112,7 +133,15 @@ def _plain(value: Any) -> Any:
         return [_plain(item) for item in value]
     if isinstance(value, np.ndarray):
         return packed(value)
-    return float(value) if isinstance(value, np.floating) else value
+    return float(value) if isinstance(value, np.floating) else _typeset(value)
+
+
+def _typeset(value: Any) -> Any:
+    """Text of a terminal as a page prints it; what is escaped already, such as a script, stays."""
+    if type(value) is str:
+        for plain, sign in TYPESET.items():
+            value = value.replace(plain, sign)
+    return value
 
 
 def _height(panel: Panel | Bars) -> int:
@@ -154,7 +183,7 @@ def _about(findings: Findings) -> str:
 
 def _improved(findings: Findings) -> list[tuple[str, str]]:
     """What the first trial missed by, and the best one does: in the units of the states."""
-    rows = [(one.text, one.what) for one in improvements_in(findings)]
+    rows = [(glued(one.text), one.what) for one in improvements_in(findings)]
     first, best = findings.first, findings.best
     if first is not None and best is not None and best is not first:
         gain = ""
@@ -212,7 +241,7 @@ def _utility(findings: Findings) -> list[Block]:
     from grounded.search.certainty import last_improvement
 
     sure = last_improvement(findings.history)
-    begun = (sure[:1].upper() + sure[1:]).replace("+-", "±")
+    begun = sure[:1].upper() + sure[1:]
     few = len(findings.history) <= OPEN
     return [
         *drawn(search_figure(findings.standing, findings.optimum)),
