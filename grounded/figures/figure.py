@@ -153,7 +153,9 @@ class Panel:
 
     def ranges(self) -> tuple[tuple[float, float], tuple[float, float]]:
         """Of x, and of y in `height`: they hold all that has a name, with some room."""
-        xs = [_log10(x) if self.log else x for c in self._seen for x in c.spread(0)] + [np.array([d.x for d in self.dots])]
+        xs = [_log10(x) if self.log else x for c in self._seen for x in c.spread(0)] + [
+            np.array([d.x for d in self.dots])
+        ]
         margin = 0.06 if self.equal else 0.03 if self.dots or self.kind != "time" else 0.0
         low, high = fitted(xs, margin)
         if self.whole:

@@ -106,8 +106,9 @@ def _curve(panel: Panel, curve: Curve) -> dict[str, Any]:
         "hovertemplate": "%{y:.5g}",
     }  # fmt: skip
     if panel.log:
-        shown = np.isfinite(panel.height(curve.y))
-        trace |= {"x": curve.x[shown].tolist(), "y": curve.y[shown].tolist(), "mode": "lines+markers"}
+        known = curve.y > 0
+        x, y = (values[known].tolist() for values in (curve.x, curve.y))
+        trace |= {"x": x, "y": y, "mode": "lines+markers"}
     if curve.role in DASHES:
         trace["line"]["dash"] = " ".join(f"{v:g}px" for v in DASHES[curve.role]).replace(" ", ",")
     if curve.times is not None:
