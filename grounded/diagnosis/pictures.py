@@ -41,7 +41,7 @@ def accuracy_figure(diagnosis: Diagnosis) -> Figure | None:
         return None
     where = "on data that was held out" if held else "on the data that it was made from"
     caption = f"Rms error of predictions, {where}. No model gets below the noise."
-    key = legend(panels)
+    key = legend(panels)[::-1]
     return Figure("accuracy", "Predictions before and after", caption, tuple(panels), key)
 
 
@@ -58,7 +58,7 @@ def _over_horizons(errors: Sequence[RulerRow]) -> list[Panel | Bars]:
                 curves.append(Curve(ahead, np.array(values, float), role, name, 2.0))
         if curves:
             label = f"{channel} [{unit}]" if unit not in ("", "1") else channel
-            panels.append(Panel(label, "predicted ahead [s]", unit, tuple(curves), log=True))
+            panels.append(Panel(label, "predicted ahead [s]", unit, tuple(curves[::-1]), log=True))
     return panels
 
 

@@ -45,6 +45,10 @@ class Body(Protocol):
     """What moves: its parts, their poses, the path of the point that is watched."""
 
     @property
+    def unit(self) -> str:
+        """Of its positions; "" where nothing says how large it is."""
+
+    @property
     def parts(self) -> Sequence[Part]:
         """What it is made of."""
 

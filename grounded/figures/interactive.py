@@ -63,7 +63,8 @@ def plotted(panel: Panel | Bars, axis: str = "") -> dict[str, Any]:
     if panel.whole:
         across |= {"tickformat": "d", "dtick": max(1, round((right - left) / 8))}
     if panel.log:
-        across, up = (axis | {"type": "log", "dtick": _decades(axis)} for axis in (across, up))
+        log = {"type": "log", "exponentformat": "power"}
+        across, up = (axis | log | {"dtick": _decades(axis)} for axis in (across, up))
     if panel.equal:
         up |= {"scaleanchor": f"x{axis}"}
     if panel.loss:
@@ -169,7 +170,9 @@ def _flat(panel: Panel, low: float, high: float, axis: str) -> dict[str, Any]:
 def _line(panel: Panel, y: float, role: str, axis: str) -> dict[str, Any]:
     dash = ",".join(f"{v:g}px" for v in DASHES.get(role, ())) or "solid"
     look = {"color": f"@{role}", "width": 1.2, "dash": dash}
-    return _flat(panel, y, y, axis) | {"type": "line", "line": look}
+    return _flat(panel, y, y, axis) | {
+        "type": "line", "line": look, "layer": "above",
+    }  # fmt: skip
 
 
 def _note(text: str, axis: str) -> dict[str, Any]:

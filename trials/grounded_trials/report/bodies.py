@@ -62,9 +62,12 @@ def body_of(model: Model, scene: Scene, size: float) -> Body:
         return model.step.body
     for role, (zero, sign) in ZEROS.items():
         if angles := _columns(model, role):
-            return Links(angles, _lengths(model, len(angles)), zero, sign, _columns(model, "rail"))
+            lengths = _lengths(model, len(angles))
+            unit = "m" if all(lengths) else ""
+            drawn = tuple(length or 1.0 for length in lengths)
+            return Links(angles, drawn, zero, sign, unit, _columns(model, "rail"))
     if not scene.spatial and (height := _columns(model, "altitude")):
-        return Cabin(height[0], size)
+        return Cabin(height[0], size, list(model.states.values())[height[0]])
     return Vehicle(scene, size)
 
 
@@ -80,9 +83,10 @@ def _columns(model: Model, role: str) -> tuple[int, ...]:
 
 
 def _lengths(model: Model, count: int) -> tuple[float, ...]:
+    """Of the links [m], zero where the model has none."""
     params = model.params
     named = [params.get(f"l{i}", params.get("l")) for i in range(1, count + 1)]
-    return tuple(1.0 if one is None or one.unit != "m" else one.value for one in named)
+    return tuple(0.0 if one is None or one.unit != "m" else one.value for one in named)
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +95,11 @@ class Vehicle:
 
     scene: Scene
     size: float
+
+    @property
+    def unit(self) -> str:
+        """Of the first axis."""
+        return self.scene.units[0]
 
     @property
     def parts(self) -> Sequence[Part]:
@@ -117,6 +126,7 @@ class Links:
     lengths: tuple[float, ...]
     zero: float  # [rad] from x towards z, where the first angle is zero
     sign: int
+    unit: str
     rail: tuple[int, ...] = ()  # a state, or none
 
     @property
@@ -164,6 +174,7 @@ class Cabin:
 
     height: int  # a state
     size: float
+    unit: str
 
     @property
     def parts(self) -> Sequence[Part]:

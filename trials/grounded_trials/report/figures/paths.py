@@ -14,7 +14,7 @@ from grounded.figures.body import Body, motion
 from grounded.figures.figure import WIDTHS, Curve, Dot, Figure, Panel, enlarging, legend
 from grounded.frozen import Array
 from grounded_trials.report.bodies import body_in, is_mechanism
-from grounded_trials.report.findings import Findings, Log, Run, compared, tracked, tracking_error
+from grounded_trials.report.findings import Findings, Log, Run, compared
 from grounded_trials.report.scene import Scene, scene_of
 from grounded_trials.wording import labelled
 
@@ -22,6 +22,7 @@ OTHERS = 60  # runs that are drawn behind the compared ones
 LOGS = 4  # that are drawn where there is no run
 LOG_ROLES = ("best", "model", "accepted", "limit")
 SEEN = 5.0  # the least factor that shows more than the paths themselves
+MOSTLY = 0.5  # of a path: one of which more lies beyond is left out
 FAR = 0.4  # of the desired path's size: enlarged deviations beyond it are not drawn
 
 
@@ -44,7 +45,8 @@ def _views(findings: Findings, scene: Scene) -> list[View]:
     """From above and from the side; of what has no position, its body or its phase plane."""
     body = body_in(findings)
     if not scene.spatial and is_mechanism(body):
-        side = View(("x [m]", "z, up [m]"), lambda s: body.path(s)[:, [0, 2]], True, body)
+        names = labelled("x", body.unit), labelled("z, up", body.unit)
+        side = View(names, lambda states: body.path(states)[:, [0, 2]], True, body)
         return [side] if findings.task.model.n > 2 else [side, _plane(scene, 1)]
     return [_plane(scene, axis) for axis in range(1, len(scene.axes))]
 
@@ -70,12 +72,19 @@ def path_figure(findings: Findings) -> Figure | None:
         )
     else:
         panels = [_seen_in(findings, view) for view in views]
-        panels += _enlarged(findings, scene) + _shaded(findings, scene)
-        bare = not scene.spatial and views[0].body is None
-        caption = "The model names no position: its first two states." * bare
+        if views[0].equal and findings.runs:
+            panels += _enlarged(findings, views[0]) + _shaded(findings, views[0])
+        caption = _caption(scene, views[0])
     if any(crash(run) for run in findings.runs):
         caption += " A cross marks where a run ended early."
     return Figure("paths", "Paths", caption.strip(), tuple(panels), legend(panels[:1]))
+
+
+def _caption(scene: Scene, view: View) -> str:
+    if view.body is None:
+        return "" if scene.spatial else "The model names no position: its first two states."
+    alike = " The model has no l1, l2 ... [m]: its links are drawn alike." * (not view.body.unit)
+    return "Dark: real; pink: predicted for the same trial; dashed: desired." + alike
 
 
 def _of_logs(findings: Findings, view: View) -> Panel:
@@ -151,45 +160,41 @@ def _crash_mark(run: Run, view: View, dt: float) -> list[Dot]:
     return [Dot(x, y, "model", note, "cross", trial=run.trial.id)] if np.isfinite(x + y) else []
 
 
-def _enlarged(findings: Findings, scene: Scene) -> list[Panel]:
+def _enlarged(findings: Findings, view: View) -> list[Panel]:
     """The compared paths as many times as far from the desired one, where one can't see it."""
-    axes = list(scene.axes[:2])
-    if not (scene.spatial and set(axes) <= set(tracked(findings.task)) and findings.runs):
+    desired = view.place(findings.task.target)
+    if not np.isfinite(desired).all():
         return []
-    desired = findings.task.target[:, axes]
-    best = compared(findings)[-1][1].trial.states[:, axes]
-    factor = enlarging(best, desired)
+    factor = enlarging(view.place(compared(findings)[-1][1].trial.states), desired)
     if factor < SEEN:
         return []
     curves, note = [], ""
     for role, name, states in named_paths(findings):
         near = desired[: len(states)]
-        path = near + factor * (states[:, axes] - near)
+        path = near + factor * (view.place(states) - near)
         off = np.abs(path - near).max(axis=1) > FAR * np.ptp(desired, axis=0).max()
-        if off.mean() > 0.5:
+        if off.mean() > MOSTLY:
             note = f"{name.partition(',')[0]} lies outside"
             continue
         path[off] = np.nan
         width = WIDTHS.get(role, 1.5)
         curves.append(Curve(path[:, 0], path[:, 1], role, name, width))
-    x_name, y_name, *_ = (labelled(*one) for one in zip(scene.names, scene.units, strict=True))
     title = f"Deviations {factor:g} times as large"
-    return [Panel(title, x_name, y_name, tuple(curves), equal=True, note=note, kind="path")]
+    return [Panel(title, *view.names, tuple(curves), equal=True, note=note, kind="path")]
 
 
-def _shaded(findings: Findings, scene: Scene) -> list[Panel]:
+def _shaded(findings: Findings, view: View) -> list[Panel]:
     """The best path, its distance from where it should have been as its colour."""
-    task, axes = findings.task, list(scene.axes)
-    if not (scene.spatial and findings.runs and set(axes) <= set(tracked(task))):
+    (_, run), body = compared(findings)[-1], body_in(findings)
+    states, target = run.trial.states, findings.task.target
+    desired = body.path(target)
+    if not np.isfinite(desired).all():
         return []
-    _, run = compared(findings)[-1]
-    far = np.linalg.norm(tracking_error(task, run.trial)[:, axes], axis=1)
-    name = labelled("distance from desired", scene.units[0])
-    states, target = run.trial.states, task.target
-    times: Array = np.arange(len(states), dtype=np.float64) * task.dt
-    a, b = axes[:2]
-    path = Curve(states[:, a], states[:, b], "other", "", 1.0, times, far, name)
-    desired = Curve(target[:, a], target[:, b], "desired", "desired", 1.0)
-    x_name, y_name, *_ = (labelled(*one) for one in zip(scene.names, scene.units, strict=True))
+    far = np.linalg.norm(body.path(states) - desired[: len(states)], axis=1)
+    times: Array = np.arange(len(states), dtype=np.float64) * findings.task.dt
+    name = labelled("distance from desired", body.unit)
+    (x, y), (a, b) = view.place(states).T, view.place(target).T
+    path = Curve(x, y, "other", "", 1.0, times, far, name)
+    wanted = Curve(a, b, "desired", "desired", 1.0)
     title = f"Where {run.label} is off"
-    return [Panel(title, x_name, y_name, (path, desired), equal=True, kind="path")]
+    return [Panel(title, *view.names, (path, wanted), equal=True, kind="path")]
