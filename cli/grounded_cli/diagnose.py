@@ -207,7 +207,7 @@ def _effects(found: Diagnosis) -> None:
             (
                 ("* " if r.claimed else "  ") + r.effect,
                 credit_of(found, r.effect),
-                f"{r.evidence:,.1f}",
+                f"{r.evidence:,.{int(abs(r.evidence) < 1000)}f}",
                 _values(r),
             )
             for r in ranking

@@ -41,7 +41,7 @@ def accuracy_figure(diagnosis: Diagnosis) -> Figure | None:
         return None
     where = "on data that was held out" if held else "on the data that it was made from"
     caption = f"Rms error of predictions, {where}. No model gets below the noise."
-    key = legend(panels)[::-1]
+    key = tuple(sorted(legend(panels), key=lambda one: one.role == "other"))
     return Figure("accuracy", "Predictions before and after", caption, tuple(panels), key)
 
 
@@ -57,8 +57,10 @@ def _over_horizons(errors: Sequence[RulerRow]) -> list[Panel | Bars]:
             if np.isfinite(values).any():
                 curves.append(Curve(ahead, np.array(values, float), role, name, 2.0))
         if curves:
-            label = f"{channel} [{unit}]" if unit not in ("", "1") else channel
-            panels.append(Panel(label, "predicted ahead [s]", unit, tuple(curves[::-1]), log=True))
+            curves.sort(key=lambda curve: curve.role != "other")  # noise lies behind
+            unit = "" if unit == "1" else unit
+            label = f"{channel} [{unit}]" if unit else channel
+            panels.append(Panel(label, "predicted ahead [s]", unit, tuple(curves), log=True))
     return panels
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,9 +35,18 @@ COLOURS = {
 STEPS = ("step1", "step2", "step3")  # roles of iterations, in order
 WIDTHS = {"best": 2.5, "desired": 1.0}  # of paths; 1.5 for the other roles
 DASHES = {"desired": (6.0, 3.0), "predicted": (2.0, 2.0), "limit": (8.0, 2.0, 2.0, 2.0)}
+TYPESET = {"^2": "²", "^3": "³", "->": "→", "+-": "±"}
 LEAST = 1e-12  # a range below which differences are rounding
 LETTER = 0.035  # of a bar's text, as a share of the longest bar
 FACTORS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)  # by which deviations are enlarged
+
+
+def typeset(value: Any) -> Any:
+    """Plain text as it is printed; anything else, such as text that is escaped already, stays."""
+    if type(value) is str:
+        for plain, sign in TYPESET.items():
+            value = value.replace(plain, sign)
+    return value
 
 
 def rgb(colour: str) -> tuple[int, int, int]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 
 from grounded.diagnosis.pictures import accuracy_figure, credit_figure, where_figure
@@ -52,7 +53,8 @@ def told_since(lines: list[str], since: Since) -> list[str]:
     """A verdict's lines; what happened since stands before them."""
     before = "Before that: " * bool(since.adopted)
     told = [f"{_begun(since.sentence)}."] if since.sentence else []
-    return [glued(line) for line in [*told, before + lines[0], *lines[1:]]]
+    lines = [*told, before + lines[0], *lines[1:]]
+    return [re.sub(r"-(?=\d)", "-\u2060", glued(line)) for line in lines]  # no break in 1e-05
 
 
 def _details(diagnosis: Diagnosis, since: Since) -> list[Block]:

@@ -20,7 +20,7 @@ import numpy as np
 from grounded.diagnosis.pictures import credit_figure, worth_of
 from grounded.errors import needs
 from grounded.figures.body import Motion
-from grounded.figures.figure import Bars, Figure, Panel
+from grounded.figures.figure import Bars, Figure, Panel, typeset
 from grounded.figures.interactive import packed, palette, plotted
 from grounded.search.pictures import search_figure
 from grounded_trials.report.diagnosis_words import error_lines, instrument_lines
@@ -44,7 +44,6 @@ from grounded_trials.report.page.tables import (
 from grounded_trials.report.three_lines import gained_most, three_lines
 from grounded_trials.wording import count, figure, glued
 
-TYPESET = {"^2": "²", "^3": "³", "->": "→", "+-": "±"}
 OPEN = 12  # candidates whose table is open
 
 
@@ -61,7 +60,7 @@ def page(findings: Findings, watched: int = 0) -> str:
     needs("jinja2", "report")
     from jinja2 import Environment
 
-    jinja = Environment(autoescape=True, finalize=_typeset, trim_blocks=True, lstrip_blocks=True)
+    jinja = Environment(autoescape=True, finalize=typeset, trim_blocks=True, lstrip_blocks=True)
     jinja.filters["glued"] = glued
     scripts = [_own("plotly-basic.min.js"), _own("page.js")]
     panels: list[dict[str, Any]] = []
@@ -133,15 +132,7 @@ def _plain(value: Any) -> Any:
         return [_plain(item) for item in value]
     if isinstance(value, np.ndarray):
         return packed(value)
-    return float(value) if isinstance(value, np.floating) else _typeset(value)
-
-
-def _typeset(value: Any) -> Any:
-    """Text of a terminal as a page prints it; what is escaped already, such as a script, stays."""
-    if type(value) is str:
-        for plain, sign in TYPESET.items():
-            value = value.replace(plain, sign)
-    return value
+    return float(value) if isinstance(value, np.floating) else typeset(value)
 
 
 def _height(panel: Panel | Bars) -> int:
@@ -183,7 +174,7 @@ def _about(findings: Findings) -> str:
 
 def _improved(findings: Findings) -> list[tuple[str, str]]:
     """What the first trial missed by, and the best one does: in the units of the states."""
-    rows = [(glued(one.text), one.what) for one in improvements_in(findings)]
+    rows = [(one.text, one.what) for one in improvements_in(findings)]
     first, best = findings.first, findings.best
     if first is not None and best is not None and best is not first:
         gain = ""
