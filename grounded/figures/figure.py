@@ -27,17 +27,22 @@ COLOURS = {
     "predicted": ("#cc79a7", "#cc79a7"),
     "limit": ("#b47c00", "#e69f00"),
     "accepted": ("#009e73", "#009e73"),
-    "other": ("#9a9a9a", "#7d7d7d"),
+    "other": ("#7a7a7a", "#7d7d7d"),
     "step1": ("#009e73", "#009e73"),
-    "step2": ("#e69f00", "#f0e442"),
-    "step3": ("#9a9a9a", "#8d8d8d"),
+    "step2": ("#b47c00", "#f0e442"),
+    "step3": ("#6f6f6f", "#8d8d8d"),
 }
 STEPS = ("step1", "step2", "step3")  # roles of iterations, in order
 WIDTHS = {"best": 2.5, "desired": 1.0}  # of paths; 1.5 for the other roles
-DASHES = {"desired": (6.0, 3.0), "predicted": (2.0, 2.0), "limit": (8.0, 2.0, 2.0, 2.0)}
+DASHES = {
+    "desired": (6.0, 3.0),
+    "predicted": (2.0, 2.0),
+    "limit": (8.0, 2.0, 2.0, 2.0),
+    "step2": (5.0, 2.0),
+}
 TYPESET = {"^2": "²", "^3": "³", "->": "→", "+-": "±"}
 LEAST = 1e-12  # a range below which differences are rounding
-LETTER = 0.035  # of a bar's text, as a share of the longest bar
+LETTER = 0.045  # of a bar's text, as a share of the longest bar
 FACTORS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)  # by which deviations are enlarged
 
 
