@@ -81,7 +81,11 @@
     Plotly.react(plot, ...looks(plot), bars ? { ...config, displayModeBar: false, staticPlot: true } : config);
     if (!first) return;
     const { kind } = panels[plot.dataset.panel];
-    plot.on("plotly_afterplot", () => marks(plot));
+    const placed = () => {
+      marks(plot);
+      for (const button of all(".modebar-btn", plot)) button.tabIndex = -1; // a plot has keys
+    };
+    plot.on("plotly_afterplot", placed);
     plot.on("plotly_relayout", (change) => zoomedTo(plot, kind, change));
     if (kind === "time") {
       plot.on("plotly_hover", (event) => point(event.xvals ? event.xvals[0] : event.points[0].x, plot));
@@ -89,7 +93,7 @@
       plot.on("plotly_hover", ({ points: [at] }) => at.customdata !== undefined && point(at.customdata, plot));
     }
     plot.addEventListener("keydown", (event) => keyed(plot, event));
-    marks(plot);
+    placed();
   };
   const waiting = []; // one panel a frame, so that the page can be scrolled meanwhile
   const next = () => {
@@ -118,6 +122,8 @@
     }
   };
   const keyed = (plot, event) => {
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    if (event.key === "s") Plotly.downloadImage(plot, { filename: plot.id });
     const axis = plot.layout.xaxis;
     const [low, high] = axis.range;
     const span = high - low, middle = (low + high) / 2;
