@@ -115,15 +115,16 @@ class FlightResult:
         found = self.summary()
         gain = found["improvement"]
 
-        def pair(value: tuple[float, float]) -> str:
-            return f"{value[0]:,.0f} (±{value[1]:,.0f})"
+        def pair(value: tuple[float, float], shape: str = ",.0f") -> str:
+            spread = f" (±{value[1]:{shape}})" * bool(np.isfinite(value[1]))  # none of one run
+            return f"{value[0]:{shape}}{spread}"
 
         rows = (
             ("utility, model-based", pair(found["model_based"]), "-13,028 (±330)"),
             (f"utility, {ITERATIONS} iterations", pair(found["learned"]), "-3,000 (±100)"),
             (
                 "improvement, mean of ratios",
-                f"{gain['mean']:.1%} (±{gain['se']:.1%})",
+                pair((gain["mean"], gain["se"]), ".1%"),
                 "76 % (±2 %)",
             ),
             ("improvement, ratio of means", f"{gain['ratio_of_means']:.1%}", ""),
@@ -132,7 +133,8 @@ class FlightResult:
             ("trials an iteration", f"{found['trials_an_iteration']:.2f}", "typically 1"),
             ("discarded", f"{found['discarded']} of {len(self.runs)}", "about 20 %"),
         )
-        title = f"Table 1: flight simulator, {len(self.flown)} runs, mean (± one standard error)"
+        several = f"{len(self.flown)} runs, mean (± one standard error)"
+        title = f"Table 1: flight simulator, {several if len(self.flown) > 1 else '1 run'}"
         return [StudyTable(title, ("", "here", "paper"), rows)]
 
 

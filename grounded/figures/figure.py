@@ -289,6 +289,11 @@ def loss_ticks(low: float, high: float, most: int = 5) -> list[float]:
     return sorted(values)
 
 
+def log_ticks(low: float, high: float) -> list[float]:
+    """The same for values from 10^low to 10^high: 1, 2, 5, 10 ..., or fewer."""
+    return sorted(-loss for loss in loss_ticks(-high, -low))
+
+
 def enlarging(path: Array, desired: Array) -> float:
     """A round factor that makes the deviation of a path (T, 2) visible beside the desired one."""
     off = np.abs(path - desired[: len(path)])[:, :2]

@@ -21,6 +21,7 @@ from grounded.figures.figure import (
     Dot,
     Figure,
     Panel,
+    log_ticks,
     loss_ticks,
     rgb,
     thinned,
@@ -63,8 +64,9 @@ def plotted(panel: Panel | Bars, axis: str = "") -> dict[str, Any]:
     if panel.whole:
         across |= {"tickformat": "d", "dtick": max(1, round((right - left) / 8))}
     if panel.log:
-        log = {"type": "log", "exponentformat": "power"}
-        across, up = (axis | log | {"dtick": _decades(axis)} for axis in (across, up))
+        for each in (across, up):
+            ticks = log_ticks(*each["range"])
+            each |= {"type": "log", "tickvals": ticks, "ticktext": [f"{v:g}" for v in ticks]}
     if panel.equal:
         up |= {"scaleanchor": f"x{axis}"}
     if panel.loss:
@@ -78,12 +80,6 @@ def plotted(panel: Panel | Bars, axis: str = "") -> dict[str, Any]:
     ]
     layout["annotations"] = [_note(panel.note, axis)] if panel.note else []
     return {"data": data, "layout": layout}
-
-
-def _decades(axis: dict[str, Any]) -> int | str:
-    """A tick at 1, 10, 100 ..., or at 1, 2, 5, 10 ... where there are few."""
-    low, high = axis["range"]
-    return 1 if high - low > 2 else "D2"
 
 
 def _ruled(axis: dict[str, Any]) -> dict[str, Any]:

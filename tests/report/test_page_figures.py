@@ -28,6 +28,7 @@ from grounded.figures.figure import (
     Figure,
     Panel,
     fitted,
+    log_ticks,
     loss_ticks,
     rgb,
     thinned,
@@ -351,6 +352,13 @@ def test_logarithmic_panels_show_what_has_a_logarithm():
     drawn = plotted(panel)
     assert drawn["data"][0]["y"] == [1e-5, 10.0] and drawn["layout"]["yaxis"]["type"] == "log"
     assert len(png(Figure("f", "f", "", (panel,)))) > 1000
+
+
+@given(st.floats(-12, 6), st.floats(0.05, 12))
+def test_a_logarithmic_axis_says_its_magnitude(low, span):
+    ticks = log_ticks(low, low + span)
+    assert len(ticks) >= 2 and ticks == sorted(ticks)
+    assert all(low - 0.05 <= np.log10(tick) <= low + span + 0.05 for tick in ticks)
 
 
 def test_a_crash_is_marked_where_it_happened(car):

@@ -65,26 +65,23 @@ def path_figure(findings: Findings) -> Figure | None:
     logs = not findings.runs and bool(findings.logs) and not scene.volume
     if not views or (len(named_paths(findings)) < 2 and not logs):
         return None
+    body, caption = views[0].body, []
     if logs:
-        panels, caption = (
-            [_of_logs(findings, view) for view in views],
-            "Data that ran no candidate.",
-        )
+        panels = [_of_logs(findings, view) for view in views]
+        caption.append("Data that ran no candidate.")
     else:
         panels = [_seen_in(findings, view) for view in views]
         if views[0].equal and findings.runs:
             panels += _enlarged(findings, views[0]) + _shaded(findings, views[0])
-        caption = _caption(scene, views[0])
+        if body is not None:
+            caption.append("Dark: real; pink: predicted for the same trial; dashed: desired.")
+    if body is None and not scene.spatial:
+        caption.append("The model names no position: its first two states.")
+    if body is not None and not body.unit:
+        caption.append("The model has no l1, l2 ... [m]: its links are drawn alike.")
     if any(crash(run) for run in findings.runs):
-        caption += " A cross marks where a run ended early."
-    return Figure("paths", "Paths", caption.strip(), tuple(panels), legend(panels[:1]))
-
-
-def _caption(scene: Scene, view: View) -> str:
-    if view.body is None:
-        return "" if scene.spatial else "The model names no position: its first two states."
-    alike = " The model has no l1, l2 ... [m]: its links are drawn alike." * (not view.body.unit)
-    return "Dark: real; pink: predicted for the same trial; dashed: desired." + alike
+        caption.append("A cross marks where a run ended early.")
+    return Figure("paths", "Paths", " ".join(caption), tuple(panels), legend(panels[:1]))
 
 
 def _of_logs(findings: Findings, view: View) -> Panel:

@@ -17,6 +17,7 @@ from grounded.figures.figure import (
     Figure,
     Key,
     Panel,
+    log_ticks,
     loss_ticks,
     typeset,
 )
@@ -113,9 +114,10 @@ def _panel(axes: Any, panel: Panel) -> None:
     axes.set(xlabel=typeset(panel.x_name), ylabel=typeset(panel.y_name))
     if panel.log:
         axes.set(xscale="log", yscale="log")
-        for axis in (axes.xaxis, axes.yaxis):
-            axis.set_major_formatter(lambda value, _: f"{value:g}")
-            axis.set_minor_formatter(lambda value, _: "")
+        for axis, span in ((axes.xaxis, across), (axes.yaxis, up)):
+            ticks = log_ticks(*span)
+            axis.set_ticks(ticks, [f"{v:g}" for v in ticks])
+            axis.set_ticks([], minor=True)
         across, up = ((10.0**low, 10.0**high) for low, high in (across, up))
     axes.set_xlim(across, auto=panel.equal)
     axes.set_ylim(up, auto=panel.equal)

@@ -218,6 +218,7 @@ def _why(findings: Findings) -> dict[str, Any]:
     told = [] if credit else error_lines(diagnosis, before)
     lines = [(title, text) for title, text in told if title == "parameters"]
     return {
+        "kind": diagnosis.kind,
         "verdict": told_since(three_lines(diagnosis, findings.task), findings.since),
         "preflight": instrument_lines(diagnosis.preflight),
         "lines": lines,

@@ -68,9 +68,11 @@ def flight_figure(result: FlightResult) -> Figure:
         Panel("Figure 1: altitude above the start", "time [s]", "m", tuple(height)),
         _utilities(result),
     )
-    more = {"other": "utilities of the other runs", "accepted": "optimum with the true parameters"}
+    more = {"other": "utilities of the other runs"} if len(result.flown) > 1 else {}
+    more["accepted"] = "optimum with the true parameters"
     key = (*legend(panels[:1]), *(Key(role, name) for role, name in more.items()))
-    title = f"The aircraft’s figure-8: the median of {len(result.flown)} runs, seed {shown.seed}"
+    several = f"the median of {len(result.flown)} runs, " * (len(result.flown) > 1)
+    title = f"The aircraft’s figure-8: {several}seed {shown.seed}"
     return Figure("flight", title, "", panels, key)
 
 
