@@ -193,7 +193,7 @@ def verdict_lines(kind: str, text: str) -> tuple[list[str], list[str]]:
     causes = first.split("; ") if kind in ("effect", "several") else [first]
     if len(causes) == 1:
         return [], [first, *others]
-    return [cause.rstrip(".") for cause in causes], others
+    return [f"{cause[:1].upper()}{cause[1:]}".rstrip(".") for cause in causes], others
 
 
 def sentences(text: str) -> list[str]:

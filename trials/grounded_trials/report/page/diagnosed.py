@@ -40,7 +40,7 @@ def gap_section(findings: Findings) -> list[Block]:
         command = Block("command", rendered(DIAGNOSE), "c-diagnose")
         return [Block("text", words), command, *ahead, *forecast_table(findings), *lacking]
     causes, others = verdict_lines(diagnosis.kind, diagnosis.sentence or diagnosis.kind)
-    verdict = Block("verdict", lines=told_since([*map(_begun, causes), *others], findings.since))
+    verdict = Block("verdict", lines=told_since([*causes, *others], findings.since))
     if diagnosis.no_cause:  # with too little data, what was fitted is no finding
         return [verdict, *ahead, *forecast_table(findings), *lacking]
     proof = drawn(accuracy_figure(diagnosis), title=True)
