@@ -176,12 +176,11 @@ def _note(text: str) -> None:
 
 def _verdict(kind: str, text: str) -> str:
     """The kind, then a cause or a sentence a line: they say different things."""
-    from grounded_trials.report.diagnosis_words import sentences
+    from grounded_trials.report.diagnosis_words import verdict_lines
 
-    causes, *others = sentences(text)
-    first, *more = causes.split("; ") if kind in ("effect", "several") else [causes]
+    causes, others = verdict_lines(kind, text)
     lines = [field("verdict", kind).replace(kind, tinted(kind), 1)]
-    for line in (first, *(f"- {cause}" for cause in more), *others):
+    for line in (*(f"- {cause}" for cause in causes), *others):
         lines += wrapped(line, "  ", "    ")
     return "\n".join(lines)
 
@@ -213,7 +212,7 @@ def _effects(found: Diagnosis) -> None:
             (
                 ("* " if r.claimed else "  ") + r.effect,
                 credit_of(found, r.effect),
-                f"{r.evidence:.1f}",
+                f"{r.evidence:,.{int(abs(r.evidence) < 1000)}f}",
                 _values(r),
             )
             for r in ranking

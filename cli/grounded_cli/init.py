@@ -118,7 +118,7 @@ def _tell(begun: Begun) -> None:
         remark("note", note)
     look = "; look at what is UNSURE in its [log]" if begun.unsure else ""
     show()
-    sentence(f"read {begun.workspace}/model.py and grounded.toml{look}, then")
+    sentence(f"read {begun.workspace}/model.py and grounded.toml{look}")
     show(next_line(begun.then, begun.workspace))
 
 

@@ -93,7 +93,8 @@ def probe(
     if best is None:
         return None
     expected, chosen, words = best
-    sentence = f"{words}: expected to tell {group[0]} from {group[1]} by {expected:.1f} nats" + (
+    gain = f"{expected:,.{int(expected < 100)}f} nats"
+    sentence = f"{words}: expected to tell {group[0]} from {group[1]} by {gain}" + (
         " (too little: try larger inputs or another manoeuvre)" if expected < 3 else ""
     )
     return Probe(chosen, expected, (group[0], group[1]), sentence)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from grounded.diagnosis.report import Diagnosis, RulerRow, number
+from grounded.diagnosis.report import Diagnosis, RulerRow, measured, number
 from grounded.figures.figure import Bar, Bars, Curve, Figure, Panel, legend
 
 MOST = 12
@@ -41,7 +41,7 @@ def accuracy_figure(diagnosis: Diagnosis) -> Figure | None:
         return None
     where = "on data that was held out" if held else "on the data that it was made from"
     caption = f"Rms error of predictions, {where}. No model gets below the noise."
-    key = legend(panels)
+    key = tuple(sorted(legend(panels), key=lambda one: one.role == "other"))
     return Figure("accuracy", "Predictions before and after", caption, tuple(panels), key)
 
 
@@ -57,8 +57,10 @@ def _over_horizons(errors: Sequence[RulerRow]) -> list[Panel | Bars]:
             if np.isfinite(values).any():
                 curves.append(Curve(ahead, np.array(values, float), role, name, 2.0))
         if curves:
-            label = f"{channel} [{unit}]" if unit not in ("", "1") else channel
-            panels.append(Panel(label, "predicted ahead [s]", unit, tuple(curves)))
+            curves.sort(key=lambda curve: curve.role != "other")  # noise lies behind
+            unit = "" if unit == "1" else unit
+            label = f"{channel} [{unit}]" if unit else channel
+            panels.append(Panel(label, "predicted ahead [s]", unit, tuple(curves), log=True))
     return panels
 
 
@@ -69,7 +71,7 @@ def _by_channel(error: RulerRow) -> list[Panel | Bars]:
         for key, (role, name) in MODELS.items():
             value = getattr(error, key).get(channel, math.nan)
             if math.isfinite(value):
-                bars.append(Bar(name, value, _with_unit(value, unit), role))
+                bars.append(Bar(name, value, measured(value, unit), role))
         if bars:
             panels.append(Bars(f"{channel}, {error.horizon_s:g} s ahead", tuple(bars)))
     return panels
@@ -113,7 +115,7 @@ def worth_of(names: Sequence[str], what: str, diagnosis: Diagnosis) -> list[Bars
     rows += [(MODELS["with_effects"], error.with_effects)]
     rows += [(MODELS["noise_floor"], error.noise_floor)]
     found = [(look, math.hypot(*(v[n] for n in names))) for look, v in rows if set(names) <= set(v)]
-    bars = tuple(Bar(n, v, _with_unit(v, unit), role) for (role, n), v in found)
+    bars = tuple(Bar(n, v, measured(v, unit), role) for (role, n), v in found)
     title = what.removeprefix("the ").capitalize() if len(names) > 1 else what
     return [Bars(f"{title}: error {error.horizon_s:g} s ahead", bars)]
 
@@ -136,7 +138,7 @@ def _improved(error: RulerRow) -> list[str]:
 def where_figure(diagnosis: Diagnosis) -> Figure | None:
     """Shares of the gap by channel, time and region, and the evidence for each effect."""
     where = diagnosis.where
-    by_channel = [(c.name, c.share, f", {_with_unit(c.rms, c.unit)}") for c in where.channels]
+    by_channel = [(c.name, c.share, f", {measured(c.rms, c.unit)}") for c in where.channels]
     by_time = [(f"{t.start:g} to {t.end:g} s", t.share, "") for t in where.times]
     by_region = [
         (r.when, r.share, f", {100 * r.occupancy:.0f} % of the time") for r in where.regions
@@ -187,7 +189,3 @@ def _shrinkage(diagnosis: Diagnosis) -> Bars:
     )
     bars = tuple(Bar(name, v, number(v), role) for name, v, role in rows)
     return Bars(f"Prediction error{ahead}, in units of the noise", bars)
-
-
-def _with_unit(value: float, unit: str) -> str:
-    return f"{number(value)} {'' if unit == '1' else unit}".rstrip()

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from grounded.figures.figure import Figure
 
 BRIEF: dict[str, Any] = {"brief": True}  # a field whose key is left out where there is nothing
+SCALED = ("m", "rad", "s")  # units, and their rates, of which thousandths have a name
+SMALL = 1e-3  # below which they are used
 
 Kind = Literal["effect", "several", "none", "unknown"]
 
@@ -457,6 +459,18 @@ class Diagnosis(Document):
 def number(value: float) -> str:
     """Three digits."""
     return f"{value:.3g}"
+
+
+def measured(value: float, unit: str) -> str:
+    """An error in two digits: in cm, mm, mrad ... where it is small in its own unit."""
+    if unit == "m" and SMALL <= value < 1.0:
+        value, unit = 100 * value, "cm"
+    elif unit.startswith(SCALED) and 0 < value < SMALL:
+        step = 1 if value >= 1e-5 else 2
+        value, unit = value * 1e3**step, "-mµ"[step] + unit
+    shape = ",.0f" if 9.95 <= value < 1e6 else "#.2g" if SMALL <= value < 1e6 else ".1e"
+    text = "-" if math.isnan(value) else f"{value:{shape}}" if value else "0"
+    return text if unit == "1" else f"{text} {unit}".rstrip()
 
 
 def quantity(estimate: Estimate) -> str:

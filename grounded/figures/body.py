@@ -1,4 +1,7 @@
-"""Bodies as plain values: the parts of a robot, and where they are in each of its states."""
+"""Bodies as plain values: the parts of a robot, and where they are in each of its states.
+
+A recording draws the parts in space; `motion` is the same body seen from the side, for a page.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,8 @@ from grounded.frozen import Array
 
 Pose = tuple[Array, Array]  # origins (T, 3), rotation matrices (T, 3, 3)
 NONE: Array = np.zeros((0, 3))
+FRAMES = 400  # poses of all parts together in one motion
+SEEN = [0, 2]  # from the side one sees x and z
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +45,10 @@ class Body(Protocol):
     """What moves: its parts, their poses, the path of the point that is watched."""
 
     @property
+    def unit(self) -> str:
+        """Of its positions; "" where nothing says how large it is."""
+
+    @property
     def parts(self) -> Sequence[Part]:
         """What it is made of."""
 
@@ -48,3 +57,65 @@ class Body(Protocol):
 
     def path(self, states: Array) -> Array:
         """Positions (T, 3) of the point that is watched; NaN where a state is unknown."""
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A body seen from the side while it moves: x to the right, z up.
+
+    times: (T,) [s] of the poses.
+    wires: of each part its polylines (k, 3) in its own frame, and how thick they are.
+    poses: (T, parts, 2, 4): what turns a point of a part, and where its origin is, in x and z.
+    """
+
+    times: Array
+    wires: tuple[tuple[tuple[Array, ...], float], ...]
+    poses: Array
+
+    @property
+    def reached(self) -> Array:
+        """Points (k, 2) that hold all that it touches."""
+        every = range(0, len(self.times), -(-len(self.times) // 60))
+        return np.vstack([line for row in every for line, _ in self.lines(row)])
+
+    def lines(self, row: int) -> list[tuple[Array, float]]:
+        """The polylines (k, 2) at one of the times, each with its thickness."""
+        return [
+            (strip @ pose[:, :3].T + pose[:, 3], thick)
+            for (strips, thick), pose in zip(self.wires, self.poses[row], strict=True)
+            for strip in strips
+        ]
+
+
+def motion(body: Body, states: Array, dt: float) -> Motion | None:
+    """A body along states (T, n), where its place is known; None where it never is."""
+    rows = np.flatnonzero(np.isfinite(body.path(states)).all(axis=1))
+    rows = rows[:: -(-len(rows) * len(body.parts) // FRAMES) or 1]
+    if not len(rows) or not body.parts:
+        return None
+    known = np.where(np.isfinite(states[rows]), states[rows], 0.0)  # rates don't move it
+    poses = [np.concatenate([turn, at[..., None]], axis=2) for at, turn in body.poses(known)]
+    seen = np.stack(poses, axis=1)[:, :, SEEN]
+    return Motion(np.float64(dt) * rows, tuple(wires(part) for part in body.parts), seen)
+
+
+def wires(part: Part) -> tuple[tuple[Array, ...], float]:
+    """Polylines that show a part from any side, and how thick they are; 0 for thin ones."""
+    if part.shape == "capsule":
+        return (np.array([[0, 0, 0], [0, 0, part.size[1]]], float),), 2 * part.size[0]
+    if part.shape in ("lines", "dot"):
+        return part.strips or (np.zeros((2, 3)),), 0.0
+    if part.shape == "ellipsoid":
+        turn = np.linspace(0, 2 * np.pi, 25)
+        round_ = np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
+        return tuple(np.roll(round_, k, axis=1) * part.size for k in range(3)), 0.0
+    if part.shape == "cylinder":
+        radius, length = part.size
+        low, high = np.array([[-radius, -radius, -length / 2], [radius, radius, length / 2]])
+    elif part.shape == "mesh":
+        low, high = part.points.min(axis=0), part.points.max(axis=0)
+    else:
+        low, high = -np.array(part.size), np.array(part.size)
+    around = [(0, 0), (1, 0), (1, 1), (0, 1), (0, 0)]
+    rings = [np.array([[x, y, z] for x, z in around]) for y in (0, 1)]
+    return tuple(low + ring * (high - low) for ring in rings), 0.0

@@ -10,10 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from grounded.figures.body import Motion
 from grounded.frozen import Array
 
 # Okabe & Ito (2008), told apart by colour-blind people too: role -> (on white, on black)
@@ -25,16 +27,31 @@ COLOURS = {
     "predicted": ("#cc79a7", "#cc79a7"),
     "limit": ("#b47c00", "#e69f00"),
     "accepted": ("#009e73", "#009e73"),
-    "other": ("#9a9a9a", "#7d7d7d"),
+    "other": ("#7a7a7a", "#7d7d7d"),
     "step1": ("#009e73", "#009e73"),
-    "step2": ("#e69f00", "#f0e442"),
-    "step3": ("#9a9a9a", "#8d8d8d"),
+    "step2": ("#b47c00", "#f0e442"),
+    "step3": ("#6f6f6f", "#8d8d8d"),
 }
 STEPS = ("step1", "step2", "step3")  # roles of iterations, in order
 WIDTHS = {"best": 2.5, "desired": 1.0}  # of paths; 1.5 for the other roles
-DASHES = {"desired": (6.0, 3.0), "predicted": (2.0, 2.0), "limit": (8.0, 2.0, 2.0, 2.0)}
+DASHES = {
+    "desired": (6.0, 3.0),
+    "predicted": (2.0, 2.0),
+    "limit": (8.0, 2.0, 2.0, 2.0),
+    "step2": (5.0, 2.0),
+}
+TYPESET = {"^2": "²", "^3": "³", "->": "→", "+-": "±"}
 LEAST = 1e-12  # a range below which differences are rounding
+LETTER = 0.045  # of a bar's text, as a share of the longest bar
 FACTORS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)  # by which deviations are enlarged
+
+
+def typeset(value: Any) -> Any:
+    """Plain text as it is printed; anything else, such as text that is escaped already, stays."""
+    if type(value) is str:
+        for plain, sign in TYPESET.items():
+            value = value.replace(plain, sign)
+    return value
 
 
 def rgb(colour: str) -> tuple[int, int, int]:
@@ -49,6 +66,7 @@ class Curve:
     times: [s] of each point of a path.
     shade: a value for each point, shown as its colour; `shade_name` says what it is.
     trial: whose path it is, so that an animation finds a trial's parts.
+    motion: the body that moves along a path.
     """
 
     x: Array
@@ -61,6 +79,12 @@ class Curve:
     shade_name: str = ""
     trial: str = ""
     style: str = "line"  # line, points, or ghost: not drawn, for the animation alone
+    motion: Motion | None = None
+
+    def spread(self, axis: int) -> list[Array]:
+        """What must fit along x (0) or y (1)."""
+        moved = [] if self.motion is None else [self.motion.reached[:, axis]]
+        return [(self.x, self.y)[axis], *moved]
 
 
 @dataclass(frozen=True)
@@ -97,7 +121,11 @@ class Band:
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """Axes with curves and marks. `loss`: y by the logarithm of its distance from 0."""
+    """Axes with curves and marks.
+
+    loss: y by the logarithm of its distance from 0.
+    log: x and y by their logarithms.
+    """
 
     title: str
     x_name: str
@@ -108,14 +136,17 @@ class Panel:
     bands: tuple[Band, ...] = ()
     equal: bool = False  # one scale for both axes
     loss: bool = False
+    log: bool = False
     whole: bool = False  # x counts
     y_range: tuple[float, float] | None = None
     note: str = ""  # inside, top right
     kind: str = ""  # time: x is the time of a run; path: where a run was
 
     def height(self, y: float | Array) -> Array:
-        """Where a value lies on the y axis: itself, or -log10(-y) of a loss."""
+        """Where a value lies on the y axis: itself, log10(y), or -log10(-y) of a loss."""
         y = np.asarray(y, float)
+        if self.log:
+            return _log10(y)
         if not self.loss:
             return y
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -127,14 +158,19 @@ class Panel:
         return max((float(v.max()) for v in known if len(v)), default=-1.0)
 
     def _heights(self) -> list[Array]:
-        seen = [c for c in self.curves if c.name] or list(self.curves)
         marks = [d.y for d in self.dots] + [rule.y for rule in self.rules]
-        return [*(c.y for c in seen if c.style != "ghost"), np.array(marks)]
+        return [*(y for c in self._seen for y in c.spread(1)), np.array(marks)]
+
+    @property
+    def _seen(self) -> list[Curve]:
+        named = [c for c in self.curves if c.name] or list(self.curves)
+        return [c for c in named if c.style != "ghost"]
 
     def ranges(self) -> tuple[tuple[float, float], tuple[float, float]]:
         """Of x, and of y in `height`: they hold all that has a name, with some room."""
-        seen = [c for c in self.curves if c.name] or list(self.curves)
-        xs = [c.x for c in seen if c.style != "ghost"] + [np.array([d.x for d in self.dots])]
+        xs = [_log10(x) if self.log else x for c in self._seen for x in c.spread(0)] + [
+            np.array([d.x for d in self.dots])
+        ]
         margin = 0.06 if self.equal else 0.03 if self.dots or self.kind != "time" else 0.0
         low, high = fitted(xs, margin)
         if self.whole:
@@ -160,6 +196,19 @@ class Bars:
     title: str
     bars: tuple[Bar, ...]
 
+    @property
+    def values(self) -> Array:
+        """How long each is."""
+        return np.array([bar.value if np.isfinite(bar.value) else 0.0 for bar in self.bars])
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """What the axis holds: the bars, and the text behind each."""
+        most = float(np.abs(self.values).max(initial=0.0)) or 1.0
+        room = np.array([most * (0.05 + LETTER * len(bar.text)) for bar in self.bars])
+        ends = self.values + np.where(self.values < 0, -room, room)
+        return float(ends.min(initial=0.0)), float(ends.max(initial=0.0)) or most
+
 
 @dataclass(frozen=True)
 class Key:
@@ -180,6 +229,11 @@ class Figure:
     caption: str
     panels: tuple[Panel | Bars, ...]
     key: tuple[Key, ...] = ()
+
+
+def _log10(values: Array) -> Array:
+    """NaN where a value has no logarithm."""
+    return np.log10(np.where(values > 0, values, np.nan))
 
 
 def legend(panels: Sequence[Panel | Bars]) -> tuple[Key, ...]:
@@ -233,6 +287,11 @@ def loss_ticks(low: float, high: float, most: int = 5) -> list[float]:
     if len(values) < 2:
         values = [float(f"{-(10.0**-v):.2g}") for v in np.linspace(low, high, 4)]
     return sorted(values)
+
+
+def log_ticks(low: float, high: float) -> list[float]:
+    """The same for values from 10^low to 10^high: 1, 2, 5, 10 ..., or fewer."""
+    return sorted(-loss for loss in loss_ticks(-high, -low))
 
 
 def enlarging(path: Array, desired: Array) -> float:

@@ -21,6 +21,7 @@ from grounded.figures.figure import (
     Dot,
     Figure,
     Panel,
+    log_ticks,
     loss_ticks,
     rgb,
     thinned,
@@ -39,7 +40,6 @@ PAPER = {
 }
 SYMBOLS = {"disc": "circle", "ring": "circle-open", "cross": "x-thin", "dash": "line-ew"}
 FONT = 12
-LETTER = 0.035  # of a bar's text, as a share of the longest bar
 
 
 def plotted(panel: Panel | Bars, axis: str = "") -> dict[str, Any]:
@@ -63,6 +63,10 @@ def plotted(panel: Panel | Bars, axis: str = "") -> dict[str, Any]:
     up: dict[str, Any] = {"title": {"text": panel.y_name}, "range": [low, high]}
     if panel.whole:
         across |= {"tickformat": "d", "dtick": max(1, round((right - left) / 8))}
+    if panel.log:
+        for each in (across, up):
+            ticks = log_ticks(*each["range"])
+            each |= {"type": "log", "tickvals": ticks, "ticktext": [f"{v:g}" for v in ticks]}
     if panel.equal:
         up |= {"scaleanchor": f"x{axis}"}
     if panel.loss:
@@ -98,6 +102,10 @@ def _curve(panel: Panel, curve: Curve) -> dict[str, Any]:
         "meta": {"role": curve.role, "trial": curve.trial, "style": curve.style},
         "hovertemplate": "%{y:.5g}",
     }  # fmt: skip
+    if panel.log:
+        known = curve.y > 0
+        x, y = (values[known].tolist() for values in (curve.x, curve.y))
+        trace |= {"x": x, "y": y, "mode": "lines+markers"}
     if curve.role in DASHES:
         trace["line"]["dash"] = " ".join(f"{v:g}px" for v in DASHES[curve.role]).replace(" ", ",")
     if curve.times is not None:
@@ -158,7 +166,9 @@ def _flat(panel: Panel, low: float, high: float, axis: str) -> dict[str, Any]:
 def _line(panel: Panel, y: float, role: str, axis: str) -> dict[str, Any]:
     dash = ",".join(f"{v:g}px" for v in DASHES.get(role, ())) or "solid"
     look = {"color": f"@{role}", "width": 1.2, "dash": dash}
-    return _flat(panel, y, y, axis) | {"type": "line", "line": look}
+    return _flat(panel, y, y, axis) | {
+        "type": "line", "line": look, "layer": "above",
+    }  # fmt: skip
 
 
 def _note(text: str, axis: str) -> dict[str, Any]:
@@ -170,18 +180,14 @@ def _note(text: str, axis: str) -> dict[str, Any]:
 
 def _bars(panel: Bars, axis: str) -> dict[str, Any]:
     bars = panel.bars[::-1]  # Plotly's first is the lowest
-    values = [bar.value if np.isfinite(bar.value) else 0.0 for bar in bars]
     trace = {
-        "type": "bar", "orientation": "h", "x": np.array(values), "y": list(range(len(bars))),
+        "type": "bar", "orientation": "h", "x": panel.values[::-1], "y": list(range(len(bars))),
         "text": [bar.text for bar in bars], "textposition": "outside", "cliponaxis": False,
         "marker": {"color": [f"@{bar.role}" for bar in bars]}, "hoverinfo": "skip",
         "textfont": {"color": "@text"}, "xaxis": f"x{axis}", "yaxis": f"y{axis}",
         "meta": {"role": "", "trial": "", "style": "bar"},
     }  # fmt: skip
-    most = max([abs(v) for v in values], default=0.0) or 1.0
-    low = min([*values, 0.0])
-    room = 1.05 + max([LETTER * len(bar.text) for bar in bars], default=0.0)
-    across = {"range": [room * low, room * most], "visible": False, "fixedrange": True}
+    across = {"range": [*panel.ends], "visible": False, "fixedrange": True}
     up = {
         "tickvals": list(range(len(bars))), "ticktext": [bar.label for bar in bars],
         "automargin": True, "fixedrange": True, "showgrid": False, "zeroline": False,

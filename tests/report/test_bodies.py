@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from grounded.figures.body import motion
 from grounded.models import arm, buggy, cart_pole, lift, pendulum
 from grounded_trials.report.bodies import body_of, is_mechanism, reach
 from grounded_trials.report.scene import scene_of
@@ -58,6 +59,36 @@ def test_a_mark_along_a_path_and_a_state_that_is_unknown():
     assert len(reach(_body(pendulum.model), states)) == 4  # two tips, two joints
 
 
+@pytest.mark.parametrize("model", [pendulum.model, cart_pole.model, arm.model, lift.model])
+def test_a_motion_is_the_body_seen_from_the_side(model):
+    body, states = _body(model), np.random.default_rng(0).normal(size=(5, model.n))
+    states[1] = np.nan
+    states[2, -1] = np.nan  # a rate: it moves nothing
+    seen = motion(body, states, 0.1)
+    assert seen is not None
+    np.testing.assert_allclose(seen.times, [0.0, 0.2, 0.3, 0.4])
+    known, filled = states[[0, 2, 3, 4]], np.nan_to_num(states[[0, 2, 3, 4]])
+    for row, (tip, poses) in enumerate(
+        zip(
+            body.path(known),
+            zip(*[list(p[0]) for p in body.poses(filled)], strict=True),
+            strict=True,
+        )
+    ):
+        lines = [line for line, _ in seen.lines(row)]
+        if model is lift.model:
+            np.testing.assert_allclose(np.mean(lines[0][:4], axis=0), tip[[0, 2]], atol=1e-9)
+            continue
+        links = [line for line in lines if len(line) == 2]
+        np.testing.assert_allclose([line[0] for line in links], np.array(poses)[: len(links), ::2])
+        np.testing.assert_allclose(links[-1][1], tip[[0, 2]], atol=1e-9)
+    assert motion(body, np.full((3, model.n), np.nan), 0.1) is None
+
+
+def test_what_has_no_length_has_no_unit():
+    assert [_body(one.model).unit for one in (pendulum, cart_pole, lift, arm)] == ["m"] * 3 + [""]
+
+
 MJCF = """
 <mujoco>
   <worldbody>
@@ -96,3 +127,7 @@ def test_a_mujoco_model_looks_as_its_file_says():
     np.testing.assert_allclose(poses[3][1][0, :, 2], [1, 0, 0], atol=1e-9)
     np.testing.assert_allclose(body.path(states)[0], [2.2, 0, 0.05], atol=1e-9)
     assert np.isnan(body.path(np.full((1, 4), np.nan))).all()
+    seen = motion(body, states, 0.1)
+    assert seen is not None
+    rod = seen.lines(0)[2][0]  # after the cart's two rings
+    np.testing.assert_allclose(np.sort(rod, axis=0), ends[:, [0, 2]], atol=1e-9)

@@ -95,7 +95,7 @@ def test_page_shows_what_the_issue_lists(cart):
         "Share of the gap by region",
         "viscous_friction:v",
         "0.290 to 0.330",  # the 95 % interval, which is not symmetric
-        "explains 90 %",
+        "explains 90\xa0%",
         "a fast run and a slow one",
         "grounded adopt viscous_friction:v",
         "N s/m",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -16,18 +17,24 @@ from grounded.diagnosis.report import Credit, Diagnosis, RulerRow, Verdict
 from grounded.errors import GroundedError
 from grounded.experiments.pendulum import pendulum_task
 from grounded.figures.figure import (
+    COLOURS,
+    DASHES,
+    STEPS,
     Band,
     Bar,
     Bars,
     Curve,
     Dot,
+    Figure,
     Panel,
     fitted,
+    log_ticks,
     loss_ticks,
+    rgb,
     thinned,
     without_astray,
 )
-from grounded.figures.interactive import coloured, packed, plotted
+from grounded.figures.interactive import PAPER, coloured, packed, plotted
 from grounded.model import Model
 from grounded.models import pendulum
 from grounded.rollout import simulate
@@ -191,7 +198,9 @@ def test_the_text_of_a_negative_bar_stays_clear_of_the_labels():
 
     sheet = Sheet(figsize=(4.8, 2.0), dpi=100)
     canvas, axes = FigureCanvasAgg(sheet), sheet.add_subplot()
-    _bars(axes, Bars("evidence", tuple(Bar(f"{v:g}", v, f"{v:.3g}") for v in (444.9, -3.21))))
+    _bars(
+        axes, Bars("evidence", tuple(Bar(f"{v:g}", v, f"{v:.3g}") for v in (444.9, -3.21))), most=2
+    )
     canvas.draw()
     edge = axes.get_window_extent().x0
     assert all(text.get_window_extent().x0 > edge for text in axes.texts)
@@ -317,7 +326,7 @@ def test_the_worth_of_each_effect_is_drawn_in_the_unit_of_the_state():
     assert [bar.label for bar in share.bars] == ["delay:u"] and share.bars[0].value == 0.9
     assert worth.title == "v: error 1 s ahead"  # what predictions improved most
     assert [bar.value for bar in worth.bars] == [0.5, 0.4, 0.05, 0.04]
-    assert worth.bars[1].label == "without delay:u" and worth.bars[1].text == "0.4 m/s"
+    assert worth.bars[1].label == "without delay:u" and worth.bars[1].text == "0.40 m/s"
     (x, v) = accuracy_figure(found).panels
     assert [bar.value for bar in x.bars] == [0.2, 0.1, 0.1, 0.05] and "v" in v.title
 
@@ -334,6 +343,68 @@ def test_the_residual_is_drawn_over_what_tells_most_of_it(cart):
     assert added.min() <= line.y.min() <= line.y.max() <= added.max()
     assert all(len(panel.bands) == 1 for panel in rest.panels)
     assert all(np.abs(c.y).max() <= 1.0 for panel in rest.panels for c in panel.curves)
+
+
+def _linear(colour):
+    value = np.array(rgb(colour)) / 255
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+
+
+def _lab(linear):
+    xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+    x, y, z = np.cbrt(xyz @ np.clip(linear, 1e-4, 1) / [0.9505, 1.0, 1.089])
+    return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])
+
+
+DEUTAN = [
+    [0.367322, 0.860646, -0.227968],
+    [0.280085, 0.672501, 0.047413],
+    [-0.01182, 0.04294, 0.968881],
+]
+PROTAN = [
+    [0.152286, 1.052583, -0.204868],
+    [0.114503, 0.786281, 0.099216],
+    [-0.003882, -0.048116, 1.051998],
+]
+
+
+@pytest.mark.parametrize("dark", [0, 1])
+def test_colours_stand_out_and_are_told_apart_by_the_colour_blind(dark):
+    paper = _linear(PAPER["paper"][dark]) @ [0.2126, 0.7152, 0.0722]
+    for role, pair in COLOURS.items():
+        light = _linear(pair[dark]) @ [0.2126, 0.7152, 0.0722]
+        ratio = (max(light, paper) + 0.05) / (min(light, paper) + 0.05)
+        assert ratio >= 3.0, role  # WCAG 2.2, 1.4.11
+    for together in (("model", "best", "real", "other", "step2"), ("model", "best", *STEPS)):
+        for a, b in combinations(together, 2):
+            for seen in (DEUTAN, PROTAN):  # Machado et al. (2009)
+                far = [_lab(np.array(seen) @ _linear(COLOURS[one][dark])) for one in (a, b)]
+                apart = np.linalg.norm(far[0] - far[1]) > 8.0
+                assert apart or DASHES.get(a) != DASHES.get(b), (a, b)
+
+
+def test_bars_leave_room_for_what_stands_behind_them():
+    bars = Bars("b", (Bar("a", 100.0, "100"), Bar("delay:torque", -0.07, "-0.0689")))
+    low, high = bars.ends
+    assert low < -20 and high > 110
+    assert plotted(bars)["layout"]["xaxis"]["range"] == [low, high]
+
+
+def test_logarithmic_panels_show_what_has_a_logarithm():
+    curve = Curve(np.array([0.1, 1.0, 10.0]), np.array([1e-5, 0.0, 10.0]), "best", "b")
+    panel = Panel("p", "x", "y", (curve,), log=True)
+    (left, right), (low, high) = panel.ranges()
+    assert left < -1 and right > 1 and -6 < low < -5 and 1 < high < 2
+    drawn = plotted(panel)
+    assert drawn["data"][0]["y"] == [1e-5, 10.0] and drawn["layout"]["yaxis"]["type"] == "log"
+    assert len(png(Figure("f", "f", "", (panel,)))) > 1000
+
+
+@given(st.floats(-12, 6), st.floats(0.05, 12))
+def test_a_logarithmic_axis_says_its_magnitude(low, span):
+    ticks = log_ticks(low, low + span)
+    assert len(ticks) >= 2 and ticks == sorted(ticks)
+    assert all(low - 0.05 <= np.log10(tick) <= low + span + 0.05 for tick in ticks)
 
 
 def test_a_crash_is_marked_where_it_happened(car):

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from grounded.diagnosis.report import Diagnosis
-from grounded_trials.report.findings import measured
+from grounded.diagnosis.report import Diagnosis, measured
+from grounded_trials.report.diagnosis_words import verdict_lines
 from grounded_trials.report.three_lines import gained_most, three_lines
 from reported import DIAGNOSIS
 from small_tasks import cart_task
@@ -95,3 +95,14 @@ def test_without_a_known_cause_the_verdict_speaks_for_itself(diagnosis):
 )
 def test_an_error_is_given_in_a_unit_that_fits(value, unit, text):
     assert measured(value, unit) == text
+
+
+def test_each_of_several_causes_stands_on_a_line_of_its_own():
+    several = (
+        "Friction slows v (60 % of the gain); the input is late (40 % of the gain). All is told."
+    )
+    causes, others = verdict_lines("several", several)
+    assert causes == ["Friction slows v (60 % of the gain)", "The input is late (40 % of the gain)"]
+    assert others == ["All is told."]
+    assert verdict_lines("effect", "Friction slows v.") == ([], ["Friction slows v."])
+    assert verdict_lines("unknown", "A gap; no cause. More.") == ([], ["A gap; no cause.", "More."])

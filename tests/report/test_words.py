@@ -4,6 +4,7 @@ import pytest
 
 from grounded_trials.wording import (
     count,
+    glued,
     labelled,
     per_second,
     percent,
@@ -22,6 +23,13 @@ def test_the_unit_one_is_not_printed():
     assert with_unit("0.146", "1") == "0.146" and with_unit("0.3", "m") == "0.3 m"
     assert labelled("throttle", "1") == "throttle" and labelled("v", "m/s") == "v [m/s]"
     assert per_second("1") == "1/s" and per_second("rad") == "rad/s"
+
+
+@pytest.mark.parametrize(
+    "whole", ["v > 1.02", "0.5 N m s", "m +30 %", "a4 -1.5 %", "27 cm", "0.35 mrad", "2 ± 0.1 rad"]
+)
+def test_no_line_is_broken_inside_a_quantity(whole):
+    assert " " not in glued(whole)
 
 
 @pytest.mark.parametrize(

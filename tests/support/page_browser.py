@@ -123,6 +123,12 @@ class Browser:
             self.devtools("Input.dispatchKeyEvent", {"type": kind, **typed})
         time.sleep(0.3)
 
+    def tab(self) -> None:
+        """Presses the tabulator where the focus is."""
+        typed = {"key": "Tab", "code": "Tab", "windowsVirtualKeyCode": 9}
+        for kind in ("rawKeyDown", "keyUp"):
+            self.devtools("Input.dispatchKeyEvent", {"type": kind, **typed})
+
     def draw_all(self) -> None:
         """Scrolls through the page, so that every panel comes into view, and back."""
         self.run("document.querySelectorAll('details').forEach(d => { d.open = true; })")

@@ -16,8 +16,10 @@ NARROW, WIDE = 60, 80  # columns: what every line can do with, and what a reader
 MARKS = "\ufdd0\ufdd1\ufdd2\ufdd3\ufdd4"  # of colours in a text: they take no column
 _WORD = re.compile(r"""(?:'[^']*'|"[^"]*"|\S)+""")  # of a command; what is quoted stays whole
 _GLUE = re.compile(
-    r"(?<=[<>]) (?=[\d.])| (?=%)| (?=(?:\+-|±) )|(?<= (?:\+-)) |(?<= ±) |^ |(?<=^[ *]) "
-    r"|(?<=\d) (?=(?:m|ms|s|rad|deg|kg|N|Nm|V|A|Hz|nats)\b)"
+    r"(?<=[<>]) (?=[\d.-])| (?=[<>] )| (?=-> )| (?=%)"
+    r"| (?=(?:\+-|±) )|(?<= (?:\+-)) |(?<= ±) |^ |(?<=^[ *]) "
+    r"|(?<=\d) (?=(?:[mµc]?(?:m|s|rad)|deg|kg|N|Nm|V|A|Hz|nats)\b)| (?=[+-]\d[\d.]* %)"
+    r"|(?<=noise:) |(?<=\bN) (?=m\b)|(?<=\bN m) (?=s\b)"
 )  # blanks where no line is broken
 
 

@@ -22,7 +22,8 @@ from grounded.adapters.stepper import Stepper
 from grounded.figures.body import Body, Part, Pose
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded_trials.report.scene import Scene
+from grounded_trials.report.findings import Findings
+from grounded_trials.report.scene import Scene, scene_of
 
 CAR = (
     [(-0.5, -0.25, 0), (0.5, -0.25, 0), (0.5, 0.25, 0), (-0.5, 0.25, 0), (-0.5, -0.25, 0)],
@@ -35,8 +36,18 @@ AIRCRAFT = (
     [(-0.4, 0, 0), (-0.65, 0, 0.25), (-0.6, 0, 0)],
 )
 ZEROS = {"hanging": (-np.pi / 2, 1), "upright": (np.pi / 2, -1), "level": (0.0, 1)}
+LENGTH = 0.07  # of the paths' size: a body that has no length of its own
 SLIM = 0.06  # of a link's length: its radius
 CARRIAGE = (0.25, 0.12, 0.1)  # of the links' length: half its edges
+
+
+def body_in(findings: Findings) -> Body:
+    """The body of a workspace's model, of a length that can be seen beside the path."""
+    model = findings.task.model
+    scene, shown = scene_of(model), findings.runs or findings.logs
+    points = scene.finite(shown[0].trial.states if shown else findings.task.target)
+    size = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
+    return body_of(model, scene, LENGTH * (size or 1.0))
 
 
 def body_of(model: Model, scene: Scene, size: float) -> Body:
@@ -51,9 +62,12 @@ def body_of(model: Model, scene: Scene, size: float) -> Body:
         return model.step.body
     for role, (zero, sign) in ZEROS.items():
         if angles := _columns(model, role):
-            return Links(angles, _lengths(model, len(angles)), zero, sign, _columns(model, "rail"))
+            lengths = _lengths(model, len(angles))
+            unit = "m" if all(lengths) else ""
+            drawn = tuple(length or 1.0 for length in lengths)
+            return Links(angles, drawn, zero, sign, unit, _columns(model, "rail"))
     if not scene.spatial and (height := _columns(model, "altitude")):
-        return Cabin(height[0], size)
+        return Cabin(height[0], size, list(model.states.values())[height[0]])
     return Vehicle(scene, size)
 
 
@@ -69,9 +83,10 @@ def _columns(model: Model, role: str) -> tuple[int, ...]:
 
 
 def _lengths(model: Model, count: int) -> tuple[float, ...]:
+    """Of the links [m], zero where the model has none."""
     params = model.params
     named = [params.get(f"l{i}", params.get("l")) for i in range(1, count + 1)]
-    return tuple(1.0 if one is None or one.unit != "m" else one.value for one in named)
+    return tuple(0.0 if one is None or one.unit != "m" else one.value for one in named)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +95,11 @@ class Vehicle:
 
     scene: Scene
     size: float
+
+    @property
+    def unit(self) -> str:
+        """Of the first axis."""
+        return self.scene.units[0]
 
     @property
     def parts(self) -> Sequence[Part]:
@@ -106,6 +126,7 @@ class Links:
     lengths: tuple[float, ...]
     zero: float  # [rad] from x towards z, where the first angle is zero
     sign: int
+    unit: str
     rail: tuple[int, ...] = ()  # a state, or none
 
     @property
@@ -153,6 +174,7 @@ class Cabin:
 
     height: int  # a state
     size: float
+    unit: str
 
     @property
     def parts(self) -> Sequence[Part]:

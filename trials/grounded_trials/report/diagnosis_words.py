@@ -190,6 +190,15 @@ def utility_sentence(diagnosis: Diagnosis) -> str:
     return f"{text} (rms; from policy to policy the utilities themselves differ by {spread})"
 
 
+def verdict_lines(kind: str, text: str) -> tuple[list[str], list[str]]:
+    """A verdict's causes, then its sentences, for a line each."""
+    first, *others = sentences(text)
+    causes = first.split("; ") if kind in ("effect", "several") else [first]
+    if len(causes) == 1:
+        return [], [first, *others]
+    return [f"{cause[:1].upper()}{cause[1:]}".rstrip(".") for cause in causes], others
+
+
 def sentences(text: str) -> list[str]:
     """A verdict's sentences, for a line each: they say different things."""
     return re.split(r"(?<=\.) (?=[A-Z`]|[\d.]+ s ahead)", text)

@@ -12,7 +12,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from grounded.diagnosis.report import Diagnosis
+from grounded.diagnosis.report import Diagnosis, measured
 from grounded.errors import NextCommand
 from grounded.frozen import Array
 from grounded.model import Model
@@ -22,14 +22,11 @@ from grounded.search.standing import Standing
 from grounded.task import Task
 from grounded.trial import Trial, mean_trial
 from grounded_trials.report.scene import scene_of
-from grounded_trials.wording import figure, rendered, shown, with_unit
+from grounded_trials.wording import figure, rendered, shown
 from grounded_trials.workspace.adopting import Better
 from grounded_trials.workspace.folder import Lost
 from grounded_trials.workspace.next_step import Since
 
-SCALED = ("m", "rad", "s")  # units, and their rates, of which thousandths have a name
-SMALL = 1e-3  # below which they are used
-PREFIXES = ("", "m", "µ")
 One = TypeVar("One")
 
 
@@ -177,16 +174,6 @@ class Improved:
     @property
     def _known(self) -> list[float]:
         return [v for v in (self.before, self.after) if np.isfinite(v)]
-
-
-def measured(value: float, unit: str) -> str:
-    """An error in two digits: in cm, mm, mrad ... where it is small in its own unit."""
-    if unit == "m" and SMALL <= value < 1.0:
-        return f"{figure(100 * value, 2)} cm"
-    if unit.startswith(SCALED) and 0 < value < SMALL:
-        step = 1 if value >= 1e-5 else 2
-        return f"{figure(value * 1e3**step, 2)} {PREFIXES[step]}{unit}"
-    return with_unit(figure(value, 2), unit)
 
 
 def weighed_groups(task: Task) -> list[tuple[list[str], str]]:

@@ -13,7 +13,7 @@ from grounded_trials.report.diagnosis_words import (
     credit_of,
     error_lines,
     error_table,
-    sentences,
+    verdict_lines,
 )
 from grounded_trials.report.findings import (
     Findings,
@@ -156,8 +156,9 @@ def _diagnosis(findings: Findings, table: Table) -> str:
     lines = ["gap to the model"]
     lines += _wrapped(since.told(findings.folder), "  ")
     then = "before that: " * bool(since.adopted)
-    for k, sentence in enumerate(sentences(diagnosis.sentence or diagnosis.kind)):
-        lines += _wrapped(then * (k == 0) + sentence, "  ")
+    causes, others = verdict_lines(diagnosis.kind, diagnosis.sentence or diagnosis.kind)
+    for k, line in enumerate([*(f"- {cause}" for cause in causes), *others]):
+        lines += _wrapped(then * (k == 0) + line, "  ")
     before = {} if since.changed else findings.values
     for title, text in error_lines(diagnosis, before):
         lines += _wrapped(f"{title}: {text}", "  ")

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from grounded.diagnosis.report import Diagnosis, Remainder, RulerRow
+from grounded.diagnosis.report import Diagnosis, Remainder, RulerRow, measured
 from grounded.diagnosis.verdict import tied, worsened
 from grounded.task import Task
 from grounded_trials.report.diagnosis_words import moved_parameters, sentences
-from grounded_trials.report.findings import measured, weighed_groups
+from grounded_trials.report.findings import weighed_groups
 from grounded_trials.wording import count, shown
 
 CAUSES = 2  # that the first line names

@@ -84,7 +84,7 @@ def _figure(findings: Findings, name: str, title: str, trial: Trial) -> Figure |
         seen = trial.id in made.trials
         caption += f" The diagnosis was {'' if seen else 'not '}made from this trial."
     if trial.steps < steps:
-        caption += f" Drawn is the worst part of the log, from {begin:g} s on."
+        caption += f" Drawn is its worst part, from {begin:g} s on."
     return Figure(name, title, caption, tuple(panels), legend(panels))
 
 

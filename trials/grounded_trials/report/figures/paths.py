@@ -1,12 +1,20 @@
-"""Where the runs went: paths in the plane, the error as their colour, deviations enlarged."""
+"""Where the runs went: paths in the plane, the error as their colour, deviations enlarged.
+
+A mechanism without a place on a map is seen from the side: the path of its tip, and itself.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import numpy as np
 
+from grounded.figures.body import Body, motion
 from grounded.figures.figure import WIDTHS, Curve, Dot, Figure, Panel, enlarging, legend
 from grounded.frozen import Array
-from grounded_trials.report.findings import Findings, Log, Run, compared, tracked, tracking_error
+from grounded_trials.report.bodies import body_in, is_mechanism
+from grounded_trials.report.findings import Findings, Log, Run, compared
 from grounded_trials.report.scene import Scene, scene_of
 from grounded_trials.wording import labelled
 
@@ -14,39 +22,86 @@ OTHERS = 60  # runs that are drawn behind the compared ones
 LOGS = 4  # that are drawn where there is no run
 LOG_ROLES = ("best", "model", "accepted", "limit")
 SEEN = 5.0  # the least factor that shows more than the paths themselves
+MOSTLY = 0.5  # of a path: one of which more lies beyond is left out
 FAR = 0.4  # of the desired path's size: enlarged deviations beyond it are not drawn
 
 
+@dataclass(frozen=True, eq=False)
+class View:
+    """Two axes, and where states (T, n) lie between them (T, 2)."""
+
+    names: tuple[str, str]
+    place: Callable[[Array], Array]
+    equal: bool
+    body: Body | None = None
+
+    @property
+    def title(self) -> str:
+        """What it shows."""
+        return "{1} over {0}".format(*self.names) if self.body is None else "From the side"
+
+
+def _views(findings: Findings, scene: Scene) -> list[View]:
+    """From above and from the side; of what has no position, its body or its phase plane."""
+    body = body_in(findings)
+    if not scene.spatial and is_mechanism(body):
+        names = labelled("x", body.unit), labelled("z, up", body.unit)
+        side = View(names, lambda states: body.path(states)[:, [0, 2]], True, body)
+        return [side] if findings.task.model.n > 2 else [side, _plane(scene, 1)]
+    return [_plane(scene, axis) for axis in range(1, len(scene.axes))]
+
+
+def _plane(scene: Scene, axis: int) -> View:
+    """Another axis over the first one."""
+    x, y = (labelled(scene.names[i], scene.units[i]) for i in (0, axis))
+    equal = axis == 1 and scene.spatial and scene.units[0] == scene.units[1]
+    return View((x, y), lambda states: states[:, [scene.axes[0], scene.axes[axis]]], equal)
+
+
 def path_figure(findings: Findings) -> Figure | None:
-    """The paths in the plane, the error along the best one, and the deviations enlarged."""
+    """The paths, the error along the best one, and the deviations enlarged."""
     scene = scene_of(findings.task.model)
-    if len(scene.axes) == 2 and not findings.runs and findings.logs:
-        return _of_logs(findings, scene)
-    if len(scene.axes) < 2 or len(named_paths(findings)) < 2:
+    views = _views(findings, scene)
+    logs = not findings.runs and bool(findings.logs) and not scene.volume
+    if not views or (len(named_paths(findings)) < 2 and not logs):
         return None
-    panels = [_plane(findings, scene, scene.axes[0], scene.axes[1], plan=True)]
-    if scene.volume:
-        panels.append(_plane(findings, scene, scene.axes[0], scene.axes[2], plan=False))
-    panels += _enlarged(findings, scene) + _shaded(findings, scene)
-    caption = "" if scene.spatial else f"No plane among the roles: {' and '.join(scene.names)}."
+    body, caption = views[0].body, []
+    if logs:
+        panels = [_of_logs(findings, view) for view in views]
+        caption.append("Data that ran no candidate.")
+    else:
+        panels = [_seen_in(findings, view) for view in views]
+        if views[0].equal and findings.runs:
+            panels += _enlarged(findings, views[0]) + _shaded(findings, views[0])
+        if body is not None:
+            caption.append("Dark: real; pink: predicted for the same trial; dashed: desired.")
+    if body is None and not scene.spatial:
+        caption.append(f"No plane among the roles: {' and '.join(scene.names)}.")
+    if body is not None and not body.unit:
+        caption.append("The model has no l1, l2 ... [m]: its links are drawn alike.")
     if any(crash(run) for run in findings.runs):
-        caption += " A cross marks where a run ended early."
-    return Figure("paths", "Paths", caption.strip(), tuple(panels), legend(panels[:1]))
+        caption.append("A cross marks where a run ended early.")
+    return Figure("paths", "Paths", " ".join(caption), tuple(panels), legend(panels[:1]))
 
 
-def _of_logs(findings: Findings, scene: Scene) -> Figure:
+def _of_logs(findings: Findings, view: View) -> Panel:
     """Where the robot went in the logs, while no candidate has been run."""
-    x_name, y_name = (labelled(*one) for one in zip(scene.names, scene.units, strict=True))
     curves = []
     for k, log in enumerate(findings.logs[-LOGS:]):
-        x, y = (log.trial.states[:, i] for i in scene.axes)
-        times = np.arange(len(x), dtype=np.float64) * log.trial.dt
-        curves.append(Curve(x, y, LOG_ROLES[k], log.trial.id, 1.5, times, trial=log.trial.id))
-    equal = scene.spatial and len(set(scene.units)) == 1
-    panel = Panel(
-        f"{y_name} over {x_name}", x_name, y_name, tuple(curves), equal=equal, kind="path"
-    )
-    return Figure("paths", "Paths", "Data that ran no candidate.", (panel,), legend([panel]))
+        states, dt, name = log.trial.states, log.trial.dt, log.trial.id
+        curves.append(_path(view, states, dt, LOG_ROLES[k], name, name, "line"))
+    return Panel(view.title, *view.names, tuple(curves), equal=view.equal, kind="path")
+
+
+def _path(
+    view: View, states: Array, dt: float, role: str, name: str, trial: str, style: str
+) -> Curve:
+    """One path with the times of its points, and the body that moves along it."""
+    width = 0.8 if role == "other" else WIDTHS.get(role, 1.5)
+    moved = None if view.body is None else motion(view.body, states, dt)
+    times: Array = np.arange(len(states), dtype=np.float64) * dt
+    x, y = view.place(states).T
+    return Curve(x, y, role, name, width, times, trial=trial, style=style, motion=moved)
 
 
 def name_of(role: str, run: Run) -> str:
@@ -70,90 +125,75 @@ def crash(run: Run | Log) -> int | None:
     return last if short else None
 
 
-def _plane(findings: Findings, scene: Scene, a: int, b: int, plan: bool) -> Panel:
+def _seen_in(findings: Findings, view: View) -> Panel:
     """Every run's path by name, the compared ones before the others, and what was predicted."""
-    task = findings.task
+    dt = findings.task.dt
     shown = {run.trial.id: (role, run) for role, run in compared(findings)}
     others = [r for r in findings.runs if r.trial.id not in shown][-OTHERS:]
-    times: Array = np.arange(task.horizon + 1, dtype=np.float64) * task.dt
-
-    def curve(states: Array, role: str, name: str, trial: str, style: str = "line") -> Curve:
-        x, y, width = states[:, a], states[:, b], WIDTHS.get(role, 1.5)
-        width = 0.8 if role == "other" else width
-        return Curve(x, y, role, name, width, times[: len(states)], trial=trial, style=style)
-
     runs = [("other", r.label, r) for r in others]
     runs += [(role, name_of(role, r), r) for role, r in shown.values()]
-    curves = [curve(r.trial.states, role, name, r.trial.id) for role, name, r in runs]
-    curves += [
-        curve(
-            r.candidate.predicted_states,
-            "predicted",
-            f"predicted for {r.candidate.id}",
-            r.trial.id,
-            "ghost",
-        )
+    drawn = [(r.trial.states, role, name, r.trial.id, "line") for role, name, r in runs]
+    drawn += [
+        (c.predicted_states, "predicted", f"predicted for {c.id}", r.trial.id, "ghost")
         for _, _, r in runs
-        if plan
+        for c in (r.candidate,)
     ]
-    for role, name, states in named_paths(findings):
-        if role in ("predicted", "desired"):
-            curves.append(curve(states, role, name, ""))
-    dots = [d for _, _, r in runs for d in _crash_mark(r, a, b, task.dt)]
-    (x_name, x_unit), (y_name, y_unit) = (list(task.model.states.items())[i] for i in (a, b))
-    names = labelled(x_name, x_unit), labelled(y_name, y_unit)
-    equal = plan and x_unit == y_unit and scene.spatial
-    title = f"{y_name} over {x_name}"
-    return Panel(title, *names, tuple(curves), tuple(dots), equal=equal, kind="path")
+    drawn += [
+        (states, role, name, "", "line")
+        for role, name, states in named_paths(findings)
+        if role in ("predicted", "desired")
+    ]
+    curves = tuple(_path(view, states, dt, *words) for states, *words in drawn)
+    dots = tuple(d for _, _, r in runs for d in _crash_mark(r, view, dt))
+    return Panel(view.title, *view.names, curves, dots, equal=view.equal, kind="path")
 
 
-def _crash_mark(run: Run, a: int, b: int, dt: float) -> list[Dot]:
+def _crash_mark(run: Run, view: View, dt: float) -> list[Dot]:
     last = crash(run)
     if last is None:
         return []
-    x, y = (float(run.trial.states[last, i]) for i in (a, b))
+    x, y = (float(v) for v in view.place(run.trial.states[[last]])[0])
     note = f"{run.label} ended after {last * dt:.2f} s of {run.trial.steps * dt:.2f} s"
     return [Dot(x, y, "model", note, "cross", trial=run.trial.id)] if np.isfinite(x + y) else []
 
 
-def _enlarged(findings: Findings, scene: Scene) -> list[Panel]:
+def _enlarged(findings: Findings, view: View) -> list[Panel]:
     """The compared paths as many times as far from the desired one, where one can't see it."""
-    axes = list(scene.axes[:2])
-    if not (scene.spatial and set(axes) <= set(tracked(findings.task)) and findings.runs):
+    desired = view.place(findings.task.target)
+    if not np.isfinite(desired).all():
         return []
-    desired = findings.task.target[:, axes]
-    best = compared(findings)[-1][1].trial.states[:, axes]
-    factor = enlarging(best, desired)
+    factor = enlarging(view.place(compared(findings)[-1][1].trial.states), desired)
     if factor < SEEN:
         return []
-    curves, cut = [], False
+    curves, note, cut = [], "", False
     for role, name, states in named_paths(findings):
         near = desired[: len(states)]
-        path = near + factor * (states[:, axes] - near)
+        path = near + factor * (view.place(states) - near)
         off = np.abs(path - near).max(axis=1) > FAR * np.ptp(desired, axis=0).max()
+        if off.mean() > MOSTLY:
+            note = f"{name.partition(',')[0]} lies outside"
+            continue
         path[off] = np.nan
         cut |= bool(off.any())
         width = WIDTHS.get(role, 1.5)
         curves.append(Curve(path[:, 0], path[:, 1], role, name, width))
-    x_name, y_name, *_ = (labelled(*one) for one in zip(scene.names, scene.units, strict=True))
     title = f"Deviations {factor:g} times as large"
     title += ", where they fit" * cut
-    return [Panel(title, x_name, y_name, tuple(curves), equal=True, kind="path")]
+    return [Panel(title, *view.names, tuple(curves), equal=True, note=note, kind="path")]
 
 
-def _shaded(findings: Findings, scene: Scene) -> list[Panel]:
+def _shaded(findings: Findings, view: View) -> list[Panel]:
     """The best path, its distance from where it should have been as its colour."""
-    task, axes = findings.task, list(scene.axes)
-    if not (scene.spatial and findings.runs and set(axes) <= set(tracked(task))):
+    (_, run), body = compared(findings)[-1], body_in(findings)
+    states, target = run.trial.states, findings.task.target
+    desired = body.path(target)
+    if not np.isfinite(desired).all():
         return []
-    _, run = compared(findings)[-1]
-    far = np.linalg.norm(tracking_error(task, run.trial)[:, axes], axis=1)
-    name = labelled("distance from desired", scene.units[0])
-    states, target = run.trial.states, task.target
-    times: Array = np.arange(len(states), dtype=np.float64) * task.dt
-    a, b = axes[:2]
-    path = Curve(states[:, a], states[:, b], "other", "", 1.0, times, far, name)
-    desired = Curve(target[:, a], target[:, b], "desired", "desired", 1.0)
-    x_name, y_name, *_ = (labelled(*one) for one in zip(scene.names, scene.units, strict=True))
+    far = np.linalg.norm(body.path(states) - desired[: len(states)], axis=1)
+    times: Array = np.arange(len(states), dtype=np.float64) * findings.task.dt
+    name = labelled("distance from desired", body.unit)
+    (x, y), (a, b) = view.place(states).T, view.place(target).T
+    path = Curve(x, y, "other", "", 1.0, times, far, name)
+    wanted = Curve(a, b, "desired", "desired", 1.0)
     title = f"Where {run.label} is off"
-    return [Panel(title, x_name, y_name, (path, desired), equal=True, kind="path")]
+    return [Panel(title, *view.names, (path, wanted), equal=True, kind="path")]

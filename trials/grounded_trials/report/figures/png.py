@@ -18,10 +18,14 @@ from grounded.figures.figure import (
     Figure,
     Key,
     Panel,
+    log_ticks,
     loss_ticks,
+    typeset,
 )
 
-WIDE, HIGH, SQUARE, ROW = 4.8, 2.7, 4.4, 0.27  # [inch] of a panel; a bar's row
+WIDE, HIGH, SQUARE = 4.8, 2.7, 4.4  # [inch] of a panel
+HEAD, ROW = 0.5, 0.27  # [inch] of bars: their title, a bar
+POSES = 6  # of a body that moves
 DPI = 200
 MARKERS = {"disc": "o", "ring": "o", "cross": "x", "dash": "_"}
 TITLE = 52  # letters of a panel's title in a line
@@ -56,8 +60,11 @@ def png(figure: Figure) -> bytes:
         for i, row in enumerate(rows):
             for j, panel in enumerate(row):
                 axes = sheet.add_subplot(grid[i, j])
-                axes.set_title(textwrap.fill(panel.title, TITLE))
-                _bars(axes, panel) if isinstance(panel, Bars) else _panel(axes, panel)
+                axes.set_title(typeset(textwrap.fill(panel.title, TITLE)))
+                if isinstance(panel, Bars):
+                    _bars(axes, panel, most=round((heights[i] - HEAD) / ROW))
+                else:
+                    _panel(axes, panel)
         handles = [_handle(key) for key in _keys(figure)]
         if handles:
             sheet.legend(handles=handles, loc="outside lower left", ncols=columns + 1)
@@ -68,7 +75,7 @@ def png(figure: Figure) -> bytes:
 
 def _height(panel: Panel | Bars) -> float:
     if isinstance(panel, Bars):
-        return 0.5 + ROW * max(len(panel.bars), 1)
+        return HEAD + ROW * max(len(panel.bars), 1)
     return SQUARE if panel.equal else HIGH
 
 
@@ -81,14 +88,14 @@ def _keys(figure: Figure) -> list[Key]:
     return [*kept, Key(single[0].role, f"{len(single)} other trials")]
 
 
-def _bars(axes: Any, panel: Bars) -> None:
-    values = [bar.value if np.isfinite(bar.value) else 0.0 for bar in panel.bars]
-    drawn = axes.barh(range(len(values)), values, color=[_colour(bar.role) for bar in panel.bars])
+def _bars(axes: Any, panel: Bars, most: int) -> None:
+    """Bars as thick as those of their row's panel that has `most`."""
+    rows = range(len(panel.bars))
+    drawn = axes.barh(rows, panel.values, color=[_colour(bar.role) for bar in panel.bars])
     axes.bar_label(drawn, [bar.text for bar in panel.bars], padding=3)
-    axes.set_yticks(range(len(values)), [bar.label for bar in panel.bars])
-    low, high = min([*values, 0.0]), max([abs(v) for v in values], default=0) or 1
-    axes.set_xlim(low - 0.25 * (high - low) * (low < 0), 1.4 * high)
-    axes.invert_yaxis()
+    axes.set_yticks(rows, [bar.label for bar in panel.bars])
+    axes.set_xlim(panel.ends)
+    axes.set_ylim(max(most, len(rows)) - 0.5, -0.5)
     axes.xaxis.set_visible(False)
     axes.grid(False)
     axes.tick_params(left=False)
@@ -106,7 +113,14 @@ def _panel(axes: Any, panel: Panel) -> None:
         _curve(axes, panel, curve)
     for dot in panel.dots:
         _dot(axes, panel, dot, up)
-    axes.set(xlabel=panel.x_name, ylabel=panel.y_name)
+    axes.set(xlabel=typeset(panel.x_name), ylabel=typeset(panel.y_name))
+    if panel.log:
+        axes.set(xscale="log", yscale="log")
+        for axis, span in ((axes.xaxis, across), (axes.yaxis, up)):
+            ticks = log_ticks(*span)
+            axis.set_ticks(ticks, [f"{v:g}" for v in ticks])
+            axis.set_ticks([], minor=True)
+        across, up = ((10.0**low, 10.0**high) for low, high in (across, up))
     axes.set_xlim(across, auto=panel.equal)
     axes.set_ylim(up, auto=panel.equal)
     if panel.equal:
@@ -125,13 +139,18 @@ def _panel(axes: Any, panel: Panel) -> None:
 
 
 def _curve(axes: Any, panel: Panel, curve: Curve) -> None:
-    y = panel.height(curve.y)
+    y = curve.y if panel.log else panel.height(curve.y)
     if curve.style == "ghost":
         return
     if curve.style == "points":
         axes.plot(curve.x, y, ".", color=_colour(curve.role), ms=2.5, alpha=0.4, mew=0)
         return
     axes.plot(curve.x, y, **_line(curve.role, curve.width))
+    if curve.motion is not None and curve.trial and curve.role != "other":
+        for row in np.linspace(0, len(curve.motion.times) - 1, POSES).astype(int):
+            for line, thick in curve.motion.lines(row):
+                width = 4.0 if thick else 1.0
+                axes.plot(*line.T, color=_colour(curve.role), lw=width, alpha=0.25)
     if curve.shade is not None:
         drawn = axes.scatter(curve.x, y, c=curve.shade, s=9, cmap="cividis", zorder=3)
         axes.figure.colorbar(drawn, ax=axes, label=curve.shade_name, shrink=0.8)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 
 from grounded.diagnosis.pictures import accuracy_figure, credit_figure, where_figure
 from grounded.diagnosis.report import ChannelParts, Diagnosis, Parts, Split, TrialValue
 from grounded_trials.report.diagnosis_words import (
     gap_sentence,
-    sentences,
     utility_sentence,
+    verdict_lines,
 )
 from grounded_trials.report.figures.gap import forecast_figures, residual_figures
 from grounded_trials.report.findings import Findings
@@ -21,7 +22,7 @@ from grounded_trials.report.page.tables import (
     leftover_table,
     table,
 )
-from grounded_trials.wording import figure, percent, rendered, with_unit
+from grounded_trials.wording import figure, glued, percent, rendered, with_unit
 from grounded_trials.workspace.next_step import DIAGNOSE, Since
 
 MOST = 6  # states whose error without each effect is drawn
@@ -38,9 +39,8 @@ def gap_section(findings: Findings) -> list[Block]:
         words = "Not diagnosed yet. This says where the model is wrong, and what makes it so:"
         command = Block("command", rendered(DIAGNOSE), "c-diagnose")
         return [Block("text", words), command, *ahead, *forecast_table(findings), *lacking]
-    verdict = Block(
-        "verdict", lines=told_since(sentences(diagnosis.sentence or diagnosis.kind), findings.since)
-    )
+    causes, others = verdict_lines(diagnosis.kind, diagnosis.sentence or diagnosis.kind)
+    verdict = Block("verdict", lines=told_since([*causes, *others], findings.since))
     if diagnosis.no_cause:  # with too little data, what was fitted is no finding
         return [verdict, *ahead, *forecast_table(findings), *lacking]
     proof = drawn(accuracy_figure(diagnosis), title=True)
@@ -53,7 +53,8 @@ def told_since(lines: list[str], since: Since) -> list[str]:
     """A verdict's lines; what happened since stands before them."""
     before = "Before that: " * bool(since.adopted)
     told = [f"{_begun(since.sentence)}."] if since.sentence else []
-    return [line.replace("->", "→") for line in [*told, before + lines[0], *lines[1:]]]
+    lines = [*told, before + lines[0], *lines[1:]]
+    return [re.sub(r"-(?=\d)", "-\u2060", glued(line)) for line in lines]  # no break in 1e-05
 
 
 def _details(diagnosis: Diagnosis, since: Since) -> list[Block]:
@@ -94,7 +95,7 @@ def _by_trial(diagnosis: Diagnosis) -> list[Block]:
 
 def _unit(diagnosis: Diagnosis, value: TrialValue) -> str:
     row = diagnosis.ranked(value.effect)
-    known = {} if row is None else row.params
+    known = {**diagnosis.parameters, **({} if row is None else row.params)}
     return known[value.quantity].unit if value.quantity in known else ""
 
 

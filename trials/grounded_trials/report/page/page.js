@@ -40,7 +40,8 @@
   const known = (plot) => {
     const panel = panels[plot.dataset.panel];
     if (!panel.ready) {
-      Object.assign(panel, { ready: true, data: unpacked(panel.data), layout: unpacked(panel.layout) });
+      for (const key of ["data", "layout", "motions"]) panel[key] = unpacked(panel[key] || []);
+      panel.ready = true;
       panel.home = [...panel.layout.xaxis.range];
     }
     return panel;
@@ -80,7 +81,11 @@
     Plotly.react(plot, ...looks(plot), bars ? { ...config, displayModeBar: false, staticPlot: true } : config);
     if (!first) return;
     const { kind } = panels[plot.dataset.panel];
-    plot.on("plotly_afterplot", () => marks(plot));
+    const placed = () => {
+      marks(plot);
+      for (const button of all(".modebar-btn", plot)) button.tabIndex = -1; // a plot has keys
+    };
+    plot.on("plotly_afterplot", placed);
     plot.on("plotly_relayout", (change) => zoomedTo(plot, kind, change));
     if (kind === "time") {
       plot.on("plotly_hover", (event) => point(event.xvals ? event.xvals[0] : event.points[0].x, plot));
@@ -88,7 +93,7 @@
       plot.on("plotly_hover", ({ points: [at] }) => at.customdata !== undefined && point(at.customdata, plot));
     }
     plot.addEventListener("keydown", (event) => keyed(plot, event));
-    marks(plot);
+    placed();
   };
   const waiting = []; // one panel a frame, so that the page can be scrolled meanwhile
   const next = () => {
@@ -117,6 +122,8 @@
     }
   };
   const keyed = (plot, event) => {
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    if (event.key === "s") Plotly.downloadImage(plot, { filename: plot.id });
     const axis = plot.layout.xaxis;
     const [low, high] = axis.range;
     const span = high - low, middle = (low + high) / 2;
@@ -151,7 +158,7 @@
     mark.style.top = `${yaxis._offset + top}px`;
     if (y === undefined) mark.style.height = `${yaxis._length}px`;
   };
-  const at = ({ x, y, customdata: t }) => {
+  const between = (t) => { // the two samples around the time, and where it lies between them
     if (!t || !t.length || time > t[t.length - 1] + 1e-9) return null;
     let low = 0, high = t.length - 1;
     while (high - low > 1) {
@@ -159,8 +166,43 @@
       if (t[middle] <= time) low = middle; else high = middle;
     }
     const part = t[high] > t[low] ? Math.min(1, Math.max(0, (time - t[low]) / (t[high] - t[low]))) : 0;
-    const place = [x[low] + part * (x[high] - x[low]), y[low] + part * (y[high] - y[low])];
-    return place.every(Number.isFinite) ? place : null;
+    return (values) => values[low] + part * (values[high] - values[low]);
+  };
+  const at = ({ x, y, customdata: t }) => {
+    const now = between(t), place = now && [now(x), now(y)];
+    return place && place.every(Number.isFinite) ? place : null;
+  };
+  // A mechanism seen from the side: its parts' lines, turned and moved to where they are now.
+  const SVG = "http://www.w3.org/2000/svg";
+  const body = (plot, name, motion) => {
+    const { xaxis, yaxis } = plot._fullLayout, now = motion && between(motion.t);
+    let drawn = plot.querySelector(":scope > svg.body");
+    if (!drawn) {
+      drawn = document.createElementNS(SVG, "svg");
+      drawn.setAttribute("class", "over body");
+      for (const [one] of parts) {
+        const group = document.createElementNS(SVG, "g");
+        group.setAttribute("class", one);
+        drawn.append(group);
+      }
+      plot.append(drawn);
+    }
+    Object.assign(drawn.style, {
+      left: `${xaxis._offset}px`, top: `${yaxis._offset}px`,
+      width: `${xaxis._length}px`, height: `${yaxis._length}px`,
+    });
+    const scale = Math.abs(xaxis.l2p(1) - xaxis.l2p(0));
+    const lines = !now ? [] : motion.parts.flatMap(({ strips, thick, pose }) => {
+      const [a, b, c, x, d, e, f, z] = pose.map((v) => typeof v === "number" ? v : now(v));
+      return strips.map((strip) => {
+        const line = document.createElementNS(SVG, "path");
+        line.setAttribute("d", "M" + strip.map(([u, v, w]) =>
+          `${xaxis.l2p(x + a * u + b * v + c * w)} ${yaxis.l2p(z + d * u + e * v + f * w)}`).join("L"));
+        line.setAttribute("stroke-width", Math.max(2, thick * scale));
+        return line;
+      });
+    });
+    drawn.querySelector(`.${name}`).replaceChildren(...lines);
   };
   const which = document.getElementById("which");
   const parts = [
@@ -169,7 +211,7 @@
     ["real", "over at mark disc real", ({ meta }) => meta.trial === which.value && meta.style === "line"],
   ];
   const marks = (plot) => {
-    const { kind, data } = known(plot);
+    const { kind, data, motions } = known(plot);
     if (!plot._fullLayout || !which) return;
     if (kind === "time") put(plot, over(plot, "time", "over line"), time);
     if (kind !== "path" || !data.some((trace) => trace.meta.trial === which.value)) return;
@@ -177,6 +219,7 @@
       const trace = data.find((one) => fits(one) && one.customdata);
       const place = trace && at(trace), mark = over(plot, name, look);
       if (place) put(plot, mark, ...place); else mark.hidden = true;
+      if (motions.length) body(plot, name, motions[data.indexOf(trace)]);
     }
   };
   const slider = document.getElementById("time"), now = document.getElementById("now");

@@ -19,7 +19,8 @@ import numpy as np
 
 from grounded.diagnosis.pictures import credit_figure, worth_of
 from grounded.errors import needs
-from grounded.figures.figure import Bars, Figure, Panel
+from grounded.figures.body import Motion
+from grounded.figures.figure import Bars, Figure, Panel, typeset
 from grounded.figures.interactive import packed, palette, plotted
 from grounded.search.pictures import search_figure
 from grounded_trials.report.diagnosis_words import error_lines, instrument_lines
@@ -41,7 +42,7 @@ from grounded_trials.report.page.tables import (
     parameter_table,
 )
 from grounded_trials.report.three_lines import gained_most, three_lines
-from grounded_trials.wording import count, figure
+from grounded_trials.wording import count, figure, glued
 
 OPEN = 12  # candidates whose table is open
 
@@ -59,7 +60,8 @@ def page(findings: Findings, watched: int = 0) -> str:
     needs("jinja2", "report")
     from jinja2 import Environment
 
-    jinja = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    jinja = Environment(autoescape=True, finalize=typeset, trim_blocks=True, lstrip_blocks=True)
+    jinja.filters["glued"] = glued
     scripts = [_own("plotly-basic.min.js"), _own("page.js")]
     panels: list[dict[str, Any]] = []
 
@@ -101,7 +103,25 @@ def _data(panel: Panel | Bars) -> dict[str, Any]:
     kind = "bars" if isinstance(panel, Bars) else panel.kind
     found: dict[str, Any] = _plain(plotted(panel))
     found["layout"].pop("annotations", None)  # a note stands in the caption
+    if not isinstance(panel, Bars) and any(curve.motion for curve in panel.curves):
+        found["motions"] = [_motion(curve.motion) for curve in panel.curves]
     return found | {"kind": kind}
+
+
+def _motion(motion: Motion | None) -> dict[str, Any] | None:
+    """What moves as the script draws it; of each part, eight numbers over time."""
+    if motion is None:
+        return None
+    rows = motion.poses.reshape(*motion.poses.shape[:2], 8)
+    parts = [
+        {
+            "strips": [strip.tolist() for strip in strips],
+            "thick": thick,
+            "pose": [packed(v) if np.ptp(v) else float(v[0]) for v in rows[:, k].T],
+        }
+        for k, (strips, thick) in enumerate(motion.wires)
+    ]
+    return {"t": packed(motion.times), "parts": parts}
 
 
 def _plain(value: Any) -> Any:
@@ -112,7 +132,7 @@ def _plain(value: Any) -> Any:
         return [_plain(item) for item in value]
     if isinstance(value, np.ndarray):
         return packed(value)
-    return float(value) if isinstance(value, np.floating) else value
+    return float(value) if isinstance(value, np.floating) else typeset(value)
 
 
 def _height(panel: Panel | Bars) -> int:
@@ -198,6 +218,7 @@ def _why(findings: Findings) -> dict[str, Any]:
     told = [] if credit else error_lines(diagnosis, before)
     lines = [(title, text) for title, text in told if title == "parameters"]
     return {
+        "kind": diagnosis.kind,
         "verdict": told_since(three_lines(diagnosis, findings.task), findings.since),
         "preflight": instrument_lines(diagnosis.preflight),
         "lines": lines,
@@ -212,7 +233,7 @@ def _utility(findings: Findings) -> list[Block]:
     from grounded.search.certainty import last_improvement
 
     sure = last_improvement(findings.history)
-    begun = (sure[:1].upper() + sure[1:]).replace("+-", "±")
+    begun = sure[:1].upper() + sure[1:]
     few = len(findings.history) <= OPEN
     return [
         *drawn(search_figure(findings.standing, findings.optimum)),

@@ -30,13 +30,13 @@ from grounded.figures.figure import COLOURS as PAGE
 from grounded.figures.figure import rgb
 from grounded.frozen import Array
 from grounded.trial import Trial
-from grounded_trials.report.bodies import body_of
+from grounded_trials.report.bodies import body_in
 from grounded_trials.report.findings import Findings, Run, selection, tracked
 from grounded_trials.report.forecast import forecast
 from grounded_trials.report.recording.drawing import drawn
 from grounded_trials.report.recording.layout import blueprint
 from grounded_trials.report.recording.space import Space
-from grounded_trials.report.scene import Scene, scene_of
+from grounded_trials.report.scene import scene_of
 from grounded_trials.report.three_lines import three_lines
 from grounded_trials.wording import count, labelled, per_second, percent
 
@@ -60,8 +60,7 @@ def write_recording(findings: Findings, path: Path) -> None:
     rr.set_strict_mode(True)
     identity = hashlib.sha256(f"{findings.name} {findings.task.hash}".encode()).hexdigest()[:32]
     stream = rr.RecordingStream("grounded", recording_id=identity)
-    scene = scene_of(findings.task.model)
-    body = body_of(findings.task.model, scene, _size(findings, scene))
+    scene, body = scene_of(findings.task.model), body_in(findings)
     temporary = path.with_name(f".{path.name}.tmp")
     try:
         stream.save(temporary, default_blueprint=blueprint(findings, Space(findings, scene, body)))
@@ -74,13 +73,6 @@ def write_recording(findings: Findings, path: Path) -> None:
         raise GroundedError(f"{path} can't be written: {error}") from None
     finally:
         temporary.unlink(missing_ok=True)
-
-
-def _size(findings: Findings, scene: Scene) -> float:
-    """The length of a body that can be seen beside the path."""
-    shown = findings.runs or findings.logs
-    points = scene.finite(shown[0].trial.states if shown else findings.task.target)
-    return 0.07 * (float(np.ptp(points, axis=0).max()) or 1.0) if len(points) else 0.07
 
 
 class _Recorder:
