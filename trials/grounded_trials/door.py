@@ -130,7 +130,7 @@ class Workspace(Folder):
 
             begin(Path(folder), log, model=model, dt=dt)
         elif example is not None:
-            from grounded_trials.workspace.examples import write_example
+            from grounded_trials.starting.examples import write_example
 
             write_example(Path(folder), example)
         return cls(folder)

@@ -5,7 +5,6 @@ Read `folder.py` first (how a folder becomes a task, trials and candidates). `co
 `running.py`, `ingest.py`, `fitting.py`, `diagnosing.py`, `adopting.py`, `exporting.py`,
 `inspecting.py` and `verifying.py` are a verb each; `grounded_trials.door` makes them the methods of
 one class. `identity.py` says what a name stands for, `handover.py` what a candidate must be when it
-leaves,
-`next_step.py` says what a person does next. Of single use: `trial_check.py` and `unmeasured.py` for
-`ingest`, `adopted.py` for planning with adopted effects, `examples.py` for `init`, `challenge.py`.
+leaves, `next_step.py` what a person does next. Of single use: `trial_check.py` and `unmeasured.py`
+for `ingest`, `adopted.py` for planning with adopted effects.
 """

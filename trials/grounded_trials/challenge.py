@@ -22,13 +22,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
+from grounded_trials.starting.examples import toml_of
 from grounded_trials.store.documents import read_document
 from grounded_trials.store.store import DIGITS, Store, write_atomically
 from grounded_trials.store.trial_file import trial_bytes
 from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.diagnosing import FILE as DIAGNOSIS
 from grounded_trials.workspace.diagnosing import diagnose_in
-from grounded_trials.workspace.examples import toml_of
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.task_file import write_target
 
