@@ -87,7 +87,8 @@ def fit_trials(
     from grounded.estimate import of_states, record_of
     from grounded.fit import fit
 
-    model, guessed = workspace.task.model, workspace.estimated_states()
+    model = workspace.task.model
+    guessed = {n for t in workspace.trials() for n in t.meta.get("estimated", "").split(",")}
     measured = [i for i, name in enumerate(model.state_names) if name not in guessed]
     records = [record_of(model, trial) for trial in usable_trials(workspace)]
     return fit(

@@ -233,12 +233,21 @@ def _namesakes(workspace: Folder) -> list[str]:
     ]
 
 
-def candidate_named(workspace: Folder, name: str) -> str:
-    """The id of a candidate: itself, or that of the best one so far for `best`.
+def candidate_named(workspace: Folder, name: str | None) -> str:
+    """The id of a candidate: itself, that of the best so far for `best`, of the one that waits.
 
     Raises:
-        GroundedError: if there is no best one yet.
+        GroundedError: if there is no best one yet, or none waits.
     """
+    if name is None:
+        waiting = standing_in(workspace).outstanding
+        if waiting is None:
+            raise GroundedError(
+                "no candidate is waiting to be run: `propose` makes the next one, or says that "
+                "the search has ended; name a candidate to run it again",
+                NextCommand("propose"),
+            )
+        return waiting.id
     if name != "best":
         return name
     best = standing_in(workspace).incumbent
