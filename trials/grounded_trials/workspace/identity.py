@@ -20,7 +20,6 @@ from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.store.candidate_file import candidate_bytes, read_candidate
-from grounded_trials.store.known import KnownCandidate
 from grounded_trials.store.store import Damaged, Store, Stored
 
 if TYPE_CHECKING:
@@ -79,6 +78,8 @@ class StoredCandidate:
     @classmethod
     def known(cls, about: dict[str, Any], load: Callable[[], Candidate]) -> StoredCandidate:
         """The same from what `about` said; `load` reads the numbers when they are asked for."""
+        from grounded_trials.store.known import KnownCandidate
+
         fields = KnownCandidate.of(load, about["candidate"])
         return cls(fields, about["kind"], about["task"], about["sha256"])
 

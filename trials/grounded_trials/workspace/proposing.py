@@ -95,11 +95,17 @@ def propose_in(workspace: Folder) -> Proposed:
     proposal = replace(proposal, notes=(*proposal.notes, *notes))
     if candidate is None:
         return Proposed(proposal, None, status_of(workspace, proposal.standing).then)
-    from grounded_trials.workspace.next_step import for_robot
-
     here = workspace.config.system.reachable
     then = NextCommand("run") if here else for_robot(workspace, candidate.id)
     return Proposed(proposal, workspace.candidate_path(candidate.id), then)
+
+
+def for_robot(workspace: Folder, candidate: str) -> NextCommand:
+    """What follows where people run the robot: export for it, or once that is done, its log."""
+    folders = (workspace.folder, Path())
+    if any(any(folder.glob(f"{candidate}.*")) for folder in folders):
+        return NextCommand("next", ("LOG",))
+    return NextCommand("export", (candidate, "--runner"))
 
 
 def _handed_over(workspace: Folder) -> tuple[Proposal, dict[str, str]]:
