@@ -8,7 +8,6 @@ finds the first.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -84,17 +83,7 @@ class _Read:
 def ingest_log(
     workspace: Folder, path: Path, candidate: str | None = None, *, data: bool = False
 ) -> Ingested:
-    """Checks a log and stores it as a trial.
-
-    Args:
-        workspace: whose model names the states and inputs.
-        path: a trial of ours, an MCAP log, or the folder of a bag.
-        candidate: which candidate was run; by default the trial's own, or the outstanding one.
-        data: the log ran no candidate: for fitting and diagnosis only.
-
-    Raises:
-        GroundedError: for a log that can't be used, with the reason; nothing is stored then.
-    """
+    """Checks a log and stores it as a trial, see `Workspace.ingest`; or else stores nothing."""
     kind = "" if path.is_dir() else kind_of(path)
     if kind == CANDIDATE:
         raise GroundedError(
@@ -135,7 +124,7 @@ def ingest_log(
 def _recognised(workspace: Folder, path: Path, read: _Read, candidate: str | None) -> _Read:
     """Refuses a log whose commands are not its candidate's; with a warning if one was named."""
     ran = read.trial.candidate
-    if not ran or hashlib.sha256(read.data).hexdigest()[:DIGITS] in workspace.store.digests():
+    if not ran or sha256(read.data)[:DIGITS] in workspace.store.digests():
         return read
     own, _ = workspace.candidate(ran)
     trial = interpolate_gaps(read.trial).trial
@@ -155,7 +144,7 @@ def _repeated(workspace: Folder, path: Path, read: _Read) -> str:
     The same bytes are a new run, not the old one ingested twice, where a run of that candidate is
     being waited for and the file was written after the stored one.
     """
-    digest = hashlib.sha256(read.data).hexdigest()
+    digest = sha256(read.data)
     known = [one for one in workspace.store.list() if digest.startswith(one.digest)]
     if not known or not read.trial.candidate:
         return ""
@@ -313,8 +302,7 @@ def _check_is_log(path: Path, files: Sequence[Path]) -> None:
 def _hashed(files: Sequence[Path]) -> str:
     """SHA-256 over a log's files, or over their hashes when there are several."""
     hashes = [hash_file(file) for file in files]
-    joined = "".join(hashes).encode()
-    return hashes[0] if len(hashes) == 1 else hashlib.sha256(joined).hexdigest()
+    return hashes[0] if len(hashes) == 1 else sha256("".join(hashes).encode())
 
 
 def _outstanding(workspace: Folder, path: Path) -> str:
