@@ -58,7 +58,7 @@ def run(
         values: arrays by name, made contiguous; None where there is none.
         out: arrays that are written, contiguous, or None.
     """
-    from grounded.compile.run.compiled import call
+    from grounded.compile.run.arguments import call
 
     words: dict[str, Any] = {
         key: 0 if value is None else np.ascontiguousarray(value, float)

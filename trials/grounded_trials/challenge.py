@@ -51,6 +51,8 @@ def write_cases(
         GroundedError: if the folder holds a challenge already, or cases that are others, or the
             labels would lie inside it.
     """
+    from grounded.challenge import sealed
+
     if (folder / MANIFEST).exists():
         raise GroundedError(f"{folder} holds a challenge already: name another folder")
     if labels.resolve().is_relative_to(folder.resolve()):
@@ -67,8 +69,7 @@ def write_cases(
         trials = _write_case(case, folder / case.name)
         text = json.dumps(case.label, sort_keys=True)
         write_atomically(labels / f"{case.name}.json", text.encode())
-        label = hashlib.sha256(text.encode()).hexdigest()
-        entries[case.name] = {"label_sha256": label, "trials_sha256": trials}
+        entries[case.name] = {"label_sha256": sealed(case.label), "trials_sha256": trials}
         tick(number)
     document = json.dumps({"format": "grounded challenge 1", "cases": entries}, indent=1)
     write_atomically(folder / MANIFEST, document.encode())
