@@ -245,28 +245,30 @@ def _foreign(workspace: Folder, path: Path, candidate: str | None, data: bool) -
             NextCommand("inspect", (str(path),)),
         )
     chosen = "" if data else candidate or _outstanding(workspace, path)
-    estimated: tuple[str, ...] = ()
+    states, estimate = model.state_names, None
     if workspace.config.estimate.names():
-        from grounded_trials.workspace.unmeasured import read_with_estimates
+        from grounded_trials.workspace.unmeasured import read_estimate, smoothed
 
-        found, estimated = read_with_estimates(workspace, files, mapping, data=data)
-    else:
-        missing = [s for s in model.state_names if s not in mapping.states]
-        missing += [i for i in model.input_names if i not in mapping.inputs]
-        if missing:
-            raise GroundedError(
-                f"[log] maps no '{missing[0]}': map it, or let the smoother find a state that is "
-                "not measured with an [estimate] table (docs/real-logs.md)"
-            )
-        found = read_log(
-            files,
-            mapping,
-            task.dt,
-            states=model.state_names,
-            inputs=model.input_names,
-            angles=model.angles,
-            steps=None if data else task.horizon,
+        estimate = read_estimate(workspace.config.estimate, model)
+        states = tuple(estimate.measured)
+    missing = [s for s in states if s not in mapping.states]
+    missing += [i for i in model.input_names if i not in mapping.inputs]
+    if missing:
+        raise GroundedError(
+            f"[log] maps no '{missing[0]}': map it, or let the smoother find a state that is "
+            "not measured with an [estimate] table (docs/real-logs.md)"
         )
+    found = read_log(
+        files,
+        mapping,
+        task.dt,
+        states=states,
+        inputs=model.input_names,
+        angles=model.angles,
+        steps=None if data else task.horizon,
+    )
+    if estimate:
+        found = smoothed(workspace, found, estimate)
     if chosen and found.late_s > task.dt / 2:
         raise GroundedError(
             f"{path}: the run starts {found.late_s:.2f} s before every state is known: the "
@@ -283,8 +285,8 @@ def _foreign(workspace: Folder, path: Path, candidate: str | None, data: bool) -
         start_inputs=found.start_inputs,
     )
     about = _about(workspace, chosen) | {"source": path.name, "source_sha256": _hashed(files)}
-    if estimated:
-        about["estimated"] = ",".join(estimated)
+    if set(states) < set(model.state_names):
+        about["estimated"] = ",".join(s for s in model.state_names if s not in states)
     if chosen:
         _check_candidate(workspace, path, chosen)
     encoded = _encode(workspace, trial, about, found.start_ns)
