@@ -26,7 +26,6 @@ import numpy as np
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import trial_bytes, write_trial
 from grounded_trials.workspace.identity import encoded
-from grounded_trials.workspace.trial_check import commands
 
 BUDGET = {"status": 1, "propose": 1, "ingest": 1, "report --html": 5, "million": 10}  # [s]
 NOISE, LEFT, SEED = 1e-4, 0.2, 7  # [m, m/s, rad]; of the first error, after the last candidate
@@ -61,7 +60,7 @@ def made(folder, trials, candidates):
         share = LEFT ** (k / candidates)
         policy = replace(first.policy, feedforward=first.policy.feedforward * (1 + 1e-5 * k))
         states = trial.states - (1 - share) * off
-        sent = commands(policy, states[None, :-1], policy.past)[0]
+        sent = policy.commands(states[None, :-1], policy.past)[0]
         one = replace(
             first,
             id=f"c{k + 1:04d}",

@@ -9,6 +9,7 @@ lock; on a cluster what all of them read is sent once (`SentOnce`).
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
@@ -22,6 +23,7 @@ import numpy as np
 from grounded.errors import GroundedError, needs
 from grounded.threads import steady
 
+STACK = 16 * 2**20  # [bytes] of a thread: kernels keep their matrices there
 CONNECT_S = 10.0  # for a cluster's scheduler to answer
 T = TypeVar("T")
 
@@ -102,6 +104,7 @@ def running(engine: Engine | None) -> Iterator[None]:
         return
     with ExitStack() as stack:
         if engine.name == "local":
+            stack.callback(threading.stack_size, threading.stack_size(STACK))
             threads = stack.enter_context(ThreadPoolExecutor(engine.jobs))
             call: Callable[..., Iterable[Any]] = partial(threads.map, _quietly)
         else:

@@ -134,6 +134,31 @@ class Policy:
         gain = (1 - alpha) * own_gain + alpha * other.gain
         return replace(other, feedforward=mixed, gain=gain)
 
+    def commands(self, states: Array, past: Array) -> Array:
+        """What it sends on given states, (B, T, m); T is at most H.
+
+        It remembers what it sent itself: a gain on the last inputs would make any smooth log look
+        alike if they were the logged ones.
+
+        Args:
+            states: (B, T, n), B runs.
+            past: (m,) the inputs held before the first step.
+        """
+        T, n = states.shape[1:]
+        asked: Array = np.repeat(self.feedforward[None, :T], len(states), 0)
+        if self.gain is None or self.reference is None:
+            return np.clip(asked, self.low, self.high)
+        off = z_difference(states, self.reference[:T, :n], self.angles)
+        asked += np.einsum("tij,btj->bti", self.gain[:T, :, :n], off)
+        memory, newest = self.gain[:T, :, n:], np.cumsum([0, *self.depths[:-1]])
+        asked -= np.einsum("tij,tj->ti", memory, self.reference[:T, n:])
+        z = np.repeat(np.repeat(past, self.depths)[None], len(states), 0)
+        for t in range(T):
+            asked[:, t] = np.clip(asked[:, t] + z @ memory[t].T, self.low, self.high)
+            z[:, 1:] = z[:, :-1].copy()
+            z[:, newest] = asked[:, t]
+        return asked
+
 
 def z_difference(a: Array, b: Array, angles: tuple[bool, ...]) -> Array:
     """The difference a - b of augmented states (..., nz), angles wrapped."""

@@ -63,7 +63,7 @@ def effects(ctx: click.Context, param: click.Parameter, incomplete: str) -> list
 
 def examples(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
     """The names of the examples."""
-    from grounded_trials.workspace.examples import EXAMPLES
+    from grounded_trials.starting.examples import EXAMPLES
 
     return [
         CompletionItem(name, help=example.text)

@@ -12,7 +12,7 @@ from grounded_cli.options import as_json, in_workspace, next_line, open_workspac
 from grounded_cli.terminal import field, show, show_json
 
 if TYPE_CHECKING:
-    from grounded_trials.door import SetAside
+    from grounded_trials.workspace.identity import SetAside
 
 _trials = click.argument(
     "trials", nargs=-1, required=True, metavar="TRIAL...", shell_complete=complete.trials

@@ -1,4 +1,4 @@
-"""grounded ingest: take in what came back from the real system."""
+"""grounded ingest, next: take in what came back from the real system, and go on."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from grounded.errors import NextCommand
 from grounded_cli import completion as complete
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
 from grounded_cli.terminal import field, number, progress, remark, sentence, show, show_json, table
@@ -47,15 +48,42 @@ def command(files: tuple[str, ...], candidate: str | None, data: bool, json_: bo
         with progress(f"reading {name}"):
             done.append(workspace.ingest(name, candidate=candidate, data=data))
         if not json_:
-            tell(name, done[-1])
+            _tell(name, done[-1])
     if json_:
         show_json({"trials": [one.to_json() for one in done]})
     else:
         show(f"\n{next_line(done[-1].then)}")
 
 
-def tell(name: str, one: Ingested) -> None:
-    """Says what became of a log."""
+@click.command("next")
+@click.argument("log", metavar="LOG")
+@in_workspace
+@as_json
+def following(log: str, json_: bool) -> None:
+    """Ingest what came back, say the verdict, propose, and export for the robot.
+
+    The same as `ingest LOG`, `propose` and `export ID --runner` one after the other; the candidate
+    is written into the workspace's folder.
+    """
+    from grounded_cli.propose import tell_proposed
+
+    workspace = open_workspace()
+    with progress(f"reading {log} and planning"):
+        done = workspace.next(log)
+    if json_:
+        show_json(done.to_json())
+        return
+    _tell(log, done.taken)
+    show("")
+    tell_proposed(workspace, done.proposed, last=done.exported is None)
+    if done.exported is not None:
+        show(field("files", f"{done.exported.file}, {done.exported.runner}", "  "))
+        then = next_line(NextCommand("next", ("LOG",)))
+        ran = done.exported.candidate
+        show(f"\ncopy both to the robot, run {ran}, record a log, then\n{then}")
+
+
+def _tell(name: str, one: Ingested) -> None:
     for warning in one.warnings:
         remark("warning", f"{name}: {warning}")
     known = "was stored before as" if one.known else "is stored as"

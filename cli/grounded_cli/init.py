@@ -123,7 +123,7 @@ def _tell(begun: Begun) -> None:
 
 
 def _list(json_: bool) -> None:
-    from grounded_trials.workspace.examples import EXAMPLES
+    from grounded_trials.starting.examples import EXAMPLES
 
     if json_:
         show_json({"examples": {key: value.text for key, value in EXAMPLES.items()}})

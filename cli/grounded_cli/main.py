@@ -32,25 +32,25 @@ COMMANDS = {
     "init": ("init", "Make a workspace from a log or an example."),
     "target": ("target", "Draw the manoeuvre: line, circle, figure-8, step, swing-up, a run."),
     "propose": ("propose", "Say what to run next and write its candidate file."),
-    "run": ("run", "Run the candidate on the system of grounded.toml."),
+    "run": ("learn", "Run the candidate on the system of grounded.toml."),
     "ingest": ("ingest", "Take in what came back: check, resample, store."),
-    "next": ("next", "Ingest a log, propose, and export for the robot, in one go."),
+    "next": ("ingest", "Ingest a log, propose, and export for the robot, in one go."),
     "discard": ("discard", "Set a trial aside; nothing is deleted."),
     "restore": ("discard", "Take back what discard did."),
     "learn": ("learn", "Propose, run and ingest until the search ends."),
     "status": ("status", "Show where the search stands."),
     "report": ("report", "Show what all trials say: text, page, pictures, recording."),
-    "view": ("view", "Open the recording in Rerun."),
+    "view": ("report", "Open the recording in Rerun."),
     "fit": ("fit", "Estimate the model's parameters from all trials."),
     "diagnose": ("diagnose", "Find where the model is wrong, and which effect makes it so."),
     "adopt": ("adopt", "Add a diagnosed effect to the model."),
     "inspect": ("inspect", "Show what is in a log and guess its [log] table."),
     "recover": ("recover", "Save what can be saved of a damaged log."),
     "export": ("export", "Write a candidate for the robot: csv, npz or json."),
-    "verify": ("verify", "Check every stored file against its hash."),
-    "demo": ("demo", "Run a whole example in a new folder: learn, diagnose, report."),
-    "experiment": ("experiment", "Run the paper's studies again."),
-    "challenge": ("challenge", "Make, diagnose and score blind cases for the diagnosis."),
+    "verify": ("status", "Check every stored file against its hash."),
+    "demo": ("studies.demo", "Run a whole example in a new folder: learn, diagnose, report."),
+    "experiment": ("studies.experiment", "Run the paper's studies again."),
+    "challenge": ("studies.challenge", "Make, diagnose and score blind cases for the diagnosis."),
     "completion": ("completion", "Print the shell's completion script."),
 }
 
@@ -67,8 +67,8 @@ class LazyGroup(click.Group):
         if name not in COMMANDS:
             return None
         module = importlib.import_module(f"grounded_cli.{COMMANDS[name][0]}")
-        command: click.Command = getattr(module, name, module.command)
-        return command
+        commands = (one for one in vars(module).values() if isinstance(one, click.Command))
+        return next(one for one in commands if one.name == name)
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]

@@ -1,4 +1,4 @@
-"""grounded status: where the search stands."""
+"""grounded status, verify: where the search stands, and whether what is kept is what it was."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import click
 
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
 from grounded_cli.terminal import field, number, progress, remark, show, show_json, sparkline, table
-from grounded_trials.wording import wrapped
+from grounded_trials.wording import count, wrapped
 
 if TYPE_CHECKING:
     from grounded.search.candidate import Tried
@@ -38,6 +38,24 @@ def command(json_: bool) -> None:
     if status.outdated:
         show(field("diagnosis", status.outdated))
     show(f"\n{next_line(status.then)}")
+
+
+@click.command("verify")
+@in_workspace
+@as_json
+def verify(json_: bool) -> None:
+    """Check everything that is kept: changed, damaged, deleted, or put in its place."""
+    workspace = open_workspace()
+    with progress("checking"):
+        found = workspace.verify()
+    if json_:
+        show_json(found.to_json())
+    else:
+        for one in found.damaged:
+            remark("damaged", one.reason)
+        show(f"{count(found.checked, 'file')} checked, {len(found.damaged)} damaged")
+    if found.damaged:
+        click.get_current_context().exit(1)
 
 
 def summary(status: Status) -> str:

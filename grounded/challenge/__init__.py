@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from grounded.challenge.cases import KINDS, Case, make, sealed
 from grounded.challenge.mechanism import simulator
-from grounded.challenge.score import Oracle, judge, oracle, study, summary, task_of
+from grounded.challenge.score import Oracle, judge, oracle, summary, task_of
 
 __all__ = [
     "KINDS",
@@ -24,7 +24,6 @@ __all__ = [
     "oracle",
     "sealed",
     "simulator",
-    "study",
     "summary",
     "task_of",
 ]

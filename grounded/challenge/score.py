@@ -8,21 +8,18 @@ diagnosis predicts, held out and in units, is compared with what the oracle pred
 Besides a first name that is wrong there are a second one that nothing makes (`false_second`), the
 right family at the wrong place (`wrong_place`), names that predict worse than the model without
 them (`worse`), and how much of the error in units is gone (`units_shrinkage`). `summary` gives each
-share with its count and Wilson's 95 % interval. `study` makes, diagnoses and judges cases in
-memory, without files.
+share with its count and Wilson's 95 % interval.
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from grounded.challenge.cases import Case, Kind, make
-from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
+from grounded.challenge.cases import Case
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
@@ -339,38 +336,3 @@ def task_of(case: Case) -> Task:
         high=case.high,
         latency=case.latency,
     )
-
-
-def study(
-    kind: Kind,
-    count: int,
-    seed: int,
-    *,
-    options: DiagnosisOptions | None = None,
-    only: str | None = None,
-    param_error: float | None = None,
-    noise: str | None = None,
-    progress: Callable[[dict[str, Any]], None] | None = None,
-) -> dict[str, Any]:
-    """Diagnoses `count` blind cases of a kind and returns the figures of `summary`, with CPU time.
-
-    Args:
-        kind: single, double, none or withheld.
-        count: cases.
-        seed: of everything.
-        options: of the diagnosis.
-        only: one system instead of all.
-        param_error: see `make`.
-        noise: see `make`.
-        progress: called with each case's marks.
-    """
-    marks = []
-    for case in make(kind, count, seed, only=only, param_error=param_error, noise=noise):
-        begin = time.process_time()
-        found = diagnose(task_of(case), case.trials, options).to_json()
-        spent = time.process_time() - begin
-        known = oracle(case.model, case.trials, case.latency, case.label, found["ranking"])
-        marks.append({**judge(case.label, found, known), "cpu_s": spent})
-        if progress is not None:
-            progress(marks[-1])
-    return summary(marks)

@@ -27,7 +27,6 @@ from grounded.compile.problem import (
     System,
     history_depths,
 )
-from grounded.compile.run.jit import parallel
 from grounded.compile.run.traced import TracedSystem
 from grounded.compile.trace.graph import TooLong
 from grounded.compile.trace.tracing import Signature, trace
@@ -42,7 +41,6 @@ __all__ = [
     "Swarm",
     "System",
     "history_depths",
-    "parallel",
     "system_of",
 ]
 MAX_COMPILED = 10_000  # operations of a model and its derivatives, about 4 s of compiling

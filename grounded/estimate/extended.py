@@ -3,8 +3,8 @@
     x^-_{t+1} = f(x_t, u_t),      A = f_x(x_t, u_t);      e_t = y_t - h(x^-_t),      H = h_x(x^-_t)
 
 The equations between are those of `grounded.filter.kalman`. How the whitened innovations react to a
-change of the model by a small theta is the same recursion, driven by f_theta (and h_theta), so that
-a fit is a least-squares problem in them (`sensitivity`).
+change of the model by a small theta is the same recursion, driven by f_theta, so that a fit is a
+least-squares problem in them (`sensitivity`).
 
 A pass is either step by step (`recursion`), linearising at each state that it reaches, or its fixed
 point: the model is evaluated along a whole track in one call, the linear filter runs about that
@@ -276,13 +276,12 @@ def recursion(
     return Filtered(x, std, x_prior, e, eps, more, g, loglik, status)
 
 
-def sensitivity(filtered: Filtered, f_theta: Array, h_theta: Array | None = None) -> Array:
+def sensitivity(filtered: Filtered, f_theta: Array) -> Array:
     """How the whitened innovations react to small changes theta of the model.
 
     Args:
         filtered: the pass about which to linearise.
         f_theta: change of the next state, (T, B, n, k).
-        h_theta: change of the measurement, (T + 1, B, ny, k); None: none.
 
     Returns:
         d eps / d theta, (T + 1, B, ny, k).
@@ -292,8 +291,6 @@ def sensitivity(filtered: Filtered, f_theta: Array, h_theta: Array | None = None
     wide = whole(k, ny)
     d, r = np.zeros((T + 1, B, n, wide)), np.zeros((T + 2, B, ny, wide))
     d[1:, ..., :k] = f_theta
-    if h_theta is not None:
-        r[1:, ..., :k] = -h_theta
     return innovations(filtered.gains, d, r)[0][..., :k]
 
 

@@ -4,8 +4,8 @@
     tracker.update(t, y)           the camera saw y at time t
     tracker.state_at(t)            the state at time t, for the controller
 
-The clocks are independent: the camera may run at 30 Hz, the controller at 20 Hz. Whenever the state
-is updated, the controller of the nearest control step is used: `nearest_step`.
+The clocks are independent: the camera may run at 30 Hz, the controller at 20 Hz; a policy's runner
+takes the controller of the nearest control step (`grounded.onboard`).
 """
 
 from __future__ import annotations
@@ -22,11 +22,6 @@ from grounded.frozen import Array
 from grounded.model import Model
 
 LONGEST_STEP = 0.1  # [s] predictions over more are made in several steps
-
-
-def nearest_step(t: float, dt: float, horizon: int) -> int:
-    """The control step whose time is closest to t [s], within 0 .. horizon - 1."""
-    return int(np.clip(np.rint(t / dt), 0, horizon - 1))
 
 
 class Tracker:

@@ -32,7 +32,6 @@ from grounded.trial import Trial
 from grounded.utility import Reward
 
 OFFSETS = (1.0, 2.0, 3.0, 5.0, 10.0, 30.0)
-CLOSE = 0.99  # share of the optimum that counts as reached
 
 
 @dataclass(frozen=True)

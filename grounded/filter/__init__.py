@@ -1,7 +1,7 @@
 """One Kalman filter and smoother, for `estimate`, `fit` and `diagnosis`.
 
     kalman      gains, innovations of any number of columns, smoother; START HERE
-    kernels     the same three passes as machine code
+    kernels     the same three passes as machine code; lanes: how their matrices are written
     augmented   states that a filter carries beside the model's: coloured noise, delayed channels
 
 Nothing here knows a model or a trial: a linear system goes in, arrays come out. Who linearises,

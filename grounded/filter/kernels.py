@@ -2,30 +2,27 @@
 
 A run's covariance is a few dozen numbers: NumPy spends its time on calls. In `gains` and `smoother`
 W runs lie side by side in the lanes of a vector (the last one repeated to fill them), in
-`innovations` W columns do. Rows of a matrix are a loop, the entries of a row are unrolled as long
-as the text stays short.
+`innovations` W columns do; `lanes` writes their matrices.
 """
 
 from __future__ import annotations
 
 import hashlib
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from grounded.compile.emit.llvm_batch import Words
-from grounded.compile.emit.llvm_text import Writer, declarations, splat
+from grounded.compile.emit.llvm_text import declarations, splat
 from grounded.compile.run import jit
+from grounded.filter.lanes import Pass
 
 LARGEST = 16  # channels; beyond, NumPy
 WIDEST = 48  # states
-UNROLLED = 12  # entries of a row
 _LOCK = threading.Lock()
-INTEGERS = ("L", "B", "blocks")
 NAMES = {
     "gains": ("A", "Q", "R", "seen", "start", "G", "H", "L", "B", "k", "weight", "P"),
     "innovations": ("A", "H", "k", "weight", "d", "r", "x", "L", "B", "blocks", "out", "track"),
@@ -61,7 +58,7 @@ def run(
         values: arrays by name, made contiguous; None where there is none.
         out: arrays that are written, contiguous, or None.
     """
-    from grounded.compile.run.compiled import call
+    from grounded.compile.run.arguments import call
 
     words: dict[str, Any] = {
         key: 0 if value is None else np.ascontiguousarray(value, float)
@@ -88,7 +85,10 @@ def _made(n: int, N: int, through: bool, general: bool) -> jit.Library:
 
     def text() -> str:
         passes = {_Gains: lanes, _Innovations: columns, _Smoother: lanes}
-        parts = (one(n, N, width, through, general).text() for one, width in passes.items())
+        parts = (
+            one(NAMES[one.name], n, N, width, through, general).text()
+            for one, width in passes.items()
+        )
         return declarations({lanes, columns}) + "".join(parts)
 
     key = f"filter {_version()} {n} {N} {through} {general} {lanes} {columns}"
@@ -97,139 +97,12 @@ def _made(n: int, N: int, through: bool, general: bool) -> jit.Library:
 
 @cache
 def _version() -> str:
-    return hashlib.sha256(Path(__file__).read_bytes()).hexdigest()[:16] + jit.writers()
+    files = (Path(__file__).with_name(name) for name in ("kernels.py", "lanes.py"))
+    text = b"".join(file.read_bytes() for file in files)
+    return hashlib.sha256(text).hexdigest()[:16] + jit.writers()
 
 
-class _Pass:
-    """A kernel being written: matrices of vectors of W lanes, [entry][lane]."""
-
-    name: str
-
-    def __init__(self, n: int, N: int, width: int, through: bool, general: bool) -> None:
-        self.f, names = Writer(f"i64 @{self.name}(ptr %words)"), NAMES[self.name]
-        words = Words(self.f, names)
-        self.base = {w: words.pointer(w) for w in names if w not in INTEGERS}
-        self.count = {w: words.integer(w) for w in names if w in INTEGERS}
-        self.L, self.B = self.count["L"], self.count["B"]
-        self.n, self.N, self.W, self.through, self.general = n, N, width, through, general
-        self.runs: list[str] = []
-
-    def text(self) -> str:
-        """The finished kernel."""
-        self.write()
-        self.f.do("ret i64 0")
-        return self.f.text()
-
-    def write(self) -> None:
-        """Its body."""
-        raise NotImplementedError
-
-    def room(self, size: int) -> str:
-        """Vectors of W lanes on the stack."""
-        return self.f.room(size * self.W)
-
-    def load(self, base: str, index: int = 0) -> str:
-        return self.f.load(base, index * self.W, self.W)
-
-    def store(self, value: str, base: str, index: int = 0) -> None:
-        self.f.store(value, base, index * self.W, self.W)
-
-    def all(self, base: str, size: int, step: int = 1) -> list[str]:
-        return [self.load(base, i * step) for i in range(size)]
-
-    def at(self, base: str, index: int | str, size: int = 1) -> str:
-        """The address of entry `index` of blocks of `size` vectors."""
-        if isinstance(index, int):
-            return self.f.at(base, index * size * self.W)
-        return self.f.at(base, self.f.integer("mul", index, size * self.W))
-
-    def each(self, size: int) -> Iterator[int | str]:
-        """Entries of a row: unrolled if they are few, else a loop."""
-        if size <= UNROLLED:
-            yield from range(size)
-            return
-        with self.f.loop(size) as i:
-            yield i
-
-    def dot(self, a: list[str], b: list[str], start: str | None = None) -> str:
-        total = self.f.mul(a[0], b[0], self.W) if start is None else start
-        for x, y in list(zip(a, b, strict=True))[start is None :]:
-            total = self.f.fma(x, y, total, self.W)
-        return total
-
-    def clear(self, base: str, size: int) -> None:
-        with self.f.loop(size) as i:
-            self.store(splat(0.0, self.W), self.at(base, i))
-
-    def groups(self) -> Iterator[None]:
-        """W runs at a time; the last one is repeated to fill the lanes."""
-        f, last = self.f, self.f.integer("sub", self.B, 1)
-        count = f.integer("sdiv", f.integer("add", self.B, self.W - 1), self.W)
-        with f.loop(count) as group:
-            first, self.runs = f.integer("mul", group, self.W), []
-            for lane in range(self.W):
-                i = f.integer("add", first, lane)
-                beyond = f.emit(f"icmp sgt i64 {i}, {last}")
-                self.runs.append(f.emit(f"select i1 {beyond}, i64 {last}, i64 {i}"))
-            yield
-
-    def _places(self, name: str, t: str, size: int) -> list[str]:
-        row = self.f.integer("mul", t, self.B)
-        places = (self.f.integer("add", row, run) for run in self.runs)
-        return [self.f.at(self.base[name], self.f.integer("mul", p, size)) for p in places]
-
-    def gather(self, name: str, t: str, size: int, to: str) -> None:
-        """Row t of an array (time, run, size) of the group's runs into lanes."""
-        places, f = self._places(name, t, size), self.f
-        with f.loop(size) as i:
-            value = "poison"
-            for lane, place in enumerate(places):
-                one = f.load(f.at(place, i))
-                value = f.emit(
-                    f"insertelement <{self.W} x double> {value}, double {one}, i64 {lane}"
-                )
-            self.store(value, self.at(to, i))
-
-    def scatter(self, source: str, name: str, t: str, size: int, *, step: int = 1) -> None:
-        """The way back; every `step`-th vector of the source."""
-        places, f = self._places(name, t, size), self.f
-        with f.loop(size) as i:
-            value = self.load(self.at(source, i, step))
-            for lane, place in enumerate(places):
-                f.store(f.lane(value, lane, self.W), f.at(place, i))
-
-    def wanted(self, name: str) -> str:
-        """Whether an output that may be missing is there."""
-        return self.f.emit(f"icmp ne ptr {self.base[name]}, null")
-
-    def sandwich(self, A: str, P: str, spare: str, *, transposed: bool) -> None:
-        """P <- A P A', or A' P A, the mean of what stands above and below the diagonal."""
-        f, N = self.f, self.N
-        row, step = (1, N) if transposed else (N, 1)
-        with f.loop(N) as line:
-            values, to = self.all(self.at(A, line, row), N, step), self.at(spare, line, N)
-            for j in self.each(N):
-                self.store(self.dot(values, self.all(self.at(P, j), N, N)), self.at(to, j))
-        with f.loop(N) as line:
-            values, to = self.all(self.at(spare, line, N), N), self.at(P, line, N)
-            for j in self.each(N):
-                other = self.all(self.at(A, j, row), N, step)
-                self.store(self.dot(values, other), self.at(to, j))
-        for i in range(1, N):  # what is not symmetric would grow, step by step
-            for j in range(i):
-                below, above = i * N + j, j * N + i
-                mean = f.add(self.load(P, below), self.load(P, above), self.W)
-                mean = f.mul(mean, splat(0.5, self.W), self.W)
-                self.store(mean, P, below)
-                self.store(mean, P, above)
-
-    def channel(self, H: str, c: str) -> tuple[str, list[str]]:
-        """The address of a channel's row of H, and its entries; without H: nothing."""
-        row = self.at(H, c, self.N)
-        return row, self.all(row, self.N) if self.general else []
-
-
-class _Gains(_Pass):
+class _Gains(Pass):
     name = "gains"
 
     def write(self) -> None:
@@ -294,7 +167,7 @@ class _Gains(_Pass):
                 self.store(f.fma(down, other, self.load(place), W), place)
 
 
-class _Innovations(_Pass):
+class _Innovations(Pass):
     """All runs go through time together, so that memory is read in order."""
 
     name = "innovations"
@@ -345,7 +218,7 @@ class _Innovations(_Pass):
         return [f.at(place, f.integer("mul", columns, i)) for i in range(rows)]
 
 
-class _Smoother(_Pass):
+class _Smoother(Pass):
     name = "smoother"
 
     def write(self) -> None:

@@ -23,7 +23,6 @@ from grounded.model import Model
 from grounded.trial import Trial, stretches
 
 SHORT = 1e-6  # [s], a step that shows the rates
-SAME = 1e-4
 FAST = 0.2  # of the largest speed: below it a course means little
 AGREE = 0.9  # length of the mean of unit vectors that point the same way
 

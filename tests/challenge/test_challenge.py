@@ -9,9 +9,9 @@ from cli import grounded
 from facts import holding, holds
 from grounded.errors import GroundedError
 from grounded_cli.main import cli
+from grounded_trials.challenge import open_label, read_manifest, score_case
 from grounded_trials.store.documents import write_document
 from grounded_trials.store.store import Store
-from grounded_trials.workspace.challenge import open_label, read_manifest, score_case
 from grounded_trials.workspace.folder import Folder
 
 
@@ -188,7 +188,7 @@ def test_families_may_be_named_in_a_list_or_one_by_one(tmp_path, monkeypatch):
     folder, seen = tmp_path / "cases", []
     said("make", folder, "--kind", "none", "--cases", "1", "--seed", "5")
     monkeypatch.setattr(
-        "grounded_trials.workspace.challenge.diagnose_cases",
+        "grounded_trials.challenge.diagnose_cases",
         lambda folder, *, without, **others: seen.append(without) or {"none-0000": 1.0},
     )
     out = said("run", folder, "--without", "delay,offset", "--without", "stall").out

@@ -16,7 +16,7 @@ from cli import COMMAND, grounded, plain, process
 from facts import holds
 from grounded.policy import load
 from grounded_cli.main import COMMANDS
-from grounded_trials.workspace.examples import EXAMPLES
+from grounded_trials.starting.examples import EXAMPLES
 from workspaces import CONFIG, REAL, make
 
 HERE = [n for n, (m, _) in COMMANDS.items() if importlib.util.find_spec(f"grounded_cli.{m}")]

@@ -215,7 +215,7 @@ def test_init_that_was_cut_off_goes_on(tmp_path: Path, monkeypatch: pytest.Monke
             done += 1
             write_atomically(path, data)
 
-        monkeypatch.setattr("grounded_trials.workspace.examples.write_atomically", cut)
+        monkeypatch.setattr("grounded_trials.starting.examples.write_atomically", cut)
         assert grounded(*words).code == 130
     monkeypatch.undo()
     assert grounded(*words).code == 0 and grounded("-C", tmp_path / "w", "status").code == 0

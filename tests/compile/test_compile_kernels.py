@@ -1,16 +1,18 @@
 """Compiled kernels against their interpreted twins: rollouts, sweeps, whole solves."""
 
+import threading
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from grounded.compile import Problem, parallel, system_of
+from grounded.compile import Problem, system_of
 from grounded.compile.kernel_words import MAX_INPUTS
 from grounded.compile.run import jit
 from grounded.compile.run.traced import TracedSystem
 from grounded.compile.trace.graph import TooLong
 from grounded.compile.trace.tracing import Signature, trace
+from grounded.engine import Engine, each, running
 from grounded.solve.ddp import solve
 from problems import SPECS, problem
 
@@ -165,10 +167,11 @@ def test_many_models_in_threads():
     def cost(p):
         return solve(replace(task, p=p), np.full((50, 2), 0.3)).cost
 
-    assert parallel(cost, values, workers=4) == [cost(p) for p in values]
-    assert parallel(cost, []) == []
-    with pytest.raises(ZeroDivisionError):
-        parallel(lambda i: 1 / i, [1, 0, 2], workers=2)
+    with running(Engine(4)):
+        assert each(cost, values) == [cost(p) for p in values]
+        with pytest.raises(ZeroDivisionError):
+            each(lambda i: 1 / i, [1, 0, 2])
+    assert threading.stack_size() == 0
 
 
 def test_too_many_operations_are_not_compiled(monkeypatch):
@@ -214,5 +217,6 @@ def test_a_hundred_states_are_interpreted_and_forty_run_in_a_thread():
     forty = wide(40, 4, True)
     assert forty.system.how == "compiled"
     u = np.zeros((12, 4))
-    costs = parallel(lambda p: solve(replace(forty, p=p), u).cost, [forty.p] * 2, workers=2)
+    with running(Engine(2)):
+        costs = each(lambda p: solve(replace(forty, p=p), u).cost, [forty.p] * 2)
     assert costs[0] == costs[1] == solve(forty, u).cost

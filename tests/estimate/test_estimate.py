@@ -29,7 +29,6 @@ from grounded.estimate.extended import (
 )
 from grounded.estimate.record import batch_of
 from grounded.estimate.steps import ModelSteps
-from grounded.estimate.tracker import nearest_step
 from grounded.model import Model, Param
 from grounded.models.car import model as car
 from grounded.trial import Trial
@@ -304,16 +303,6 @@ def test_camera_at_30_hz_and_control_at_20_hz_from_two_markers():
     assert np.sqrt(np.mean(error[:, 2] ** 2)) < sigma
     assert 0.85 < np.mean(nis[1:]) < 1.15
     assert np.isnan(tracker.update(1.0, y[0]))  # older than the estimate: not used
-
-
-def test_controllers_are_those_of_the_nearest_step():
-    assert [nearest_step(t, 0.05, 200) for t in (0.0, 0.024, 0.026, 3.0, 99.0)] == [
-        0,
-        0,
-        1,
-        60,
-        199,
-    ]
 
 
 def test_angles_wrap_in_innovations():

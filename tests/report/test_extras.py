@@ -45,7 +45,7 @@ def test_a_picture_names_the_extra_that_it_needs(monkeypatch):
 
 @pytest.mark.slow
 def test_the_demo_does_without_a_recording(tmp_path, monkeypatch):
-    monkeypatch.setattr("grounded_cli.demo.find_spec", lambda name: None)
+    monkeypatch.setattr("grounded_cli.studies.demo.find_spec", lambda name: None)
     done = grounded("demo", "pendulum", "--dir", tmp_path / "d", "--json")
     assert done.code == 0 and not json.loads(done.out)["paths"]
     assert "extra `view`" in done.err and "extra `report`" in done.err

@@ -9,7 +9,7 @@ import pytest
 
 from cli import grounded
 from facts import holds
-from grounded_cli import view
+from grounded_cli import report
 from reported import cart, copied
 
 __all__ = ["cart"]
@@ -37,7 +37,7 @@ def test_the_viewer_is_started_for_this_machine_alone(cart, tmp_path, monkeypatc
     program.write_text(f'#!/bin/sh\necho "$@" > {tmp_path}/words\n{ending}\n')
     program.chmod(program.stat().st_mode | stat.S_IXUSR)
     monkeypatch.setenv("DISPLAY", ":7")
-    monkeypatch.setattr(view.sys, "executable", str(tmp_path / "python"))
+    monkeypatch.setattr(report.sys, "executable", str(tmp_path / "python"))
     done = grounded("-C", folder, "view")
     assert done.code == code, done.err
     assert "Traceback" not in done.err

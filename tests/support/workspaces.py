@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from grounded_trials.workspace.examples import EXAMPLES, write_example
+from grounded_trials.starting.examples import EXAMPLES, write_example
 from grounded_trials.workspace.folder import Folder
 
 MODEL = """import numpy as np

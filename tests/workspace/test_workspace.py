@@ -8,8 +8,8 @@ import pytest
 
 from cli import grounded
 from grounded.errors import GroundedError
+from grounded_trials.starting.examples import EXAMPLES, write_example
 from grounded_trials.workspace.config import read_config
-from grounded_trials.workspace.examples import EXAMPLES, write_example
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.task_file import read_target, target_arrays, write_target
 from workspaces import CONFIG, MODEL, make

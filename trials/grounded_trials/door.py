@@ -14,12 +14,10 @@ frozen result whose `to_json()` is the document that the command prints with --j
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Self
 
-from grounded.errors import GroundedError, NextCommand
-from grounded.result import Result
+from grounded.errors import GroundedError
 from grounded_trials.workspace.folder import Folder
 
 if TYPE_CHECKING:
@@ -33,49 +31,13 @@ if TYPE_CHECKING:
     from grounded_trials.workspace.adopting import Adopted
     from grounded_trials.workspace.exporting import Exported
     from grounded_trials.workspace.fitting import Fitted
+    from grounded_trials.workspace.identity import SetAside
     from grounded_trials.workspace.ingest import Ingested
     from grounded_trials.workspace.inspecting import Inspected
+    from grounded_trials.workspace.looping import NextRun
     from grounded_trials.workspace.proposing import Proposed, Status
     from grounded_trials.workspace.running import Ran
     from grounded_trials.workspace.verifying import Verified
-
-
-@dataclass(frozen=True, repr=False)
-class SetAside(Result):
-    """What `discard` and `restore` answer: the trials that were named, and all that are aside."""
-
-    trials: tuple[str, ...]
-    discarded: dict[str, str]  # t0004 -> why
-
-    def summary(self) -> str:
-        """All that are set aside."""
-        return f"set aside: {', '.join(self.discarded) or 'none'}"
-
-    def to_json(self) -> dict[str, Any]:
-        """The document of `discard --json` and of `restore --json`."""
-        return {"trials": list(self.trials), "discarded": self.discarded}
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class NextRun(Result):
-    """What a log gave, what to run next, and the file for the robot (None: the search ended)."""
-
-    taken: Ingested
-    proposed: Proposed
-    exported: Exported | None
-
-    def summary(self) -> str:
-        """What was taken in, and what comes next."""
-        name = None if self.proposed.candidate is None else self.proposed.candidate.id
-        return f"{self.taken.trial} is in; next {name or 'nothing: the search has ended'}"
-
-    def to_json(self) -> dict[str, Any]:
-        """The document of `next --json`: those of ingest, propose and export."""
-        return {
-            "trials": [self.taken.to_json()],
-            "propose": self.proposed.to_json(),
-            "export": None if self.exported is None else self.exported.to_json(),
-        }
 
 
 class Workspace(Folder):
@@ -130,7 +92,7 @@ class Workspace(Folder):
 
             begin(Path(folder), log, model=model, dt=dt)
         elif example is not None:
-            from grounded_trials.workspace.examples import write_example
+            from grounded_trials.starting.examples import write_example
 
             write_example(Path(folder), example)
         return cls(folder)
@@ -164,21 +126,11 @@ class Workspace(Folder):
             anyway: run it though it is void.
             warn: told what is overridden, before the robot moves.
         """
-        from grounded_trials.workspace.proposing import candidate_named, standing_in
+        from grounded_trials.workspace.proposing import candidate_named
         from grounded_trials.workspace.running import run_candidate
 
-        here = self._afresh()
-        if candidate is None:
-            waiting = standing_in(here).outstanding
-            if waiting is None:
-                raise GroundedError(
-                    "no candidate is waiting to be run: `propose` makes the next one, or says that "
-                    "the search has ended; name a candidate to run it again",
-                    NextCommand("propose"),
-                )
-            candidate = waiting.id
-        name = candidate_named(here, candidate)
-        return run_candidate(here, name, anyway=anyway, warn=warn)
+        name = candidate_named(self._afresh(), candidate)
+        return run_candidate(self, name, anyway=anyway, warn=warn)
 
     def ingest(
         self, path: str | Path, *, candidate: str | None = None, data: bool = False
@@ -205,17 +157,9 @@ class Workspace(Folder):
             log: what came back of the outstanding candidate.
             runner: write the program that runs the candidate beside it, see `export`.
         """
-        from grounded_trials.workspace.exporting import export_candidate
-        from grounded_trials.workspace.proposing import propose_in
+        from grounded_trials.workspace.looping import next_in
 
-        taken = self.ingest(log)
-        proposed, exported = propose_in(self._afresh()), None
-        if proposed.candidate is not None:
-            name = proposed.candidate.id
-            form = "npz" if runner else "json"
-            file = self.folder / f"{name}.{form}"
-            exported = export_candidate(self, name, form, file, runner=runner)
-        return NextRun(taken, proposed, exported)
+        return next_in(self._afresh(), Path(log), runner=runner)
 
     def target(self, columns: Mapping[str, Array]) -> Path:
         """Writes target.csv and its length to grounded.toml; the old one is kept as target.csv.bak.
@@ -223,18 +167,9 @@ class Workspace(Folder):
         Args:
             columns: what each state is to do, (H + 1,) each, a row a control step; see `starting`.
         """
-        from grounded_trials.workspace.config import set_target
-        from grounded_trials.workspace.task_file import equal_weights, write_target
+        from grounded_trials.workspace.task_file import replace_target
 
-        here = self._afresh()
-        name = here.config.task.target or "target.csv"
-        path = here.folder / name
-        if path.is_file():
-            path.replace(path.with_name(path.name + ".bak"))
-        write_target(path, here.config.task.dt, dict(columns))
-        weights = {state: round(w, 6) for state, w in equal_weights(columns).items()}
-        steps = len(next(iter(columns.values()))) - 1
-        set_target(here.config.file, name, steps, weights)
+        path = replace_target(self._afresh().config, columns)
         self.forget()
         return path
 
@@ -252,27 +187,9 @@ class Workspace(Folder):
             progress: told what is being done.
             each: given every candidate with its trial, once that is stored.
         """
-        from grounded_trials.workspace.ingest import ingest_log
-        from grounded_trials.workspace.proposing import propose_in, standing_in, status_of
-        from grounded_trials.workspace.running import run_candidate
+        from grounded_trials.workspace.looping import learn_in
 
-        here, tell, done = self._afresh(), progress or (lambda stage: None), 0
-        while trials is None or done < trials:
-            tell("planning")
-            proposed = propose_in(here)
-            made = proposed.candidate
-            if made is None:
-                return status_of(here, proposed.standing, proposed.proposal.notes)
-            tell(f"running {made.id}")
-            path = run_candidate(here, made.id).trial_file
-            found = ingest_log(here, path, made.id)
-            path.unlink()  # its bytes are in the store now
-            done += 1
-            if each is not None:
-                each(made, found)
-        status = status_of(here, standing_in(here))
-        goes_on = status.standing.phase == "propose"
-        return replace(status, then=NextCommand("learn")) if goes_on else status
+        return learn_in(self._afresh(), trials, progress, each)
 
     def status(self) -> Status:
         """Where the search stands; nothing is written."""
@@ -385,27 +302,9 @@ class Workspace(Folder):
         Raises:
             GroundedError: if an extra is missing that one of them needs; nothing is written then.
         """
-        from grounded.errors import needs
-        from grounded_trials.report import reporting
-        from grounded_trials.report.gathering import gather
+        from grounded_trials.report.reporting import report_in
 
-        for module, asked, extra in (
-            ("jinja2", html, "report"),
-            ("matplotlib", png, "png"),
-            ("rerun", rrd, "view"),
-        ):
-            if asked:
-                needs(module, extra)
-        findings, paths = gather(self._afresh()), []
-        if html:
-            paths.append(reporting.save_page(self, findings))
-        if png:
-            paths += reporting.save_pictures(self, findings)
-        if rrd:
-            paths.append(reporting.save_recording(self, findings))
-        if html or rrd:
-            paths += reporting.save_layouts(self, findings)
-        return reporting.Report(findings, tuple(paths))
+        return report_in(self._afresh(), html=html, png=png, rrd=rrd)
 
     def watch(
         self, *, every: float = 1.0, trouble: Callable[[GroundedError], None] = lambda error: None
@@ -475,20 +374,15 @@ class Workspace(Folder):
             trials: short names, t0004.
             why: kept with it, for who asks later.
         """
-        return self._noted("discard", trials, why)
+        from grounded_trials.workspace.identity import set_aside
+
+        return set_aside(self._afresh(), "discard", trials, why)
 
     def restore(self, *trials: str) -> SetAside:
         """Takes back what `discard` did."""
-        return self._noted("restore", trials, "")
+        from grounded_trials.workspace.identity import set_aside
 
-    def _noted(self, note: str, trials: Sequence[str], why: str) -> SetAside:
-        here = self._afresh()
-        found = [here.store.find(name.lower()) for name in trials]
-        for one in found:
-            if (one.digest in here.noted.aside) == (note == "restore"):
-                here.notes.add({"note": note, "trial": one.digest, "why": why})
-        here.forget_trials()
-        return SetAside(tuple(one.id for one in found), here.discarded())
+        return set_aside(self._afresh(), "restore", trials, "")
 
     def inspect(self, log: str | Path) -> Inspected:
         """Shows what a log holds, and guesses a [log] table for this workspace's model."""

@@ -41,7 +41,6 @@ from grounded.compile.problem import (
 from grounded.compile.run import jit
 from grounded.compile.run.arguments import (
     address,
-    call,
     empty,
     packed,
     plain,
@@ -54,8 +53,6 @@ from grounded.compile.run.arguments import (
 from grounded.compile.run.traced import TracedSystem
 from grounded.compile.trace.tracing import Signature, Trace, Variant
 from grounded.frozen import Array
-
-__all__ = ["BATCH", "CompiledSystem", "Kernels", "call"]
 
 SMALL = 600  # operations of a model that need not be counted with their derivatives
 MAX_PLACES = 8_000  # of a Jacobian that a kernel keeps on its stack, 4 MB of it

@@ -1,8 +1,8 @@
-"""LLVM IR text to functions, by llvmlite, through a cache on disk; and many calls at once.
+"""LLVM IR text to functions, by llvmlite, through a cache on disk.
 
 Compiling takes a tenth of a second, loading a cached object a millisecond. Kernels are called
 through ctypes, which releases the GIL while they run: threads are enough for many models or trials
-(`parallel`).
+(`grounded.engine`).
 
 The cache is the user's: one file a kernel, of a header, the SHA-256 of the code, and the code. A
 file that is short, damaged or of another format is not used and is replaced; a file or folder that
@@ -21,10 +21,10 @@ import os
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from grounded.trusted import suspicion
 
@@ -32,9 +32,6 @@ OLDEST = (0, 45)  # of llvmlite: pointers without a type
 OPTIMISATION = 1  # of LLVM's code generator; the text is optimised as it is written
 MAGIC = b"grounded kernel 1\n"
 MAX_BYTES = 64 * 2**20  # of all files
-STACK = 16 * 2**20  # bytes for each thread: kernels keep their matrices there
-Item = TypeVar("Item")
-Outcome = TypeVar("Outcome")
 _LOCK = threading.Lock()
 
 
@@ -219,37 +216,3 @@ def _prune(home: Path) -> None:
         with contextlib.suppress(OSError):
             path.unlink()
             total -= size
-
-
-def parallel(
-    function: Callable[[Item], Outcome], items: Iterable[Item], workers: int | None = None
-) -> list[Outcome]:
-    """[function(item) for item in items], in that order, by threads.
-
-    Args:
-        function: must not change anything shared.
-        items: what it is called with.
-        workers: threads; None: as many as the process may use processors.
-
-    Raises:
-        Exception: the first that `function` raises, in the order of the items.
-    """
-    work = list(items)
-    count = min(len(work), workers or _processors())
-    if count <= 1:
-        return [function(item) for item in work]
-    from concurrent.futures import ThreadPoolExecutor
-
-    before = threading.stack_size(STACK)
-    try:
-        with ThreadPoolExecutor(count) as pool:
-            return list(pool.map(function, work))
-    finally:
-        threading.stack_size(before)
-
-
-def _processors() -> int:
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:  # macOS, Windows
-        return os.cpu_count() or 1

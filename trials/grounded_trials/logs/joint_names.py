@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import replace
 
-from grounded_trials.formats.mcap_records import Channel, Messages, Schema
+from grounded_trials.formats.mcap_records import Channel, Messages
 from grounded_trials.logs.inspect_guess import Guess
 from grounded_trials.logs.inspect_log import LogReport
 from grounded_trials.logs.log_files import log_records
@@ -22,11 +22,9 @@ def joint_names(log: LogReport) -> dict[str, tuple[str, ...]]:
     wanted = {t.topic for t in log.topics if t.type.endswith("/JointState") and t.messages}
     found: dict[str, set[tuple[str, ...]]] = {topic: set() for topic in wanted}
     for file in log.files if wanted else ():
-        schemas, channels = dict[int, Schema](), dict[int, Channel]()
+        channels: dict[int, Channel] = {}
         for record in log_records(file):
-            if isinstance(record, Schema):
-                schemas[record.id] = record
-            elif isinstance(record, Channel):
+            if isinstance(record, Channel):
                 channels[record.id] = record
             elif isinstance(record, Messages):
                 for identity in record.channel_ids():

@@ -57,7 +57,7 @@ def forecast(planner: Planner, trial: Trial, seconds: float = SECONDS) -> Foreca
     whole, n = trial.finite_steps, planner.task.model.n
     if whole < 1:
         return None
-    part = replace(trial, states=trial.states[: whole + 1], inputs=trial.inputs[:whole])
+    part = trial.until(whole)
     lifted, plan = anchored(planner, part), planner.plan
     problem = plan.problem(exact=True)
     past = plan.past if part.start_inputs is None else part.start_inputs

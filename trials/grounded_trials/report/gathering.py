@@ -136,8 +136,8 @@ def _residual(planner: Planner, trial: Trial) -> Array:
     whole, n = trial.finite_steps, planner.task.model.n
     residual = np.full((trial.steps, n), np.nan)
     if whole > 0:
-        part = replace(trial, states=trial.states[: whole + 1], inputs=trial.inputs[:whole])
-        residual[:whole] = residuals(planner.plan, anchored(planner, part))[:, :n]
+        part = anchored(planner, trial.until(whole))
+        residual[:whole] = residuals(planner.plan, part)[:, :n]
     return residual
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from grounded.errors import GroundedError
+from grounded.errors import GroundedError, needs
 from grounded.result import Result
 from grounded.task import Task
 from grounded_trials.report.findings import Findings, Run, prediction_error, rms, tracking_error
@@ -92,6 +92,27 @@ def _measures(task: Task, run: Run | None) -> dict[str, Any] | None:
     }
 
 
+def report_in(workspace: Folder, *, html: bool, png: bool, rrd: bool) -> Report:
+    """The findings, and the files that were asked for, see `Workspace.report`."""
+    for module, asked, extra in (
+        ("jinja2", html, "report"),
+        ("matplotlib", png, "png"),
+        ("rerun", rrd, "view"),
+    ):
+        if asked:
+            needs(module, extra)
+    findings, paths = gather(workspace), []
+    if html:
+        paths.append(save_page(workspace, findings))
+    if png:
+        paths += save_pictures(workspace, findings)
+    if rrd:
+        paths.append(save_recording(workspace, findings))
+    if html or rrd:
+        paths += save_layouts(workspace, findings)
+    return Report(findings, tuple(paths))
+
+
 def save_recording(workspace: Folder, findings: Findings | None = None) -> Path:
     """reports/recording.rrd for the Rerun viewer."""
     from grounded_trials.report.recording.recording import write_recording
@@ -127,13 +148,7 @@ def save_page(workspace: Folder, findings: Findings, watched: int = 0) -> Path:
 def watched(
     workspace: Folder, every: float, trouble: Callable[[GroundedError], None]
 ) -> Iterator[Report]:
-    """Writes the page now and whenever a file that it shows has changed; it ends by Ctrl-C.
-
-    Args:
-        workspace: whose files may change meanwhile.
-        every: how often they are looked at [s].
-        trouble: told what keeps the page from being written for now, a file half edited.
-    """
+    """Writes the page now and whenever a file that it shows has changed, see `Workspace.watch`."""
     before: object = None
     revision = int(time.time()) % 30_000
     while True:

@@ -38,34 +38,10 @@ FRAME, BODY = "map", "robot"
 Message = tuple[str, str, int, Any]  # topic, type, time [ns], message
 
 
-def write_bag(
-    path: Path,
-    model: Model,
-    dt: float,
-    states: Array,
-    inputs: Array,
-    *,
-    target: Array | None = None,
-    start_ns: int = 0,
-) -> Path:
-    """Writes a run as a ROS 2 bag.
-
-    Args:
-        path: the bag's folder, which must not exist; with "mcap" in its name it holds MCAP, else
-            `.db3`.
-        model: whose names and roles say what is what.
-        dt: control interval [s].
-        states: (T + 1, n); inputs: (T, m), sent at the beginning of each step.
-        inputs: see `states`.
-        target: (H + 1, n), NaN where free.
-        start_ns: the stamp of the first state.
-
-    Returns:
-        The folder.
-
-    Raises:
-        GroundedError: if it exists, or can't be written.
-    """
+def _write_bag(
+    path: Path, model: Model, dt: float, states: Array, inputs: Array, target: Array
+) -> None:
+    """A run as the folder `path`, which must not exist; "mcap" in its name: MCAP, else `.db3`."""
     from rosbags.rosbag2 import StoragePlugin, Writer
 
     if path.exists():
@@ -76,14 +52,11 @@ def write_bag(
         made = Path(room) / path.name
         with Writer(made, version=9, storage_plugin=storage) as writer:
             topics: dict[str, Any] = {}
-            for topic, kind, time, message in _Run(model, dt, start_ns).messages(
-                states, inputs, target
-            ):
+            for topic, kind, time, message in _Run(model, dt).messages(states, inputs, target):
                 if topic not in topics:
                     topics[topic] = writer.add_connection(topic, kind, typestore=store)
                 writer.write(topics[topic], time, store.serialize_cdr(message, kind))
         shutil.move(made, path)
-    return path
 
 
 def _parent(path: Path) -> Path:
@@ -95,24 +68,22 @@ def _parent(path: Path) -> Path:
 
 
 class _Run:
-    """The messages of one run, in the order of time."""
+    """The messages of one run, in the order of time, which begins at 0."""
 
-    def __init__(self, model: Model, dt: float, start_ns: int) -> None:
-        self.model, self.dt, self.start = model, dt, start_ns
+    def __init__(self, model: Model, dt: float) -> None:
+        self.model, self.dt = model, dt
         self.kinds = standard_types().types
         scene = scene_of(model)
         self.scene: Scene | None = scene if scene.spatial else None
         self.joints = {q: w for q, w in velocities(model).items() if model.states[q] == "rad"}
 
-    def messages(self, states: Array, inputs: Array, target: Array | None) -> Iterator[Message]:
+    def messages(self, states: Array, inputs: Array, target: Array) -> Iterator[Message]:
         """All of them; a state that is not finite is left out."""
-        if target is not None and self.scene is not None:
-            path = self._path(target)
-            if path is not None:
-                yield "/target", "nav_msgs/msg/Path", self.start, path
+        if self.scene is not None and len(points := self.scene.finite(target)):
+            yield "/target", "nav_msgs/msg/Path", 0, self._path(points)
         turns = self.scene.rotations(states) if self.scene is not None else None
         for step, x in enumerate(states):
-            time = self.start + round(step * self.dt * 1e9)
+            time = round(step * self.dt * 1e9)
             for name, value in zip(self.model.state_names, x, strict=True):
                 if np.isfinite(value):
                     yield f"/state/{name}", "std_msgs/msg/Float64", time, self._number(value)
@@ -187,12 +158,8 @@ class _Run:
             effort=np.zeros(0),
         )
 
-    def _path(self, target: Array) -> Any:
-        assert self.scene is not None
-        points = self.scene.finite(target)
-        if not len(points):
-            return None
-        still, header = np.eye(3), self._header(self.start)
+    def _path(self, points: Array) -> Any:
+        still, header = np.eye(3), self._header(0)
         poses = [
             self._of("PoseStamped", header=header, pose=self._pose(point, still))
             for point in points
@@ -209,17 +176,7 @@ def quaternion(turn: Array) -> tuple[float, float, float, float]:
 
 
 def export_run(workspace: Folder, identity: str, form: str | None, path: Path | None) -> Exported:
-    """Writes a trial, or the run that a candidate predicts: as a bag, csv or npz.
-
-    Args:
-        workspace: its own.
-        identity: t0007, c0003 or `best`.
-        form: bag, csv or npz; None: as `path` is named, else bag.
-        path: file or folder; None: named after the run, in the current folder.
-
-    Raises:
-        GroundedError: for an unknown run or form, or a place that can't be written.
-    """
+    """Writes a trial, or the run that a candidate predicts, see `Workspace.export`."""
     named = path.suffix.lstrip(".").lower() if path else ""
     form = form or (named if named in ("csv", "npz") else "bag")
     if form not in ("bag", "csv", "npz"):
@@ -228,8 +185,7 @@ def export_run(workspace: Folder, identity: str, form: str | None, path: Path | 
     path = path or Path(f"{identity}.{form}" if form != "bag" else f"{identity}_bag")
     model = workspace.base_model
     if form == "bag":
-        target = workspace.task.target
-        write_bag(path, model, dt, states, inputs, target=target)
+        _write_bag(path, model, dt, states, inputs, workspace.task.target)
         return Exported(identity, path, form)
     names = ("t", *model.state_names, *model.input_names)
     last = np.full((1, model.m), np.nan)  # the last state has no input

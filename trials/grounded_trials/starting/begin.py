@@ -24,10 +24,10 @@ from grounded_trials.logs.inspect_log import LogReport, inspect_log
 from grounded_trials.logs.joint_names import joint_names
 from grounded_trials.logs.log_files import kind_of, log_files
 from grounded_trials.logs.log_table import LogMapping, log_mapping, read_log
+from grounded_trials.starting.examples import fresh_folder
 from grounded_trials.starting.kinds import KINDS, kind_in, skeleton
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.config import FILE
-from grounded_trials.workspace.examples import fresh_folder
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.model_file import load_module, model_in
 from grounded_trials.workspace.task_file import equal_weights, write_target

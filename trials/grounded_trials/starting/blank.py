@@ -15,9 +15,9 @@ from grounded.errors import GroundedError
 from grounded.model import Model
 from grounded.task import Task
 from grounded.utility import Reward
+from grounded_trials.starting.examples import fresh_folder, toml_of
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.config import FILE
-from grounded_trials.workspace.examples import fresh_folder, toml_of
 from grounded_trials.workspace.model_file import load_module, model_in
 from grounded_trials.workspace.task_file import write_target
 

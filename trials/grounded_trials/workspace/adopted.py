@@ -52,15 +52,13 @@ def installed_effects() -> Library:
     return Library().with_families(found)
 
 
-def planner_with(
-    task: Task, effects: Sequence[Mapping[str, Any]], library: Library | None = None
-) -> Planner:
+def planner_with(task: Task, effects: Sequence[Mapping[str, Any]]) -> Planner:
     """The planner of a task whose model got these effects, in the order in which they act.
 
     Raises:
         GroundedError: for an unknown effect, or a quantity that is missing or unknown.
     """
-    library = library or Library()
+    library = installed_effects() if effects else Library()
     assert task.latency is not None
     model, latency = task.model, np.array(task.latency)
     families = [library.family(str(entry["name"]).partition(":")[0]) for entry in effects]

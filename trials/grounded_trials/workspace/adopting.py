@@ -45,15 +45,11 @@ class Adopted(Result):
 
 
 def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool = True) -> Adopted:
-    """Adds diagnosed effects to [model] effects, and the parameters that belong to them.
+    """Adds diagnosed effects to [model] effects, see `Workspace.adopt`; or else writes nothing.
 
     Where the diagnosis calibrated the model's own parameters beside the effects that it claims,
     they are adopted with those: the effects' values hold beside them. An effect that it does not
     claim was fitted in place of those, without them.
-
-    Raises:
-        GroundedError: if nothing was diagnosed, an effect is not in its ranking, or they were not
-            fitted together; nothing is written then.
     """
     found = read_diagnosis(workspace.reports)
     if found is None:

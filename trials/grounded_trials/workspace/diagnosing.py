@@ -42,21 +42,9 @@ def diagnose_in(
 ) -> Diagnosis:
     """Diagnoses the gap between the model and the stored trials; keeps reports/diagnosis.json.
 
-    Where two effects tie, it writes the candidate that would tell them apart, `.probe`; asked to,
-    else the one that teaches most. `.next_trial` says what to expect of it.
-
-    Args:
-        workspace: the model is diagnosed with the effects that were adopted.
-        trials: short names; all usable ones by default.
-        max_effects: at most so many effects at once.
-        library: the effects that may be blamed.
-        compare: short names of a second group, whose differences from `trials` are told.
-        probe: write a candidate also where nothing ties.
-        engine: workers that fit hypotheses.
-        progress: told of each stage.
-
-    Raises:
-        GroundedError: for an unknown trial, or where there is none to learn from.
+    The model is diagnosed with the effects that were adopted. Where two effects tie, it writes the
+    candidate that would tell them apart, `.probe`; asked to, else the one that teaches most.
+    `.next_trial` says what to expect of it. Arguments as `Workspace.diagnose`.
     """
     from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
     from grounded.effects import Library

@@ -61,20 +61,7 @@ def export_candidate(
     runner: bool = False,
     anyway: bool = False,
 ) -> Exported:
-    """Writes a candidate, `best` or by its id; without `form` as `path` is named, else as json.
-
-    Args:
-        workspace: its own.
-        identity: c0003, or `best`; one of an earlier task will do if today's [limits] hold.
-        form: csv, json or npz.
-        path: the file; None: named after the candidate, in the current folder.
-        runner: npz, and RUNNER beside it, which runs it on a robot that has numpy alone.
-        anyway: write it though it is void, see `handover`.
-
-    Raises:
-        GroundedError: if the candidate must not be handed over; for an unknown candidate or format,
-            or a place that can't be written.
-    """
+    """Writes a candidate; without `form` as `path` is named, else as json: `Workspace.export`."""
     encoders = {"csv": _csv, "json": _json, "npz": _npz}
     named = path.suffix.lstrip(".").lower() if path else ""
     form = form or (named if named in encoders else "npz" if runner else "json")

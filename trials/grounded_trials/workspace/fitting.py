@@ -38,23 +38,7 @@ class Fitted(Result):
 
     def to_json(self) -> dict[str, Any]:
         """The document of `fit --json`: values, intervals, held-out prediction errors."""
-        keys = ("value", "std", "low", "high", "unit", "identified", "start")
-        fit = self.fit
-        document: dict[str, Any] = {
-            "params": {name: {k: getattr(e, k) for k in keys} for name, e in fit.params.items()},
-            "status": fit.status,
-            "sentence": fit.sentence,
-            "samples": fit.samples,
-            "applied": self.applied,
-        }
-        for name, error in (("before", fit.before), ("after", fit.after)):
-            if error is not None:
-                document[f"prediction_error_{name}"] = {
-                    "horizon_s": error.horizon_s,
-                    "one_step": dict(zip(error.names, error.one_step.tolist(), strict=True)),
-                    "ahead": dict(zip(error.names, error.ahead.tolist(), strict=True)),
-                }
-        return document
+        return self.fit.to_json() | {"applied": self.applied}
 
 
 def usable_trials(workspace: Folder) -> list[Trial]:
@@ -63,11 +47,8 @@ def usable_trials(workspace: Folder) -> list[Trial]:
     Raises:
         GroundedError: if there is none of at least 3 steps.
     """
-    found = []
-    for trial in workspace.task_trials():
-        T = trial.finite_steps
-        if T >= 3:
-            found.append(replace(trial, states=trial.states[: T + 1], inputs=trial.inputs[:T]))
+    trials = ((trial, trial.finite_steps) for trial in workspace.task_trials())
+    found = [trial.until(T) for trial, T in trials if T >= 3]
     if not found:
         raise GroundedError(
             "there is no trial to learn from: ingest some, runs of candidates or logs with --data"
@@ -87,7 +68,8 @@ def fit_trials(
     from grounded.estimate import of_states, record_of
     from grounded.fit import fit
 
-    model, guessed = workspace.task.model, workspace.estimated_states()
+    model = workspace.task.model
+    guessed = {n for t in workspace.trials() for n in t.meta.get("estimated", "").split(",")}
     measured = [i for i, name in enumerate(model.state_names) if name not in guessed]
     records = [record_of(model, trial) for trial in usable_trials(workspace)]
     return fit(

@@ -120,11 +120,7 @@ class Folder:
 
     @cached_property
     def noted(self) -> Noted:
-        """What the notes say.
-
-        Raises:
-            GroundedError: if one is damaged.
-        """
+        """What the notes say."""
         return self._read_notes(None)
 
     def note_handed(self, identity: str, data: bytes) -> None:
@@ -182,9 +178,8 @@ class Folder:
     def discarded(self) -> dict[str, str]:
         """Trials that are set aside, t0004 -> why."""
         aside = self.noted.aside
-        if not aside:
-            return {}
-        return {one.id: aside[one.digest] for one in self.store.list() if one.digest in aside}
+        entries = self.store.list() if aside else ()
+        return {one.id: aside[one.digest] for one in entries if one.digest in aside}
 
     def fits(self, trial: Trial) -> bool:
         """Whether a trial's states and inputs are this model's, and its dt is this task's."""
@@ -198,13 +193,7 @@ class Folder:
         Args:
             measured: as they were logged; else short gaps are bridged.
         """
-        fitting = [t for t in self.trials() if self.fits(t.trial)]
-        return [t.measured if measured else t.trial for t in fitting]
-
-    def estimated_states(self) -> tuple[str, ...]:
-        """States that some stored trial did not measure: the smoother's, no evidence."""
-        found = {n for t in self.trials() for n in t.meta.get("estimated", "").split(",") if n}
-        return tuple(name for name in self.base_model.state_names if name in found)
+        return [t.measured if measured else t.trial for t in self.trials() if self.fits(t.trial)]
 
     def candidate_path(self, identity: str) -> Path:
         """candidates/c0001.mcap and so on."""
@@ -302,7 +291,7 @@ class Folder:
                 broken.append(Damaged(stored.path, str(error)))
         self.save_index()
         if lost is not None:
-            lost += [Lost(one.path.name, one.reason) for one in (*broken, *self.gone(known))]
+            lost += [Lost(one.path.name, one.reason) for one in (*broken, *known.gone(self.store))]
         return named_apart(found, known, self.candidate_path)
 
     @property
@@ -320,8 +309,7 @@ class Folder:
     def _whole(self, stored: Stored) -> StoredTrial:
         trial, meta, policy = self._read_one(stored)
         ran = sha256(policy) if policy else ""
-        bridged = interpolate_gaps(trial).trial
-        return StoredTrial(stored, bridged, meta, trial, ran, lambda: policy)
+        return StoredTrial(stored, interpolate_gaps(trial).trial, meta, trial, ran, lambda: policy)
 
     @cached_property
     def _index(self) -> tuple[Index, dict[str, StoredTrial]]:
@@ -347,18 +335,6 @@ class Folder:
         """Keeps what was learnt of many trials for the next command."""
         if "_index" in vars(self):
             self._index[0].save()
-
-    def gone(self, known: Noted) -> Iterator[Damaged]:
-        """Trials that were stored, and are not there any more."""
-        entries = self.store.list()
-        numbers = {stored.number for stored in entries}
-        gaps = set(range(1, max(numbers, default=0))) - numbers
-        lost = known.last - {stored.path.stem for stored in entries} - {""}
-        names = {name.split("-")[0] for name in lost}
-        names |= {f"{self.store.prefix}{number:04d}" for number in gaps}
-        for name in sorted(names):
-            reason = f"trials/ has no file of the number {name}: it was removed"
-            yield Damaged(self.store.folder / name, reason)
 
     def _read_candidates(
         self, trials: tuple[StoredTrial, ...], lost: list[Lost] | None

@@ -92,14 +92,10 @@ def intact(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]:
     Raises:
         GroundedError: if it is damaged, rewritten or renamed.
     """
-    from grounded_trials.workspace.trial_check import commands
-
     candidate, meta = candidate_of(data, identity)
     predicted, policy = candidate.predicted_inputs, candidate.policy
     with np.errstate(all="ignore"):
-        sent = commands(
-            candidate.policy, candidate.predicted_states[None, :-1], candidate.policy.past
-        )
+        sent = policy.commands(candidate.predicted_states[None, :-1], policy.past)
         off = np.abs(sent[0] - predicted)
         wrong = off > AGREES * (1 + np.abs(predicted).max(axis=0))
     if wrong.any():

@@ -15,15 +15,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from grounded.errors import GroundedError
+from grounded.result import Result
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.store.candidate_file import candidate_bytes, read_candidate
-from grounded_trials.store.known import KnownCandidate
-from grounded_trials.store.store import Stored
+from grounded_trials.store.store import Damaged, Store, Stored
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Iterator
+
+    from grounded_trials.workspace.folder import Folder
 
 # a candidate's metadata, in the order of the file
 _FIELDS: Mapping[str, Callable[[str], Any]] = {
@@ -76,6 +78,8 @@ class StoredCandidate:
     @classmethod
     def known(cls, about: dict[str, Any], load: Callable[[], Candidate]) -> StoredCandidate:
         """The same from what `about` said; `load` reads the numbers when they are asked for."""
+        from grounded_trials.store.known import KnownCandidate
+
         fields = KnownCandidate.of(load, about["candidate"])
         return cls(fields, about["kind"], about["task"], about["sha256"])
 
@@ -88,6 +92,18 @@ class Noted:
     handed: dict[str, set[str]] = field(default_factory=dict)  # candidate -> SHA-256 of its files
     ran: dict[str, str] = field(default_factory=dict)  # trials without a policy -> its SHA-256
     last: set[str] = field(default_factory=set)  # the last file of a trial at each hand-out, or ""
+
+    def gone(self, store: Store) -> Iterator[Damaged]:
+        """Trials that were stored, and are not there any more."""
+        entries = store.list()
+        numbers = {stored.number for stored in entries}
+        gaps = set(range(1, max(numbers, default=0))) - numbers
+        lost = self.last - {stored.path.stem for stored in entries} - {""}
+        names = {name.split("-")[0] for name in lost}
+        names |= {f"{store.prefix}{number:04d}" for number in gaps}
+        for name in sorted(names):
+            reason = f"trials/ has no file of the number {name}: it was removed"
+            yield Damaged(store.folder / name, reason)
 
 
 def noted(notes: Iterable[Mapping[str, str]]) -> Noted:
@@ -105,6 +121,32 @@ def noted(notes: Iterable[Mapping[str, str]]) -> Noted:
         elif kind == "run":
             found.ran[note["trial"]] = note["sha256"]
     return found
+
+
+@dataclass(frozen=True, repr=False)
+class SetAside(Result):
+    """What `discard` and `restore` answer: the trials that were named, and all that are aside."""
+
+    trials: tuple[str, ...]
+    discarded: dict[str, str]  # t0004 -> why
+
+    def summary(self) -> str:
+        """All that are set aside."""
+        return f"set aside: {', '.join(self.discarded) or 'none'}"
+
+    def to_json(self) -> dict[str, Any]:
+        """The document of `discard --json` and of `restore --json`."""
+        return {"trials": list(self.trials), "discarded": self.discarded}
+
+
+def set_aside(workspace: Folder, note: str, trials: Sequence[str], why: str) -> SetAside:
+    """Notes that trials were discarded, or restored: see `Workspace.discard`."""
+    found = [workspace.store.find(name.lower()) for name in trials]
+    for one in found:
+        if (one.digest in workspace.noted.aside) == (note == "restore"):
+            workspace.notes.add({"note": note, "trial": one.digest, "why": why})
+    workspace.forget_trials()
+    return SetAside(tuple(one.id for one in found), workspace.discarded())
 
 
 def sha256(data: bytes) -> str:

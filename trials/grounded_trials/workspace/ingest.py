@@ -8,7 +8,6 @@ finds the first.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -84,17 +83,7 @@ class _Read:
 def ingest_log(
     workspace: Folder, path: Path, candidate: str | None = None, *, data: bool = False
 ) -> Ingested:
-    """Checks a log and stores it as a trial.
-
-    Args:
-        workspace: whose model names the states and inputs.
-        path: a trial of ours, an MCAP log, or the folder of a bag.
-        candidate: which candidate was run; by default the trial's own, or the outstanding one.
-        data: the log ran no candidate: for fitting and diagnosis only.
-
-    Raises:
-        GroundedError: for a log that can't be used, with the reason; nothing is stored then.
-    """
+    """Checks a log and stores it as a trial, see `Workspace.ingest`; or else stores nothing."""
     kind = "" if path.is_dir() else kind_of(path)
     if kind == CANDIDATE:
         raise GroundedError(
@@ -135,7 +124,7 @@ def ingest_log(
 def _recognised(workspace: Folder, path: Path, read: _Read, candidate: str | None) -> _Read:
     """Refuses a log whose commands are not its candidate's; with a warning if one was named."""
     ran = read.trial.candidate
-    if not ran or hashlib.sha256(read.data).hexdigest()[:DIGITS] in workspace.store.digests():
+    if not ran or sha256(read.data)[:DIGITS] in workspace.store.digests():
         return read
     own, _ = workspace.candidate(ran)
     trial = interpolate_gaps(read.trial).trial
@@ -155,7 +144,7 @@ def _repeated(workspace: Folder, path: Path, read: _Read) -> str:
     The same bytes are a new run, not the old one ingested twice, where a run of that candidate is
     being waited for and the file was written after the stored one.
     """
-    digest = hashlib.sha256(read.data).hexdigest()
+    digest = sha256(read.data)
     known = [one for one in workspace.store.list() if digest.startswith(one.digest)]
     if not known or not read.trial.candidate:
         return ""
@@ -256,28 +245,30 @@ def _foreign(workspace: Folder, path: Path, candidate: str | None, data: bool) -
             NextCommand("inspect", (str(path),)),
         )
     chosen = "" if data else candidate or _outstanding(workspace, path)
-    estimated: tuple[str, ...] = ()
+    states, estimate = model.state_names, None
     if workspace.config.estimate.names():
-        from grounded_trials.workspace.unmeasured import read_with_estimates
+        from grounded_trials.workspace.unmeasured import read_estimate, smoothed
 
-        found, estimated = read_with_estimates(workspace, files, mapping, data=data)
-    else:
-        missing = [s for s in model.state_names if s not in mapping.states]
-        missing += [i for i in model.input_names if i not in mapping.inputs]
-        if missing:
-            raise GroundedError(
-                f"[log] maps no '{missing[0]}': map it, or let the smoother find a state that is "
-                "not measured with an [estimate] table (docs/real-logs.md)"
-            )
-        found = read_log(
-            files,
-            mapping,
-            task.dt,
-            states=model.state_names,
-            inputs=model.input_names,
-            angles=model.angles,
-            steps=None if data else task.horizon,
+        estimate = read_estimate(workspace.config.estimate, model)
+        states = tuple(estimate.measured)
+    missing = [s for s in states if s not in mapping.states]
+    missing += [i for i in model.input_names if i not in mapping.inputs]
+    if missing:
+        raise GroundedError(
+            f"[log] maps no '{missing[0]}': map it, or let the smoother find a state that is "
+            "not measured with an [estimate] table (docs/real-logs.md)"
         )
+    found = read_log(
+        files,
+        mapping,
+        task.dt,
+        states=states,
+        inputs=model.input_names,
+        angles=model.angles,
+        steps=None if data else task.horizon,
+    )
+    if estimate:
+        found = smoothed(workspace, found, estimate)
     if chosen and found.late_s > task.dt / 2:
         raise GroundedError(
             f"{path}: the run starts {found.late_s:.2f} s before every state is known: the "
@@ -294,8 +285,8 @@ def _foreign(workspace: Folder, path: Path, candidate: str | None, data: bool) -
         start_inputs=found.start_inputs,
     )
     about = _about(workspace, chosen) | {"source": path.name, "source_sha256": _hashed(files)}
-    if estimated:
-        about["estimated"] = ",".join(estimated)
+    if set(states) < set(model.state_names):
+        about["estimated"] = ",".join(s for s in model.state_names if s not in states)
     if chosen:
         _check_candidate(workspace, path, chosen)
     encoded = _encode(workspace, trial, about, found.start_ns)
@@ -313,8 +304,7 @@ def _check_is_log(path: Path, files: Sequence[Path]) -> None:
 def _hashed(files: Sequence[Path]) -> str:
     """SHA-256 over a log's files, or over their hashes when there are several."""
     hashes = [hash_file(file) for file in files]
-    joined = "".join(hashes).encode()
-    return hashes[0] if len(hashes) == 1 else hashlib.sha256(joined).hexdigest()
+    return hashes[0] if len(hashes) == 1 else sha256("".join(hashes).encode())
 
 
 def _outstanding(workspace: Folder, path: Path) -> str:

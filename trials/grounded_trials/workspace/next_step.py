@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from grounded.diagnosis.report import Diagnosis, Made
 from grounded.errors import NextCommand
@@ -16,6 +15,7 @@ from grounded.search.standing import Standing
 from grounded_trials.wording import rendered
 from grounded_trials.workspace.diagnosing import diagnosable
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.proposing import for_robot
 
 PROPOSE = NextCommand("propose")
 DIAGNOSE = NextCommand("diagnose")
@@ -59,14 +59,6 @@ def another_trial(workspace: Folder, now: Standing) -> NextCommand:
     if not workspace.config.system.reachable:
         return for_robot(workspace, now.outstanding.id if waiting and now.outstanding else "best")
     return NextCommand("run", () if waiting else ("best",))
-
-
-def for_robot(workspace: Folder, candidate: str) -> NextCommand:
-    """What follows where people run the robot: export for it, or once that is done, its log."""
-    folders = (workspace.folder, Path())
-    if any(any(folder.glob(f"{candidate}.*")) for folder in folders):
-        return NextCommand("next", ("LOG",))
-    return NextCommand("export", (candidate, "--runner"))
 
 
 def after_diagnosis(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:

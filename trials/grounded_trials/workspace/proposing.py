@@ -95,11 +95,17 @@ def propose_in(workspace: Folder) -> Proposed:
     proposal = replace(proposal, notes=(*proposal.notes, *notes))
     if candidate is None:
         return Proposed(proposal, None, status_of(workspace, proposal.standing).then)
-    from grounded_trials.workspace.next_step import for_robot
-
     here = workspace.config.system.reachable
     then = NextCommand("run") if here else for_robot(workspace, candidate.id)
     return Proposed(proposal, workspace.candidate_path(candidate.id), then)
+
+
+def for_robot(workspace: Folder, candidate: str) -> NextCommand:
+    """What follows where people run the robot: export for it, or once that is done, its log."""
+    folders = (workspace.folder, Path())
+    if any(any(folder.glob(f"{candidate}.*")) for folder in folders):
+        return NextCommand("next", ("LOG",))
+    return NextCommand("export", (candidate, "--runner"))
 
 
 def _handed_over(workspace: Folder) -> tuple[Proposal, dict[str, str]]:
@@ -233,12 +239,21 @@ def _namesakes(workspace: Folder) -> list[str]:
     ]
 
 
-def candidate_named(workspace: Folder, name: str) -> str:
-    """The id of a candidate: itself, or that of the best one so far for `best`.
+def candidate_named(workspace: Folder, name: str | None) -> str:
+    """The id of a candidate: itself, that of the best so far for `best`, of the one that waits.
 
     Raises:
-        GroundedError: if there is no best one yet.
+        GroundedError: if there is no best one yet, or none waits.
     """
+    if name is None:
+        waiting = standing_in(workspace).outstanding
+        if waiting is None:
+            raise GroundedError(
+                "no candidate is waiting to be run: `propose` makes the next one, or says that "
+                "the search has ended; name a candidate to run it again",
+                NextCommand("propose"),
+            )
+        return waiting.id
     if name != "best":
         return name
     best = standing_in(workspace).incumbent

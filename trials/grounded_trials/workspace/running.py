@@ -64,18 +64,7 @@ def run_candidate(
     anyway: bool = False,
     warn: Callable[[str], None] | None = None,
 ) -> Ran:
-    """Runs a candidate once; its trial file is runs/cNNNN-K.mcap.
-
-    Args:
-        workspace: whose system runs it.
-        identity: c0003.
-        anyway: run it though it is void, see `handover`.
-        warn: told what is overridden, before the robot moves.
-
-    Raises:
-        GroundedError: if the candidate must not be run, no system is configured, it failed, or it
-            wrote no trial.
-    """
+    """Runs a candidate once; its trial file is runs/cNNNN-K.mcap. See `Workspace.run`."""
     system = workspace.config.system
     handed = checked_candidate(workspace, identity, anyway=anyway)
     if warn is not None:

@@ -18,7 +18,7 @@ from grounded.model import Model
 from grounded.task import Task
 from grounded.utility import Reward
 from grounded_trials.plain_file import open_file
-from grounded_trials.workspace.config import Config
+from grounded_trials.workspace.config import Config, set_target
 from grounded_trials.workspace.model_file import check_names
 
 
@@ -197,6 +197,18 @@ def target_arrays(
         return target, None
     columns = [given.get(name, np.zeros(horizon + 1))[:horizon] for name in inputs]
     return target, np.stack(columns, axis=1)
+
+
+def replace_target(config: Config, columns: Mapping[str, Array]) -> Path:
+    """Writes target.csv and its length to grounded.toml, see `Workspace.target`."""
+    name = config.task.target or "target.csv"
+    path = config.file.parent / name
+    if path.is_file():
+        path.replace(path.with_name(path.name + ".bak"))
+    write_target(path, config.task.dt, dict(columns))
+    weights = {state: round(w, 6) for state, w in equal_weights(columns).items()}
+    set_target(config.file, name, len(next(iter(columns.values()))) - 1, weights)
+    return path
 
 
 def equal_weights(columns: Mapping[str, Array]) -> dict[str, float]:

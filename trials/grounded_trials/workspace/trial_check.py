@@ -146,7 +146,7 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
     sent, past = np.clip(trial.inputs[:T], policy.low, policy.high), trial.start_inputs
     width = policy.high - policy.low
     states = np.stack([_earlier(trial.states[:T], back, policy.angles) for back in BACK])
-    free = commands(policy, states, policy.past if past is None else past)
+    free = policy.commands(states, policy.past if past is None else past)
     size = np.maximum(np.abs(free).max(axis=1), np.abs(sent).max(axis=0))
     size = size + np.where(np.isfinite(width), 0.1 * width, 1e-12)
     fits = {}
@@ -245,33 +245,6 @@ def what_ran(task: Task, trial: Trial, own: Candidate, others: Sequence[Candidat
     )
 
 
-def commands(policy: Policy, states: Array, past: Array) -> Array:
-    """What a policy sends on given states, (B, T, m).
-
-    It remembers what it sent itself: a gain on the last inputs would make any smooth log look
-    alike if they were the logged ones.
-
-    Args:
-        policy: at least T steps long.
-        states: (B, T, n), B runs.
-        past: (m,) the inputs held before the first step.
-    """
-    T, n = states.shape[1:]
-    asked: Array = np.repeat(policy.feedforward[None, :T], len(states), 0)
-    if policy.gain is None or policy.reference is None:
-        return np.clip(asked, policy.low, policy.high)
-    off = z_difference(states, policy.reference[:T, :n], policy.angles)
-    asked += np.einsum("tij,btj->bti", policy.gain[:T, :, :n], off)
-    memory, newest = policy.gain[:T, :, n:], np.cumsum([0, *policy.depths[:-1]])
-    asked -= np.einsum("tij,tj->ti", memory, policy.reference[:T, n:])
-    z = np.repeat(np.repeat(past, policy.depths)[None], len(states), 0)
-    for t in range(T):
-        asked[:, t] = np.clip(asked[:, t] + z @ memory[t].T, policy.low, policy.high)
-        z[:, 1:] = z[:, :-1].copy()
-        z[:, newest] = asked[:, t]
-    return asked
-
-
 def _latest(task: Task) -> int:
     """Steps by which a log of what the actuators got, not of what was sent, is late."""
     assert task.latency is not None
@@ -292,5 +265,5 @@ def _noise_sent(policy: Policy, states: Array, asked: Array) -> Array:
     change = z_difference(states[1:], states[:-1], policy.angles)
     power = (np.diff(change, axis=0) ** 2).mean(axis=0) / 6  # second differences of white noise
     noisy = states + np.random.default_rng(0).normal(size=states.shape) * np.sqrt(power)
-    squares: Array = (commands(policy, noisy[None], policy.past)[0] - asked) ** 2
+    squares: Array = (policy.commands(noisy[None], policy.past)[0] - asked) ** 2
     return squares

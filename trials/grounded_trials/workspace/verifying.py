@@ -38,7 +38,7 @@ def verify_in(workspace: Folder) -> Verified:
     """Checks every file of a workspace that a result rests on."""
     broken = [*workspace.store.verify()]
     known = noted(workspace.notes.read(broken))
-    broken += workspace.gone(known)
+    broken += known.gone(workspace.store)
     damaged = [Lost(str(one.path), one.reason) for one in broken]
     checked = len(workspace.store.list()) + len(workspace.notes.store.list())
     for path, check in (*_candidates(workspace, known), *_documents(workspace)):

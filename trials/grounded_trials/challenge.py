@@ -22,13 +22,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
+from grounded_trials.starting.examples import toml_of
 from grounded_trials.store.documents import read_document
 from grounded_trials.store.store import DIGITS, Store, write_atomically
 from grounded_trials.store.trial_file import trial_bytes
 from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.diagnosing import FILE as DIAGNOSIS
 from grounded_trials.workspace.diagnosing import diagnose_in
-from grounded_trials.workspace.examples import toml_of
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.task_file import write_target
 
@@ -51,6 +51,8 @@ def write_cases(
         GroundedError: if the folder holds a challenge already, or cases that are others, or the
             labels would lie inside it.
     """
+    from grounded.challenge import sealed
+
     if (folder / MANIFEST).exists():
         raise GroundedError(f"{folder} holds a challenge already: name another folder")
     if labels.resolve().is_relative_to(folder.resolve()):
@@ -67,8 +69,7 @@ def write_cases(
         trials = _write_case(case, folder / case.name)
         text = json.dumps(case.label, sort_keys=True)
         write_atomically(labels / f"{case.name}.json", text.encode())
-        label = hashlib.sha256(text.encode()).hexdigest()
-        entries[case.name] = {"label_sha256": label, "trials_sha256": trials}
+        entries[case.name] = {"label_sha256": sealed(case.label), "trials_sha256": trials}
         tick(number)
     document = json.dumps({"format": "grounded challenge 1", "cases": entries}, indent=1)
     write_atomically(folder / MANIFEST, document.encode())

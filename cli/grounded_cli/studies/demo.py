@@ -38,7 +38,7 @@ def command(name: str, folder: str | None, json_: bool) -> None:
     from grounded_trials import Workspace
     from grounded_trials.report.reporting import save_optimum
     from grounded_trials.report.three_lines import three_lines
-    from grounded_trials.workspace.examples import example
+    from grounded_trials.starting.examples import example
     from grounded_trials.workspace.running import optimum
 
     example(name)

@@ -62,7 +62,7 @@ def make_cases(
 ) -> None:
     """Write N workspaces of trials into DIR, and their labels, sealed by hash, elsewhere."""
     from grounded.challenge import make
-    from grounded_trials.workspace.challenge import write_cases
+    from grounded_trials.challenge import write_cases
 
     sealed = Path(labels or f"{folder}-labels")
     groups = _at_hand(names_in(systems))
@@ -106,7 +106,7 @@ def run_cases(
     json_: bool,
 ) -> None:
     """Diagnose the cases of DIR that have no diagnosis yet; a run that was cut off goes on."""
-    from grounded_trials.workspace.challenge import diagnose_cases, undiagnosed
+    from grounded_trials.challenge import diagnose_cases, undiagnosed
 
     families = [name for text in without for name in names_in(text)]
     waiting = undiagnosed(Path(folder), again=again)
@@ -134,7 +134,7 @@ def run_cases(
 def score(folder: str, labels: str | None, engine: Engine, json_: bool) -> None:
     """Open the labels and mark the diagnoses of DIR, beside an oracle that knows the effects."""
     from grounded.challenge import summary
-    from grounded_trials.workspace.challenge import score_cases
+    from grounded_trials.challenge import score_cases
 
     sealed = _labels(folder, labels)
     with bar("cases") as progress:

@@ -1,0 +1,84 @@
+"""The loop in one call: with a system that can be reached (`learn`), and at the track (`next`)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from grounded.errors import NextCommand
+from grounded.result import Result
+from grounded.search.candidate import Candidate
+from grounded_trials.workspace.exporting import Exported, export_candidate
+from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.ingest import Ingested, ingest_log
+from grounded_trials.workspace.proposing import (
+    Proposed,
+    Status,
+    propose_in,
+    standing_in,
+    status_of,
+)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class NextRun(Result):
+    """What a log gave, what to run next, and the file for the robot (None: the search ended)."""
+
+    taken: Ingested
+    proposed: Proposed
+    exported: Exported | None
+
+    def summary(self) -> str:
+        """What was taken in, and what comes next."""
+        name = None if self.proposed.candidate is None else self.proposed.candidate.id
+        return f"{self.taken.trial} is in; next {name or 'nothing: the search has ended'}"
+
+    def to_json(self) -> dict[str, Any]:
+        """The document of `next --json`: those of ingest, propose and export."""
+        return {
+            "trials": [self.taken.to_json()],
+            "propose": self.proposed.to_json(),
+            "export": None if self.exported is None else self.exported.to_json(),
+        }
+
+
+def learn_in(
+    workspace: Folder,
+    trials: int | None,
+    progress: Callable[[str], None] | None,
+    each: Callable[[Candidate, Ingested], None] | None,
+) -> Status:
+    """Proposes, runs and ingests until the search ends, see `Workspace.learn`."""
+    from grounded_trials.workspace.running import run_candidate
+
+    tell, done = progress or (lambda stage: None), 0
+    while trials is None or done < trials:
+        tell("planning")
+        proposed = propose_in(workspace)
+        made = proposed.candidate
+        if made is None:
+            return status_of(workspace, proposed.standing, proposed.proposal.notes)
+        tell(f"running {made.id}")
+        path = run_candidate(workspace, made.id).trial_file
+        found = ingest_log(workspace, path, made.id)
+        path.unlink()  # its bytes are in the store now
+        done += 1
+        if each is not None:
+            each(made, found)
+    status = status_of(workspace, standing_in(workspace))
+    goes_on = status.standing.phase == "propose"
+    return replace(status, then=NextCommand("learn")) if goes_on else status
+
+
+def next_in(workspace: Folder, log: Path, *, runner: bool) -> NextRun:
+    """Takes a log in, proposes, and exports for the robot, see `Workspace.next`."""
+    taken = ingest_log(workspace, log)
+    workspace.forget()
+    proposed, exported = propose_in(workspace), None
+    if proposed.candidate is not None:
+        name, form = proposed.candidate.id, "npz" if runner else "json"
+        file = workspace.folder / f"{name}.{form}"
+        exported = export_candidate(workspace, name, form, file, runner=runner)
+    return NextRun(taken, proposed, exported)
