@@ -233,3 +233,18 @@ def foreign_log(path, seed):
             log.message(state, k * 25_000_000, x)
             log.message(force, k * 25_000_000, u)
         log.finish()
+
+
+def test_the_candidate_after_a_false_crash_is_not_handed_out_once_that_is_discarded(tmp_path):
+    w = Workspace(make(tmp_path / "w").folder)
+    ran, _, _ = read_trial(w.run(w.propose().candidate.id).trial_file)
+    write_trial(tmp_path / "short.mcap", ran.until(20), {"kind": "trial", "task": w.task.hash})
+    assert w.ingest(tmp_path / "short.mcap", candidate="c0001").verdict == "crashed"
+    assert w.propose().candidate.caution == 1
+    w.discard("t0001")
+    again = w.propose()
+    assert again.candidate.id == "c0001" and "crash" not in again.proposal.standing.sentence
+    w.ingest(w.run("c0001").trial_file)
+    new = w.propose()
+    assert (new.candidate.id, new.candidate.base, new.candidate.caution) == ("c0003", "c0001", 0)
+    assert any("c0002" in note and "set aside" in note for note in new.proposal.notes)

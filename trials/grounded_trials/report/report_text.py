@@ -90,7 +90,7 @@ def _utilities(findings: Findings, table: Table, bars: Callable[[Sequence[float]
     if not history:
         return "utility\n  no candidate was proposed yet"
     shown, left = few(history, ROWS)
-    rows = [_candidate(t, t is history[-1]) for t in shown]
+    rows = [_candidate(t, findings.standing.verdict(t)) for t in shown]
     header = ("candidate", "iter.", "alpha", "predicted", "real", "+-", "trials", "")
     lines = ["utility", table(rows, header), *_wrapped(LEGEND, "  ")]
     if left:
@@ -111,7 +111,7 @@ def _utilities(findings: Findings, table: Table, bars: Callable[[Sequence[float]
     return "\n".join(lines)
 
 
-def _candidate(tried: Tried, last: bool) -> tuple[str, ...]:
+def _candidate(tried: Tried, verdict: str) -> tuple[str, ...]:
     error = standard_error(tried)
     return (
         tried.candidate.id,
@@ -121,7 +121,7 @@ def _candidate(tried: Tried, last: bool) -> tuple[str, ...]:
         figure(tried.utility),
         figure(error, 2),
         str(len(tried.trials)),
-        tried.verdict(last),
+        verdict,
     )
 
 

@@ -51,10 +51,12 @@ def warnings_about(workspace: Folder, trial: Trial) -> tuple[str, ...]:
     if not trial.candidate:
         return tuple(found)
     if whole.steps < task.horizon:
+        ends = f"after {whole.steps} of {task.horizon} steps ({whole.steps * trial.dt:.2f} s)"
         found.append(
-            f"the run ended after {whole.steps} of {task.horizon} steps "
-            f"({whole.steps * trial.dt:.2f} s): a failed candidate; its data stay usable for "
-            "fit and diagnose"
+            f"the run ended {ends}: a failed candidate; its data stay usable for fit and diagnose"
+            if whole.whole(task.horizon) is whole
+            else f"the log ends {ends}: the rest is judged as if the robot had gone on as it did "
+            "last; keep recording for a second after the run"
         )
     if whole.steps > task.horizon:
         found.append(
