@@ -14,6 +14,7 @@ frozen result whose `to_json()` is the document that the command prints with --j
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -224,17 +225,21 @@ class Workspace(Folder):
             columns: what each state is to do, (H + 1,) each, a row a control step; see `starting`.
         """
         from grounded_trials.workspace.config import set_target
-        from grounded_trials.workspace.task_file import equal_weights, write_target
+        from grounded_trials.workspace.task_file import equal_weights, read_target, write_target
 
         here = self._afresh()
         name = here.config.task.target or "target.csv"
         path = here.folder / name
+        before: dict[str, float] = {}
         if path.is_file():
+            with suppress(GroundedError, ValueError):  # one that can't be read is replaced
+                names, values = read_target(path)
+                before = equal_weights(dict(zip(names[1:], values.T[1:], strict=True)))
             path.replace(path.with_name(path.name + ".bak"))
         write_target(path, here.config.task.dt, dict(columns))
         weights = {state: round(w, 6) for state, w in equal_weights(columns).items()}
         steps = len(next(iter(columns.values()))) - 1
-        set_target(here.config.file, name, steps, weights)
+        set_target(here.config.file, name, steps, weights, before)
         self.forget()
         return path
 

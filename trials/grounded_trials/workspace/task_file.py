@@ -216,6 +216,7 @@ def target_text(dt: float, columns: dict[str, Array]) -> str:
     H = len(next(iter(columns.values())))
     lines = [",".join(["t", *columns])]
     for i in range(H):
-        row = [f"{i * dt:.10g}", *(f"{values[i]:.9g}" for values in columns.values())]
+        at = (round(float(values[i]), 12) + 0.0 for values in columns.values())  # no -0
+        row = [f"{i * dt:.10g}", *(f"{value:.9g}" for value in at)]
         lines.append(",".join(row))
     return "\n".join(lines) + "\n"
