@@ -130,7 +130,9 @@ def settled(
     own, changed = dict(params), []
     for effect in effects:
         names = {q: param_name(str(effect["name"]), q) for q in effect}
-        changed.append(dict(effect) | {q: own.pop(name) for q, name in names.items() if name in own})
+        changed.append(
+            dict(effect) | {q: own.pop(name) for q, name in names.items() if name in own}
+        )
     return own, changed
 
 
