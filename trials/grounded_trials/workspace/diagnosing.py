@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from grounded.engine import Engine
     from grounded.frozen import Array
     from grounded.instruments.finding import Finding
+    from grounded.policy import Policy
+    from grounded.search.candidate import Candidate
     from grounded.task import Task
     from grounded.trial import Trial
     from grounded_trials.workspace.folder import Folder
@@ -164,9 +166,6 @@ def _probe(
     if found.no_cause:
         return "", ""
     from grounded.diagnosis.excitation import probe
-    from grounded.rollout import simulate
-    from grounded.search.candidate import Candidate
-    from grounded.search.improve import model_fingerprint
     from grounded.search.safety import objections, spread
     from grounded_trials.workspace.handover import outside_limits
     from grounded_trials.workspace.proposing import standing_in
@@ -176,39 +175,52 @@ def _probe(
     if best is None:
         return "", ""
     planner = workspace.planner
-    task, strays = planner.plan, spread(planner.task, now.history)
+    task, strays = planner.task, spread(planner.task, now.history)
     own = best.candidate.policy
     low, high = np.maximum(own.low, task.low), np.minimum(own.high, task.high)
-    base = planner.widened(replace(own, low=low, high=high))
-    inside = _narrower(task, strays.max(axis=0))
-    made = None if inside is None else probe(inside, base, found, trials, library)
-    if made is None and found.indistinguishable:
-        return "", (
-            f"{found.next_trial}; no candidate for it is offered: none of those tried stays inside "
-            "[safety] by as much as runs have strayed"
-        )
-    if made is None or not (write or found.indistinguishable):
-        return "", made.sentence if made is not None else ""
-    policy = planner.narrowed(made.policy)
+    base, offer = (
+        planner.widened(replace(own, low=low, high=high)),
+        write or found.indistinguishable,
+    )
+    why = "none of those tried stays inside [safety]"
+    for room in (0 * strays, strays):
+        inside = _narrower(planner.plan, room.max(axis=0))
+        made = None if inside is None else probe(inside, base, found, trials, library)
+        if made is None:
+            break
+        if not offer:
+            return "", made.sentence
+        candidate = _candidate_of(workspace, planner.narrowed(made.policy), best.candidate.id)
+        reasons = (*outside_limits(task, candidate.policy), *objections(task, candidate, strays))
+        if not reasons:
+            while (saved := workspace.save_candidate(candidate, kind="probe")) is None:
+                workspace.forget_trials()  # somebody took the name
+                candidate = replace(candidate, id=workspace.next_id())
+            return saved.id, made.sentence
+        why = "; ".join(reasons).replace(candidate.id, "the best")
+    return "", f"{found.next_trial}; no candidate for it is offered: {why}" * bool(offer)
+
+
+def _candidate_of(workspace: Folder, policy: Policy, base: str) -> Candidate:
+    """A probe as the model predicts it, not stored yet."""
+    from grounded.rollout import simulate
+    from grounded.search.candidate import Candidate
+    from grounded.search.improve import model_fingerprint
+
+    planner = workspace.planner
+    task = planner.plan
     predicted = simulate(task.problem(exact=True), planner.widened(policy))
-    candidate = Candidate(
+    return Candidate(
         id=workspace.next_id(),
         policy=policy,
         iteration=0,
         alpha=1.0,
-        base=best.candidate.id,
+        base=base,
         model=model_fingerprint(task),
         predicted_states=predicted.states[:, : planner.task.model.n],
         predicted_inputs=predicted.inputs,
         predicted_utility=predicted.utility,
     )
-    reasons = (*outside_limits(planner.task, policy), *objections(planner.task, candidate, strays))
-    if reasons:
-        return "", f"{made.sentence}; no candidate for it is offered: {'; '.join(reasons)}"
-    while (saved := workspace.save_candidate(candidate, kind="probe")) is None:
-        workspace.forget_trials()  # somebody took the name
-        candidate = replace(candidate, id=workspace.next_id())
-    return saved.id, made.sentence
 
 
 def _narrower(task: Task, strays: Array) -> Task | None:
