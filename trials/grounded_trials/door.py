@@ -199,17 +199,20 @@ class Workspace(Folder):
         ran = candidate and candidate_named(here, candidate)
         return ingest_log(here, Path(path), ran, data=data)
 
-    def next(self, log: str | Path, *, runner: bool = True) -> NextRun:
+    def next(
+        self, log: str | Path, *, candidate: str | None = None, runner: bool = True
+    ) -> NextRun:
         """The loop at the track in one call: takes a log in, proposes, exports for the robot.
 
         Args:
-            log: what came back of the outstanding candidate.
+            log: what came back.
+            candidate: which one was run; None: the outstanding one.
             runner: write the program that runs the candidate beside it, see `export`.
         """
         from grounded_trials.workspace.exporting import export_candidate
         from grounded_trials.workspace.proposing import propose_in
 
-        taken = self.ingest(log)
+        taken = self.ingest(log, candidate=candidate)
         proposed, exported = propose_in(self._afresh()), None
         if proposed.candidate is not None:
             name = proposed.candidate.id
