@@ -37,7 +37,7 @@ from grounded_trials.wording import (
 )
 from grounded_trials.workspace.next_step import DIAGNOSE
 
-ROWS = 12  # candidates in the table; the others are counted
+ROWS, SPARED = 12, 3  # candidates in the table; more than so many others are counted
 ITERATIONS = 5  # of the bias
 EFFECTS = 5
 VALUES = 34  # columns for an effect's parameters
@@ -89,7 +89,7 @@ def _utilities(findings: Findings, table: Table, bars: Callable[[Sequence[float]
     history = findings.history
     if not history:
         return "utility\n  no candidate was proposed yet"
-    shown, left = few(history, ROWS)
+    shown, left = few(history, ROWS if len(history) > ROWS + SPARED else len(history))
     rows = [_candidate(t, findings.standing.verdict(t)) for t in shown]
     header = ("candidate", "iter.", "alpha", "predicted", "real", "+-", "trials", "")
     lines = ["utility", table(rows, header), *_wrapped(LEGEND, "  ")]
