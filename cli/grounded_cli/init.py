@@ -82,8 +82,8 @@ def command(
 
         asked = None if yes or json_ or not sys.stdin.isatty() else _ask
         with progress(f"reading {log}"):
-            chosen = {"model": model, "kind": kind, "inputs": names_in(inputs)}
-            begun = begin(Path(folder), log, dt=dt, ask=asked, **chosen)
+            named = names_in(inputs)
+            begun = begin(Path(folder), log, model=model, kind=kind, dt=dt, inputs=named, ask=asked)
         show_json(begun.to_json()) if json_ else _tell(begun)
     else:
         _example(folder, str(name), json_)
