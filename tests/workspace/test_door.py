@@ -168,9 +168,14 @@ effects = [
 
     w.fit(apply=True)
     assert w.base_model.params["mass"].value == pytest.approx(1.4, abs=0.1)
+    before = w.planner.plan.latency
     kept = {effect["name"]: effect for effect in w.config.model.effects}
     assert kept["delay:force"]["d"] == 0.02
     assert kept["dead_zone:force"]["c"] == pytest.approx(0.6, abs=0.1)
     assert kept["first_order_lag:force"]["tau"] == pytest.approx(
         found.params["first_order_lag_force_tau"].value
     )
+
+    w.fit(["mass"], latency=True, apply=True)  # the whole delay: it is not counted twice
+    assert "delay:force" not in {effect["name"] for effect in w.config.model.effects}
+    assert w.planner.plan.latency == pytest.approx(before, abs=0.02)
