@@ -15,7 +15,8 @@ is raised; what can't be used is left out, and `runner.blind` counts it:
     off for that call: the feed-forward alone is sent;
   - a time that runs backwards is taken as the latest one; one that is not a number sends the last
     input again;
-  - after the last step the input that was held before the start is sent, inside the limits.
+  - after the last step the input that was held before the start is sent, inside the limits;
+    `done` is true then. Keep recording for a second more: the last state is part of the run.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from zipfile import ZipFile
 
 import numpy as np
 
+EARLY = 0.1  # of a step: what a timer may be early by at the end of the run
 LIMIT = 2**28  # [bytes] of an exported policy when decompressed
 
 FORMAT = "grounded-policy-1"
@@ -60,7 +62,7 @@ class Runner:
         self._z = np.empty(self._n + len(columns))
 
     def done(self, t: float) -> bool:
-        """Whether t [s] since the start is past the last control step."""
+        """Whether t [s] since the start is the end of the last control step."""
         return self._step(t) >= self._H
 
     def action(self, t: float, s: Any) -> Any:
@@ -90,14 +92,18 @@ class Runner:
         return u
 
     def _step(self, t: float) -> int:
-        """The control step nearest to t; -1 where t is not a number, H where it is past the end."""
+        """The control step nearest to t; -1 where t is not a number, H where it is past the end.
+
+        The last one lasts to the end of the horizon.
+        """
         try:
             where = float(t) / self.policy.dt + 0.5
         except (TypeError, ValueError):
             return -1
         if where != where:
             return -1
-        return int(min(max(where, 0.0), float(self._H)))
+        last = self._H if where - 0.5 >= self._H - EARLY else self._H - 1
+        return int(min(max(where, 0.0), float(last)))
 
     def _correction(self, step: int, base: int, s: Any) -> Any:
         """K_t (z - zbar), (m,); None where the state can't be used."""

@@ -196,7 +196,7 @@ class Task:
 
         What a log holds after the horizon is not judged.
         """
-        trial = trial.until(self.horizon)
+        trial = trial.whole(self.horizon)
         T = trial.steps
         assert self.input_target is not None
         error = self.model.difference(trial.states, self.target[: T + 1])
@@ -204,8 +204,12 @@ class Task:
         return step_rewards(self.reward, error, trial.inputs, self.input_target[:T], past)
 
     def utility(self, trial: Trial) -> float:
-        """U of a real trial (section 2); -inf for one that ended early or is not finite."""
-        return trial.worth(f"{self.hash}{self.model.angles}", lambda: self._utility(trial))
+        """U of a real trial (section 2); -inf for one that ended early or is not finite.
+
+        A run that was not recorded for its last step or two did not end early: `Trial.whole`.
+        """
+        judge = lambda: self._utility(trial.whole(self.horizon))  # noqa: E731
+        return trial.worth(f"{self.hash}{self.model.angles}whole", judge)
 
     def _utility(self, trial: Trial) -> float:
         if trial.steps < self.horizon or trial.finite_steps < self.horizon:

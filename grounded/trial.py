@@ -3,7 +3,8 @@
 Samples get lost: a camera that misses the car for half a second loses states, not the trial. Short
 gaps are interpolated (`interpolate_gaps`), and with them the bias (2 % lost samples are harmless);
 long ones end the trial. Inputs are never invented: a trial ends before its first unknown
-input.
+input. A recording that stops a step or two before the end of the run is judged as if it had gone on
+(`Trial.whole`).
 """
 
 from __future__ import annotations
@@ -18,6 +19,9 @@ from grounded.errors import GroundedError
 from grounded.frozen import Array, readonly, wrapped
 
 MAX_GAP_S = 1.0  # a longer gap ends a trial
+LAST = 2  # steps that may be missing at the end of a run,
+ENOUGH = 10  # if it has this many times as many
+RECENT = 4  # steps whose mean rate goes on there
 HUGE = 1e100  # from here on a number is as good as infinite: squares and products must be numbers
 
 
@@ -95,6 +99,25 @@ class Trial:
     def repeats(self, other: Trial) -> bool:
         """Whether the other has the very same states."""
         return np.array_equal(self.states, other.states)
+
+    def whole(self, steps: int) -> Trial:
+        """The trial up to so many steps; one that ends a step or two before goes on to there.
+
+        The input is held meanwhile, and the states move as they did in the last steps.
+        """
+        missing = steps - self.steps
+        if not (0 < missing <= LAST and self.steps >= ENOUGH * missing):
+            return self.until(steps)
+        if self.finite_steps < self.steps:
+            return self
+        rate = (self.states[-1] - self.states[-1 - RECENT]) / RECENT
+        ahead = self.states[-1] + np.arange(1, missing + 1)[:, None] * rate
+        held = np.repeat(self.inputs[-1:], missing, axis=0)
+        return replace(
+            self,
+            states=np.concatenate([self.states, ahead]),
+            inputs=np.concatenate([self.inputs, held]),
+        )
 
     def until(self, steps: int) -> Trial:
         """The trial up to so many steps; a log may go on after the horizon."""

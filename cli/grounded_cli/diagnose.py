@@ -105,23 +105,37 @@ def command(
     if json_:
         show_json(found.to_json())
     else:
+        from grounded_trials.workspace.diagnosing import probe_command
+
         params = workspace.base_model.params
-        _tell(found, {name: param.value for name, param in params.items()})
+        run = probe_command(workspace, found.probe) if found.probe else None
+        _tell(found, {name: param.value for name, param in params.items()}, run)
         show(f"\n{next_line(_follow(workspace, found))}")
 
 
 def _follow(workspace: Workspace, found: Diagnosis) -> NextCommand:
     """What follows: adopt what was claimed, run another trial, or see the whole."""
-    from grounded_trials.workspace.next_step import after_diagnosis, another_trial
+    from grounded_trials.workspace.diagnosing import probe_command
+    from grounded_trials.workspace.next_step import (
+        after_diagnosis,
+        another_trial,
+        next_command,
+        usable_ids,
+    )
     from grounded_trials.workspace.proposing import standing_in
 
     if found.no_cause:
         return another_trial(workspace, standing_in(workspace, ahead=True))
-    probe = NextCommand("run", (found.probe,)) if found.probe else None
-    return after_diagnosis(workspace, found) or probe or NextCommand("report", ("--html",))
+    if follow := after_diagnosis(workspace, found):
+        return follow
+    if found.probe:
+        return probe_command(workspace, found.probe)
+    if found.kind == "none" and workspace.config.task.target:
+        return next_command(workspace, standing_in(workspace), found, usable_ids(workspace))
+    return NextCommand("report", ("--html",))
 
 
-def _tell(found: Diagnosis, before: dict[str, float]) -> None:
+def _tell(found: Diagnosis, before: dict[str, float], run: NextCommand | None) -> None:
     from grounded_trials.report.diagnosis_words import (
         agreement_lines,
         correction_line,
@@ -146,8 +160,9 @@ def _tell(found: Diagnosis, before: dict[str, float]) -> None:
         show(field("correction", correction_line(found.correction)))
     for title, text in agreement_lines(found):
         show(field(title, text))
-    run = NextCommand("run", (found.probe,))
-    text = found.next_trial.replace(rendered(run), typed(run))
+    text = found.next_trial
+    if run is not None:
+        text = text.replace(rendered(run), typed(run))
     show("\n" + field("next trial", text))
 
 

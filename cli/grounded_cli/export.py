@@ -28,7 +28,12 @@ USES = {
     type=click.Choice(list(USES)),
     help="Default: as FILE is named, else json. npz is what `grounded.policy.load` reads.",
 )
-@click.option("-o", "--output", metavar="FILE", help="Default: ID.FORMAT in the current folder.")
+@click.option(
+    "-o",
+    "--output",
+    metavar="FILE",
+    help="Default: ID.FORMAT in the current folder, with -C DIR too; `next` writes into DIR.",
+)
 @click.option(
     "--runner",
     is_flag=True,

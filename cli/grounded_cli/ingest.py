@@ -57,9 +57,12 @@ def command(files: tuple[str, ...], candidate: str | None, data: bool, json_: bo
 
 @click.command("next")
 @click.argument("log", metavar="LOG")
+@click.option(
+    "--candidate", metavar="ID", shell_complete=complete.candidates, help="Which candidate was run."
+)
 @in_workspace
 @as_json
-def following(log: str, json_: bool) -> None:
+def following(log: str, candidate: str | None, json_: bool) -> None:
     """Ingest what came back, say the verdict, propose, and export for the robot.
 
     The same as `ingest LOG`, `propose` and `export ID --runner` one after the other; the candidate
@@ -69,7 +72,7 @@ def following(log: str, json_: bool) -> None:
 
     workspace = open_workspace()
     with progress(f"reading {log} and planning"):
-        done = workspace.next(log)
+        done = workspace.next(log, candidate=candidate)
     if json_:
         show_json(done.to_json())
         return

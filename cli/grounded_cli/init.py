@@ -10,7 +10,7 @@ import click
 
 from grounded_cli import completion as complete
 from grounded_cli.options import as_json, next_line
-from grounded_cli.terminal import field, progress, remark, sentence, show, show_json
+from grounded_cli.terminal import field, names_in, progress, remark, sentence, show, show_json
 
 if TYPE_CHECKING:
     from grounded_trials.logs.inspect_guess import Guess
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 @click.option("--model", metavar="FILE", help="Your model.py, beside --from or --blank.")
 @click.option("--blank", is_flag=True, help="No log yet: a workspace of --model, to fill in.")
 @click.option("--kind", help="Of the model skeleton: car, rover, drone, arm, pendulum, generic.")
+@click.option("--inputs", metavar="A,B,...", help="Columns that are inputs (kind generic).")
 @click.option(
     "--dt",
     type=click.FloatRange(min=0, min_open=True),
@@ -45,6 +46,7 @@ def command(
     model: str | None,
     blank: bool,
     kind: str | None,
+    inputs: str | None,
     dt: float | None,
     yes: bool,
     name: str | None,
@@ -58,6 +60,7 @@ def command(
     writes drive.py, the robot's program. --example NAME takes an example, whose real.py stands in
     for your robot.
     """
+    sorts = (("--kind", kind), ("--inputs", inputs), ("--yes", yes))
     if list_:
         _list(json_)
     elif folder is None or [log is not None, name is not None, blank].count(True) != 1:
@@ -66,7 +69,7 @@ def command(
             "init DIR --example car-turn (`grounded init --list` names them), or a model alone, "
             "grounded init DIR --blank --model model.py"
         )
-    elif foreign := [key for key, given in (("--kind", kind), ("--yes", yes)) if given and not log]:
+    elif foreign := [key for key, given in sorts if given and not log]:
         raise click.UsageError(f"{foreign[0]} belongs to --from LOG")
     elif name is not None and (model or dt):
         raise click.UsageError("an example brings its own model and dt: edit its files afterwards")
@@ -79,7 +82,8 @@ def command(
 
         asked = None if yes or json_ or not sys.stdin.isatty() else _ask
         with progress(f"reading {log}"):
-            begun = begin(Path(folder), log, model=model, kind=kind, dt=dt, ask=asked)
+            named = names_in(inputs)
+            begun = begin(Path(folder), log, model=model, kind=kind, dt=dt, inputs=named, ask=asked)
         show_json(begun.to_json()) if json_ else _tell(begun)
     else:
         _example(folder, str(name), json_)
@@ -94,7 +98,8 @@ def _ask(guess: Guess) -> str:
     for i, path in enumerate(paths, start=1):
         show(f"  {i}  {path}")
     first = "1" if guess.path else ""
-    answer = click.prompt("  a number, another message path, or - for none", default=first or "-")
+    none = "- for none" if guess.path else "- for none (model.py must change then, or see --inputs)"
+    answer = click.prompt(f"  a number, another message path, or {none}", default=first or "-")
     if answer == "-":
         return ""
     return paths[int(answer) - 1] if answer.isdigit() and 0 < int(answer) <= len(paths) else answer
@@ -117,6 +122,8 @@ def _tell(begun: Begun) -> None:
     for note in begun.notes:
         remark("note", note)
     look = "; look at what is UNSURE in its [log]" if begun.unsure else ""
+    if begun.then == begun.look:
+        look = "; map its inputs in [log] to numbers of the log"
     show()
     sentence(f"read {begun.workspace}/model.py and grounded.toml{look}")
     show(next_line(begun.then, begun.workspace))

@@ -46,7 +46,8 @@ def command(log: str, json_: bool) -> None:
     for one in report.remarks:
         remark("note", one)
     if found.log_table:
-        show(f"\n# for grounded.toml; look at what is marked unsure\n{found.log_table}")
+        look = "; look at what is marked unsure" if "# unsure" in found.log_table else ""
+        show(f"\n# for grounded.toml{look}\n{found.log_table}")
     else:
         show()
     show(_next(found))

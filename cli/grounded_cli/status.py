@@ -65,8 +65,7 @@ def summary(status: Status) -> str:
     standing, lines = status.standing, []
     if standing.history:
         header = ("id", "iter", "alpha", "damp", "predicted", "utility", "+-", "runs", "")
-        last = standing.history[-1]
-        lines.append(table([_row(t, t is last) for t in standing.history], header))
+        lines.append(table([_row(t, standing.verdict(t)) for t in standing.history], header))
         lines += wrapped(LEGEND, "  ", "  ")
         bars = sparkline([t.utility for t in standing.history if t.utilities])
         lines.append("\n" + field("utility", bars))
@@ -93,7 +92,7 @@ def _gained(standing: Standing) -> str:
     return f", {gain:.1f} % better than the model's own policy"
 
 
-def _row(tried: Tried, last: bool) -> tuple[str, ...]:
+def _row(tried: Tried, verdict: str) -> tuple[str, ...]:
     error = tried.standard_error
     return (
         tried.candidate.id,
@@ -104,5 +103,5 @@ def _row(tried: Tried, last: bool) -> tuple[str, ...]:
         number(tried.utility),
         number(error, 2),
         str(len(tried.trials)),
-        tried.verdict(last),
+        verdict,
     )

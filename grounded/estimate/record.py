@@ -40,7 +40,8 @@ class Record:
         command_times: when each command was sent, ascending [s], (M,).
         commands: held from its time on, (M, m).
         past: held before the first command, (m,); None: zero.
-        start: mean of the first state where no channel measures it, (n,); None: zero.
+        start: mean of the first state where no channel measures it, (n,), or of the state at each
+            of the times, (T + 1, n), so that a part of the record knows its own; None: zero.
         start_std: its standard deviation, (n,); None: 1 in the state's unit.
         id: of the trial it came from.
 
@@ -204,7 +205,11 @@ def cut(record: Record, seconds: float) -> list[Record]:
 def part(record: Record, first: int, last: int) -> Record:
     """Rows first .. last of a record; the commands stay whole, so that latency needs no start."""
     rows = slice(first, last + 1)
-    start = record.start if first == 0 else None
+    start = record.start
+    if start is not None and start.ndim == 2:
+        start = start[rows]
+    elif first > 0:
+        start = None
     return replace(record, times=record.times[rows], measured=record.measured[rows], start=start)
 
 
@@ -304,7 +309,7 @@ def _start(
     A state that is measured starts at its first sample, with that sample's noise; the sample is
     then not used a second time.
     """
-    mean = np.zeros(n) if record.start is None else np.array(record.start)
+    mean = np.zeros(n) if record.start is None else np.array(np.atleast_2d(record.start)[0])
     given = np.full(n, START_STD) if record.start_std is None else np.array(record.start_std)
     var, channel = given**2, np.full(n, -1)
     for c, i in enumerate(measurement.states):

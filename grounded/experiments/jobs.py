@@ -201,10 +201,10 @@ def improvement(before: float, after: float) -> float:
     return (after - before) / abs(before)
 
 
-def mean_text(values: Sequence[float], of_error: str = ".1%") -> str:
+def mean_text(values: Sequence[float], digits: str = ".1%", of_error: str = ".1%") -> str:
     """`76.1% (±0.4%)`; the mean alone where there is one value."""
     mean, se = mean_se(values)
-    return f"{mean:.1%}" if len(values) < 2 else f"{mean:.1%} (±{se:{of_error}})"
+    return f"{mean:{digits}}" if len(values) < 2 else f"{mean:{digits}} (±{se:{of_error}})"
 
 
 def mean_se(values: Sequence[float]) -> tuple[float, float]:

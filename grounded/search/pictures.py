@@ -75,7 +75,7 @@ def few(history: Sequence[Tried], most: int) -> tuple[list[Tried], int]:
 def _utility(
     now: Standing, tried: list[Tried], number: dict[str, int], optimum: float | None, noise: float
 ) -> Panel:
-    dots = [d for t in tried for d in _dots(t, number[t.candidate.id], t is now.history[-1])]
+    dots = [d for t in tried for d in _dots(t, number[t.candidate.id], now.verdict(t))]
     rules, bands = [], []
     values = [d.y for d in dots if math.isfinite(d.y)]
     if optimum is not None:
@@ -112,10 +112,9 @@ def _near(whole: Panel) -> Panel:
     return replace(whole, title=title, dots=dots, loss=False, y_range=bounds)
 
 
-def _dots(tried: Tried, at: int, last: bool) -> list[Dot]:
+def _dots(tried: Tried, at: int, became: str) -> list[Dot]:
     candidate = tried.candidate
     real = _said(tried.utility)
-    became = tried.verdict(last)
     note = (
         f"{candidate.id}, iteration {candidate.iteration}, α = {candidate.alpha:g}\n"
         f"utility {real}, predicted {_said(candidate.predicted_utility)}\n{became}"

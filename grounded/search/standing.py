@@ -158,6 +158,10 @@ class Standing(Result):
             return {"propose": "going on", "await-trial": "waiting"}.get(self.phase, self.phase)
         return self.ending
 
+    def verdict(self, tried: Tried) -> str:
+        """What became of a candidate; one that will not get its trials any more has none."""
+        return tried.verdict(tried.candidate is (self.outstanding or self.history[-1].candidate))
+
     def summary(self) -> str:
         """Its phase and the best candidate."""
         best = self.incumbent
@@ -166,7 +170,7 @@ class Standing(Result):
 
     def to_json(self) -> dict[str, Any]:
         """The document of `grounded status --json`, with the whole history."""
-        best, last = self.incumbent, self.history[-1] if self.history else None
+        best = self.incumbent
         return document(
             phase=self.phase,
             iteration=self.iteration,
@@ -178,7 +182,7 @@ class Standing(Result):
             sentence=self.sentence,
             ending=self.ending or None,
             certainty=last_improvement(self.history),
-            history=[t.to_json() | {"verdict": t.verdict(t is last)} for t in self.history],
+            history=[t.to_json() | {"verdict": self.verdict(t)} for t in self.history],
         )
 
     def figures(self) -> Sequence[Figure]:
@@ -304,7 +308,7 @@ def wild(tried: Tried) -> bool:
 
 def _awaited(now: Standing, options: SearchOptions, model: str) -> Standing | None:
     """The same, waiting for a trial; None where every candidate has its trials."""
-    last = now.history[-1] if now.history else None
+    waiting = _waiting(now, model)
     doubt = next((t for t in now.history if t.in_doubt), None)
     if doubt is not None and now.incumbent is not None:
         made, missing = now.incumbent.candidate, 1
@@ -312,12 +316,29 @@ def _awaited(now: Standing, options: SearchOptions, model: str) -> Standing | No
             f"{doubt.candidate.id} lost to {made.id} by less than luck may do: {made.id} is "
             "waiting for another trial"
         )
-    elif last is not None and last.accepted is None and last.candidate.model == model:
-        made, missing = last.candidate, options.repeats - len(last.trials)
+    elif waiting is not None:
+        made, missing = waiting.candidate, options.repeats - len(waiting.trials)
         sentence = f"{made.id} is waiting for {missing} trial{'s' * (missing > 1)}"
     else:
         return None
     return replace(now, phase="await-trial", outstanding=made, missing=missing, sentence=sentence)
+
+
+def _waiting(now: Standing, model: str) -> Tried | None:
+    """The latest candidate without its trials whose reason still stands.
+
+    A trial may be set aside after a candidate was made of it: the crash for which a first policy
+    is gentle, or the run that a step starts from.
+    """
+    undecided = {t.candidate.id for t in now.history if t.accepted is None}
+    failed = sum(t.accepted is False for t in now.history)
+    for tried in reversed(now.history):
+        made = tried.candidate
+        if tried.accepted is not None or made.model != model:
+            return None
+        if made.base not in undecided and (made.base or made.caution <= failed):
+            return tried
+    return None
 
 
 def losers_of(
@@ -363,7 +384,7 @@ def _judge(
     spent = sum(t.candidate in ids for t in trials) >= options.max_trials
     by_name: dict[str, list[Trial]] = {}
     for trial in trials:
-        by_name.setdefault(trial.candidate, []).append(trial.until(task.horizon))
+        by_name.setdefault(trial.candidate, []).append(trial.whole(task.horizon))
     for candidate in candidates:
         own = tuple(by_name.get(candidate.id, ()))
         utilities = tuple(task.utility(t) for t in own)

@@ -13,6 +13,7 @@ from grounded_trials.logs.inspect_evidence import velocities
 from grounded_trials.starting.begin import begin
 from grounded_trials.starting.kinds import KINDS
 from grounded_trials.starting.shapes import Drive, path_target
+from grounded_trials.workspace.task_file import read_target
 from ros_bags import arm_bag, car_bag
 from shared_data import data
 
@@ -168,7 +169,127 @@ def test_what_only_the_log_names_is_never_sure(tmp_path):
     assert by["v"] == "/run00.vel_encoder" and by["x"] == by["psi"] == ""
 
 
+@pytest.fixture
+def wheels(tmp_path):
+    """A table of a robot on two wheels, its columns with units; psi wraps."""
+    rng, t = np.random.default_rng(0), 0.02 * np.arange(1500)
+    left, right = (np.repeat(rng.uniform(0.1, 0.6, 60), 25) for _ in range(2))
+    v, omega, pwm = np.zeros(len(t)), np.zeros(len(t)), (left + right) / 2
+    for k in range(1, len(t)):
+        v[k] = v[k - 1] + 0.1 * (pwm[k - 1] - v[k - 1])
+        omega[k] = omega[k - 1] + 0.1 * (4 * (right - left)[k - 1] + 1 - omega[k - 1])
+    psi = 0.02 * np.cumsum(omega)
+    x, y = 0.02 * np.cumsum(v * np.cos(psi)), 0.02 * np.cumsum(v * np.sin(psi))
+    seen = np.column_stack([x, y, psi, v, omega]) + rng.normal(0, 0.002, (len(t), 5))
+    seen[:, 2] = np.mod(seen[:, 2] + np.pi, 2 * np.pi) - np.pi
+    assert np.abs(np.diff(seen[:, 2])).max() > 6
+
+    def write(names="left,right"):
+        head = f"t,x [m],y [m],psi [rad],v (m/s),omega [rad/s],{names}"
+        rows = np.column_stack([t, seen, left, right])
+        path = tmp_path / "drive.csv"
+        np.savetxt(path, rows, "%.5f", ",", header=head, comments="")
+        return path
+
+    return write
+
+
+TWO_WHEELS = """import numpy as np
+from grounded import Model, Param
+def f(s, a, p):
+    return {"v": p.k * (a.left + a.right - s.v), "omega": p.k * (a.right - a.left - s.omega),
+            "x": s.v * np.cos(s.psi), "y": s.v * np.sin(s.psi), "psi": s.omega}
+model = Model(
+    states={"v": "m/s", "omega": "rad/s", "x": "m", "y": "m", "psi": "rad"},
+    inputs={"left": "1", "right": "1"}, params={"k": Param(5, "1/s", 1, 20)}, angles=("psi",),
+    roles={"position": ("x", "y"), "heading": "psi", "speed": "v", "heading_rate": "omega"},
+    derivative=f)
+"""
+
+
+@pytest.mark.parametrize("turn", [1, 180 / np.pi])
+def test_a_heading_that_wraps_has_a_derivative(wheels, tmp_path, turn):
+    (tmp_path / "model.py").write_text(TWO_WHEELS)
+    log = wheels()
+    rows = np.loadtxt(log, delimiter=",", skiprows=1)
+    rows[:, 3] *= turn
+    head = log.read_text().splitlines()[0].replace(" [rad]", "")
+    np.savetxt(log, rows, "%.5f", ",", header=head, comments="")
+    found = begin(tmp_path / "w", log, model=tmp_path / "model.py")
+    by = {guess.name: guess for guess in found.states}
+    assert by["omega"].sure and by["psi"].scale == pytest.approx(1 / turn)
+    assert "your model" in (tmp_path / "w/grounded.toml").read_text().splitlines()[0]
+
+
+@pytest.mark.parametrize("names", ["left,right", "u_left,u_right", "port,starboard"])
+def test_inputs_are_known_by_their_name_or_by_being_held(wheels, tmp_path, names):
+    found = begin(tmp_path / "w", wheels(names))
+    assert [guess.name for guess in found.inputs] == names.split(",")
+    model = Workspace(tmp_path / "w").base_model
+    units = {"x": "m", "y": "m", "psi": "rad", "v": "m/s", "omega": "rad/s"}
+    assert dict(model.states) == units and model.angles == ("psi",)
+    command = found.then
+    assert grounded("-C", tmp_path / "w", command.verb, *command.arguments).code == 0
+    assert [t.trial.steps > 1000 for t in Workspace(tmp_path / "w").trials()] == [True]
+
+
+def test_what_is_left_out_is_said_and_inputs_can_be_named(wheels, tmp_path):
+    log = wheels("aa,bb")
+    rows = np.loadtxt(log, delimiter=",", skiprows=1)
+    rows[:, 6:] += np.random.default_rng(0).normal(0, 1e-3, (len(rows), 2))  # nothing is held
+    np.savetxt(log, rows, "%.5f", ",", header=log.read_text().splitlines()[0], comments="")
+    found = begin(tmp_path / "w", log)
+    assert any("bb" in note for note in found.notes)
+    assert any("--inputs" in note for note in found.notes)
+    assert grounded("-C", tmp_path / "w", found.then.verb, *found.then.arguments).code == 0
+    done = grounded("init", tmp_path / "v", "--from", log, "--inputs", "aa,bb", "--json").json
+    assert [one["name"] for one in done["signals"]][-2:] == ["aa", "bb"] and not done["notes"]
+    wrong = grounded("init", tmp_path / "u", "--from", log, "--inputs", "aa,cc")
+    assert wrong.code == 1 and "cc" in wrong.err and not (tmp_path / "u").exists()
+
+
+def test_a_person_has_the_numbers_of_the_log_to_choose_from(wheels, tmp_path):
+    offered = {}
+    begin(
+        tmp_path / "w",
+        wheels("port,starboard"),
+        kind="rover",
+        ask=lambda guess: offered.setdefault(guess.name, guess.others) and "",
+    )
+    assert "/csv.port" in offered["turn"]
+
+
+def test_inspect_goes_on_as_init_does(wheels, tmp_path):
+    (tmp_path / "model.py").write_text(TWO_WHEELS)
+    found = begin(tmp_path / "w", wheels(), model=tmp_path / "model.py")
+    w = Workspace(tmp_path / "w")
+    assert w.inspect(wheels()).then == found.then
+    assert "unsure" not in grounded("-C", w.folder, "inspect", wheels()).out
+
+
 # targets
+
+
+@pytest.mark.parametrize("chosen", [False, True])
+def test_weights_belong_to_the_target_until_somebody_chooses_them(wheels, tmp_path, chosen):
+    (tmp_path / "model.py").write_text(TWO_WHEELS)
+    begin(tmp_path / "w", wheels(), model=tmp_path / "model.py", dt=0.05)
+    w, file = Workspace(tmp_path / "w"), tmp_path / "w/grounded.toml"
+    assert "that of the log" not in file.read_text()
+    before = w.task.reward.state
+    if chosen:
+        file.write_text(file.read_text().replace("state = { v = ", "state = { v = 1"))
+    grounded("-C", w.folder, "target", "circle", "--size", 3)
+    w.forget()
+    names, values = read_target(tmp_path / "w/target.csv")
+    by = dict(zip(names, values.T, strict=True))
+    new = [max(np.ptp(by[name]), 0.1) ** -2 for name in w.base_model.state_names]
+    now = w.task.reward.state
+    assert now[1:] == pytest.approx((before if chosen else new)[1:], rel=1e-3)
+    assert before[1:] != pytest.approx(new[1:], rel=0.1)
+    assert values[-1, names.index("psi")] == pytest.approx(2 * np.pi)
+    cells = (tmp_path / "w/target.csv").read_text().replace(",", " ").split()
+    assert "-0" not in cells
 
 
 def test_a_path_keeps_to_its_speeds_and_starts_from_rest(tmp_path):

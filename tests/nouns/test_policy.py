@@ -203,12 +203,13 @@ def test_a_turn_more_changes_nothing():
 def test_after_the_horizon_the_held_input_is_sent():
     p = policy()
     run = Runner(p)
-    assert not run.done(0.9) and run.done(1.0)
-    for t in (0.96, 1.0, 5.0, 1e9):
+    assert not run.done(0.9) and not run.done(0.98) and run.done(1.0)
+    assert not np.array_equal(run.action(0.98, np.zeros(2)), p.past)
+    for t in (0.995, 1.0, 5.0, 1e9):
         np.testing.assert_array_equal(run.action(t, np.zeros(2)), p.past)
 
 
-@pytest.mark.parametrize("t", [0.949, 0.951, 0.95, 1.05, 0.05, 0.15])
+@pytest.mark.parametrize("t", [0.949, 0.951, 0.989, 0.991, 1.05, 0.05, 0.15])
 def test_done_agrees_with_action(t):
     """A loop `while not done(t)` never asks for a step that the policy doesn't have."""
     p = policy(feedback=False)

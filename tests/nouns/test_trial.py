@@ -49,6 +49,18 @@ def test_steps(T):
     assert made.steps == T and made.finite_steps == T
 
 
+def test_a_recording_that_stops_a_step_or_two_early_goes_on():
+    states = np.column_stack([0.1 * np.arange(41.0), np.ones(41)])
+    run = trial(40, states=states, inputs=np.linspace(0, 1, 40)[:, None])
+    short = run.until(38).whole(40)
+    np.testing.assert_allclose(short.states, run.states)
+    assert short.inputs[-2:, 0] == pytest.approx([run.inputs[37, 0]] * 2)
+    assert run.until(37).whole(40).steps == 37  # three steps short: it ended early
+    assert run.whole(38).steps == 38 and trial(5).whole(6).steps == 5
+    lost = np.where(np.arange(39)[:, None] == 38, np.nan, states[:39])
+    assert trial(38, states=lost).whole(40).steps == 38
+
+
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -1e200])
 def test_finite_steps_end_before_the_first_bad_number(bad):
     for k in range(6):

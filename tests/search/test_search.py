@@ -279,6 +279,36 @@ def test_after_a_gentler_first_policy_the_search_goes_on():
     assert story.now.iteration == 1 and story.now.incumbent.candidate.id == "c0003"
 
 
+def test_a_gentler_policy_is_not_run_for_a_crash_that_was_set_aside():
+    story = Story().add(cut)
+    gentle = story.propose().candidate
+    assert gentle.caution == 1
+    story.trials.clear()
+    again = story.propose()
+    assert not again.is_new and again.candidate is story.candidates[0]
+    assert [story.now.verdict(t) for t in story.now.history] == ["waiting", "no trial"]
+    story.add().propose()
+    made = story.candidates[-1]
+    assert (made.id, made.base, made.caution) == ("c0003", "c0001", 0)
+
+
+def test_a_step_is_not_run_from_a_run_that_was_set_aside():
+    story = Story().add().add()
+    assert story.propose().candidate.base == "c0002"
+    del story.trials[1]
+    assert story.propose().candidate is story.candidates[1]
+
+
+def test_a_run_whose_last_steps_were_not_recorded_did_not_crash():
+    def unrecorded(trial):
+        return trial.until(trial.steps - 2)
+
+    story, whole = Story().add(unrecorded), Story().add()
+    assert story.now.incumbent.utility == pytest.approx(whole.now.incumbent.utility, rel=3e-2)
+    story.add(unrecorded).propose()
+    assert story.now.iteration == 1 and story.now.incumbent.trials[0].steps == TASK.horizon
+
+
 def test_with_repeats_a_single_crash_fails_the_candidate():
     story = Story(repeats=3).add().add().add().add(cut)
     assert story.now.history[-1].accepted is False and story.now.history[-1].utility == -np.inf

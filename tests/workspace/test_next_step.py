@@ -2,6 +2,7 @@
 
 import re
 import shlex
+from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -9,9 +10,11 @@ import pytest
 
 from cli import grounded, plain, process
 from facts import holds
-from grounded.diagnosis.report import Diagnosis
+from grounded.diagnosis.report import Diagnosis, Made
+from grounded_cli.diagnose import _follow
 from grounded_cli.main import COMMANDS, cli
 from grounded_cli.options import ELSEWHERE
+from grounded_trials import Workspace
 from grounded_trials.store.documents import write_document
 from grounded_trials.wording import folded
 from grounded_trials.workspace.config import set_in_model
@@ -277,3 +280,12 @@ def test_a_delay_more_than_the_adopted_one_is_open_until_it_is_adopted(cart, tmp
     assert since.changed and since.adopted == ("delay:force",)
     set_in_model(workspace.config.file, effects=[then])
     assert since_diagnosis(Folder(folder), found, []).sentence == ""
+
+
+def test_after_a_verdict_of_none_the_search_goes_on(tmp_path):
+    w = Workspace(make(tmp_path / "w").folder)
+    w.learn(2)
+    nothing = {"kind": "none", "effects": [], "sentence": "Nothing."}
+    found = Diagnosis.from_json({**DIAGNOSIS, "verdict": nothing, "next_trial": ""})
+    made = replace(Made(), params=dict(w.config.model.params))
+    assert _follow(w, replace(found, made=made)).verb == "propose"

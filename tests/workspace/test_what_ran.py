@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 
 from cli import grounded
-from facts import holds
-from grounded.errors import GroundedError
+from facts import holding, holds
+from grounded.errors import GroundedError, NextCommand
 from grounded.trial import Trial
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import read_trial, write_trial
 from grounded_trials.workspace.ingest import ingest_log
 from grounded_trials.workspace.proposing import propose_in, standing_in
 from grounded_trials.workspace.running import run_candidate
-from grounded_trials.workspace.trial_check import commands, what_ran
+from grounded_trials.workspace.trial_check import commands, suspicion, what_ran
 from workspaces import CONFIG, make
 
 NOISY = CONFIG + "[system.noise.measurement]\nx = 0.002\nv = 0.01\n"
@@ -148,8 +148,12 @@ def test_the_log_of_another_candidate_says_so(waiting, tmp_path):
     w, ran, _ = waiting
     trial, _, _ = read_trial(ran)
     write_trial(tmp_path / "again.mcap", replace(trial, candidate=""), {"kind": "trial"})
-    with pytest.raises(GroundedError, match="those of c0001"):
+    with pytest.raises(GroundedError, match="those of c0001") as refused:
         w.ingest(tmp_path / "again.mcap")
+    arguments = (str(tmp_path / "again.mcap"), "--candidate", "c0001")
+    assert refused.value.then == NextCommand("ingest", arguments)
+    done = grounded("-C", w.folder, "next", tmp_path / "again.mcap", "--candidate", "c0001")
+    assert done.code == 0, done.err
     assert w.ingest(tmp_path / "again.mcap", candidate="c0001").candidate == "c0001"
 
 
@@ -233,3 +237,84 @@ def foreign_log(path, seed):
             log.message(state, k * 25_000_000, x)
             log.message(force, k * 25_000_000, u)
         log.finish()
+
+
+def test_the_candidate_after_a_false_crash_is_not_handed_out_once_that_is_discarded(tmp_path):
+    w = Workspace(make(tmp_path / "w").folder)
+    ran, _, _ = read_trial(w.run(w.propose().candidate.id).trial_file)
+    write_trial(tmp_path / "short.mcap", ran.until(20), {"kind": "trial", "task": w.task.hash})
+    assert w.ingest(tmp_path / "short.mcap", candidate="c0001").verdict == "crashed"
+    assert w.propose().candidate.caution == 1
+    w.discard("t0001")
+    again = w.propose()
+    assert again.candidate.id == "c0001" and "crash" not in again.proposal.standing.sentence
+    w.ingest(w.run("c0001").trial_file)
+    new = w.propose()
+    assert (new.candidate.id, new.candidate.base, new.candidate.caution) == ("c0003", "c0001", 0)
+    assert any("c0002" in note and "set aside" in note for note in new.proposal.notes)
+
+
+def test_it_is_said_whose_commands_they_are_only_where_they_match(learnt):
+    """A third policy's run, nearer to one candidate than to the other, is neither's."""
+    (own, _, candidates), _, (_, theirs, _) = runs(learnt)
+    inputs = theirs.inputs + 0.2 * np.sin(np.arange(theirs.steps) / 8)[:, None]
+    why, name = suspicion(learnt.task, replace(theirs, inputs=inputs), own, candidates)
+    assert "nearer" in why and name == ""
+    why, name = suspicion(learnt.task, theirs, own, candidates)
+    assert why and name == theirs.candidate != own.id
+
+
+LOGGED = (
+    CONFIG
+    + """
+[log.state.x]
+path = "/csv.x"
+[log.state.v]
+path = "/csv.v"
+[log.input.force]
+path = "/csv.force"
+"""
+)
+
+
+def recorded(path, trial, before, rng):
+    """A run as a table at 100 Hz that begins earlier: the robot rests and is sent zeros."""
+    t = np.arange(round((before + 2.5) * 100)) / 100
+    run = np.clip(t - before, 0, 2)
+    x = [np.interp(run, 0.05 * np.arange(41), column) for column in trial.states.T]
+    step = np.clip(np.floor((t - before) / 0.05 + 1e-6).astype(int), -1, 40)
+    force = np.concatenate([[0.0], trial.inputs[:, 0], [0.0]])[step + 1]
+    noisy = np.column_stack(x) + rng.normal(0, 0.001, (len(t), 2))
+    rows = np.column_stack([1000 + t, noisy, force])
+    np.savetxt(path, rows, "%.5f", ",", header="t,x,v,force", comments="")
+
+
+@pytest.mark.parametrize("before", [0.0, 1.0, 3.23])
+def test_a_recording_may_begin_before_the_run(tmp_path, before):
+    w = Workspace(make(tmp_path / "w", config=LOGGED).folder)
+    trial, _, _ = read_trial(w.run(w.propose().candidate.id).trial_file)
+    recorded(tmp_path / "run.csv", trial, before, np.random.default_rng(0))
+    taken = w.ingest(tmp_path / "run.csv")
+    assert taken.candidate == "c0001" and taken.utility == pytest.approx(
+        w.task.utility(trial), rel=0.02
+    )
+    (stored,) = w.trials()
+    np.testing.assert_allclose(stored.trial.inputs, trial.inputs, atol=1e-4)
+    assert any(f"start = {before:g}" in one for one in taken.warnings) == (before > 0)
+
+
+@pytest.mark.parametrize("given", ["start = 0.0", 'start = "first-input"'])
+def test_a_span_that_was_given_is_kept_to_and_a_strange_run_has_no_start(tmp_path, given):
+    config = LOGGED + f"[log.span]\n{given}\n"
+    w = Workspace(make(tmp_path / "w", config=config).folder)
+    trial, _, _ = read_trial(w.run(w.propose().candidate.id).trial_file)
+    recorded(tmp_path / "run.csv", trial, 1.0, np.random.default_rng(0))
+    with pytest.raises(GroundedError, match=holding("log.span")):
+        w.ingest(tmp_path / "run.csv")
+    (w.folder / "grounded.toml").write_text(LOGGED)
+    w.forget()
+    strange = replace(trial, inputs=OTHERS["somebody"](np.array(trial.inputs)))
+    recorded(tmp_path / "strange.csv", strange, 1.0, np.random.default_rng(0))
+    with pytest.raises(GroundedError, match="c0001"):
+        w.ingest(tmp_path / "strange.csv")
+    assert not w.trials()

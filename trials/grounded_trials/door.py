@@ -150,16 +150,22 @@ class Workspace(Folder):
         ran = candidate and candidate_named(here, candidate)
         return ingest_log(here, Path(path), ran, data=data)
 
-    def next(self, log: str | Path, *, runner: bool = True) -> NextRun:
+    def next(
+        self, log: str | Path, *, candidate: str | None = None, runner: bool = True
+    ) -> NextRun:
         """The loop at the track in one call: takes a log in, proposes, exports for the robot.
 
         Args:
-            log: what came back of the outstanding candidate.
+            log: what came back.
+            candidate: which one was run; None: the outstanding one.
             runner: write the program that runs the candidate beside it, see `export`.
         """
         from grounded_trials.workspace.looping import next_in
+        from grounded_trials.workspace.proposing import candidate_named
 
-        return next_in(self._afresh(), Path(log), runner=runner)
+        here = self._afresh()
+        ran = candidate and candidate_named(here, candidate)
+        return next_in(here, Path(log), ran, runner=runner)
 
     def target(self, columns: Mapping[str, Array]) -> Path:
         """Writes target.csv and its length to grounded.toml; the old one is kept as target.csv.bak.

@@ -14,7 +14,7 @@ from grounded_cli.learn import narrated
 from grounded_cli.options import as_json, next_line
 from grounded_cli.status import summary
 from grounded_cli.terminal import field, number, progress, remark, say, show, show_json
-from grounded_trials.wording import count
+from grounded_trials.wording import count, rendered
 
 if TYPE_CHECKING:
     from grounded_trials import Workspace
@@ -97,6 +97,10 @@ def _tell(document: dict[str, Any], verdict: list[str]) -> None:
         show(field("gap" if k == 0 else "", line))
     for kind, path in document["paths"].items():
         if kind in ("html", "rrd"):
-            show(field(kind, path + ": open it in a browser" * (kind == "html")))
-    verb = "view" if "rrd" in document["paths"] else "report"
-    show(f"\n{next_line(NextCommand(verb), document['workspace'])}")
+            show(field(kind, path))
+    if "rrd" in document["paths"]:
+        show(f"\n{next_line(NextCommand('view'), document['workspace'])}")
+    else:
+        page = document["paths"].get("html")
+        opened = f"open {page} in a browser, then " * bool(page)
+        show(f"\nnext: {opened}{rendered(NextCommand('init', ('robot', '--from', 'LOG')))}")

@@ -64,6 +64,18 @@ def csv_records(path: Path) -> Iterator[Record]:
     yield from table_records({"/csv": columns}, "csv", path)
 
 
+def column_units(path: Path) -> dict[str, str]:
+    """The units that a text table's first row states, `x [m]` or `x (m)`, by message path."""
+    if path.suffix.lower() not in (".csv", ".tsv", ".txt"):
+        return {}
+    with path.open(encoding="utf-8-sig", errors="replace", newline="") as stream:
+        head = stream.readline(65536)
+    mark = next((m for m in "\t;," if m in head), ",")
+    cells = next(csv.reader([head], delimiter=mark), [])
+    said = {_name(cell): re.search(r"[\[(]\s*([^\d\s][^\])]*?)\s*[\])]", cell) for cell in cells}
+    return {f"/csv.{name}": unit[1] for name, unit in said.items() if unit and '"' not in unit[1]}
+
+
 def _with_holes(stream: Any, mark: str, width: int, path: Path) -> Floats:
     """Rows with texts or empty cells, which are no number."""
     rows: list[list[float]] = []

@@ -16,7 +16,7 @@ unsure.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice, product
 from pathlib import Path
@@ -69,7 +69,8 @@ def weigh(
     guesses |= in_order(guesses, units, joints, log)
     guesses = {name: _unit(guess, units[name]) for name, guess in guesses.items()}
     guesses |= _speed_asked(guesses, model, log)
-    signals = _Signals(log, guesses.values())
+    turning = [guesses[name] for name in model.state_names if units[name] in ("rad", "deg")]
+    signals = _Signals(log, guesses.values(), {p for g in turning for p in (g.path, *g.others)})
     guesses |= _speed(guesses, model, signals)
     for position, rate in velocities(model).items():
         if position in guesses and rate in guesses:
@@ -135,7 +136,7 @@ def _unit(guess: Guess, unit: str) -> Guess:
 class _Signals:
     """The samples of everything that was guessed, read once, and put on one grid when asked."""
 
-    def __init__(self, log: LogReport, guesses: Iterable[Guess]) -> None:
+    def __init__(self, log: LogReport, guesses: Iterable[Guess], angles: Collection[str]) -> None:
         clocks = {t.topic: "header" if t.stamped else "log" for t in log.topics}
         if any(t.skew_s is not None and abs(t.skew_s) > SIMULATED_S for t in log.topics):
             clocks = dict.fromkeys(clocks, "log")
@@ -148,9 +149,10 @@ class _Signals:
             series = _one_by_one(log.files, specs)
         for path, one in series.items():
             try:
-                self.found[path] = tidy(path, one, unwrap="@rpy" in path)
+                found = tidy(path, one, unwrap="@rpy" in path)
             except GroundedError:
                 continue
+            self.found[path] = _unwound(found) if path in angles else found
 
     def grid(self, paths: Sequence[str]) -> tuple[float, list[Floats]] | None:
         """These signals on a common grid: its step [s] and the columns; None if they don't meet."""
@@ -165,6 +167,13 @@ class _Signals:
             return None
         at = (t - start) * 1e-9
         return step, [np.interp(at, (s.t - start) * 1e-9, s.y) for s in samples]
+
+
+def _unwound(angle: Samples) -> Samples:
+    """An angle whose values jump by a turn, in radians or degrees, without the jumps."""
+    jump, width = np.abs(np.diff(angle.y)).max(initial=0.0), np.ptp(angle.y)
+    turns = [turn for turn in (2 * np.pi, 360.0) if 0.9 * turn < jump <= width < 1.02 * turn]
+    return replace(angle, y=np.unwrap(angle.y, period=turns[0])) if turns else angle
 
 
 def _clock(path: str, clocks: Mapping[str, str]) -> str:

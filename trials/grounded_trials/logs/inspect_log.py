@@ -54,6 +54,7 @@ class FieldReport:
     high: float | None
     not_finite: int
     noise: float = 0.0  # standard deviation of what changes from sample to sample
+    held: float = 0.0  # share of samples that repeat the one before, but for zeros
 
 
 @dataclass(frozen=True)
@@ -221,6 +222,7 @@ class _Range:
     not_finite: int = 0
     samples: list[tuple[Ints, Floats]] | None = None  # kept where twins may be found
     noises: list[float] = field(default_factory=list)
+    repeated: int = 0
 
     def add(self, values: Floats, log_times: Ints) -> None:
         if self.samples is not None:
@@ -229,6 +231,7 @@ class _Range:
         finite = values[np.isfinite(values)]
         self.count += len(values)
         self.not_finite += len(values) - len(finite)
+        self.repeated += int(((np.diff(values) == 0) & (values[1:] != 0)).sum())
         if len(finite) >= NOISE_SAMPLES:
             self.noises.append(_noise(finite))
         if len(finite):
@@ -330,6 +333,7 @@ def _field(path: str, found: _Range) -> FieldReport:
         high=None if none else found.high,
         not_finite=found.not_finite,
         noise=float(np.median(found.noises)) if found.noises else 0.0,
+        held=found.repeated / max(found.count - 1, 1),
     )
 
 

@@ -13,7 +13,7 @@ from typing import Any, Literal, cast
 from grounded.errors import GroundedError
 from grounded_trials.formats.message_path import parse_path
 from grounded_trials.logs.resample import Crossing, Gridded, Span, to_grid
-from grounded_trials.logs.signals import Clock, SignalSpec, read_signals
+from grounded_trials.logs.signals import Clock, Series, SignalSpec, read_signals
 from grounded_trials.toml_table import Table
 
 CLOCKS = ("header", "log", "publish")
@@ -136,9 +136,23 @@ def read_log(
     """
     states = list(mapping.states) if states is None else states
     inputs = list(mapping.inputs) if inputs is None else inputs
+    series = mapped_signals(paths, mapping, states, inputs)
+    return to_grid(series, dt, states, inputs, mapping.span, angles=angles, steps=steps)
+
+
+def mapped_signals(
+    paths: str | Path | Sequence[str | Path],
+    mapping: LogMapping,
+    states: Sequence[str],
+    inputs: Sequence[str],
+) -> dict[str, Series]:
+    """The raw samples of a log's states, inputs, and of what its span watches.
+
+    Raises:
+        GroundedError: see `signals.read_signals`.
+    """
     if not states or not inputs:
         raise GroundedError("[log] maps no state or no input; a trial needs one of each")
     specs = {name: mapping.states[name] for name in states}
     specs |= {name: mapping.inputs[name] for name in inputs}
-    series = read_signals(paths, {**specs, **mapping.span.signals()})
-    return to_grid(series, dt, states, inputs, mapping.span, angles=angles, steps=steps)
+    return read_signals(paths, {**specs, **mapping.span.signals()})

@@ -74,6 +74,7 @@ class Gridded:
     inputs: Floats  # (T, m)
     start_inputs: Floats | None  # (m,) held before t = 0; None where the log does not say
     start_ns: int  # t = 0 on the signals' clock [ns]
+    origin_ns: int  # the first sample of any signal, likewise
     late_s: float  # the start was moved by this much, because a state was not known yet
     reports: tuple[SignalReport, ...]  # of the states, then of the inputs
     warnings: tuple[str, ...]
@@ -131,6 +132,7 @@ def to_grid(
         inputs=np.column_stack(columns[len(states) :]),
         start_inputs=held if np.isfinite(held).all() else None,
         start_ns=start,
+        origin_ns=origin,
         late_s=late,
         reports=tuple(reports),
         warnings=warnings_of(tuple(reports), late),

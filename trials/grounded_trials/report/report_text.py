@@ -37,7 +37,7 @@ from grounded_trials.wording import (
 )
 from grounded_trials.workspace.next_step import DIAGNOSE
 
-ROWS = 12  # candidates in the table; the others are counted
+ROWS, SPARED = 12, 3  # candidates in the table; more than so many others are counted
 ITERATIONS = 5  # of the bias
 EFFECTS = 5
 VALUES = 34  # columns for an effect's parameters
@@ -89,8 +89,8 @@ def _utilities(findings: Findings, table: Table, bars: Callable[[Sequence[float]
     history = findings.history
     if not history:
         return "utility\n  no candidate was proposed yet"
-    shown, left = few(history, ROWS)
-    rows = [_candidate(t, t is history[-1]) for t in shown]
+    shown, left = few(history, ROWS if len(history) > ROWS + SPARED else len(history))
+    rows = [_candidate(t, findings.standing.verdict(t)) for t in shown]
     header = ("candidate", "iter.", "alpha", "predicted", "real", "+-", "trials", "")
     lines = ["utility", table(rows, header), *_wrapped(LEGEND, "  ")]
     if left:
@@ -111,7 +111,7 @@ def _utilities(findings: Findings, table: Table, bars: Callable[[Sequence[float]
     return "\n".join(lines)
 
 
-def _candidate(tried: Tried, last: bool) -> tuple[str, ...]:
+def _candidate(tried: Tried, verdict: str) -> tuple[str, ...]:
     error = standard_error(tried)
     return (
         tried.candidate.id,
@@ -121,7 +121,7 @@ def _candidate(tried: Tried, last: bool) -> tuple[str, ...]:
         figure(tried.utility),
         figure(error, 2),
         str(len(tried.trials)),
-        tried.verdict(last),
+        verdict,
     )
 
 

@@ -18,6 +18,7 @@ from grounded.errors import GroundedError, NextCommand, nearest
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.result import Result
+from grounded_trials.formats.tables import column_units
 from grounded_trials.logs.inspect_evidence import weigh
 from grounded_trials.logs.inspect_guess import Guess, guess_mapping, is_simulated, mapping_toml
 from grounded_trials.logs.inspect_log import LogReport, inspect_log
@@ -25,7 +26,7 @@ from grounded_trials.logs.joint_names import joint_names
 from grounded_trials.logs.log_files import kind_of, log_files
 from grounded_trials.logs.log_table import LogMapping, log_mapping, read_log
 from grounded_trials.starting.examples import fresh_folder
-from grounded_trials.starting.kinds import KINDS, kind_in, skeleton
+from grounded_trials.starting.kinds import KINDS, kind_in, moving, skeleton
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.folder import Folder
@@ -34,6 +35,7 @@ from grounded_trials.workspace.task_file import equal_weights, write_target
 
 STEPS = (0.001, 0.002, 0.0025, 0.004, 0.005, 0.008, 0.01, 0.02, 0.025, 0.04, 0.05, 0.1, 0.2, 0.5)
 WRITTEN = (FILE, "model.py", "target.csv")
+MOST_ASKED = 20  # numbers of the log to choose from where nothing fits
 HORIZON = 200  # steps of a target that is a recorded run, at most
 Ask = Callable[[Guess], str]
 
@@ -60,8 +62,14 @@ class Begun(Result):
 
     @property
     def then(self) -> NextCommand:
-        """Take the log in, to fit and diagnose the model on it."""
-        return NextCommand("ingest", ("--data", self.log))
+        """Take the log in, to fit and diagnose the model on it; where an input is missing, look."""
+        whole = all(guess.path for guess in self.inputs)
+        return NextCommand("ingest", ("--data", self.log)) if whole else self.look
+
+    @property
+    def look(self) -> NextCommand:
+        """What names the numbers of the log, for grounded.toml."""
+        return NextCommand("inspect", (self.log,))
 
     def summary(self) -> str:
         """How much was matched."""
@@ -101,6 +109,7 @@ def begin(
     model: str | Path | None = None,
     kind: str | None = None,
     dt: float | None = None,
+    inputs: Sequence[str] = (),
     ask: Ask | None = None,
 ) -> Begun:
     """Makes a workspace from a log; an existing file is never overwritten.
@@ -111,6 +120,7 @@ def begin(
         model: the user's model.py, which is copied; None: a skeleton is written.
         kind: of the skeleton, see `KINDS`; None: as the log looks.
         dt: control interval [s]; None: that of the commands in the log.
+        inputs: which numbers of the log are a generic skeleton's inputs; none: as they look.
         ask: given each unsure signal, returns the path to take; None: the best guess is taken.
 
     Raises:
@@ -118,8 +128,10 @@ def begin(
             name is unknown.
     """
     _check(model, kind)
+    if inputs and (model or kind not in (None, "generic")):
+        raise GroundedError("--inputs is for a skeleton of kind generic: others have their own")
     with fresh_folder(folder, WRITTEN):
-        return _begin(folder, log, model, kind, dt, ask)
+        return _begin(folder, log, model, "generic" if inputs else kind, dt, inputs, ask)
 
 
 def _begin(
@@ -128,6 +140,7 @@ def _begin(
     model: str | Path | None,
     kind: str | None,
     dt: float | None,
+    named: Sequence[str],
     ask: Ask | None,
 ) -> Begun:
     files = log_files(log)
@@ -139,7 +152,10 @@ def _begin(
     report, notes = _one_run(report)
     joints = joint_names(report)
     chosen, why = (kind, "as you said") if kind else kind_in(report, joints)
-    text = Path(model).read_text("utf-8") if model else skeleton(chosen, report, joints).source()
+    if model:
+        why, text = "your model", Path(model).read_text("utf-8")
+    else:
+        text = skeleton(chosen, report, joints, named, column_units(files[0])).source()
     found = _model_in(folder, text)
     states, inputs = guess_mapping(report, found.state_names, found.input_names)
     states, inputs = weigh(report, found, states, inputs, joints)
@@ -147,8 +163,11 @@ def _begin(
         states, inputs = (
             tuple(_only_named(g, of) for g in s) for s, of in ((states, "state"), (inputs, "input"))
         )
+        notes = (*notes, *_left_out(report, found))
     if ask is not None:
-        states, inputs = (tuple(_asked(g, ask) for g in some) for some in (states, inputs))
+        taken = {g.path for g in (*states, *inputs)}
+        free = tuple(one.path for one in moving(report).values() if one.path not in taken)
+        states, inputs = (tuple(_asked(g, ask, free) for g in some) for some in (states, inputs))
     step = dt or _interval(report, inputs, states)
     ranges = {g.name: _range(report, g) for g in (*states, *inputs)}
     if chosen != "drone":  # what is sent after a run must be allowed: rest
@@ -158,7 +177,7 @@ def _begin(
     table = mapping_toml(states, inputs, simulated=is_simulated(report))
 
     def write(columns: Mapping[str, Array], rows: int) -> None:
-        _write(folder, found, step, columns, rows, ranges, table, why)
+        _write(folder, found, (step, dt is None), columns, rows, ranges, table, why)
 
     write({found.state_names[0]: np.zeros(2)}, 1)
     target, horizon, more = _recorded(folder, files, found, states, step, write)
@@ -166,7 +185,7 @@ def _begin(
         workspace=str(folder),
         log=str(log),
         kind="" if model else chosen,
-        why="your model" if model else why,
+        why=why,
         dt=step,
         horizon=horizon,
         states=states,
@@ -206,9 +225,20 @@ def _only_named(guess: Guess, of: str) -> Guess:
     return replace(guess, sure=False, reasons=(*guess.reasons, why)) if guess.path else guess
 
 
-def _asked(guess: Guess, ask: Ask) -> Guess:
+def _left_out(report: LogReport, model: Model) -> tuple[str, ...]:
+    """What a generic skeleton has no place for, and how to say what is an input."""
+    left = [name for name in moving(report) if name not in {**model.states, **model.inputs}]
+    found = [f"left out of model.py: {', '.join(reversed(left))}"] * bool(left)
+    if not set(model.inputs) & set(moving(report)):
+        found.append("no number looks like a command: --inputs A,B says which are")
+    return tuple(found)
+
+
+def _asked(guess: Guess, ask: Ask, free: tuple[str, ...]) -> Guess:
     if guess.sure:
         return guess
+    if not guess.path and not guess.others:
+        guess = replace(guess, others=free[:MOST_ASKED])
     path = ask(guess)
     if path == guess.path:
         return replace(guess, sure=bool(path))
@@ -309,13 +339,14 @@ def _maps(mapping: LogMapping, topic: str) -> bool:
 def _write(
     folder: Path,
     model: Model,
-    dt: float,
+    grid: tuple[float, bool],
     columns: Mapping[str, Array],
     horizon: int,
     ranges: Mapping[str, tuple[float, float] | None],
     table: str,
     why: str,
 ) -> None:
+    dt, logged = grid
     write_target(folder / "target.csv", dt, dict(columns))
     weights = equal_weights(columns)
     limits = [
@@ -330,14 +361,16 @@ def _write(
         'file = "model.py"             # the crude model, plain NumPy',
         "",
         "[task]",
-        f"dt = {dt:g}                     # [s] control interval: that of the log's commands",
+        f"dt = {dt:g}                     # [s] control interval"
+        + ": that of the log's commands" * logged,
         f"horizon = {horizon}                 # steps",
         'target = "target.csv"         # `grounded target` draws another; no column: free',
         "start = { }",
         "feedback = true               # false: open loop",
         "latency = { }                 # [s] transport delay of inputs: `fit --latency` finds it",
         "",
-        "[reward]                      # quadratic weights: 1 / (range in the target)^2",
+        "[reward]                      # quadratic weights: 1 / (range in the target)^2; `target`",
+        "                              # sets them anew until you change one",
         f"state = {_inline(weights)}",
         f"input_change = {_inline(dict.fromkeys(model.input_names, 0.01))}",
         "",

@@ -10,10 +10,14 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from grounded_trials.logs.inspect_log import LogReport, TopicReport
+from grounded.errors import GroundedError, nearest
+from grounded_trials.logs.inspect_log import FieldReport, LogReport, TopicReport
 
 Joints = Mapping[str, tuple[str, ...]]  # of each topic, see `joint_names`
-MOST = 6  # states of a generic model
+Units = Mapping[str, str]  # of a number by its path
+HELD = 0.3  # of the samples that repeat the one before: what a loop sends, no sensor
+MOST, INPUTS = 6, 4  # states and inputs of a generic model, where nobody says which
+SIDES = re.compile(r"^(left|right|u\d*|u_\w+)$")  # what inputs are called, beside COMMANDED
 COMMANDED = re.compile(
     "cmd|command|desired|setpoint|target|input|throttle|torque|tau|effort|volt|pwm|duty|motor|steer"
     r"|goal|control|_con|_ref"
@@ -193,26 +197,56 @@ def arm(joints: Sequence[str]) -> Skeleton:
     )
 
 
-def generic(log: LogReport) -> Skeleton:
-    """Every number that moves is a state that follows the inputs with a lag."""
-    fields = [(topic, one) for topic in log.topics for one in topic.fields if one.low != one.high]
-    names = {one.path: _word(one.path) for _, one in fields}
-    commands = [p for p, name in names.items() if COMMANDED.search(p.lower())]
-    others = [p for p in names if p not in commands and not re.search(r"covariance|layout", p)]
-    inputs = [names[p] for p in commands[:2]] or ["u"]
-    states = list(dict.fromkeys(names[p] for p in others if names[p] not in inputs))[:MOST]
-    states = states or ["x"]
-    gains = {f"gain_{s}_{i}": '0.0, "1", -100.0, 100.0' for s in states for i in inputs}
+def moving(log: LogReport) -> dict[str, FieldReport]:
+    """The numbers of a log that change, by the names that a generic model gives them."""
+    fields = [one for t in log.topics for one in t.fields if one.low != one.high]
+    fields = [one for one in fields if not re.search(r"covariance|layout", one.path)]
+    return {_word(one.path): one for one in reversed(fields)}
+
+
+def generic(log: LogReport, inputs: Sequence[str] = (), units: Units | None = None) -> Skeleton:
+    """Every number that moves is a state that follows the inputs with a lag.
+
+    Inputs are those that are named, else those that are called like one, else those whose value is
+    held for several samples while others move.
+
+    Args:
+        log: whose numbers they are.
+        inputs: names of those that are inputs, in order; none: as said above.
+        units: of numbers by their path, where the log says them.
+
+    Raises:
+        GroundedError: for an input that the log does not have.
+    """
+    found, known = moving(log), units or {}
+    for name in inputs:
+        if name not in found:
+            raise GroundedError(f"the log has no number '{name}': {nearest(name, found)}")
+    if not inputs:
+        names = list(reversed(found))
+        called = [n for n in names if COMMANDED.search(found[n].path.lower()) or SIDES.search(n)]
+        held = [n for n in names if found[n].held > HELD]
+        inputs = (called or (held if 2 * len(held) < len(names) else []))[:INPUTS] or ["u"]
+    states = [name for name in reversed(found) if name not in inputs][:MOST] or ["x"]
+    unit = {name: known.get(one.path, "1") for name, one in found.items()}
+    per = {i: f"/({u})" * (u != "1") for i in inputs if (u := unit.get(i, "1"))}
+    gains = {
+        f"gain_{s}_{i}": f'0.0, "{unit.get(s, "1")}{per[i]}", -100.0, 100.0'
+        for s in states
+        for i in inputs
+    }
+    turned = {s: found[s] for s in states if unit.get(s) == "rad"}
     return Skeleton(
         "generic",
         "Numbers that follow the inputs with a lag: write down what moves your robot",
-        dict.fromkeys(states, "1"),
-        dict.fromkeys(inputs, "1"),
+        {s: unit.get(s, "1") for s in states},
+        {i: unit.get(i, "1") for i in inputs},
         {f"tau_{s}": '1.0, "s", 0.01, 100.0' for s in states} | gains,
         [
             f'"{s}": ({" + ".join(f"p.gain_{s}_{i} * a.{i}" for i in inputs)} - s.{s}) / p.tau_{s}'
             for s in states
         ],
+        tuple(s for s, one in turned.items() if min(-(one.low or 0.0), one.high or 0.0) > 3.0),
     )
 
 
@@ -252,7 +286,7 @@ def kind_in(log: LogReport, joints: Joints) -> tuple[str, str]:
         return "pendulum", "an angle and a torque"
     if flat := next((t.topic for t in log.topics if _in_the_plane(t)), None):
         return "rover", f"{flat} moves in the plane and no steering is named"
-    return "generic", "nothing tells what kind of robot it is: the names are the log's"
+    return "generic", "nothing tells what kind of robot it is, --kind does: the names are the log's"
 
 
 def _in_the_plane(topic: TopicReport) -> bool:
@@ -268,8 +302,14 @@ def _says(topic: TopicReport, words: Sequence[str]) -> bool:
     return any(word in everything for word in words)
 
 
-def skeleton(kind: str, log: LogReport, joints: Joints) -> Skeleton:
-    """The skeleton of a kind, named after what is in the log."""
+def skeleton(
+    kind: str,
+    log: LogReport,
+    joints: Joints,
+    inputs: Sequence[str] = (),
+    units: Units | None = None,
+) -> Skeleton:
+    """The skeleton of a kind, named after what is in the log; for the rest see `generic`."""
     if kind == "arm":
         return arm(next(iter(joints.values())) if joints else ("joint1", "joint2"))
     ackermann = any("Ackermann" in topic.type for topic in log.topics)
@@ -277,4 +317,4 @@ def skeleton(kind: str, log: LogReport, joints: Joints) -> Skeleton:
         lines = [line.replace("a.speed", "a.throttle") for line in CAR.lines]
         return replace(CAR, inputs={"steering": "1", "throttle": "1"}, lines=lines)
     fixed = {"car": CAR, "rover": ROVER, "drone": DRONE, "pendulum": PENDULUM}
-    return fixed[kind] if kind in fixed else generic(log)
+    return fixed[kind] if kind in fixed else generic(log, inputs, units)

@@ -59,7 +59,7 @@ def path_target(shape: str, drive: Drive, model: Model, dt: float) -> dict[str, 
     speed = _reachable(along, limit, drive.accel)
     middle = 0.5 * (speed[1:] + speed[:-1])
     when = np.concatenate([[0.0], np.cumsum(np.diff(along) / np.maximum(middle, 1e-6))])
-    t = np.arange(0.0, when[-1] + 1e-9, dt)
+    t = dt * np.arange(np.ceil(when[-1] / dt - 1e-6) + 1)
     columns = {position[0]: np.interp(t, when, x), position[1]: np.interp(t, when, y)}
     rate = np.gradient(heading, along) * speed
     for role, values in {"heading": heading, "speed": speed, "heading_rate": rate}.items():

@@ -72,7 +72,7 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
             adopted = [e | values if e["name"] == name else e for e in adopted]
         else:
             adopted.append({"name": name, **values})
-    own, adopted = _settled(params, adopted)
+    own, adopted = settled(params, adopted)
     whole = dict(workspace.config.model.params) | own
     set_in_model(workspace.config.file, params=whole if own else None, effects=adopted or None)
     return Adopted(tuple(adopted), own, claimed)
@@ -117,8 +117,8 @@ def _nominal(found: Diagnosis, workspace: Folder, name: str) -> float:
     return float(workspace.base_model.params[name].value)
 
 
-def _settled(
-    params: Mapping[str, float], effects: Sequence[Effect]
+def settled(
+    params: Mapping[str, float], effects: Sequence[Mapping[str, Any]]
 ) -> tuple[dict[str, float], list[Effect]]:
     """The model's own parameters, and the effects with the values of theirs."""
     from grounded.effects.wrap import param_name
@@ -126,7 +126,9 @@ def _settled(
     own, changed = dict(params), []
     for effect in effects:
         names = {q: param_name(str(effect["name"]), q) for q in effect}
-        changed.append(effect | {q: own.pop(name) for q, name in names.items() if name in own})
+        changed.append(
+            dict(effect) | {q: own.pop(name) for q, name in names.items() if name in own}
+        )
     return own, changed
 
 

@@ -205,13 +205,25 @@ def set_latency(file: Path, latency: Mapping[str, float]) -> None:
     _change(file, "task", {"latency": _inline(latency)})
 
 
-def set_target(file: Path, name: str, steps: int, weights: Mapping[str, float]) -> None:
-    """Replaces [task] target and horizon; `weights` go to a [reward] that weighs no state yet."""
+def set_target(
+    file: Path,
+    name: str,
+    steps: int,
+    weights: Mapping[str, float],
+    before: Mapping[str, float],
+) -> None:
+    """Replaces [task] target and horizon, and the state weights of [reward] that nobody chose.
+
+    Those are none, or `before`, which belonged to the last target.
+    """
     import tomlkit
 
     _change(file, "task", {"target": name, "horizon": steps})
     reward = tomlkit.parse(file.read_text(encoding="utf-8")).get("reward", {})
-    if not reward.get("state") and not reward.get("terminal"):
+    own = dict(reward.get("state", {}))
+    same = own.keys() == before.keys()
+    same = same and all(abs(own[k] - w) <= 1e-3 * abs(w) for k, w in before.items())
+    if same or (not own and not reward.get("terminal")):
         _change(file, "reward", {"state": _inline(weights)})
 
 

@@ -13,6 +13,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from grounded.diagnosis.report import Diagnosis, Made
 from grounded.errors import GroundedError, NextCommand, nearest
 from grounded_trials.store.documents import read_document, write_document
@@ -21,7 +23,11 @@ from grounded_trials.wording import rendered
 if TYPE_CHECKING:
     from grounded.effects import Library
     from grounded.engine import Engine
+    from grounded.frozen import Array
     from grounded.instruments.finding import Finding
+    from grounded.policy import Policy
+    from grounded.search.candidate import Candidate
+    from grounded.task import Task
     from grounded.trial import Trial
     from grounded_trials.workspace.folder import Folder
 
@@ -73,7 +79,7 @@ def diagnose_in(
     _keep(workspace, found)
     identity, words = _probe(workspace, found, lifted + second, library, write=probe)
     if words:
-        run = f" ({identity}: {rendered(NextCommand('run', (identity,)))})" * bool(identity)
+        run = f" ({identity}: {rendered(probe_command(workspace, identity))})" * bool(identity)
         found = replace(found, next_trial=f"{words}{run}", probe=identity)
         _keep(workspace, found)
     return found
@@ -140,41 +146,88 @@ def _measured(trial: Trial, guessed: Sequence[str]) -> Trial:
 def _probe(
     workspace: Folder, found: Diagnosis, trials: Sequence[Trial], library: Library, *, write: bool
 ) -> tuple[str, str]:
-    """Writes the candidate that would tell two tied effects apart, or if asked: (id, sentence)."""
+    """Writes the candidate that would tell two tied effects apart, or if asked: (id, sentence).
+
+    It is one that `run` and `export` hand over: inside today's [limits], and inside [safety] by as
+    much as runs have strayed.
+    """
     if found.no_cause:
         return "", ""
     from grounded.diagnosis.excitation import probe
-    from grounded.rollout import simulate
-    from grounded.search.candidate import Candidate
-    from grounded.search.improve import model_fingerprint
+    from grounded.search.safety import objections, spread
+    from grounded_trials.workspace.handover import outside_limits
     from grounded_trials.workspace.proposing import standing_in
 
-    best = standing_in(workspace).incumbent
+    now = standing_in(workspace)
+    best = now.incumbent
     if best is None:
         return "", ""
     planner = workspace.planner
+    task, strays = planner.task, spread(planner.task, now.history, best.candidate.model)
+    own = best.candidate.policy
+    low, high = np.maximum(own.low, task.low), np.minimum(own.high, task.high)
+    base, offer = (
+        planner.widened(replace(own, low=low, high=high)),
+        write or found.indistinguishable,
+    )
+    why = "none of those tried stays inside [safety]"
+    for room in (0 * strays, strays):
+        inside = _narrower(planner.plan, room.max(axis=0))
+        made = None if inside is None else probe(inside, base, found, trials, library)
+        if made is None:
+            break
+        if not offer:
+            return "", made.sentence
+        candidate = _candidate_of(workspace, planner.narrowed(made.policy), best.candidate.id)
+        reasons = (*outside_limits(task, candidate.policy), *objections(task, candidate, strays))
+        if not reasons:
+            while (saved := workspace.save_candidate(candidate, kind="probe")) is None:
+                workspace.forget_trials()  # somebody took the name
+                candidate = replace(candidate, id=workspace.next_id())
+            return saved.id, made.sentence
+        why = "; ".join(reasons).replace(candidate.id, "the best")
+    return "", f"{found.next_trial}; no candidate for it is offered: {why}" * bool(offer)
+
+
+def _candidate_of(workspace: Folder, policy: Policy, base: str) -> Candidate:
+    """A probe as the model predicts it, not stored yet."""
+    from grounded.rollout import simulate
+    from grounded.search.candidate import Candidate
+    from grounded.search.improve import model_fingerprint
+
+    planner = workspace.planner
     task = planner.plan
-    base = planner.widened(best.candidate.policy)
-    made = probe(task, base, found, trials, library)
-    if made is None or not (write or found.indistinguishable):
-        return "", made.sentence if made is not None else ""
-    policy = planner.narrowed(made.policy)
     predicted = simulate(task.problem(exact=True), planner.widened(policy))
-    candidate = Candidate(
+    return Candidate(
         id=workspace.next_id(),
         policy=policy,
         iteration=0,
         alpha=1.0,
-        base=best.candidate.id,
+        base=base,
         model=model_fingerprint(task),
         predicted_states=predicted.states[:, : planner.task.model.n],
         predicted_inputs=predicted.inputs,
         predicted_utility=predicted.utility,
     )
-    while (saved := workspace.save_candidate(candidate, kind="probe")) is None:
-        workspace.forget_trials()  # somebody took the name
-        candidate = replace(candidate, id=workspace.next_id())
-    return saved.id, made.sentence
+
+
+def _narrower(task: Task, strays: Array) -> Task | None:
+    """A task whose [safety] is narrower by how far runs have strayed, (n,); None: nothing is left.
+
+    Its further states, the memory of effects, have none.
+    """
+    room = np.append(strays, np.zeros(task.model.n - len(strays)))
+    assert task.safety_low is not None and task.safety_high is not None
+    low, high = task.safety_low + room, task.safety_high - room
+    return replace(task, safety_low=low, safety_high=high) if (low < high).all() else None
+
+
+def probe_command(workspace: Folder, identity: str) -> NextCommand:
+    """How a probe is run: by [system], or by people, who need its export."""
+    from grounded_trials.workspace.proposing import for_robot
+
+    here = workspace.config.system.reachable
+    return NextCommand("run", (identity,)) if here else for_robot(workspace, identity)
 
 
 def diagnosable(workspace: Folder) -> list[Trial]:

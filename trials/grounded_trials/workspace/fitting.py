@@ -11,6 +11,7 @@ import numpy as np
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result
 from grounded.trial import Trial
+from grounded_trials.workspace.adopting import settled
 from grounded_trials.workspace.config import set_in_model, set_latency
 from grounded_trials.workspace.folder import Folder
 
@@ -64,17 +65,34 @@ def fit_trials(
     engine: Engine | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Fit:
-    """Parameters of the workspace's model from its trials."""
+    """Parameters of the workspace's model, adopted effects in it, from its trials.
+
+    The memory of an effect (a lag's output) is measured by nothing: the filter follows it from
+    what the commands say of its start.
+    """
     from grounded.estimate import of_states, record_of
     from grounded.fit import fit
 
-    model = workspace.task.model
+    planner = workspace.planner
     guessed = {n for t in workspace.trials() for n in t.meta.get("estimated", "").split(",")}
-    measured = [i for i, name in enumerate(model.state_names) if name not in guessed]
-    records = [record_of(model, trial) for trial in usable_trials(workspace)]
+    model, n = planner.plan.model, planner.task.model.n
+    measured = [i for i, name in enumerate(model.state_names[:n]) if name not in guessed]
+    records = []
+    for trial in usable_trials(workspace):
+        lifted = planner.lift(trial)
+        known = np.r_[np.ones(n), 0.1 * np.ptp(lifted.states[:, n:], axis=0) + 1e-6]
+        record = record_of(model, lifted)
+        records.append(
+            replace(
+                record,
+                measured=record.measured[:, measured],
+                start=np.where(np.arange(model.n) < n, 0.0, lifted.states),
+                start_std=known,
+            )
+        )
     return fit(
-        workspace.task,
-        [replace(r, measured=r.measured[:, measured]) for r in records],
+        planner.plan,
+        records,
         names,
         fit_latency="common" if latency else "known",
         measurement=of_states(model, [model.state_names[i] for i in measured]),
@@ -87,15 +105,22 @@ def fit_trials(
 def apply_fit(workspace: Folder, found: Fit) -> None:
     """Writes the fitted values (and a fitted latency) that the data identify to grounded.toml.
 
-    What they don't identify was held where it was while the others were fitted.
+    What they don't identify was held where it was while the others were fitted. A fitted latency
+    is the whole one: it takes the place of adopted delays.
     """
-    base = workspace.base_model
+    base, table = workspace.base_model, workspace.config.model
     values = {
         name: float(f"{e.value:.8g}")
         for name, e in found.params.items()
-        if name in base.params and e.identified
+        if name != "latency" and e.identified
     }
-    set_in_model(workspace.config.file, params=dict(workspace.config.model.params) | values)
+    own, effects = settled(values, table.effects)
     if "latency" in found.params and found.params["latency"].identified:
         delays = zip(base.input_names, found.latency, strict=True)
         set_latency(workspace.config.file, {name: round(float(d), 6) for name, d in delays})
+        effects = [e for e in effects if not str(e["name"]).startswith("delay:")]
+    set_in_model(
+        workspace.config.file,
+        params=dict(table.params) | own,
+        effects=effects if table.effects else None,
+    )

@@ -13,12 +13,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from grounded.errors import GroundedError, NextCommand
+from grounded.policy import Policy
 from grounded.result import Result
 from grounded.search.candidate import Tried
-from grounded.trial import Trial, interpolate_gaps
+from grounded.trial import LAST, Trial, interpolate_gaps
 from grounded_trials.logs.log_files import kind_of, log_files, log_records
-from grounded_trials.logs.log_table import log_mapping, read_log
+from grounded_trials.logs.log_table import log_mapping, mapped_signals, read_log
+from grounded_trials.logs.resample import Span, to_grid
 from grounded_trials.logs.samples import SignalReport
 from grounded_trials.plain_file import read_file
 from grounded_trials.store.own_files import CANDIDATE, FILE_LIMIT, TRIAL
@@ -28,7 +32,8 @@ from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import sha256
 from grounded_trials.workspace.proposing import standing_in
-from grounded_trials.workspace.trial_check import warnings_about, what_ran
+from grounded_trials.workspace.run_start import likely_starts, run_start
+from grounded_trials.workspace.trial_check import suspicion, warnings_about
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -91,8 +96,11 @@ def ingest_log(
         )
     if candidate is not None and data:
         raise GroundedError("--data is for a log that ran no candidate; drop it or --candidate")
-    read = (_own if kind == TRIAL else _foreign)(workspace, path, candidate, data)
-    read = _recognised(workspace, path, read, candidate)
+    if kind == TRIAL:
+        read = _own(workspace, path, candidate, data)
+    else:
+        read = _foreign(workspace, path, candidate, data)
+    read = _recognised(workspace, path, read, candidate, foreign=kind != TRIAL)
     before = _repeated(workspace, path, read)
     added = workspace.store.add(read.data, again=before != "")
     if read.bare:  # what it ran is kept beside it
@@ -121,21 +129,70 @@ def ingest_log(
     )
 
 
-def _recognised(workspace: Folder, path: Path, read: _Read, candidate: str | None) -> _Read:
-    """Refuses a log whose commands are not its candidate's; with a warning if one was named."""
+def _recognised(
+    workspace: Folder, path: Path, read: _Read, candidate: str | None, *, foreign: bool
+) -> _Read:
+    """Refuses a log whose commands are not its candidate's; with a warning if one was named.
+
+    A foreign log without a [log.span] may begin before the run: it is taken from where that fits.
+    """
     ran = read.trial.candidate
     if not ran or sha256(read.data)[:DIGITS] in workspace.store.digests():
         return read
     own, _ = workspace.candidate(ran)
     trial = interpolate_gaps(read.trial).trial
-    why = what_ran(workspace.task, trial, own, workspace.read().candidates)
+    why, other = suspicion(workspace.task, trial, own, workspace.read().candidates)
+    if why and foreign and not workspace.config.log.sub("span").names():
+        start = _begins(workspace, path, own.policy)
+        if start is not None:
+            later = _foreign(workspace, path, ran, False, start)
+            said = (
+                f"the log begins {start:.2f} s before {ran} does: it is taken from there; "
+                f"[log.span] start = {start:.4g} says so"
+            )
+            return replace(later, warnings=(*later.warnings, said))
     if why and candidate is None:
+        instead = ("--candidate", other) if other else ("--data",)
+        what = f"; with --candidate {other} for what it seems to have run" * bool(other)
         raise GroundedError(
-            f"{path} did not run {ran}: {why}. Take it in with --data for fitting and diagnosis, "
-            "or with --candidate ID for what it ran all the same",
-            NextCommand("ingest", (str(path), "--data")),
+            f"{path} did not run {ran}: {why}. If it begins before the run does, say where that "
+            "begins, [log.span] start = SECONDS; take it in with --data for fitting and diagnosis"
+            f"{what}, or with --candidate {ran} all the same",
+            NextCommand("ingest", (str(path), *instead)),
         )
     return replace(read, warnings=(*read.warnings, why)) if why else read
+
+
+def _begins(workspace: Folder, path: Path, policy: Policy) -> float | None:
+    """Where in a foreign log the run of a policy begins, seconds after its first sample.
+
+    None where nothing in it looks like that run, or states are estimated.
+    """
+    model, task = workspace.base_model, workspace.task
+    mapping = log_mapping(workspace.config.log, model.state_names, model.input_names)
+    if mapping is None or workspace.config.estimate.names():
+        return None
+    names = (model.state_names, model.input_names)
+    try:
+        series = mapped_signals(log_files(path), mapping, *names)
+        whole = to_grid(series, task.dt, *names, angles=model.angles)
+    except GroundedError:
+        return None
+
+    def trial_from(start: float) -> Trial | None:
+        span = Span(start=start)
+        try:
+            cut = to_grid(series, task.dt, *names, span, angles=model.angles, steps=task.horizon)
+        except GroundedError:
+            return None
+        run = Trial(cut.states, cut.inputs, task.dt, *names, start_inputs=cut.start_inputs)
+        whole = cut.late_s == 0 and run.steps >= task.horizon - LAST
+        return interpolate_gaps(run).trial if whole else None
+
+    sent = [series[name] for name in model.input_names]
+    at = np.concatenate([s.t[1:][np.diff(s.values) != 0] for s in sent])
+    changes = (at - whole.origin_ns) * 1e-9
+    return run_start(policy, likely_starts(policy, whole), changes, trial_from)
 
 
 def _repeated(workspace: Folder, path: Path, read: _Read) -> str:
@@ -232,8 +289,10 @@ def _check_candidate(
         )
 
 
-def _foreign(workspace: Folder, path: Path, candidate: str | None, data: bool) -> _Read:
-    """Somebody else's log, through [log]."""
+def _foreign(
+    workspace: Folder, path: Path, candidate: str | None, data: bool, start: float | None = None
+) -> _Read:
+    """Somebody else's log, through [log]; from `start` on, seconds after its first sample."""
     model, task = workspace.base_model, workspace.config.task
     files = log_files(path)
     mapping = log_mapping(workspace.config.log, model.state_names, model.input_names)
@@ -244,6 +303,8 @@ def _foreign(workspace: Folder, path: Path, candidate: str | None, data: bool) -
             "map it: `inspect` prints one",
             NextCommand("inspect", (str(path),)),
         )
+    if start is not None:
+        mapping = replace(mapping, span=Span(start=start))
     chosen = "" if data else candidate or _outstanding(workspace, path)
     states, estimate = model.state_names, None
     if workspace.config.estimate.names():

@@ -22,6 +22,7 @@ class Inspected(Result):
     report: LogReport
     log_table: str  # TOML; "" where none is guessed
     why_none: str = ""  # why no table is guessed for a log that needs one
+    ran_nothing: bool = False  # no candidate was proposed yet that it could have run
 
     @property
     def format(self) -> str:
@@ -42,8 +43,9 @@ class Inspected(Result):
             return NextCommand("run", (Path(self.log).stem,))
         if self.stored:
             return NextCommand("report")
-        ready = self.format == TRIAL or self.log_table
-        return NextCommand("ingest" if ready else "inspect", (self.log,))
+        if self.format != TRIAL and not self.log_table:
+            return NextCommand("inspect", (self.log,))
+        return NextCommand("ingest", (*["--data"] * self.ran_nothing, self.log))
 
     def summary(self) -> str:
         """The log and its size."""
@@ -90,4 +92,4 @@ def inspect_in(workspace: Folder, log: str | Path) -> Inspected:
     states, inputs = guess_mapping(report, model.state_names, model.input_names)
     states, inputs = weigh(report, model, states, inputs)
     table = mapping_toml(states, inputs, simulated=is_simulated(report))
-    return Inspected(str(log), report, table)
+    return Inspected(str(log), report, table, ran_nothing=not workspace.candidate_ids())

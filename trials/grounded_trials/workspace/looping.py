@@ -72,9 +72,9 @@ def learn_in(
     return replace(status, then=NextCommand("learn")) if goes_on else status
 
 
-def next_in(workspace: Folder, log: Path, *, runner: bool) -> NextRun:
+def next_in(workspace: Folder, log: Path, candidate: str | None, *, runner: bool) -> NextRun:
     """Takes a log in, proposes, and exports for the robot, see `Workspace.next`."""
-    taken = ingest_log(workspace, log)
+    taken = ingest_log(workspace, log, candidate)
     workspace.forget()
     proposed, exported = propose_in(workspace), None
     if proposed.candidate is not None:

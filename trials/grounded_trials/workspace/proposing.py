@@ -163,7 +163,11 @@ def _void(workspace: Folder, before: Sequence[str]) -> list[str]:
     if meta.get("kind") != "search":
         return []
     if meta.get("task") == workspace.task.hash:
-        why = "the model was changed since it was made"
+        from grounded.search.improve import model_fingerprint
+
+        same = made.model == model_fingerprint(workspace.planner.plan)
+        why = "the trial that it followed was set aside" if same else "the model was changed"
+        why += " since it was made"
     elif (made.policy.state_names, made.policy.input_names) != (
         workspace.base_model.state_names,
         workspace.base_model.input_names,

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Mapping
+from contextlib import suppress
 from io import TextIOWrapper
 from pathlib import Path
 
@@ -203,11 +204,15 @@ def replace_target(config: Config, columns: Mapping[str, Array]) -> Path:
     """Writes target.csv and its length to grounded.toml, see `Workspace.target`."""
     name = config.task.target or "target.csv"
     path = config.file.parent / name
+    before: dict[str, float] = {}
     if path.is_file():
+        with suppress(GroundedError, ValueError):  # one that can't be read is replaced
+            names, values = read_target(path)
+            before = equal_weights(dict(zip(names[1:], values.T[1:], strict=True)))
         path.replace(path.with_name(path.name + ".bak"))
     write_target(path, config.task.dt, dict(columns))
     weights = {state: round(w, 6) for state, w in equal_weights(columns).items()}
-    set_target(config.file, name, len(next(iter(columns.values()))) - 1, weights)
+    set_target(config.file, name, len(next(iter(columns.values()))) - 1, weights, before)
     return path
 
 
@@ -228,6 +233,7 @@ def target_text(dt: float, columns: dict[str, Array]) -> str:
     H = len(next(iter(columns.values())))
     lines = [",".join(["t", *columns])]
     for i in range(H):
-        row = [f"{i * dt:.10g}", *(f"{values[i]:.9g}" for values in columns.values())]
+        at = (round(float(values[i]), 12) + 0.0 for values in columns.values())  # no -0
+        row = [f"{i * dt:.10g}", *(f"{value:.9g}" for value in at)]
         lines.append(",".join(row))
     return "\n".join(lines) + "\n"

@@ -17,6 +17,7 @@ from grounded.policy import Policy, z_difference
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import HUGE, Trial, interpolate_gaps
+from grounded_trials.wording import with_unit
 from grounded_trials.workspace.folder import Folder
 
 FAR = 0.1  # of a state's range in the trial: a start this far from s_0 is worth a warning
@@ -24,6 +25,7 @@ LEAST = 10  # steps: less says nothing of who drove
 UNLIKE = 0.25  # of the squared difference of unrelated commands; 1 - UNLIKE: concordance (Lin 1989)
 WINDOWS = 8  # parts of a trial that must each be alike, twice as loosely: somebody may take over
 DECISIVE = 12.0  # [nats] of evidence that another candidate ran: luck gives it to 1 run in 10^6
+SAME, CLEAR = 0.5, 0.01  # of the own one's difference, and of an input: it is the other's run
 ROUGH = 4.0  # steps over which noise keeps its sign: what strays for longer, somebody steers
 FINE = 1e-4  # of an input's size: how finely commands are logged at best
 BACK = (0.0, 0.5, 1.0, 1.5, 2.0, -0.5, -1.0)  # steps: states of the log older than those acted on
@@ -51,10 +53,12 @@ def warnings_about(workspace: Folder, trial: Trial) -> tuple[str, ...]:
     if not trial.candidate:
         return tuple(found)
     if whole.steps < task.horizon:
+        ends = f"after {whole.steps} of {task.horizon} steps ({whole.steps * trial.dt:.2f} s)"
         found.append(
-            f"the run ended after {whole.steps} of {task.horizon} steps "
-            f"({whole.steps * trial.dt:.2f} s): a failed candidate; its data stay usable for "
-            "fit and diagnose"
+            f"the run ended {ends}: a failed candidate; its data stay usable for fit and diagnose"
+            if whole.whole(task.horizon) is whole
+            else f"the log ends {ends}: the rest is judged as if the robot had gone on as it did "
+            "last; keep recording for a second after the run"
         )
     if whole.steps > task.horizon:
         found.append(
@@ -69,7 +73,8 @@ def warnings_about(workspace: Folder, trial: Trial) -> tuple[str, ...]:
     if ran is not None and ran.alike and abs(ran.late) == 1 and ran.moved < UNLIKE:
         found.append(
             "the inputs fit the policy better when moved by one step: they seem to be logged a "
-            f"step {'late' if ran.late > 0 else 'early'}; log each command at the time it is sent"
+            f"step {'late' if ran.late > 0 else 'early'}. Log each command at the time it is sent; "
+            f"if it is, [log.span] start is a step too {'early' if ran.late > 0 else 'late'}"
         )
     return tuple(found)
 
@@ -215,7 +220,14 @@ def _steps_alike(noise: Array) -> float:
 
 
 def what_ran(task: Task, trial: Trial, own: Candidate, others: Sequence[Candidate]) -> str:
-    """Why a trial is not a run of its candidate, "" where nothing says so.
+    """Why a trial is not a run of its candidate, "" where nothing says so; see `suspicion`."""
+    return suspicion(task, trial, own, others)[0]
+
+
+def suspicion(
+    task: Task, trial: Trial, own: Candidate, others: Sequence[Candidate]
+) -> tuple[str, str]:
+    """Why a trial is not a run of its candidate, "" where nothing says so; and whose it is.
 
     Args:
         task: whose latency and units hold.
@@ -226,23 +238,26 @@ def what_ran(task: Task, trial: Trial, own: Candidate, others: Sequence[Candidat
     trial, latest = trial.until(task.horizon), _latest(task)
     found = follows(own.policy, trial, latest)
     if found is None or (found.alike and found.error < 1e-5):
-        return ""
+        return "", ""
     rivals = [(follows(c.policy, trial, latest), c.id) for c in others[-OTHERS:] if c.id != own.id]
-    alike = [(evidence(found, f), name) for f, name in rivals if f is not None and f.alike]
-    nats, name = max(alike, default=(-np.inf, ""))
+    alike = [(evidence(found, f), n, f.error) for f, n in rivals if f is not None and f.alike]
+    nats, name, left = max(alike, default=(-np.inf, "", 0.0))
     if nats > DECISIVE:
-        looks = f"they are those of {name}"
+        same = left < max(CLEAR, SAME * found.error)
+        looks = f"they are {'' if same else 'nearer to '}those of {name}"
+        name = name if same else ""
     elif found.alike:
-        return ""
+        return "", ""
     elif found.until_s >= LEAST * trial.dt:
         looks = f"up to {found.until_s:.1f} s they are alike: somebody, or something, took over"
     else:
         looks = "somebody, or another controller, drove"
-    unit = task.model.inputs[found.input]
+    name = name if nats > DECISIVE else ""
+    differs = with_unit(f"{found.rms:.3g}", task.model.inputs[found.input])
     return (
         f"its commands are not what {own.id} sends on the logged states: {found.input} differs by "
-        f"{found.rms:.3g} {unit} (rms); {looks}"
-    )
+        f"{differs} (rms); {looks}"
+    ), name
 
 
 def _latest(task: Task) -> int:

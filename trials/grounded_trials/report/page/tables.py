@@ -84,7 +84,7 @@ def candidate_table(findings: Findings) -> list[Block]:
             "predicted utility": figure(c.predicted_utility),
             "real utility": figure(tried.utility),
             "std. error": figure(standard_error(tried), 2),
-            "verdict ": tried.verdict(tried is findings.history[-1]),
+            "verdict ": findings.standing.verdict(tried),
             "trials ": " ".join(t.id for t in tried.trials) or "none",
         }
         rows.append(cells)

@@ -1,0 +1,51 @@
+"""The candidate that a diagnosis offers next is one that `run` and `export` hand over."""
+
+import pytest
+
+from grounded.effects import Library
+from grounded.errors import NextCommand
+from grounded_trials import Workspace
+from grounded_trials.workspace.diagnosing import _probe, probe_command
+from grounded_trials.workspace.handover import checked_candidate
+from workspaces import CONFIG, make
+
+NOISY = CONFIG + "[system.noise.measurement]\nx = 0.02\nv = 0.05\n"
+
+
+@pytest.fixture(scope="module")
+def diagnosed(tmp_path_factory):
+    """A noisy cart after three trials, and its diagnosis, which offers a probe."""
+    w = Workspace(make(tmp_path_factory.mktemp("w") / "w", config=NOISY).folder)
+    w.learn(3)
+    return w, w.diagnose(probe=True)
+
+
+def offered(w, found):
+    trials = [w.planner.lift(trial) for trial in w.task_trials()]
+    return _probe(w, found, trials, Library(), write=True)
+
+
+def bounded(w, low, high):
+    (w.folder / "grounded.toml").write_text(NOISY + f"[safety]\nx = [{low}, {high}]\n")
+    w.forget()
+
+
+def test_every_probe_that_is_offered_is_handed_over(diagnosed):
+    """The last bounds are kept by the predicted run, but not where it strays as others did."""
+    w, found = diagnosed
+    assert found.probe and found.probe in found.next_trial
+    reached = w.candidate(found.probe)[0].predicted_states[:, 0]
+    for room in (0.5, 0.05, 0.0):
+        bounded(w, -1.0, reached.max() + room)
+        identity, _ = offered(w, found)
+        assert checked_candidate(w, identity).overridden == ()
+    bounded(w, reached.min() - 0.01, reached.max() + 0.5)
+    identity, sentence = offered(w, found)
+    assert identity == "" and "[safety]" in sentence
+
+
+def test_people_export_a_probe(diagnosed, tmp_path):
+    w, found = diagnosed
+    assert probe_command(w, found.probe) == NextCommand("run", (found.probe,))
+    bare = make(tmp_path / "w", config=CONFIG.partition("[system]")[0])
+    assert probe_command(bare, "c0004") == NextCommand("export", ("c0004", "--runner"))
