@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from grounded.solve.bias import Grounding
 
 PLANNING = DescentOptions(max_iterations=30, tolerance=1e-6)  # a direction needs no more digits
-FORETOLD = 0.3  # share of a step's gain by which crude slopes that are good enough may be off
 GENTLER = 1e3  # factor on the price of inputs from which gentler gains are designed
 GENTLER_TIMES = 2  # they are tried
 
@@ -51,35 +50,16 @@ class About:
         exact = ground(plan, own, exact=True, shift=self.grounding.shift)
         self.real = exact.on(plan.problem(exact=True))
         self.theta = planner.widened(incumbent.candidate.policy)
-        self.corrected = self._corrected() if options.damps else None
+        self.corrected: Corrected | None = None
+        if options.damps and len(make.now.history) > 1:
+            from grounded.search.mispredictions import corrected
+
+            self.corrected = corrected(planner, incumbent, make.now.history, self.real)
         if self.corrected is not None:
             self.real = self.corrected.on(self.real)
         already = make.predicted(self.real, incumbent.candidate.policy).utility
         self.already = already if np.isfinite(already) else incumbent.utility
         self.least = options.tolerance * abs(self.already)
-
-    def _corrected(self) -> Corrected | None:
-        """The model with slopes that other trials have corrected, where it is to be believed.
-
-        Not where the crude slopes are good enough: asked about the step that made the incumbent,
-        the model that replays the incumbent knows what that step has brought.
-        """
-        make, history, own = self.make, self.make.now.history, self.incumbent.candidate
-        lost = losers_of(history, own.id, make.fingerprint)
-        base = next((t for t in history if t.candidate.id == own.base), None)
-        if not lost and (base is None or self._knows(base)):
-            return None
-        from grounded.search.mispredictions import SURE, corrected
-
-        found = corrected(make.planner, self.incumbent, history, self.real)
-        return found[0] if found and (found[1] < SURE or lost) else None
-
-    def _knows(self, base: Tried) -> bool:
-        """Whether the model would have told by how much the incumbent is better than its base."""
-        expected = self.make.predicted(self.real, base.candidate.policy).utility
-        real = self.incumbent.utility - base.utility
-        off = abs(self.incumbent.utility - expected - real)
-        return bool(off <= FORETOLD * abs(real))
 
     def candidate(self, policy: Policy, step: Step, way: Way) -> Candidate:
         """A candidate with what this model promises of it."""

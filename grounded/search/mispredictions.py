@@ -31,7 +31,8 @@ import numpy as np
 
 from grounded.compile import Problem
 from grounded.frozen import Array, wrapped
-from grounded.rollout import augmented
+from grounded.policy import Policy
+from grounded.rollout import augmented, simulate
 from grounded.search.candidate import Tried
 from grounded.search.corrected import Corrected
 from grounded.search.planner import Planner
@@ -43,8 +44,12 @@ PRICES = (1e-4, 1e-3, 1e-2, 0.1, 1.0, 10.0)  # of the ridge
 FADING = (0.0, 2.0)  # powers of the distance with which a trial's squares lose weight
 PARTS = 8  # of the run, left out in turn
 NEAREST = 12  # trials that count
+ASKED = 3  # of the nearest trials, which slopes foretell them
 LATEST = 100  # of which they are chosen
 DEAD = 1e-4  # of the mean square effect of the inputs: less explains nothing
+
+
+Run = tuple[Array, Array]  # states (H + 1, n) and inputs (H, m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,12 +68,14 @@ class Seen:
     u: Array  # (H, m)
     before: Array  # (H, m) u one step earlier
     y: Array  # (H, n) what was mispredicted
+    run: Run  # its states and the inputs as sent
+    policy: Policy
 
 
 def corrected(
     planner: Planner, incumbent: Tried, history: Sequence[Tried], grounded: Problem
-) -> tuple[Corrected, float] | None:
-    """The grounded model with slopes that other trials have corrected, and `Slopes.missed`.
+) -> Corrected | None:
+    """The grounded model with slopes that other trials have corrected.
 
     Args:
         planner: the task, and the task as it is planned.
@@ -77,15 +84,53 @@ def corrected(
         grounded: the exact model with the incumbent's bias.
 
     Returns:
-        None where there is no other whole trial.
+        None where the crude slopes foretell the other trials as well.
     """
     own = seen(planner, incumbent, grounded)
-    told = [t for t in history[-LATEST:] if t is not incumbent and t.trials]
-    others = [seen(planner, t, grounded) for t in told if np.isfinite(t.utility)]
-    found = None if own is None else slopes(own, [o for o in others if o is not None], grounded)
-    if own is None or found is None:
+    if own is None:
         return None
-    return Corrected(grounded.system, found.law, own.x, own.u, own.before), found.missed
+    told = [t for t in history[-LATEST:] if t is not incumbent and np.isfinite(t.utility)]
+    others = [o for o in (seen(planner, t, grounded) for t in told) if o is not None]
+    moved = [_apart(grounded, o.run, own.run) for o in others]
+    others = [others[j] for j in np.argsort(moved, kind="stable") if moved[j] > 0]
+
+    def without(left_out: Sequence[Seen]) -> tuple[Problem, Corrected, float] | None:
+        found = slopes(own, [o for o in others if o not in left_out], grounded)
+        if found is None:
+            return None
+        made = Corrected(grounded.system, found.law, own.x, own.u, own.before)
+        return made.on(grounded), made, found.missed
+
+    best = without(())
+    if best is None or (len(others) == 1 and best[2] > SURE):
+        return None
+    crude = fair = 0.0
+    for other in others[:ASKED]:
+        judged = best if len(others) == 1 else without((other,))
+        crude += foretold(planner, grounded, own, other)
+        fair += foretold(planner, judged[0], own, other) if judged else 1.0
+    return best[1] if fair < crude else None
+
+
+def foretold(planner: Planner, problem: Problem, own: Seen, other: Seen) -> float:
+    """The share of what a trial did otherwise than the incumbent's that a model is off by."""
+    policy, angles = other.policy, tuple(map(bool, problem.angles))
+    run = simulate(problem, policy.laid_out(problem.system.states, angles, problem.depths))
+    n = own.x.shape[1]
+    off = _apart(problem, (run.states[:, :n], run.inputs), other.run)
+    return min(1.0, off / _apart(problem, own.run, other.run))
+
+
+def _apart(problem: Problem, a: Run, b: Run) -> float:
+    """The cost of the difference of two runs."""
+    n = a[0].shape[1]
+    with np.errstate(all="ignore"):
+        x = wrapped(a[0] - b[0], problem.angles[:n]) ** 2
+        u = a[1] - b[1]
+        change = np.diff(u, axis=0, prepend=0.0) ** 2
+        cost = np.vdot(problem.state_weight[:, :n], x) + np.sum(u**2 @ problem.input_weight)
+        cost += np.sum(change @ problem.change_weight)
+    return float(cost) if np.isfinite(cost) else np.inf
 
 
 def seen(planner: Planner, tried: Tried, grounded: Problem) -> Seen | None:
@@ -101,7 +146,8 @@ def seen(planner: Planner, tried: Tried, grounded: Problem) -> Seen | None:
     x = np.ascontiguousarray(trial.states[:-1])
     predicted = grounded.system.step(x, _sent(grounded, u), grounded.p, grounded.dt)
     y = wrapped(trial.states[1:] - predicted - grounded.bias, grounded.angles)
-    return Seen(x, u, np.vstack([u[:1], u[:-1]]), y)
+    run = (trial.states, trial.inputs)
+    return Seen(x, u, np.vstack([u[:1], u[:-1]]), y, run, tried.candidate.policy)
 
 
 def _sent(problem: Problem, u: Array) -> Array:
