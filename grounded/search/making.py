@@ -14,6 +14,7 @@ from grounded.result import Result, document
 from grounded.rollout import Rollout, simulate
 from grounded.search.candidate import Candidate, Tried, Way
 from grounded.search.first_policy import first_policy
+from grounded.search.mispredictions import Believed, apart, believed
 from grounded.search.planner import Planner
 from grounded.search.safety import objections, spread
 from grounded.search.standing import SearchOptions, Standing, losers_of, wild
@@ -31,6 +32,7 @@ GENTLER = 1e3  # factor on the price of inputs from which gentler gains are desi
 GENTLER_TIMES = 2  # they are tried
 
 
+def PROBE(*a): pass
 class About:
     """The model grounded on the incumbent's trial, and what it promises of other policies.
 
@@ -50,23 +52,34 @@ class About:
         exact = ground(plan, own, exact=True, shift=self.grounding.shift)
         self.real = exact.on(plan.problem(exact=True))
         self.theta = planner.widened(incumbent.candidate.policy)
-        self.corrected: Corrected | None = None
+        self.own = (own.states, own.inputs)
+        self.models = [Believed(self.real)]
         if options.damps and len(make.now.history) > 1:
-            from grounded.search.mispredictions import corrected
-
-            self.corrected = corrected(planner, incumbent, make.now.history, self.real)
-        if self.corrected is not None:
-            self.real = self.corrected.on(self.real)
+            self.models = believed(planner, incumbent, make.now.history, self.real)[-1:]
         already = make.predicted(self.real, incumbent.candidate.policy).utility
         self.already = already if np.isfinite(already) else incumbent.utility
         self.least = options.tolerance * abs(self.already)
 
-    def candidate(self, policy: Policy, step: Step, way: Way) -> Candidate:
+    def candidate(self, policy: Policy, step: Step, way: Way, model: Believed) -> Candidate:
         """A candidate with what this model promises of it."""
-        return self.make.candidate(policy, self.real, step, self.already, way)
+        made = self.make.candidate(policy, model.problem, step, self.already, way)
+        return replace(made, slopes="corrected" if model.corrected else "")
 
     def step_from(self, first: Step, promised: list[float]) -> Proposal | None:
         """The first step worth a trial; one that is not allowed, or None; adds to the promises."""
+        found: list[tuple[float, Proposal]] = []
+        for model in self.models:
+            if (one := self._step_in(model, first, promised)) is not None:
+                found.append(one)
+        allowed = [one for one in found if one[1].candidate is not None]
+        if not allowed:
+            return found[0][1] if found else None
+        return max(allowed, key=lambda one: one[0])[1]
+
+    def _step_in(
+        self, model: Believed, first: Step, promised: list[float]
+    ) -> tuple[float, Proposal] | None:
+        """The same in one model, and the gain that is to be expected of it."""
         make, options, plan = self.make, self.options, self.make.planner.plan
         own = self.incumbent.candidate.id
         lost = losers_of(make.now.history, own, make.fingerprint, self.way)
@@ -78,20 +91,27 @@ class About:
                 continue
             if step.damping not in directions:
                 directions[step.damping] = direction(
-                    plan, self.theta, self.grounding, options, step.damping, self.corrected
+                    plan, self.theta, self.grounding, options, step.damping, model.corrected
                 )
             policy = self.theta.toward(directions[step.damping], step.alpha)
-            made = self.candidate(policy, step, self.way)
-            if made.predicted_gain > self.least:
+            made = self.candidate(policy, step, self.way, model)
+            gain = made.predicted_gain
+            if gain > self.least:
+                run = (made.predicted_states, made.predicted_inputs)
+                expected = gain - model.missed * apart(model.problem, run, self.own)
+                PROBE(model, step, gain, expected)
+                if expected <= 0:
+                    promised.append(gain)
+                    continue
                 proposal = make.checked(made)
                 if proposal.candidate is not None:
-                    return proposal
+                    return expected, proposal
                 unsafe = proposal
                 continue
-            promised.append(made.predicted_gain)
-            if abs(made.predicted_gain) <= self.least:
+            promised.append(gain)
+            if abs(gain) <= self.least:
                 break
-        return unsafe
+        return (0.0, unsafe) if unsafe else None
 
     def own_plan(self, rival: Proposal | None) -> Proposal | None:
         """A model that was changed since: its own new plan, where more is promised of that.
@@ -105,7 +125,8 @@ class About:
         if base.model == make.fingerprint or tried:
             return None
         policy, _ = first_policy(make.planner.plan)
-        made = self.candidate(policy, Step(), "own plan")
+        model = min(self.models, key=lambda model: model.missed)
+        made = self.candidate(policy, Step(), "own plan", model)
         promise = rival.candidate.predicted_gain if rival and rival.candidate else self.least
         better = made.predicted_gain > promise or wild(self.incumbent)
         proposal = make.checked(made) if better else None

@@ -72,44 +72,54 @@ class Seen:
     policy: Policy
 
 
-def corrected(
+@dataclass(frozen=True, eq=False)
+class Believed:
+    """A model that replays the incumbent's trial, and the share of movements that it misses."""
+
+    problem: Problem
+    corrected: Corrected | None = None
+    missed: float = 0.0
+
+
+def believed(
     planner: Planner, incumbent: Tried, history: Sequence[Tried], grounded: Problem
-) -> Corrected | None:
-    """The grounded model with slopes that other trials have corrected.
+) -> list[Believed]:
+    """The grounded model; and it with corrected slopes, where those foretell trials better.
 
     Args:
         planner: the task, and the task as it is planned.
         incumbent: whose trial the model replays.
         history: all candidates with their trials.
         grounded: the exact model with the incumbent's bias.
-
-    Returns:
-        None where the crude slopes foretell the other trials as well.
     """
     own = seen(planner, incumbent, grounded)
     if own is None:
-        return None
+        return [Believed(grounded)]
     told = [t for t in history[-LATEST:] if t is not incumbent and np.isfinite(t.utility)]
     others = [o for o in (seen(planner, t, grounded) for t in told) if o is not None]
-    moved = [_apart(grounded, o.run, own.run) for o in others]
+    moved = [apart(grounded, o.run, own.run) for o in others]
     others = [others[j] for j in np.argsort(moved, kind="stable") if moved[j] > 0]
+    if not others:
+        return [Believed(grounded)]
 
-    def without(left_out: Sequence[Seen]) -> tuple[Problem, Corrected, float] | None:
+    def without(left_out: Sequence[Seen]) -> tuple[Corrected, float] | None:
         found = slopes(own, [o for o in others if o not in left_out], grounded)
         if found is None:
             return None
-        made = Corrected(grounded.system, found.law, own.x, own.u, own.before)
-        return made.on(grounded), made, found.missed
+        return Corrected(grounded.system, found.law, own.x, own.u, own.before), found.missed
 
     best = without(())
-    if best is None or (len(others) == 1 and best[2] > SURE):
-        return None
     crude = fair = 0.0
-    for other in others[:ASKED]:
+    asked = others[:ASKED]
+    for other in asked:
         judged = best if len(others) == 1 else without((other,))
         crude += foretold(planner, grounded, own, other)
-        fair += foretold(planner, judged[0], own, other) if judged else 1.0
-    return best[1] if fair < crude else None
+        fair += foretold(planner, judged[0].on(grounded), own, other) if judged else 1.0
+    crude, fair = crude / len(asked), fair / len(asked)
+    found = [Believed(grounded, None, crude)]
+    if best is None or fair >= crude or (len(others) == 1 and best[1] > SURE):
+        return found
+    return [*found, Believed(best[0].on(grounded), best[0], fair)]
 
 
 def foretold(planner: Planner, problem: Problem, own: Seen, other: Seen) -> float:
@@ -117,11 +127,11 @@ def foretold(planner: Planner, problem: Problem, own: Seen, other: Seen) -> floa
     policy, angles = other.policy, tuple(map(bool, problem.angles))
     run = simulate(problem, policy.laid_out(problem.system.states, angles, problem.depths))
     n = own.x.shape[1]
-    off = _apart(problem, (run.states[:, :n], run.inputs), other.run)
-    return min(1.0, off / _apart(problem, own.run, other.run))
+    off = apart(problem, (run.states[:, :n], run.inputs), other.run)
+    return min(1.0, off / apart(problem, own.run, other.run))
 
 
-def _apart(problem: Problem, a: Run, b: Run) -> float:
+def apart(problem: Problem, a: Run, b: Run) -> float:
     """The cost of the difference of two runs."""
     n = a[0].shape[1]
     with np.errstate(all="ignore"):
