@@ -53,33 +53,20 @@ class About:
         self.real = exact.on(plan.problem(exact=True))
         self.theta = planner.widened(incumbent.candidate.policy)
         self.own = (own.states, own.inputs)
-        self.models = [Believed(self.real)]
+        self.model = Believed(self.real)
         if options.damps and len(make.now.history) > 1:
-            self.models = believed(planner, incumbent, make.now.history, self.real)[-1:]
+            self.model = believed(planner, incumbent, make.now.history, self.real)
         already = make.predicted(self.real, incumbent.candidate.policy).utility
         self.already = already if np.isfinite(already) else incumbent.utility
         self.least = options.tolerance * abs(self.already)
 
-    def candidate(self, policy: Policy, step: Step, way: Way, model: Believed) -> Candidate:
+    def candidate(self, policy: Policy, step: Step, way: Way) -> Candidate:
         """A candidate with what this model promises of it."""
-        made = self.make.candidate(policy, model.problem, step, self.already, way)
-        return replace(made, slopes="corrected" if model.corrected else "")
+        made = self.make.candidate(policy, self.model.problem, step, self.already, way)
+        return replace(made, slopes="corrected" if self.model.corrected else "")
 
     def step_from(self, first: Step, promised: list[float]) -> Proposal | None:
         """The first step worth a trial; one that is not allowed, or None; adds to the promises."""
-        found: list[tuple[float, Proposal]] = []
-        for model in self.models:
-            if (one := self._step_in(model, first, promised)) is not None:
-                found.append(one)
-        allowed = [one for one in found if one[1].candidate is not None]
-        if not allowed:
-            return found[0][1] if found else None
-        return max(allowed, key=lambda one: one[0])[1]
-
-    def _step_in(
-        self, model: Believed, first: Step, promised: list[float]
-    ) -> tuple[float, Proposal] | None:
-        """The same in one model, and the gain that is to be expected of it."""
         make, options, plan = self.make, self.options, self.make.planner.plan
         own = self.incumbent.candidate.id
         lost = losers_of(make.now.history, own, make.fingerprint, self.way)
@@ -91,27 +78,27 @@ class About:
                 continue
             if step.damping not in directions:
                 directions[step.damping] = direction(
-                    plan, self.theta, self.grounding, options, step.damping, model.corrected
+                    plan, self.theta, self.grounding, options, step.damping, self.model.corrected
                 )
             policy = self.theta.toward(directions[step.damping], step.alpha)
-            made = self.candidate(policy, step, self.way, model)
+            made = self.candidate(policy, step, self.way)
             gain = made.predicted_gain
             if gain > self.least:
                 run = (made.predicted_states, made.predicted_inputs)
-                expected = gain - model.missed * apart(model.problem, run, self.own)
-                PROBE(model, step, gain, expected)
+                expected = gain - self.model.missed * apart(self.real, run, self.own)
+                PROBE(self.model, step, gain, expected)
                 if expected <= 0:
                     promised.append(gain)
                     continue
                 proposal = make.checked(made)
                 if proposal.candidate is not None:
-                    return expected, proposal
+                    return proposal
                 unsafe = proposal
                 continue
             promised.append(gain)
             if abs(gain) <= self.least:
                 break
-        return (0.0, unsafe) if unsafe else None
+        return unsafe
 
     def own_plan(self, rival: Proposal | None) -> Proposal | None:
         """A model that was changed since: its own new plan, where more is promised of that.
@@ -125,8 +112,7 @@ class About:
         if base.model == make.fingerprint or tried:
             return None
         policy, _ = first_policy(make.planner.plan)
-        model = min(self.models, key=lambda model: model.missed)
-        made = self.candidate(policy, Step(), "own plan", model)
+        made = self.candidate(policy, Step(), "own plan")
         promise = rival.candidate.predicted_gain if rival and rival.candidate else self.least
         better = made.predicted_gain > promise or wild(self.incumbent)
         proposal = make.checked(made) if better else None

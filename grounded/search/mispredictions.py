@@ -25,7 +25,7 @@ than the crude ones from the second trial on; above it they are asked only after
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -40,6 +40,8 @@ from grounded.solve.bias import input_span
 from grounded.trial import mean_trial
 
 SURE = 0.1  # share of the mispredictions that a law may leave where it was not fitted
+FINER = 0.5  # share of what a law misses that its finer one may
+PRICE = 0.1  # of a law of one step's own, of the features' mean square
 PRICES = (1e-4, 1e-3, 1e-2, 0.1, 1.0, 10.0)  # of the ridge
 FADING = (0.0, 2.0)  # powers of the distance with which a trial's squares lose weight
 PARTS = 8  # of the run, left out in turn
@@ -50,14 +52,6 @@ DEAD = 1e-4  # of the mean square effect of the inputs: less explains nothing
 
 
 Run = tuple[Array, Array]  # states (H + 1, n) and inputs (H, m)
-
-
-@dataclass(frozen=True, eq=False)
-class Slopes:
-    """What the slopes lack, by the features [x, u, u before, y before] of n states, m inputs."""
-
-    law: Array  # (H, n, 2 n + 2 m)
-    missed: float  # share of the nearest trial's mispredictions that the first law leaves
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +77,7 @@ class Believed:
 
 def believed(
     planner: Planner, incumbent: Tried, history: Sequence[Tried], grounded: Problem
-) -> list[Believed]:
+) -> Believed:
     """The grounded model; and it with corrected slopes, where those foretell trials better.
 
     Args:
@@ -94,32 +88,31 @@ def believed(
     """
     own = seen(planner, incumbent, grounded)
     if own is None:
-        return [Believed(grounded)]
+        return Believed(grounded)
     told = [t for t in history[-LATEST:] if t is not incumbent and np.isfinite(t.utility)]
     others = [o for o in (seen(planner, t, grounded) for t in told) if o is not None]
     moved = [apart(grounded, o.run, own.run) for o in others]
     others = [others[j] for j in np.argsort(moved, kind="stable") if moved[j] > 0]
     if not others:
-        return [Believed(grounded)]
+        return Believed(grounded)
 
-    def without(left_out: Sequence[Seen]) -> tuple[Corrected, float] | None:
-        found = slopes(own, [o for o in others if o not in left_out], grounded)
-        if found is None:
-            return None
-        return Corrected(grounded.system, found.law, own.x, own.u, own.before), found.missed
-
-    best = without(())
-    crude = fair = 0.0
-    asked = others[:ASKED]
+    asked, missed = others[:ASKED], dict[str, float]()
     for other in asked:
-        judged = best if len(others) == 1 else without((other,))
-        crude += foretold(planner, grounded, own, other)
-        fair += foretold(planner, judged[0].on(grounded), own, other) if judged else 1.0
-    crude, fair = crude / len(asked), fair / len(asked)
-    found = [Believed(grounded, None, crude)]
-    if best is None or fair >= crude or (len(others) == 1 and best[1] > SURE):
-        return found
-    return [*found, Believed(best[0].on(grounded), best[0], fair)]
+        rest = [o for o in others if o is not other]
+        made = laws(own, rest or others, grounded, sure=not rest)
+        for kind, law in {"": None, **made}.items():
+            share = foretold(planner, _with(law, own, grounded).problem, own, other)
+            missed[kind] = missed.get(kind, 0.0) + share / len(asked)
+    kind = min(("", "shared", "each"), key=lambda kind: missed.get(kind, 1.0))
+    law = laws(own, others, grounded, sure=len(others) == 1).get(kind)
+    return replace(_with(law, own, grounded), missed=missed[kind])
+
+
+def _with(law: Array | None, own: Seen, grounded: Problem) -> Believed:
+    if law is None:
+        return Believed(grounded)
+    made = Corrected(grounded.system, law, own.x, own.u, own.before)
+    return Believed(made.on(grounded), made)
 
 
 def foretold(planner: Planner, problem: Problem, own: Seen, other: Seen) -> float:
@@ -164,13 +157,16 @@ def _sent(problem: Problem, u: Array) -> Array:
     return np.ascontiguousarray(u if problem.input_shift is None else u - problem.input_shift)
 
 
-def slopes(own: Seen, others: Sequence[Seen], grounded: Problem) -> Slopes | None:
-    """Both laws.
+def laws(
+    own: Seen, others: Sequence[Seen], grounded: Problem, *, sure: bool = False
+) -> dict[str, Array]:
+    """What the slopes lack, (H, n, 2 n + 2 m) by [x, u, u before, y before], in several ways.
 
     Args:
         own: the incumbent's trial.
         others: trials that moved away from it.
         grounded: the exact model with the incumbent's bias.
+        sure: only a law that holds in parts of the run that it was not fitted to.
     """
     span = input_span(grounded, own.u)
     reach = np.ptp(own.x, axis=0) + 1e-9
@@ -179,7 +175,7 @@ def slopes(own: Seen, others: Sequence[Seen], grounded: Problem) -> Slopes | Non
     far = np.array([_rms(d[:, :n] / reach) + _rms(d[:, n : n + m] / span) for d in moves])
     near = [int(j) for j in np.argsort(far, kind="stable")[:NEAREST] if far[j] > 1e-9]
     if not near:
-        return None
+        return {}
     d, y, far = np.array([moves[j] for j in near]), np.array([others[j].y for j in near]), far[near]
     f_u, by_input = _matching(own, y / far[:, None, None], grounded, span)
     v = np.einsum("tmn,jtn->jtm", by_input, y)
@@ -188,9 +184,25 @@ def slopes(own: Seen, others: Sequence[Seen], grounded: Problem) -> Slopes | Non
     law = np.zeros((len(own.x), n, 2 * n + 2 * m))
     law[:, :, : n + 2 * m] = f_u @ D[:, : n + 2 * m]
     law[1:, :, n + 2 * m :] = f_u[1:] @ D[:, n + 2 * m :] @ by_input[:-1]
-    left = y - np.einsum("tnq,jtq->jtn", law, d)
-    law[:, :, : n + m] += shared(d[:, :, : n + m], left, far)[0]
-    return Slopes(law, missed)
+    now = d[:, :, : n + m]
+    law[:, :, : n + m] += shared(now, y - np.einsum("tnq,jtq->jtn", law, d), far)[0]
+    if sure:
+        return {"shared": law} if missed < SURE else {}
+    each, both = np.zeros_like(law), law.copy()
+    each[:, :, : n + m] = each_step(now, y, far)
+    both[:, :, : n + m] += each_step(now, y - np.einsum("tnq,jtq->jtn", law, d), far)
+    return {"shared": law, "each": each, "both": both}
+
+
+def each_step(d: Array, y: Array, far: Array) -> Array:
+    """A law of its own for each step, (H, k, q); see `shared`."""
+    d, y = d / far[:, None, None], y / far[:, None, None]
+    scale = np.sqrt(np.mean(d**2, axis=(0, 1))) + 1e-12
+    d = (d / scale).transpose(1, 0, 2)  # (H, j, q)
+    gram = d @ d.transpose(0, 2, 1)
+    price = PRICE * np.trace(gram, axis1=1, axis2=2).mean() / d.shape[2]
+    found = np.linalg.solve(gram + price * np.diag(far / far[0]), y.transpose(1, 0, 2))
+    return (found.transpose(0, 2, 1) @ d) / scale
 
 
 def _features(own: Seen, other: Seen, grounded: Problem) -> Array:
