@@ -11,14 +11,12 @@ from grounded.compile import DescentOptions, Problem
 from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.result import Result, document
-from grounded.rollout import Rollout, simulate
 from grounded.search.candidate import Candidate, Tried, Way
 from grounded.search.first_policy import first_policy
-from grounded.search.mispredictions import Believed, apart, believed
-from grounded.search.planner import Planner
+from grounded.search.planner import Planner, predicted
 from grounded.search.safety import objections, spread
 from grounded.search.standing import SearchOptions, Standing, losers_of, wild
-from grounded.search.step_size import Step
+from grounded.search.step_size import KEPT, Step
 from grounded.solve import ddp
 from grounded.task import Task
 from grounded.trial import mean_trial
@@ -32,7 +30,6 @@ GENTLER = 1e3  # factor on the price of inputs from which gentler gains are desi
 GENTLER_TIMES = 2  # they are tried
 
 
-def PROBE(*a): pass
 class About:
     """The model grounded on the incumbent's trial, and what it promises of other policies.
 
@@ -52,18 +49,41 @@ class About:
         exact = ground(plan, own, exact=True, shift=self.grounding.shift)
         self.real = exact.on(plan.problem(exact=True))
         self.theta = planner.widened(incumbent.candidate.policy)
-        self.own = (own.states, own.inputs)
-        self.model = Believed(self.real)
-        if options.damps and len(make.now.history) > 1:
-            self.model = believed(planner, incumbent, make.now.history, self.real)
-        already = make.predicted(self.real, incumbent.candidate.policy).utility
+        self.run = (own.states[:, : planner.task.model.n], own.inputs)
+        self.corrected: Corrected | None = None
+        self.missed = 0.0  # share of its movements that the model is likely to be off by
+        if options.damps and len(make.now.history) > 1 and not self._kept():
+            from grounded.search.mispredictions import believed
+
+            found = believed(planner, incumbent, make.now.history, self.real)
+            self.real, self.corrected, self.missed = found.problem, found.corrected, found.missed
+        already = predicted(self.real, incumbent.candidate.policy).utility
         self.already = already if np.isfinite(already) else incumbent.utility
         self.least = options.tolerance * abs(self.already)
 
+    def _kept(self) -> bool:
+        """Whether the model's own slopes have foretold what the step to the incumbent brought."""
+        made, history = self.incumbent.candidate, self.make.now.history
+        base = next((t for t in history if t.candidate.id == made.base), None)
+        if base is None or made.slopes or made.model != self.make.fingerprint:
+            return False
+        off = self.incumbent.utility - base.utility - made.predicted_gain
+        lost = losers_of(history, made.id, made.model)
+        return not lost and abs(off) <= (1 - KEPT) * made.predicted_gain
+
     def candidate(self, policy: Policy, step: Step, way: Way) -> Candidate:
         """A candidate with what this model promises of it."""
-        made = self.make.candidate(policy, self.model.problem, step, self.already, way)
-        return replace(made, slopes="corrected" if self.model.corrected else "")
+        made = self.make.candidate(policy, self.real, step, self.already, way)
+        return replace(made, slopes="corrected" if self.corrected else "")
+
+    def _expected(self, made: Candidate) -> float:
+        """The predicted gain less what the model is likely to miss of the step."""
+        if not self.missed:
+            return made.predicted_gain
+        from grounded.search.mispredictions import apart
+
+        run = (made.predicted_states, made.predicted_inputs)
+        return made.predicted_gain - self.missed * apart(self.real, run, self.run)
 
     def step_from(self, first: Step, promised: list[float]) -> Proposal | None:
         """The first step worth a trial; one that is not allowed, or None; adds to the promises."""
@@ -78,25 +98,19 @@ class About:
                 continue
             if step.damping not in directions:
                 directions[step.damping] = direction(
-                    plan, self.theta, self.grounding, options, step.damping, self.model.corrected
+                    plan, self.theta, self.grounding, options, step.damping, self.corrected
                 )
             policy = self.theta.toward(directions[step.damping], step.alpha)
             made = self.candidate(policy, step, self.way)
-            gain = made.predicted_gain
+            gain = self._expected(made)
             if gain > self.least:
-                run = (made.predicted_states, made.predicted_inputs)
-                expected = gain - self.model.missed * apart(self.real, run, self.own)
-                PROBE(self.model, step, gain, expected)
-                if expected <= 0:
-                    promised.append(gain)
-                    continue
                 proposal = make.checked(made)
                 if proposal.candidate is not None:
                     return proposal
                 unsafe = proposal
                 continue
             promised.append(gain)
-            if abs(gain) <= self.least:
+            if abs(made.predicted_gain) <= self.least:
                 break
         return unsafe
 
@@ -144,19 +158,19 @@ class Maker:
             caution = base.candidate.caution if base and follows else self.now.caution
         if caution and base is not None:
             policy = self._gently(policy, problem, caution)
-        predicted = self.predicted(problem, policy)
+        run = predicted(problem, policy)
         return Candidate(
             id=self.identity,
             policy=policy,
             iteration=0 if base is None else self.now.iteration + 1,
             alpha=step.alpha,
             damping=step.damping,
-            predicted_gain=predicted.utility - already,
+            predicted_gain=run.utility - already,
             base="" if base is None else base.candidate.id,
             model=self.fingerprint,
-            predicted_states=predicted.states[:, : self.planner.task.model.n],
-            predicted_inputs=predicted.inputs,
-            predicted_utility=predicted.utility,
+            predicted_states=run.states[:, : self.planner.task.model.n],
+            predicted_inputs=run.inputs,
+            predicted_utility=run.utility,
             caution=caution,
             way=way,
         )
@@ -181,7 +195,7 @@ class Maker:
         """The same run with the gains of a regulator whose inputs cost GENTLER ** caution more."""
         if policy.gain is None:
             return policy
-        run = self.predicted(problem, policy)
+        run = predicted(problem, policy)
         factor = GENTLER**caution
         weight = factor * problem.input_weight + (factor - 1) * problem.change_weight
         found = ddp.sweep(replace(problem, input_weight=weight), run.z, run.inputs)
@@ -190,11 +204,6 @@ class Maker:
         plan, columns = self.planner.plan, _columns(problem, self.planner.plan)
         gains, about = found.gains.K[:, :, columns], run.z[:-1, columns]
         return self.planner.narrowed(plan.policy(run.inputs, gains, about))
-
-    def predicted(self, problem: Problem, policy: Policy) -> Rollout:
-        """A robot's policy in a model that may have more states than it measures."""
-        angles = tuple(map(bool, problem.angles))
-        return simulate(problem, policy.laid_out(problem.system.states, angles, problem.depths))
 
     def checked(self, made: Candidate) -> Proposal:
         """A candidate that is finite, inside the limits and predicted to stay safe; or none."""

@@ -16,10 +16,15 @@ second one to what the first leaves:
 
 Each is a ridge regression. Its price, and how much less trials count the farther they are from the
 incumbent, are chosen by leaving out parts of the run in turn (Stone, "Cross-validatory choice and
-assessment of statistical predictions", J. R. Stat. Soc. B 36, 1974): a law that does not hold in
-parts of the run that it was not fitted to is not used. `Slopes.missed` is the share that the first
-law leaves there, by the trial nearest to the incumbent. Below SURE the corrected slopes are better
-than the crude ones from the second trial on; above it they are asked only after a step has lost.
+assessment of statistical predictions", J. R. Stat. Soc. B 36, 1974). A third law is one of each
+step's own, for what no single law says: dry friction, tyres that let go.
+
+Which slopes are believed, the crude ones, those of laws 1 and 2 or those of each step, is decided by
+leaving out trials in turn, the nearest ones: each model, fitted to the others, runs the policy of the
+one left out, and `Believed.missed` is the share of what that trial did otherwise than the incumbent's
+(`apart`, in the units of the cost) that it does not foretell. The least wins. As much of every new
+step is likely to be missed, so that is taken off its promise (`making.About.step_from`). A single other trial
+can't be left out: there, laws 1 and 2 must hold in parts of the run that they were not fitted to.
 """
 
 from __future__ import annotations
@@ -32,21 +37,21 @@ import numpy as np
 from grounded.compile import Problem
 from grounded.frozen import Array, wrapped
 from grounded.policy import Policy
-from grounded.rollout import augmented, simulate
+from grounded.rollout import augmented
 from grounded.search.candidate import Tried
 from grounded.search.corrected import Corrected
-from grounded.search.planner import Planner
+from grounded.search.planner import Planner, predicted
 from grounded.solve.bias import input_span
 from grounded.trial import mean_trial
 
-SURE = 0.1  # share of the mispredictions that a law may leave where it was not fitted
-FINER = 0.5  # share of what a law misses that its finer one may
+SURE = 0.1  # share of the mispredictions that a law of one trial may leave where it was not fitted
 PRICE = 0.1  # of a law of one step's own, of the features' mean square
 PRICES = (1e-4, 1e-3, 1e-2, 0.1, 1.0, 10.0)  # of the ridge
 FADING = (0.0, 2.0)  # powers of the distance with which a trial's squares lose weight
 PARTS = 8  # of the run, left out in turn
 NEAREST = 12  # trials that count
-ASKED = 3  # of the nearest trials, which slopes foretell them
+KINDS = ("", "shared", "each")  # the crude slopes, laws 1 and 2, those of each step
+ASKED = 3  # the nearest trials, which are left out in turn
 LATEST = 100  # of which they are chosen
 DEAD = 1e-4  # of the mean square effect of the inputs: less explains nothing
 
@@ -78,7 +83,7 @@ class Believed:
 def believed(
     planner: Planner, incumbent: Tried, history: Sequence[Tried], grounded: Problem
 ) -> Believed:
-    """The grounded model; and it with corrected slopes, where those foretell trials better.
+    """The grounded model, with corrected slopes where those foretell trials better.
 
     Args:
         planner: the task, and the task as it is planned.
@@ -100,10 +105,11 @@ def believed(
     for other in asked:
         rest = [o for o in others if o is not other]
         made = laws(own, rest or others, grounded, sure=not rest)
-        for kind, law in {"": None, **made}.items():
-            share = foretold(planner, _with(law, own, grounded).problem, own, other)
+        for kind in KINDS:
+            model = _with(made.get(kind), own, grounded).problem
+            share = unforetold(model, own, other) if kind in made or not kind else 1.0
             missed[kind] = missed.get(kind, 0.0) + share / len(asked)
-    kind = min(("", "shared", "each"), key=lambda kind: missed.get(kind, 1.0))
+    kind = min(missed, key=lambda kind: missed[kind])
     law = laws(own, others, grounded, sure=len(others) == 1).get(kind)
     return replace(_with(law, own, grounded), missed=missed[kind])
 
@@ -115,13 +121,11 @@ def _with(law: Array | None, own: Seen, grounded: Problem) -> Believed:
     return Believed(made.on(grounded), made)
 
 
-def foretold(planner: Planner, problem: Problem, own: Seen, other: Seen) -> float:
+def unforetold(problem: Problem, own: Seen, other: Seen) -> float:
     """The share of what a trial did otherwise than the incumbent's that a model is off by."""
-    policy, angles = other.policy, tuple(map(bool, problem.angles))
-    run = simulate(problem, policy.laid_out(problem.system.states, angles, problem.depths))
-    n = own.x.shape[1]
-    off = apart(problem, (run.states[:, :n], run.inputs), other.run)
-    return min(1.0, off / apart(problem, own.run, other.run))
+    found = predicted(problem, other.policy)
+    run = (found.states[:, : own.x.shape[1]], found.inputs)
+    return min(1.0, apart(problem, run, other.run) / apart(problem, own.run, other.run))
 
 
 def apart(problem: Problem, a: Run, b: Run) -> float:
@@ -147,8 +151,8 @@ def seen(planner: Planner, tried: Tried, grounded: Problem) -> Seen | None:
     z = augmented(grounded, trial.states, trial.inputs, past)
     u = grounded.queue.effective(z[:-1], trial.inputs)
     x = np.ascontiguousarray(trial.states[:-1])
-    predicted = grounded.system.step(x, _sent(grounded, u), grounded.p, grounded.dt)
-    y = wrapped(trial.states[1:] - predicted - grounded.bias, grounded.angles)
+    moved = grounded.system.step(x, _sent(grounded, u), grounded.p, grounded.dt)
+    y = wrapped(trial.states[1:] - moved - grounded.bias, grounded.angles)
     run = (trial.states, trial.inputs)
     return Seen(x, u, np.vstack([u[:1], u[:-1]]), y, run, tried.candidate.policy)
 
@@ -188,10 +192,9 @@ def laws(
     law[:, :, : n + m] += shared(now, y - np.einsum("tnq,jtq->jtn", law, d), far)[0]
     if sure:
         return {"shared": law} if missed < SURE else {}
-    each, both = np.zeros_like(law), law.copy()
+    each = np.zeros_like(law)
     each[:, :, : n + m] = each_step(now, y, far)
-    both[:, :, : n + m] += each_step(now, y - np.einsum("tnq,jtq->jtn", law, d), far)
-    return {"shared": law, "each": each, "both": both}
+    return {"shared": law, "each": each}
 
 
 def each_step(d: Array, y: Array, far: Array) -> Array:
