@@ -169,9 +169,8 @@ def _ended(
     elif finite and max(finite) < -least and not lost:
         ending = "every step loses"
         sentence = (
-            f"every step from {own} is expected to lose by the grounded model, at least "
-            f"{-max(finite):.4g}: its slopes don't hold along this trial; a diagnosis may say what "
-            "it lacks"
+            f"every step from {own} loses in the grounded model, by at least {-max(finite):.4g}: "
+            "its slopes don't hold along this trial; a diagnosis may say what it lacks"
         )
     elif lost:
         phase, then, ending = "converged", None, "no step improved"

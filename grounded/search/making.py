@@ -86,12 +86,16 @@ class About:
         return made.predicted_gain - self.missed * apart(self.real, run, self.run)
 
     def step_from(self, first: Step, promised: list[float]) -> Proposal | None:
-        """The first step worth a trial; one that is not allowed, or None; adds to the promises."""
+        """The first step worth a trial; one that is not allowed, or None; adds to the promises.
+
+        One that is likely to lose, for what the model misses, is left for when there is no other.
+        """
         make, options, plan = self.make, self.options, self.make.planner.plan
         own = self.incumbent.candidate.id
         lost = losers_of(make.now.history, own, make.fingerprint, self.way)
         losers = {(candidate.damping, candidate.alpha) for candidate in lost}
         unsafe: Proposal | None = None
+        doubted: Proposal | None = None
         directions: dict[float, Policy] = {}
         for step in options.steps_from(first):
             if (step.damping, step.alpha) in losers:
@@ -102,17 +106,19 @@ class About:
                 )
             policy = self.theta.toward(directions[step.damping], step.alpha)
             made = self.candidate(policy, step, self.way)
-            gain = self._expected(made)
-            if gain > self.least:
+            if made.predicted_gain > self.least:
                 proposal = make.checked(made)
-                if proposal.candidate is not None:
+                if proposal.candidate is None:
+                    unsafe = proposal
+                elif self._expected(made) > self.least:
                     return proposal
-                unsafe = proposal
+                else:
+                    doubted = doubted or proposal
                 continue
-            promised.append(gain)
+            promised.append(made.predicted_gain)
             if abs(made.predicted_gain) <= self.least:
                 break
-        return unsafe
+        return doubted or unsafe
 
     def own_plan(self, rival: Proposal | None) -> Proposal | None:
         """A model that was changed since: its own new plan, where more is promised of that.

@@ -19,12 +19,13 @@ incumbent, are chosen by leaving out parts of the run in turn (Stone, "Cross-val
 assessment of statistical predictions", J. R. Stat. Soc. B 36, 1974). A third law is one of each
 step's own, for what no single law says: dry friction, tyres that let go.
 
-Which slopes are believed, the crude ones, those of laws 1 and 2 or those of each step, is decided by
-leaving out trials in turn, the nearest ones: each model, fitted to the others, runs the policy of the
-one left out, and `Believed.missed` is the share of what that trial did otherwise than the incumbent's
-(`apart`, in the units of the cost) that it does not foretell. The least wins. As much of every new
-step is likely to be missed, so that is taken off its promise (`making.About.step_from`). A single other trial
-can't be left out: there, laws 1 and 2 must hold in parts of the run that they were not fitted to.
+Which slopes are believed, the crude ones, those of laws 1 and 2 or those of each step, is decided
+by leaving out the nearest trials in turn: each model, fitted to the others, runs the policy of the
+one left out, and `Believed.missed` is the share of what that trial did otherwise than the
+incumbent's (`apart`, in the units of the cost) that it does not foretell. The least wins. As much of
+a new step is likely to be missed, so one that would lose by that is put last (`making.About`). A
+single other trial can't be left out: there, law 1 must hold in parts of the run that it was not
+fitted to.
 """
 
 from __future__ import annotations

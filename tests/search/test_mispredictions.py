@@ -33,7 +33,7 @@ def found(request):
         task = cart_task()
         return searched(task, Plant(task.model.with_values({"mass": 1.6, "drag": 0.6})), 2)
     task = rover_task()
-    return searched(task, Plant(other(task.model, 1.3), latency={"speed": 0.05, "turn": 0.02}), 2)
+    return searched(task, Plant(other(task.model, 1.3), latency={"speed": 0.05, "turn": 0.02}), 3)
 
 
 def test_the_trial_is_still_replayed_and_others_are_foretold(found):
@@ -124,7 +124,7 @@ def test_each_step_may_have_a_law_of_its_own():
     laws = rng.normal(size=(30, 2, 3))
     far = np.ones(9)
     got = each_step(d, np.einsum("tkq,jtq->jtk", laws, d), far)
-    assert np.abs(got - laws).mean() < 0.1 * np.abs(laws).mean()
+    assert np.abs(got - laws).mean() < 0.2 * np.abs(laws).mean()
     assert not each_step(d, np.zeros((9, 30, 2)), far).any()
 
 
@@ -140,12 +140,11 @@ def test_runs_are_apart_by_the_cost_of_their_difference(found):
 def test_slopes_that_kept_their_promise_are_not_corrected():
     """Worse before: the aircraft's flight went on with laws that do not hold (-1840 for -1826)."""
     task = cart_task()
-    plant = Plant(task.model.with_values({"mass": 1.02}))
+    plant = Plant(task.model.with_values({"mass": 1.3}))
     found = searched(task, plant, 2)
     first, second = found.search.standing.history
     brought = second.utility - first.utility
     assert second.accepted and brought == pytest.approx(second.candidate.predicted_gain, rel=0.1)
-    made = found.search.ask()
-    assert made is None or made.slopes == ""
+    assert found.search.ask().slopes == ""
     wrong = searched(task, Plant(task.model.with_values({"mass": 1.6, "drag": 0.6})), 2)
     assert wrong.search.ask().slopes == "corrected"

@@ -21,6 +21,7 @@ from grounded.search.ask_tell import Search, learn
 from grounded.search.first_guess import filled_target
 from grounded.search.first_policy import first_policy
 from grounded.search.improve import propose
+from grounded.search.mispredictions import Believed
 from grounded.search.planner import planner_for
 from grounded.search.standing import SearchOptions
 from grounded.solve import ddp
@@ -98,7 +99,7 @@ def test_an_unstable_loop_gets_gentler_gains(late_arm):
 def test_an_end_says_what_it_is(late_arm, monkeypatch):
     """Reason 5: 0.1 said "promises less than 0.1 %" where the grounded model diverges."""
     monkeypatch.setattr(making, "GENTLER_TIMES", 0)
-    monkeypatch.setattr(mispredictions, "corrected", lambda *_: None)
+    monkeypatch.setattr(mispredictions, "believed", lambda *a: Believed(a[3]))
     standing = learn(late_arm.task, late_arm.run).standing
     assert standing.ending in ("model diverges", "every step loses", "no step improved")
     if standing.ending != "no step improved":
@@ -153,6 +154,6 @@ def test_slopes_that_trials_have_corrected_pay(mechanisms, monkeypatch):
         return replace(trial, states=trial.states[:, : len(names)], state_names=names)
 
     with_them = learn(task, run).best.utility
-    monkeypatch.setattr(mispredictions, "corrected", lambda *_: None)
+    monkeypatch.setattr(mispredictions, "believed", lambda *a: Believed(a[3]))
     without = learn(task, run).best.utility
     assert with_them > without + 2.0  # of a gap of 22
