@@ -22,10 +22,10 @@ step's own, for what no single law says: dry friction, tyres that let go.
 Which slopes are believed, the crude ones, those of laws 1 and 2 or those of each step, is decided
 by leaving out the nearest trials in turn: each model, fitted to the others, runs the policy of the
 one left out, and `Believed.missed` is the share of what that trial did otherwise than the
-incumbent's (`apart`, in the units of the cost) that it does not foretell. The least wins. As much of
-a new step is likely to be missed, so one that would lose by that is put last (`making.About`). A
-single other trial can't be left out: there, law 1 must hold in parts of the run that it was not
-fitted to.
+incumbent's (`apart`, in the units of the cost) that it does not foretell. The least wins. As much
+of a new step is likely to be missed, so one that would lose by that is put last (`making.About`).
+A single other trial can't be left out: there, it is at least the share of the mispredictions that
+law 1 leaves in parts of the run that it was not fitted to.
 """
 
 from __future__ import annotations
@@ -45,7 +45,6 @@ from grounded.search.planner import Planner, predicted
 from grounded.solve.bias import input_span
 from grounded.trial import mean_trial
 
-SURE = 0.1  # share of the mispredictions that a law of one trial may leave where it was not fitted
 PRICE = 0.1  # of a law of one step's own, of the features' mean square
 PRICES = (1e-4, 1e-3, 1e-2, 0.1, 1.0, 10.0)  # of the ridge
 FADING = (0.0, 2.0)  # powers of the distance with which a trial's squares lose weight
@@ -105,13 +104,15 @@ def believed(
     asked, missed = others[:ASKED], dict[str, float]()
     for other in asked:
         rest = [o for o in others if o is not other]
-        made = laws(own, rest or others, grounded, sure=not rest)
-        for kind in KINDS:
+        made, left = laws(own, rest or others, grounded)
+        for kind in KINDS if rest else KINDS[:2]:
             model = _with(made.get(kind), own, grounded).problem
             share = unforetold(model, own, other) if kind in made or not kind else 1.0
+            if kind and not rest:
+                share = max(share, left)
             missed[kind] = missed.get(kind, 0.0) + share / len(asked)
     kind = min(missed, key=lambda kind: missed[kind])
-    law = laws(own, others, grounded, sure=len(others) == 1).get(kind)
+    law = laws(own, others, grounded)[0].get(kind)
     return replace(_with(law, own, grounded), missed=missed[kind])
 
 
@@ -162,16 +163,17 @@ def _sent(problem: Problem, u: Array) -> Array:
     return np.ascontiguousarray(u if problem.input_shift is None else u - problem.input_shift)
 
 
-def laws(
-    own: Seen, others: Sequence[Seen], grounded: Problem, *, sure: bool = False
-) -> dict[str, Array]:
-    """What the slopes lack, (H, n, 2 n + 2 m) by [x, u, u before, y before], in several ways.
+def laws(own: Seen, others: Sequence[Seen], grounded: Problem) -> tuple[dict[str, Array], float]:
+    """What the slopes lack, (H, n, 2 n + 2 m) by [x, u, u before, y before], in both ways.
 
     Args:
         own: the incumbent's trial.
         others: trials that moved away from it.
         grounded: the exact model with the incumbent's bias.
-        sure: only a law that holds in parts of the run that it was not fitted to.
+
+    Returns:
+        The laws by their names in KINDS, and the share of the nearest trial's mispredictions that
+        law 1 leaves in parts of the run that it was not fitted to.
     """
     span = input_span(grounded, own.u)
     reach = np.ptp(own.x, axis=0) + 1e-9
@@ -180,7 +182,7 @@ def laws(
     far = np.array([_rms(d[:, :n] / reach) + _rms(d[:, n : n + m] / span) for d in moves])
     near = [int(j) for j in np.argsort(far, kind="stable")[:NEAREST] if far[j] > 1e-9]
     if not near:
-        return {}
+        return {}, 1.0
     d, y, far = np.array([moves[j] for j in near]), np.array([others[j].y for j in near]), far[near]
     f_u, by_input = _matching(own, y / far[:, None, None], grounded, span)
     v = np.einsum("tmn,jtn->jtm", by_input, y)
@@ -191,11 +193,9 @@ def laws(
     law[1:, :, n + 2 * m :] = f_u[1:] @ D[:, n + 2 * m :] @ by_input[:-1]
     now = d[:, :, : n + m]
     law[:, :, : n + m] += shared(now, y - np.einsum("tnq,jtq->jtn", law, d), far)[0]
-    if sure:
-        return {"shared": law} if missed < SURE else {}
     each = np.zeros_like(law)
     each[:, :, : n + m] = each_step(now, y, far)
-    return {"shared": law, "each": each}
+    return {"shared": law, "each": each}, missed
 
 
 def each_step(d: Array, y: Array, far: Array) -> Array:
@@ -206,7 +206,7 @@ def each_step(d: Array, y: Array, far: Array) -> Array:
     gram = d @ d.transpose(0, 2, 1)
     price = PRICE * np.trace(gram, axis1=1, axis2=2).mean() / d.shape[2]
     found = np.linalg.solve(gram + price * np.diag(far / far[0]), y.transpose(1, 0, 2))
-    return (found.transpose(0, 2, 1) @ d) / scale
+    return np.asarray((found.transpose(0, 2, 1) @ d) / scale)
 
 
 def _features(own: Seen, other: Seen, grounded: Problem) -> Array:
