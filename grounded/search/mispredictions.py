@@ -17,7 +17,7 @@ second one to what the first leaves:
 Each is a ridge regression. Its price, and how much less trials count the farther they are from the
 incumbent, are chosen by leaving out parts of the run in turn (Stone, "Cross-validatory choice and
 assessment of statistical predictions", J. R. Stat. Soc. B 36, 1974). A third law is one of each
-step's own, for what no single law says: dry friction, tyres that let go.
+step's own, for what no single law says: a carpet that drags by heading, tyres that let go.
 
 Which slopes are believed, the crude ones, those of laws 1 and 2 or those of each step, is decided
 by leaving out the nearest trials in turn: each model, fitted to the others, runs the policy of the
