@@ -21,6 +21,11 @@ Way = Literal[
     "own plan",  # of a model that was changed since the incumbent was planned (`About.own_plan`)
 ]
 
+Slopes = Literal[
+    "",  # the model's own
+    "corrected",  # by what earlier trials were mispredicted by, see `mispredictions`
+]
+
 if TYPE_CHECKING:
     from grounded.figures.figure import Figure
 
@@ -42,6 +47,7 @@ class Candidate(Result):
     predicted_gain: float = float("nan")  # over the mean trial of its base
     caution: int = 0  # how often the first policy, or its gains, were designed more gently
     way: Way = ""  # how it was made
+    slopes: Slopes = ""  # of the model that it was planned in
 
     @property
     def grounded(self) -> bool:

@@ -11,13 +11,12 @@ from grounded.compile import DescentOptions, Problem
 from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.result import Result, document
-from grounded.rollout import Rollout, simulate
 from grounded.search.candidate import Candidate, Tried, Way
 from grounded.search.first_policy import first_policy
-from grounded.search.planner import Planner
+from grounded.search.planner import Planner, predicted
 from grounded.search.safety import objections, spread
 from grounded.search.standing import SearchOptions, Standing, losers_of, wild
-from grounded.search.step_size import Step
+from grounded.search.step_size import KEPT, Step
 from grounded.solve import ddp
 from grounded.task import Task
 from grounded.trial import mean_trial
@@ -27,7 +26,6 @@ if TYPE_CHECKING:
     from grounded.solve.bias import Grounding
 
 PLANNING = DescentOptions(max_iterations=30, tolerance=1e-6)  # a direction needs no more digits
-FORETOLD = 0.3  # share of a step's gain by which crude slopes that are good enough may be off
 GENTLER = 1e3  # factor on the price of inputs from which gentler gains are designed
 SWINGS = 6  # of an input about its plan, each as large as the plan's own range: a limit cycle
 
@@ -51,47 +49,53 @@ class About:
         exact = ground(plan, own, exact=True, shift=self.grounding.shift)
         self.real = exact.on(plan.problem(exact=True))
         self.theta = planner.widened(incumbent.candidate.policy)
-        self.corrected = self._corrected() if options.damps else None
-        if self.corrected is not None:
-            self.real = self.corrected.on(self.real)
-        already = make.predicted(self.real, incumbent.candidate.policy).utility
+        self.run = (own.states[:, : planner.task.model.n], own.inputs)
+        self.corrected: Corrected | None = None
+        self.missed = 0.0  # share of its movements that the model is likely to be off by
+        if options.damps and len(make.now.history) > 1 and not self._kept():
+            from grounded.search.mispredictions import believed
+
+            found = believed(planner, incumbent, make.now.history, self.real)
+            self.real, self.corrected, self.missed = found.problem, found.corrected, found.missed
+        already = predicted(self.real, incumbent.candidate.policy).utility
         self.already = already if np.isfinite(already) else incumbent.utility
         self.least = options.tolerance * abs(self.already)
 
-    def _corrected(self) -> Corrected | None:
-        """The model with slopes that other trials have corrected, where it is to be believed.
-
-        Not where the crude slopes are good enough: asked about the step that made the incumbent,
-        the model that replays the incumbent knows what that step has brought.
-        """
-        make, history, own = self.make, self.make.now.history, self.incumbent.candidate
-        lost = losers_of(history, own.id, make.fingerprint)
-        base = next((t for t in history if t.candidate.id == own.base), None)
-        if not lost and (base is None or self._knows(base)):
-            return None
-        from grounded.search.mispredictions import SURE, corrected
-
-        found = corrected(make.planner, self.incumbent, history, self.real)
-        return found[0] if found and (found[1] < SURE or lost) else None
-
-    def _knows(self, base: Tried) -> bool:
-        """Whether the model would have told by how much the incumbent is better than its base."""
-        expected = self.make.predicted(self.real, base.candidate.policy).utility
-        real = self.incumbent.utility - base.utility
-        off = abs(self.incumbent.utility - expected - real)
-        return bool(off <= FORETOLD * abs(real))
+    def _kept(self) -> bool:
+        """Whether the model's own slopes have foretold what the step to the incumbent brought."""
+        made, history = self.incumbent.candidate, self.make.now.history
+        base = next((t for t in history if t.candidate.id == made.base), None)
+        if base is None or made.slopes or made.model != self.make.fingerprint:
+            return False
+        off = self.incumbent.utility - base.utility - made.predicted_gain
+        lost = losers_of(history, made.id, made.model)
+        return not lost and abs(off) <= (1 - KEPT) * made.predicted_gain
 
     def candidate(self, policy: Policy, step: Step, way: Way) -> Candidate:
         """A candidate with what this model promises of it."""
-        return self.make.candidate(policy, self.real, step, self.already, way)
+        made = self.make.candidate(policy, self.real, step, self.already, way)
+        return replace(made, slopes="corrected" if self.corrected else "")
+
+    def _expected(self, made: Candidate) -> float:
+        """The predicted gain less what the model is likely to miss of the step."""
+        if not self.missed:
+            return made.predicted_gain
+        from grounded.search.mispredictions import apart
+
+        run = (made.predicted_states, made.predicted_inputs)
+        return made.predicted_gain - self.missed * apart(self.real, run, self.run)
 
     def step_from(self, first: Step, promised: list[float]) -> Proposal | None:
-        """The first step worth a trial; one that is not allowed, or None; adds to the promises."""
+        """The first step worth a trial; one that is not allowed, or None; adds to the promises.
+
+        One that is likely to lose, for what the model misses, is left for when there is no other.
+        """
         make, options, plan = self.make, self.options, self.make.planner.plan
         own = self.incumbent.candidate.id
         lost = losers_of(make.now.history, own, make.fingerprint, self.way)
         losers = {(candidate.damping, candidate.alpha) for candidate in lost}
         unsafe: Proposal | None = None
+        doubted: Proposal | None = None
         directions: dict[float, Policy] = {}
         for step in options.steps_from(first):
             if (step.damping, step.alpha) in losers:
@@ -104,14 +108,17 @@ class About:
             made = self.candidate(policy, step, self.way)
             if made.predicted_gain > self.least:
                 proposal = make.checked(made)
-                if proposal.candidate is not None:
+                if proposal.candidate is None:
+                    unsafe = proposal
+                elif self._expected(made) > self.least:
                     return proposal
-                unsafe = proposal
+                else:
+                    doubted = doubted or proposal
                 continue
             promised.append(made.predicted_gain)
             if abs(made.predicted_gain) <= self.least:
                 break
-        return unsafe
+        return doubted or unsafe
 
     def own_plan(self, rival: Proposal | None) -> Proposal | None:
         """A model that was changed since: its own new plan, where more is promised of that.
@@ -157,19 +164,19 @@ class Maker:
             caution = base.candidate.caution if base and follows else self.now.caution
         if caution and base is not None:
             policy = self._gently(policy, problem, caution)
-        predicted = self.predicted(problem, policy)
+        run = predicted(problem, policy)
         return Candidate(
             id=self.identity,
             policy=policy,
             iteration=0 if base is None else self.now.iteration + 1,
             alpha=step.alpha,
             damping=step.damping,
-            predicted_gain=predicted.utility - already,
+            predicted_gain=run.utility - already,
             base="" if base is None else base.candidate.id,
             model=self.fingerprint,
-            predicted_states=predicted.states[:, : self.planner.task.model.n],
-            predicted_inputs=predicted.inputs,
-            predicted_utility=predicted.utility,
+            predicted_states=run.states[:, : self.planner.task.model.n],
+            predicted_inputs=run.inputs,
+            predicted_utility=run.utility,
             caution=caution,
             way=way,
         )
@@ -193,7 +200,7 @@ class Maker:
         """The same run with the gains of a regulator whose inputs cost GENTLER ** caution more."""
         if policy.gain is None:
             return policy
-        run = self.predicted(problem, policy)
+        run = predicted(problem, policy)
         factor = GENTLER**caution
         weight = factor * problem.input_weight + (factor - 1) * problem.change_weight
         found = ddp.sweep(replace(problem, input_weight=weight), run.z, run.inputs)
@@ -202,11 +209,6 @@ class Maker:
         plan, columns = self.planner.plan, _columns(problem, self.planner.plan)
         gains, about = found.gains.K[:, :, columns], run.z[:-1, columns]
         return self.planner.narrowed(plan.policy(run.inputs, gains, about))
-
-    def predicted(self, problem: Problem, policy: Policy) -> Rollout:
-        """A robot's policy in a model that may have more states than it measures."""
-        angles = tuple(map(bool, problem.angles))
-        return simulate(problem, policy.laid_out(problem.system.states, angles, problem.depths))
 
     def checked(self, made: Candidate) -> Proposal:
         """A candidate that is finite, inside the limits and predicted to stay safe; or none."""

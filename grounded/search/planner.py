@@ -13,8 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from grounded.compile import Problem
 from grounded.model import Model
 from grounded.policy import Policy
+from grounded.rollout import Rollout, simulate
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded.utility import Reward
@@ -54,6 +56,12 @@ class Planner:
     def with_model(self, model: Model) -> Planner:
         """The same with other parameter values of the planning model."""
         return dataclasses.replace(self, plan=self.plan.with_model(model))
+
+
+def predicted(problem: Problem, policy: Policy) -> Rollout:
+    """A robot's policy in a model that may have more states than it measures."""
+    angles = tuple(map(bool, problem.angles))
+    return simulate(problem, policy.laid_out(problem.system.states, angles, problem.depths))
 
 
 def planner_for(task: Task, model: Model, latency: np.ndarray) -> Planner:

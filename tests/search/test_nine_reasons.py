@@ -21,6 +21,7 @@ from grounded.search.ask_tell import Search, learn
 from grounded.search.first_guess import filled_target
 from grounded.search.first_policy import first_policy
 from grounded.search.improve import propose
+from grounded.search.mispredictions import Believed
 from grounded.search.planner import planner_for
 from grounded.search.standing import SearchOptions
 from grounded.solve import ddp
@@ -161,6 +162,6 @@ def test_slopes_that_trials_have_corrected_pay(mechanisms, monkeypatch):
         return replace(trial, states=trial.states[:, : len(names)], state_names=names)
 
     with_them = learn(task, run).best.utility
-    monkeypatch.setattr(mispredictions, "corrected", lambda *_: None)
+    monkeypatch.setattr(mispredictions, "believed", lambda *a: Believed(a[3]))
     without = learn(task, run).best.utility
     assert with_them > without + 2.0  # of a gap of 22

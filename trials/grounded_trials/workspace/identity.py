@@ -40,8 +40,9 @@ _FIELDS: Mapping[str, Callable[[str], Any]] = {
     "damping": float,
     "caution": int,
     "way": str,
+    "slopes": str,
 }
-_ABSENT = {"predicted_gain": "nan", "damping": "1.0", "caution": "0", "way": ""}  # in 0.1
+_ABSENT = {"predicted_gain": "nan", "damping": "1.0", "caution": "0", "way": "", "slopes": ""}
 
 
 @dataclass(frozen=True, eq=False)
