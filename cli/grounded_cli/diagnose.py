@@ -19,7 +19,7 @@ from grounded_cli.options import (
     typed,
 )
 from grounded_cli.terminal import field, names_in, number, show, show_json, stages, table, tinted
-from grounded_trials.wording import rendered, with_unit, wrapped
+from grounded_trials.wording import percent, rendered, with_unit, wrapped
 
 if TYPE_CHECKING:
     from grounded.diagnosis.report import Diagnosis, Ranked, Where
@@ -129,7 +129,7 @@ def _tell(found: Diagnosis, before: dict[str, float]) -> None:
         error_table,
     )
 
-    show(_verdict(found.kind, found.sentence))
+    show(_verdict(found))
     _instruments(found.preflight)
     for text in found.unknowable:
         if text not in found.sentence:
@@ -174,14 +174,14 @@ def _note(text: str) -> None:
     show("\n".join(wrapped(text, "  ", "  ")))
 
 
-def _verdict(kind: str, text: str) -> str:
+def _verdict(found: Diagnosis) -> str:
     """The kind, then a cause or a sentence a line: they say different things."""
-    from grounded_trials.report.diagnosis_words import sentences
-
-    causes, *others = sentences(text)
-    first, *more = causes.split("; ") if kind in ("effect", "several") else [causes]
+    kind, told = found.kind, list(found.verdict.lines)
+    if len(causes := found.verdict.causes) > 1:
+        shares = (percent(one.share) for one in found.credit)
+        told[:1] = [f"- {c} ({s} of the gain)" for c, s in zip(causes, shares, strict=True)]
     lines = [field("verdict", kind).replace(kind, tinted(kind), 1)]
-    for line in (first, *(f"- {cause}" for cause in more), *others):
+    for line in told:
         lines += wrapped(line, "  ", "    ")
     return "\n".join(lines)
 

@@ -24,11 +24,22 @@ Kind = Literal["effect", "several", "none", "unknown"]
 
 @dataclass(frozen=True, eq=False)
 class Verdict(Document):
-    """The answer: its kind, the effects that it claims, and why, in sentences."""
+    """The answer: its kind, the effects that it claims, and why.
+
+    `sentences` is a line each and `sentence` their join; the first tells `causes`, a clause each
+    in the order of `Diagnosis.credit`.
+    """
 
     kind: str  # one of `Kind`
     effects: tuple[str, ...] = ()
     sentence: str = ""
+    causes: tuple[str, ...] = ()
+    sentences: tuple[str, ...] = ()
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """The sentences; of an older document, all of them as one."""
+        return self.sentences or (self.sentence or self.kind,)
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,6 @@ noise          what no model predicts
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterable, Mapping
 
 from grounded.diagnosis.report import Correction, Diagnosis, Estimate, Gap
@@ -185,8 +184,3 @@ def utility_sentence(diagnosis: Diagnosis) -> str:
         return f"{text} (rms)"
     spread = figure(found.spread, 3)
     return f"{text} (rms; from policy to policy the utilities themselves differ by {spread})"
-
-
-def sentences(text: str) -> list[str]:
-    """A verdict's sentences, for a line each: they say different things."""
-    return re.split(r"(?<=\.) (?=[A-Z`]|[\d.]+ s ahead)", text)

@@ -13,7 +13,6 @@ from grounded_trials.report.diagnosis_words import (
     credit_of,
     error_lines,
     error_table,
-    sentences,
 )
 from grounded_trials.report.findings import (
     Findings,
@@ -156,7 +155,7 @@ def _diagnosis(findings: Findings, table: Table) -> str:
     lines = ["gap to the model"]
     lines += _wrapped(since.told(findings.folder), "  ")
     then = "before that: " * bool(since.adopted)
-    for k, sentence in enumerate(sentences(diagnosis.sentence or diagnosis.kind)):
+    for k, sentence in enumerate(diagnosis.verdict.lines):
         lines += _wrapped(then * (k == 0) + sentence, "  ")
     before = {} if since.changed else findings.values
     for title, text in error_lines(diagnosis, before):

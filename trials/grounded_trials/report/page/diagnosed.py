@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from grounded.diagnosis.pictures import accuracy_figure, credit_figure, where_figure
 from grounded.diagnosis.report import ChannelParts, Diagnosis, Parts, Split, TrialValue
 from grounded_trials.report.diagnosis_words import (
     gap_sentence,
-    sentences,
     utility_sentence,
 )
 from grounded_trials.report.figures.gap import forecast_figures, residual_figures
@@ -38,9 +37,7 @@ def gap_section(findings: Findings) -> list[Block]:
         words = "Not diagnosed yet. This says where the model is wrong, and what makes it so:"
         command = Block("command", rendered(DIAGNOSE), "c-diagnose")
         return [Block("text", words), command, *ahead, *forecast_table(findings), *lacking]
-    verdict = Block(
-        "verdict", lines=told_since(sentences(diagnosis.sentence or diagnosis.kind), findings.since)
-    )
+    verdict = Block("verdict", lines=told_since(diagnosis.verdict.lines, findings.since))
     if diagnosis.no_cause:  # with too little data, what was fitted is no finding
         return [verdict, *ahead, *forecast_table(findings), *lacking]
     proof = drawn(accuracy_figure(diagnosis), title=True)
@@ -49,7 +46,7 @@ def gap_section(findings: Findings) -> list[Block]:
     return [verdict, *proof, *lacking, *_details(diagnosis, findings.since)]
 
 
-def told_since(lines: list[str], since: Since) -> list[str]:
+def told_since(lines: Sequence[str], since: Since) -> list[str]:
     """A verdict's lines; what happened since stands before them."""
     before = "Before that: " * bool(since.adopted)
     told = [f"{_begun(since.sentence)}."] if since.sentence else []
