@@ -241,6 +241,30 @@ class Credit(Document):
 
 
 @dataclass(frozen=True, eq=False)
+class Unconfirmed(Document):
+    """A likely effect that other trials hardly show, from its trial's `start` to `end` [s].
+
+    share: of what predictions gain by it, in that trial; region: where most of that lies.
+    """
+
+    effect: str
+    meaning: str = ""
+    params: Mapping[str, Estimate] = field(default_factory=dict)
+    evidence: float = math.nan  # [nats]
+    trial: str = ""
+    start: float = field(metadata={"key": "from"}, default=math.nan)
+    end: float = field(metadata={"key": "to"}, default=math.nan)
+    share: float = math.nan
+    region: Region | None = None
+
+    def sentence(self) -> str:
+        """One clause."""
+        where = "" if self.region is None else f", mostly where {self.region.when}"
+        when = f"trial {self.trial}, {number(self.start)} to {number(self.end)} s{where}"
+        return f"seen once, unconfirmed: {self.meaning} ({when})"
+
+
+@dataclass(frozen=True, eq=False)
 class Remainder(Document):
     """A leftover that no known effect explains.
 
@@ -391,6 +415,7 @@ class Diagnosis(Document):
     utility_prediction: UtilityPrediction | None = None  # where the subject was a task
     whole_run: Mapping[str, RunChange] = field(default_factory=dict)
     leftover: tuple[Remainder, ...] = ()
+    unconfirmed: tuple[Unconfirmed, ...] = ()  # no named causes
     correction: Correction | None = None  # where something is left
     next_trial: str = ""
     unknowable: tuple[str, ...] = ()  # what the trials are too few or too quiet for

@@ -15,6 +15,7 @@ from grounded.diagnosis.report import (
     Ranked,
     Remainder,
     RulerRow,
+    Unconfirmed,
     Verdict,
     number,
     quantity,
@@ -34,6 +35,7 @@ def verdict(
     remainder: tuple[Remainder, ...],
     rows: tuple[RulerRow, ...],
     credit: tuple[Credit, ...],
+    seen: Sequence[Unconfirmed] = (),
 ) -> Verdict:
     """One effect, several, none or unknown, and why: what, by how much, what is left.
 
@@ -44,7 +46,9 @@ def verdict(
         remainder: what no effect explains.
         rows: the ruler's.
         credit: what each cause is worth, largest first.
+        seen: what only one trial shows.
     """
+    once = [sentence([one.sentence()]) for one in seen]
     left = remainder[0].sentence() if remainder else ""
     left += f"; {len(remainder) - 1} more" if len(remainder) > 1 else ""
     claimed = [row for row in ranking if row.claimed]
@@ -53,8 +57,8 @@ def verdict(
         return _said("unknown", f"No cause is named: {claims.known.sentences[0]}.")
     if not claimed:
         if remainder:
-            return _said("unknown", f"A gap remains that no known effect explains: {left}.")
-        return _said("none", f"The model explains the data down to the noise{floor(row)}.")
+            return _said("unknown", f"A gap remains that no known effect explains: {left}.", *once)
+        return _said("none", f"The model explains the data down to the noise{floor(row)}.", *once)
     causes = _causes(claims, ranking, credit)
     several = len(causes) > 1
     shares = [f" ({_percent(one.share)} of the gain)" * several for one in credit]
@@ -62,6 +66,7 @@ def verdict(
     words += [f"The data can't tell {tied(group)}." for group in groups[:1]]
     if remainder:
         words.append(f"Something is left that no known effect explains: {left}.")
+    words += once
     kind: Kind = "effect" if len(claimed) == 1 else "several"
     return replace(_said(kind, *words), effects=tuple(r.effect for r in claimed), causes=causes)
 
@@ -159,7 +164,10 @@ def _noise(row: RulerRow, name: str) -> str:
 
 
 def next_trial(
-    claims: Claims, left: Sequence[Leftover], groups: tuple[tuple[str, ...], ...]
+    claims: Claims,
+    left: Sequence[Leftover],
+    groups: tuple[tuple[str, ...], ...],
+    seen: Sequence[Unconfirmed] = (),
 ) -> str:
     """A sentence; `excitation.probe` makes the trial itself."""
     if claims.known.no_cause:
@@ -167,6 +175,8 @@ def next_trial(
     if groups:
         made = f"A trial made for it would tell {tied(groups[0])}."
         return " ".join([made, *distinguishing(groups[0])])
+    if seen:
+        return f"Repeat trial {seen[0].trial}: hardly another one shows {seen[0].effect}."
     if not claims.names and left:
         return (
             f"Repeat a trial twice with the same inputs to see whether the leftover in "

@@ -86,6 +86,7 @@ def _together(errors: Mapping[str, float], names: list[str]) -> float:
 def _open(diagnosis: Diagnosis) -> str:
     """What ties, and what no known effect explains."""
     found = [f"the data can't tell {tied(group)}" for group in diagnosis.indistinguishable[:1]]
+    found += [one.sentence() for one in diagnosis.unconfirmed[:1]]
     if diagnosis.leftover:
         found.append(_left(diagnosis.leftover[0], len(diagnosis.leftover) - 1))
     text = "; ".join(found) or "nothing is left above the noise"
