@@ -22,7 +22,8 @@ from grounded_cli.terminal import field, names_in, number, show, show_json, stag
 from grounded_trials.wording import percent, rendered, with_unit, wrapped
 
 if TYPE_CHECKING:
-    from grounded.diagnosis.report import Diagnosis, Ranked, Where
+    from grounded.diagnosis.error_report import Where
+    from grounded.diagnosis.report import Diagnosis, Ranked
     from grounded.engine import Engine
     from grounded.instruments.finding import Finding
     from grounded_trials import Workspace

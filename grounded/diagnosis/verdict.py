@@ -7,19 +7,9 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
+from grounded.diagnosis.error_report import Credit, Remainder, RulerRow, number
 from grounded.diagnosis.hypotheses.leftover import Leftover
-from grounded.diagnosis.report import (
-    Credit,
-    Estimate,
-    Kind,
-    Ranked,
-    Remainder,
-    RulerRow,
-    Unconfirmed,
-    Verdict,
-    number,
-    quantity,
-)
+from grounded.diagnosis.report import Estimate, Kind, Ranked, Unconfirmed, Verdict, quantity
 from grounded.diagnosis.validation.claims import Claims
 from grounded.effects import Effect, ParamFamily, places
 from grounded.model import Model

@@ -23,8 +23,6 @@ import numpy as np
 from grounded.effects import places
 from grounded.effects.family import Quantity, RateFamily, Site, Values, coupled, per, speed_limit
 
-MOST_FREQUENCIES = 80  # a scan filters two columns for each, of every state
-
 
 def _coupling(site: Site) -> tuple[Quantity, ...]:
     target, source = coupled(site)
@@ -36,7 +34,7 @@ def _periodic(site: Site) -> tuple[Quantity, ...]:
     duration, dt = site.scales.duration, site.scales.dt
     lowest, highest = 1.0 / duration, min(0.2 / dt, 5.0)
     bins = max((highest - lowest) * duration, 1.0)
-    count = int(min(max(2 * bins, 4), MOST_FREQUENCIES))
+    count = int(min(max(2 * bins, 4), 40))
     grid = tuple(float(2 * np.pi * f) for f in np.linspace(lowest, highest, count))
     unit = per(site.unit(site.target))
     return (

@@ -7,6 +7,7 @@ from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import diagnose
 from grounded.diagnosis.hypotheses.attribution import attribute
 from grounded.diagnosis.likelihood.data import prepare
+from grounded.diagnosis.report import Diagnosis
 from grounded.diagnosis.validation.decide import causes, decide, shares
 from grounded.diagnosis.validation.ruler import Gain, Ruler, folds
 from grounded.effects import Library
@@ -145,3 +146,54 @@ def test_an_effect_of_one_channel_pays_there():
     assert not vague.pays(2.0, 0.01)
     worse = Gain(-0.01, 0.014, 0.3, clear.channels, clear.scatters)
     assert not worse.pays(1.0, 0.01)
+
+
+def test_what_two_of_eight_trials_show_is_seen_again():
+    """Its scatter over trials is that of how much each shows, and says nothing of noise."""
+    trial, visited = np.repeat(np.arange(8), 10), np.zeros(80)
+    visited[[2, 3, 4, 5, 6]], visited[[52, 53, 54, 55, 56]] = 1.0, 0.2
+
+    def shown(pieces):
+        noise = 0.01 * np.random.default_rng(1).standard_normal(80)
+        no_channel = np.zeros(1)
+        return Gain(0.1, 0.07, 0.3, no_channel, no_channel + 1, pieces + noise, trial)
+
+    assert not shown(visited).beyond(2.0, 0.01) and shown(visited).pays(2.0, 0.01)
+    once = np.where(trial == 0, visited, 0.0)
+    assert not shown(once).pays(2.0, 0.01) and not shown(0 * visited).pays(2.0, 0.01)
+
+
+def pushed_hard_once(seed=0):
+    """Five runs with friction; an input beyond the drive's limit in a second of the fourth."""
+    model = Model(
+        states={"x": "m", "v": "m/s"},
+        inputs={"u": "m/s^2"},
+        derivative=lambda s, a, p: {"x": s.v, "v": 1.0 * a.u},
+        roles={"position": ("x",), "speed": "v"},
+        name="sled",
+    )
+    rng, found = np.random.default_rng(seed), []
+    for k in range(5):
+        u = np.repeat(rng.uniform(-1, 1, 20), 10)
+        if k == 3:
+            u[80:120] = np.repeat([3.0, -3.0], 20)
+        x, states = np.zeros(2), [np.zeros(2)]
+        for value in u:
+            for _ in range(10):
+                x = x + 0.005 * np.array([x[1], np.clip(value, -1.5, 1.5) - 0.5 * x[1]])
+            states.append(x)
+        y = np.array(states) + 2e-3 * rng.standard_normal((201, 2))
+        found.append(Trial(y, u[:, None], 0.05, ("x", "v"), ("u",), start_inputs=u[:1], id=f"t{k}"))
+    return model, found
+
+
+def test_what_one_trial_shows_is_told_with_its_place_and_is_no_cause():
+    found = diagnose(*pushed_hard_once())
+    assert any("friction" in name or "drag" in name for name in found.effects), found.sentence
+    assert not any(name.startswith(("saturation", "input_curve")) for name in found.effects)
+    (one, *_) = found.unconfirmed
+    assert one.effect.endswith(":u") and one.trial == "t3" and one.seen == (1, 5)
+    assert 3.5 < one.start < one.end < 7.0 and one.evidence > 10
+    assert any(one.meaning in line for line in found.verdict.lines)
+    assert "t3" in found.next_trial
+    assert Diagnosis.from_json(found.to_json()).unconfirmed == found.unconfirmed

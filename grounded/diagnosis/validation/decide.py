@@ -11,7 +11,7 @@ likeliest of every other structure of noise, are held against the `ruler`:
     a cause without which predictions are as good, within their scatter, is dropped
     what is left then must be likelier than none by itself
     what predicts no better than the crude model is not claimed at all
-    a likely effect that was dropped, since hardly more than one trial shows it, is doubtful
+    a likely effect that was dropped is doubtful: seen in too few trials, maybe
 
 A cause is an effect or the calibration of the model's own parameters. Its credit is what is lost
 without it, the others fitted again.
@@ -26,7 +26,7 @@ from grounded.diagnosis.hypotheses.explored import CLAIM, parametric
 from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.noise import Structure
-from grounded.diagnosis.validation.ruler import Gain, Ruler
+from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import ParamFamily
 
 CALIBRATION = "calibration"
@@ -43,12 +43,12 @@ REFIT = 12  # iterations after a cause was taken out
 
 @dataclass(frozen=True, eq=False)
 class Doubtful:
-    """A likely effect that was dropped: few trials show it, and predictions gain too little."""
+    """A likely effect that was dropped because predictions gain too little by it."""
 
     name: str
     nats: float
     fit: Fitted  # with it
-    gain: Gain  # by it
+    less: Fitted  # the same without it
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,8 +164,8 @@ def _pruned(
             return fit, without, doubtful
         name = min(idle, key=lambda name: gains[name].mean)
         nats = search.score(fit) - search.score(without[name])
-        if nats > LIKELY and gains[name].mean > least and name in _effects(fit):
-            doubtful.append(Doubtful(name, nats, fit, gains[name]))
+        if nats > LIKELY and name in _effects(fit):
+            doubtful.append(Doubtful(name, nats, fit, without[name]))
         fit = without[name]
 
 

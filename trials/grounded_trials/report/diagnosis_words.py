@@ -10,7 +10,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 
-from grounded.diagnosis.report import Correction, Diagnosis, Estimate, Gap
+from grounded.diagnosis.error_report import Gap
+from grounded.diagnosis.report import Correction, Diagnosis, Estimate
 from grounded.instruments.finding import Finding
 from grounded_trials.wording import count, figure, percent, shown, with_unit
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from grounded.diagnosis.report import Diagnosis, Remainder, RulerRow
+from grounded.diagnosis.error_report import Remainder, RulerRow
+from grounded.diagnosis.report import Diagnosis
 from grounded.diagnosis.verdict import tied, worsened
 from grounded.task import Task
 from grounded_trials.report.diagnosis_words import moved_parameters

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from grounded.diagnosis.error_report import ChannelParts, Parts, Split
 from grounded.diagnosis.pictures import accuracy_figure, credit_figure, where_figure
-from grounded.diagnosis.report import ChannelParts, Diagnosis, Parts, Split, TrialValue
+from grounded.diagnosis.report import Diagnosis, TrialValue
 from grounded_trials.report.diagnosis_words import (
     gap_sentence,
     utility_sentence,
