@@ -94,7 +94,7 @@ class Likeness(Document):
 class Unconfirmed(Document):
     """A likely effect that few trials show, most of all `trial` from `start` to `end` [s].
 
-    seen: how many trials hold most of its evidence, of how many; region: where it lies.
+    seen: how many trials hold most of what it does, of how many; region: where it does.
     """
 
     effect: str

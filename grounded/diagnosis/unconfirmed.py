@@ -20,7 +20,7 @@ from grounded.diagnosis.verdict import meaning
 from grounded.frozen import Array
 
 MENTIONED = 2
-MOST = 0.8  # of the evidence, which few trials hold
+MOST = 0.8  # of all that it does, which few trials hold
 FEW = 4  # one of so many trials
 
 
@@ -33,17 +33,17 @@ def unconfirmed(claims: Claims, doubtful: Sequence[Doubtful]) -> tuple[Unconfirm
 
 
 def _seen(claims: Claims, one: Doubtful) -> Unconfirmed | None:
-    data, nats = claims.data, _by_step(claims, one)
-    by = np.maximum(np.bincount(data.trial_of, nats.sum(axis=0), data.count), 0.0)
+    data, acts = claims.data, _acting(claims, one)
+    by = np.bincount(data.trial_of, acts.sum(axis=0), data.count)
     held = np.cumsum(np.sort(by)[::-1])
     few = 1 + int(np.searchsorted(held, MOST * held[-1]))
     if data.count < 2 or few > max(data.count // FEW, 1):
         return None
     trial = int(by.argmax())
     own = np.flatnonzero(data.trial_of == trial)
-    run = int(own[nats[:, own].sum(axis=0).argmax()])
-    start, end = (t * data.dt for t in _stretch(nats[:, run]))
-    regions = by_region(np.maximum(nats, 0.0)[..., None], claims.predictor, one.fit, 1)
+    run = int(own[acts[:, own].sum(axis=0).argmax()])
+    start, end = (t * data.dt for t in _stretch(acts[:, run] - acts.mean()))
+    regions = by_region(acts[..., None], claims.predictor, one.fit, 1)
     i = one.fit.hypothesis.names.index(one.name)
     params, begin = claims.estimates(one.fit)[i], data.time[0, run]
     return Unconfirmed(
@@ -59,17 +59,20 @@ def _seen(claims: Claims, one: Doubtful) -> Unconfirmed | None:
     )
 
 
-def _by_step(claims: Claims, one: Doubtful) -> Array:
-    """What each step says for it, (L, B) [nats]."""
-    valid = claims.data.valid.T
-    square = (one.less.white**2 - one.fit.white**2).sum(axis=-1)
-    spread = (one.less.logdet - one.fit.logdet) / np.maximum(valid.sum(axis=0), 1)
-    return np.asarray(0.5 * (square + spread) * valid)
+def _acting(claims: Claims, one: Doubtful) -> Array:
+    """How much it does in each step, squared, in units of the noise, (L, B)."""
+    predictor, data, fit = claims.predictor, claims.data, one.fit
+    h, x = fit.hypothesis, fit.track
+    less = h.minus(one.name)
+    moved = data.model.difference(predictor.next(less, x[:-1]), predictor.next(h, x[:-1]))
+    shown = np.zeros_like(x) + predictor.offset(h, x) - predictor.offset(less, x)
+    square = moved**2 / np.exp(fit.noise.log_q) + shown[1:] ** 2 / np.exp(fit.noise.log_r)
+    return np.asarray(square.sum(axis=-1) * data.valid.T)
 
 
-def _stretch(nats: Array) -> Any:
-    """From which step to which most is said (Kadane's largest sum of neighbours)."""
-    total = np.concatenate([[0.0], np.cumsum(nats)])
+def _stretch(more: Array) -> Any:
+    """From which step to which most is done (Kadane's largest sum of neighbours)."""
+    total = np.concatenate([[0.0], np.cumsum(more)])
     least = np.minimum.accumulate(total)
     end = int((total - least).argmax())
     return int(total[: end + 1].argmin()), end

@@ -48,7 +48,6 @@ class Doubtful:
     name: str
     nats: float
     fit: Fitted  # with it
-    less: Fitted  # the same without it
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +164,7 @@ def _pruned(
         name = min(idle, key=lambda name: gains[name].mean)
         nats = search.score(fit) - search.score(without[name])
         if nats > LIKELY and name in _effects(fit):
-            doubtful.append(Doubtful(name, nats, fit, without[name]))
+            doubtful.append(Doubtful(name, nats, fit))
         fit = without[name]
 
 
