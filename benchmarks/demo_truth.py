@@ -16,7 +16,8 @@ import sys
 import numpy as np
 
 from grounded.diagnosis.likelihood.data import prepare
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, Predictor
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.experiments.real_car import CALIBRATION, LATENCY, UNMODELLED, real_car
 from grounded_trials import Workspace
 from grounded_trials.workspace.diagnosing import diagnosable, read_diagnosis

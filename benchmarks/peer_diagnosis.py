@@ -32,7 +32,8 @@ import numpy as np
 from grounded.challenge import make, task_of
 from grounded.diagnosis.diagnose import diagnose
 from grounded.diagnosis.likelihood.data import prepare
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, Predictor
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects import Library
 from grounded.fit import fit
 

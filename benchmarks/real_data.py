@@ -100,11 +100,11 @@ def told(name, found, seconds):
 def main():
     """Runs the named systems, all by default."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("names", nargs="*", choices=[[], *PUBLISHED], default=list(PUBLISHED))
+    parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(PUBLISHED))
     parser.add_argument("--json", type=Path, help="write all documents there")
     options, documents = parser.parse_args(), {}
     print("errors: crude, calibrated, as diagnosed, noise floor")
-    for name in options.names:
+    for name in options.names or PUBLISHED:
         system, start = getattr(real_systems, name), time.process_time()
         found = diagnose(system.model, system.read())
         told(name, found, time.process_time() - start)

@@ -143,7 +143,7 @@ def _tell(found: Diagnosis, before: dict[str, float], run: NextCommand | None) -
         error_table,
     )
 
-    show(_verdict(found.kind, found.sentence))
+    show(_verdict(found))
     _instruments(found.preflight)
     for text in found.unknowable:
         if text not in found.sentence:
@@ -189,12 +189,12 @@ def _note(text: str) -> None:
     show("\n".join(wrapped(text, "  ", "  ")))
 
 
-def _verdict(kind: str, text: str) -> str:
+def _verdict(found: Diagnosis) -> str:
     """The kind, then a cause or a sentence a line: they say different things."""
     from grounded_trials.report.diagnosis_words import verdict_lines
 
-    causes, others = verdict_lines(kind, text)
-    lines = [field("verdict", kind).replace(kind, tinted(kind), 1)]
+    causes, others = verdict_lines(found)
+    lines = [field("verdict", found.kind).replace(found.kind, tinted(found.kind), 1)]
     for line in (*(f"- {cause}" for cause in causes), *others):
         lines += wrapped(line, "  ", "    ")
     return "\n".join(lines)

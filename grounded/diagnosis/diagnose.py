@@ -12,6 +12,7 @@ leftover          what no effect explains
 agreement         whether the trials agree; what changed between two groups of them
 prediction_error  where the gap lies: channels, times, regions
 split             what the error is made of: explained, unexplained, irreducible
+unconfirmed       what was seen once, and where
 verdict           all of it in sentences; `report` is the result as data
 excitation        what to run next, where two explanations tie
 """
@@ -24,6 +25,7 @@ from typing import Any
 
 import numpy as np
 
+from grounded.diagnosis.error_report import Change, ChannelShare, Gap, UtilityPrediction, Where
 from grounded.diagnosis.hypotheses.attribution import attribute, so_far
 from grounded.diagnosis.hypotheses.correction import correction
 from grounded.diagnosis.hypotheses.leftover import whiteness
@@ -31,17 +33,10 @@ from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, Predictor, param_scale
-from grounded.diagnosis.report import (
-    Change,
-    ChannelShare,
-    Diagnosis,
-    Gap,
-    Identifiable,
-    NoiseLevels,
-    UtilityPrediction,
-    Where,
-)
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
+from grounded.diagnosis.likelihood.predictor import Predictor
+from grounded.diagnosis.report import Diagnosis, Identifiable, NoiseLevels
+from grounded.diagnosis.unconfirmed import unconfirmed
 from grounded.diagnosis.validation.agreement import by_trial, changed
 from grounded.diagnosis.validation.claims import Claims
 from grounded.diagnosis.validation.decide import Decision, decide
@@ -201,9 +196,10 @@ class _Writer:
         remainder = measured.remainders()
         rows, credit = measured.prediction_error(), measured.credits()
         named = [row.effect for row in ranking if row.claimed]
+        seen = unconfirmed(self.claims, self.decision.doubtful)
         values, agreement = by_trial(self.best, data, named) if named else ((), ())
         return Diagnosis(
-            verdict=verdict(self.claims, ranking, groups, remainder, rows, credit),
+            verdict=verdict(self.claims, ranking, groups, remainder, rows, credit, seen),
             where=Where(
                 channels=self.channels(gain, shrunk.before, where.spread),
                 times=tuple(by_time(gain.sum(axis=-1), data)),
@@ -227,8 +223,9 @@ class _Writer:
             utility_prediction=self.utility_prediction(bare),
             whole_run=measured.whole_run(),
             leftover=remainder,
+            unconfirmed=seen,
             correction=correction(predictor, self.best, self.left, where),
-            next_trial=next_trial(self.claims, self.left, groups),
+            next_trial=next_trial(self.claims, self.left, groups, seen),
             unknowable=self.known.sentences,
             noise=self.noise(),
             parameters=self.claims.parameters(),

@@ -25,8 +25,9 @@ import numpy as np
 
 from grounded.diagnosis.likelihood.data import prepare, shifted
 from grounded.diagnosis.likelihood.fitted import calibrated
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, Predictor, param_scale
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.noise import NoiseModel, Structure
+from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.refine import refine
 from grounded.diagnosis.report import Diagnosis
 from grounded.effects import Library, Scales, memory_start, scales_of, wrap, wrapping_order

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from grounded.diagnosis.report import Diagnosis, RulerRow, measured, number
+from grounded.diagnosis.error_report import RulerRow, measured, number
+from grounded.diagnosis.report import Diagnosis
 from grounded.figures.figure import Bar, Bars, Curve, Figure, Panel, legend
 
 MOST = 12

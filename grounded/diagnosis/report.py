@@ -11,106 +11,46 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
+from grounded.diagnosis.error_report import (
+    BRIEF,
+    Credit,
+    Gap,
+    Region,
+    Remainder,
+    RulerRow,
+    RunChange,
+    UtilityPrediction,
+    Where,
+    number,
+)
 from grounded.instruments.finding import Finding
 from grounded.result import Document
 
 if TYPE_CHECKING:
     from grounded.figures.figure import Figure
 
-BRIEF: dict[str, Any] = {"brief": True}  # a field whose key is left out where there is nothing
-SCALED = ("m", "rad", "s")  # units, and their rates, of which thousandths have a name
-SMALL = 1e-3  # below which they are used
 
 Kind = Literal["effect", "several", "none", "unknown"]
 
 
 @dataclass(frozen=True, eq=False)
 class Verdict(Document):
-    """The answer: its kind, the effects that it claims, and why, in sentences."""
+    """The answer: its kind, the effects that it claims, and why.
+
+    `sentences` is a line each and `sentence` their join; the first tells `causes`, a clause each
+    in the order of `Diagnosis.credit`.
+    """
 
     kind: str  # one of `Kind`
     effects: tuple[str, ...] = ()
     sentence: str = ""
+    causes: tuple[str, ...] = ()
+    sentences: tuple[str, ...] = ()
 
-
-@dataclass(frozen=True, eq=False)
-class ChannelShare(Document):
-    """A state's part of the gap, the rms of its prediction error and of its noise alone."""
-
-    name: str
-    share: float  # 0 to 1
-    rms: float
-    unit: str = ""
-    noise: float = math.nan
-
-
-@dataclass(frozen=True, eq=False)
-class TimeShare(Document):
-    """A time's part of the gap, from `start` to `end` [s] of a trial."""
-
-    start: float = field(metadata={"key": "from"})
-    end: float = field(metadata={"key": "to"})
-    share: float
-
-
-@dataclass(frozen=True, eq=False)
-class Region(Document):
-    """A region's part of the gap (`v > 0.5`), and of the time."""
-
-    when: str
-    share: float = math.nan
-    occupancy: float = math.nan
-
-
-@dataclass(frozen=True, eq=False)
-class Parts(Document):
-    """A mean squared error in three parts that sum to 1."""
-
-    explained: float = math.nan
-    unexplained: float = math.nan
-    irreducible: float = math.nan
-
-
-@dataclass(frozen=True, eq=False)
-class ChannelParts(Document):
-    """The same of one state, and the rms error of the bare model."""
-
-    name: str
-    unit: str = ""
-    rms: float = math.nan
-    explained: float = math.nan
-    unexplained: float = math.nan
-    irreducible: float = math.nan
-
-
-@dataclass(frozen=True, eq=False)
-class Split(Document):
-    """What the error a while ahead is made of: of all states in units of their noise, and of each.
-
-    The irreducible part comes from "repeats" of a candidate, or else from the estimated "noise".
-    """
-
-    horizon_s: float
-    whole: Parts = field(metadata={"key": "all"})
-    channels: tuple[ChannelParts, ...] = ()
-    irreducible_from: str = "noise"
-
-
-@dataclass(frozen=True, eq=False)
-class Where(Document):
-    """Where the gap lies, and what is left of it: the largest shares first.
-
-    split: by horizon (one_step, horizon, whole_run).
-    whiteness: by state, the chance that white noise leaves what is left of it (a p-value).
-    tempering: what a nat of evidence is worth, by the correlation and the size of what is left.
-    """
-
-    channels: tuple[ChannelShare, ...] = ()
-    times: tuple[TimeShare, ...] = ()
-    regions: tuple[Region, ...] = ()
-    split: Mapping[str, Split] = field(default_factory=dict)
-    whiteness: Mapping[str, float] = field(default_factory=dict)
-    tempering: float = 1.0
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """The sentences; of an older document, all of them as one."""
+        return self.sentences or (self.sentence or self.kind,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,113 +91,28 @@ class Likeness(Document):
 
 
 @dataclass(frozen=True, eq=False)
-class Change(Document):
-    """An error without effects and with them."""
+class Unconfirmed(Document):
+    """A likely effect that few trials show, most of all `trial` from `start` to `end` [s].
 
-    before: float = math.nan
-    after: float = math.nan
-
-
-@dataclass(frozen=True, eq=False)
-class RunChange(Change):
-    """The rms error of predictions from the first state to the end of each run."""
-
-    unit: str = ""
-
-
-@dataclass(frozen=True, eq=False)
-class Gap(Document):
-    """The prediction error in units of the noise that one diagnosis estimates, before and after.
-
-    Figures of two diagnoses don't compare; verdicts rest on `prediction_error`, not on these.
+    seen: how many trials hold most of what it does, of how many; region: where it does.
     """
 
-    horizon_s: float = math.nan
-    unit: str = ""
-    before: float = math.nan
-    after: float = math.nan
-    floor: float = math.nan
-    held_out: bool = False
-    channels: Mapping[str, Change] = field(default_factory=dict)
-
-    @property
-    def measured(self) -> bool:
-        """Whether the document has a gap at all."""
-        return self != Gap()
-
-
-@dataclass(frozen=True, eq=False)
-class UtilityPrediction(Document):
-    """Rms error of predicted utilities of whole trials, without the effects and with them."""
-
-    trials: int = 0
-    unit: str = field(metadata=BRIEF, default="")
-    before: float = math.nan  # NaN: the predicted run diverged
-    after: float = math.nan
-    spread: float = field(metadata=BRIEF, default=math.nan)  # standard deviation of the real ones
-    mean: float = field(metadata=BRIEF, default=math.nan)
-
-
-@dataclass(frozen=True, eq=False)
-class RulerRow(Document):
-    """Rms errors of held-out open-loop predictions over one horizon, by channel in its unit.
-
-    held_out: by "trials", by "pieces" of one long log, or "no" where there is too little.
-    calibrated: with the model's own parameters fitted; empty where none may move.
-    floor_from: "repeats" of a manoeuvre, or the "short horizon", whose noise is carried on.
-    """
-
-    horizon_s: float
-    whole_trial: bool = False
-    unit_by_channel: Mapping[str, str] = field(default_factory=dict)
-    held_out: str = "trials"
-    crude: Mapping[str, float] = field(default_factory=dict)
-    calibrated: Mapping[str, float] = field(default_factory=dict)
-    with_effects: Mapping[str, float] = field(default_factory=dict)
-    noise_floor: Mapping[str, float] = field(default_factory=dict)
-    floor_from: str = ""
-
-
-@dataclass(frozen=True, eq=False)
-class Credit(Document):
-    """What an effect, or the "calibration", is worth: what predictions lose without it.
-
-    share: of what predictions gain in all, by the logarithm of their errors, over channels and
-    horizons; without_it: rms by channel, 1 s ahead, all the rest fitted again.
-    """
-
-    of: str
-    share: float = math.nan
-    without_it: Mapping[str, float] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, eq=False)
-class Remainder(Document):
-    """A leftover that no known effect explains.
-
-    size: rms of the rate that a state lacks, where a flexible model finds one [unit of the state
-    per second]; error: rms of predictions `horizon_s` ahead, which noise alone leaves at `floor`.
-    """
-
-    channel: str
-    size: float = math.nan
-    unit: str = ""
+    effect: str
+    meaning: str = ""
+    params: Mapping[str, Estimate] = field(default_factory=dict)
     evidence: float = math.nan  # [nats]
-    region: Region | None = None  # that holds most of it
-    error: float = math.nan
-    floor: float = math.nan
-    horizon_s: float = math.nan
-    error_unit: str = ""
+    trial: str = ""
+    start: float = field(metadata={"key": "from"}, default=math.nan)
+    end: float = field(metadata={"key": "to"}, default=math.nan)
+    seen: tuple[int, int] = (1, 1)
+    region: Region | None = None
 
     def sentence(self) -> str:
         """One clause."""
+        few, all_ = self.seen
         where = "" if self.region is None else f", mostly where {self.region.when}"
-        if not math.isfinite(self.error):
-            return f"{self.channel} is off by {number(self.size)} {self.unit} rms{where}"
-        noise = f" ({number(self.floor)} is noise)" if math.isfinite(self.floor) else ""
-        unit = "" if self.error_unit == "1" else f" {self.error_unit}"
-        ahead = f"{number(self.horizon_s)} s ahead"
-        return f"{self.channel} is still off by {number(self.error)}{unit} {ahead}{noise}{where}"
+        when = f"trial {self.trial}, {number(self.start)} to {number(self.end)} s{where}"
+        return f"unconfirmed, seen in {few} of {all_} trials: {self.meaning} ({when})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -382,6 +237,7 @@ class Diagnosis(Document):
     utility_prediction: UtilityPrediction | None = None  # where the subject was a task
     whole_run: Mapping[str, RunChange] = field(default_factory=dict)
     leftover: tuple[Remainder, ...] = ()
+    unconfirmed: tuple[Unconfirmed, ...] = ()  # no named causes
     correction: Correction | None = None  # where something is left
     next_trial: str = ""
     unknowable: tuple[str, ...] = ()  # what the trials are too few or too quiet for
@@ -454,23 +310,6 @@ class Diagnosis(Document):
         now = {str(effect["name"]): dict(effect) for effect in adopted}
         then = self.made.effects if self.made is not None else {}
         return tuple(name for name in self.effects if now.get(name) == then.get(name))
-
-
-def number(value: float) -> str:
-    """Three digits."""
-    return f"{value:.3g}"
-
-
-def measured(value: float, unit: str) -> str:
-    """An error in two digits: in cm, mm, mrad ... where it is small in its own unit."""
-    if unit == "m" and SMALL <= value < 1.0:
-        value, unit = 100 * value, "cm"
-    elif unit.startswith(SCALED) and 0 < value < SMALL:
-        step = 1 if value >= 1e-5 else 2
-        value, unit = value * 1e3**step, "-mµ"[step] + unit
-    shape = ",.0f" if 9.95 <= value < 1e6 else "#.2g" if SMALL <= value < 1e6 else ".1e"
-    text = "-" if math.isnan(value) else f"{value:{shape}}" if value else "0"
-    return text if unit == "1" else f"{text} {unit}".rstrip()
 
 
 def quantity(estimate: Estimate) -> str:

@@ -5,19 +5,11 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 
+from grounded.diagnosis.error_report import Credit, Remainder, RulerRow, number
 from grounded.diagnosis.hypotheses.leftover import Leftover
-from grounded.diagnosis.report import (
-    Credit,
-    Estimate,
-    Kind,
-    Ranked,
-    Remainder,
-    RulerRow,
-    Verdict,
-    number,
-    quantity,
-)
+from grounded.diagnosis.report import Estimate, Kind, Ranked, Unconfirmed, Verdict, quantity
 from grounded.diagnosis.validation.claims import Claims
 from grounded.effects import Effect, ParamFamily, places
 from grounded.model import Model
@@ -33,6 +25,7 @@ def verdict(
     remainder: tuple[Remainder, ...],
     rows: tuple[RulerRow, ...],
     credit: tuple[Credit, ...],
+    seen: Sequence[Unconfirmed] = (),
 ) -> Verdict:
     """One effect, several, none or unknown, and why: what, by how much, what is left.
 
@@ -43,27 +36,38 @@ def verdict(
         remainder: what no effect explains.
         rows: the ruler's.
         credit: what each cause is worth, largest first.
+        seen: what only one trial shows.
     """
+    once = [sentence([one.sentence()]) for one in seen]
     left = remainder[0].sentence() if remainder else ""
     left += f"; {len(remainder) - 1} more" if len(remainder) > 1 else ""
     claimed = [row for row in ranking if row.claimed]
     row = next((r for r in reversed(rows) if not r.whole_trial), None)
     if claims.known.no_cause:
-        return Verdict("unknown", (), f"No cause is named: {claims.known.sentences[0]}.")
+        return _said("unknown", f"No cause is named: {claims.known.sentences[0]}.")
     if not claimed:
         if remainder:
-            return Verdict("unknown", (), f"A gap remains that no known effect explains: {left}.")
-        return Verdict("none", (), f"The model explains the data down to the noise{floor(row)}.")
-    words = [sentence(_causes(claims, ranking, credit)), improvement(row), worsened(rows)]
+            return _said("unknown", f"A gap remains that no known effect explains: {left}.", *once)
+        return _said("none", f"The model explains the data down to the noise{floor(row)}.", *once)
+    causes = _causes(claims, ranking, credit)
+    several = len(causes) > 1
+    shares = [f" ({_percent(one.share)} of the gain)" * several for one in credit]
+    words = [sentence(map(str.__add__, causes, shares)), improvement(row), worsened(rows)]
     words += [f"The data can't tell {tied(group)}." for group in groups[:1]]
     if remainder:
         words.append(f"Something is left that no known effect explains: {left}.")
+    words += once
     kind: Kind = "effect" if len(claimed) == 1 else "several"
-    return Verdict(kind, tuple(row.effect for row in claimed), " ".join(w for w in words if w))
+    return replace(_said(kind, *words), effects=tuple(r.effect for r in claimed), causes=causes)
 
 
-def _causes(claims: Claims, ranking: Sequence[Ranked], credit: Sequence[Credit]) -> list[str]:
-    """A clause a cause, largest first, each with its share where there are several."""
+def _said(kind: Kind, *words: str) -> Verdict:
+    said = tuple(text for text in words if text)
+    return Verdict(kind, sentence=" ".join(said), sentences=said)
+
+
+def _causes(claims: Claims, ranking: Sequence[Ranked], credit: Sequence[Credit]) -> tuple[str, ...]:
+    """A clause a cause, largest first."""
     effects = {e.name: e for e in claims.best.hypothesis.effects}
     values = {row.effect: row.params for row in ranking}
     found = []
@@ -72,9 +76,8 @@ def _causes(claims: Claims, ranking: Sequence[Ranked], credit: Sequence[Credit])
             text = meaning(effects[one.of], values[one.of])
         else:
             text = f"the model's own parameters are off: {_moved(claims)}"
-        share = f" ({_percent(one.share)} of the gain)" if len(credit) > 1 else ""
-        found.append(text + share)
-    return found
+        found.append(text)
+    return tuple(found)
 
 
 def _percent(share: float) -> str:
@@ -151,7 +154,10 @@ def _noise(row: RulerRow, name: str) -> str:
 
 
 def next_trial(
-    claims: Claims, left: Sequence[Leftover], groups: tuple[tuple[str, ...], ...]
+    claims: Claims,
+    left: Sequence[Leftover],
+    groups: tuple[tuple[str, ...], ...],
+    seen: Sequence[Unconfirmed] = (),
 ) -> str:
     """A sentence; `excitation.probe` makes the trial itself."""
     if claims.known.no_cause:
@@ -159,6 +165,8 @@ def next_trial(
     if groups:
         made = f"A trial made for it would tell {tied(groups[0])}."
         return " ".join([made, *distinguishing(groups[0])])
+    if seen:
+        return f"Repeat trial {seen[0].trial}: hardly another one shows {seen[0].effect}."
     if not claims.names and left:
         return (
             f"Repeat a trial twice with the same inputs to see whether the leftover in "

@@ -10,10 +10,11 @@ import pytest
 from grounded import GroundedError, Model, Param, Trial
 from grounded.challenge import judge, make, oracle, sealed, summary
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
+from grounded.diagnosis.error_report import Credit, Remainder, RulerRow
 from grounded.diagnosis.excitation import probe
 from grounded.diagnosis.hypotheses.leftover import whiteness
 from grounded.diagnosis.likelihood.data import prepare, shifted
-from grounded.diagnosis.report import Credit, Estimate, Ranked, Remainder, RulerRow
+from grounded.diagnosis.report import Estimate, Ranked
 from grounded.diagnosis.validation.claims import loss
 from grounded.diagnosis.validation.prediction_error import _stump
 from grounded.diagnosis.verdict import meaning, sentence, verdict

@@ -7,8 +7,13 @@ from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import diagnose
 from grounded.diagnosis.hypotheses.attribution import attribute
 from grounded.diagnosis.likelihood.data import prepare
+from grounded.diagnosis.report import Unconfirmed
+from grounded.diagnosis.unconfirmed import unconfirmed
+from grounded.diagnosis.validation.claims import Claims
 from grounded.diagnosis.validation.decide import causes, decide, shares
+from grounded.diagnosis.validation.limits import limits
 from grounded.diagnosis.validation.ruler import Gain, Ruler, folds
+from grounded.diagnosis.verdict import verdict
 from grounded.effects import Library
 
 DT = 0.02
@@ -145,3 +150,71 @@ def test_an_effect_of_one_channel_pays_there():
     assert not vague.pays(2.0, 0.01)
     worse = Gain(-0.01, 0.014, 0.3, clear.channels, clear.scatters)
     assert not worse.pays(1.0, 0.01)
+
+
+def test_what_two_of_eight_trials_show_is_seen_again():
+    """Its scatter over trials is that of how much each shows, and says nothing of noise."""
+    trial, visited = np.repeat(np.arange(8), 10), np.zeros(80)
+    visited[[2, 3, 4, 5, 6]], visited[[52, 53, 54, 55, 56]] = 1.0, 0.2
+
+    def shown(pieces):
+        noise = 0.01 * np.random.default_rng(1).standard_normal(80)
+        no_channel = np.zeros(1)
+        return Gain(0.1, 0.07, 0.3, no_channel, no_channel + 1, pieces + noise, trial)
+
+    assert not shown(visited).beyond(2.0, 0.01) and shown(visited).pays(2.0, 0.01)
+    once = np.where(trial == 0, visited, 0.0)
+    assert not shown(once).pays(2.0, 0.01) and not shown(0 * visited).pays(2.0, 0.01)
+
+
+def pushed_hard_once(seed=0):
+    """Five runs with friction; half a second of the fourth is beyond the drive's limit."""
+    model = Model(
+        states={"x": "m", "v": "m/s"},
+        inputs={"u": "m/s^2"},
+        derivative=lambda s, a, p: {"x": s.v, "v": 1.0 * a.u},
+        roles={"position": ("x",), "speed": "v"},
+        name="sled",
+    )
+    rng, found = np.random.default_rng(seed), []
+    for k in range(5):
+        u = np.repeat(rng.uniform(-1, 1, 20), 10)
+        if k == 3:
+            u[80:90] = 2.2
+        x, states = np.zeros(2), [np.zeros(2)]
+        for value in u:
+            for _ in range(10):
+                x = x + 0.005 * np.array([x[1], np.clip(value, -1.5, 1.5) - 0.5 * x[1]])
+            states.append(x)
+        y = np.array(states) + 2e-3 * rng.standard_normal((201, 2))
+        found.append(Trial(y, u[:, None], 0.05, ("x", "v"), ("u",), start_inputs=u[:1], id=f"t{k}"))
+    return model, found
+
+
+@pytest.fixture(scope="module")
+def rare():
+    model, trials = pushed_hard_once()
+    data = prepare(model, trials, np.zeros(1))
+    return attribute(data, Library().candidates(model, data.scales), max_effects=2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("needed", ["viscous_friction:v", "saturation:u"])
+def test_what_one_trial_shows_is_told_with_its_place_and_is_no_cause(rare, needed):
+    """A likely effect that predictions don't need, told where few trials show it."""
+    search, best = rare
+    assert set(best.hypothesis.names) == {"viscous_friction:v", "saturation:u"}
+    decision = decide(search, best, Said(lambda c: 0.2 if needed in c else 1.0), 3)
+    assert {d.name for d in decision.doubtful} == set(best.hypothesis.names) - {needed}
+    claims = Claims(decision, {}, limits(search.data))
+    found = unconfirmed(claims, decision.doubtful)
+    if needed == "saturation:u":
+        assert not found  # every trial shows the friction
+        return
+    (one,) = found
+    assert one.effect == "saturation:u" and one.trial == "t3" and one.seen == (1, 5)
+    assert 3.9 < one.start < 4.2 < 4.4 < one.end < 6.0 and one.evidence > 10
+    assert one.params["c"].value == pytest.approx(1.5, abs=0.05)
+    told = verdict(claims, (), (), (), (), (), found)
+    assert told.effects == () and one.meaning in told.lines[-1] and "t3" in told.lines[-1]
+    assert Unconfirmed.from_json(one.to_json()) == one

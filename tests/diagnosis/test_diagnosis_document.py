@@ -12,18 +12,8 @@ from test_diagnosis import cart
 from test_diagnosis_split import task_of
 
 from grounded.diagnosis.diagnose import diagnose
-from grounded.diagnosis.report import (
-    Diagnosis,
-    Estimate,
-    Gap,
-    Made,
-    Ranked,
-    Region,
-    Remainder,
-    UtilityPrediction,
-    Verdict,
-    Where,
-)
+from grounded.diagnosis.error_report import Gap, Region, Remainder, UtilityPrediction, Where
+from grounded.diagnosis.report import Diagnosis, Estimate, Made, Ranked, Verdict
 from grounded.errors import GroundedError
 from grounded.result import Document
 from reported import DIAGNOSIS

@@ -11,7 +11,8 @@ from test_diagnosis_split import task_of
 from grounded import Trial
 from grounded.diagnosis.likelihood import data as diagnosis_data
 from grounded.diagnosis.likelihood.data import prepare
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, Predictor
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.validation.held_out import utility_prediction
 from grounded.diagnosis.validation.ruler import Ruler, folds, repeated
 

@@ -9,8 +9,9 @@ from grounded.challenge.cases import make
 from grounded.diagnosis.hypotheses.explored import price
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, Predictor
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.linearise import sensitivities, step_jacobian
+from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects import Library
 
 

@@ -2,7 +2,7 @@
 
 import math
 
-from grounded.diagnosis.report import RulerRow
+from grounded.diagnosis.error_report import RulerRow
 from grounded.diagnosis.verdict import worsened
 
 UNITS = {"x": "m", "v": "m/s"}

@@ -5,7 +5,8 @@ import pytest
 
 from grounded import GroundedError, Model, Param, Trial
 from grounded.diagnosis.likelihood.data import prepare
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, Predictor
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects import (
     InputFamily,
     Library,

@@ -10,8 +10,9 @@ import grounded as gr
 from grounded import Model, Param, Trial
 from grounded.compile import Named
 from grounded.diagnosis.likelihood.data import prepare
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, Predictor
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.linearise import sensitivities_of, step_jacobian
+from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects import Library, wrap
 from grounded.effects.joint import dry, has_viscous, pairs_of
 from grounded.models.pendulum import model as pendulum

@@ -6,7 +6,8 @@ import pytest
 from grounded import Trial
 from grounded.diagnosis.excitation import _run
 from grounded.diagnosis.likelihood.data import prepare, shifted
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, Predictor
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects import Library, acting_order, memory_start, scales_of, wrapping_order
 from grounded.models.car import model as car
 from grounded.task import Task

@@ -5,8 +5,9 @@ import pytest
 
 from grounded import Model, Param, Trial
 from grounded.diagnosis.likelihood.data import prepare
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, Predictor
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.linearise import linearise
+from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects import Library, wrap
 from grounded.models.aircraft import model as aircraft
 from grounded.models.car import model as car

@@ -8,7 +8,8 @@ from test_effects_order import DT, HELD, STEPS, commands, task
 
 from grounded import Model, Trial
 from grounded.diagnosis.likelihood.data import prepare
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, Predictor
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects import Library, memory_start, wrap
 from grounded.effects.wrap import plain_step
 from grounded.models.car import model as car

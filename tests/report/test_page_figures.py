@@ -12,8 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from facts import holding
+from grounded.diagnosis.error_report import Credit, RulerRow
 from grounded.diagnosis.pictures import accuracy_figure, credit_figure
-from grounded.diagnosis.report import Credit, Diagnosis, RulerRow, Verdict
+from grounded.diagnosis.report import Diagnosis, Verdict
 from grounded.errors import GroundedError
 from grounded.experiments.pendulum import pendulum_task
 from grounded.figures.figure import (

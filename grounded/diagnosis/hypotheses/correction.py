@@ -16,7 +16,8 @@ import numpy as np
 
 from grounded.diagnosis.hypotheses.leftover import CLAIM, Leftover, held_out_columns
 from grounded.diagnosis.likelihood.fitted import Fitted
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, Predictor
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.report import Correction, Curve
 from grounded.diagnosis.validation.prediction_error import Horizon, errors
 from grounded.effects import Library

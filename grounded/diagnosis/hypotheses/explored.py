@@ -22,8 +22,9 @@ import numpy as np
 
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, Predictor, rates_of
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.noise import Structure
+from grounded.diagnosis.likelihood.predictor import Predictor, rates_of
 from grounded.effects import Effect, ParamFamily
 from grounded.filter.tempering import Tempering, tempering
 

@@ -20,8 +20,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from grounded.diagnosis.likelihood.fitted import Fitted
-from grounded.diagnosis.likelihood.hypothesis import Predictor
 from grounded.diagnosis.likelihood.linearise import gains_of, step_jacobian
+from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.validation.ruler import folds
 from grounded.effects import places
 from grounded.effects.family import per

@@ -22,8 +22,9 @@ from grounded.diagnosis.hypotheses.leftover import filter_of
 from grounded.diagnosis.hypotheses.scan import scan_candidates
 from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, Predictor
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.linearise import base_columns
+from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.report import Likeness
 from grounded.effects import Effect, ParamFamily
 from grounded.filter import kalman

@@ -15,8 +15,9 @@ from grounded.diagnosis.hypotheses.explored import FittedHypotheses, parametric
 from grounded.diagnosis.hypotheses.scan import Look, scan_candidates
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, Predictor, param_scale
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.noise import NoiseModel, Structure, noise_guess
+from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.refine import refine
 from grounded.effects import Effect, ParamFamily
 from grounded.errors import GroundedError, NextCommand

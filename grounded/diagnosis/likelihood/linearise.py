@@ -35,14 +35,9 @@ import numpy as np
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
-from grounded.diagnosis.likelihood.hypothesis import (
-    Hypothesis,
-    Predictor,
-    limits_of,
-    param_scale,
-    rates_of,
-)
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.noise import NoiseModel
+from grounded.diagnosis.likelihood.predictor import Predictor, limits_of, rates_of
 from grounded.effects import ParamFamily
 from grounded.filter import kalman
 from grounded.filter.augmented import Delayed, coloured

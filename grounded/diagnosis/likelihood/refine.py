@@ -24,7 +24,7 @@ import numpy as np
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.delays import Delays, delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated, moved, shift_precision
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, Predictor, param_scale
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.linearise import (
     filter_system,
     gains_of,
@@ -39,6 +39,7 @@ from grounded.diagnosis.likelihood.noise import (
     likelihood_slopes,
     working,
 )
+from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.step import ProposedStep, inside, proposed
 from grounded.effects import SensorDelayFamily
 from grounded.engine import each

@@ -185,7 +185,7 @@ class Claims:
     def groups(self) -> tuple[tuple[str, ...], ...]:
         """For each claimed effect, what could stand in its place within a few nats.
 
-        For parameters that are off: the effects that are the same thing.
+        For parameters that are off: the effects that are the same thing, or as likely alone.
         """
         found = []
         for name in dict.fromkeys(one.effect for one in self.like_parameters):
@@ -193,6 +193,16 @@ class Claims:
             if same:
                 found.append((name, *(one.like for one in same[:2])))
         whole = self.search.score(self.best)
+        said = {name for group in found for name in group}
+        as_likely = [
+            names[0]
+            for (_, spread, names), f in self.search.fits.items()
+            if self.blamed and len(names) == 1 and spread == 0 and not parametric(f)
+            if whole - self.search.score(f) < TIE and names[0] not in said
+        ]
+        if as_likely:
+            first = self.data.model.param_names[self.blamed[0].index]
+            found.append((f"parameter:{first}", *dict.fromkeys(as_likely[:2])))
         for name in self.names:
             rest = set(self.names) - {name}
             rivals = [

@@ -11,6 +11,7 @@ likeliest of every other structure of noise, are held against the `ruler`:
     a cause without which predictions are as good, within their scatter, is dropped
     what is left then must be likelier than none by itself
     what predicts no better than the crude model is not claimed at all
+    a likely effect that was dropped is doubtful: seen in too few trials, maybe
 
 A cause is an effect or the calibration of the model's own parameters. Its credit is what is lost
 without it, the others fitted again.
@@ -26,6 +27,7 @@ from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.noise import Structure
 from grounded.diagnosis.validation.ruler import Ruler
+from grounded.effects import ParamFamily
 
 CALIBRATION = "calibration"
 RIVALS = 8  # likeliest hypotheses that are measured
@@ -35,7 +37,17 @@ BETTER = (2.0, 0.05)  # the same for a rival to take the place of a likelier hyp
 OVERRULES = (3.0, 0.1)  # and for a claim that is likely under another noise only
 SLIGHT = 0.02  # of what all causes gain: one that makes less is not named
 AMOUNTS = 0.1  # of what the likeliest gains: what a rival has to gain beyond it
+LIKELY = 10.0  # nats from which a dropped effect is mentioned
 REFIT = 12  # iterations after a cause was taken out
+
+
+@dataclass(frozen=True, eq=False)
+class Doubtful:
+    """A likely effect that was dropped because predictions gain too little by it."""
+
+    name: str
+    nats: float
+    fit: Fitted  # with it
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +58,7 @@ class Decision:
     fit: Fitted
     crude: Fitted
     without: dict[str, Fitted]  # by effect, or "calibration"
+    doubtful: tuple[Doubtful, ...] = ()  # likeliest first
 
     @property
     def causes(self) -> tuple[str, ...]:
@@ -70,12 +83,14 @@ def decide(search: HypothesisSearch, best: Fitted, ruler: Ruler, most: int) -> D
     crude = search.exact_null()
     ruler.beside(crude)
     search, fit = _proposed(search, best, crude, ruler, most)
-    fit, without = _pruned(search, fit, ruler)
+    fit, without, doubtful = _pruned(search, fit, ruler)
     if not _likely(search, fit):
-        fit, without = _pruned(search, search.best_null(), ruler)
+        fit, without, _ = _pruned(search, search.best_null(), ruler)
     if causes(fit) and not _pays(ruler, crude, fit, PAYS):
         fit, without = crude, {}
-    return Decision(search, fit if causes(fit) else _quiet(search, fit, crude), crude, without)
+    fit = fit if causes(fit) else _quiet(search, fit, crude)
+    open_ = sorted((d for d in doubtful if d.name not in causes(fit)), key=lambda d: -d.nats)
+    return Decision(search, fit, crude, without, tuple(open_))
 
 
 def _likely(search: HypothesisSearch, fit: Fitted) -> bool:
@@ -133,19 +148,29 @@ def _proposed(
 
 def _pruned(
     search: HypothesisSearch, fit: Fitted, ruler: Ruler
-) -> tuple[Fitted, dict[str, Fitted]]:
-    """Without the causes that predictions don't need, the least needed first."""
+) -> tuple[Fitted, dict[str, Fitted], list[Doubtful]]:
+    """Without the causes that predictions don't need, the least needed first; the likely ones."""
+    doubtful: list[Doubtful] = []
     while True:
         without = {name: fit_without(search, fit, name) for name in causes(fit)}
         if not ruler.held_out:
-            return fit, without
+            return fit, without, doubtful
         gains = {name: ruler.gain(less, fit) for name, less in without.items()}
         least = SLIGHT * ruler.gain(search.exact_null(), fit).mean
         bar = PAYS if len(fit.hypothesis.effects) < 2 else FURTHER
         idle = [n for n, gain in gains.items() if not gain.pays(*bar) or gain.mean < least]
         if not idle:
-            return fit, without
-        fit = without[min(idle, key=lambda name: gains[name].mean)]
+            return fit, without, doubtful
+        name = min(idle, key=lambda name: gains[name].mean)
+        nats = search.score(fit) - search.score(without[name])
+        if nats > LIKELY and name in _effects(fit):
+            doubtful.append(Doubtful(name, nats, fit))
+        fit = without[name]
+
+
+def _effects(fit: Fitted) -> list[str]:
+    """Those that are no parameters."""
+    return [e.name for e in fit.hypothesis.effects if not isinstance(e.family, ParamFamily)]
 
 
 def fit_without(search: HypothesisSearch, fit: Fitted, name: str) -> Fitted:

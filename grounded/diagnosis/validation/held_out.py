@@ -13,9 +13,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from grounded.diagnosis.error_report import UtilityPrediction
 from grounded.diagnosis.likelihood.fitted import Fitted, leave_one_out, moved
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, Predictor
-from grounded.diagnosis.report import UtilityPrediction
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.validation.prediction_error import Horizon, errors, normalised
 from grounded.diagnosis.validation.ruler import folds
 from grounded.frozen import Array

@@ -14,8 +14,8 @@ import numpy as np
 from grounded.diagnosis.hypotheses.leftover import filter_of
 from grounded.diagnosis.likelihood.data import PIECES, Data
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
-from grounded.diagnosis.likelihood.hypothesis import Predictor
 from grounded.diagnosis.likelihood.linearise import base_columns
+from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.report import Identifiable
 from grounded.effects import (
     Effect,

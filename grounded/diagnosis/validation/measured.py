@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from grounded.diagnosis.error_report import Credit, Remainder, RulerRow, RunChange, Split
 from grounded.diagnosis.hypotheses.leftover import Leftover, leftovers
 from grounded.diagnosis.likelihood.fitted import Fitted
-from grounded.diagnosis.report import Credit, Remainder, RulerRow, RunChange, Split
 from grounded.diagnosis.validation.decide import Decision, ordered, plain, shares
 from grounded.diagnosis.validation.prediction_error import by_region, horizon
 from grounded.diagnosis.validation.ruler import Errors, Ruler, repeated

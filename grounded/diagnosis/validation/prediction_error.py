@@ -16,12 +16,13 @@ from typing import Any
 
 import numpy as np
 
+from grounded.diagnosis.error_report import Region, TimeShare
 from grounded.diagnosis.hypotheses.leftover import filter_of
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, Predictor
-from grounded.diagnosis.report import Region, TimeShare
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.filter import kalman
 from grounded.frozen import Array
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from grounded.diagnosis.report import ChannelParts, Parts, Split
+from grounded.diagnosis.error_report import ChannelParts, Parts, Split
 from grounded.frozen import Array
 
 

@@ -8,10 +8,10 @@ noise          what no model predicts
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterable, Mapping
 
-from grounded.diagnosis.report import Correction, Diagnosis, Estimate, Gap
+from grounded.diagnosis.error_report import Gap
+from grounded.diagnosis.report import Correction, Diagnosis, Estimate
 from grounded.instruments.finding import Finding
 from grounded_trials.wording import count, figure, percent, shown, with_unit
 
@@ -190,15 +190,13 @@ def utility_sentence(diagnosis: Diagnosis) -> str:
     return f"{text} (rms; from policy to policy the utilities themselves differ by {spread})"
 
 
-def verdict_lines(kind: str, text: str) -> tuple[list[str], list[str]]:
-    """A verdict's causes, then its sentences, for a line each."""
-    first, *others = sentences(text)
-    causes = first.split("; ") if kind in ("effect", "several") else [first]
-    if len(causes) == 1:
-        return [], [first, *others]
-    return [f"{cause[:1].upper()}{cause[1:]}".rstrip(".") for cause in causes], others
-
-
-def sentences(text: str) -> list[str]:
-    """A verdict's sentences, for a line each: they say different things."""
-    return re.split(r"(?<=\.) (?=[A-Z`]|[\d.]+ s ahead)", text)
+def verdict_lines(diagnosis: Diagnosis) -> tuple[list[str], list[str]]:
+    """A verdict's causes, where they are several, with their shares; then its sentences."""
+    causes, told = diagnosis.verdict.causes, list(diagnosis.verdict.lines)
+    if len(causes) < 2:
+        return [], told
+    shares = (percent(one.share) for one in diagnosis.credit)
+    return [
+        f"{cause[:1].upper()}{cause[1:]} ({share} of the gain)"
+        for cause, share in zip(causes, shares, strict=True)
+    ], told[1:]

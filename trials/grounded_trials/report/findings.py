@@ -12,7 +12,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from grounded.diagnosis.report import Diagnosis, measured
+from grounded.diagnosis.error_report import measured
+from grounded.diagnosis.report import Diagnosis
 from grounded.errors import NextCommand
 from grounded.frozen import Array
 from grounded.model import Model

@@ -156,7 +156,7 @@ def _diagnosis(findings: Findings, table: Table) -> str:
     lines = ["gap to the model"]
     lines += _wrapped(since.told(findings.folder), "  ")
     then = "before that: " * bool(since.adopted)
-    causes, others = verdict_lines(diagnosis.kind, diagnosis.sentence or diagnosis.kind)
+    causes, others = verdict_lines(diagnosis)
     for k, line in enumerate([*(f"- {cause}" for cause in causes), *others]):
         lines += _wrapped(then * (k == 0) + line, "  ")
     before = {} if since.changed else findings.values

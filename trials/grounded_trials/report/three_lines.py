@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from grounded.diagnosis.report import Diagnosis, Remainder, RulerRow, measured
+from grounded.diagnosis.error_report import Remainder, RulerRow, measured
+from grounded.diagnosis.report import Diagnosis
 from grounded.diagnosis.verdict import tied, worsened
 from grounded.task import Task
-from grounded_trials.report.diagnosis_words import moved_parameters, sentences
+from grounded_trials.report.diagnosis_words import moved_parameters
 from grounded_trials.report.findings import weighed_groups
 from grounded_trials.wording import count, shown
 
@@ -24,24 +25,23 @@ def three_lines(diagnosis: Diagnosis, task: Task) -> list[str]:
         diagnosis: what was found.
         task: whose weighed states the second line speaks of.
     """
-    clauses = sentences(diagnosis.sentence or diagnosis.kind)[0].rstrip(".").split("; ")
-    if diagnosis.no_cause or not diagnosis.credit or len(clauses) != len(diagnosis.credit):
-        return sentences(diagnosis.sentence or diagnosis.kind)
-    return [_wrong(diagnosis, clauses), *_gained(diagnosis, task), _open(diagnosis)]
+    if not diagnosis.verdict.causes:
+        return list(diagnosis.verdict.lines)
+    return [_wrong(diagnosis), *_gained(diagnosis, task), _open(diagnosis)]
 
 
-def _wrong(diagnosis: Diagnosis, clauses: list[str]) -> str:
+def _wrong(diagnosis: Diagnosis) -> str:
     """The largest causes without their shares, which the bars show; the others are counted."""
     told: list[str] = []
     small = 0
-    for clause, credit in zip(clauses, diagnosis.credit, strict=True):
+    for clause, credit in zip(diagnosis.verdict.causes, diagnosis.credit, strict=True):
         if told and (len(told) == CAUSES or credit.share < SMALL):
             small += 1
         elif credit.of == "calibration":
             named = moved_parameters(diagnosis, brief=True)
             told.append("the model's own parameters are off" + f": {named}" * bool(named))
         else:
-            told.append(clause.rsplit(" (", 1)[0] if len(clauses) > 1 else clause)
+            told.append(clause)
     text = "; ".join(told) + f"; {count(small, 'smaller cause')}" * bool(small)
     return f"{text[:1].upper()}{text[1:]}."
 
@@ -87,6 +87,7 @@ def _together(errors: Mapping[str, float], names: list[str]) -> float:
 def _open(diagnosis: Diagnosis) -> str:
     """What ties, and what no known effect explains."""
     found = [f"the data can't tell {tied(group)}" for group in diagnosis.indistinguishable[:1]]
+    found += [one.sentence() for one in diagnosis.unconfirmed[:1]]
     if diagnosis.leftover:
         found.append(_left(diagnosis.leftover[0], len(diagnosis.leftover) - 1))
     text = "; ".join(found) or "nothing is left above the noise"

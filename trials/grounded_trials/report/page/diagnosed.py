@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
+from grounded.diagnosis.error_report import ChannelParts, Parts, Split
 from grounded.diagnosis.pictures import accuracy_figure, credit_figure, where_figure
-from grounded.diagnosis.report import ChannelParts, Diagnosis, Parts, Split, TrialValue
+from grounded.diagnosis.report import Diagnosis, TrialValue
 from grounded_trials.report.diagnosis_words import (
     gap_sentence,
     utility_sentence,
@@ -39,7 +40,7 @@ def gap_section(findings: Findings) -> list[Block]:
         words = "Not diagnosed yet. This says where the model is wrong, and what makes it so:"
         command = Block("command", rendered(DIAGNOSE), "c-diagnose")
         return [Block("text", words), command, *ahead, *forecast_table(findings), *lacking]
-    causes, others = verdict_lines(diagnosis.kind, diagnosis.sentence or diagnosis.kind)
+    causes, others = verdict_lines(diagnosis)
     verdict = Block("verdict", lines=told_since([*causes, *others], findings.since))
     if diagnosis.no_cause:  # with too little data, what was fitted is no finding
         return [verdict, *ahead, *forecast_table(findings), *lacking]
@@ -49,7 +50,7 @@ def gap_section(findings: Findings) -> list[Block]:
     return [verdict, *proof, *lacking, *_details(diagnosis, findings.since)]
 
 
-def told_since(lines: list[str], since: Since) -> list[str]:
+def told_since(lines: Sequence[str], since: Since) -> list[str]:
     """A verdict's lines; what happened since stands before them."""
     before = "Before that: " * bool(since.adopted)
     told = [f"{_begun(since.sentence)}."] if since.sentence else []

@@ -1,0 +1,336 @@
+"""What a hypothesis predicts: the model, some effects with their values, its parameters shifted.
+
+    x_{t+1} = f_h(x_t, commands)        y_t = x_t + offset_h(x)
+
+Effects on inputs act on the command sequence of the whole trial, a joint's losses on what arrives
+of it at a step; rates act by Strang splitting, half before and half after the model's step, or,
+limits, on its mean rate; sensor effects act on what is compared with the log.
+The very equations that `grounded.effects.wrap` adopts, evaluated on arrays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from hashlib import blake2b
+from typing import Any
+
+import numpy as np
+
+from grounded.compile import Named
+from grounded.compile.run.differenced import DifferencedSystem
+from grounded.diagnosis.likelihood.data import Data, shifted
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.effects import (
+    Effect,
+    InputFamily,
+    LossFamily,
+    MemoryFamily,
+    ParamFamily,
+    RateFamily,
+    SensorDelayFamily,
+    SensorFamily,
+    SensorLagFamily,
+    acting_order,
+)
+from grounded.effects.family import braked, coupled
+from grounded.effects.joint import Loads, loads, solved
+from grounded.effects.registry import partner
+from grounded.effects.sensor import lagging
+from grounded.engine import SentOnce
+from grounded.frozen import Array
+
+MOST_KEPT = 8_000_000  # numbers of inputs that a predictor keeps
+STEPS_KEPT = 16  # of a simulator
+
+
+@dataclass(frozen=True, eq=False)
+class Predictor(SentOnce):
+    """Evaluates hypotheses on one Data. Shapes: tracks (L + 1, B, n), inputs (L, B, m)."""
+
+    data: Data
+    _inputs: dict[Any, Array] = field(default_factory=dict)
+    _steps: dict[bytes, Array] = field(default_factory=dict)
+
+    def inputs(self, h: Hypothesis) -> Array:
+        """What the actuators receive under a hypothesis, by run (L, B, m)."""
+        return self._kept("runs", h, lambda: self.data.runs(self.received(h)))
+
+    def received(self, h: Hypothesis) -> Array:
+        """The same on whole trials, (S, T_max, m); zeros of those of which no run is kept."""
+
+        def found() -> Array:
+            data, whole = self.data.in_use, np.zeros_like(self.data.commands)
+            u = data.commands
+            for effect, values in self.acting(h):
+                u = transformed(effect, values, u, data)
+            whole[data.used] = data.delayed(u)
+            return whole
+
+        return self._kept("trials", h, found)
+
+    def _kept(self, what: str, h: Hypothesis, make: Callable[[], Array]) -> Array:
+        """Made once for the same values."""
+        acting = self.acting(h)
+        key = (what, *((e.name, tuple(sorted(v.items()))) for e, v in acting))
+        if (found := self._inputs.get(key)) is None:
+            if len(self._inputs) > max(64, MOST_KEPT // self.data.commands.size):
+                self._inputs.clear()
+            found = self._inputs[key] = make()
+        return found
+
+    @staticmethod
+    def acting(h: Hypothesis) -> list[tuple[Effect, Mapping[str, float]]]:
+        """The effects on inputs with their values, in the order in which they act."""
+        return [h.pairs[i] for i in acting_order([effect.family for effect in h.effects])]
+
+    def params(self, h: Hypothesis) -> Array:
+        """The model's parameters under a hypothesis (k,)."""
+        p = np.array(self.data.model.values)
+        if h.shift is not None:
+            p = p + h.shift
+        names = self.data.model.param_names
+        for effect, values in h.pairs:
+            if isinstance(effect.family, ParamFamily):
+                p[names.index(effect.site.target)] += values["d"]
+        return p
+
+    def step(self, x: Array, u: Array, p: Array, dt: float | None = None) -> Array:
+        """The model's own step at any leading shape."""
+        rows, system = self.flat(x, u), self.data.model.system
+        if not isinstance(system, DifferencedSystem):
+            return system.step(*rows, p, dt or self.data.dt).reshape(x.shape)
+        parts = (*rows, p, np.array(dt or self.data.dt))  # a simulator is slow: losses ask again
+        key = blake2b(b"".join(part.tobytes() for part in parts)).digest()
+        if (found := self._steps.get(key)) is None:
+            if len(self._steps) >= STEPS_KEPT:
+                self._steps.clear()
+            found = self._steps[key] = system.step(*rows, p, dt or self.data.dt)
+        return found.reshape(x.shape).copy()
+
+    def slopes(self, x: Array, u: Array, p: Array, dt: float | None = None) -> tuple[Array, Array]:
+        """Slopes of the model's own step at any leading shape: f_x (..., n, n), f_u (..., n, m)."""
+        found = self.data.model.system.linearise(*self.flat(x, u), p, dt or self.data.dt)
+        f_x, f_u = (f.reshape(*x.shape, f.shape[-1]) for f in found)
+        return f_x, f_u
+
+    def flat(self, x: Array, u: Array) -> tuple[Array, Array]:
+        """States (..., n) and inputs (..., m) as rows."""
+        n, m = self.data.model.n, self.data.model.m
+        return np.ascontiguousarray(x.reshape(-1, n)), np.ascontiguousarray(u.reshape(-1, m))
+
+    def next(self, h: Hypothesis, x: Array) -> Array:
+        """f_h at the start of every step: x (L, B, n) -> (L, B, n)."""
+        return self.advance(h, x, self.inputs(h), self.data.time)
+
+    def advance(self, h: Hypothesis, x: Array, u: Array, t: Array) -> Array:
+        """One step of a hypothesis from x (..., n) with received inputs u (..., m) at times t."""
+        dt, rates = self.data.dt, rates_of(h)
+        if not rates and not limits_of(h):
+            return self.moved(h, x, u)
+        needs_own = any(e.family.needs_own for e, _ in rates)
+        own = self.named((self.moved(h, x, u) - x) / dt) if needs_own else {}
+        start = x + 0.5 * dt * self.added_rate(rates, x, u, t, own)
+        after, mean = self.limited(h, start, u, t)
+        if needs_own:  # the mean over the very step: second order, steady where the model is stiff
+            own = self.named(mean)
+        result = after + 0.5 * dt * self.added_rate(rates, after, u, t + dt, own)
+        for i, j in self.tied():  # a carried heading rate is the heading's rate, effects and all
+            found = []
+            for s, when in ((x, t), (result, t + dt)):
+                rate = self.instant(h, s, u)
+                own = self.named(rate) if needs_own else {}
+                found.append(rate[..., i] + self.added_rate(rates, s, u, when, own)[..., i])
+            result[..., j] = x[..., j] + found[1] - found[0]
+        return result
+
+    def stepper(self, h: Hypothesis) -> Callable[[Array, Array, Array], Array]:
+        """`advance` of many steps one after the other: from x (M, n) with u (M, m) at t (M,)."""
+        if rates_of(h) or limits_of(h) or losses_of(h):
+            return lambda x, u, t: self.advance(h, x, u, t)
+        step, p, dt = self.data.model.system.step, self.params(h), self.data.dt
+        return lambda x, u, t: step(x, u, p, dt)
+
+    def moved(self, h: Hypothesis, x: Array, u: Array, dt: float | None = None) -> Array:
+        """The model's step with what its motion takes off the inputs, without further rates."""
+        return self.step(x, self.left(h, x, u, dt), self.params(h), dt)
+
+    def left(self, h: Hypothesis, x: Array, u: Array, dt: float | None = None) -> Array:
+        """What losses leave of the inputs u (..., m) that reach the model at x (..., n)."""
+        pairs, names = losses_of(h), self.data.model.input_names
+        if not pairs:
+            return u
+        found = u.copy()
+        taken = solved(pairs, self.loads(h, x, u, dt), dt or self.data.dt)
+        for (effect, _), loss in zip(pairs, taken, strict=True):
+            found[..., names.index(coupled(effect.site)[0])] -= loss
+        return found
+
+    def loads(self, h: Hypothesis, x: Array, u: Array, dt: float | None = None) -> Loads:
+        """Of each loss: speed at the start, at the end without it, gains, the input (`joint`)."""
+        names, p = self.data.model.input_names, self.params(h)
+
+        def step(a: Named) -> Named:
+            return self.named(self.step(x, np.stack([a[n] for n in names], axis=-1), p, dt))
+
+        given = Named("input", names, list(np.moveaxis(u, -1, 0)))
+        return loads(losses_of(h), self.named(x), given, step)
+
+    def loss_slopes(
+        self, h: Hypothesis, x: Array, u: Array, f_x: Array, f_p: Array | None = None
+    ) -> tuple[Array, Array]:
+        """Slopes of what losses take off the inputs: by state (..., m, n), parameter (..., m, k).
+
+        f_x, f_p: slopes of the model's own step (..., n, n), (..., n, k).
+        """
+        names, pairs = self.data.model.input_names, losses_of(h)
+        f_p = f_x[..., :0] if f_p is None else f_p
+        m = len(names)
+        by_x, by_p = (np.zeros((*x.shape[:-1], m, f.shape[-1])) for f in (f_x, f_p))
+        if not pairs:
+            return by_x, by_p
+        at = w, free, gain, given = self.loads(h, x, u)
+        base = solved(pairs, at, self.data.dt)
+        drives = [coupled(effect.site) for effect, _ in pairs]
+        for i, (_, source) in enumerate(drives):
+            k = self.data.model.state_names.index(source)
+            size = 1e-6 * self.data.scales.peak(source)
+            more = [value + size if j == i else value for j, value in enumerate(w)]
+            ends = [value + size if j == i else value for j, value in enumerate(free)]
+            started = solved(pairs, (more, free, gain, given), self.data.dt)
+            ended = solved(pairs, (w, ends, gain, given), self.data.dt)
+            for (tau, _), was, by_w, by_end in zip(drives, base, started, ended, strict=True):
+                row, slope = names.index(tau), (by_end - was)[..., None] / size
+                by_x[..., row, :] += slope * f_x[..., k, :]
+                by_x[..., row, k] += (by_w - was) / size
+                by_p[..., row, :] += slope * f_p[..., k, :]
+        return by_x, by_p
+
+    def limited(self, h: Hypothesis, x: Array, u: Array, t: Array) -> tuple[Array, Array]:
+        """The model's step through the effects that limit its rates, and its mean rate."""
+        after, limits = self.moved(h, x, u), limits_of(h)
+        free = (after - x) / self.data.dt
+        if not limits:
+            return after, free
+        parts = max(e.family.parts for e, _ in limits)
+        dt, mean = self.data.dt / parts, np.zeros_like(x)
+        touched = np.zeros((*x.shape[:-1], 1), bool)
+        for k in range(parts):
+            own = (self.moved(h, x, u, dt) - x) / dt
+            added = self.added_rate(limits, x, u, t + k * dt, self.named(own))
+            x, mean = x + dt * (own + added), mean + own / parts
+            touched |= (added != 0).any(axis=-1, keepdims=True)
+        return np.where(touched, x, after), np.where(touched, mean, free)
+
+    def named(self, x: Array) -> Named:
+        """States, or their rates (..., n), by name."""
+        return Named("state", self.data.model.state_names, list(np.moveaxis(x, -1, 0)))
+
+    def instant(self, h: Hypothesis, x: Array, u: Array) -> Array:
+        """The model's own rates at x (..., n), by a very short step."""
+        short = 1e-3 * self.data.dt
+        return np.asarray((self.moved(h, x, u, short) - x) / short)
+
+    def tied(self) -> list[tuple[int, int]]:
+        """(heading, heading rate) where the rate is only carried along."""
+        names = self.data.model.state_names
+        key = ("tied",)
+        if key not in self._inputs:
+            found = [(i, k) for i, n in enumerate(names) if (k := partner(self.data.model, n))]
+            self._inputs[key] = np.array([(i, names.index(k)) for i, k in found]).reshape(-1, 2)
+        return [(int(i), int(j)) for i, j in self._inputs[key]]
+
+    def added_rate(self, rates: Any, x: Array, u: Array, t: Array, own: Any) -> Array:
+        """Sum of the rates of (effect, values) pairs at x (..., n), (..., n) per second.
+
+        `own` are the model's own rates by name, for families that need them.
+        """
+        names, s = self.data.model.state_names, self.named(x)
+        a = Named("input", self.data.model.input_names, list(np.moveaxis(u, -1, 0)))
+        total = np.zeros_like(x)
+        for effect, values in rates:
+            added = effect.family.rate(s, a, own, t, values, effect.site)
+            added = braked(effect, s, added, 0.5 * self.data.dt)
+            for name, value in added.items():
+                total[..., names.index(name)] += value
+        return total
+
+    def offset(self, h: Hypothesis, track: Array) -> Array | float:
+        """The log minus the state along a track (L + 1, B, n); 0.0 where sensors are right."""
+        names, dt, old = self.data.model.state_names, self.data.dt, track
+        for effect, values in h.pairs:
+            if isinstance(effect.family, SensorDelayFamily):
+                i, old = names.index(effect.site.target), old.copy()
+                old[..., i] += sensor_offset(effect, values, track[..., i], dt)
+        standing = self.standing(h, old)
+        return standing if old is track else standing + old - track
+
+    def standing(self, h: Hypothesis, shown: Array) -> Array | float:
+        """What sensors add to what they are shown (..., n), however old it is; 0.0 if nothing."""
+        kinds = SensorFamily | SensorLagFamily
+        sensors = [(e, v) for e, v in h.pairs if isinstance(e.family, kinds)]
+        if not sensors:
+            return 0.0
+        names, total = self.data.model.state_names, np.zeros_like(shown)
+        for effect, values in sensors:
+            i = names.index(effect.site.target)
+            total[..., i] += sensor_offset(effect, values, shown[..., i], self.data.dt)
+        return total
+
+
+def rates_of(h: Hypothesis) -> list[tuple[Any, Mapping[str, float]]]:
+    """The rate effects of halves of a step, with their values."""
+    return [(e, v) for e, v in h.pairs if isinstance(e.family, RateFamily) and not e.family.parts]
+
+
+def limits_of(h: Hypothesis) -> list[tuple[Any, Mapping[str, float]]]:
+    """Those of parts of it: limits of rates."""
+    return [(e, v) for e, v in h.pairs if isinstance(e.family, RateFamily) and e.family.parts]
+
+
+def losses_of(h: Hypothesis) -> list[tuple[Any, Mapping[str, float]]]:
+    """What the motion takes off the inputs that drive it."""
+    return [(e, v) for e, v in h.pairs if isinstance(e.family, LossFamily)]
+
+
+def sensor_offset(effect: Effect, values: Mapping[str, float], track: Array, dt: float) -> Array:
+    """What a sensor effect adds to the log of its state along a track (L + 1, B)."""
+    if isinstance(effect.family, SensorFamily):
+        return np.asarray(effect.family.measure(track, values) - track)
+    if isinstance(effect.family, SensorLagFamily):
+        return _behind(track, values["tau"], dt)
+    steps = values["d"] / dt
+    slope = np.vstack([track[1:2] - track[:1], np.diff(track, axis=0)])
+    whole, part = int(np.floor(steps)), steps - np.floor(steps)
+    first = track[:1] - slope[:1] * np.arange(whole + 1, 0, -1)[:, None]  # as if it came so
+    line = np.concatenate([first, track])
+    count = len(track)
+    old = (1 - part) * line[1 : count + 1] + part * line[:count]
+    return np.asarray(old - track)
+
+
+def _behind(track: Array, tau: float, dt: float) -> Array:
+    """How far a filtered sensor is off along a track (L + 1, B) that moved before as it begins."""
+    moved = np.diff(track, axis=0)
+    off = [-moved[0] * tau / dt]
+    for step in moved:
+        off.append(lagging(off[-1], step, tau, dt))
+    return np.array(off)
+
+
+def transformed(effect: Effect, values: Mapping[str, float], u: Array, data: Data) -> Array:
+    """Commands (S, T, m) after an input or memory effect."""
+    family, names = effect.family, data.model.input_names
+    out = u.copy()
+    for target in effect.site.targets:
+        j = names.index(target)
+        if isinstance(family, InputFamily):
+            t = np.arange(u.shape[1]) * data.dt
+            out[:, :, j] = family.effect(u[:, :, j], t[None, :], values)
+        elif isinstance(family, MemoryFamily):
+            if family.name == "delay":  # the same as its queue, at once
+                out[:, :, j] = shifted(u[:, :, j], data.held[:, j], values["d"] / data.dt)
+                continue
+            before = family.along(u[:, :, j], data.held[:, j], values, data.dt)
+            out[:, :, j], _ = family.advance(u[:, :, j], (before,), values, data.dt)
+    return out

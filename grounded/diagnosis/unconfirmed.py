@@ -1,0 +1,78 @@
+"""What was seen once: likely effects of too few trials for predictions of others to bear them out.
+
+They are never causes. Each is told with the trial, the time and the region that show it, where a
+further trial would have to go. What most trials show as likely, and none predicts better by, is a
+fault of the likelihood and is not told.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from grounded.diagnosis.report import Unconfirmed
+from grounded.diagnosis.validation.claims import Claims
+from grounded.diagnosis.validation.decide import Doubtful
+from grounded.diagnosis.validation.prediction_error import by_region
+from grounded.diagnosis.verdict import meaning
+from grounded.frozen import Array
+
+MENTIONED = 2
+MOST = 0.8  # of all that it does, which few trials hold
+FEW = 4  # one of so many trials
+
+
+def unconfirmed(claims: Claims, doubtful: Sequence[Doubtful]) -> tuple[Unconfirmed, ...]:
+    """The likeliest effects that a decision dropped, of those that few trials show."""
+    if claims.known.no_cause:
+        return ()
+    found = [_seen(claims, one) for one in doubtful]
+    return tuple([one for one in found if one is not None][:MENTIONED])
+
+
+def _seen(claims: Claims, one: Doubtful) -> Unconfirmed | None:
+    data, acts = claims.data, _acting(claims, one)
+    by = np.bincount(data.trial_of, acts.sum(axis=0), data.count)
+    held = np.cumsum(np.sort(by)[::-1])
+    few = 1 + int(np.searchsorted(held, MOST * held[-1]))
+    if data.count < 2 or few > max(data.count // FEW, 1):
+        return None
+    trial = int(by.argmax())
+    own = np.flatnonzero(data.trial_of == trial)
+    run = int(own[acts[:, own].sum(axis=0).argmax()])
+    start, end = (t * data.dt for t in _stretch(acts[:, run] - acts.mean()))
+    regions = by_region(acts[..., None], claims.predictor, one.fit, 1)
+    i = one.fit.hypothesis.names.index(one.name)
+    params, begin = claims.estimates(one.fit)[i], data.time[0, run]
+    return Unconfirmed(
+        one.name,
+        meaning(one.fit.hypothesis.effects[i], params),
+        params,
+        one.nats,
+        data.ids[trial] or str(trial + 1),
+        float(begin + start),
+        float(begin + end),
+        (few, data.count),
+        regions[0] if regions else None,
+    )
+
+
+def _acting(claims: Claims, one: Doubtful) -> Array:
+    """How much it does in each step, squared, in units of the noise, (L, B)."""
+    predictor, data, fit = claims.predictor, claims.data, one.fit
+    h, x = fit.hypothesis, fit.track
+    less = h.minus(one.name)
+    moved = data.model.difference(predictor.next(less, x[:-1]), predictor.next(h, x[:-1]))
+    shown = np.zeros_like(x) + predictor.offset(h, x) - predictor.offset(less, x)
+    square = moved**2 / np.exp(fit.noise.log_q) + shown[1:] ** 2 / np.exp(fit.noise.log_r)
+    return np.asarray(square.sum(axis=-1) * data.valid.T)
+
+
+def _stretch(more: Array) -> Any:
+    """From which step to which most is done (Kadane's largest sum of neighbours)."""
+    total = np.concatenate([[0.0], np.cumsum(more)])
+    least = np.minimum.accumulate(total)
+    end = int((total - least).argmax())
+    return int(total[: end + 1].argmin()), end
