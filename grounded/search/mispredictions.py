@@ -16,14 +16,14 @@ second one to what the first leaves:
 
 Each is a ridge regression. Its price, and how much less trials count the farther they are from the
 incumbent, are chosen by leaving out parts of the run in turn (Stone, "Cross-validatory choice and
-assessment of statistical predictions", J. R. Stat. Soc. B 36, 1974). A third law is one of each
-step's own, for what no single law says: a carpet that drags by heading, tyres that let go.
+assessment of statistical predictions", J. R. Stat. Soc. B 36, 1974). (A law of each step's own
+gains the last half per cent on cars and costs twice the trials.)
 
-Which slopes are believed, the crude ones, those of laws 1 and 2 or those of each step, is decided
-by leaving out the nearest trials in turn: each model, fitted to the others, runs the policy of the
-one left out, and `Believed.missed` is the share of what that trial did otherwise than the
-incumbent's (`apart`, in the units of the cost) that it does not foretell. The least wins. As much
-of a new step is likely to be missed, so one that would lose by that is put last (`making.About`).
+Which slopes are believed, the crude ones or those of the laws, is decided by leaving out the
+nearest trials in turn: each model, fitted to the others, runs the policy of the one left out, and
+`Believed.missed` is the share of what that trial did otherwise than the incumbent's (`apart`, in
+the units of the cost) that it does not foretell. The least wins. As much of a new step is likely to
+be missed, so one that would lose by that is put last (`making.About`).
 A single other trial can't be left out: there, it is at least the share of the mispredictions that
 law 1 leaves in parts of the run that it was not fitted to.
 """
@@ -45,12 +45,10 @@ from grounded.search.planner import Planner, predicted
 from grounded.solve.bias import input_span
 from grounded.trial import mean_trial
 
-PRICE = 0.1  # of a law of one step's own, of the features' mean square
 PRICES = (1e-4, 1e-3, 1e-2, 0.1, 1.0, 10.0)  # of the ridge
 FADING = (0.0, 2.0)  # powers of the distance with which a trial's squares lose weight
 PARTS = 8  # of the run, left out in turn
 NEAREST = 12  # trials that count
-KINDS = ("", "shared", "each")  # the crude slopes, laws 1 and 2, those of each step
 ASKED = 3  # the nearest trials, which are left out in turn
 LATEST = 100  # of which they are chosen
 DEAD = 1e-4  # of the mean square effect of the inputs: less explains nothing
@@ -101,19 +99,18 @@ def believed(
     if not others:
         return Believed(grounded)
 
-    asked, missed = others[:ASKED], dict[str, float]()
-    for other in asked:
+    crude, corrected = [], []
+    for other in others[:ASKED]:
         rest = [o for o in others if o is not other]
-        made, left = laws(own, rest or others, grounded)
-        for kind in KINDS if rest else KINDS[:2]:
-            model = _with(made.get(kind), own, grounded).problem
-            share = unforetold(model, own, other) if kind in made or not kind else 1.0
-            if kind and not rest:
-                share = max(share, left)
-            missed[kind] = missed.get(kind, 0.0) + share / len(asked)
-    kind = min(missed, key=lambda kind: missed[kind])
-    law = laws(own, others, grounded)[0].get(kind)
-    return replace(_with(law, own, grounded), missed=missed[kind])
+        law, left = laws(own, rest or others, grounded)
+        crude.append(unforetold(grounded, own, other))
+        share = 1.0 if law is None else unforetold(_with(law, own, grounded).problem, own, other)
+        corrected.append(share if rest else max(share, left))
+    missed = float(np.mean(corrected))
+    if (own_share := float(np.mean(crude))) <= missed:
+        return Believed(grounded, missed=own_share)
+    law, _ = laws(own, others, grounded)
+    return replace(_with(law, own, grounded), missed=missed)
 
 
 def _with(law: Array | None, own: Seen, grounded: Problem) -> Believed:
@@ -163,8 +160,8 @@ def _sent(problem: Problem, u: Array) -> Array:
     return np.ascontiguousarray(u if problem.input_shift is None else u - problem.input_shift)
 
 
-def laws(own: Seen, others: Sequence[Seen], grounded: Problem) -> tuple[dict[str, Array], float]:
-    """What the slopes lack, (H, n, 2 n + 2 m) by [x, u, u before, y before], in both ways.
+def laws(own: Seen, others: Sequence[Seen], grounded: Problem) -> tuple[Array | None, float]:
+    """What the slopes lack, (H, n, 2 n + 2 m) by [x, u, u before, y before]: laws 1 and 2.
 
     Args:
         own: the incumbent's trial.
@@ -172,8 +169,8 @@ def laws(own: Seen, others: Sequence[Seen], grounded: Problem) -> tuple[dict[str
         grounded: the exact model with the incumbent's bias.
 
     Returns:
-        The laws by their names in KINDS, and the share of the nearest trial's mispredictions that
-        law 1 leaves in parts of the run that it was not fitted to.
+        Their sum, None where no trial moved, and the share of the nearest trial's mispredictions
+        that law 1 leaves in parts of the run that it was not fitted to.
     """
     span = input_span(grounded, own.u)
     reach = np.ptp(own.x, axis=0) + 1e-9
@@ -182,7 +179,7 @@ def laws(own: Seen, others: Sequence[Seen], grounded: Problem) -> tuple[dict[str
     far = np.array([_rms(d[:, :n] / reach) + _rms(d[:, n : n + m] / span) for d in moves])
     near = [int(j) for j in np.argsort(far, kind="stable")[:NEAREST] if far[j] > 1e-9]
     if not near:
-        return {}, 1.0
+        return None, 1.0
     d, y, far = np.array([moves[j] for j in near]), np.array([others[j].y for j in near]), far[near]
     f_u, by_input = _matching(own, y / far[:, None, None], grounded, span)
     v = np.einsum("tmn,jtn->jtm", by_input, y)
@@ -193,20 +190,7 @@ def laws(own: Seen, others: Sequence[Seen], grounded: Problem) -> tuple[dict[str
     law[1:, :, n + 2 * m :] = f_u[1:] @ D[:, n + 2 * m :] @ by_input[:-1]
     now = d[:, :, : n + m]
     law[:, :, : n + m] += shared(now, y - np.einsum("tnq,jtq->jtn", law, d), far)[0]
-    each = np.zeros_like(law)
-    each[:, :, : n + m] = each_step(now, y, far)
-    return {"shared": law, "each": each}, missed
-
-
-def each_step(d: Array, y: Array, far: Array) -> Array:
-    """A law of its own for each step, (H, k, q); see `shared`."""
-    d, y = d / far[:, None, None], y / far[:, None, None]
-    scale = np.sqrt(np.mean(d**2, axis=(0, 1))) + 1e-12
-    d = (d / scale).transpose(1, 0, 2)  # (H, j, q)
-    gram = d @ d.transpose(0, 2, 1)
-    price = PRICE * np.trace(gram, axis1=1, axis2=2).mean() / d.shape[2]
-    found = np.linalg.solve(gram + price * np.diag(far / far[0]), y.transpose(1, 0, 2))
-    return np.asarray((found.transpose(0, 2, 1) @ d) / scale)
+    return law, missed
 
 
 def _features(own: Seen, other: Seen, grounded: Problem) -> Array:

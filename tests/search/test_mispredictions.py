@@ -9,7 +9,7 @@ import pytest
 from grounded.plant import Plant
 from grounded.rollout import simulate
 from grounded.search.ask_tell import Search
-from grounded.search.mispredictions import apart, believed, each_step, shared
+from grounded.search.mispredictions import apart, believed, shared
 from grounded.search.planner import Planner, predicted
 from grounded.solve import ddp
 from grounded.solve.bias import ground
@@ -116,16 +116,6 @@ def test_without_another_whole_trial_there_is_nothing_to_learn_from():
     found = searched(task, Plant(other(task.model, 1.3)), 1)
     made = believed(Planner(task, task), found.best, (found.best,), found.problem)
     assert (made.corrected, made.missed) == (None, 0.0)
-
-
-def test_each_step_may_have_a_law_of_its_own():
-    rng = np.random.default_rng(2)
-    d = rng.normal(size=(9, 30, 3))
-    laws = rng.normal(size=(30, 2, 3))
-    far = np.ones(9)
-    got = each_step(d, np.einsum("tkq,jtq->jtk", laws, d), far)
-    assert np.abs(got - laws).mean() < 0.2 * np.abs(laws).mean()
-    assert not each_step(d, np.zeros((9, 30, 2)), far).any()
 
 
 def test_runs_are_apart_by_the_cost_of_their_difference(found):
