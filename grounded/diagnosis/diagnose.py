@@ -72,6 +72,8 @@ class DiagnosisOptions:
         horizon: how far ahead predictions are judged [s].
         hidden: states that no sensor has: the memory of effects that were adopted.
         but: effects that are not blamed, by name: adopted ones, whose numbers are parameters now.
+        origin: the task before anything was adopted: what matters is measured by what its model
+            misses, in the second diagnosis as in the first.
     """
 
     library: Library = field(default_factory=Library)
@@ -79,6 +81,7 @@ class DiagnosisOptions:
     horizon: float = 1.0
     hidden: tuple[str, ...] = ()
     but: Collection[str] = ()
+    origin: Task | None = None
 
 
 @steady()
@@ -136,7 +139,7 @@ def diagnose(
     used = [trial for trial in trials if trial.known_steps >= 2]
     here = interruptible(lambda: so_far(search, options.max_effects))
     with np.errstate(all="ignore"), here, running(engine):
-        decision = decide(search, best, ruler := Ruler(search.predictor), options.max_effects)
+        decision = decide(search, best, ruler := Ruler(search.predictor, options.origin), options.max_effects)
         tick("leftover")
         task = subject if isinstance(subject, Task) else None
         found = _Writer(decision, ruler, known, options, tick, task, used).diagnosis()
@@ -180,7 +183,7 @@ class _Writer:
         self.predictor, self.data = self.search.predictor, self.search.data
         self.shown = list(zip(ruler.shown, ruler.names, strict=True))
         self.measured = Measured(decision, ruler, trials)
-        self.claims = Claims(decision, self.measured.credit, known)
+        self.claims = Claims(decision, self.measured.credit, known, ruler)
         self.left = self.measured.left
 
     def diagnosis(self) -> Diagnosis:

@@ -82,11 +82,9 @@ def _percent(share: float) -> str:
 
 
 def _moved(claims: Claims) -> str:
-    """`L should be 0.166 m (+11 %)` of the parameters that moved most, in units of their std."""
+    """`L should be 0.166 m (+11 %)` of the parameters that have to differ."""
     params, known = claims.data.model.params, claims.parameters()
-    named = [claims.data.model.param_names[blame.index] for blame in claims.blamed] or sorted(
-        known, key=lambda n: -abs(known[n].value - params[n].value) / max(known[n].std, 1e-300)
-    )
+    named = [claims.data.model.param_names[one.index] for one in claims.moved]
     texts = []
     for name in named[:NAMED]:
         old = params[name].value

@@ -14,22 +14,24 @@ knows (a gain and a time constant) are not both blamed for it.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from grounded.diagnosis.hypotheses.explored import TIE, parametric
 from grounded.diagnosis.hypotheses.lookalike import lookalikes, of_parameters
+from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import Data
-from grounded.diagnosis.likelihood.fitted import Fitted, calibrated, standard_deviations
+from grounded.diagnosis.likelihood.fitted import Fitted, calibrated, moved
 from grounded.diagnosis.likelihood.hypothesis import param_scale
+from grounded.diagnosis.likelihood.intervals import standard_deviations
 from grounded.diagnosis.report import Estimate, Likeness, Ranked
-from grounded.diagnosis.validation.decide import Decision, ordered
+from grounded.diagnosis.validation.decide import SLIGHT, Decision, ordered
 from grounded.diagnosis.validation.held_out import gaps_of, held_out_errors
 from grounded.diagnosis.validation.limits import Limits
 from grounded.diagnosis.validation.prediction_error import normalised
-from grounded.diagnosis.validation.ruler import folds
+from grounded.diagnosis.validation.ruler import Ruler, folds
 from grounded.frozen import Array
 
 ENOUGH = 3.0  # nats that the parameters that are not named may still hold
@@ -55,13 +57,20 @@ def loss(H: Array, b: Array, free: list[int]) -> float:
     return 0.5 * float(left @ block @ left)
 
 
-def blamed(data: Data, fit: Fitted) -> tuple[Blame, ...]:
-    """The parameters of a calibrated fit that have to differ, most important first."""
-    h = fit.hypothesis
+def moved_parameters(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> tuple[Blame, ...]:
+    """The parameters of a calibrated fit that have to differ, most important first.
+
+    By evidence as few as leave ENOUGH to the others; of these each without which, the others fitted
+    again, predictions are as good within what matters is as good as right.
+    """
+    data, h = search.data, fit.hypothesis
     if h.spread == 0 or h.shift is None:
         return ()
     k, which = len(h.theta), calibrated(data)
-    H = fit.gram.sum(axis=0)[k:, k:] + np.diag(fit.prior[k:])
+    G = fit.gram.sum(axis=0)
+    across = G[k:, :k]
+    H = G[k:, k:] - across @ np.linalg.pinv(G[:k, :k], hermitian=True) @ across.T
+    H = H + np.diag(fit.prior[k:])
     b = h.shift[which] / param_scale(data.model)[which]
     free: list[int] = []
     now = loss(H, b, free)
@@ -69,8 +78,28 @@ def blamed(data: Data, fit: Fitted) -> tuple[Blame, ...]:
         losses = {i: loss(H, b, [*free, i]) for i in range(len(b)) if i not in free}
         i = min(losses, key=lambda j: losses[j])
         free, now = [*free, i], losses[i]
-    found = [Blame(int(which[i]), loss(H, b, [j for j in free if j != i]) - now) for i in free]
-    return tuple(sorted(found, key=lambda blame: -blame.nats))
+    nats = {i: loss(H, b, [j for j in free if j != i]) - now for i in free}
+    if ruler.held_out:
+        least = SLIGHT * ruler.since_outset(fit)
+        gains = {i: ruler.gain(unmoved(data, fit, k + i, b[i]), fit).mean for i in free}
+        most = max(free, key=lambda i: gains[i])
+        free = [i for i in free if gains[i] >= least or i == most]
+    # a parabola about the fit reaches no further than the fit itself
+    whole = max(search.score(fit) - search.score(search.exact_null()), 0.0)
+    worth = {i: min(search.tempering.factor * nats[i], whole) for i in free}
+    return tuple(Blame(int(which[i]), worth[i]) for i in sorted(free, key=lambda i: -nats[i]))
+
+
+def unmoved(data: Data, fit: Fitted, column: int, shift: float) -> Fitted:
+    """The fit with one parameter as it was, the others fitted again: one Newton step."""
+    H = fit.gram.sum(axis=0) + np.diag(fit.prior)
+    rest = np.delete(np.arange(len(H)), column)
+    delta = np.zeros(len(H))
+    delta[column] = -shift
+    delta[rest] = shift * np.linalg.pinv(H[np.ix_(rest, rest)], hermitian=True) @ H[rest, column]
+    gram, score = fit.gram.copy(), fit.score - fit.gram @ delta
+    gram[:, column], gram[..., column], score[:, column] = 0.0, 0.0, 0.0  # it stays there
+    return replace(fit, hypothesis=moved(data, fit.hypothesis, delta), gram=gram, score=score)
 
 
 RANKED = 12  # explanations that are listed
@@ -80,7 +109,9 @@ SAME = 0.95  # share of a parameter's signal from which an effect is the same th
 class Claims:
     """What the best hypothesis blames: effects, or parameters where calibrating them is enough."""
 
-    def __init__(self, decision: Decision, credit: dict[str, float], known: Limits) -> None:
+    def __init__(
+        self, decision: Decision, credit: dict[str, float], known: Limits, ruler: Ruler
+    ) -> None:
         self.search, self.best, self.known = decision.search, decision.fit, known
         search, best, self.credit = decision.search, decision.fit, credit
         self.predictor, self.data = search.predictor, search.data
@@ -88,7 +119,8 @@ class Claims:
         calibrating = not self.names and best.hypothesis.spread > 0
         self.null = best if calibrating else search.best_null()
         self.base = search.score(decision.crude if parametric(best) else self.null)
-        self.blamed = blamed(self.data, self.null) if calibrating else ()
+        self.moved = moved_parameters(search, best, ruler)  # also beside effects
+        self.blamed = self.moved if calibrating else ()
         off = [blame.index for blame in self.blamed[:2]]
         candidates = search.candidates
         self.like_parameters = (
@@ -171,7 +203,7 @@ class Claims:
 
     def estimates(self, fit: Fitted) -> list[dict[str, Estimate]]:
         """Values with intervals, effect by effect."""
-        stds, halves = standard_deviations(fit, folds(self.data))
+        stds, halves = standard_deviations(self.predictor, fit, folds(self.data))
         found, at = [], 0
         for effect, values in zip(fit.hypothesis.effects, fit.hypothesis.values, strict=True):
             some = {}
@@ -220,7 +252,7 @@ class Claims:
         h, model = self.best.hypothesis, self.data.model
         if h.spread == 0 or h.shift is None:
             return {}
-        stds, halves = standard_deviations(self.best, folds(self.data))
+        stds, halves = standard_deviations(self.predictor, self.best, folds(self.data))
         scale, k = param_scale(model), len(h.theta)
         found = {}
         for at, index in enumerate(calibrated(self.data)):

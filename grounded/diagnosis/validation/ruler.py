@@ -18,7 +18,7 @@ leaves, as white noise, carried on by the model.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -29,6 +29,7 @@ from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted, leave_one_out, moved
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, Predictor
 from grounded.frozen import Array
+from grounded.task import Task
 from grounded.trial import Trial
 
 SECONDS = (0.1, 0.5, 1.0)
@@ -97,8 +98,8 @@ class Gain:
 class Ruler:
     """Errors of fitted hypotheses on one set of trials."""
 
-    def __init__(self, predictor: Predictor) -> None:
-        self.predictor, self.data = predictor, predictor.data
+    def __init__(self, predictor: Predictor, origin: Task | None = None) -> None:
+        self.predictor, self.data, self.origin = predictor, predictor.data, origin
         data = self.data
         self.folds = folds(data)
         self.held_out = len(np.unique(self.folds)) > 1
@@ -134,13 +135,33 @@ class Ruler:
 
     @cached_property
     def fine(self) -> Array:
-        """Error of each state below which nothing matters, (n,)."""
-        return np.asarray(np.maximum(FINE * self.data.filled.std(axis=0), 1e-12))
+        """Error of each state below which nothing matters, by horizon, (K, n)."""
+        least = np.maximum(FINE * self.data.filled.std(axis=0), 1e-12)
+        return np.repeat(least[None], len(self.steps) + 1, axis=0)
 
     def beside(self, crude: Fitted) -> None:
-        """What matters from now on is measured by what the crude model misses."""
-        missed = np.nan_to_num(self.errors(crude).rms[:-1].max(axis=0))
+        """What matters from now on is measured by what the crude model missed at the outset."""
+        self.outset = self.errors(crude) if self.origin is None else self._origin(crude.track)
+        missed = np.nan_to_num(self.outset.rms)
+        missed[:-1] = missed[:-1].max(axis=0)
         self.fine = np.maximum(self.fine, SLIGHT * np.minimum(missed, self.data.filled.std(axis=0)))
+
+    def since_outset(self, fit: Fitted) -> float:
+        """What a hypothesis predicts better than the model did before anything was adopted."""
+        return self.compared(self.outset, self.errors(fit)).mean
+
+    def _origin(self, track: Array) -> Errors:
+        """Errors of the model before effects were adopted, whose states are the first of these."""
+        assert self.origin is not None
+        model, latency = self.origin.model, self.origin.latency
+        n, B = model.n, len(self.data.valid)
+        states = self.data.states[:, :n]
+        data = replace(self.data, model=model, states=states, latency=latency, hidden=())
+        shape = len(self.steps) + 1, B, self.data.model.n
+        found = Errors(np.zeros(shape), np.zeros(shape))
+        own = Errors(found.total[..., :n], found.count[..., :n])  # views
+        Ruler(Predictor(data))._add(own, Hypothesis(), track[..., :n], np.arange(B))
+        return found
 
     @property
     def measured(self) -> list[tuple[Fitted, Errors]]:
@@ -248,7 +269,7 @@ class Ruler:
         """The same of errors."""
         a, b = (errors.total[..., self.shown] for errors in (before, after))
         count = before.count[..., self.shown].sum(axis=1, keepdims=True)
-        seen, least = count > 0, count * self.fine[self.shown] ** 2 + 1e-300
+        seen, least = count > 0, count * self.fine[:, None, self.shown] ** 2 + 1e-300
 
         def ratio(x: Array, y: Array) -> Array:
             return np.asarray(np.where(seen, 0.5 * np.log((x + least) / (y + least)), 0.0))

@@ -69,7 +69,11 @@ def diagnose_in(
     others = _chosen(workspace, compare) if compare else []
     memory = planner.plan.model.state_names[planner.task.model.n :]
     options = DiagnosisOptions(
-        library=library, max_effects=max_effects, hidden=tuple(memory), but=adopted
+        library=library,
+        max_effects=max_effects,
+        hidden=tuple(memory),
+        but=adopted,
+        origin=workspace.origin,
     )
     lifted, second = ([planner.lift(trial) for trial in some] for some in (used, others))
     made = Made(
