@@ -2,10 +2,14 @@
 
 Two hypotheses A and B tie on the trials so far. Each of a set of probes (the base policy with a
 staircase, steps, doublets, a sweep of frequencies or a slow ramp added to one input) is run in the
-model with A; then B, its values free to adapt, tries to explain that run through the same filter
-and noise. What it fails to explain is the evidence that the probe is expected to bring:
+model with A; then B, its values and all calibrated parameters free to adapt, tries to explain that
+run through the same filter and noise. What it fails to explain is the evidence of the probe:
 
     E[log p(y | A) - log p(y | B)] = 1/2 |whitened innovations of B on A's run|^2
+
+The trials so far measure how far that can be believed: n of them, mostly of the base policy, have
+not told the two apart by TIE nats, so one more tells TIE / n at most, and whatever a probe is
+expected to tell is scaled by the same factor.
 
 Where nothing ties, the probe teaches most about the values that are claimed or calibrated: from
 the information F of the trials so far and J of its run, filtered alike, the expected gain is
@@ -23,12 +27,13 @@ from typing import Any
 
 import numpy as np
 
+from grounded.diagnosis.hypotheses.explored import TIE
 from grounded.diagnosis.likelihood.data import prepare, shifted
 from grounded.diagnosis.likelihood.fitted import calibrated
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, Predictor, param_scale
 from grounded.diagnosis.likelihood.noise import NoiseModel, Structure
 from grounded.diagnosis.likelihood.refine import refine
-from grounded.diagnosis.report import Diagnosis
+from grounded.diagnosis.report import Diagnosis, Estimate
 from grounded.effects import Library, Scales, memory_start, scales_of, wrap, wrapping_order
 from grounded.frozen import Array
 from grounded.model import Model
@@ -38,6 +43,7 @@ from grounded.task import Task
 from grounded.trial import Trial
 
 SIZES = (0.15, 0.35)  # of the input's range
+ADAPTED = 12  # iterations in which a rival adapts to a run
 LITTLE = 1e-6  # of a value's own information, and of its size
 
 
@@ -76,15 +82,21 @@ def probe(
     if not ties:
         return _teaching(task, policy, diagnosis, trials, library or Library())
     group = ties[0]
-    first, second = _hypotheses(task, diagnosis, trials, library or Library(), group[0], group[1])
+    task, first, second = _rivals(task, diagnosis, trials, library or Library(), group[:2])
     noise = _noise(task.model, diagnosis)
+    base = _run(task, first, policy)
+    if base is None:
+        return None
+    second = _adapted(task, base, second, noise)
+    told = _evidence(task, base, first, second, noise)
+    trust = min(1.0, TIE / len(trials) / max(told, 1e-12))
     best: tuple[float, Policy, str] | None = None
-    for words, candidate in probes(policy, _inputs_of(task.model, (group[0], group[1]))):
+    for words, candidate in probes(policy, _inputs_of(task.model, group[:2])):
         runs = [_run(task, h, candidate) for h in (first, second)]
         if any(run is None or not _safe(task, run) for run in runs):
             continue
         assert runs[0] is not None and runs[1] is not None
-        expected = min(
+        expected = trust * min(
             _evidence(task, runs[0], first, second, noise),
             _evidence(task, runs[1], second, first, noise),
         )
@@ -94,7 +106,7 @@ def probe(
         return None
     expected, chosen, words = best
     sentence = f"{words}: expected to tell {group[0]} from {group[1]} by {expected:.1f} nats" + (
-        " (too little: try larger inputs or another manoeuvre)" if expected < 3 else ""
+        " (too little: try larger inputs or another manoeuvre)" if expected < TIE else ""
     )
     return Probe(chosen, expected, (group[0], group[1]), sentence)
 
@@ -103,9 +115,7 @@ def _teaching(
     task: Task, policy: Policy, diagnosis: Diagnosis, trials: Sequence[Trial], library: Library
 ) -> Probe | None:
     """The probe from which most is learnt about claimed and calibrated values."""
-    known = {n: e for n, e in diagnosis.parameters.items() if n in task.model.params}
-    values = {n: e.value for n, e in known.items() if np.isfinite(e.value)}
-    task = task.with_model(task.model.with_values(values))
+    known, task = _calibrated(task, diagnosis)
     scales, h = _scales(task, trials), Hypothesis()
     spreads: dict[str, tuple[float, str]] = {}  # by column: standard deviation, unit
     for name in (n for n in diagnosis.effects if not n.startswith("parameter:")):
@@ -204,21 +214,40 @@ def _inputs_of(model: Model, names: Sequence[str]) -> list[int]:
     return own or list(range(model.m))
 
 
-def _hypotheses(
+def _calibrated(task: Task, diagnosis: Diagnosis) -> tuple[dict[str, Estimate], Task]:
+    """The parameters that were calibrated, and the task with their values."""
+    known = {n: e for n, e in diagnosis.parameters.items() if n in task.model.params}
+    values = {n: e.value for n, e in known.items() if np.isfinite(e.value)}
+    return known, task.with_model(task.model.with_values(values))
+
+
+def _rivals(
     task: Task,
     diagnosis: Diagnosis,
     trials: Sequence[Trial],
     library: Library,
-    first: str,
-    second: str,
-) -> tuple[Hypothesis, Hypothesis]:
+    pair: Sequence[str],
+) -> tuple[Task, Hypothesis, Hypothesis]:
+    """The calibrated task, and two hypotheses in which whatever was calibrated may still move."""
+    known, task = _calibrated(task, diagnosis)
     scales, h = _scales(task, trials), Hypothesis()
     for name in diagnosis.effects:
-        if name not in (first, second):
+        if name not in pair and not name.startswith("parameter:"):
             h = h.plus(library.effect(name, task.model, scales), diagnosis.values(name))
-    built = (library.effect(name, task.model, scales) for name in (first, second))
-    one, other = (h.plus(effect, diagnosis.values(effect.name)) for effect in built)
-    return one, other
+    if known:
+        h = replace(h, shift=np.zeros(task.model.system.k), spread=1.0)
+    one, other = (
+        h.plus(library.effect(name, task.model, scales), diagnosis.values(name)) for name in pair
+    )
+    return task, one, other
+
+
+def _adapted(task: Task, run: Trial, h: Hypothesis, noise: NoiseModel) -> Hypothesis:
+    """A hypothesis with the values that explain a run best: as the trials left it."""
+    data = prepare(task.model, [run], task.latency, task.past)
+    start = [(h, noise, data.y.copy())]
+    fits = refine(Predictor(data), start, iterations=ADAPTED, fixed_noise=True)
+    return fits[0].hypothesis if fits else h
 
 
 def _scales(task: Task, trials: Sequence[Trial]) -> Scales:
@@ -258,8 +287,11 @@ def _run(task: Task, h: Hypothesis, policy: Policy) -> Trial | None:
 
 
 def _wrapped(task: Task, h: Hypothesis) -> Model:
-    """The model with a hypothesis' effects in it."""
+    """The model with a hypothesis' shifts and effects in it."""
     model = task.model
+    if h.shift is not None:
+        moved = model.values + h.shift
+        model = model.with_values(dict(zip(model.param_names, moved.tolist(), strict=True)))
     for i in wrapping_order([effect.family for effect in h.effects]):
         effect = h.effects[i]
         current = Library((effect.family,)).effect(effect.name, model, effect.site.scales)
@@ -282,6 +314,7 @@ def _evidence(
     predictor = Predictor(data)
     rss = []
     for h in (true, rival):
-        fits = refine(predictor, [(h, noise, data.y.copy())], iterations=4, fixed_noise=True)
+        start = [(h, noise, data.y.copy())]
+        fits = refine(predictor, start, iterations=ADAPTED, fixed_noise=True)
         rss.append(float(fits[0].rss.sum()) if fits else np.inf)
     return max(0.5 * (rss[1] - rss[0]), 0.0)

@@ -54,7 +54,7 @@ def verdict(
         if remainder:
             return Verdict("unknown", (), f"A gap remains that no known effect explains: {left}.")
         return Verdict("none", (), f"The model explains the data down to the noise{floor(row)}.")
-    words = [sentence(_causes(claims, ranking, credit)), improvement(row), worsened(rows)]
+    words = [sentence(_causes(claims, ranking, credit)), improvement(rows), worsened(rows)]
     words += [f"The data can't tell {tied(group)}." for group in groups[:1]]
     if remainder:
         words.append(f"Something is left that no known effect explains: {left}.")
@@ -88,26 +88,37 @@ def _moved(claims: Claims) -> str:
     texts = []
     for name in named[:NAMED]:
         old = params[name].value
-        part = f" ({(known[name].value - old) / abs(old):+.0%})" if old else ""
+        change = 100 * (known[name].value - old) / abs(old) if old else 0.0
+        part = f" ({change:+.{0 if abs(change) >= 1 else 1}f}%)" if old else ""
         texts.append(f"{name} should be {quantity(known[name])}{part}")
     more = len(named) - NAMED
     return ", ".join(texts) + (f" and {more} more" if more > 0 else "")
 
 
-def improvement(row: RulerRow | None) -> str:
-    """What predictions gain: `1 s ahead predictions miss v by 0.08 m/s instead of 0.31`."""
-    if row is None:
-        return ""
-    gains = {n: 1 - row.with_effects[n] / e for n, e in row.crude.items() if e > 0}
-    best = sorted((n for n in gains if gains[n] > SHOWS), key=lambda n: -gains[n])[: NAMED - 1]
-    parts = [
-        f"{name} by {_measured(row, name, row.with_effects[name])} instead of "
-        f"{number(row.crude[name])}{_noise(row, name)}"
-        for name in best
-    ]
-    held = "" if row.held_out != "no" else ", not held out"
-    ahead = f"{number(row.horizon_s)} s ahead{held} predictions"
-    return f"{ahead} miss {' and '.join(parts)}." if parts else f"{ahead} hardly change."
+def improvement(rows: Sequence[RulerRow]) -> str:
+    """What predictions gain: `1 s ahead predictions miss v by 0.08 m/s instead of 0.31`.
+
+    Over whole trials, where they gain nothing a second ahead.
+    """
+    short = [row for row in rows if not row.whole_trial][-1:]
+    for row in (*short, *(row for row in rows if row.whole_trial)):
+        gains = {n: 1 - row.with_effects[n] / e for n, e in row.crude.items() if e > 0}
+        best = sorted((n for n in gains if gains[n] > SHOWS), key=lambda n: -gains[n])
+        parts = [
+            f"{name} by {_measured(row, name, row.with_effects[name])} instead of "
+            f"{number(row.crude[name])}{_noise(row, name)}"
+            for name in best[: NAMED - 1]
+        ]
+        if parts:
+            return f"{_ahead(row)} miss {' and '.join(parts)}."
+    return f"{_ahead(short[0])} hardly change." if short else ""
+
+
+def _ahead(row: RulerRow) -> str:
+    held = "" if row.held_out != "no" else ", not held out,"
+    if row.whole_trial:
+        return f"Over whole trials{held} predictions"
+    return f"{number(row.horizon_s)} s ahead{held} predictions"
 
 
 def worsened(rows: Sequence[RulerRow]) -> str:
@@ -121,9 +132,8 @@ def worsened(rows: Sequence[RulerRow]) -> str:
     ratio, row, name = max(losses, key=lambda loss: loss[0], default=(0.0, None, ""))
     if row is None or not ratio > 1 + SHOWS:
         return ""
-    ahead = "Whole trials" if row.whole_trial else f"{number(row.horizon_s)} s ahead predictions"
     value = _measured(row, name, row.with_effects[name])
-    return f"{ahead} miss {name} by {value} instead of {number(row.crude[name])}: that is worse."
+    return f"{_ahead(row)} miss {name} by {value} instead of {number(row.crude[name])}: that is worse."
 
 
 def floor(row: RulerRow | None) -> str:

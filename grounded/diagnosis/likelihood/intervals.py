@@ -71,7 +71,7 @@ def _by_stretch(predictor: Predictor, fit: Fitted) -> list[Array]:
     axes = _whitener(fit.gram.sum(axis=0) + np.diag(fit.prior))
     columns, steps = white[..., 1:] @ axes, np.rint(data.time / data.dt).astype(int)
     length, found = int(data.lengths.max()), []
-    for count in (c for c in STRETCHES if length >= LONG * c):
+    for count in (c for c in STRETCHES if length >= LONG * c and axes.size):
         part = steps * count // length
         s, G = np.zeros((count, axes.shape[1])), np.zeros((count, *2 * axes.shape[1:]))
         for p in range(count):

@@ -14,6 +14,7 @@ knows (a gain and a time constant) are not both blamed for it.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -139,6 +140,11 @@ class Claims:
             rows.append(self._row(self.best, name, parts[name], after, before, claimed=claimed))
         rows += self.off(after, before)
         listed = [row.effect for row in rows]
+        for name, (fit, evidence) in self.tied(parts).items():
+            if name not in listed:
+                gap = gaps_of(self.predictor, [fit], where)[0]
+                rows.append(self._row(fit, name, evidence, gap, before, claimed=False))
+                listed.append(name)
         singles = [f for f in search.of_size(1) if f.hypothesis.names[0] not in listed]
         singles = singles[: max(RANKED - len(rows), 3)]
         gaps = gaps_of(self.predictor, singles, where)
@@ -224,19 +230,30 @@ class Claims:
             same = [o for o in self.like_parameters if o.effect == name and o.share > SAME]
             if same:
                 found.append((name, *(one.like for one in same[:2])))
-        whole = self.search.score(self.best)
         for name in self.names:
-            rest = set(self.names) - {name}
-            rivals = [
-                f
-                for f in self.search.of_size(len(self.names))
-                if rest <= set(f.hypothesis.names) and name not in f.hypothesis.names
-            ]
-            close = [f for f in rivals if whole - self.search.score(f) < TIE]
-            others = [next(n for n in f.hypothesis.names if n not in rest) for f in close[:2]]
+            others = [other for other, _ in self.rivals(name)]
             if others:
                 found.append((name, *others))
         return tuple(found)
+
+    def rivals(self, name: str) -> list[tuple[str, Fitted]]:
+        """What may stand in the place of a claimed effect, beside all the others: name and fit."""
+        rest, score = set(self.names) - {name}, self.search.score
+        close = [
+            f
+            for f in self.search.of_size(len(self.names))
+            if rest <= set(f.hypothesis.names) and name not in f.hypothesis.names
+            if score(self.best) - score(f) < TIE
+        ]
+        return [(next(n for n in f.hypothesis.names if n not in rest), f) for f in close[:2]]
+
+    def tied(self, parts: Mapping[str, float]) -> dict[str, tuple[Fitted, float]]:
+        """Each rival's fit in the place of a claimed effect, and its evidence there."""
+        best, found = self.search.score(self.best), dict[str, tuple[Fitted, float]]()
+        for name in self.names:
+            for other, fit in self.rivals(name):
+                found.setdefault(other, (fit, parts[name] + self.search.score(fit) - best))
+        return found
 
     def nearly(self, groups: tuple[tuple[str, ...], ...]) -> tuple[Likeness, ...]:
         """Look-alikes by shape, beside those that tie."""

@@ -143,7 +143,7 @@ class Measured:
     def remainders(self) -> tuple[Remainder, ...]:
         """What is left above the floor, and what a flexible model finds that would show there."""
         k, data, ruler = len(self.ruler.steps) - 1, self.data, self.ruler
-        now, fine = self.rms(self.best), ruler.fine[:, ruler.shown]
+        now, fine = self.rms(self.best), ruler.fine[ruler.shown]
         short = slice(0, len(ruler.steps))
         doubt = np.minimum(2 * ruler.doubt(self.best), np.log(FAR))
         least = np.maximum(np.log(ABOVE), doubt)
@@ -165,7 +165,7 @@ class Measured:
                 horizon_s=ruler.steps[at] * data.dt,
                 error_unit=self.units[name],
             )
-            found.append((left is None, -error / max(floor, float(fine[at, i])), i, left, row))
+            found.append((left is None, -error / max(floor, float(fine[i])), i, left, row))
         return tuple(self.with_region(row, left) for *_, left, row in sorted(found, key=_first))
 
     def with_region(self, row: Remainder, left: Leftover | None) -> Remainder:

@@ -135,33 +135,29 @@ class Ruler:
 
     @cached_property
     def fine(self) -> Array:
-        """Error of each state below which nothing matters, by horizon, (K, n)."""
-        least = np.maximum(FINE * self.data.filled.std(axis=0), 1e-12)
-        return np.repeat(least[None], len(self.steps) + 1, axis=0)
+        """Error of each state below which nothing matters, (n,)."""
+        return np.asarray(np.maximum(FINE * self.data.filled.std(axis=0), 1e-12))
 
     def beside(self, crude: Fitted) -> None:
         """What matters from now on is measured by what the crude model missed at the outset."""
-        self.outset = self.errors(crude) if self.origin is None else self._origin(crude.track)
-        missed = np.nan_to_num(self.outset.rms)
-        missed[:-1] = missed[:-1].max(axis=0)
-        self.fine = np.maximum(self.fine, SLIGHT * np.minimum(missed, self.data.filled.std(axis=0)))
+        self.outset = self.errors(crude) if self.origin is None else self._origin(crude)
+        missed, spread = np.nan_to_num(self.outset.rms), self.data.filled.std(axis=0)
+        self.fine_whole = np.maximum(self.fine, SLIGHT * np.minimum(missed.max(axis=0), spread))
+        self.fine = np.maximum(self.fine, SLIGHT * np.minimum(missed[:-1].max(axis=0), spread))
 
     def since_outset(self, fit: Fitted) -> float:
         """What a hypothesis predicts better than the model did before anything was adopted."""
         return self.compared(self.outset, self.errors(fit)).mean
 
-    def _origin(self, track: Array) -> Errors:
+    def _origin(self, crude: Fitted) -> Errors:
         """Errors of the model before effects were adopted, whose states are the first of these."""
         assert self.origin is not None
-        model, latency = self.origin.model, self.origin.latency
-        n, B = model.n, len(self.data.valid)
-        states = self.data.states[:, :n]
+        model, n = self.origin.model, self.origin.model.n
+        states, latency = self.data.states[:, :n], self.origin.latency
         data = replace(self.data, model=model, states=states, latency=latency, hidden=())
-        shape = len(self.steps) + 1, B, self.data.model.n
-        found = Errors(np.zeros(shape), np.zeros(shape))
-        own = Errors(found.total[..., :n], found.count[..., :n])  # views
-        Ruler(Predictor(data))._add(own, Hypothesis(), track[..., :n], np.arange(B))
-        return found
+        bare = replace(crude, hypothesis=Hypothesis(), track=crude.track[..., :n])
+        found, more = Ruler(Predictor(data)).errors(bare), [(0, 0), (0, 0), (0, self.data.model.n - n)]
+        return Errors(np.pad(found.total, more), np.pad(found.count, more))
 
     @property
     def measured(self) -> list[tuple[Fitted, Errors]]:
@@ -269,7 +265,7 @@ class Ruler:
         """The same of errors."""
         a, b = (errors.total[..., self.shown] for errors in (before, after))
         count = before.count[..., self.shown].sum(axis=1, keepdims=True)
-        seen, least = count > 0, count * self.fine[:, None, self.shown] ** 2 + 1e-300
+        seen, least = count > 0, count * self._matters()[:, None] ** 2 + 1e-300
 
         def ratio(x: Array, y: Array) -> Array:
             return np.asarray(np.where(seen, 0.5 * np.log((x + least) / (y + least)), 0.0))
@@ -288,6 +284,11 @@ class Ruler:
             whole.sum(axis=(0, 1)) / counts,
             _jackknife(by / counts),
         )
+
+    def _matters(self) -> Array:
+        """Error below which nothing matters, by horizon and shown state, (K, n')."""
+        short, whole = self.fine[self.shown], getattr(self, "fine_whole", self.fine)[self.shown]
+        return np.stack([*[short] * len(self.steps), whole])
 
     # -- the floor ----------------------------------------------------------------------------
 
