@@ -7,9 +7,8 @@ run through the same filter and noise. What it fails to explain is the evidence 
 
     E[log p(y | A) - log p(y | B)] = 1/2 |whitened innovations of B on A's run|^2
 
-The trials so far measure how far that can be believed: n of them, mostly of the base policy, have
-not told the two apart by TIE nats, so one more tells TIE / n at most, and whatever a probe is
-expected to tell is scaled by the same factor.
+The trials so far measure how far that can be believed: their own commands would have told the two
+apart by some nats, and have by few; whatever a probe is expected to tell is scaled alike.
 
 Where nothing ties, the probe teaches most about the values that are claimed or calibrated: from
 the information F of the trials so far and J of its run, filtered alike, the expected gain is
@@ -43,6 +42,7 @@ from grounded.task import Task
 from grounded.trial import Trial
 
 SIZES = (0.15, 0.35)  # of the input's range
+REPLAYED = 4  # trials whose commands show what they should have told
 ADAPTED = 12  # iterations in which a rival adapts to a run
 LITTLE = 1e-6  # of a value's own information, and of its size
 
@@ -84,12 +84,14 @@ def probe(
     group = ties[0]
     task, first, second = _rivals(task, diagnosis, trials, library or Library(), group[:2])
     noise = _noise(task.model, diagnosis)
-    base = _run(task, first, policy)
-    if base is None:
-        return None
-    second = _adapted(task, base, second, noise)
-    told = _evidence(task, base, first, second, noise)
-    trust = min(1.0, TIE / len(trials) / max(told, 1e-12))
+    again = [run for t in trials[-REPLAYED:] if (run := _run(task, first, policy, t)) is not None]
+    if again:
+        second = _adapted(task, again, second, noise)
+    told = sum(_evidence(task, run, first, second, noise) for run in again)
+    told *= len(trials) / max(len(again), 1)
+    rows = [diagnosis.ranked(name) for name in group[:2]]
+    apart = [row.evidence for row in rows if row is not None]
+    trust = min(1.0, max(TIE, float(np.ptp(apart))) / max(told, 1e-12))
     best: tuple[float, Policy, str] | None = None
     for words, candidate in probes(policy, _inputs_of(task.model, group[:2])):
         runs = [_run(task, h, candidate) for h in (first, second)]
@@ -242,9 +244,9 @@ def _rivals(
     return task, one, other
 
 
-def _adapted(task: Task, run: Trial, h: Hypothesis, noise: NoiseModel) -> Hypothesis:
-    """A hypothesis with the values that explain a run best: as the trials left it."""
-    data = prepare(task.model, [run], task.latency, task.past)
+def _adapted(task: Task, runs: list[Trial], h: Hypothesis, noise: NoiseModel) -> Hypothesis:
+    """A hypothesis with the values that explain runs best: as the trials left it."""
+    data = prepare(task.model, runs, task.latency, task.past)
     start = [(h, noise, data.y.copy())]
     fits = refine(Predictor(data), start, iterations=ADAPTED, fixed_noise=True)
     return fits[0].hypothesis if fits else h
@@ -265,25 +267,32 @@ def _noise(model: Model, diagnosis: Diagnosis) -> NoiseModel:
     return NoiseModel(Structure(), q, r, q.copy(), np.full(model.n, -60.0))
 
 
-def _run(task: Task, h: Hypothesis, policy: Policy) -> Trial | None:
-    """A run of the policy in the model with a hypothesis, without noise; None if it diverges."""
+def _run(task: Task, h: Hypothesis, policy: Policy, like: Trial | None = None) -> Trial | None:
+    """A run of the policy in the model with a hypothesis, without noise; None if it diverges.
+
+    With `like` the commands and the start of that trial take the policy's place.
+    """
     model = _wrapped(task, h)
     assert task.latency is not None
     names = (task.model.state_names, task.model.input_names)
     nothing = np.empty((0, task.model.m))
-    start = Trial(task.start[None], nothing, task.dt, *names, start_inputs=task.past)
-    z = np.concatenate([task.start, memory_start(model, task.model, start)])
-    states, inputs, runner = [task.start], np.zeros((policy.horizon, model.m)), Runner(policy)
-    late, past = task.latency / task.dt, task.past[:, None]
-    for t in range(policy.horizon):
-        inputs[t] = runner.action(t * policy.dt, states[-1])
+    begin, held, steps = task.start, task.past, policy.horizon
+    if like is not None and np.isfinite(like.states[0]).all():
+        begin, steps = like.states[0], like.known_steps
+        held = held if like.start_inputs is None else like.start_inputs
+    start = Trial(begin[None], nothing, task.dt, *names, start_inputs=held)
+    z = np.concatenate([begin, memory_start(model, task.model, start)])
+    states, inputs, runner = [begin], np.zeros((steps, model.m)), Runner(policy)
+    late, past = task.latency / task.dt, held[:, None]
+    for t in range(steps):
+        inputs[t] = like.inputs[t] if like else runner.action(t * policy.dt, states[-1])
         sent = inputs[None, : t + 1]
         received = [shifted(sent[..., j], past[j], late[j])[0, -1] for j in range(model.m)]
         z = model.system.step(z[None], np.array([received]), model.values, task.dt)[0]
         if not np.isfinite(z).all():
             return None
         states.append(z[: task.model.n])
-    return Trial(np.array(states), inputs, task.dt, *names, start_inputs=task.past)
+    return Trial(np.array(states), inputs, task.dt, *names, start_inputs=held)
 
 
 def _wrapped(task: Task, h: Hypothesis) -> Model:

@@ -19,10 +19,12 @@ from grounded.diagnosis.report import (
     quantity,
 )
 from grounded.diagnosis.validation.claims import Claims
+from grounded.diagnosis.validation.measured import ABOVE
 from grounded.effects import Effect, ParamFamily, places
 from grounded.model import Model
 
 NAMED = 3  # parameters, channels and leftovers that a sentence names at most
+MATTERS = 0.05  # of the crude model's error: a rest below it is told as its share
 SHOWS = 0.1  # of the error: a channel that improves by less is not named
 
 
@@ -58,6 +60,8 @@ def verdict(
     words += [f"The data can't tell {tied(group)}." for group in groups[:1]]
     if remainder:
         words.append(f"Something is left that no known effect explains: {left}.")
+    elif above := rest(rows):
+        words.append(sentence([above]))
     kind: Kind = "effect" if len(claimed) == 1 else "several"
     return Verdict(kind, tuple(row.effect for row in claimed), " ".join(w for w in words if w))
 
@@ -146,6 +150,23 @@ def floor(row: RulerRow | None) -> str:
     name = max(known, key=lambda n: known[n] / max(row.noise_floor.get(n, math.nan), 1e-300))
     ahead = f"{number(row.horizon_s)} s ahead"
     return f": {ahead} it misses {name} by {_measured(row, name, known[name])}{_noise(row, name)}"
+
+
+def rest(rows: Sequence[RulerRow]) -> str:
+    """What is left above the noise where no leftover is stated, and why none is; "": nothing."""
+    found = [
+        (row.with_effects[name] / noise, row.with_effects[name] / max(row.crude[name], 1e-300), name)
+        for row in rows
+        for name, noise in row.noise_floor.items()
+        if noise > 0 and math.isfinite(row.with_effects[name])
+    ]
+    times, share, name = max(found, default=(0.0, 0.0, ""))
+    if not times > ABOVE:
+        return ""
+    text = f"what is left in {name} is {times:.2g} times the noise"
+    if share < MATTERS:
+        return f"{text} but {100 * share:.1g} % of what the crude model missed"
+    return f"{text}, too little to stand out of what the state spans or of its scatter"
 
 
 def _measured(row: RulerRow, name: str, value: float) -> str:

@@ -128,8 +128,8 @@ def _made_of(splits: Mapping[str, Split]) -> list[Block]:
     rows = [(words, *_shares(splits[key].whole)) for key, words in named.items()]
     main = "horizon" if "horizon" in named else next(iter(named))
     by_state = [(parts.name, *_shares(parts)) for parts in splits[main].channels]
-    repeated = any(one.irreducible_from == "repeats" for one in splits.values())
-    source = "repeated trials" if repeated else "the estimated noise"
+    known = {"repeats": "repeated trials", "alike": "trials whose commands agree to 2 %"}
+    source = known.get(splits[main].irreducible_from, "the estimated noise")
     words = (
         "Explained is the share of the squared error that the effects take away on trials that "
         "were held out, unexplained what they leave above the noise; how large the noise is comes "
