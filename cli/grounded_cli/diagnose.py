@@ -221,12 +221,15 @@ def _effects(found: Diagnosis) -> None:
             rows.insert(0, ("  (calibration)", share, "", "the model's own parameters, below"))
         show("\n" + table(rows, ("effect (*: claimed)", "credit", "evidence [nats]", "value")))
         _note(
-            "credit: what predictions lose without it, of what they gain in all; evidence: of what "
-            "is claimed or tied, what is lost without it beside the other causes; of the rest, what "
+            "credit: what predictions lose without it, of what they gain in all; evidence: of "
+            "what is claimed or tied, what is lost without it beside the other causes; of the rest, what "
             "it gains alone"
         )
     for group in found.indistinguishable:
-        show(field("tied", f"the data can't tell apart: {', '.join(group)}"))
+        if group in found.equivalent:
+            show(field("same", f"{' and '.join(group)} are one thing in this model"))
+        else:
+            show(field("tied", f"the data can't tell apart: {', '.join(group)}"))
 
 
 def _values(row: Ranked) -> str:

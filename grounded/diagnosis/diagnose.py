@@ -18,7 +18,7 @@ excitation        what to run next, where two explanations tie
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -36,6 +36,7 @@ from grounded.diagnosis.report import (
     Change,
     ChannelShare,
     Diagnosis,
+    Estimate,
     Gap,
     Identifiable,
     NoiseLevels,
@@ -139,14 +140,16 @@ def diagnose(
     used = [trial for trial in trials if trial.known_steps >= 2]
     here = interruptible(lambda: so_far(search, options.max_effects))
     with np.errstate(all="ignore"), here, running(engine):
-        decision = decide(search, best, ruler := Ruler(search.predictor, options.origin), options.max_effects)
+        decision = decide(
+            search, best, ruler := Ruler(search.predictor, options.origin), options.max_effects
+        )
         tick("leftover")
         task = subject if isinstance(subject, Task) else None
         found = _Writer(decision, ruler, known, options, tick, task, used).diagnosis()
         groups = [k < first for k in range(data.count)]
         return replace(
             found,
-            identifiable=tuple(_identified(uncertain, decision.fit)),
+            identifiable=tuple(_identified(uncertain, decision.fit, found.parameters)),
             preflight=looked.findings,
             changed=changed(search, decision.fit, groups) if compare else None,
         )
@@ -157,11 +160,13 @@ USUAL = 160  # stages of a diagnosis, and hypotheses that are refined together
 FIRST_LOOK = 6  # iterations of the fit by whose noise the parameters are found identifiable
 
 
-def _identified(uncertain: Predictor, best: Fitted) -> list[Identifiable]:
+def _identified(
+    uncertain: Predictor, best: Fitted, known: Mapping[str, Estimate]
+) -> list[Identifiable]:
     """Of all uncertain parameters, those that were held too, beside the best hypothesis."""
     if not param_scale(uncertain.data.model).any():
         return []
-    return identifiable(uncertain, best)
+    return identifiable(uncertain, best, {name: e.std for name, e in known.items()})
 
 
 class _Writer:
@@ -199,6 +204,7 @@ class _Writer:
             gain[..., i] += self.left[0].improvement
         ranking = self.claims.ranking(where, shrunk.gap_before)
         groups = self.claims.groups()
+        same = self.claims.equivalent(groups)
         alike = self.claims.nearly(groups)
         measured = self.measured
         remainder = measured.remainders()
@@ -206,7 +212,7 @@ class _Writer:
         named = [row.effect for row in ranking if row.claimed]
         values, agreement = by_trial(self.best, data, named) if named else ((), ())
         return Diagnosis(
-            verdict=verdict(self.claims, ranking, groups, remainder, rows, credit),
+            verdict=verdict(self.claims, ranking, groups, remainder, rows, credit, same),
             where=Where(
                 channels=self.channels(gain, shrunk.before, where.spread),
                 times=tuple(by_time(gain.sum(axis=-1), data)),
@@ -217,6 +223,7 @@ class _Writer:
             ),
             ranking=ranking,
             indistinguishable=groups,
+            equivalent=same,
             lookalikes=alike,
             gap=Gap(
                 horizon_s=where.steps * data.dt,
@@ -231,7 +238,7 @@ class _Writer:
             whole_run=measured.whole_run(),
             leftover=remainder,
             correction=correction(predictor, self.best, self.left, where),
-            next_trial=next_trial(self.claims, self.left, groups),
+            next_trial=next_trial(self.claims, self.left, groups, same),
             unknowable=self.known.sentences,
             noise=self.noise(),
             parameters=self.claims.parameters(),
@@ -296,4 +303,4 @@ class _Writer:
             return None
         self.tick("utility")
         found = utility_prediction(self.predictor, self.best, bare, self.task, self.trials)
-        return found.summary()
+        return replace(found.summary(), feedback=self.task.feedback)

@@ -42,6 +42,7 @@ from grounded.task import Task
 from grounded.trial import Trial
 
 SIZES = (0.15, 0.35)  # of the input's range
+NOTHING = 0.1  # nats: less is nothing that a trial could tell
 REPLAYED = 4  # trials whose commands show what they should have told
 ADAPTED = 12  # iterations in which a rival adapts to a run
 LITTLE = 1e-6  # of a value's own information, and of its size
@@ -78,7 +79,8 @@ def probe(
         trials: the trials it was made from (for the sizes of signals).
         library: where the effects come from.
     """
-    ties = [g for g in diagnosis.indistinguishable if all(diagnosis.values(n) for n in g[:2])]
+    open_ = [g for g in diagnosis.indistinguishable if g not in diagnosis.equivalent]
+    ties = [g for g in open_ if all(diagnosis.values(n) for n in g[:2])]
     if not ties:
         return _teaching(task, policy, diagnosis, trials, library or Library())
     group = ties[0]
@@ -107,6 +109,9 @@ def probe(
     if best is None:
         return None
     expected, chosen, words = best
+    if expected < NOTHING:
+        same = f"no probe tells {group[0]} from {group[1]}: with other values of the rest"
+        return Probe(chosen, expected, (group[0], group[1]), f"{same} they do the same")
     sentence = f"{words}: expected to tell {group[0]} from {group[1]} by {expected:.1f} nats" + (
         " (too little: try larger inputs or another manoeuvre)" if expected < TIE else ""
     )

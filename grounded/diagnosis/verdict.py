@@ -35,6 +35,7 @@ def verdict(
     remainder: tuple[Remainder, ...],
     rows: tuple[RulerRow, ...],
     credit: tuple[Credit, ...],
+    same: tuple[tuple[str, ...], ...] = (),
 ) -> Verdict:
     """One effect, several, none or unknown, and why: what, by how much, what is left.
 
@@ -45,6 +46,7 @@ def verdict(
         remainder: what no effect explains.
         rows: the ruler's.
         credit: what each cause is worth, largest first.
+        same: of the groups, what is one thing in the model.
     """
     left = remainder[0].sentence() if remainder else ""
     left += f"; {len(remainder) - 1} more" if len(remainder) > 1 else ""
@@ -57,7 +59,7 @@ def verdict(
             return Verdict("unknown", (), f"A gap remains that no known effect explains: {left}.")
         return Verdict("none", (), f"The model explains the data down to the noise{floor(row)}.")
     words = [sentence(_causes(claims, ranking, credit)), improvement(rows), worsened(rows)]
-    words += [f"The data can't tell {tied(group)}." for group in groups[:1]]
+    words += [f"{told_apart(group, same)}." for group in groups[:1]]
     if remainder:
         words.append(f"Something is left that no known effect explains: {left}.")
     elif above := rest(rows):
@@ -137,7 +139,9 @@ def worsened(rows: Sequence[RulerRow]) -> str:
     if row is None or not ratio > 1 + SHOWS:
         return ""
     value = _measured(row, name, row.with_effects[name])
-    return f"{_ahead(row)} miss {name} by {value} instead of {number(row.crude[name])}: that is worse."
+    return (
+        f"{_ahead(row)} miss {name} by {value} instead of {number(row.crude[name])}: that is worse."
+    )
 
 
 def floor(row: RulerRow | None) -> str:
@@ -155,7 +159,11 @@ def floor(row: RulerRow | None) -> str:
 def rest(rows: Sequence[RulerRow]) -> str:
     """What is left above the noise where no leftover is stated, and why none is; "": nothing."""
     found = [
-        (row.with_effects[name] / noise, row.with_effects[name] / max(row.crude[name], 1e-300), name)
+        (
+            row.with_effects[name] / noise,
+            row.with_effects[name] / max(row.crude[name], 1e-300),
+            name,
+        )
         for row in rows
         for name, noise in row.noise_floor.items()
         if noise > 0 and math.isfinite(row.with_effects[name])
@@ -180,11 +188,16 @@ def _noise(row: RulerRow, name: str) -> str:
 
 
 def next_trial(
-    claims: Claims, left: Sequence[Leftover], groups: tuple[tuple[str, ...], ...]
+    claims: Claims,
+    left: Sequence[Leftover],
+    groups: tuple[tuple[str, ...], ...],
+    same: tuple[tuple[str, ...], ...] = (),
 ) -> str:
     """A sentence; `excitation.probe` makes the trial itself."""
     if claims.known.no_cause:
         return "Run two or more trials in which every input changes."
+    if groups and groups[0] in same:
+        return f"{told_apart(groups[0], same)}: no trial tells them apart, adopt either."
     if groups:
         made = f"A trial made for it would tell {tied(groups[0])}."
         return " ".join([made, *distinguishing(groups[0])])
@@ -275,6 +288,13 @@ def sentence(clauses: Iterable[str]) -> str:
     """Clauses as one sentence: first word capital (never a name: `called` puts a word before)."""
     text = "; ".join(clauses)
     return f"{text[:1].upper()}{text[1:]}."
+
+
+def told_apart(group: Sequence[str], same: Sequence[Sequence[str]]) -> str:
+    """What is said of a tie: that these data can't break it, or that no data can."""
+    if group in same:
+        return f"{' and '.join(group)} are one thing in this model"
+    return f"The data can't tell {tied(group)}"
 
 
 def tied(group: Sequence[str]) -> str:

@@ -15,8 +15,6 @@ inference, 2015, its CR3). A value that the manoeuvre has from one stretch alone
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from grounded.diagnosis.likelihood.fitted import Fitted, leave_one_out
@@ -31,9 +29,7 @@ CHANCE = 0.01  # of scores that differ so much, below which the model is taken t
 LEAST = 0.2  # of the information that must be left without a stretch, or counts as left
 
 
-def standard_deviations(
-    predictor: Predictor, fit: Fitted, trial_of: Array
-) -> tuple[Array, Array]:
+def standard_deviations(predictor: Predictor, fit: Fitted, trial_of: Array) -> tuple[Array, Array]:
     """Of every free value: standard deviation, half-width of the 95 % interval, (C,) each.
 
     Args:

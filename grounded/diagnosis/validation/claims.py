@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis.hypotheses.explored import TIE, parametric
-from grounded.diagnosis.hypotheses.lookalike import lookalikes, of_parameters
+from grounded.diagnosis.hypotheses.lookalike import lookalikes, of_parameters, one_thing
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated, moved
@@ -234,6 +234,19 @@ class Claims:
             others = [other for other, _ in self.rivals(name)]
             if others:
                 found.append((name, *others))
+        return tuple(found)
+
+    def equivalent(self, groups: tuple[tuple[str, ...], ...]) -> tuple[tuple[str, ...], ...]:
+        """Of the groups, those of a parameter that are one thing in the model: no trial helps."""
+        effects = {e.name: e for e in self.search.candidates}
+        model, found = self.data.model, []
+        for first, *others in groups:
+            name = first.removeprefix("parameter:")
+            if name == first or name not in model.param_names:
+                continue
+            index = model.param_names.index(name)
+            if all(o in effects and one_thing(self.predictor, index, effects[o]) for o in others):
+                found.append((first, *others))
         return tuple(found)
 
     def rivals(self, name: str) -> list[tuple[str, Fitted]]:

@@ -154,9 +154,11 @@ class Ruler:
         assert self.origin is not None
         model, n = self.origin.model, self.origin.model.n
         states, latency = self.data.states[:, :n], self.origin.latency
+        latency = np.zeros(model.m) if latency is None else latency
         data = replace(self.data, model=model, states=states, latency=latency, hidden=())
         bare = replace(crude, hypothesis=Hypothesis(), track=crude.track[..., :n])
-        found, more = Ruler(Predictor(data)).errors(bare), [(0, 0), (0, 0), (0, self.data.model.n - n)]
+        found = Ruler(Predictor(data)).errors(bare)
+        more = [(0, 0), (0, 0), (0, self.data.model.n - n)]
         return Errors(np.pad(found.total, more), np.pad(found.count, more))
 
     @property

@@ -178,7 +178,8 @@ def utility_sentence(diagnosis: Diagnosis) -> str:
         f"by {figure(value, 3)}" if math.isfinite(value) else "beyond all measure"
         for value in (found.before, found.after)
     )
-    text = f"the model misses the utility of {count(found.trials, 'whole trial')} {without}"
+    text = "replayed without the feedback that they had, " * found.feedback
+    text += f"the model misses the utility of {count(found.trials, 'whole trial')} {without}"
     if diagnosis.effects:
         text += f", the diagnosed one {better}"
     if found.trials < 2:

@@ -159,7 +159,7 @@ def _probe(
     """Writes the candidate that would tell two tied effects apart, or if asked: (id, sentence)."""
     if found.no_cause:
         return "", ""
-    from grounded.diagnosis.excitation import probe
+    from grounded.diagnosis.excitation import NOTHING, probe
     from grounded.rollout import simulate
     from grounded.search.candidate import Candidate
     from grounded.search.improve import model_fingerprint
@@ -172,7 +172,8 @@ def _probe(
     task = planner.plan
     base = planner.widened(best.candidate.policy)
     made = probe(task, base, found, trials, library)
-    if made is None or not (write or found.indistinguishable):
+    ties = {*found.indistinguishable} - {*found.equivalent}
+    if made is None or not (write or ties) or (ties and made.expected < NOTHING):
         return "", made.sentence if made is not None else ""
     policy = planner.narrowed(made.policy)
     predicted = simulate(task.problem(exact=True), planner.widened(policy))

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 from grounded.diagnosis.pictures import accuracy_figure, credit_figure, where_figure
 from grounded.diagnosis.report import ChannelParts, Diagnosis, Parts, Split, TrialValue
+from grounded.diagnosis.verdict import told_apart
 from grounded_trials.report.diagnosis_words import (
     gap_sentence,
     sentences,
@@ -101,7 +102,7 @@ def _unit(diagnosis: Diagnosis, value: TrialValue) -> str:
 def _alike(diagnosis: Diagnosis) -> list[Block]:
     """Ties, and effects that would do nearly the same as one that is claimed."""
     found = [
-        Block("text", f"These data can’t tell apart: {', '.join(group)}.")
+        Block("text", f"{told_apart(group, diagnosis.equivalent)}.")
         for group in diagnosis.indistinguishable
     ]
     if diagnosis.lookalikes:
