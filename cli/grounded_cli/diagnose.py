@@ -222,8 +222,8 @@ def _effects(found: Diagnosis) -> None:
         show("\n" + table(rows, ("effect (*: claimed)", "credit", "evidence [nats]", "value")))
         _note(
             "credit: what predictions lose without it, of what they gain in all; evidence: of "
-            "what is claimed or tied, what is lost without it beside the other causes; of the rest, what "
-            "it gains alone"
+            "what is claimed or tied, what is lost without it beside the other causes; of the "
+            "rest, what it gains alone"
         )
     for group in found.indistinguishable:
         if group in found.equivalent:
