@@ -194,7 +194,7 @@ class UtilityPrediction(Document):
     after: float = math.nan
     spread: float = field(metadata=BRIEF, default=math.nan)  # standard deviation of the real ones
     mean: float = field(metadata=BRIEF, default=math.nan)
-    feedback: bool = field(metadata=BRIEF, default=False)  # trials had one, the predictions lack it
+    feedback: bool = False  # trials had one, the predictions lack it
 
 
 @dataclass(frozen=True, eq=False)
@@ -377,7 +377,7 @@ class Diagnosis(Document):
     where: Where = field(default_factory=Where)
     ranking: tuple[Ranked, ...] = ()  # what is claimed first, then what lost
     indistinguishable: tuple[tuple[str, ...], ...] = ()
-    equivalent: tuple[tuple[str, ...], ...] = field(metadata=BRIEF, default=())  # in any trial
+    equivalent: tuple[tuple[str, ...], ...] = ()  # in any trial
     lookalikes: tuple[Likeness, ...] = ()  # that hardly differ from a claimed effect
     gap: Gap = field(default_factory=Gap)
     utility_prediction: UtilityPrediction | None = None  # where the subject was a task

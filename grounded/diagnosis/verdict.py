@@ -104,7 +104,7 @@ def _moved(claims: Claims) -> str:
 def improvement(rows: Sequence[RulerRow]) -> str:
     """What predictions gain: `1 s ahead predictions miss v by 0.08 m/s instead of 0.31`.
 
-    Over whole trials, where they gain nothing a second ahead.
+    Of whole trials, where they gain nothing a second ahead.
     """
     short = [row for row in rows if not row.whole_trial][-1:]
     for row in (*short, *(row for row in rows if row.whole_trial)):
@@ -121,9 +121,9 @@ def improvement(rows: Sequence[RulerRow]) -> str:
 
 
 def _ahead(row: RulerRow) -> str:
-    held = "" if row.held_out != "no" else ", not held out,"
     if row.whole_trial:
-        return f"Over whole trials{held} predictions"
+        return "Whole trials"
+    held = "" if row.held_out != "no" else ", not held out"
     return f"{number(row.horizon_s)} s ahead{held} predictions"
 
 
