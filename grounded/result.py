@@ -10,6 +10,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields
 from functools import cache
+from math import isfinite
 from types import UnionType
 from typing import TYPE_CHECKING, Any, Self, Union, get_args, get_origin, get_type_hints
 
@@ -68,8 +69,8 @@ class Document(Result):
     """Base of frozen dataclasses that are written to JSON field by field, and read back.
 
     A field's metadata may name another `key` than its own name, or leave the key out (`brief`)
-    where the value is None, NaN or "". Two are equal where their documents are: a number that is
-    not finite is null in both.
+    where the value is None, not finite or "". Two are equal where their documents are: a number
+    that is not finite is null in both.
     """
 
     def to_json(self) -> dict[str, Any]:
@@ -77,7 +78,8 @@ class Document(Result):
         found = {}
         for one in fields(self):
             value = getattr(self, one.name)
-            if not (one.metadata.get("brief") and (value in (None, "") or value != value)):
+            nothing = value in (None, "") or (isinstance(value, float) and not isfinite(value))
+            if not (one.metadata.get("brief") and nothing):
                 found[one.metadata.get("key", one.name)] = plain(value)
         return found
 

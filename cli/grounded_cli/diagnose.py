@@ -173,7 +173,11 @@ def _held_out(found: Diagnosis) -> str:
         "trials": "each trial predicted with values from the others",
         "pieces": "each piece of the log predicted with values from the others",
     }
-    noise = {"repeats": "the scatter of repeats", "short horizon": "one step's noise, carried on"}
+    noise = {
+        "repeats": "the scatter of repeats",
+        "alike": "the scatter of trials whose commands agree to 2 %",
+        "short horizon": "one step's noise, carried on",
+    }
     return f"{by.get(row.held_out, 'not held out')}; noise: {noise.get(row.floor_from, 'unknown')}"
 
 
@@ -235,9 +239,16 @@ def _effects(found: Diagnosis) -> None:
         if share := credit_of(found, "calibration"):
             rows.insert(0, ("  (calibration)", share, "", "the model's own parameters, below"))
         show("\n" + table(rows, ("effect (*: claimed)", "credit", "evidence [nats]", "value")))
-        _note("credit: what predictions lose without it, of what they gain in all")
+        _note(
+            "credit: what predictions lose without it, of what they gain in all; evidence: of "
+            "what is claimed or tied, what is lost without it beside the other causes; of the "
+            "rest, what it gains alone"
+        )
     for group in found.indistinguishable:
-        show(field("tied", f"the data can't tell apart: {', '.join(group)}"))
+        if group in found.equivalent:
+            show(field("same", f"{' and '.join(group)} are one thing in this model"))
+        else:
+            show(field("tied", f"the data can't tell apart: {', '.join(group)}"))
 
 
 def _values(row: Ranked) -> str:

@@ -19,7 +19,7 @@ excitation        what to run next, where two explanations tie
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -35,7 +35,7 @@ from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.diagnosis.report import Diagnosis, Identifiable, NoiseLevels
+from grounded.diagnosis.report import Diagnosis, Estimate, Identifiable, NoiseLevels
 from grounded.diagnosis.unconfirmed import unconfirmed
 from grounded.diagnosis.validation.agreement import by_trial, changed
 from grounded.diagnosis.validation.claims import Claims
@@ -67,6 +67,8 @@ class DiagnosisOptions:
         horizon: how far ahead predictions are judged [s].
         hidden: states that no sensor has: the memory of effects that were adopted.
         but: effects that are not blamed, by name: adopted ones, whose numbers are parameters now.
+        origin: the task before anything was adopted: what matters is measured by what its model
+            misses, in the second diagnosis as in the first.
     """
 
     library: Library = field(default_factory=Library)
@@ -74,6 +76,7 @@ class DiagnosisOptions:
     horizon: float = 1.0
     hidden: tuple[str, ...] = ()
     but: Collection[str] = ()
+    origin: Task | None = None
 
 
 @steady()
@@ -131,14 +134,16 @@ def diagnose(
     used = [trial for trial in trials if trial.known_steps >= 2]
     here = interruptible(lambda: so_far(search, options.max_effects))
     with np.errstate(all="ignore"), here, running(engine):
-        decision = decide(search, best, ruler := Ruler(search.predictor), options.max_effects)
+        decision = decide(
+            search, best, ruler := Ruler(search.predictor, options.origin), options.max_effects
+        )
         tick("leftover")
         task = subject if isinstance(subject, Task) else None
         found = _Writer(decision, ruler, known, options, tick, task, used).diagnosis()
         groups = [k < first for k in range(data.count)]
         return replace(
             found,
-            identifiable=tuple(_identified(uncertain, decision.fit)),
+            identifiable=tuple(_identified(uncertain, decision.fit, found.parameters)),
             preflight=looked.findings,
             changed=changed(search, decision.fit, groups) if compare else None,
         )
@@ -149,11 +154,13 @@ USUAL = 160  # stages of a diagnosis, and hypotheses that are refined together
 FIRST_LOOK = 6  # iterations of the fit by whose noise the parameters are found identifiable
 
 
-def _identified(uncertain: Predictor, best: Fitted) -> list[Identifiable]:
+def _identified(
+    uncertain: Predictor, best: Fitted, known: Mapping[str, Estimate]
+) -> list[Identifiable]:
     """Of all uncertain parameters, those that were held too, beside the best hypothesis."""
     if not param_scale(uncertain.data.model).any():
         return []
-    return identifiable(uncertain, best)
+    return identifiable(uncertain, best, {name: e.std for name, e in known.items()})
 
 
 class _Writer:
@@ -175,7 +182,7 @@ class _Writer:
         self.predictor, self.data = self.search.predictor, self.search.data
         self.shown = list(zip(ruler.shown, ruler.names, strict=True))
         self.measured = Measured(decision, ruler, trials)
-        self.claims = Claims(decision, self.measured.credit, known)
+        self.claims = Claims(decision, self.measured.credit, known, ruler)
         self.left = self.measured.left
 
     def diagnosis(self) -> Diagnosis:
@@ -191,6 +198,7 @@ class _Writer:
             gain[..., i] += self.left[0].improvement
         ranking = self.claims.ranking(where, shrunk.gap_before)
         groups = self.claims.groups()
+        same = self.claims.equivalent(groups)
         alike = self.claims.nearly(groups)
         measured = self.measured
         remainder = measured.remainders()
@@ -199,7 +207,7 @@ class _Writer:
         seen = unconfirmed(self.claims, self.decision.doubtful)
         values, agreement = by_trial(self.best, data, named) if named else ((), ())
         return Diagnosis(
-            verdict=verdict(self.claims, ranking, groups, remainder, rows, credit, seen),
+            verdict=verdict(self.claims, ranking, groups, remainder, rows, credit, seen, same),
             where=Where(
                 channels=self.channels(gain, shrunk.before, where.spread),
                 times=tuple(by_time(gain.sum(axis=-1), data)),
@@ -210,6 +218,7 @@ class _Writer:
             ),
             ranking=ranking,
             indistinguishable=groups,
+            equivalent=same,
             lookalikes=alike,
             gap=Gap(
                 horizon_s=where.steps * data.dt,
@@ -225,7 +234,7 @@ class _Writer:
             leftover=remainder,
             unconfirmed=seen,
             correction=correction(predictor, self.best, self.left, where),
-            next_trial=next_trial(self.claims, self.left, groups, seen),
+            next_trial=next_trial(self.claims, self.left, groups, seen, same),
             unknowable=self.known.sentences,
             noise=self.noise(),
             parameters=self.claims.parameters(),
@@ -290,4 +299,4 @@ class _Writer:
             return None
         self.tick("utility")
         found = utility_prediction(self.predictor, self.best, bare, self.task, self.trials)
-        return found.summary()
+        return replace(found.summary(), feedback=self.task.feedback)

@@ -68,7 +68,7 @@ class ChannelParts(Document):
 class Split(Document):
     """What the error a while ahead is made of: of all states in units of their noise, and of each.
 
-    The irreducible part comes from "repeats" of a candidate, or else from the estimated "noise".
+    The irreducible part comes from "repeats" of a candidate, trials "alike", or the "noise".
     """
 
     horizon_s: float
@@ -140,6 +140,7 @@ class UtilityPrediction(Document):
     after: float = math.nan
     spread: float = field(metadata=BRIEF, default=math.nan)  # standard deviation of the real ones
     mean: float = field(metadata=BRIEF, default=math.nan)
+    feedback: bool = False  # trials had one, the predictions lack it
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +149,8 @@ class RulerRow(Document):
 
     held_out: by "trials", by "pieces" of one long log, or "no" where there is too little.
     calibrated: with the model's own parameters fitted; empty where none may move.
-    floor_from: "repeats" of a manoeuvre, or the "short horizon", whose noise is carried on.
+    floor_from: "repeats" of a candidate, trials whose commands are "alike", or the "short horizon",
+        whose noise is carried on.
     """
 
     horizon_s: float

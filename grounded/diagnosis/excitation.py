@@ -2,10 +2,13 @@
 
 Two hypotheses A and B tie on the trials so far. Each of a set of probes (the base policy with a
 staircase, steps, doublets, a sweep of frequencies or a slow ramp added to one input) is run in the
-model with A; then B, its values free to adapt, tries to explain that run through the same filter
-and noise. What it fails to explain is the evidence that the probe is expected to bring:
+model with A; then B, its values and all calibrated parameters free to adapt, tries to explain that
+run through the same filter and noise. What it fails to explain is the evidence of the probe:
 
     E[log p(y | A) - log p(y | B)] = 1/2 |whitened innovations of B on A's run|^2
+
+The trials so far measure how far that can be believed: their own commands would have told the two
+apart by some nats, and have by few; whatever a probe is expected to tell is scaled alike.
 
 Where nothing ties, the probe teaches most about the values that are claimed or calibrated: from
 the information F of the trials so far and J of its run, filtered alike, the expected gain is
@@ -23,13 +26,14 @@ from typing import Any
 
 import numpy as np
 
+from grounded.diagnosis.hypotheses.explored import TIE
 from grounded.diagnosis.likelihood.data import prepare, shifted
 from grounded.diagnosis.likelihood.fitted import calibrated
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.noise import NoiseModel, Structure
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.refine import refine
-from grounded.diagnosis.report import Diagnosis
+from grounded.diagnosis.report import Diagnosis, Estimate
 from grounded.effects import Library, Scales, memory_start, scales_of, wrap, wrapping_order
 from grounded.frozen import Array
 from grounded.model import Model
@@ -39,6 +43,9 @@ from grounded.task import Task
 from grounded.trial import Trial
 
 SIZES = (0.15, 0.35)  # of the input's range
+NOTHING = 0.1  # nats: less is nothing that a trial could tell
+REPLAYED = 4  # trials whose commands show what they should have told
+ADAPTED = 12  # iterations in which a rival adapts to a run
 LITTLE = 1e-6  # of a value's own information, and of its size
 
 
@@ -73,19 +80,28 @@ def probe(
         trials: the trials it was made from (for the sizes of signals).
         library: where the effects come from.
     """
-    ties = [g for g in diagnosis.indistinguishable if all(diagnosis.values(n) for n in g[:2])]
+    open_ = [g for g in diagnosis.indistinguishable if g not in diagnosis.equivalent]
+    ties = [g for g in open_ if all(diagnosis.values(n) for n in g[:2])]
     if not ties:
         return _teaching(task, policy, diagnosis, trials, library or Library())
     group = ties[0]
-    first, second = _hypotheses(task, diagnosis, trials, library or Library(), group[0], group[1])
+    task, first, second = _rivals(task, diagnosis, trials, library or Library(), group[:2])
     noise = _noise(task.model, diagnosis)
+    again = [run for t in trials[-REPLAYED:] if (run := _run(task, first, policy, t)) is not None]
+    if again:
+        second = _adapted(task, again, second, noise)
+    told = sum(_evidence(task, run, first, second, noise) for run in again)
+    told *= len(trials) / max(len(again), 1)
+    rows = [diagnosis.ranked(name) for name in group[:2]]
+    apart = [row.evidence for row in rows if row is not None]
+    trust = min(1.0, max(TIE, float(np.ptp(apart))) / max(told, 1e-12))
     best: tuple[float, Policy, str] | None = None
-    for words, candidate in probes(policy, _inputs_of(task.model, (group[0], group[1]))):
+    for words, candidate in probes(policy, _inputs_of(task.model, group[:2])):
         runs = [_run(task, h, candidate) for h in (first, second)]
         if any(run is None or not _safe(task, run) for run in runs):
             continue
         assert runs[0] is not None and runs[1] is not None
-        expected = min(
+        expected = trust * min(
             _evidence(task, runs[0], first, second, noise),
             _evidence(task, runs[1], second, first, noise),
         )
@@ -94,9 +110,12 @@ def probe(
     if best is None:
         return None
     expected, chosen, words = best
+    if expected < NOTHING:
+        same = f"no probe tells {group[0]} from {group[1]}: with other values of the rest"
+        return Probe(chosen, expected, (group[0], group[1]), f"{same} they do the same")
     gain = f"{expected:,.{int(expected < 100)}f} nats"
     sentence = f"{words}: expected to tell {group[0]} from {group[1]} by {gain}" + (
-        " (too little: try larger inputs or another manoeuvre)" if expected < 3 else ""
+        " (too little: try larger inputs or another manoeuvre)" if expected < TIE else ""
     )
     return Probe(chosen, expected, (group[0], group[1]), sentence)
 
@@ -105,9 +124,7 @@ def _teaching(
     task: Task, policy: Policy, diagnosis: Diagnosis, trials: Sequence[Trial], library: Library
 ) -> Probe | None:
     """The probe from which most is learnt about claimed and calibrated values."""
-    known = {n: e for n, e in diagnosis.parameters.items() if n in task.model.params}
-    values = {n: e.value for n, e in known.items() if np.isfinite(e.value)}
-    task = task.with_model(task.model.with_values(values))
+    known, task = _calibrated(task, diagnosis)
     scales, h = _scales(task, trials), Hypothesis()
     spreads: dict[str, tuple[float, str]] = {}  # by column: standard deviation, unit
     for name in (n for n in diagnosis.effects if not n.startswith("parameter:")):
@@ -206,21 +223,40 @@ def _inputs_of(model: Model, names: Sequence[str]) -> list[int]:
     return own or list(range(model.m))
 
 
-def _hypotheses(
+def _calibrated(task: Task, diagnosis: Diagnosis) -> tuple[dict[str, Estimate], Task]:
+    """The parameters that were calibrated, and the task with their values."""
+    known = {n: e for n, e in diagnosis.parameters.items() if n in task.model.params}
+    values = {n: e.value for n, e in known.items() if np.isfinite(e.value)}
+    return known, task.with_model(task.model.with_values(values))
+
+
+def _rivals(
     task: Task,
     diagnosis: Diagnosis,
     trials: Sequence[Trial],
     library: Library,
-    first: str,
-    second: str,
-) -> tuple[Hypothesis, Hypothesis]:
+    pair: Sequence[str],
+) -> tuple[Task, Hypothesis, Hypothesis]:
+    """The calibrated task, and two hypotheses in which whatever was calibrated may still move."""
+    known, task = _calibrated(task, diagnosis)
     scales, h = _scales(task, trials), Hypothesis()
     for name in diagnosis.effects:
-        if name not in (first, second):
+        if name not in pair and not name.startswith("parameter:"):
             h = h.plus(library.effect(name, task.model, scales), diagnosis.values(name))
-    built = (library.effect(name, task.model, scales) for name in (first, second))
-    one, other = (h.plus(effect, diagnosis.values(effect.name)) for effect in built)
-    return one, other
+    if known:
+        h = replace(h, shift=np.zeros(task.model.system.k), spread=1.0)
+    one, other = (
+        h.plus(library.effect(name, task.model, scales), diagnosis.values(name)) for name in pair
+    )
+    return task, one, other
+
+
+def _adapted(task: Task, runs: list[Trial], h: Hypothesis, noise: NoiseModel) -> Hypothesis:
+    """A hypothesis with the values that explain runs best: as the trials left it."""
+    data = prepare(task.model, runs, task.latency, task.past)
+    start = [(h, noise, data.y.copy())]
+    fits = refine(Predictor(data), start, iterations=ADAPTED, fixed_noise=True)
+    return fits[0].hypothesis if fits else h
 
 
 def _scales(task: Task, trials: Sequence[Trial]) -> Scales:
@@ -238,30 +274,40 @@ def _noise(model: Model, diagnosis: Diagnosis) -> NoiseModel:
     return NoiseModel(Structure(), q, r, q.copy(), np.full(model.n, -60.0))
 
 
-def _run(task: Task, h: Hypothesis, policy: Policy) -> Trial | None:
-    """A run of the policy in the model with a hypothesis, without noise; None if it diverges."""
+def _run(task: Task, h: Hypothesis, policy: Policy, like: Trial | None = None) -> Trial | None:
+    """A run of the policy in the model with a hypothesis, without noise; None if it diverges.
+
+    With `like` the commands and the start of that trial take the policy's place.
+    """
     model = _wrapped(task, h)
     assert task.latency is not None
     names = (task.model.state_names, task.model.input_names)
     nothing = np.empty((0, task.model.m))
-    start = Trial(task.start[None], nothing, task.dt, *names, start_inputs=task.past)
-    z = np.concatenate([task.start, memory_start(model, task.model, start)])
-    states, inputs, runner = [task.start], np.zeros((policy.horizon, model.m)), Runner(policy)
-    late, past = task.latency / task.dt, task.past[:, None]
-    for t in range(policy.horizon):
-        inputs[t] = runner.action(t * policy.dt, states[-1])
+    begin, held, steps = task.start, task.past, policy.horizon
+    if like is not None and np.isfinite(like.states[0]).all():
+        begin, steps = like.states[0], like.known_steps
+        held = held if like.start_inputs is None else like.start_inputs
+    start = Trial(begin[None], nothing, task.dt, *names, start_inputs=held)
+    z = np.concatenate([begin, memory_start(model, task.model, start)])
+    states, inputs, runner = [begin], np.zeros((steps, model.m)), Runner(policy)
+    late, past = task.latency / task.dt, held[:, None]
+    for t in range(steps):
+        inputs[t] = like.inputs[t] if like else runner.action(t * policy.dt, states[-1])
         sent = inputs[None, : t + 1]
         received = [shifted(sent[..., j], past[j], late[j])[0, -1] for j in range(model.m)]
         z = model.system.step(z[None], np.array([received]), model.values, task.dt)[0]
         if not np.isfinite(z).all():
             return None
         states.append(z[: task.model.n])
-    return Trial(np.array(states), inputs, task.dt, *names, start_inputs=task.past)
+    return Trial(np.array(states), inputs, task.dt, *names, start_inputs=held)
 
 
 def _wrapped(task: Task, h: Hypothesis) -> Model:
-    """The model with a hypothesis' effects in it."""
+    """The model with a hypothesis' shifts and effects in it."""
     model = task.model
+    if h.shift is not None:
+        moved = model.values + h.shift
+        model = model.with_values(dict(zip(model.param_names, moved.tolist(), strict=True)))
     for i in wrapping_order([effect.family for effect in h.effects]):
         effect = h.effects[i]
         current = Library((effect.family,)).effect(effect.name, model, effect.site.scales)
@@ -284,6 +330,7 @@ def _evidence(
     predictor = Predictor(data)
     rss = []
     for h in (true, rival):
-        fits = refine(predictor, [(h, noise, data.y.copy())], iterations=4, fixed_noise=True)
+        start = [(h, noise, data.y.copy())]
+        fits = refine(predictor, start, iterations=ADAPTED, fixed_noise=True)
         rss.append(float(fits[0].rss.sum()) if fits else np.inf)
     return max(0.5 * (rss[1] - rss[0]), 0.0)

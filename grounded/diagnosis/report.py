@@ -232,6 +232,7 @@ class Diagnosis(Document):
     where: Where = field(default_factory=Where)
     ranking: tuple[Ranked, ...] = ()  # what is claimed first, then what lost
     indistinguishable: tuple[tuple[str, ...], ...] = ()
+    equivalent: tuple[tuple[str, ...], ...] = ()  # in any trial
     lookalikes: tuple[Likeness, ...] = ()  # that hardly differ from a claimed effect
     gap: Gap = field(default_factory=Gap)
     utility_prediction: UtilityPrediction | None = None  # where the subject was a task

@@ -11,10 +11,12 @@ from grounded.diagnosis.error_report import Credit, Remainder, RulerRow, number
 from grounded.diagnosis.hypotheses.leftover import Leftover
 from grounded.diagnosis.report import Estimate, Kind, Ranked, Unconfirmed, Verdict, quantity
 from grounded.diagnosis.validation.claims import Claims
+from grounded.diagnosis.validation.measured import ABOVE
 from grounded.effects import Effect, ParamFamily, places
 from grounded.model import Model
 
 NAMED = 3  # parameters, channels and leftovers that a sentence names at most
+MATTERS = 0.05  # of the crude model's error: a rest below it is told as its share
 SHOWS = 0.1  # of the error: a channel that improves by less is not named
 
 
@@ -26,6 +28,7 @@ def verdict(
     rows: tuple[RulerRow, ...],
     credit: tuple[Credit, ...],
     seen: Sequence[Unconfirmed] = (),
+    same: tuple[tuple[str, ...], ...] = (),
 ) -> Verdict:
     """One effect, several, none or unknown, and why: what, by how much, what is left.
 
@@ -37,6 +40,7 @@ def verdict(
         rows: the ruler's.
         credit: what each cause is worth, largest first.
         seen: what only one trial shows.
+        same: of the groups, what is one thing in the model.
     """
     once = [sentence([one.sentence()]) for one in seen]
     left = remainder[0].sentence() if remainder else ""
@@ -52,10 +56,12 @@ def verdict(
     causes = _causes(claims, ranking, credit)
     several = len(causes) > 1
     shares = [f" ({_percent(one.share)} of the gain)" * several for one in credit]
-    words = [sentence(map(str.__add__, causes, shares)), improvement(row), worsened(rows)]
-    words += [f"The data can't tell {tied(group)}." for group in groups[:1]]
+    words = [sentence(map(str.__add__, causes, shares)), improvement(rows), worsened(rows)]
+    words += [f"{told_apart(group, same)}." for group in groups[:1]]
     if remainder:
         words.append(f"Something is left that no known effect explains: {left}.")
+    elif above := rest(rows):
+        words.append(sentence([above]))
     words += once
     kind: Kind = "effect" if len(claimed) == 1 else "several"
     return replace(_said(kind, *words), effects=tuple(r.effect for r in claimed), causes=causes)
@@ -85,34 +91,43 @@ def _percent(share: float) -> str:
 
 
 def _moved(claims: Claims) -> str:
-    """`L should be 0.166 m (+11 %)` of the parameters that moved most, in units of their std."""
+    """`L should be 0.166 m (+11 %)` of the parameters that have to differ."""
     params, known = claims.data.model.params, claims.parameters()
-    named = [claims.data.model.param_names[blame.index] for blame in claims.blamed] or sorted(
-        known, key=lambda n: -abs(known[n].value - params[n].value) / max(known[n].std, 1e-300)
-    )
+    named = [claims.data.model.param_names[one.index] for one in claims.moved]
     texts = []
     for name in named[:NAMED]:
         old = params[name].value
-        part = f" ({(known[name].value - old) / abs(old):+.0%})" if old else ""
+        change = 100 * (known[name].value - old) / abs(old) if old else 0.0
+        part = f" ({change:+.{0 if abs(change) >= 1 else 1}f}%)" if old else ""
         texts.append(f"{name} should be {quantity(known[name])}{part}")
     more = len(named) - NAMED
     return ", ".join(texts) + (f" and {more} more" if more > 0 else "")
 
 
-def improvement(row: RulerRow | None) -> str:
-    """What predictions gain: `1 s ahead predictions miss v by 0.08 m/s instead of 0.31`."""
-    if row is None:
-        return ""
-    gains = {n: 1 - row.with_effects[n] / e for n, e in row.crude.items() if e > 0}
-    best = sorted((n for n in gains if gains[n] > SHOWS), key=lambda n: -gains[n])[: NAMED - 1]
-    parts = [
-        f"{name} by {_measured(row, name, row.with_effects[name])} instead of "
-        f"{number(row.crude[name])}{_noise(row, name)}"
-        for name in best
-    ]
+def improvement(rows: Sequence[RulerRow]) -> str:
+    """What predictions gain: `1 s ahead predictions miss v by 0.08 m/s instead of 0.31`.
+
+    Of whole trials, where they gain nothing a second ahead.
+    """
+    short = [row for row in rows if not row.whole_trial][-1:]
+    for row in (*short, *(row for row in rows if row.whole_trial)):
+        gains = {n: 1 - row.with_effects[n] / e for n, e in row.crude.items() if e > 0}
+        best = sorted((n for n in gains if gains[n] > SHOWS), key=lambda n: -gains[n])
+        parts = [
+            f"{name} by {_measured(row, name, row.with_effects[name])} instead of "
+            f"{number(row.crude[name])}{_noise(row, name)}"
+            for name in best[: NAMED - 1]
+        ]
+        if parts:
+            return f"{_ahead(row)} miss {' and '.join(parts)}."
+    return f"{_ahead(short[0])} hardly change." if short else ""
+
+
+def _ahead(row: RulerRow) -> str:
+    if row.whole_trial:
+        return "Whole trials"
     held = "" if row.held_out != "no" else ", not held out"
-    ahead = f"{number(row.horizon_s)} s ahead{held} predictions"
-    return f"{ahead} miss {' and '.join(parts)}." if parts else f"{ahead} hardly change."
+    return f"{number(row.horizon_s)} s ahead{held} predictions"
 
 
 def worsened(rows: Sequence[RulerRow]) -> str:
@@ -126,9 +141,10 @@ def worsened(rows: Sequence[RulerRow]) -> str:
     ratio, row, name = max(losses, key=lambda loss: loss[0], default=(0.0, None, ""))
     if row is None or not ratio > 1 + SHOWS:
         return ""
-    ahead = "Whole trials" if row.whole_trial else f"{number(row.horizon_s)} s ahead predictions"
     value = _measured(row, name, row.with_effects[name])
-    return f"{ahead} miss {name} by {value} instead of {number(row.crude[name])}: that is worse."
+    return (
+        f"{_ahead(row)} miss {name} by {value} instead of {number(row.crude[name])}: that is worse."
+    )
 
 
 def floor(row: RulerRow | None) -> str:
@@ -141,6 +157,27 @@ def floor(row: RulerRow | None) -> str:
     name = max(known, key=lambda n: known[n] / max(row.noise_floor.get(n, math.nan), 1e-300))
     ahead = f"{number(row.horizon_s)} s ahead"
     return f": {ahead} it misses {name} by {_measured(row, name, known[name])}{_noise(row, name)}"
+
+
+def rest(rows: Sequence[RulerRow]) -> str:
+    """What is left above the noise where no leftover is stated, and why none is; "": nothing."""
+    found = [
+        (
+            row.with_effects[name] / noise,
+            row.with_effects[name] / max(row.crude[name], 1e-300),
+            name,
+        )
+        for row in rows
+        for name, noise in row.noise_floor.items()
+        if noise > 0 and math.isfinite(row.with_effects[name])
+    ]
+    times, share, name = max(found, default=(0.0, 0.0, ""))
+    if not times > ABOVE:
+        return ""
+    text = f"what is left in {name} is {times:.2g} times the noise"
+    if share < MATTERS:
+        return f"{text} but {100 * share:.1g} % of what the crude model missed"
+    return f"{text}, too little to stand out of what the state spans or of its scatter"
 
 
 def _measured(row: RulerRow, name: str, value: float) -> str:
@@ -158,10 +195,13 @@ def next_trial(
     left: Sequence[Leftover],
     groups: tuple[tuple[str, ...], ...],
     seen: Sequence[Unconfirmed] = (),
+    same: tuple[tuple[str, ...], ...] = (),
 ) -> str:
     """A sentence; `excitation.probe` makes the trial itself."""
     if claims.known.no_cause:
         return "Run two or more trials in which every input changes."
+    if groups and groups[0] in same:
+        return f"{told_apart(groups[0], same)}: no trial tells them apart, adopt either."
     if groups:
         made = f"A trial made for it would tell {tied(groups[0])}."
         return " ".join([made, *distinguishing(groups[0])])
@@ -254,6 +294,13 @@ def sentence(clauses: Iterable[str]) -> str:
     """Clauses as one sentence: first word capital (never a name: `called` puts a word before)."""
     text = "; ".join(clauses)
     return f"{text[:1].upper()}{text[1:]}."
+
+
+def told_apart(group: Sequence[str], same: Sequence[Sequence[str]]) -> str:
+    """What is said of a tie: that these data can't break it, or that no data can."""
+    if group in same:
+        return f"{' and '.join(group)} are one thing in this model"
+    return f"The data can't tell {tied(group)}"
 
 
 def tied(group: Sequence[str]) -> str:

@@ -15,9 +15,9 @@ from grounded.diagnosis.excitation import probe
 from grounded.diagnosis.hypotheses.leftover import whiteness
 from grounded.diagnosis.likelihood.data import prepare, shifted
 from grounded.diagnosis.report import Estimate, Ranked
-from grounded.diagnosis.validation.claims import loss
+from grounded.diagnosis.validation.claims import Blame, loss
 from grounded.diagnosis.validation.prediction_error import _stump
-from grounded.diagnosis.verdict import meaning, sentence, verdict
+from grounded.diagnosis.verdict import meaning, rest, sentence, verdict
 from grounded.effects import Library
 from grounded.filter import kalman
 from grounded.models.pendulum import model as pendulum
@@ -265,6 +265,7 @@ def test_the_cause_that_makes_most_is_named_first(effect_first):
         known=known, blamed=(), best=best, parameters=lambda: {"m": Estimate(1.2, 0.01, None, "kg")}
     )
     claims.data = SimpleNamespace(model=pendulum)
+    claims.moved = (Blame(pendulum.param_names.index("m"), 9.0),)
     credit = [Credit(effect.name, 0.9), Credit("calibration", 0.004)]
     credit = credit if effect_first else [Credit("calibration", 0.9), Credit(effect.name, 0.1)]
     table = errors(0.5, with_effects={"omega": 0.1}, noise_floor={"omega": 0.09})
@@ -283,6 +284,14 @@ def test_leftovers_that_are_not_named_are_counted():
     assert said[3].endswith("a is off by 0.1 m/s rms; 2 more.")
     assert verdict(claims, (), (), off[:1], (), ()).kind == "unknown"
     assert verdict(claims, (), (), (), (errors(0.1),), ()).kind == "none"
+
+
+def test_a_rest_above_the_noise_that_is_no_leftover_is_said_with_its_reason():
+    floor = {"omega": 0.001}
+    row = errors(10.0, with_effects={"omega": 0.012}, noise_floor=floor)
+    assert "12 times" in rest([row]) and "0.1 %" in rest([row])
+    assert "%" not in rest([errors(0.013, with_effects={"omega": 0.012}, noise_floor=floor)])
+    assert not rest([errors(10.0, with_effects={"omega": 0.0012}, noise_floor=floor)])
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1.0])

@@ -103,7 +103,10 @@ class Said:
         self.error = error
 
     def beside(self, crude):
-        pass
+        self.outset = crude
+
+    def since_outset(self, fit):
+        return self.gain(self.outset, fit).mean
 
     def gain(self, before, after):
         mean = np.log(self.error(causes(before)) / self.error(causes(after)))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from grounded.diagnosis.likelihood.fitted import _fisher
+from grounded.diagnosis.likelihood.intervals import _fisher
 
 
 @pytest.mark.parametrize("seed", range(4))

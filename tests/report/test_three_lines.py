@@ -72,7 +72,10 @@ def test_ties_are_named_and_nothing_left_is_said(diagnosis):
     tied = replace(diagnosis, indistinguishable=(("a:v", "b:v"),), leftover=())
     assert "a:v from b:v" in three_lines(tied, cart_task())[-1]
     clean = replace(diagnosis, leftover=())
-    assert "above the noise" in three_lines(clean, cart_task())[-1]
+    assert "1.3 times the noise" in three_lines(clean, cart_task())[-1]
+    (row,) = diagnosis.prediction_error
+    quiet = replace(clean, prediction_error=(replace(row, noise_floor=row.with_effects),))
+    assert "above the noise" in three_lines(quiet, cart_task())[-1]
 
 
 def test_without_a_known_cause_the_verdict_speaks_for_itself(diagnosis):

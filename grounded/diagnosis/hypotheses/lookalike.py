@@ -21,15 +21,16 @@ import numpy as np
 from grounded.diagnosis.hypotheses.leftover import filter_of
 from grounded.diagnosis.hypotheses.scan import scan_candidates
 from grounded.diagnosis.likelihood.delays import delays_of
-from grounded.diagnosis.likelihood.fitted import Fitted
+from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
-from grounded.diagnosis.likelihood.linearise import base_columns
+from grounded.diagnosis.likelihood.linearise import base_columns, linearise
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.report import Likeness
 from grounded.effects import Effect, ParamFamily
 from grounded.filter import kalman
 
 NEARLY = 0.75  # share of an effect's signal from which a look-alike is named
+IDENTICAL = 1e-6  # of a slope's power that may differ where two are one thing
 MOST = 3  # that are named for one effect
 
 
@@ -80,6 +81,29 @@ def of_parameters(
         own = [c for c in candidates if related(effect, c) and not c.name.startswith("parameter:")]
         found += _likely(there, replace(null, hypothesis=h), effect, own, nearly)
     return tuple(found)
+
+
+def one_thing(predictor: Predictor, index: int, effect: Effect) -> bool:
+    """Whether an effect does what a parameter does in the model itself, whatever is run.
+
+    Seen far from the trials: every state and input drawn by itself, anywhere in its range. There
+    the slope of a step in the one is a multiple of its slope in the other.
+    """
+    data, rng = predictor.data, np.random.default_rng(0)
+    if len(effect.free) != 1 or index not in calibrated(data):
+        return False
+    low, high = (f(data.filled, axis=0) for f in (np.min, np.max))
+    least, most = (f(data.commands, axis=(0, 1)) for f in (np.min, np.max))
+    apart = np.maximum(most - least, 1e-9)
+    commands = rng.uniform(least - apart, most + apart, data.commands.shape)
+    anywhere = replace(data, commands=commands)
+    track = rng.uniform(low, high, (len(data.time) + 1, data.time.shape[1], data.model.n))
+    h = replace(Hypothesis().plus(effect, {q.name: q.start for q in effect.free}), spread=1.0)
+    columns = linearise(Predictor(anywhere), h, track)[1] / np.maximum(high - low, 1e-12)[:, None]
+    own = columns[..., 1].ravel()
+    other = columns[..., 2 + int(np.flatnonzero(calibrated(data) == index)[0])].ravel()
+    power = float(own @ own) * float(other @ other)
+    return power > 0 and float(own @ other) ** 2 > (1 - IDENTICAL) * power
 
 
 def related(one: Effect, other: Effect) -> bool:

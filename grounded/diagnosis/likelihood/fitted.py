@@ -1,8 +1,4 @@
-"""A hypothesis at its most likely values (`refine` returns it), and how sure these values are.
-
-The Fisher information believes the noise model; the jackknife asks the trials themselves, each left
-out once (Efron & Tibshirani 1993, ch. 11). The larger of the two is reported.
-"""
+"""A hypothesis at its most likely values (`refine` returns it); how sure they are: `intervals`."""
 
 from __future__ import annotations
 
@@ -101,30 +97,3 @@ def leave_one_out(fit: Fitted, trial_of: Array) -> tuple[Array, Array]:
             shifts[i] = scale * np.linalg.lstsq(scaled, scale * s, rcond=1e-8)[0]
         rss[i] = fit.rss[own].sum() + 2 * s @ shifts[i] + shifts[i] @ G @ shifts[i]
     return shifts, rss
-
-
-def standard_deviations(fit: Fitted, trial_of: Array) -> tuple[Array, Array]:
-    """Of every free value: standard deviation, half-width of the 95 % interval, (C,) each."""
-    from scipy.special import stdtrit
-
-    if fit.gram.shape[-1] == 0:
-        return np.zeros(0), np.zeros(0)
-    fisher = _fisher(fit.gram.sum(axis=0) + np.diag(fit.prior))
-    shifts, _ = leave_one_out(fit, trial_of)
-    S = len(shifts)
-    if S < 3:
-        return fisher, 1.96 * fisher
-    spread = shifts - shifts.mean(axis=0)
-    jack = np.sqrt((S - 1) / S * (spread**2).sum(axis=0))
-    t = float(stdtrit(S - 1, 0.975))  # Student's quantile
-    return np.maximum(fisher, jack), np.maximum(1.96 * fisher, t * jack)
-
-
-def _fisher(information: Array) -> Array:
-    """Standard deviations from an information matrix (C, C), each unknown in units of its own.
-
-    A direction in which nothing is known makes all that take part in it as good as unknown.
-    """
-    scale = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
-    size, axes = np.linalg.eigh(information * np.outer(scale, scale))
-    return np.asarray(scale * np.sqrt((axes**2 / np.maximum(size, 1e-12)).sum(axis=1)))

@@ -54,8 +54,11 @@ class Hypothesis:
         return replace(self, values=tuple(values))
 
     def plus(self, effect: Effect, values: Mapping[str, float]) -> Hypothesis:
-        """One more effect."""
+        """One more effect; constants among its values are its own from now on."""
         whole = {**effect.fixed, **values}
+        for name, value in effect.fixed.items():
+            if whole[name] != value:
+                effect = effect.tuned(name, whole[name])
         return replace(self, effects=(*self.effects, effect), values=(*self.values, whole))
 
     def tuned(self, index: int, name: str, value: float) -> Hypothesis:

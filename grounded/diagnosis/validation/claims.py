@@ -14,22 +14,25 @@ knows (a gain and a time constant) are not both blamed for it.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from grounded.diagnosis.hypotheses.explored import TIE, parametric
-from grounded.diagnosis.hypotheses.lookalike import lookalikes, of_parameters
+from grounded.diagnosis.hypotheses.lookalike import lookalikes, of_parameters, one_thing
+from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import Data
-from grounded.diagnosis.likelihood.fitted import Fitted, calibrated, standard_deviations
+from grounded.diagnosis.likelihood.fitted import Fitted, calibrated, moved
 from grounded.diagnosis.likelihood.hypothesis import param_scale
+from grounded.diagnosis.likelihood.intervals import standard_deviations
 from grounded.diagnosis.report import Estimate, Likeness, Ranked
-from grounded.diagnosis.validation.decide import Decision, ordered
+from grounded.diagnosis.validation.decide import SLIGHT, Decision, ordered
 from grounded.diagnosis.validation.held_out import gaps_of, held_out_errors
 from grounded.diagnosis.validation.limits import Limits
 from grounded.diagnosis.validation.prediction_error import normalised
-from grounded.diagnosis.validation.ruler import folds
+from grounded.diagnosis.validation.ruler import Ruler, folds
 from grounded.frozen import Array
 
 ENOUGH = 3.0  # nats that the parameters that are not named may still hold
@@ -55,13 +58,20 @@ def loss(H: Array, b: Array, free: list[int]) -> float:
     return 0.5 * float(left @ block @ left)
 
 
-def blamed(data: Data, fit: Fitted) -> tuple[Blame, ...]:
-    """The parameters of a calibrated fit that have to differ, most important first."""
-    h = fit.hypothesis
+def moved_parameters(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> tuple[Blame, ...]:
+    """The parameters of a calibrated fit that have to differ, most important first.
+
+    By evidence as few as leave ENOUGH to the others; of these each without which, the others fitted
+    again, predictions are as good within what matters is as good as right.
+    """
+    data, h = search.data, fit.hypothesis
     if h.spread == 0 or h.shift is None:
         return ()
     k, which = len(h.theta), calibrated(data)
-    H = fit.gram.sum(axis=0)[k:, k:] + np.diag(fit.prior[k:])
+    G = fit.gram.sum(axis=0)
+    across = G[k:, :k]
+    H = G[k:, k:] - across @ np.linalg.pinv(G[:k, :k], hermitian=True) @ across.T
+    H = H + np.diag(fit.prior[k:])
     b = h.shift[which] / param_scale(data.model)[which]
     free: list[int] = []
     now = loss(H, b, free)
@@ -69,8 +79,28 @@ def blamed(data: Data, fit: Fitted) -> tuple[Blame, ...]:
         losses = {i: loss(H, b, [*free, i]) for i in range(len(b)) if i not in free}
         i = min(losses, key=lambda j: losses[j])
         free, now = [*free, i], losses[i]
-    found = [Blame(int(which[i]), loss(H, b, [j for j in free if j != i]) - now) for i in free]
-    return tuple(sorted(found, key=lambda blame: -blame.nats))
+    nats = {i: loss(H, b, [j for j in free if j != i]) - now for i in free}
+    if ruler.held_out:
+        least = SLIGHT * ruler.since_outset(fit)
+        gains = {i: ruler.gain(unmoved(data, fit, k + i, b[i]), fit).mean for i in free}
+        most = max(free, key=lambda i: gains[i])
+        free = [i for i in free if gains[i] >= least or i == most]
+    # a parabola about the fit reaches no further than the fit itself
+    whole = max(search.score(fit) - search.score(search.exact_null()), 0.0)
+    worth = {i: min(search.tempering.factor * nats[i], whole) for i in free}
+    return tuple(Blame(int(which[i]), worth[i]) for i in sorted(free, key=lambda i: -nats[i]))
+
+
+def unmoved(data: Data, fit: Fitted, column: int, shift: float) -> Fitted:
+    """The fit with one parameter as it was, the others fitted again: one Newton step."""
+    H = fit.gram.sum(axis=0) + np.diag(fit.prior)
+    rest = np.delete(np.arange(len(H)), column)
+    delta = np.zeros(len(H))
+    delta[column] = -shift
+    delta[rest] = shift * np.linalg.pinv(H[np.ix_(rest, rest)], hermitian=True) @ H[rest, column]
+    gram, score = fit.gram.copy(), fit.score - fit.gram @ delta
+    gram[:, column], gram[..., column], score[:, column] = 0.0, 0.0, 0.0  # it stays there
+    return replace(fit, hypothesis=moved(data, fit.hypothesis, delta), gram=gram, score=score)
 
 
 RANKED = 12  # explanations that are listed
@@ -80,7 +110,9 @@ SAME = 0.95  # share of a parameter's signal from which an effect is the same th
 class Claims:
     """What the best hypothesis blames: effects, or parameters where calibrating them is enough."""
 
-    def __init__(self, decision: Decision, credit: dict[str, float], known: Limits) -> None:
+    def __init__(
+        self, decision: Decision, credit: dict[str, float], known: Limits, ruler: Ruler
+    ) -> None:
         self.search, self.best, self.known = decision.search, decision.fit, known
         search, best, self.credit = decision.search, decision.fit, credit
         self.predictor, self.data = search.predictor, search.data
@@ -88,7 +120,8 @@ class Claims:
         calibrating = not self.names and best.hypothesis.spread > 0
         self.null = best if calibrating else search.best_null()
         self.base = search.score(decision.crude if parametric(best) else self.null)
-        self.blamed = blamed(self.data, self.null) if calibrating else ()
+        self.moved = moved_parameters(search, best, ruler)  # also beside effects
+        self.blamed = self.moved if calibrating else ()
         off = [blame.index for blame in self.blamed[:2]]
         candidates = search.candidates
         self.like_parameters = (
@@ -107,6 +140,11 @@ class Claims:
             rows.append(self._row(self.best, name, parts[name], after, before, claimed=claimed))
         rows += self.off(after, before)
         listed = [row.effect for row in rows]
+        for name, (fit, evidence) in self.tied(parts).items():
+            if name not in listed:
+                gap = gaps_of(self.predictor, [fit], where)[0]
+                rows.append(self._row(fit, name, evidence, gap, before, claimed=False))
+                listed.append(name)
         singles = [f for f in search.of_size(1) if f.hypothesis.names[0] not in listed]
         singles = singles[: max(RANKED - len(rows), 3)]
         gaps = gaps_of(self.predictor, singles, where)
@@ -171,7 +209,7 @@ class Claims:
 
     def estimates(self, fit: Fitted) -> list[dict[str, Estimate]]:
         """Values with intervals, effect by effect."""
-        stds, halves = standard_deviations(fit, folds(self.data))
+        stds, halves = standard_deviations(self.predictor, fit, folds(self.data))
         found, at = [], 0
         for effect, values in zip(fit.hypothesis.effects, fit.hypothesis.values, strict=True):
             some = {}
@@ -204,17 +242,42 @@ class Claims:
             first = self.data.model.param_names[self.blamed[0].index]
             found.append((f"parameter:{first}", *dict.fromkeys(as_likely[:2])))
         for name in self.names:
-            rest = set(self.names) - {name}
-            rivals = [
-                f
-                for f in self.search.of_size(len(self.names))
-                if rest <= set(f.hypothesis.names) and name not in f.hypothesis.names
-            ]
-            close = [f for f in rivals if whole - self.search.score(f) < TIE]
-            others = [next(n for n in f.hypothesis.names if n not in rest) for f in close[:2]]
+            others = [other for other, _ in self.rivals(name)]
             if others:
                 found.append((name, *others))
         return tuple(found)
+
+    def equivalent(self, groups: tuple[tuple[str, ...], ...]) -> tuple[tuple[str, ...], ...]:
+        """Of the groups, those of a parameter that are one thing in the model: no trial helps."""
+        effects = {e.name: e for e in self.search.candidates}
+        model, found = self.data.model, []
+        for first, *others in groups:
+            name = first.removeprefix("parameter:")
+            if name == first or name not in model.param_names:
+                continue
+            index = model.param_names.index(name)
+            if all(o in effects and one_thing(self.predictor, index, effects[o]) for o in others):
+                found.append((first, *others))
+        return tuple(found)
+
+    def rivals(self, name: str) -> list[tuple[str, Fitted]]:
+        """What may stand in the place of a claimed effect, beside all the others: name and fit."""
+        rest, score = set(self.names) - {name}, self.search.score
+        close = [
+            f
+            for f in self.search.of_size(len(self.names))
+            if rest <= set(f.hypothesis.names) and name not in f.hypothesis.names
+            if score(self.best) - score(f) < TIE
+        ]
+        return [(next(n for n in f.hypothesis.names if n not in rest), f) for f in close[:2]]
+
+    def tied(self, parts: Mapping[str, float]) -> dict[str, tuple[Fitted, float]]:
+        """Each rival's fit in the place of a claimed effect, and its evidence there."""
+        best, found = self.search.score(self.best), dict[str, tuple[Fitted, float]]()
+        for name in self.names:
+            for other, fit in self.rivals(name):
+                found.setdefault(other, (fit, parts[name] + self.search.score(fit) - best))
+        return found
 
     def nearly(self, groups: tuple[tuple[str, ...], ...]) -> tuple[Likeness, ...]:
         """Look-alikes by shape, beside those that tie."""
@@ -230,7 +293,7 @@ class Claims:
         h, model = self.best.hypothesis, self.data.model
         if h.spread == 0 or h.shift is None:
             return {}
-        stds, halves = standard_deviations(self.best, folds(self.data))
+        stds, halves = standard_deviations(self.predictor, self.best, folds(self.data))
         scale, k = param_scale(model), len(h.theta)
         found = {}
         for at, index in enumerate(calibrated(self.data)):

@@ -35,7 +35,7 @@ PAYS = (1.0, 0.01)  # scatters that a cause must gain, and the least gain in one
 FURTHER = (2.0, 0.01)  # the same where there are several effects
 BETTER = (2.0, 0.05)  # the same for a rival to take the place of a likelier hypothesis
 OVERRULES = (3.0, 0.1)  # and for a claim that is likely under another noise only
-SLIGHT = 0.02  # of what all causes gain: one that makes less is not named
+SLIGHT = 0.02  # of what all causes gain, adopted ones too: one that makes less is not named
 AMOUNTS = 0.1  # of what the likeliest gains: what a rival has to gain beyond it
 LIKELY = 10.0  # nats from which a dropped effect is mentioned
 REFIT = 12  # iterations after a cause was taken out
@@ -156,7 +156,7 @@ def _pruned(
         if not ruler.held_out:
             return fit, without, doubtful
         gains = {name: ruler.gain(less, fit) for name, less in without.items()}
-        least = SLIGHT * ruler.gain(search.exact_null(), fit).mean
+        least = SLIGHT * ruler.since_outset(fit)
         bar = PAYS if len(fit.hypothesis.effects) < 2 else FURTHER
         idle = [n for n, gain in gains.items() if not gain.pays(*bar) or gain.mean < least]
         if not idle:

@@ -104,17 +104,17 @@ def utility_prediction(
         fit: the best hypothesis.
         bare: filtered states that the bare model starts from; the fit has its own.
         task: whose reward it is.
-        trials: those of the data, in its order.
+        trials: those of the data, in its order; of candidates alone, where there are any.
     """
     data, h = predictor.data, fit.hypothesis
     fixed = not h.effects and h.spread == 0
     shifts = None if fixed or data.count < 2 else leave_one_out(fit, data.trial_of)[0]
     groups = np.unique(data.trial_of).tolist()
-    rows = []
+    rows, chosen = [], any(trial.candidate for trial in trials)
     for i, trial in enumerate(trials):
         real = task.utility(trial)
-        if not np.isfinite(real) or i not in groups:
-            continue
+        if not np.isfinite(real) or i not in groups or (chosen and not trial.candidate):
+            continue  # driven by hand: no policy's utility
         first = int(np.flatnonzero(data.trial_of == i)[0])
         if data.time[0, first] > 0:  # the run that it began with was left out
             continue

@@ -6,7 +6,7 @@ there may exist and can't be known, so it is not offered and the reader is told.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -121,17 +121,21 @@ def knowable(data: Data, effects: Sequence[Effect]) -> tuple[Effect, ...]:
     return tuple(kept)
 
 
-def identifiable(predictor: Predictor, fit: Fitted, quieter: float = 1.0) -> list[Identifiable]:
+def identifiable(
+    predictor: Predictor, fit: Fitted, stds: Mapping[str, float] | None = None
+) -> list[Identifiable]:
     """How well the trials tell each uncertain parameter, all others free, under a fit's noise.
 
     The sensitivities of the predictions, whitened, are the information that the data add to the
-    priors; what is left of each prior's standard deviation is the verdict.
+    priors; what is left of each prior's standard deviation is the verdict, or what a calibrated
+    value's own standard deviation is of it, where that is more.
     """
-    left = _left(_information(predictor, fit) * quieter)
+    left, stds = _left(_information(predictor, fit)), stds or {}
     model, found = predictor.data.model, []
     for i, share in zip(calibrated(predictor.data), left, strict=True):
-        name = model.param_names[i]
-        found.append(Identifiable(name, _verdict(share), model.params[name].spread, float(share)))
+        name, prior = model.param_names[i], model.params[model.param_names[i]].spread
+        share = max(float(share), min(stds.get(name, 0.0) / prior, 1.0))
+        found.append(Identifiable(name, _verdict(share), prior, share))
     return found
 
 

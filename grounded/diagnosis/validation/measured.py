@@ -58,6 +58,8 @@ class Measured:
         """
         repeats = repeated(self.trials, self.data)
         found, source = self.ruler.scatter(self.best, repeats), "repeats"
+        if not all(len({self.trials[i].candidate or i for i in group}) == 1 for group in repeats):
+            source = "alike"
         if found is None:
             found, source = self.carried(self.best), "short horizon"
             off = [self.data.model.state_names.index(left.channel) for left in self.left]

@@ -21,7 +21,7 @@ leaves, as white noise, carried on by the model.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -33,6 +33,7 @@ from grounded.diagnosis.likelihood.fitted import Fitted, leave_one_out, moved
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.frozen import Array
+from grounded.task import Task
 from grounded.trial import Trial
 
 SECONDS = (0.1, 0.5, 1.0)
@@ -114,8 +115,8 @@ class Gain:
 class Ruler:
     """Errors of fitted hypotheses on one set of trials."""
 
-    def __init__(self, predictor: Predictor) -> None:
-        self.predictor, self.data = predictor, predictor.data
+    def __init__(self, predictor: Predictor, origin: Task | None = None) -> None:
+        self.predictor, self.data, self.origin = predictor, predictor.data, origin
         data = self.data
         self.folds = folds(data)
         self.held_out = len(np.unique(self.folds)) > 1
@@ -158,9 +159,27 @@ class Ruler:
         return np.asarray(np.maximum(FINE * self.data.filled.std(axis=0), 1e-12))
 
     def beside(self, crude: Fitted) -> None:
-        """What matters from now on is measured by what the crude model misses."""
-        missed = np.nan_to_num(self.errors(crude).rms[:-1].max(axis=0))
-        self.fine = np.maximum(self.fine, SLIGHT * np.minimum(missed, self.data.filled.std(axis=0)))
+        """What matters from now on is measured by what the crude model missed at the outset."""
+        self.outset = self.errors(crude) if self.origin is None else self._origin(crude)
+        missed, spread = np.nan_to_num(self.outset.rms), self.data.filled.std(axis=0)
+        self.fine_whole = np.maximum(self.fine, SLIGHT * np.minimum(missed.max(axis=0), spread))
+        self.fine = np.maximum(self.fine, SLIGHT * np.minimum(missed[:-1].max(axis=0), spread))
+
+    def since_outset(self, fit: Fitted) -> float:
+        """What a hypothesis predicts better than the model did before anything was adopted."""
+        return self.compared(self.outset, self.errors(fit)).mean
+
+    def _origin(self, crude: Fitted) -> Errors:
+        """Errors of the model before effects were adopted, whose states are the first of these."""
+        assert self.origin is not None
+        model, n = self.origin.model, self.origin.model.n
+        states, latency = self.data.states[:, :n], self.origin.latency
+        latency = np.zeros(model.m) if latency is None else latency
+        data = replace(self.data, model=model, states=states, latency=latency, hidden=())
+        bare = replace(crude, hypothesis=Hypothesis(), track=crude.track[..., :n])
+        found = Ruler(Predictor(data)).errors(bare)
+        more = [(0, 0), (0, 0), (0, self.data.model.n - n)]
+        return Errors(np.pad(found.total, more), np.pad(found.count, more))
 
     @property
     def measured(self) -> list[tuple[Fitted, Errors]]:
@@ -271,7 +290,7 @@ class Ruler:
         """The same of errors."""
         a, b = (errors.total[..., self.shown] for errors in (before, after))
         count = before.count[..., self.shown].sum(axis=1, keepdims=True)
-        seen, least = count > 0, count * self.fine[self.shown] ** 2 + 1e-300
+        seen, least = count > 0, count * self._matters()[:, None] ** 2 + 1e-300
 
         def ratio(x: Array, y: Array) -> Array:
             return np.asarray(np.where(seen, 0.5 * np.log((x + least) / (y + least)), 0.0))
@@ -292,6 +311,11 @@ class Ruler:
             self._pieces(before, after),
             self.data.trial_of[self.run_of],
         )
+
+    def _matters(self) -> Array:
+        """Error below which nothing matters, by horizon and shown state, (K, n')."""
+        short, whole = self.fine[self.shown], getattr(self, "fine_whole", self.fine)[self.shown]
+        return np.stack([*[short] * len(self.steps), whole])
 
     def _pieces(self, before: Errors, after: Errors) -> Array:
         """What each piece gains (P,), beside what `after` misses on average: no piece rules."""

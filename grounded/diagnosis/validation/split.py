@@ -54,5 +54,5 @@ def split(
         ChannelParts(name, unit, float(np.nan_to_num(before[i])), *map(float, each[:, i]))
         for i, (name, unit) in enumerate(units.items())
     )
-    origin = "repeats" if source == "repeats" else "noise"
+    origin = "noise" if source == "short horizon" else source
     return Split(horizon_s, Parts(*map(float, whole)), channels, origin)

@@ -179,9 +179,8 @@ def utility_sentence(diagnosis: Diagnosis) -> str:
         for value in (found.before, found.after)
     )
     whole = count(found.trials, "whole trial")
-    text = (
-        f"with the commands of {whole} replayed open loop, the model misses their utility {without}"
-    )
+    how = "replayed without the feedback that they had, " * found.feedback
+    text = f"{how}the model misses the utility of {whole} {without}"
     if diagnosis.effects:
         text += f", the diagnosed one {better}"
     if found.trials < 2:

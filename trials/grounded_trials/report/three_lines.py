@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 from grounded.diagnosis.error_report import Remainder, RulerRow, measured
 from grounded.diagnosis.report import Diagnosis
-from grounded.diagnosis.verdict import tied, worsened
+from grounded.diagnosis.verdict import rest, told_apart, worsened
 from grounded.task import Task
 from grounded_trials.report.diagnosis_words import moved_parameters
 from grounded_trials.report.findings import weighed_groups
@@ -86,11 +86,11 @@ def _together(errors: Mapping[str, float], names: list[str]) -> float:
 
 def _open(diagnosis: Diagnosis) -> str:
     """What ties, and what no known effect explains."""
-    found = [f"the data can't tell {tied(group)}" for group in diagnosis.indistinguishable[:1]]
+    found = [told_apart(group, diagnosis.equivalent) for group in diagnosis.indistinguishable[:1]]
     found += [one.sentence() for one in diagnosis.unconfirmed[:1]]
     if diagnosis.leftover:
         found.append(_left(diagnosis.leftover[0], len(diagnosis.leftover) - 1))
-    text = "; ".join(found) or "nothing is left above the noise"
+    text = "; ".join(found) or rest(diagnosis.prediction_error) or "nothing is left above the noise"
     return f"{text[:1].upper()}{text[1:]}."
 
 

@@ -63,7 +63,11 @@ def diagnose_in(
     others = _chosen(workspace, compare) if compare else []
     memory = planner.plan.model.state_names[planner.task.model.n :]
     options = DiagnosisOptions(
-        library=library, max_effects=max_effects, hidden=tuple(memory), but=adopted
+        library=library,
+        max_effects=max_effects,
+        hidden=tuple(memory),
+        but=adopted,
+        origin=workspace.origin,
     )
     lifted, second = ([planner.lift(trial) for trial in some] for some in (used, others))
     made = Made(
@@ -153,7 +157,7 @@ def _probe(
     """
     if found.no_cause:
         return "", ""
-    from grounded.diagnosis.excitation import probe
+    from grounded.diagnosis.excitation import NOTHING, probe
     from grounded.search.safety import objections, spread
     from grounded_trials.workspace.handover import outside_limits
     from grounded_trials.workspace.proposing import standing_in
@@ -166,17 +170,16 @@ def _probe(
     task, strays = planner.task, spread(planner.task, now.history, best.candidate.model)
     own = best.candidate.policy
     low, high = np.maximum(own.low, task.low), np.minimum(own.high, task.high)
-    base, offer = (
-        planner.widened(replace(own, low=low, high=high)),
-        write or found.indistinguishable,
-    )
+    base = planner.widened(replace(own, low=low, high=high))
+    ties = {*found.indistinguishable} - {*found.equivalent}
+    offer = write or bool(ties)
     why = "none of those tried stays inside [safety]"
     for room in (0 * strays, strays):
         inside = _narrower(planner.plan, room.max(axis=0))
         made = None if inside is None else probe(inside, base, found, trials, library)
         if made is None:
             break
-        if not offer:
+        if not offer or (ties and made.expected < NOTHING):
             return "", made.sentence
         candidate = _candidate_of(workspace, planner.narrowed(made.policy), best.candidate.id)
         reasons = (*outside_limits(task, candidate.policy), *objections(task, candidate, strays))
@@ -186,7 +189,7 @@ def _probe(
                 candidate = replace(candidate, id=workspace.next_id())
             return saved.id, made.sentence
         why = "; ".join(reasons).replace(candidate.id, "the best")
-    return "", f"{found.next_trial}; no candidate for it is offered: {why}" * bool(offer)
+    return "", f"{found.next_trial}; no candidate for it is offered: {why}" * offer
 
 
 def _candidate_of(workspace: Folder, policy: Policy, base: str) -> Candidate:

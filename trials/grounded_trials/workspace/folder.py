@@ -93,15 +93,24 @@ class Folder:
     @cached_property
     def base_model(self) -> Model:
         """The crude model of model.py with [model] params, without adopted effects."""
+        params, model = self.config.model.params, self._written
+        check_names(params, list(model.params), "grounded.toml: [model] params: parameter")
+        return model.with_values(params)
+
+    @cached_property
+    def _written(self) -> Model:
         table = self.config.model
-        model = model_in(load_module(self.folder, table.file, table.module))
-        check_names(table.params, list(model.params), "grounded.toml: [model] params: parameter")
-        return model.with_values(table.params)
+        return model_in(load_module(self.folder, table.file, table.module))
 
     @cached_property
     def task(self) -> Task:
         """The task with the crude model: it judges trials."""
         return build_task(self.config, self.base_model, self.folder)
+
+    @property
+    def origin(self) -> Task:
+        """The task with the model of model.py as it is: nothing fitted, nothing adopted."""
+        return build_task(self.config, self._written, self.folder)
 
     @cached_property
     def planner(self) -> Planner:

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from grounded.diagnosis.error_report import ChannelParts, Parts, Split
 from grounded.diagnosis.pictures import accuracy_figure, credit_figure, where_figure
 from grounded.diagnosis.report import Diagnosis, TrialValue
+from grounded.diagnosis.verdict import told_apart
 from grounded_trials.report.diagnosis_words import (
     gap_sentence,
     utility_sentence,
@@ -103,7 +104,7 @@ def _unit(diagnosis: Diagnosis, value: TrialValue) -> str:
 def _alike(diagnosis: Diagnosis) -> list[Block]:
     """Ties, and effects that would do nearly the same as one that is claimed."""
     found = [
-        Block("text", f"These data can’t tell apart: {', '.join(group)}.")
+        Block("text", f"{told_apart(group, diagnosis.equivalent)}.")
         for group in diagnosis.indistinguishable
     ]
     if diagnosis.lookalikes:
@@ -130,8 +131,8 @@ def _made_of(splits: Mapping[str, Split]) -> list[Block]:
     rows = [(words, *_shares(splits[key].whole)) for key, words in named.items()]
     main = "horizon" if "horizon" in named else next(iter(named))
     by_state = [(parts.name, *_shares(parts)) for parts in splits[main].channels]
-    repeated = any(one.irreducible_from == "repeats" for one in splits.values())
-    source = "repeated trials" if repeated else "the estimated noise"
+    known = {"repeats": "repeated trials", "alike": "trials whose commands agree to 2 %"}
+    source = known.get(splits[main].irreducible_from, "the estimated noise")
     words = (
         "Explained is the share of the squared error that the effects take away on trials that "
         "were held out, unexplained what they leave above the noise; how large the noise is comes "

@@ -1,0 +1,102 @@
+"""How sure the values of a fit are: the largest of three answers.
+
+The Fisher information believes the noise model. The jackknife asks the trials, each left out once
+(Efron & Tibshirani 1993, ch. 11). But trials of one manoeuvre share what is wrong with the model,
+and agree on a value that it bends. So the stretches of time are asked too: with s_p and G_p what a
+stretch of all trials has of the score and the information,
+
+    sum_p s_p' G_p^-1 s_p ~ chi-squared
+
+where model and noise are right. Where chance hardly makes as much, the values change along the
+manoeuvre, and the jackknife that leaves out one stretch of all trials at once counts as well: a
+sandwich that is clustered by time (Cameron & Miller, A practitioner's guide to cluster-robust
+inference, 2015, its CR3). A value that the manoeuvre has from one stretch alone says nothing there.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from grounded.diagnosis.likelihood.fitted import Fitted, leave_one_out
+from grounded.diagnosis.likelihood.linearise import gains_of, linearise
+from grounded.diagnosis.likelihood.predictor import Predictor
+from grounded.filter import kalman
+from grounded.frozen import Array
+
+STRETCHES = (5, 10, 20)  # of equal time: misfits are as long as they are
+LONG = 4  # steps that a stretch has at least
+CHANCE = 0.01  # of scores that differ so much, below which the model is taken to be wrong
+LEAST = 0.2  # of the information that must be left without a stretch, or counts as left
+
+
+def standard_deviations(predictor: Predictor, fit: Fitted, trial_of: Array) -> tuple[Array, Array]:
+    """Of every free value: standard deviation, half-width of the 95 % interval, (C,) each.
+
+    Args:
+        predictor: of the data of the fit.
+        fit: at its most likely values.
+        trial_of: what each run is left out with (B,).
+    """
+    if fit.gram.shape[-1] == 0:
+        return np.zeros(0), np.zeros(0)
+    std = _fisher(fit.gram.sum(axis=0) + np.diag(fit.prior))
+    half = 1.96 * std
+    shifts, _ = leave_one_out(fit, trial_of)
+    for some in (shifts, *_by_stretch(predictor, fit)):
+        if len(some) >= 3:
+            scatter = np.sqrt((len(some) - 1) * some.var(axis=0))
+            std = np.maximum(std, scatter)
+            half = np.maximum(half, _student(len(some) - 1) * scatter)
+    return std, half
+
+
+def _student(freedom: int) -> float:
+    from scipy.special import stdtrit
+
+    return float(stdtrit(freedom, 0.975))
+
+
+def _by_stretch(predictor: Predictor, fit: Fitted) -> list[Array]:
+    """Changes of all values without each stretch, (P, C) a partition; none where all agree."""
+    from scipy.special import chdtrc
+
+    data = predictor.data
+    F, d, r = linearise(predictor, fit.hypothesis, fit.track)
+    gains = gains_of(predictor, fit.hypothesis, fit.noise, fit.track, F)
+    white = kalman.innovations(gains, d, r)[0]
+    axes = _whitener(fit.gram.sum(axis=0) + np.diag(fit.prior))
+    columns, steps = white[..., 1:] @ axes, np.rint(data.time / data.dt).astype(int)
+    length, found = int(data.lengths.max()), []
+    for count in (c for c in STRETCHES if length >= LONG * c and axes.size):
+        part = steps * count // length
+        s, G = np.zeros((count, axes.shape[1])), np.zeros((count, *2 * axes.shape[1:]))
+        for p in range(count):
+            own = columns[part == p].reshape(-1, axes.shape[1])
+            s[p] = own.T @ white[..., 0][part == p].ravel()
+            G[p] = own.T @ own
+        share, turned = np.linalg.eigh(G)
+        along = np.einsum("pij,pi->pj", turned, s)
+        told = share > 1e-6
+        surprise = float((along[told] ** 2 / share[told]).sum())
+        if chdtrc(max(int(told.sum()) - len(s[0]), 1), surprise) < CHANCE:
+            moved = np.einsum("pij,pj->pi", turned, along / np.maximum(1 - share, LEAST))
+            found.append(moved @ axes.T)
+    return found
+
+
+def _whitener(information: Array) -> Array:
+    """A (C, K) with A' information A = 1, over all directions in which something is known."""
+    scale = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+    size, axes = np.linalg.eigh(information * np.outer(scale, scale))
+    known = size > 1e-10
+    return np.asarray(scale[:, None] * axes[:, known] / np.sqrt(size[known]))
+
+
+def _fisher(information: Array) -> Array:
+    """Standard deviations from an information matrix (C, C), each unknown in units of its own.
+
+    A direction in which nothing is known makes all that take part in it as good as unknown.
+    """
+    scale = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+    size, axes = np.linalg.eigh(information * np.outer(scale, scale))
+    return np.asarray(scale * np.sqrt((axes**2 / np.maximum(size, 1e-12)).sum(axis=1)))
