@@ -4,7 +4,6 @@ import os
 import pickle
 import subprocess
 import sys
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -238,18 +237,6 @@ def test_the_plant_runs_the_runner():
     made = task.policy(np.full((60, 2), 0.3), np.zeros((60, 2, 5)), np.zeros((60, 5)))
     trial = Plant(other(task.model)).run(made, {}, np.random.default_rng(0))
     assert trial.steps == 60 and (trial.inputs == 0.3).all()
-
-
-def test_a_call_is_quick():
-    """Below 20 us on a quiet machine (benchmarks); here the best of several, with room."""
-    p = policy(H=200, depths=(2, 2))
-    s, best = np.array([0.1, 0.2]), np.inf
-    for _ in range(7):
-        run, start = Runner(p), time.perf_counter()
-        for t in range(200):
-            run.action(t * 0.1, s)
-        best = min(best, (time.perf_counter() - start) / 200)
-    assert best < 60e-6
 
 
 # load

@@ -35,10 +35,12 @@ def test_every_probe_that_is_offered_is_handed_over(diagnosed):
     w, found = diagnosed
     assert found.probe and found.probe in found.next_trial
     reached = w.candidate(found.probe)[0].predicted_states[:, 0]
+    handed = []
     for room in (0.5, 0.05, 0.0):
         bounded(w, -1.0, reached.max() + room)
-        identity, _ = offered(w, found)
-        assert checked_candidate(w, identity).overridden == ()
+        if identity := offered(w, found)[0]:  # "": with so little room it would tell nothing
+            handed.append(checked_candidate(w, identity))
+    assert len(handed) >= 2 and all(one.overridden == () for one in handed)
     bounded(w, reached.min() - 0.01, reached.max() + 0.5)
     identity, sentence = offered(w, found)
     assert identity == "" and "[safety]" in sentence
