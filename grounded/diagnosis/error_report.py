@@ -200,10 +200,10 @@ class Remainder(Document):
         where = "" if self.region is None else f", mostly where {self.region.when}"
         if not math.isfinite(self.error):
             return f"{self.channel} is off by {number(self.size)} {self.unit} rms{where}"
-        noise = f" ({number(self.floor)} is noise)" if math.isfinite(self.floor) else ""
-        unit = "" if self.error_unit == "1" else f" {self.error_unit}"
+        off, floor = (measured(value, self.error_unit) for value in (self.error, self.floor))
+        noise = f" (noise: {floor})" if math.isfinite(self.floor) else ""
         ahead = f"{number(self.horizon_s)} s ahead"
-        return f"{self.channel} is still off by {number(self.error)}{unit} {ahead}{noise}{where}"
+        return f"{self.channel} is still off by {off} {ahead}{noise}{where}"
 
 
 def number(value: float) -> str:

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
-from grounded.diagnosis.error_report import Credit, Remainder, RulerRow, number
+from grounded.diagnosis.error_report import Credit, Remainder, RulerRow, measured, number
 from grounded.diagnosis.hypotheses.leftover import Leftover
 from grounded.diagnosis.report import Estimate, Kind, Ranked, Unconfirmed, Verdict, quantity
 from grounded.diagnosis.validation.claims import Claims
@@ -115,7 +115,7 @@ def improvement(rows: Sequence[RulerRow]) -> str:
         best = sorted((n for n in gains if gains[n] > SHOWS), key=lambda n: -gains[n])
         parts = [
             f"{name} by {_measured(row, name, row.with_effects[name])} instead of "
-            f"{number(row.crude[name])}{_noise(row, name)}"
+            f"{_measured(row, name, row.crude[name])}{_noise(row, name)}"
             for name in best[: NAMED - 1]
         ]
         if parts:
@@ -141,10 +141,8 @@ def worsened(rows: Sequence[RulerRow]) -> str:
     ratio, row, name = max(losses, key=lambda loss: loss[0], default=(0.0, None, ""))
     if row is None or not ratio > 1 + SHOWS:
         return ""
-    value = _measured(row, name, row.with_effects[name])
-    return (
-        f"{_ahead(row)} miss {name} by {value} instead of {number(row.crude[name])}: that is worse."
-    )
+    now, then = (_measured(row, name, errors[name]) for errors in (row.with_effects, row.crude))
+    return f"{_ahead(row)} miss {name} by {now} instead of {then}: that is worse."
 
 
 def floor(row: RulerRow | None) -> str:
@@ -181,13 +179,12 @@ def rest(rows: Sequence[RulerRow]) -> str:
 
 
 def _measured(row: RulerRow, name: str, value: float) -> str:
-    unit = row.unit_by_channel[name]
-    return number(value) if unit == "1" else f"{number(value)} {unit}"
+    return measured(value, row.unit_by_channel[name])
 
 
 def _noise(row: RulerRow, name: str) -> str:
     value = row.noise_floor.get(name, math.nan)
-    return f" (noise: {number(value)})" if math.isfinite(value) else ""
+    return f" (noise: {_measured(row, name, value)})" if math.isfinite(value) else ""
 
 
 def next_trial(

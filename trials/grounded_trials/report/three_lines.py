@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from grounded.diagnosis.error_report import Remainder, RulerRow, measured
+from grounded.diagnosis.error_report import RulerRow, measured
 from grounded.diagnosis.report import Diagnosis
 from grounded.diagnosis.verdict import rest, told_apart, worsened
 from grounded.task import Task
@@ -89,17 +89,8 @@ def _open(diagnosis: Diagnosis) -> str:
     found = [told_apart(group, diagnosis.equivalent) for group in diagnosis.indistinguishable[:1]]
     found += [one.sentence() for one in diagnosis.unconfirmed[:1]]
     if diagnosis.leftover:
-        found.append(_left(diagnosis.leftover[0], len(diagnosis.leftover) - 1))
+        others = len(diagnosis.leftover) - 1
+        more = f"; {count(others, 'more state')}" * bool(others)
+        found.append(f"still unexplained: {diagnosis.leftover[0].sentence()}{more}")
     text = "; ".join(found) or rest(diagnosis.prediction_error) or "nothing is left above the noise"
     return f"{text[:1].upper()}{text[1:]}."
-
-
-def _left(one: Remainder, others: int) -> str:
-    if not math.isfinite(one.error):
-        text = one.sentence()
-    else:
-        unit = shown(one.error_unit)
-        noise = f" (noise: {measured(one.floor, unit)})" if math.isfinite(one.floor) else ""
-        where = "" if one.region is None else f", mostly where {one.region.when}"
-        text = f"{one.channel} is off by {measured(one.error, unit)}{noise}{where}"
-    return f"still unexplained: {text}" + f"; {count(others, 'more state')}" * bool(others)

@@ -335,5 +335,13 @@
     }, 1000);
   }
   for (const plot of plots) seen.observe(plot);
+  // The others later, one at a time: a page that is saved or scrolled fast is whole.
+  const others = [...plots];
+  const rest = () => {
+    const plot = others.shift();
+    if (plot && !plot.drawn && plot.offsetParent) draw(plot);
+    if (others.length) setTimeout(rest, 30);
+  };
+  addEventListener("load", () => setTimeout(rest, 300));
   document.documentElement.dataset.ready = "yes";
 })();
