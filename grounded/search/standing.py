@@ -259,7 +259,7 @@ def standing(
         why = f"{why}: {own} is the result"
         return replace(now, phase="converged", sentence=why, ending=ending)
     sentence = f"improve on {own} with {step}"
-    if why := _suspicion(history, incumbent):
+    if why := _suspicion(history, incumbent, model):
         then = NextCommand("diagnose")
         return replace(now, step=step, way=way, sentence=f"{sentence}; {why}", then=then)
     return replace(now, step=step, way=way, sentence=sentence)
@@ -283,8 +283,10 @@ def _hardly(history: tuple[Tried, ...], tolerance: float, model: str) -> tuple[E
     )
 
 
-def _suspicion(history: tuple[Tried, ...], incumbent: Tried) -> str:
+def _suspicion(history: tuple[Tried, ...], incumbent: Tried, model: str) -> str:
     """Why a diagnosis helps more than the next trial, "" where nothing says so."""
+    if history[-1].candidate.model != model:
+        return ""  # it was changed since: the next trial tells what that was worth
     lost = 0
     for tried in history:
         lost = 0 if tried is incumbent or tried.accepted is None else lost + 1
@@ -300,7 +302,7 @@ def _suspicion(history: tuple[Tried, ...], incumbent: Tried) -> str:
 
 
 def wild(tried: Tried) -> bool:
-    """Whether a model's own policy did so much worse than promised that its loop is unstable."""
+    """Whether a model's own policy did so much worse than promised that its bias says little."""
     predicted = tried.candidate.predicted_utility
     worse = predicted - tried.utility > WILD * max(abs(predicted), 1e-9)
     return bool(tried.utilities) and not tried.candidate.base and worse

@@ -24,7 +24,7 @@ def test_what_got_worse_is_said_of_the_channel_that_lost_most():
     whole = row({"x": 2.12, "v": 0.5}, {"x": 3.79, "v": 0.3}, whole_trial=True, horizon_s=60.0)
     said = worsened((short, whole))
     assert "x" in said.split() and "3.8 m" in said and "2.1 m" in said
-    assert "0.6 m/s" in worsened((short,))
+    assert "0.60 m/s" in worsened((short,))
 
 
 def test_nothing_is_said_where_nothing_lost_or_only_within_the_noise():

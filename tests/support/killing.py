@@ -26,7 +26,7 @@ def child(arguments):
 
 def main():
     seed, kills, longest, folder, *command = sys.argv[1:]
-    for name in ("main", "learn", "propose", "ingest", "run"):
+    for name in ("main", "learn", "propose", "ingest"):
         import_module(f"grounded_cli.{name}")
     for name in ("ingest", "running", "proposing"):
         import_module(f"grounded_trials.workspace.{name}")

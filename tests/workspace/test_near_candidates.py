@@ -14,7 +14,7 @@ from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace.ingest import ingest_log
 from grounded_trials.workspace.proposing import propose_in
 from grounded_trials.workspace.running import run_candidate
-from grounded_trials.workspace.trial_check import commands, evidence, follows, what_ran
+from grounded_trials.workspace.trial_check import evidence, follows, what_ran
 from workspaces import CONFIG, make
 
 FULL = CONFIG.replace("[search]", '[search]\nstep = "full"\nrerun_incumbent = false')
@@ -31,7 +31,7 @@ def ladder(tmp_path_factory):
     lost = first.states + np.linspace(0, 1, len(first.states))[:, None]
     for k in range(5):
         made = propose_in(w).candidate
-        sent = commands(made.policy, lost[None, :-1], made.policy.past)[0]
+        sent = made.policy.commands(lost[None, :-1], made.policy.past)[0]
         trial = replace(first, states=lost, inputs=sent, candidate=made.id)
         path = folder / f"{k}.mcap"
         write_trial(path, trial, {"kind": "trial", "task": w.task.hash})
@@ -54,7 +54,7 @@ def noisy(made, share, seed, *, other):
     felt = (acted if other else logged)[None, :-1]
     return Trial(
         states=logged,
-        inputs=commands(made.policy, felt, made.policy.past)[0],
+        inputs=made.policy.commands(felt, made.policy.past)[0],
         dt=made.policy.dt,
         state_names=made.policy.state_names,
         input_names=made.policy.input_names,

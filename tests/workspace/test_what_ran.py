@@ -19,7 +19,7 @@ from grounded_trials.store.trial_file import read_trial, write_trial
 from grounded_trials.workspace.ingest import ingest_log
 from grounded_trials.workspace.proposing import propose_in, standing_in
 from grounded_trials.workspace.running import run_candidate
-from grounded_trials.workspace.trial_check import commands, suspicion, what_ran
+from grounded_trials.workspace.trial_check import suspicion, what_ran
 from workspaces import CONFIG, make
 
 NOISY = CONFIG + "[system.noise.measurement]\nx = 0.002\nv = 0.01\n"
@@ -81,7 +81,7 @@ def test_a_run_on_states_of_varying_age_with_noise_of_its_own_is_recognised(lear
             logged = replace(
                 trial,
                 states=clean + noise * rng.normal(size=clean.shape),
-                inputs=commands(own.policy, acted[None], own.policy.past)[0],
+                inputs=own.policy.commands(acted[None], own.policy.past)[0],
             )
             assert what_ran(learnt.task, logged, own, [own]) == ""
 
