@@ -25,15 +25,15 @@ def in_doubt(incumbent: Tried, loser: Tried, most: int) -> bool:
 
     A lucky winner blocks every step from there on. So a loss within two standard errors of the
     incumbent's own scatter sends it out once more, until it has `most` trials: one for each loss.
-    After one trial the scatter is taken to be that of chi-squared with one degree of freedom, the
-    widest that a sum of squares has: sqrt(2) of the utility itself. Where trials repeat themselves
-    exactly, it costs one trial a winner.
+    After one trial the scatter is taken to be half of the utility, that of chi-squared with eight
+    degrees of freedom: a loss by more than 1.4 times the best cost is believed at once. Where
+    trials repeat themselves exactly, it costs one trial a winner.
     """
     if not np.isfinite(loser.utility) or len(incumbent.trials) >= most:
         return False
     scatter = incumbent.standard_error * np.sqrt(len(incumbent.trials))
     if len(incumbent.trials) == 1:
-        scatter = np.sqrt(2) * abs(incumbent.utility)
+        scatter = 0.5 * abs(incumbent.utility)
     error = scatter * np.sqrt(1 / len(incumbent.trials) + 1 / len(loser.trials))
     return not incumbent.utility - loser.utility > 2 * error
 

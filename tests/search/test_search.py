@@ -193,7 +193,7 @@ def test_a_lucky_winner_loses_its_luck():
     honest = [story.task.utility(t) for t in story.trials]
     assert honest[1] > honest[0]
     lucky = replace(story.trials[1], candidate="c0001")
-    nearly = 0.2 * lucky.states + 0.8 * np.nan_to_num(TASK.target)
+    nearly = 0.75 * lucky.states + 0.25 * np.nan_to_num(TASK.target)
     lucky = replace(lucky, states=nearly)
     story.trials[0] = lucky
     assert story.task.utility(lucky) > honest[1]

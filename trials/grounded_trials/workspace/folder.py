@@ -152,16 +152,7 @@ class Folder:
 
     def forget(self) -> None:
         """Everything is read again when it is asked for next."""
-        for name in (
-            "config",
-            "_written",
-            "base_model",
-            "task",
-            "planner",
-            "_trials",
-            "noted",
-            "_index",
-        ):
+        for name in "config _written base_model task planner _trials noted _index".split():
             vars(self).pop(name, None)
 
     def forget_trials(self) -> None:
