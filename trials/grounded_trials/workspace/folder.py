@@ -48,6 +48,7 @@ if TYPE_CHECKING:
 
 MANY = 200  # trials: fewer are all read, more are indexed
 _ID = re.compile(r"c\d{4,}")
+CACHED = ("config", "_written", "base_model", "task", "planner", "_trials", "noted", "_index")
 
 
 @dataclass(frozen=True)
@@ -152,7 +153,7 @@ class Folder:
 
     def forget(self) -> None:
         """Everything is read again when it is asked for next."""
-        for name in "config _written base_model task planner _trials noted _index".split():
+        for name in CACHED:
             vars(self).pop(name, None)
 
     def forget_trials(self) -> None:
