@@ -163,19 +163,23 @@ def rest(rows: Sequence[RulerRow]) -> str:
         (
             row.with_effects[name] / noise,
             row.with_effects[name] / max(row.crude[name], 1e-300),
-            name,
+            f"{name} {_when(row)}",
         )
         for row in rows
         for name, noise in row.noise_floor.items()
         if noise > 0 and math.isfinite(row.with_effects[name])
     ]
-    times, share, name = max(found, default=(0.0, 0.0, ""))
+    times, share, where = max(found, default=(0.0, 0.0, ""))
     if not times > ABOVE:
         return ""
-    text = f"what is left in {name} is {times:.2g} times the noise"
+    text = f"what is left in {where} is {times:.2g} times the noise"
     if share < MATTERS:
         return f"{text} but {100 * share:.1g} % of what the crude model missed"
-    return f"{text}, too little to stand out of what the state spans or of its scatter"
+    return f"{text}, yet little beside how far the state moves, or no more than trials differ by"
+
+
+def _when(row: RulerRow) -> str:
+    return "over whole trials" if row.whole_trial else f"{number(row.horizon_s)} s ahead"
 
 
 def _measured(row: RulerRow, name: str, value: float) -> str:

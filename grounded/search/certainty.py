@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from grounded.search.candidate import Tried
 
 
+FEW = 4.0  # degrees of freedom, with which two standard errors are no certainty
+
+
 def repeated_exactly(trials: Sequence[Trial]) -> bool:
     """Whether two trials of a candidate have the very same states."""
     return any(a.repeats(b) for a, b in pairwise(trials))
@@ -73,7 +76,7 @@ def last_improvement(history: Sequence[Tried]) -> str:
     probability = student(gain / error, freedom)
     return (
         f"the last gain is {gain:.3g} +- {error:.2g}: an improvement with probability "
-        f"{probability:.2f}"
+        f"{probability:.2f}" + ", for so few repeats" * (freedom < FEW)
     )
 
 

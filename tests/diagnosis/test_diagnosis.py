@@ -273,7 +273,7 @@ def test_the_cause_that_makes_most_is_named_first(effect_first):
     damped, moved = found.sentence.find("damped"), found.sentence.find("m should be 1.2 kg")
     assert found.kind == "effect" and min(damped, moved) >= 0
     assert (damped < moved) is effect_first
-    assert "omega by 0.1 rad/s instead of 0.5 (noise: 0.09)" in found.sentence
+    assert "omega by 0.10 rad/s instead of 0.50 rad/s (noise: 0.090 rad/s)" in found.sentence
 
 
 def test_leftovers_that_are_not_named_are_counted():
