@@ -22,6 +22,7 @@ from grounded.frozen import Array
 MENTIONED = 2
 MOST = 0.8  # of all that it does, which few trials hold
 FEW = 4  # one of so many trials
+SURE = 2.0  # standard deviations that one of its numbers is from zero
 
 
 def unconfirmed(claims: Claims, doubtful: Sequence[Doubtful]) -> tuple[Unconfirmed, ...]:
@@ -46,6 +47,8 @@ def _seen(claims: Claims, one: Doubtful) -> Unconfirmed | None:
     regions = by_region(acts[..., None], claims.predictor, one.fit, 1)
     i = one.fit.hypothesis.names.index(one.name)
     params, begin = claims.estimates(one.fit)[i], data.time[0, run]
+    if not any(abs(e.value) > SURE * e.std for e in params.values()):
+        return None  # no size is known that it would have
     return Unconfirmed(
         one.name,
         meaning(one.fit.hypothesis.effects[i], params),

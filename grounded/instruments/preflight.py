@@ -41,6 +41,7 @@ OFF = 0.03  # of a scale, beyond both of its brackets
 DEGREES = 180 / np.pi
 UNIT = 0.1  # relative, from which a scale is taken for one of degrees
 TURNED_AWAY = np.deg2rad(20)  # what no side slip makes
+COPY = 0.99  # coherence of two inputs that are one: two motors of one vehicle have 0.96
 SAME_WAY = 0.95  # of a speed and the way: below it something drifts or slips
 AT_LIMITS = 0.1  # of the time
 
@@ -246,7 +247,7 @@ def _inputs(subject: Task | Model, trials: Sequence[Trial]) -> Iterator[Finding]
         if fixed[i] or fixed[j]:
             continue
         lag = lag_between(list(zip(columns[i], columns[j], strict=True)), trials[0].dt)
-        if lag is not None and lag.coherence > 0.95 and 0.9 < lag.sign * lag.low < 1.1:
+        if lag is not None and lag.coherence > COPY and 0.9 < lag.sign * lag.low < 1.1:
             yield _copy(names[i], names[j], lag)
 
 

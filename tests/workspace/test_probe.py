@@ -1,5 +1,6 @@
 """The candidate that a diagnosis offers next is one that `run` and `export` hand over."""
 
+import numpy as np
 import pytest
 
 from grounded.effects import Library
@@ -51,3 +52,12 @@ def test_people_export_a_probe(diagnosed, tmp_path):
     assert probe_command(w, found.probe) == NextCommand("run", (found.probe,))
     bare = make(tmp_path / "w", config=CONFIG.partition("[system]")[0])
     assert probe_command(bare, "c0004") == NextCommand("export", ("c0004", "--runner"))
+
+
+def test_without_safety_a_probe_stays_near_where_trials_have_been(diagnosed):
+    """Seen on a quadrotor: doublets that sharpen its mass, predicted to end 100 m below ground."""
+    w, found = diagnosed
+    been = np.vstack([trial.states for trial in w.task_trials()])
+    room = 0.5 * np.ptp(been, axis=0) + 1e-9
+    made = w.candidate(found.probe)[0].predicted_states
+    assert (made > been.min(axis=0) - room).all() and (made < been.max(axis=0) + room).all()

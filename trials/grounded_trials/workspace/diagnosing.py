@@ -173,9 +173,10 @@ def _probe(
     base = planner.widened(replace(own, low=low, high=high))
     ties = {*found.indistinguishable} - {*found.equivalent}
     offer = write or bool(ties)
-    why = "none of those tried stays inside [safety]"
+    why = "none of those tried stays inside [safety], or near where trials have been"
+    plan = _near(planner.plan, trials)
     for room in (0 * strays, strays):
-        inside = _narrower(planner.plan, room.max(axis=0))
+        inside = _narrower(plan, room.max(axis=0))
         made = None if inside is None else probe(inside, base, found, trials, library)
         if made is None:
             break
@@ -211,6 +212,25 @@ def _candidate_of(workspace: Folder, policy: Policy, base: str) -> Candidate:
         predicted_states=predicted.states[:, : planner.task.model.n],
         predicted_inputs=predicted.inputs,
         predicted_utility=predicted.utility,
+    )
+
+
+def _near(task: Task, trials: Sequence[Trial]) -> Task:
+    """A task whose states without [safety] stay near where trials have been: half as far again.
+
+    Doublets that sharpen a number have flown a quadrotor 100 m below the ground.
+    """
+    been = np.vstack([trial.states[np.isfinite(trial.states).all(axis=1)] for trial in trials])
+    low, high = been.min(axis=0), been.max(axis=0)
+    free = task.model.angle_mask | (np.arange(task.model.n) >= been.shape[1])
+    room = np.where(free, np.inf, 0.5 * (high - low))
+    own_low, own_high = task.safety_low, task.safety_high
+    assert own_low is not None and own_high is not None
+    unset = ~(np.isfinite(own_low) | np.isfinite(own_high))
+    return replace(
+        task,
+        safety_low=np.where(unset, low - room, own_low),
+        safety_high=np.where(unset, high + room, own_high),
     )
 
 
