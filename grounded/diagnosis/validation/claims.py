@@ -168,7 +168,7 @@ class Claims:
                     effect=f"parameter:{name}",
                     params={"d": d},
                     fixed={},
-                    evidence=blame.nats,
+                    evidence=blame.nats if blame.nats > ENOUGH else math.nan,  # a parabola errs
                     gap_after=after,
                     shrinkage=1 - after / before if before > 0 else 0.0,
                     claimed=not self.known.no_cause,
