@@ -16,7 +16,6 @@ from grounded.instruments.finding import Finding
 from grounded_trials.wording import count, figure, percent, shown, with_unit
 
 MOST = 3  # parameters that are named
-HARDLY = 0.01  # of a parameter: a change that is not worth a word
 
 
 def error_lines(diagnosis: Diagnosis, before: Mapping[str, float]) -> list[tuple[str, str]]:
@@ -139,34 +138,17 @@ def calibrated_sentence(diagnosis: Diagnosis, before: Mapping[str, float]) -> st
     """The model's own parameters that were fitted beside the effects, most changed first."""
     if all(name.startswith("parameter:") for name in diagnosis.effects):
         return ""
-    moved = moved_parameters(diagnosis, before)
-    return f"calibrated beside them: {moved}" if moved else ""
-
-
-def moved_parameters(
-    diagnosis: Diagnosis, before: Mapping[str, float] | None = None, brief: bool = False
-) -> str:
-    """`tau 0.4 -> 0.48 s (and 5 more)`, or `tau +19 %, 5 more`: those that changed most first.
-
-    Args:
-        diagnosis: what was found.
-        before: the values of the model's parameters before it, where it does not say them.
-        brief: by how many percent they changed, without those that hardly did.
-    """
     made = diagnosis.made
-    moved, then = [], {**(before or {}), **(made.nominal if made is not None else {})}
+    moved, then = [], {**before, **(made.nominal if made is not None else {})}
     for name, e in diagnosis.parameters.items():
         old = then.get(name, math.nan)
         if abs(e.value - old) > 1e-6 * max(abs(e.value), abs(old)):
-            change = (e.value - old) / abs(old) if old else math.inf
+            change = abs(e.value - old) / abs(old) if old else math.inf
             text = with_unit(f"{name} {figure(old, 3)} -> {figure(e.value, 3)}", e.unit)
-            short = f"{name} {100 * change:+.0f} %" if old else text
-            if not brief or abs(change) >= HARDLY:
-                moved.append((-abs(change), short if brief else text))
-    named = [text for _, text in sorted(moved)[:MOST]]
+            moved.append((-change, text))
+    named = ", ".join(text for _, text in sorted(moved)[:MOST])
     others = len(moved) - MOST
-    more = (f", {others} more" if brief else f" (and {others} more)") * (others > 0)
-    return ", ".join(named) + more
+    return f"calibrated beside them: {named}{f' (and {others} more)' * (others > 0)}" * bool(moved)
 
 
 def utility_sentence(diagnosis: Diagnosis) -> str:

@@ -9,7 +9,6 @@ from grounded.diagnosis.error_report import RulerRow, measured
 from grounded.diagnosis.report import Diagnosis
 from grounded.diagnosis.verdict import rest, told_apart, worsened
 from grounded.task import Task
-from grounded_trials.report.diagnosis_words import moved_parameters
 from grounded_trials.report.findings import weighed_groups
 from grounded_trials.wording import count, shown
 
@@ -37,9 +36,6 @@ def _wrong(diagnosis: Diagnosis) -> str:
     for clause, credit in zip(diagnosis.verdict.causes, diagnosis.credit, strict=True):
         if told and (len(told) == CAUSES or credit.share < SMALL):
             small += 1
-        elif credit.of == "calibration":
-            named = moved_parameters(diagnosis, brief=True)
-            told.append("the model's own parameters are off" + f": {named}" * bool(named))
         else:
             told.append(clause)
     text = "; ".join(told) + f"; {count(small, 'smaller cause')}" * bool(small)
