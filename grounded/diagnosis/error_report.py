@@ -201,7 +201,7 @@ class Remainder(Document):
         if not math.isfinite(self.error):
             return f"{self.channel} is off by {number(self.size)} {self.unit} rms{where}"
         off, floor = (measured(value, self.error_unit) for value in (self.error, self.floor))
-        noise = f" (noise: {floor})" if math.isfinite(self.floor) else ""
+        noise = f" (noise: {floor})" if 0 < self.floor < math.inf else ""
         ahead = f"{number(self.horizon_s)} s ahead"
         return f"{self.channel} is still off by {off} {ahead}{noise}{where}"
 

@@ -188,7 +188,7 @@ def _measured(row: RulerRow, name: str, value: float) -> str:
 
 def _noise(row: RulerRow, name: str) -> str:
     value = row.noise_floor.get(name, math.nan)
-    return f" (noise: {_measured(row, name, value)})" if math.isfinite(value) else ""
+    return f" (noise: {_measured(row, name, value)})" if 0 < value < math.inf else ""
 
 
 def next_trial(

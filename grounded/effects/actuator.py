@@ -123,8 +123,8 @@ saturation = InputFamily(
 input_curve = InputFamily(
     name="input_curve",
     equation="u_eff = (1 + a sign(u) + b (|u| / U - 1/2)) u",
-    sentence="{target} acts[ {a%more|less} to its positive side, and] {b%more|less} at its end "
-    "than about zero",
+    sentence="{target} acts[ {a%more|less} to its positive side, and] {b%more|less} at full "
+    "deflection than near zero",
     targets=places.inputs,
     quantities=_curve,
     lookalikes=("input_gain", "input_bias", "saturation", "dead_zone"),
