@@ -9,6 +9,7 @@ finds the first.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -146,7 +147,7 @@ def _recognised(
     if not ran or sha256(read.data)[:DIGITS] in workspace.store.digests():
         return read
     own, _ = workspace.candidate(ran)
-    candidates, task = workspace.read().candidates, workspace.task
+    candidates, task = _latest(workspace), workspace.task
     why, other = suspicion(task, interpolate_gaps(read.trial).trial, own, candidates)
     log = recording(workspace, path) if foreign else None
     found = log.start_of(own.policy) if log else None
@@ -162,6 +163,8 @@ def _recognised(
         other_why, name = suspicion(task, rival, own, candidates)
         why, other = (other_why, name) if name else (why or other_why, other)
     if why and (candidate is None or (log and not (found and found.opens_alike))):
+        if other and workspace.candidate(other)[1].get("task") != task.hash:
+            other = ""  # it can't be judged by this one
         instead = ("--candidate", other) if other else ("--data",)
         what = f"; with --candidate {other} for what it seems to have run" * bool(other)
         force = f"with [log.span] start = SECONDS and --candidate {ran}" if log else ""
@@ -174,12 +177,21 @@ def _recognised(
     return replace(read, warnings=(*read.warnings, why)) if why else read
 
 
+def _latest(workspace: Folder) -> list[Candidate]:
+    """The latest candidates, probes and those of earlier tasks too: any may have been run."""
+    found = []
+    for identity in workspace.candidate_ids()[-OTHERS:]:
+        with suppress(GroundedError):  # a damaged file was not run now
+            found.append(workspace.candidate(identity)[0])
+    return found
+
+
 def _rival(
     log: Recording, found: Start | None, own: str, candidates: Sequence[Candidate]
 ) -> Trial | None:
     """The log from where another candidate fits it much better than the own one anywhere."""
     best, bound = None, SAME * found.apart if found and found.alike else np.inf
-    for one in candidates[-OTHERS:]:
+    for one in candidates:
         start = log.start_of(one.policy) if one.id != own else None
         if start is not None and start.alike and start.apart < bound:
             best, bound = log.trial_from(start.seconds), start.apart

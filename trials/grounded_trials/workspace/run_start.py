@@ -24,7 +24,7 @@ from grounded_trials.logs.log_table import log_mapping, mapped_signals
 from grounded_trials.logs.resample import Gridded, Span, to_grid
 from grounded_trials.logs.signals import Series
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.trial_check import LEAST, follows
+from grounded_trials.workspace.trial_check import LEAST, UNLIKE, follows
 
 TRIED = 5  # instants at which the commands fit best
 FINEST = 8  # parts of a step, between which the start is sought
@@ -81,6 +81,8 @@ class Recording:
         Args:
             policy: what is sought, for the states and inputs of this log.
         """
+        if (policy.state_names, policy.input_names) != self.names or policy.dt != self.dt:
+            return None
         apart, found = self._apart(policy), list[Start]()
         left = apart.copy()
         while len(found) < TRIED and np.isfinite(left).any():
@@ -90,8 +92,8 @@ class Recording:
             trial = self.trial_from(seconds)
             fit = None if trial is None else follows(policy, trial.until(policy.horizon), 0)
             if fit is not None:
-                opens = fit.alike or fit.until_s >= LEAST * self.dt
-                alike = fit.alike and not fit.late
+                alike = fit.alike and not fit.late and apart[k] < UNLIKE
+                opens = alike or fit.until_s >= LEAST * self.dt
                 found.append(Start(seconds, float(apart[k]), alike, opens))
         return min(found, key=lambda one: (not one.alike, one.apart), default=None)
 
