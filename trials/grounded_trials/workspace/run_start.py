@@ -24,7 +24,7 @@ from grounded_trials.logs.log_table import log_mapping, mapped_signals
 from grounded_trials.logs.resample import Gridded, Span, to_grid
 from grounded_trials.logs.signals import Series
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.trial_check import LEAST, UNLIKE, follows
+from grounded_trials.workspace.trial_check import FINE, LEAST, UNLIKE, follows
 
 TRIED = 5  # instants at which the commands fit best
 FINEST = 8  # parts of a step, between which the start is sought
@@ -91,8 +91,8 @@ class Recording:
             seconds = self._on_step(policy, self.first + k * self.dt / self.parts)
             trial = self.trial_from(seconds)
             fit = None if trial is None else follows(policy, trial.until(policy.horizon), 0)
-            if fit is not None:
-                alike = fit.alike and not fit.late and apart[k] < UNLIKE
+            if trial is not None and fit is not None:
+                alike = fit.alike and not fit.late and _close(policy, trial)
                 opens = alike or fit.until_s >= LEAST * self.dt
                 found.append(Start(seconds, float(apart[k]), alike, opens))
         return min(found, key=lambda one: (not one.alike, one.apart), default=None)
@@ -143,6 +143,20 @@ class Recording:
             known = here < len(sent)
             apart[ks] = (off * known).sum(axis=1) / known.sum(axis=1)
         return apart
+
+
+def _close(policy: Policy, trial: Trial) -> bool:
+    """Whether commands differ by little of what unrelated ones do.
+
+    A start that is sought over a whole log fits by luck where one that is given does not: states
+    of any age within two steps, which `follows` allows, are not enough.
+    """
+    T = min(trial.finite_steps, policy.horizon)
+    sent = np.clip(trial.inputs[:T], policy.low, policy.high)
+    asked = policy.commands(trial.states[None, :T], policy.past)[0]
+    usual = sum(np.abs(u - u.mean(axis=0)).mean(axis=0) for u in (sent, asked))
+    finest = FINE * np.abs(policy.feedforward).max(axis=0)
+    return bool((np.abs(sent - asked).mean(axis=0) <= UNLIKE * usual + finest).all())
 
 
 def recording(workspace: Folder, path: Path) -> Recording | None:
