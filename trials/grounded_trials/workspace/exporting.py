@@ -81,8 +81,8 @@ def export_candidate(
     if program is not None:
         write_atomically(program, Path(onboard.__file__).read_bytes())
     waiting = standing_in(workspace).outstanding
-    named = () if waiting and waiting.id == identity else ("--candidate", identity)
-    return Exported(identity, path, form, program, handed.notes, handed.overridden, named)
+    how = () if waiting and waiting.id == identity else ("--candidate", identity)
+    return Exported(identity, path, form, program, handed.notes, handed.overridden, how)
 
 
 def _units(workspace: Folder) -> dict[str, str]:

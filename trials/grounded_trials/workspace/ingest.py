@@ -163,26 +163,26 @@ def _recognised(
         other_why, name = suspicion(task, rival, own, candidates)
         why, other = (other_why, name) if name else (why or other_why, other)
     if why and (candidate is None or (log and not (found and found.opens_alike))):
-        if other and workspace.candidate(other)[1].get("task") != task.hash:
-            other = ""  # it can't be judged by this one
         instead = ("--candidate", other) if other else ("--data",)
         what = f"; with --candidate {other} for what it seems to have run" * bool(other)
         force = f"with [log.span] start = SECONDS and --candidate {ran}" if log else ""
         raise GroundedError(
             f"{path} did not run {ran}: {why}. Take it in with --data for fitting and diagnosis"
             f"{what}, or {force or f'with --candidate {ran}'} all the same"
-            + "; [log.span] says where the run begins" * (foreign and not log),
+            + "; [log.span] says where the run begins"
+            * (foreign and not log),
             NextCommand("ingest", (str(path), *instead)),
         )
     return replace(read, warnings=(*read.warnings, why)) if why else read
 
 
 def _latest(workspace: Folder) -> list[Candidate]:
-    """The latest candidates, probes and those of earlier tasks too: any may have been run."""
+    """The latest candidates of the task, probes and void ones too: any may have been run."""
     found = []
     for identity in workspace.candidate_ids()[-OTHERS:]:
         with suppress(GroundedError):  # a damaged file was not run now
-            found.append(workspace.candidate(identity)[0])
+            candidate, meta = workspace.candidate(identity)
+            found += [candidate] * (meta.get("task") == workspace.task.hash)
     return found
 
 

@@ -99,9 +99,9 @@ class Recording:
 
     def apart_at(self, policy: Policy, start: float) -> float:
         """The mean difference of the commands from an instant on, as `Start.apart`."""
-        apart = self._apart(policy)
         k = round((start - self.first) * self.parts / self.dt)
-        return float(apart[k]) if 0 <= k < len(apart) else np.inf
+        inside = 0 <= k < len(self.whole.inputs)
+        return float(self._apart(policy, range(k, k + 1))[k]) if inside else np.inf
 
     def _on_step(self, policy: Policy, start: float) -> float:
         """A start moved to where the commands change, by less than a step."""
@@ -116,7 +116,7 @@ class Recording:
         tried = [start + phase + move * dt for move in (-1, 0, 1)]
         return min(tried, key=lambda one: self.apart_at(policy, one))
 
-    def _apart(self, policy: Policy) -> Array:
+    def _apart(self, policy: Policy, instants: range | None = None) -> Array:
         """The mean difference of the commands at every instant, infinite where none can be."""
         states, sent, parts, H = self.whole.states, self.whole.inputs, self.parts, policy.horizon
         sent = np.clip(sent, policy.low, policy.high)
@@ -127,7 +127,7 @@ class Recording:
         count, quiet = np.cumsum(changed), round(QUIET_S / self.dt * parts)
         apart = np.full(len(sent), np.inf)
         wanted = []
-        for k in range(len(sent)):
+        for k in range(len(sent)) if instants is None else instants:
             left = (len(sent) - k - parts // 2 - 1) // parts + 1
             ran = left >= H - LAST
             begun = count[max(k - 1, 0)] == count[max(k - 1 - quiet, 0)]
