@@ -1,7 +1,7 @@
 """Where a run begins in a recording: a second arm was refused, or stored a second out of step.
 
 A cart with feedback and noisy sensors is recorded at 100 Hz; whoever records begins before the run.
-Sought by the feed-forward alone, and only where the first command fitted nobody, starts were missed.
+Sought by the feed-forward alone, and only for what fitted nobody, starts were missed.
 """
 
 from dataclasses import replace

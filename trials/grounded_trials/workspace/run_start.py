@@ -160,8 +160,9 @@ def _close(policy: Policy, trial: Trial) -> bool:
 
 
 def recording(workspace: Folder, path: Path) -> Recording | None:
-    """A foreign log whose run may begin anywhere; None where it can't be cut, or states are
-    estimated, or a [log.span] says where the run begins.
+    """A foreign log whose run may begin anywhere.
+
+    None where it can't be cut, states are estimated, or a [log.span] says where the run begins.
 
     Args:
         workspace: whose [log] maps it.
