@@ -77,5 +77,5 @@ def command(
             show(f"  {USES[done.format]}")
         else:
             show(f"  on the robot, with Python 3.8 and numpy alone: {done.runner}")
-            then = next_line(NextCommand("next", ("LOG",)))
+            then = next_line(NextCommand("next", ("LOG", *done.named)))
             show(f"\ncopy both to the robot, run it, record a log, then\n{then}")

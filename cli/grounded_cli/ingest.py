@@ -89,6 +89,8 @@ def following(log: str, candidate: str | None, json_: bool) -> None:
 def _tell(name: str, one: Ingested) -> None:
     for warning in one.warnings:
         remark("warning", f"{name}: {warning}")
+    for note in one.notes:
+        remark("note", f"{name}: {note}")
     known = "was stored before as" if one.known else "is stored as"
     sentence(f"{name} {known} {one.trial}")
     if not one.candidate:

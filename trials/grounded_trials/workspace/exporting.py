@@ -25,7 +25,7 @@ from grounded.result import Result
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.handover import checked_candidate
-from grounded_trials.workspace.proposing import candidate_named
+from grounded_trials.workspace.proposing import candidate_named, standing_in
 
 RUNNER = "grounded_runner.py"
 LAW = "u_t = clip(feedforward_t + gain_t (z - reference_t), low, high); z = [state, past inputs]"
@@ -41,6 +41,7 @@ class Exported(Result):
     runner: Path | None = None  # the program that runs it, where one was asked for
     notes: tuple[str, ...] = ()  # what to know about the candidate
     overridden: tuple[str, ...] = ()  # what spoke against it, with `anyway`
+    named: tuple[str, ...] = ()  # how its log is taken in, where another candidate is waited for
 
     def summary(self) -> str:
         """The candidate and its file."""
@@ -79,7 +80,9 @@ def export_candidate(
     program = path.with_name(RUNNER) if runner else None
     if program is not None:
         write_atomically(program, Path(onboard.__file__).read_bytes())
-    return Exported(identity, path, form, program, handed.notes, handed.overridden)
+    waiting = standing_in(workspace).outstanding
+    how = () if waiting and waiting.id == identity else ("--candidate", identity)
+    return Exported(identity, path, form, program, handed.notes, handed.overridden, how)
 
 
 def _units(workspace: Folder) -> dict[str, str]:

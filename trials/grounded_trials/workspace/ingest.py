@@ -9,6 +9,7 @@ finds the first.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,13 +17,12 @@ from typing import Any
 import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
-from grounded.policy import Policy
 from grounded.result import Result
-from grounded.search.candidate import Tried
-from grounded.trial import LAST, Trial, interpolate_gaps
+from grounded.search.candidate import Candidate, Tried
+from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.logs.log_files import kind_of, log_files, log_records
-from grounded_trials.logs.log_table import log_mapping, mapped_signals, read_log
-from grounded_trials.logs.resample import Span, to_grid
+from grounded_trials.logs.log_table import log_mapping, read_log
+from grounded_trials.logs.resample import Span
 from grounded_trials.logs.samples import SignalReport
 from grounded_trials.plain_file import read_file
 from grounded_trials.store.own_files import CANDIDATE, FILE_LIMIT, TRIAL
@@ -32,8 +32,11 @@ from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import sha256
 from grounded_trials.workspace.proposing import standing_in
-from grounded_trials.workspace.run_start import likely_starts, run_start
-from grounded_trials.workspace.trial_check import suspicion, warnings_about
+from grounded_trials.workspace.run_start import Recording, Start, recording
+from grounded_trials.workspace.trial_check import OTHERS, SAME, suspicion, warnings_about
+
+ALIGNED = 0.75  # of the time between samples: a start nearer than that is as good
+CLEAR = 0.7  # of the commands' difference at the first command: the start is elsewhere
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -49,6 +52,7 @@ class Ingested(Result):
     warnings: tuple[str, ...]
     signals: tuple[SignalReport, ...]  # for a foreign log
     verdict: str = ""  # a word of `wording.verdict`, run again, probe; "" for data
+    notes: tuple[str, ...] = ()  # where in a longer log the run was found
 
     @property
     def then(self) -> NextCommand:
@@ -72,6 +76,7 @@ class Ingested(Result):
             "accepted": self.accepted,
             "verdict": self.verdict or None,
             "warnings": list(self.warnings),
+            "notes": list(self.notes),
             "signals": [vars(signal) for signal in self.signals],
         }
 
@@ -82,6 +87,7 @@ class _Read:
     data: bytes
     warnings: tuple[str, ...] = ()
     signals: tuple[SignalReport, ...] = ()
+    notes: tuple[str, ...] = ()
     bare: bool = False  # it ran a candidate, and carries no copy of it
 
 
@@ -126,6 +132,7 @@ def ingest_log(
         warnings=warnings,
         signals=read.signals,
         verdict=_verdict(trial, tried, workspace.config.search.repeats),
+        notes=read.notes,
     )
 
 
@@ -140,59 +147,55 @@ def _recognised(
     if not ran or sha256(read.data)[:DIGITS] in workspace.store.digests():
         return read
     own, _ = workspace.candidate(ran)
-    trial = interpolate_gaps(read.trial).trial
-    why, other = suspicion(workspace.task, trial, own, workspace.read().candidates)
-    if why and foreign and not workspace.config.log.sub("span").names():
-        start = _begins(workspace, path, own.policy)
-        if start is not None:
-            later = _foreign(workspace, path, ran, False, start)
-            said = (
-                f"the log begins {start:.2f} s before {ran} does: it is taken from there; "
-                f"[log.span] start = {start:.4g} says so"
-            )
-            return replace(later, warnings=(*later.warnings, said))
-    if why and candidate is None:
+    candidates, task = _latest(workspace), workspace.task
+    why, other = suspicion(task, interpolate_gaps(read.trial).trial, own, candidates)
+    log = recording(workspace, path) if foreign else None
+    found = log.start_of(own.policy) if log else None
+    if log and found and found.opens_alike:
+        beyond = abs(found.seconds - log.first) > ALIGNED * log.interval
+        if beyond and (why or found.apart < CLEAR * log.apart_at(own.policy, log.first)):
+            read = _foreign(workspace, path, ran, False, found.seconds)
+            said = f"the log begins {found.seconds:.3f} s before {ran} does: it is taken from there"
+            read = replace(read, notes=(said,))
+            why, other = suspicion(task, interpolate_gaps(read.trial).trial, own, candidates)
+    rival = _rival(log, found, own.id, candidates) if log else None
+    if rival is not None:  # as it lies where that one fits best
+        other_why, name = suspicion(task, rival, own, candidates)
+        why, other = (other_why, name) if name else (why or other_why, other)
+    if why and (candidate is None or (log and not (found and found.opens_alike))):
         instead = ("--candidate", other) if other else ("--data",)
         what = f"; with --candidate {other} for what it seems to have run" * bool(other)
+        force = f"with [log.span] start = SECONDS and --candidate {ran}" if log else ""
         raise GroundedError(
-            f"{path} did not run {ran}: {why}. If it begins before the run does, say where that "
-            "begins, [log.span] start = SECONDS; take it in with --data for fitting and diagnosis"
-            f"{what}, or with --candidate {ran} all the same",
+            f"{path} did not run {ran}: {why}. Take it in with --data for fitting and diagnosis"
+            f"{what}, or {force or f'with --candidate {ran}'} all the same"
+            + "; [log.span] says where the run begins"
+            * (foreign and not log),
             NextCommand("ingest", (str(path), *instead)),
         )
     return replace(read, warnings=(*read.warnings, why)) if why else read
 
 
-def _begins(workspace: Folder, path: Path, policy: Policy) -> float | None:
-    """Where in a foreign log the run of a policy begins, seconds after its first sample.
+def _latest(workspace: Folder) -> list[Candidate]:
+    """The latest candidates of the task, probes and void ones too: any may have been run."""
+    found = []
+    for identity in workspace.candidate_ids()[-OTHERS:]:
+        with suppress(GroundedError):  # a damaged file was not run now
+            candidate, meta = workspace.candidate(identity)
+            found += [candidate] * (meta.get("task") == workspace.task.hash)
+    return found
 
-    None where nothing in it looks like that run, or states are estimated.
-    """
-    model, task = workspace.base_model, workspace.task
-    mapping = log_mapping(workspace.config.log, model.state_names, model.input_names)
-    if mapping is None or workspace.config.estimate.names():
-        return None
-    names = (model.state_names, model.input_names)
-    try:
-        series = mapped_signals(log_files(path), mapping, *names)
-        whole = to_grid(series, task.dt, *names, angles=model.angles)
-    except GroundedError:
-        return None
 
-    def trial_from(start: float) -> Trial | None:
-        span = Span(start=start)
-        try:
-            cut = to_grid(series, task.dt, *names, span, angles=model.angles, steps=task.horizon)
-        except GroundedError:
-            return None
-        run = Trial(cut.states, cut.inputs, task.dt, *names, start_inputs=cut.start_inputs)
-        whole = cut.late_s == 0 and run.steps >= task.horizon - LAST
-        return interpolate_gaps(run).trial if whole else None
-
-    sent = [series[name] for name in model.input_names]
-    at = np.concatenate([s.t[1:][np.diff(s.values) != 0] for s in sent])
-    changes = (at - whole.origin_ns) * 1e-9
-    return run_start(policy, likely_starts(policy, whole), changes, trial_from)
+def _rival(
+    log: Recording, found: Start | None, own: str, candidates: Sequence[Candidate]
+) -> Trial | None:
+    """The log from where another candidate fits it much better than the own one anywhere."""
+    best, bound = None, SAME * found.apart if found and found.alike else np.inf
+    for one in candidates:
+        start = log.start_of(one.policy) if one.id != own else None
+        if start is not None and start.alike and start.apart < bound:
+            best, bound = log.trial_from(start.seconds), start.apart
+    return best
 
 
 def _repeated(workspace: Folder, path: Path, read: _Read) -> str:

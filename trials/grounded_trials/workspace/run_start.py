@@ -2,85 +2,188 @@
 
 Without a [log.span] the run is taken to begin with the first command in the log. A robot that sends
 zeros while it waits has sent commands for a second by then, and its log looks like somebody else's
-run. So the commands are laid against the candidate's feed-forward at every step of the log; where
-that fits best, the policy itself is compared (`follows`), feedback and all, at every quarter of a
-step, since a log's own grid is not the run's. The instants at which commands change say the rest.
+run. So at every instant of the log, as finely as it was sampled, the logged commands are compared
+with what the policy would send on the states logged from there on, feedback and all. The instants
+at which commands change say the rest. A log that ends before the run would have is compared as far
+as it goes, where it was quiet before.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
+from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.policy import Policy
-from grounded.trial import LAST, Trial
-from grounded_trials.logs.resample import Gridded
-from grounded_trials.workspace.trial_check import Following, follows
+from grounded.trial import LAST, Trial, interpolate_gaps
+from grounded_trials.logs.log_files import log_files
+from grounded_trials.logs.log_table import log_mapping, mapped_signals
+from grounded_trials.logs.resample import Gridded, Span, to_grid
+from grounded_trials.logs.signals import Series
+from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.trial_check import FINE, LEAST, UNLIKE, follows
 
-TRIED = 5  # steps of the log at which the feed-forward fits best
-QUARTERS = 4  # of a step, between which the start is sought
-CLEAR = 0.5
+TRIED = 5  # instants at which the commands fit best
+FINEST = 8  # parts of a step, between which the start is sought
 FEW = 5  # changes, which are too few to say when the steps begin
+QUIET_S = 1.0  # without a change of commands, before a run that the log does not have whole
+SHORT = 4  # at least 1 / SHORT of a run tells that it was one
+BATCH = 256  # instants compared at once
 
 
-def likely_starts(policy: Policy, whole: Gridded) -> list[float]:
-    """When the run may have begun, seconds after the log's first sample, the likeliest first.
+@dataclass(frozen=True)
+class Start:
+    """Where a policy's run seems to begin."""
+
+    seconds: float  # after the log's first sample
+    apart: float  # mean difference of the commands there, in units of each input's size
+    alike: bool  # the commands are the policy's from there on
+    opens_alike: bool  # they are at the beginning at least; somebody may have taken over
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """A foreign log, to be cut anywhere; on a grid of `parts` instants a control step."""
+
+    series: dict[str, Series]
+    names: tuple[tuple[str, ...], tuple[str, ...]]
+    angles: tuple[str, ...]
+    dt: float
+    steps: int
+    parts: int
+    whole: Gridded
+    changes: Array  # when a command changed, seconds after the log's first sample
+    interval: float  # between samples [s]
+
+    @property
+    def first(self) -> float:
+        """The first command, where a run begins if nothing else is known [s]."""
+        return (self.whole.start_ns - self.whole.origin_ns) * 1e-9
+
+    def trial_from(self, start: float) -> Trial | None:
+        """The log as a trial that begins then, None where a state is not known in time."""
+        span = Span(start=start)
+        try:
+            cut = to_grid(
+                self.series, self.dt, *self.names, span, angles=self.angles, steps=self.steps
+            )
+        except GroundedError:
+            return None
+        run = Trial(cut.states, cut.inputs, self.dt, *self.names, start_inputs=cut.start_inputs)
+        return interpolate_gaps(run).trial if cut.late_s == 0 else None
+
+    def start_of(self, policy: Policy) -> Start | None:
+        """Where a policy's run begins: the best of all instants; None for a log too short to tell.
+
+        Args:
+            policy: what is sought, for the states and inputs of this log.
+        """
+        if (policy.state_names, policy.input_names) != self.names or policy.dt != self.dt:
+            return None
+        apart, found = self._apart(policy), list[Start]()
+        left = apart.copy()
+        while len(found) < TRIED and np.isfinite(left).any():
+            k = int(np.argmin(left))
+            left[max(0, k - self.parts) : k + self.parts + 1] = np.inf
+            seconds = self._on_step(policy, self.first + k * self.dt / self.parts)
+            trial = self.trial_from(seconds)
+            fit = None if trial is None else follows(policy, trial.until(policy.horizon), 0)
+            if trial is not None and fit is not None:
+                alike = fit.alike and not fit.late and _close(policy, trial)
+                opens = alike or fit.until_s >= LEAST * self.dt
+                found.append(Start(seconds, float(apart[k]), alike, opens))
+        return min(found, key=lambda one: (not one.alike, one.apart), default=None)
+
+    def apart_at(self, policy: Policy, start: float) -> float:
+        """The mean difference of the commands from an instant on, as `Start.apart`."""
+        k = round((start - self.first) * self.parts / self.dt)
+        inside = 0 <= k < len(self.whole.inputs)
+        return float(self._apart(policy, range(k, k + 1))[k]) if inside else np.inf
+
+    def _on_step(self, policy: Policy, start: float) -> float:
+        """A start moved to where the commands change, by less than a step."""
+        dt, length = self.dt, self.dt * policy.horizon
+        inside = self.changes[(self.changes > start - dt / 2) & (self.changes < start + length)]
+        turns = np.exp(2j * np.pi * (inside - start) / dt)
+        if len(inside) <= FEW or abs(turns.mean()) < 0.8:  # they do not come in steps
+            return start
+        phase = float(np.angle(turns.mean())) / (2 * np.pi) * dt
+        if abs(phase) < self.dt / self.parts:
+            return start + phase
+        tried = [start + phase + move * dt for move in (-1, 0, 1)]
+        return min(tried, key=lambda one: self.apart_at(policy, one))
+
+    def _apart(self, policy: Policy, instants: range | None = None) -> Array:
+        """The mean difference of the commands at every instant, infinite where none can be."""
+        states, sent, parts, H = self.whole.states, self.whole.inputs, self.parts, policy.horizon
+        sent = np.clip(sent, policy.low, policy.high)
+        width = policy.high - policy.low
+        size = np.maximum(np.abs(sent).max(axis=0), np.abs(policy.feedforward).max(axis=0))
+        size = size + np.where(np.isfinite(width), 0.1 * width, 1e-12)
+        changed = np.any(np.diff(sent, axis=0, prepend=sent[:1]) != 0, axis=1)
+        count, quiet = np.cumsum(changed), round(QUIET_S / self.dt * parts)
+        apart = np.full(len(sent), np.inf)
+        wanted = []
+        for k in range(len(sent)) if instants is None else instants:
+            left = (len(sent) - k - parts // 2 - 1) // parts + 1
+            ran = left >= H - LAST
+            begun = count[max(k - 1, 0)] == count[max(k - 1 - quiet, 0)]
+            if ran or (begun and left >= max(LEAST, H // SHORT)):
+                wanted.append(k)
+        steps = parts * np.arange(H)
+        for at in range(0, len(wanted), BATCH):
+            ks = np.array(wanted[at : at + BATCH])
+            x = states[np.minimum(ks[:, None] + steps, len(states) - 1)]
+            here = ks[:, None] + steps + parts // 2
+            u = sent[np.minimum(here, len(sent) - 1)]
+            off = (np.abs(policy.commands(x, policy.past) - u) / size).mean(axis=2)
+            known = here < len(sent)
+            apart[ks] = (off * known).sum(axis=1) / known.sum(axis=1)
+        return apart
+
+
+def _close(policy: Policy, trial: Trial) -> bool:
+    """Whether commands differ by little of what unrelated ones do.
+
+    A start that is sought over a whole log fits by luck where one that is given does not: states
+    of any age within two steps, which `follows` allows, are not enough.
+    """
+    T = min(trial.finite_steps, policy.horizon)
+    sent = np.clip(trial.inputs[:T], policy.low, policy.high)
+    asked = policy.commands(trial.states[None, :T], policy.past)[0]
+    usual = sum(np.abs(u - u.mean(axis=0)).mean(axis=0) for u in (sent, asked))
+    finest = FINE * np.abs(policy.feedforward).max(axis=0)
+    return bool((np.abs(sent - asked).mean(axis=0) <= UNLIKE * usual + finest).all())
+
+
+def recording(workspace: Folder, path: Path) -> Recording | None:
+    """A foreign log whose run may begin anywhere.
+
+    None where it can't be cut, states are estimated, or a [log.span] says where the run begins.
 
     Args:
-        policy: what is sought.
-        whole: the log from its first command to its end, on the policy's grid.
+        workspace: whose [log] maps it.
+        path: the log.
     """
-    sent, ubar = whole.inputs, policy.feedforward
-    H = min(len(ubar), len(sent))
-    if len(ubar) - LAST > H:
-        return []
-    ubar = np.clip(ubar, policy.low, policy.high)[:H]
-    size = np.maximum(np.abs(ubar).max(axis=0), 1e-12)
-    off = np.zeros(len(sent) - H + 1)
-    for u, asked in zip((sent / size).T, (ubar / size).T, strict=True):
-        power = np.concatenate([[0.0], np.cumsum(u**2)])
-        off += power[H:] - power[:-H] - 2 * np.correlate(u, asked, "valid")
-    best, left = list[int](), off.copy()
-    while len(best) < TRIED and np.isfinite(left).any():
-        best.append(int(np.argmin(left)))
-        left[max(0, best[-1] - 2) : best[-1] + 3] = np.inf
-    begin = (whole.start_ns - whole.origin_ns) * 1e-9
-    return [begin + k * policy.dt for k in best]
-
-
-def run_start(
-    policy: Policy,
-    starts: Iterable[float],
-    changes: Array,
-    trial_from: Callable[[float], Trial | None],
-) -> float | None:
-    """When the run of a policy begins, None where no start fits clearly.
-
-    Clearly: at most half of what differs a step before is left there.
-
-    Args:
-        policy: what was to be run.
-        starts: where it may begin, see `likely_starts`.
-        changes: when a command changed, seconds after the log's first sample.
-        trial_from: the log as a trial that begins then, None where it is too short.
-    """
-
-    def compared(start: float) -> Following | None:
-        trial = trial_from(start) if start >= 0 else None
-        return None if trial is None else follows(policy, trial.until(policy.horizon), 0)
-
-    reach = policy.dt * (policy.horizon - 1) / 2
-    for start in starts:
-        tried = [start + k * policy.dt / QUARTERS for k in range(-QUARTERS, QUARTERS + 1)]
-        found = [(f.error, one) for one in tried if (f := compared(one)) and f.alike and not f.late]
-        if not found:
-            continue
-        error, best = min(found)
-        before = compared(best - policy.dt)
-        if before is not None and error < CLEAR * before.error:
-            inside = changes[np.abs(changes - best - policy.dt * policy.horizon / 2) < reach]
-            phase = (inside - best + policy.dt / 2) % policy.dt - policy.dt / 2
-            return best + float(np.median(phase)) if len(phase) > FEW else best
-    return None
+    model, task, config = workspace.base_model, workspace.task, workspace.config
+    names = (model.state_names, model.input_names)
+    mapping = log_mapping(config.log, *names)
+    if mapping is None or config.estimate.names() or config.log.sub("span").names():
+        return None
+    try:
+        series = dict(mapped_signals(log_files(path), mapping, *names))
+        every = [float(np.median(np.diff(np.sort(s.t)))) for s in series.values() if len(s.t) > 1]
+        interval = max(every, default=task.dt * 1e9) * 1e-9
+        parts = 2 * int(np.clip(np.ceil(task.dt / max(interval, 1e-9) / 2 - 0.01), 1, FINEST / 2))
+        whole = to_grid(series, task.dt / parts, *names, angles=model.angles)
+    except GroundedError:
+        return None
+    sent = [series[name] for name in model.input_names]
+    at = np.concatenate([s.t[1:][np.diff(s.values) != 0] for s in sent])
+    changes = (at - whole.origin_ns) * 1e-9
+    return Recording(
+        series, names, model.angles, task.dt, task.horizon, parts, whole, changes, interval
+    )

@@ -1,0 +1,138 @@
+"""Where a run begins in a recording: a second arm was refused, or stored a second out of step.
+
+A cart with feedback and noisy sensors is recorded at 100 Hz; whoever records begins before the run.
+Sought by the feed-forward alone, and only for what fitted nobody, starts were missed.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cli import grounded
+from grounded.errors import GroundedError, NextCommand
+from grounded_trials import Workspace
+from workspaces import CONFIG, make
+
+LOGGED = CONFIG + "".join(
+    f'[log.{kind}.{name}]\npath = "/csv.{name}"\n'
+    for kind, name in (("state", "x"), ("state", "v"), ("input", "force"))
+)
+RATE = 100  # [Hz]
+
+
+def record(w, path, policy, before, seed=0, until=None, after=1.0, jog=0.0):
+    """Runs a policy on the model, with a load the policy fights, and logs all of it as a table."""
+    model, dt, rng = w.task.model, policy.dt, np.random.default_rng(seed)
+    z, force, rows, sent = np.array(w.task.start, float), 0.0, [], policy.past.copy()
+    every, begin = round(dt * RATE), round(before * RATE)
+    end = begin + every * policy.horizon if until is None else begin + round(until * RATE)
+    last = end + round(after * RATE) if until is None else end
+    for k in range(last):
+        felt = z + rng.normal(0, [0.002, 0.01])
+        step, part = divmod(k - begin, every)
+        if 0 <= step < policy.horizon and part == 0:
+            force = float(follow(policy, step, felt, sent)[0])
+        if step >= policy.horizon:
+            force = 0.0
+        if k < begin:
+            force = jog * np.sin(k / RATE * 4) if k < 0.4 * begin else 0.0
+        rows.append([1000 + k / RATE, *felt, force])
+        push = 0.7 * force - 0.4 * np.tanh(20 * z[1]) if k >= begin else 0.0
+        z = model.system.step(z[None], np.array([[push]]), model.values, 1 / RATE)[0]
+    np.savetxt(path, rows, "%.5f", ",", header="t,x,v,force", comments="")
+    return path
+
+
+def follow(policy, step, state, past):
+    """One command of a policy, from its published law."""
+    if policy.gain is None:
+        return policy.feedforward[step]
+    z = np.concatenate([state, past[: policy.gain.shape[2] - len(state)]])
+    u = policy.feedforward[step] + policy.gain[step] @ (z - policy.reference[step])
+    past[:] = u = np.clip(u, policy.low, policy.high)
+    return u
+
+
+@pytest.fixture
+def w(tmp_path):
+    """It waits for c0002; c0001 was run."""
+    w = Workspace(make(tmp_path / "w", config=LOGGED).folder)
+    w.ingest(record(w, tmp_path / "first.csv", w.propose().candidate.policy, 0.0, seed=9))
+    w.propose()
+    return w
+
+
+@pytest.mark.parametrize("forced", [False, True])
+@pytest.mark.parametrize("before", [0.01, 0.02, 0.04, 1.0])
+def test_a_run_with_feedback_is_found_to_the_log_s_sample(w, tmp_path, before, forced):
+    policy = w.candidate("c0002")[0].policy
+    exact = w.ingest(record(w, tmp_path / "a.csv", policy, 0.0), data=True)
+    found = w.ingest(
+        record(w, tmp_path / "b.csv", policy, before, after=1.0),
+        candidate="c0002" if forced else None,
+    )
+    assert found.candidate == "c0002" and not found.warnings[:-1] and found.notes
+    assert exact.notes == ()
+    stored = w.trials()[-1].trial
+    table = np.loadtxt(tmp_path / "b.csv", delimiter=",", skiprows=1)
+    k = round(before * RATE) + 5 * np.arange(policy.horizon)
+    np.testing.assert_allclose(stored.inputs[:, 0], table[k, 3], atol=1e-4)
+    np.testing.assert_allclose(stored.states[:-1], table[k, 1:3], atol=1e-3)
+
+
+def test_a_log_that_begins_with_the_run_is_taken_as_it_is(w, tmp_path):
+    found = w.ingest(record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.0))
+    assert found.candidate == "c0002" and found.notes == ()
+
+
+@pytest.mark.parametrize("until", [1.0, 1.5, 1.9])
+def test_an_aborted_run_crashed_with_a_lead_in_too(w, tmp_path, until):
+    policy = w.candidate("c0002")[0].policy
+    found = w.ingest(record(w, tmp_path / "a.csv", policy, 1.0, until=until))
+    assert (found.candidate, found.verdict) == ("c0002", "crashed")
+    assert abs(w.trials()[-1].trial.steps - until / policy.dt) <= 1
+
+
+def test_the_operator_jogged_the_cart_first(w, tmp_path):
+    policy = w.candidate("c0002")[0].policy
+    found = w.ingest(record(w, tmp_path / "a.csv", policy, 7.0, jog=1.5))
+    assert found.candidate == "c0002" and "7.00" in found.notes[0]
+
+
+@pytest.mark.parametrize("before", [0.0, 0.02, 1.0])
+def test_the_log_of_another_candidate_is_not_credited_wherever_it_begins(w, tmp_path, before):
+    path = record(w, tmp_path / "a.csv", w.candidate("c0001")[0].policy, before)
+    with pytest.raises(GroundedError, match="those of c0001") as refused:
+        w.ingest(path)
+    assert refused.value.then == NextCommand("ingest", (str(path), "--candidate", "c0001"))
+    assert w.ingest(path, candidate="c0001").candidate == "c0001"
+
+
+def test_the_log_of_a_probe_is_not_credited_and_its_export_says_how_it_is_taken_in(w, tmp_path):
+    made, _ = w.candidate("c0002")
+    turned = replace(made.policy, feedforward=np.array(made.policy.feedforward[::-1]))
+    sent = turned.commands(made.predicted_states[None, :-1], turned.past)[0]
+    probe = w.save_candidate(
+        replace(made, id="c0003", policy=turned, predicted_inputs=sent), kind="probe"
+    )
+    w.forget()
+    with pytest.raises(GroundedError, match=f"those of {probe.id}") as refused:
+        w.ingest(record(w, tmp_path / "a.csv", turned, 1.0))
+    assert refused.value.then.arguments[1:] == ("--candidate", probe.id)
+    out = str(tmp_path / "p.npz")
+    done = grounded("-C", w.folder, "export", probe.id, "--runner", "-o", out)
+    assert done.out.replace("\\", "").split()[-3:] == ["LOG", "--candidate", probe.id]
+    waiting = grounded("-C", w.folder, "export", "c0002", "--runner", "-o", out)
+    assert waiting.out.split()[-1] == "LOG"
+
+
+@pytest.mark.parametrize("forced", [False, True])
+def test_a_strange_log_has_no_start_forced_or_not(w, tmp_path, forced):
+    policy = w.candidate("c0002")[0].policy
+    driven = 3 * np.sin(np.arange(policy.horizon) / 3)[:, None]
+    strange = replace(policy, feedforward=driven, gain=0 * policy.gain)
+    path = record(w, tmp_path / "a.csv", strange, 1.0)
+    with pytest.raises(GroundedError, match="c0002"):
+        w.ingest(path, candidate="c0002" if forced else None)
+    assert len(w.trials()) == 1
