@@ -131,7 +131,8 @@ def _follow(workspace: Workspace, found: Diagnosis) -> NextCommand:
     if found.probe:
         return probe_command(workspace, found.probe)
     if found.kind == "none" and workspace.config.task.target:
-        return next_command(workspace, standing_in(workspace), found, usable_ids(workspace))
+        now = standing_in(workspace, ahead=True)
+        return next_command(workspace, now, found, usable_ids(workspace))
     return NextCommand("report", ("--html",))
 
 

@@ -48,8 +48,10 @@ def command(params: str | None, latency: bool, apply_: bool, engine: Engine, jso
     remark("fit", f"{found.sentence}; {count(found.samples, 'sample')}")
     if apply_:
         show("\nwritten to grounded.toml [model] params")
-    else:
+    elif found.helps:
         show("\nto write the values to grounded.toml, add --apply")
+    else:
+        show("\nnothing was written: these values don't lower the held-out errors")
     show(next_line(done.then))
 
 

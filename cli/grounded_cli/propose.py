@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+import re
+from typing import TYPE_CHECKING
 
 import click
 
@@ -18,6 +19,9 @@ if TYPE_CHECKING:
     from grounded.task import Task
     from grounded_trials import Workspace
     from grounded_trials.workspace.proposing import Proposed
+
+
+MOST = 3  # target states whose range is told
 
 
 @click.command("propose")
@@ -96,21 +100,34 @@ def _gain(candidate: Candidate) -> float:
 def _extent(candidate: Candidate, task: Task) -> list[tuple[str, str]]:
     """Where the predicted run goes, and how much of the inputs it uses."""
     model, rows = task.model, []
-    position = model.roles.get("position", ())
-    for name in (position,) if isinstance(position, str) else position:
-        if name in model.states:
-            values = candidate.predicted_states[:, model.state_names.index(name)]
-            rows.append((name, with_unit(_span(values), model.states[name])))
+    for name in _told(task):
+        values = candidate.predicted_states[:, model.state_names.index(name)]
+        rows.append((name, with_unit(_span(values.min(), values.max()), model.states[name])))
     for i, (name, unit) in enumerate(model.inputs.items()):
         low, high = float(task.low[i]), float(task.high[i])
-        limits = f", limits {low:.4g} to {high:.4g}" * (high < float("inf"))
-        rows.append((name, with_unit(_span(candidate.predicted_inputs[:, i]), unit) + limits))
+        ends = re.sub(r"\.?0+(?= |$)", "", _span(low, high))
+        limits = f", limits {ends}" * (high < float("inf"))
+        values = candidate.predicted_inputs[:, i]
+        rows.append((name, with_unit(_span(values.min(), values.max()), unit) + limits))
     return rows
 
 
-def _span(values: Any) -> str:
+def _told(task: Task) -> list[str]:
+    """The states that say where a run goes: the position; else those of [safety] and a target."""
+    model, position = task.model, task.model.roles.get("position", ())
+    where = [position] if isinstance(position, str) else list(position)
+    if found := [name for name in where if name in model.states]:
+        return found
+    assert task.safety_low is not None and task.safety_high is not None
+    ends = zip(model.state_names, task.safety_low, task.safety_high, strict=True)
+    guarded = [name for name, low, high in ends if math.isfinite(low) or math.isfinite(high)]
+    tracked = zip(model.state_names, (task.target == task.target).any(axis=0), strict=True)
+    wanted = [name for name, told in tracked if told and name not in guarded][:MOST]
+    return [name for name in model.state_names if name in guarded or name in wanted]
+
+
+def _span(low: float, high: float) -> str:
     """From the lowest to the highest value, to a hundredth or finer where all are small."""
-    low, high = float(values.min()), float(values.max())
     size = max(abs(low), abs(high))
     digits = 2 if size >= 1 or not 0 < size < float("inf") else 2 - math.floor(math.log10(size))
     return f"{round(low, digits) + 0.0:.{digits}f} to {round(high, digits) + 0.0:.{digits}f}"
@@ -118,12 +135,14 @@ def _span(values: Any) -> str:
 
 def _trust(standing: Standing, workspace: Workspace) -> str:
     """How the last prediction came true; before that, what the model was compared with."""
-    pairs = [
-        (tried.candidate.predicted_utility, tried.utility)
-        for tried in standing.history
-        if tried.utilities
-    ]
-    if not pairs:
+    from grounded.search.improve import model_fingerprint
+
+    ran = [tried for tried in standing.history if tried.utilities]
+    model = model_fingerprint(workspace.planner.plan) if ran else ""
+    same = [tried for tried in ran if tried.candidate.model == model]
+    if ran and not same:
+        return "unknown: the model was changed since the last run, none has tested it as it is now"
+    if not ran:
         logs = len(workspace.trials()) - sum(len(tried.trials) for tried in standing.history)
         if not logs:
             return "unknown: the crude model was never compared with the real system"
@@ -136,5 +155,5 @@ def _trust(standing: Standing, workspace: Workspace) -> str:
             f"the model {by} {count(logs, 'log')} of data (`grounded diagnose` says how far it "
             "predicts), but it was never tried on this manoeuvre"
         )
-    predicted, real = pairs[-1]
-    return f"the last prediction was {number(predicted)}, the real run gave {number(real)}"
+    promised = number(same[-1].candidate.predicted_utility)
+    return f"the last prediction was {promised}, the real run gave {number(same[-1].utility)}"

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
+from grounded_cli.options import as_json, in_workspace, next_line, open_workspace, typed
 from grounded_cli.terminal import field, number, progress, remark, show, show_json, sparkline, table
 from grounded_trials.wording import count, wrapped
 
@@ -68,12 +68,13 @@ def summary(status: Status) -> str:
         lines.append(table([_row(t, standing.verdict(t)) for t in standing.history], header))
         lines += wrapped(LEGEND, "  ", "  ")
         bars = sparkline([t.utility for t in standing.history if t.utilities])
-        lines.append("\n" + field("utility", bars))
+        lines.append("\n" + field("utility", bars) if bars else "")
     if standing.incumbent is not None:
         best = standing.incumbent
         text = f"{best.candidate.id}, utility {number(best.utility)}{_gained(standing)}"
         lines.append(field("best", text))
-    if certainty := last_improvement(standing.history):
+    again = f"run the best one again: `{typed(status.again)}`"
+    if certainty := last_improvement(standing.history, again):
         lines.append(field("certainty", certainty))
     lines.append(field("phase", f"{standing.outcome}: {standing.sentence}"))
     return "\n".join(lines)

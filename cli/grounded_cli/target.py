@@ -82,7 +82,6 @@ def _values(pairs: tuple[str, ...]) -> dict[str, float]:
 
 def _recorded(workspace: Workspace, file: str) -> dict[str, Array]:
     """A run of a log, or the columns of a CSV of states."""
-    from grounded_trials.starting.begin import recorded_run
-    from grounded_trials.starting.shapes import SHAPES
+    from grounded_trials.starting.shapes import SHAPES, recorded_run
 
     return recorded_run(workspace, file, SHAPES)

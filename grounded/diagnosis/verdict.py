@@ -214,9 +214,8 @@ def next_trial(
             f"{left[0].channel} repeats."
         )
     if not claims.names and not claims.blamed:
-        return "Nothing is tied and nothing to adopt: go on with the search."
-    them = "them" if len(claims.names) > 1 else "it"
-    return f"Nothing is tied: adopt {them}, or go on with the search."
+        return "Nothing is tied and nothing to adopt."
+    return f"Nothing is tied: adopt {'them' if len(claims.names) > 1 else 'it'}."
 
 
 HINTS = {

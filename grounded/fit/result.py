@@ -87,6 +87,11 @@ class Fit(Result):
             sentence=f"{self.sentence}; the data do not identify {names}, held as before",
         )
 
+    @property
+    def helps(self) -> bool:
+        """Whether held-out time is predicted better than before; True where none was held out."""
+        return _lowered(self.before, self.after)
+
     def summary(self) -> str:
         """The values with their standard deviations."""
         found = ", ".join(f"{name} {e.value:.4g} +- {e.std:.2g}" for name, e in self.params.items())
@@ -150,12 +155,25 @@ def report(
         noise=last.noise,
         loglik=at.loglik,
         status=last.status,
-        sentence=_sentence(unknowns, params, wide, last),
+        sentence=_sentence(unknowns, params, wide, last)
+        + "; held-out time is predicted no better than before" * (not _lowered(before, after)),
         before=before,
         after=after,
         samples=at.count,
         covariance=wide.covariance,
     )
+
+
+def _lowered(before: PredictionError | None, after: PredictionError | None) -> bool:
+    """Whether errors fell, by the geometric mean over the states, as far ahead as is known."""
+    if before is None or after is None:
+        return True
+    far = bool(np.isfinite(before.ahead).any())
+    was, now = (before.ahead, after.ahead) if far else (before.one_step, after.one_step)
+    told = np.isfinite(was) & (was > 0)
+    if not told.any() or not np.isfinite(now[told]).all():
+        return not told.any()
+    return bool(np.log(np.maximum(now[told], 1e-300) / was[told]).mean() < 0)
 
 
 def _estimates(unknowns: Unknowns, found: SearchEnd) -> tuple[dict[str, FittedValue], Uncertainty]:

@@ -52,7 +52,7 @@ def utility_noise(history: Sequence[Tried]) -> tuple[float, int]:
     return (math.sqrt(square / freedom) if freedom else float("nan")), freedom
 
 
-def last_improvement(history: Sequence[Tried]) -> str:
+def last_improvement(history: Sequence[Tried], again: str = "run the best one again") -> str:
     """How sure the last accepted improvement is, as a sentence; "" before there is one.
 
     Welch's t-test of the two candidates' own trials, whose standard errors stand beside them in the
@@ -69,7 +69,7 @@ def last_improvement(history: Sequence[Tried]) -> str:
     if not freedom:
         return (
             f"the last gain is {gain:.3g}; both candidates were run once, so the noise of a "
-            "trial is unknown: run the best one again"
+            f"trial is unknown: {again}"
         )
     if error == 0:
         return f"the last gain is {gain:.3g}; repeated trials agree exactly"

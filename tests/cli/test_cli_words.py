@@ -43,6 +43,20 @@ def test_a_model_that_is_not_compiled_is_named_once(here):
     assert text.count("not compiled") == 1 and "model.py" in text
 
 
+def test_where_a_run_without_a_position_goes(here):
+    """[safety] and the target say which states a person looks at; both ends are rounded alike."""
+    (here / "model.py").write_text(MODEL.replace('"position": ("x",), ', ""))
+    config = CONFIG.replace("force = [-5.0, 5.0]", "force = [-0.56967, 0.57636]")
+    (here / "grounded.toml").write_text(config)
+    text = said(grounded("propose"))
+    assert re.search(r"^  x +-?\d.* to .* m$", text, re.M) and not re.search(r"^  v ", text, re.M)
+    force = re.search(r"^  force +(\S+) to (\S+) N, limits -0.57 to 0.576$", text, re.M)
+    assert force and float(force[2]) <= 0.576 and len(force[2].split(".")[1]) == 3
+    (here / "grounded.toml").write_text(config + "[safety]\nv = [-9.0, 9.0]\n")
+    text = said(grounded("propose"))
+    assert re.search(r"^  x ", text, re.M) and re.search(r"^  v +.* m/s$", text, re.M)
+
+
 def test_a_session_from_the_first_trial_to_the_export(here):
     assert "N, limits -5 to 5" in said(grounded("propose"))
     said(grounded("run"))

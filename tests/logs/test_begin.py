@@ -267,6 +267,47 @@ def test_inspect_goes_on_as_init_does(wheels, tmp_path):
     assert "unsure" not in grounded("-C", w.folder, "inspect", wheels()).out
 
 
+@pytest.fixture
+def swung(tmp_path):
+    """A table of one joint, its columns called as its owner likes."""
+    rng, t = np.random.default_rng(0), 0.02 * np.arange(800)
+    u = 0.5 * np.sin(0.7 * t) + 0.3 * np.sin(2.1 * t)
+    q = np.cumsum(np.convolve(u, np.ones(20) / 20)[: len(t)]) * 0.05
+
+    def write(names="q,w,u", linked=True):
+        w = np.gradient(q, 0.02) if linked else rng.normal(0, 1, len(t))
+        rows = np.column_stack([t, q, w, u]) + rng.normal(0, 1e-4, (len(t), 4)) * (0, 1, 1, 0)
+        path = tmp_path / "swing.csv"
+        np.savetxt(path, rows, "%.5f", ",", header=f"t,{names}", comments="")
+        return path
+
+    return write
+
+
+def test_a_joint_by_its_behaviour_where_no_name_fits(swung, tmp_path):
+    found = begin(tmp_path / "w", swung())
+    assert found.kind == "pendulum" and len(found.unsure) == 3
+    paths = [g.path for g in (*found.states, *found.inputs)]
+    assert paths == ["/csv.q", "/csv.w", "/csv.u"]
+    done = grounded("-C", tmp_path / "w", found.then.verb, *found.then.arguments)
+    assert found.then.verb == "ingest" and done.code == 0
+    assert "log's commands" in (tmp_path / "w/grounded.toml").read_text()
+
+
+def test_a_kind_whose_states_are_not_there_gives_way_to_the_log_s_names(swung, tmp_path):
+    found = begin(tmp_path / "w", swung(linked=False))
+    assert found.kind == "generic" and "pendulum" in found.why
+    assert [g.name for g in found.inputs] == ["u"]
+    assert grounded("-C", tmp_path / "w", found.then.verb, *found.then.arguments).code == 0
+
+
+def test_an_interval_that_nothing_says_is_called_a_guess(swung, tmp_path):
+    found = begin(tmp_path / "w", swung("aa,bb,cc"), kind="car")
+    text = (tmp_path / "w/grounded.toml").read_text()
+    assert found.dt == 0.05 and "a guess" in text and "commands" not in text.split("[limits]")[0]
+    assert found.then == found.look
+
+
 # targets
 
 
@@ -330,6 +371,20 @@ def test_a_recorded_run_becomes_the_target(tmp_path):
     (tmp_path / "run.csv").write_text("t,x\n0,0\n1,2\n")
     done = grounded("-C", w, "target", tmp_path / "run.csv", "--json").json
     assert done["horizon"] == 20 and done["columns"] == {"x": [0.0, 2.0]}
+
+
+def test_a_csv_of_states_is_a_target_where_logs_are_csv_too(swung, tmp_path):
+    w = tmp_path / "w"
+    assert grounded("init", w, "--from", swung(), "--kind", "generic").code == 0
+    (tmp_path / "run.csv").write_text("t,q,w\n0,0,1\n1,2,1\n")
+    done = grounded("-C", w, "target", tmp_path / "run.csv", "--json").json
+    assert done["columns"] == {"q": [0.0, 2.0], "w": [1.0, 1.0]}
+    done = grounded("-C", w, "target", swung(), "--json").json  # a log is read through [log]
+    assert done["horizon"] > 100 and set(done["columns"]) == {"q", "w"}
+    wrong = grounded("-C", w, "ingest", "--data", tmp_path / "run.csv")
+    said = " ".join(wrong.err.split())
+    assert wrong.code == 1 and "'u' is read from '/csv.u'" in said and "'q' is" not in said
+    assert said.count("csv, time in") == 1
 
 
 def test_logs_are_fitted_and_diagnosed_without_a_task(tmp_path):

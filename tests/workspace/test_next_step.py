@@ -265,6 +265,55 @@ def test_a_candidate_that_another_replaces_is_said_to_be_void(tmp_path):
     assert "void" not in grounded("-C", folder, "propose").err  # it is said once
 
 
+def test_a_candidate_is_void_though_a_probe_was_made_since(tmp_path):
+    w = Workspace(make(tmp_path / "w").folder)
+    w.learn(1)
+    second = w.propose().candidate
+    assert w.save_candidate(replace(second, id=w.next_id()), kind="probe").id == "c0003"
+    w.forget()
+    (w.folder / "reports").mkdir(exist_ok=True)
+    diagnosed(w.folder)
+    assert grounded("-C", w.folder, "adopt", "viscous_friction:v").code == 0
+    done = grounded("-C", w.folder, "propose")
+    assert holds(done.err, "c0002", "void") and "c0004" in done.out
+    # no run has tested the changed model: what the older one foretold is no reason for trust
+    (trust,) = re.findall(r"^  trust +(.*(?:\n {10,}.*)*)", done.out, re.M)
+    assert "prediction" not in trust and holds(trust, "unknown", "changed")
+    assert "last prediction" in grounded("-C", again(w, tmp_path), "propose").out
+
+
+def again(w, tmp_path):
+    """The workspace after the next trial."""
+    assert grounded("-C", w.folder, "learn", "--trials", 1).code == 0
+    return w.folder
+
+
+def test_a_rerun_after_the_end_goes_on_as_status_does(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    diagnosed(folder, verdict={"kind": "none", "effects": [], "sentence": "None."})
+    trial = grounded("-C", folder, "run", "best", "--json").json["trial_file"]
+    done = grounded("-C", folder, "ingest", trial)
+    assert last(done) == last(grounded("-C", folder, "status")) != "grounded propose"
+
+
+def test_a_single_run_asks_for_another_by_its_command(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    out = " ".join(plain(grounded("-C", folder, "status").out).split())
+    assert "run the best one again: `grounded run best`" in out
+    config = folder / "grounded.toml"
+    config.write_text(config.read_text().partition("[system]")[0])
+    out = " ".join(plain(grounded("-C", folder, "status").out).split())
+    assert "`grounded ingest LOG --candidate best`" in out
+
+
+def test_no_line_for_utilities_that_nothing_has(tmp_path):
+    folder = make(tmp_path / "w").folder
+    grounded("-C", folder, "propose")
+    out = grounded("-C", folder, "status").out
+    assert "no trial" in out or "waiting" in out
+    assert not re.search(r"^utility *$", out, re.M)
+
+
 def test_a_delay_more_than_the_adopted_one_is_open_until_it_is_adopted(cart, tmp_path):
     folder = copied(cart, tmp_path / "w")
     then = {"name": "delay:force", "d": 0.01}
@@ -289,3 +338,12 @@ def test_after_a_verdict_of_none_the_search_goes_on(tmp_path):
     found = Diagnosis.from_json({**DIAGNOSIS, "verdict": nothing, "next_trial": ""})
     made = replace(Made(), params=dict(w.config.model.params))
     assert _follow(w, replace(found, made=made)).verb == "propose"
+
+
+def test_after_a_verdict_of_none_a_search_that_has_ended_is_exported(cart, tmp_path):
+    w = Workspace(copied(cart, tmp_path / "w"))
+    nothing = {"kind": "none", "effects": [], "sentence": "Nothing."}
+    found = Diagnosis.from_json({**DIAGNOSIS, "verdict": nothing, "next_trial": ""})
+    made = replace(Made(), params=dict(w.config.model.params))
+    ended = w.status().standing.phase in ("converged", "stopped")
+    assert ended and _follow(w, replace(found, made=made)).verb == "export"

@@ -297,7 +297,7 @@ def _moved(guess: Guess, path: str) -> Guess:
     """The guess at another of its candidates."""
     if path == guess.path:
         return guess
-    rest = tuple(p for p in (guess.path, *guess.others) if p != path)
+    rest = tuple(p for p in (guess.path, *guess.others) if p not in ("", path))
     return replace(guess, path=path, others=rest[:3], field=None, reasons=())
 
 

@@ -120,12 +120,13 @@ class _Log:
         self.topics[channel.topic] = schema.name if schema else channel.encoding
         wanting = [c for c in self.collectors if c.path.topic == channel.topic]
         if wanting:
+            collector = wanting[0]
             try:
                 decoder = decoder_of(channel, schema)
                 for collector in wanting:
                     collector.bind(decoder)
             except (BadSchema, BadPath) as error:
-                raise self._misfit(channel, wanting[0], error) from None
+                raise self._misfit(channel, collector, error) from None
             self.wanted[channel.id] = (decoder, wanting)
 
     def messages(self, batch: Messages) -> None:
@@ -160,10 +161,16 @@ class _Log:
             raise self._misfit(channel, collector, error) from None
 
     def _misfit(self, channel: Channel, collector: _Collector, error: Exception) -> GroundedError:
-        name = self.topics[channel.topic]
+        name, said = self.topics[channel.topic], str(error)
+        what = said.removeprefix(f"{name} has ")
+        kind = f" ({name})" * (name != channel.topic)
+        said = (
+            f"in {channel.topic}{kind} {said}"
+            if what == said
+            else f"{channel.topic}{kind} has {what}"
+        )
         return GroundedError(
-            f"{self.name}: '{collector.name}' is read from '{collector.path.text}', but in "
-            f"{channel.topic} ({name}) {error}"
+            f"{self.name}: '{collector.name}' is read from '{collector.path.text}', but {said}"
         )
 
 

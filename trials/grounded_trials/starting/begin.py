@@ -19,14 +19,14 @@ from grounded.frozen import Array
 from grounded.model import Model
 from grounded.result import Result
 from grounded_trials.formats.tables import column_units
-from grounded_trials.logs.inspect_evidence import weigh
+from grounded_trials.logs.inspect_evidence import velocities, weigh
 from grounded_trials.logs.inspect_guess import Guess, guess_mapping, is_simulated, mapping_toml
 from grounded_trials.logs.inspect_log import LogReport, inspect_log
 from grounded_trials.logs.joint_names import joint_names
 from grounded_trials.logs.log_files import kind_of, log_files
-from grounded_trials.logs.log_table import LogMapping, log_mapping, read_log
+from grounded_trials.logs.log_table import log_mapping, read_log
 from grounded_trials.starting.examples import fresh_folder
-from grounded_trials.starting.kinds import KINDS, kind_in, moving, skeleton
+from grounded_trials.starting.kinds import KINDS, Joints, called_input, kind_in, moving, skeleton
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.folder import Folder
@@ -63,7 +63,7 @@ class Begun(Result):
     @property
     def then(self) -> NextCommand:
         """Take the log in, to fit and diagnose the model on it; where an input is missing, look."""
-        whole = all(guess.path for guess in self.inputs)
+        whole = all(g.path for g in self.inputs) and any(g.path for g in self.states)
         return NextCommand("ingest", ("--data", self.log)) if whole else self.look
 
     @property
@@ -157,8 +157,13 @@ def _begin(
     else:
         text = skeleton(chosen, report, joints, named, column_units(files[0])).source()
     found = _model_in(folder, text)
-    states, inputs = guess_mapping(report, found.state_names, found.input_names)
-    states, inputs = weigh(report, found, states, inputs, joints)
+    states, inputs = _matched(report, found, joints, unnamed=not model)
+    if not (kind or model or any(g.path for g in states)):
+        why = f"no number of the log fits a state of kind {chosen}: the names are the log's"
+        chosen = "generic"
+        text = skeleton(chosen, report, joints, named, column_units(files[0])).source()
+        found = _model_in(folder, text)
+        states, inputs = _matched(report, found, joints)
     if chosen == "generic" and not model:
         states, inputs = (
             tuple(_only_named(g, of) for g in s) for s, of in ((states, "state"), (inputs, "input"))
@@ -168,7 +173,7 @@ def _begin(
         taken = {g.path for g in (*states, *inputs)}
         free = tuple(one.path for one in moving(report).values() if one.path not in taken)
         states, inputs = (tuple(_asked(g, ask, free) for g in some) for some in (states, inputs))
-    step = dt or _interval(report, inputs, states)
+    step, whose = (dt, "") if dt else _interval(report, inputs, states)
     ranges = {g.name: _range(report, g) for g in (*states, *inputs)}
     if chosen != "drone":  # what is sent after a run must be allowed: rest
         ranges |= {
@@ -177,7 +182,7 @@ def _begin(
     table = mapping_toml(states, inputs, simulated=is_simulated(report))
 
     def write(columns: Mapping[str, Array], rows: int) -> None:
-        _write(folder, found, (step, dt is None), columns, rows, ranges, table, why)
+        _write(folder, found, (step, whose), columns, rows, ranges, table, why)
 
     write({found.state_names[0]: np.zeros(2)}, 1)
     target, horizon, more = _recorded(folder, files, found, states, step, write)
@@ -193,6 +198,35 @@ def _begin(
         target=target,
         notes=(*notes, *more),
     )
+
+
+def _matched(
+    report: LogReport, model: Model, joints: Joints, *, unnamed: bool = False
+) -> tuple[tuple[Guess, ...], tuple[Guess, ...]]:
+    """Where the states and inputs are; `unnamed`: a skeleton's, whose names the log need not know.
+
+    Where no name fits a position and its rate, any two numbers may be they, of which one follows
+    the derivative of the other; the one number that is left is the one input.
+    """
+    names = guess_mapping(report, model.state_names, model.input_names)
+    states, inputs = weigh(report, model, *names, joints)
+    if not unnamed or any(g.path or g.others for g in states):
+        return states, inputs
+    found, taken = moving(report), {g.path for g in inputs}
+    free = [f.path for f in reversed(found.values()) if f.path not in taken]
+    sent = {f.path for name, f in found.items() if called_input(name, f.path)}
+    others = tuple(path for path in free if path not in sent)
+    pair = {name for both in velocities(model).items() for name in both}
+    tried = tuple(replace(g, others=others) if g.name in pair else g for g in states)
+    tried, inputs = weigh(report, model, tried, inputs, joints)
+    pairs = zip(tried, states, strict=True)
+    states = tuple(replace(g, sure=False, others=()) if g.path else old for g, old in pairs)
+    rest = [path for path in free if path not in {g.path for g in states}]
+    if all(g.path for g in states) and len(inputs) == len(rest) == 1 and not inputs[0].path:
+        left = replace(inputs[0], path=rest[0], reasons=("the one number that is left",))
+        _, (left,) = weigh(report, model, states, (left,), joints)
+        inputs = (replace(left, sure=False),)
+    return states, inputs
 
 
 def _one_run(report: LogReport) -> tuple[LogReport, tuple[str, ...]]:
@@ -247,15 +281,18 @@ def _asked(guess: Guess, ask: Ask, free: tuple[str, ...]) -> Guess:
     )
 
 
-def _interval(report: LogReport, inputs: Sequence[Guess], states: Sequence[Guess]) -> float:
-    """The control interval: the slowest command or state, as a round number."""
-    for guesses in (inputs, states):
+def _interval(
+    report: LogReport, inputs: Sequence[Guess], states: Sequence[Guess]
+) -> tuple[float, str]:
+    """The control interval: the slowest command or state, as a round number; and whose it is."""
+    for guesses, whose in ((inputs, "log's commands"), (states, "log's states")):
         rates = [
             t.rate_hz for g in guesses if (t := _topic(report, g)) is not None and t.rate_hz > 0
         ]
         if rates:
-            return min(STEPS, key=lambda step: abs(np.log(step * min(rates))))
-    return 0.05
+            step = min(STEPS, key=lambda step: abs(np.log(step * min(rates))))
+            return step, f": that of the {whose}"
+    return 0.05, ": a guess, no input or state was found"
 
 
 def _topic(report: LogReport, guess: Guess) -> Any:
@@ -298,55 +335,17 @@ def _recorded(
     return f"the run in the log, its first {horizon * dt:g} s", horizon, found.warnings
 
 
-def recorded_run(workspace: Folder, file: str, shapes: Sequence[str]) -> dict[str, Array]:
-    """The states of a recorded run as a target: a log through [log], or a CSV of states.
-
-    Args:
-        workspace: whose model and [log] it is read by.
-        file: a log of any format; a CSV may have columns `t` and states instead.
-        shapes: what else could have been meant, for the message.
-
-    Raises:
-        GroundedError: if there is no such file, or it can't be sampled.
-    """
-    model, dt = workspace.base_model, workspace.config.task.dt
-    if not Path(file).exists():
-        raise GroundedError(f"'{file}' is neither a file nor a shape: {nearest(file, shapes)}")
-    mapping = log_mapping(workspace.config.log, model.state_names, model.input_names)
-    if Path(file).suffix == ".csv" and (mapping is None or not _maps(mapping, "/csv")):
-        from grounded_trials.workspace.task_file import read_target
-
-        names, values = read_target(Path(file))
-        known = [name for name in names[1:] if name in model.states]
-        if not known:
-            raise GroundedError(f"{file} has no column named after a state: {', '.join(names)}")
-        t = np.arange(0.0, values[-1, 0] - values[0, 0] + 1e-9, dt)
-        at = values[:, 0] - values[0, 0]
-        return {name: np.interp(t, at, values[:, names.index(name)]) for name in known}
-    if mapping is None:
-        raise GroundedError(
-            f"grounded.toml has no [log] table to read {file} by: `inspect` prints one",
-            NextCommand("inspect", (file,)),
-        )
-    found = read_log(log_files(file), mapping, dt, angles=model.angles)
-    return dict(zip(mapping.states, found.states.T, strict=True))
-
-
-def _maps(mapping: LogMapping, topic: str) -> bool:
-    return any(s.path.startswith(topic) for s in mapping.states.values())
-
-
 def _write(
     folder: Path,
     model: Model,
-    grid: tuple[float, bool],
+    grid: tuple[float, str],
     columns: Mapping[str, Array],
     horizon: int,
     ranges: Mapping[str, tuple[float, float] | None],
     table: str,
     why: str,
 ) -> None:
-    dt, logged = grid
+    dt, whose = grid
     write_target(folder / "target.csv", dt, dict(columns))
     weights = equal_weights(columns)
     limits = [
@@ -361,8 +360,7 @@ def _write(
         'file = "model.py"             # the crude model, plain NumPy',
         "",
         "[task]",
-        f"dt = {dt:g}                     # [s] control interval"
-        + ": that of the log's commands" * logged,
+        f"dt = {dt:g}                     # [s] control interval{whose}",
         f"horizon = {horizon}                 # steps",
         'target = "target.csv"         # `grounded target` draws another; no column: free',
         "start = { }",

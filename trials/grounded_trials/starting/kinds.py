@@ -204,6 +204,11 @@ def moving(log: LogReport) -> dict[str, FieldReport]:
     return {_word(one.path): one for one in reversed(fields)}
 
 
+def called_input(name: str, path: str) -> bool:
+    """Whether a number of a log is called like what is sent to a robot."""
+    return bool(COMMANDED.search(path.lower()) or SIDES.search(name))
+
+
 def generic(log: LogReport, inputs: Sequence[str] = (), units: Units | None = None) -> Skeleton:
     """Every number that moves is a state that follows the inputs with a lag.
 
@@ -224,7 +229,7 @@ def generic(log: LogReport, inputs: Sequence[str] = (), units: Units | None = No
             raise GroundedError(f"the log has no number '{name}': {nearest(name, found)}")
     if not inputs:
         names = list(reversed(found))
-        called = [n for n in names if COMMANDED.search(found[n].path.lower()) or SIDES.search(n)]
+        called = [n for n in names if called_input(n, found[n].path)]
         held = [n for n in names if found[n].held > HELD]
         inputs = (called or (held if 2 * len(held) < len(names) else []))[:INPUTS] or ["u"]
     states = [name for name in reversed(found) if name not in inputs][:MOST] or ["x"]

@@ -7,14 +7,20 @@ column: position, heading, speed, heading_rate.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
-from grounded.errors import GroundedError, nearest
+from grounded.errors import GroundedError, NextCommand, nearest
 from grounded.frozen import Array
 from grounded.model import Model
+from grounded_trials.logs.inspect_log import inspect_log
+from grounded_trials.logs.log_files import log_files
+from grounded_trials.logs.log_table import LogMapping, log_mapping, read_log
+from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.task_file import read_target
 
 PATHS = ("line", "circle", "figure-8")
 SHAPES = (*PATHS, "step", "swing-up")
@@ -125,3 +131,41 @@ def swing_up(model: Model, dt: float, seconds: float) -> dict[str, Array]:
     rates = [name for name, unit in model.states.items() if unit == "rad/s"][:1]
     rows = round(seconds / dt) + 1
     return {angle: np.full(rows, np.pi)} | {rate: np.zeros(rows) for rate in rates}
+
+
+def recorded_run(workspace: Folder, file: str, shapes: Sequence[str]) -> dict[str, Array]:
+    """The states of a recorded run as a target: a log through [log], or a CSV of states.
+
+    Args:
+        workspace: whose model and [log] it is read by.
+        file: a log of any format; a CSV may have columns `t` and states instead.
+        shapes: what else could have been meant, for the message.
+
+    Raises:
+        GroundedError: if there is no such file, or it can't be sampled.
+    """
+    model, dt = workspace.base_model, workspace.config.task.dt
+    if not Path(file).exists():
+        raise GroundedError(f"'{file}' is neither a file nor a shape: {nearest(file, shapes)}")
+    mapping = log_mapping(workspace.config.log, model.state_names, model.input_names)
+    if Path(file).suffix == ".csv" and (mapping is None or not _holds(Path(file), mapping)):
+        names, values = read_target(Path(file))
+        known = [name for name in names[1:] if name in model.states]
+        if not known:
+            raise GroundedError(f"{file} has no column named after a state: {', '.join(names)}")
+        t = np.arange(0.0, values[-1, 0] - values[0, 0] + 1e-9, dt)
+        at = values[:, 0] - values[0, 0]
+        return {name: np.interp(t, at, values[:, names.index(name)]) for name in known}
+    if mapping is None:
+        raise GroundedError(
+            f"grounded.toml has no [log] table to read {file} by: `inspect` prints one",
+            NextCommand("inspect", (file,)),
+        )
+    found = read_log(log_files(file), mapping, dt, angles=model.angles)
+    return dict(zip(mapping.states, found.states.T, strict=True))
+
+
+def _holds(table: Path, mapping: LogMapping) -> bool:
+    """Whether a table has all that [log] names, inputs too, as a log has and a target has not."""
+    known = {f.path for t in inspect_log(table).topics for f in t.fields}
+    return all(s.path in known for s in (*mapping.states.values(), *mapping.inputs.values()))

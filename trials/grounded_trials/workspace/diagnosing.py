@@ -190,7 +190,7 @@ def _probe(
                 candidate = replace(candidate, id=workspace.next_id())
             return saved.id, made.sentence
         why = "; ".join(reasons).replace(candidate.id, "the best")
-    return "", f"{found.next_trial}; no candidate for it is offered: {why}" * offer
+    return "", f"{found.next_trial.rstrip('.')}; no candidate for it is offered: {why}" * offer
 
 
 def _candidate_of(workspace: Folder, policy: Policy, base: str) -> Candidate:

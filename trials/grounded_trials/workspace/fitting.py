@@ -30,7 +30,9 @@ class Fitted(Result):
 
     @property
     def then(self) -> NextCommand:
-        """Write the values to grounded.toml, or go on with those that were written."""
+        """Write the values where they predict better; go on with those that were written."""
+        if not (self.applied or self.fit.helps):
+            return NextCommand("diagnose")
         return NextCommand("propose" if self.applied else "fit", self.asked)
 
     def summary(self) -> str:

@@ -53,6 +53,7 @@ class Status(Result):
 
     standing: Standing
     then: NextCommand
+    again: NextCommand  # one more trial of the best candidate, or its log
     outdated: str = ""  # why the last diagnosis is not the last word
     notes: tuple[str, ...] = ()  # of the search, where it has ended; trials of namesakes
     discarded: dict[str, str] = field(default_factory=dict)  # t0004 -> why it is set aside
@@ -155,13 +156,12 @@ def _proposal(workspace: Folder, without: Collection[str]) -> Proposal:
 
 
 def _void(workspace: Folder, before: Sequence[str]) -> list[str]:
-    """That the last candidate, which was never run, is replaced by a new one, and why."""
-    last = before[-1] if before else ""
+    """That the search's last candidate, which was never run, is replaced by a new one, and why."""
+    search = (c for c in reversed(before) if workspace.candidate(c)[1].get("kind") == "search")
+    last = next(search, "")
     if not last or any(t.trial.candidate == last for t in workspace.trials()):
         return []
     made, meta = workspace.candidate(last)
-    if meta.get("kind") != "search":
-        return []
     if meta.get("task") == workspace.task.hash:
         from grounded.search.improve import model_fingerprint
 
@@ -224,10 +224,18 @@ def status_of(workspace: Folder, standing: Standing, notes: tuple[str, ...] = ()
     return Status(
         standing,
         next_command(workspace, standing, found, usable),
+        again_best(workspace),
         since.told(workspace.address) if since else "",
         (*notes, *_namesakes(workspace)),
         workspace.discarded(),
     )
+
+
+def again_best(workspace: Folder) -> NextCommand:
+    """One more trial of the best candidate: its run, or where people run the robot, its log."""
+    if workspace.config.system.reachable:
+        return NextCommand("run", ("best",))
+    return NextCommand("ingest", ("LOG", "--candidate", "best"))
 
 
 def _namesakes(workspace: Folder) -> list[str]:
