@@ -372,11 +372,14 @@ def _hashed(files: Sequence[Path]) -> str:
 
 
 def _outstanding(workspace: Folder, path: Path) -> str:
-    waiting = standing_in(workspace).outstanding
+    now = standing_in(workspace)
+    waiting = now.outstanding
     if waiting is None:
+        then = NextCommand("ingest", (str(path), "--candidate", "best"))
         raise GroundedError(
             f"{path} doesn't say which candidate it ran, and none is waiting for a trial: name it "
-            "with --candidate ID, or use --data for a log that ran none"
+            "with --candidate ID, or use --data for a log that ran none",
+            then if now.incumbent is not None else None,
         )
     return waiting.id
 
