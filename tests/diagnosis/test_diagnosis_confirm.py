@@ -209,7 +209,9 @@ def test_what_one_trial_shows_is_told_with_its_place_and_is_no_cause(rare, neede
     assert set(best.hypothesis.names) == {"viscous_friction:v", "saturation:u"}
     decision = decide(search, best, Said(lambda c: 0.2 if needed in c else 1.0), 3)
     assert {d.name for d in decision.doubtful} == set(best.hypothesis.names) - {needed}
-    claims = Claims(decision, {}, limits(search.data))
+    measure = Ruler(search.predictor)
+    measure.beside(decision.crude)
+    claims = Claims(decision, {}, limits(search.data), measure)
     found = unconfirmed(claims, decision.doubtful)
     if needed == "saturation:u":
         assert not found  # every trial shows the friction

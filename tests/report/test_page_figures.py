@@ -211,8 +211,9 @@ def test_the_text_of_a_negative_bar_stays_clear_of_the_labels():
 def test_an_enlarged_path_that_leaves_the_frame_is_said(car):
     figure = path_figure(gather(Folder(car)))
     large = next(p for p in figure.panels if p.title.startswith("Deviations"))
-    assert any(np.isnan(curve.x).any() for curve in large.curves)
-    assert "where they fit" in large.title
+    cut = any(np.isnan(curve.x).any() for curve in large.curves)
+    assert cut == ("where they fit" in large.title)
+    assert cut or large.note  # or left out as a whole
 
 
 def test_rotations_are_right_handed_and_point_along_the_heading():

@@ -46,7 +46,8 @@ def load_module(
     spec = importlib.util.spec_from_file_location(f"grounded_workspace_{path.stem}", path)
     assert spec is not None and spec.loader is not None
     found = importlib.util.module_from_spec(spec)
-    before = set(sys.modules)
+    before, writes = set(sys.modules), sys.dont_write_bytecode
+    sys.dont_write_bytecode = True  # bytecode is dated to the second: an edit may be quicker
     sys.path.insert(0, str(folder))
     sys.modules[spec.name] = found  # dataclasses look their module up there
     try:
@@ -57,6 +58,7 @@ def load_module(
     except (Exception, SystemExit) as error:
         raise GroundedError(_where(error, str(path))) from None
     finally:
+        sys.dont_write_bytecode = writes
         sys.path.remove(str(folder))
         sys.modules.pop(spec.name, None)
         _forget_neighbours(folder, before)
