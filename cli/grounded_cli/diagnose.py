@@ -224,6 +224,7 @@ def _places(found: Diagnosis) -> None:
 
 
 def _effects(found: Diagnosis) -> None:
+    from grounded.diagnosis.verdict import told_apart
     from grounded_trials.report.diagnosis_words import credit_of
 
     ranking = found.ranking[:8]
@@ -232,7 +233,9 @@ def _effects(found: Diagnosis) -> None:
             (
                 ("* " if r.claimed else "  ") + r.effect,
                 credit_of(found, r.effect),
-                f"{r.evidence:,.{int(abs(r.evidence) < 1000)}f}",
+                f"{r.evidence:,.{int(abs(r.evidence) < 1000)}f}"
+                if r.evidence == r.evidence
+                else "-",
                 _values(r),
             )
             for r in ranking
@@ -247,7 +250,7 @@ def _effects(found: Diagnosis) -> None:
         )
     for group in found.indistinguishable:
         if group in found.equivalent:
-            show(field("same", f"{' and '.join(group)} are one thing in this model"))
+            show(field("same", told_apart(group, found.equivalent)))
         else:
             show(field("tied", f"the data can't tell apart: {', '.join(group)}"))
 

@@ -207,8 +207,8 @@ class Remainder(Document):
 
 
 def number(value: float) -> str:
-    """Three digits."""
-    return f"{value:.3g}"
+    """Three digits; a dash for what is no number."""
+    return "-" if math.isnan(value) else f"{value:.3g}"
 
 
 def measured(value: float, unit: str) -> str:

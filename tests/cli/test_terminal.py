@@ -68,3 +68,13 @@ def test_bars_say_their_scale():
 def test_colour_means_something_and_takes_no_room():
     coloured, plain = table([("c1", "crashed")], ("id", "")), "id\nc1  crashed"
     assert harmless(coloured) == plain and "\033[1;31mcrashed" in harmless(coloured, coloured=True)
+
+
+def test_evidence_that_is_not_known_is_a_dash(capsys):
+    from grounded.diagnosis.report import Diagnosis, Ranked, Verdict
+    from grounded_cli.diagnose import _effects
+
+    row = Ranked("parameter:m", claimed=True)
+    _effects(Diagnosis(Verdict("several", ("parameter:m",)), ranking=(row,)))
+    told = capsys.readouterr().out
+    assert "parameter:m" in told and "nan" not in told

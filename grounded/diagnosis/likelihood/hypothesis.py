@@ -7,9 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from grounded.effects import (
-    Effect,
-)
+from grounded.effects import Effect
 from grounded.frozen import Array
 from grounded.model import Model
 

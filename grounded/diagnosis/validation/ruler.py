@@ -130,6 +130,7 @@ class Ruler:
         count = -(-data.valid.sum(axis=1).astype(int) // self.steps[-1])
         self.piece0 = np.cumsum([0, *np.maximum(count, 1)])  # the first of each run, and the end
         self.run_of = np.repeat(np.arange(len(count)), np.diff(self.piece0))
+        self.fine_whole = self.fine  # over whole trials
         self._measured: dict[int, tuple[Fitted, Errors]] = {}
 
     @cached_property
@@ -314,7 +315,7 @@ class Ruler:
 
     def _matters(self) -> Array:
         """Error below which nothing matters, by horizon and shown state, (K, n')."""
-        short, whole = self.fine[self.shown], getattr(self, "fine_whole", self.fine)[self.shown]
+        short, whole = self.fine[self.shown], self.fine_whole[self.shown]
         return np.stack([*[short] * len(self.steps), whole])
 
     def _pieces(self, before: Errors, after: Errors) -> Array:
