@@ -103,6 +103,7 @@ def test_labels_inside_the_cases_are_refused(tmp_path):
     assert not (tmp_path / "c").exists()
 
 
+@pytest.mark.slow
 def test_an_interrupted_challenge_goes_on_with_the_same_command(made, tmp_path, monkeypatch):
     folder, labels, _ = made
     add, calls = Store.add, []

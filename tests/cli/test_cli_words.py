@@ -57,6 +57,7 @@ def test_where_a_run_without_a_position_goes(here):
     assert re.search(r"^  x ", text, re.M) and re.search(r"^  v +.* m/s$", text, re.M)
 
 
+@pytest.mark.slow
 def test_a_session_from_the_first_trial_to_the_export(here):
     assert "N, limits -5 to 5" in said(grounded("propose"))
     said(grounded("run"))

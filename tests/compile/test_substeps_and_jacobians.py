@@ -56,6 +56,7 @@ def test_the_derivatives_of_substeps_are_exact():
     np.testing.assert_allclose(f_u[:, :, 0], change, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_stiff_friction_holds_with_substeps():
     def stiff(s, a, p):
         return {"x": s.v, "v": a.u - p.c * np.tanh(s.v / 0.01)}

@@ -242,6 +242,7 @@ def test_sentences_are_english():
         assert "{" not in text and ":" not in text, text
 
 
+@pytest.mark.slow
 def test_what_no_effect_explains_is_left_over():
     model, trials = cart(asymmetric=0.6, trials=6)
     found = diagnose(model, trials, DiagnosisOptions(library=Library().without(["input_curve"])))
@@ -323,6 +324,7 @@ def test_one_trial_names_no_cause():
     assert "one trial" in found.sentence
 
 
+@pytest.mark.slow
 def test_a_constant_input_is_not_blamed():
     model, trials = cart(friction=0.5)
     flat = [
@@ -343,6 +345,7 @@ def test_no_trials_and_foreign_trials_are_refused():
         diagnose(pendulum, trials)
 
 
+@pytest.mark.slow
 def test_gaps_in_the_log_are_bridged_by_the_filter():
     model, trials = cart(friction=0.4)
     holed = []

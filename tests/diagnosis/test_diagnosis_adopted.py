@@ -60,6 +60,7 @@ def adopted(model, runs):
     return better, lifted, better.state_names[model.n :]
 
 
+@pytest.mark.slow
 def test_what_is_left_beside_an_adopted_lag_is_named():
     model, runs = lagging(0.4)
     better, lifted, memory = adopted(model, runs)

@@ -57,6 +57,7 @@ def task(model, steps=200):
     )
 
 
+@pytest.mark.slow
 def test_after_adoption_what_is_too_little_to_matter_is_not_claimed():
     """A gain of 1.0 that is 1.5: adopted as 1.502, its last 0.13 % are above the noise."""
     trials = runs(1.5)

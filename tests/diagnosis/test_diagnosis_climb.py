@@ -65,6 +65,7 @@ def test_an_unknown_whose_slope_is_no_number_stays_where_it_is():
     assert not _bounded(np.full((2, 2), np.nan), np.full(2, np.nan), -wide[:2], wide[:2]).any()
 
 
+@pytest.mark.slow
 def test_a_parameter_at_its_bound_does_not_hold_up_the_others():
     """A pendulum 30 % too heavy with dry friction; its g may move by 1 % only."""
     task = pendulum_task(pendulum)
@@ -86,6 +87,7 @@ def test_a_parameter_at_its_bound_does_not_hold_up_the_others():
     assert found.gap.before > 50 * found.gap.after and found.gap.after < 3
 
 
+@pytest.mark.slow
 def test_without_noise_the_demo_names_the_friction_alone():
     """The last digits of a step are no claim."""
     task = pendulum_task(pendulum)

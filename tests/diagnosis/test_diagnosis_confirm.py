@@ -135,6 +135,7 @@ def test_noise_can_not_hide_what_predicts_far_better(wavy):
     assert not decide(search, null, Said(lambda c: 0.95 if c else 1.0), 3).causes  # too little
 
 
+@pytest.mark.slow
 def test_one_long_log_is_held_out_by_pieces():
     model, trials = axis(WAVE, trials=1)
     data = prepare(model, trials, np.zeros(1))

@@ -81,6 +81,7 @@ def test_a_threshold_of_the_model_has_a_slope(cars):
     np.testing.assert_array_equal(f_p[..., others], exact[..., others])
 
 
+@pytest.mark.slow
 def test_a_stall_that_is_off_is_calibrated_not_blamed_on_another_effect():
     case = next(iter(make("none", 1, 20, only="car", noise="white")))  # its throttle passes there
     crude = case.model.with_values({"stall": 1.15 * case.model.params["stall"].value})

@@ -35,6 +35,7 @@ def pushed(friction, trials=4, steps=120, seed=0):
     return model, found
 
 
+@pytest.mark.slow
 def test_the_width_of_a_large_friction_is_found():
     model, trials = pushed(FRICTION)
     found = diagnose(model, trials)

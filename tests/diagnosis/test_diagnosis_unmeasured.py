@@ -65,6 +65,7 @@ def test_a_state_that_is_measured_now_and_then_leaves_its_noise_to_be_found(stat
     assert found.kind == "none" and 0.85 < found.gap.after < 1.15
 
 
+@pytest.mark.slow
 def test_a_friction_is_still_found_with_an_angle_at_every_tenth_step():
     trials = list(seen_every(swings(6, 200, 3, friction=0.03), 0, 10))
     found = diagnose(pendulum, trials)

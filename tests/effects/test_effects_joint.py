@@ -116,6 +116,7 @@ def test_dry_friction_over_a_step_is_that_of_many_small_ones(w, free):
         assert end == pytest.approx(x, abs=5e-3 + 1.5 * width)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", ["joint_friction", "load_friction", "added_inertia"])
 def test_an_adopted_loss_is_the_one_that_was_diagnosed(family):
     trials = real_trials(2, 60)

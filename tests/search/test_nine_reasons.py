@@ -139,6 +139,7 @@ def test_exact_repeats_end_all_reruns(mechanisms):
     assert len(ran) - len(set(ran)) <= 1
 
 
+@pytest.mark.slow
 def test_slopes_that_trials_have_corrected_pay(mechanisms, monkeypatch):
     """Issue 12: an input with a lag; without it the search stops where the model's slopes end."""
     task = mechanisms.cart_task("gentle")
