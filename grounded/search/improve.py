@@ -22,7 +22,6 @@ bit. `ask_tell` is the loop around it.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -45,24 +44,6 @@ from grounded.search.standing import (
 from grounded.search.step_size import Step
 from grounded.task import Task
 from grounded.trial import Trial
-
-
-def model_fingerprint(task: Task) -> str:
-    """16 hex digits over the model that plans: its values, latency, smoothing and predictions.
-
-    Predictions at fixed points stand for the code of the dynamics, which has no other identity.
-    """
-    model, problem = task.model, task.problem(exact=True)
-    digest = hashlib.sha256()
-    digest.update(repr((model.state_names, model.input_names, model.param_names)).encode())
-    rng = np.random.default_rng(0)
-    x = task.start + rng.uniform(-0.5, 0.5, (8, model.n))
-    u = np.clip(task.past + rng.uniform(-0.5, 0.5, (8, model.m)), task.low, task.high)
-    with np.errstate(all="ignore"):
-        moved = problem.system.step(x, u, problem.p, problem.dt)
-    for array in (model.values, problem.delay, np.array([task.smoothing]), np.round(moved, 9)):
-        digest.update(np.ascontiguousarray(array + 0.0).tobytes())
-    return digest.hexdigest()[:16]
 
 
 def propose(
@@ -90,7 +71,7 @@ def propose(
         tick: told what is going on while planning takes its time.
     """
     planner = planner or Planner(task, task)
-    fingerprint = model_fingerprint(planner.plan)
+    fingerprint = planner.fingerprint
     now = standing(task, candidates, trials, options, fingerprint)
     if now.phase == "await-trial":
         return Proposal(now, now.outstanding, is_new=False)

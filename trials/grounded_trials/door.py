@@ -148,7 +148,7 @@ class Workspace(Folder):
 
         here = self._afresh()
         ran = candidate and candidate_named(here, candidate)
-        return ingest_log(here, Path(path), ran, data=data)
+        return ingest_log(here, Path(path), ran, data=data, ahead=True)
 
     def next(
         self, log: str | Path, *, candidate: str | None = None, runner: bool = True
