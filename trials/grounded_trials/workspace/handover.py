@@ -14,6 +14,7 @@ changed since a candidate was proposed, so nothing of that day is believed:
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -91,8 +92,24 @@ def checked_candidate(
     reasons = tuple(check.reasons())
     if reasons and not anyway:
         raise Void(identity, reasons)
-    workspace.note_handed(identity, data)
+    _note(workspace, identity, data)
     return Handed(candidate, meta, data, check, reasons)
+
+
+def _note(workspace: Folder, identity: str, data: bytes) -> None:
+    """Keeps that a candidate was handed out, as these bytes, after the trials there are.
+
+    Nothing is kept in a folder that can only be read.
+    """
+    stored = workspace.store.list()
+    after = stored[-1].path.stem if stored else ""
+    note = {"note": "hand-out", "candidate": identity, "sha256": sha256(data), "after": after}
+    try:
+        workspace.notes.add(note, again=False)
+    except GroundedError:
+        if os.access(workspace.folder, os.W_OK):
+            raise
+    vars(workspace).pop("noted", None)
 
 
 def intact(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]:

@@ -32,7 +32,7 @@ from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.foreign import ForeignLog, mapping_of, read_foreign
 from grounded_trials.workspace.identity import sha256
 from grounded_trials.workspace.next_step import PROPOSE, after_log
-from grounded_trials.workspace.proposing import standing_in
+from grounded_trials.workspace.proposing import candidate_named, standing_in
 from grounded_trials.workspace.run_start import Recording, Start
 from grounded_trials.workspace.trial_check import OTHERS, SAME, suspicion, warnings_about
 
@@ -100,6 +100,7 @@ def ingest_log(
 
     `ahead`: plan on where only that tells what follows, see `standing_in`.
     """
+    candidate = candidate and candidate_named(workspace, candidate)
     kind = "" if path.is_dir() else kind_of(path)
     if kind == CANDIDATE:
         raise GroundedError(
