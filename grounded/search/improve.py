@@ -24,13 +24,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from grounded.errors import NextCommand
 from grounded.model import Model
 from grounded.search.candidate import Candidate, Tried
-from grounded.search.first_policy import Tick, first_policy
 from grounded.search.making import About, Maker, Proposal
 from grounded.search.planner import Planner
 from grounded.search.standing import (
@@ -44,6 +44,9 @@ from grounded.search.standing import (
 from grounded.search.step_size import Step
 from grounded.task import Task
 from grounded.trial import Trial
+
+if TYPE_CHECKING:
+    from grounded.search.first_policy import Tick
 
 
 def propose(
@@ -81,6 +84,8 @@ def propose(
         planner = planner.with_model((refit or refitted)(planner.plan, trials))
     make = Maker(planner, now, identity or f"c{len(candidates) + 1:04d}", fingerprint)
     if now.incumbent is None:
+        from grounded.search.first_policy import first_policy
+
         policy, plan = first_policy(planner.plan, now.caution, tick)
         made = make.checked(make.candidate(policy, planner.plan.problem(exact=True), Step()))
         if plan.status == "converged":
