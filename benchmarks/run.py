@@ -63,12 +63,11 @@ def our_row(case):
     }
 
 
-def peer_rows(case, best, python, folder, fatrop):
+def peer_rows(case, best, python, folder):
     """What each peer prints, or why it printed nothing."""
     path = case.save(folder)
-    calls = [[peer] for peer in PEERS] + ([["casadi", "fatrop"]] if fatrop else [])
-    for peer, *extra in calls:
-        command = [python, f"peer_{peer}.py", str(path), repr(best), *extra]
+    for peer in PEERS:
+        command = [python, f"peer_{peer}.py", str(path), repr(best)]
         environment = os.environ | {"PYTHONPATH": str(HERE.parent)}
         done = subprocess.run(command, cwd=HERE, env=environment, capture_output=True, text=True)
         if done.returncode == 0:
@@ -87,7 +86,7 @@ def solve_part(options):
             print(f"\n{case.name}: H = {case.problem.horizon}, nz = {case.problem.nz}")
             show(ours, ours)
             if options.peers:
-                rows = peer_rows(case, best, options.peers, Path(folder), options.fatrop)
+                rows = peer_rows(case, best, options.peers, Path(folder))
                 for row in rows:
                     show(row, ours)
 
@@ -239,7 +238,6 @@ def process_part(options):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--peers", help="a Python that has the peers")
-    parser.add_argument("--fatrop", action="store_true", help="CasADi's fatrop too (slow to build)")
     parser.add_argument("parts", nargs="*", help=f"of {', '.join(PARTS)}")
     options = parser.parse_args()
     sys.path[:0] = [str(HERE.parent / folder) for folder in ("", "cli", "trials")]
