@@ -25,16 +25,6 @@ from grounded.estimate.trials import (
 )
 
 __all__ = [
-    "Estimated",
-    "Measurement",
-    "NoiseEstimate",
-    "NoiseStd",
-    "Record",
-    "Tracker",
-    "cut",
-    "noise_of",
-    "of_function",
-    "of_states",
-    "record_of",
-    "smooth_trials",
-]
+    "Estimated", "Measurement", "NoiseEstimate", "NoiseStd", "Record", "Tracker", "cut",
+    "noise_of", "of_function", "of_states", "record_of", "smooth_trials",
+]  # fmt: skip
