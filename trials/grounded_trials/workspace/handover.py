@@ -163,12 +163,18 @@ class Check:
     @cached_property
     def standing(self) -> Standing:
         """Where the search stands."""
-        from grounded_trials.workspace.proposing import standing_in
+        from grounded.search.standing import standing
 
+        if self.now is not None:
+            return self.now
+        here = self.workspace
         try:
-            return self.now or standing_in(self.workspace)
+            candidates = here.read().candidates
         except GroundedError:
-            return standing_in(self.workspace, contents=self.workspace.read(strict=False))
+            candidates = here.read(strict=False).candidates
+        trials = [t.trial for t in self.trials if here.fits(t.trial)]
+        options, model = here.config.search, here.planner.fingerprint
+        return standing(here.task, candidates, trials, options, model)
 
     @property
     def same_task(self) -> bool:
