@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from models import MODELS
+from peer_data import MODELS
 
 from grounded.compile import Problem
 from grounded.experiments.car_tasks import car_task

@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import crocoddyl
 import numpy as np
-from models import rk4
-from peer_data import fastest, load, reached, report
+from peer_data import fastest, load, reached, report, rk4
 
 case = load(np)
 n, m = case.n, case.m

@@ -5,27 +5,55 @@ existing Dask cluster through Dask's own joblib backend (extra `cluster`). The p
 computation (`each`: records of a fit, hypotheses of a diagnosis) are many and short and share their
 data: on this machine they are threads, which need no extra, because compiled passes leave Python's
 lock; on a cluster what all of them read is sent once (`SentOnce`).
+
+Either uses one BLAS thread, and keeps its pages (`steady`). Matrices here are small: the threads
+that OpenBLAS starts by itself wait for one another and burn a core each (three times the CPU of a
+diagnosis on two busy cores), and sum in another order. Arrays are large enough that the C library
+hands each back to the system, which then clears every page of the next one: 40 % of a diagnosis.
 """
 
 from __future__ import annotations
 
+import ctypes
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from typing import Any, TypeVar
 
 import numpy as np
 
 from grounded.errors import GroundedError, needs
-from grounded.threads import steady
 
 STACK = 16 * 2**20  # [bytes] of a thread: kernels keep their matrices there
 CONNECT_S = 10.0  # for a cluster's scheduler to answer
+TRIM, MAP = -1, -3  # M_TRIM_THRESHOLD, M_MMAP_THRESHOLD of the GNU C library
+LARGE = 2**28  # [bytes] blocks up to here are reused
 T = TypeVar("T")
+
+
+@contextmanager
+def steady() -> Iterator[None]:
+    """One BLAS thread for NumPy and SciPy, and pages kept; also a decorator, `@steady()`."""
+    import scipy.linalg  # noqa: F401  SciPy's BLAS is another one, loaded with it
+    from threadpoolctl import threadpool_limits
+
+    _keep_pages()
+    with threadpool_limits(1, user_api="blas"):
+        yield
+
+
+@cache
+def _keep_pages() -> None:
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (AttributeError, OSError, TypeError):  # another C library
+        return
+    mallopt(MAP, LARGE)
+    mallopt(TRIM, LARGE)
 
 
 @dataclass(frozen=True)

@@ -68,9 +68,9 @@ def document(**values: Any) -> dict[str, Any]:
 class Document(Result):
     """Base of frozen dataclasses that are written to JSON field by field, and read back.
 
-    A field's metadata may name another `key` than its own name, or leave the key out (`brief`)
-    where the value is None, not finite or "". Two are equal where their documents are: a number
-    that is not finite is null in both.
+    A field's metadata may name another `key` than its own name ("": it is not written), or leave
+    the key out (`brief`) where the value is None, not finite or "". Two are equal where
+    their documents are: a number that is not finite is null in both.
     """
 
     def to_json(self) -> dict[str, Any]:
@@ -79,8 +79,9 @@ class Document(Result):
         for one in fields(self):
             value = getattr(self, one.name)
             nothing = value in (None, "") or (isinstance(value, float) and not isfinite(value))
-            if not (one.metadata.get("brief") and nothing):
-                found[one.metadata.get("key", one.name)] = plain(value)
+            key = one.metadata.get("key", one.name)
+            if key and not (one.metadata.get("brief") and nothing):
+                found[key] = plain(value)
         return found
 
     @classmethod
@@ -134,7 +135,7 @@ def _given(kind: Any, document: dict[str, Any]) -> dict[str, Any]:
     found = {}
     for one in fields(kind):
         key = one.metadata.get("key", one.name)
-        if key in document:
+        if key and key in document:
             found[one.name] = _read(_types(kind)[one.name], document[key])
         elif one.default is MISSING and one.default_factory is MISSING:
             raise ValueError(f"it has no '{key}'")

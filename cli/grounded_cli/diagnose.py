@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import click
 
-from grounded.errors import NextCommand
 from grounded_cli import completion as complete
 from grounded_cli.options import (
     as_json,
@@ -25,7 +24,6 @@ if TYPE_CHECKING:
     from grounded.diagnosis.report import Diagnosis, Ranked
     from grounded.engine import Engine
     from grounded.instruments.finding import Finding
-    from grounded_trials import Workspace
 
 
 @click.command("diagnose")
@@ -105,38 +103,20 @@ def command(
     if json_:
         show_json(found.to_json())
     else:
-        from grounded_trials.workspace.diagnosing import probe_command
+        from grounded_trials.workspace.proposing import to_run
 
+        text = found.next_trial
+        if found.probe:
+            run = to_run(workspace, found.probe, found.probe)
+            text = text.replace(rendered(run), typed(run))
         params = workspace.base_model.params
-        run = probe_command(workspace, found.probe) if found.probe else None
-        _tell(found, {name: param.value for name, param in params.items()}, run)
-        show(f"\n{next_line(_follow(workspace, found))}")
+        _tell(found, {name: param.value for name, param in params.items()})
+        show("\n" + field("next trial", text))
+        assert found.then is not None
+        show(f"\n{next_line(found.then)}")
 
 
-def _follow(workspace: Workspace, found: Diagnosis) -> NextCommand:
-    """What follows: adopt what was claimed, run another trial, or see the whole."""
-    from grounded_trials.workspace.diagnosing import probe_command
-    from grounded_trials.workspace.next_step import (
-        after_diagnosis,
-        another_trial,
-        next_command,
-        usable_ids,
-    )
-    from grounded_trials.workspace.proposing import standing_in
-
-    if found.no_cause:
-        return another_trial(workspace, standing_in(workspace, ahead=True))
-    if follow := after_diagnosis(workspace, found):
-        return follow
-    if found.probe:
-        return probe_command(workspace, found.probe)
-    if found.kind == "none" and workspace.config.task.target:
-        now = standing_in(workspace, ahead=True)
-        return next_command(workspace, now, found, usable_ids(workspace))
-    return NextCommand("report", ("--html",))
-
-
-def _tell(found: Diagnosis, before: dict[str, float], run: NextCommand | None) -> None:
+def _tell(found: Diagnosis, before: dict[str, float]) -> None:
     from grounded_trials.report.diagnosis_words import (
         agreement_lines,
         correction_line,
@@ -161,10 +141,6 @@ def _tell(found: Diagnosis, before: dict[str, float], run: NextCommand | None) -
         show(field("correction", correction_line(found.correction)))
     for title, text in agreement_lines(found):
         show(field(title, text))
-    text = found.next_trial
-    if run is not None:
-        text = text.replace(rendered(run), typed(run))
-    show("\n" + field("next trial", text))
 
 
 def _held_out(found: Diagnosis) -> str:

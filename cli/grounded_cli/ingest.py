@@ -12,7 +12,6 @@ from grounded_cli.options import as_json, in_workspace, next_line, open_workspac
 from grounded_cli.terminal import field, number, progress, remark, sentence, show, show_json, table
 
 if TYPE_CHECKING:
-    from grounded_trials import Workspace
     from grounded_trials.workspace.ingest import Ingested
 
 # what a verdict means for the search
@@ -53,18 +52,7 @@ def command(files: tuple[str, ...], candidate: str | None, data: bool, json_: bo
     if json_:
         show_json({"trials": [one.to_json() for one in done]})
     else:
-        show(f"\n{next_line(_follow(workspace, done[-1]))}")
-
-
-def _follow(workspace: Workspace, one: Ingested) -> NextCommand:
-    """The next candidate; what the standing says where the search has ended."""
-    from grounded_trials.workspace.proposing import standing_in, status_of
-
-    if one.then.verb != "propose":
-        return one.then
-    now = standing_in(workspace, ahead=one.verdict == "run again")
-    goes_on = now.phase in ("propose", "await-trial")
-    return one.then if goes_on else status_of(workspace, now).then
+        show(f"\n{next_line(done[-1].then)}")
 
 
 @click.command("next")

@@ -135,11 +135,8 @@ def _span(low: float, high: float) -> str:
 
 def _trust(standing: Standing, workspace: Workspace) -> str:
     """How the last prediction came true; before that, what the model was compared with."""
-    from grounded.search.improve import model_fingerprint
-
     ran = [tried for tried in standing.history if tried.utilities]
-    model = model_fingerprint(workspace.planner.plan) if ran else ""
-    same = [tried for tried in ran if tried.candidate.model == model]
+    same = [tried for tried in ran if tried.candidate.model == workspace.planner.fingerprint]
     if ran and not same:
         return "unknown: the model was changed since the last run, none has tested it as it is now"
     if not ran:

@@ -47,13 +47,12 @@ from grounded.diagnosis.validation.prediction_error import by_region, by_time, e
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.diagnosis.verdict import next_trial, verdict
 from grounded.effects import Library
-from grounded.engine import Engine, running
+from grounded.engine import Engine, running, steady
 from grounded.errors import GroundedError
 from grounded.instruments.preflight import preflight
 from grounded.model import Model
 from grounded.progress import Stages, interruptible
 from grounded.task import Task
-from grounded.threads import steady
 from grounded.trial import Trial
 
 

@@ -11,6 +11,7 @@ from grounded.result import Document
 
 SCALED = ("m", "rad", "s")  # units, and their rates, of which thousandths have a name
 SMALL = 1e-3  # below which they are used
+ABOVE = 1.3  # times the noise floor: what is left is stated
 BRIEF: dict[str, Any] = {"brief": True}  # a field whose key is left out where there is nothing
 
 

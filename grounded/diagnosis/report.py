@@ -23,6 +23,7 @@ from grounded.diagnosis.error_report import (
     Where,
     number,
 )
+from grounded.errors import NextCommand
 from grounded.instruments.finding import Finding
 from grounded.result import Document
 
@@ -256,6 +257,7 @@ class Diagnosis(Document):
     candidates: int = 0
     made: Made | None = field(metadata=BRIEF | {"key": "diagnosed"}, default=None)  # in a workspace
     probe: str = field(metadata=BRIEF, default="")  # the candidate that tells what ties apart
+    then: NextCommand | None = field(metadata={"key": ""}, default=None)  # what to type next
 
     def __repr__(self) -> str:
         named = ", ".join(self.effects) or "no effect"

@@ -6,14 +6,16 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
-from grounded.diagnosis.error_report import Credit, Remainder, RulerRow, measured, number
-from grounded.diagnosis.hypotheses.leftover import Leftover
+from grounded.diagnosis.error_report import ABOVE, Credit, Remainder, RulerRow, measured, number
 from grounded.diagnosis.report import Estimate, Kind, Ranked, Unconfirmed, Verdict, quantity
-from grounded.diagnosis.validation.claims import Claims
-from grounded.diagnosis.validation.measured import ABOVE
-from grounded.effects import Effect, ParamFamily, places
-from grounded.model import Model
+
+if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
+    from grounded.diagnosis.hypotheses.leftover import Leftover
+    from grounded.diagnosis.validation.claims import Claims
+    from grounded.effects import Effect
+    from grounded.model import Model
 
 NAMED = 3  # parameters, channels and leftovers that a sentence names at most
 MATTERS = 0.05  # of the crude model's error: a rest below it is told as its share
@@ -250,6 +252,8 @@ def called(model: Model, name: str) -> str:
 
     Symbols get a word before them: what is short, Greek, or not letters alone.
     """
+    from grounded.effects import places
+
     roles = {
         "speed": (places.speed(model),),
         "heading": places.role(model, "heading"),
@@ -265,6 +269,8 @@ def called(model: Model, name: str) -> str:
 
 def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
     """The family's sentence with names and numbers filled in; starts with a small letter."""
+    from grounded.effects import ParamFamily
+
     model, targets = effect.site.model, effect.site.targets
     words: dict[str, str] = {name: quantity(e) for name, e in params.items()}
     words.setdefault("s", "s" if len(targets) == 1 else "")

@@ -1,9 +1,7 @@
 """State estimation: filter, smoother, likelihood, noise, and a tracker for the running robot.
 
-    filter_trials   the extended Kalman filter along trials, with the innovations' likelihood
-    smooth_trials   the smoother, for stored trials
+    smooth_trials   the smoother, or the extended Kalman filter alone, along stored trials
     noise_of        process and measurement noise by maximum likelihood
-    consistency     is what the filter claims true? (NIS, NEES, whiteness)
     Tracker         predict and update while the robot runs (footnotes 15 and 18)
 
 Everything works for any model (also a black-box simulator), any measurement function, lost samples,
@@ -18,32 +16,15 @@ from __future__ import annotations
 
 from grounded.estimate.likelihood import NoiseEstimate
 from grounded.estimate.measurement import Measurement, NoiseStd, of_function, of_states
-from grounded.estimate.record import Record, cut, merged, record_of
+from grounded.estimate.record import Record, cut, record_of
 from grounded.estimate.tracker import Tracker
 from grounded.estimate.trials import (
-    Consistency,
     Estimated,
-    consistency,
-    filter_trials,
     noise_of,
     smooth_trials,
 )
 
 __all__ = [
-    "Consistency",
-    "Estimated",
-    "Measurement",
-    "NoiseEstimate",
-    "NoiseStd",
-    "Record",
-    "Tracker",
-    "consistency",
-    "cut",
-    "filter_trials",
-    "merged",
-    "noise_of",
-    "of_function",
-    "of_states",
-    "record_of",
-    "smooth_trials",
-]
+    "Estimated", "Measurement", "NoiseEstimate", "NoiseStd", "Record", "Tracker", "cut",
+    "noise_of", "of_function", "of_states", "record_of", "smooth_trials",
+]  # fmt: skip

@@ -32,12 +32,10 @@ ROWS = 8_000  # more samples than this teach the noise little
 
 @dataclass(frozen=True, eq=False)
 class NoiseEstimate:
-    """The noise, its log-likelihood, what is seen of it, and how the search ended."""
+    """The noise, its log-likelihood, and how the search ended."""
 
     noise: NoiseStd
     loglik: float
-    process_seen: tuple[bool, ...]  # (n,) False: at the floor, or nothing says anything about it
-    measurement_seen: tuple[bool, ...]  # (ny,)
     status: str
 
 
@@ -64,13 +62,12 @@ def maximum_likelihood(
     """
     steps = ModelSteps(system, p, batch, wide)
     noise, best = _expectation(batch, measurement, start, steps, FIRST_STEPS)
-    seen = np.zeros(len(start.process) + measurement.ny, dtype=bool)
     status = "converged"
     for round_ in range(rounds):
         if not np.isfinite(best.loglik):
             status = best.status
             break
-        trial, seen = _climb(batch, noise, best, start)
+        trial = _climb(batch, noise, best, start)
         after = filter_batch(batch, measurement, trial, steps, best)
         gain = after.loglik - best.loglik
         if gain > 0:
@@ -79,10 +76,7 @@ def maximum_likelihood(
             break
         if round_ == rounds - 1:
             status = "still rising"
-    n = len(noise.process)
-    return NoiseEstimate(
-        noise, best.loglik, tuple(map(bool, seen[:n])), tuple(map(bool, seen[n:])), status
-    )
+    return NoiseEstimate(noise, best.loglik, status)
 
 
 def _expectation(
@@ -148,10 +142,8 @@ def enough(records: Sequence[Record], rng: np.random.Generator | None = None) ->
     return kept
 
 
-def _climb(
-    batch: RecordBatch, noise: NoiseStd, about: Filtered, start: NoiseStd
-) -> tuple[NoiseStd, Array]:
-    """The best noise for a fixed linearisation, and which variances the data see."""
+def _climb(batch: RecordBatch, noise: NoiseStd, about: Filtered, start: NoiseStd) -> NoiseStd:
+    """The best noise for a fixed linearisation."""
     from scipy.optimize import minimize
 
     n, dt = len(noise.process), noise.dt
@@ -175,7 +167,7 @@ def _climb(
     options = {"maxiter": 60, "ftol": 1e-9, "gtol": 1e-6}
     found = minimize(cost, theta, jac=True, method="L-BFGS-B", bounds=bounds, options=options).x
     std = np.exp(0.5 * found)
-    return NoiseStd(std[:n], std[n:], dt), found > low + 2.0
+    return NoiseStd(std[:n], std[n:], dt)
 
 
 def _spread(values: Array) -> float:

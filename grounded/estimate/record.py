@@ -161,36 +161,6 @@ def record_of(model: Model, trial: Trial) -> Record:
     )
 
 
-def merged(
-    times: Array,
-    measured: Array,
-    command_times: Array,
-    commands: Array,
-    past: Array | None = None,
-    *,
-    resolution: float = 1e-6,
-) -> Record:
-    """A record whose states live at the instants of measurements AND of commands.
-
-    For a camera and a controller of different rates; instants closer than `resolution` [s] are one.
-    The commands act exactly when they were sent, up to their latency.
-
-    Args:
-        times: of the measurements [s], (N,).
-        measured: (N, ny).
-        command_times: [s], (M,).
-        commands: (M, m).
-        past: held before the first command, (m,).
-        resolution: [s].
-    """
-    inside = (command_times >= times[0]) & (command_times <= times[-1])
-    ticks = np.unique(np.round(np.concatenate([times, command_times[inside]]) / resolution))
-    where = np.searchsorted(ticks, np.round(np.asarray(times) / resolution))
-    rows = np.full((len(ticks), measured.shape[1]), np.nan)
-    rows[where] = measured
-    return Record(np.asarray(ticks * resolution), rows, command_times, commands, past)
-
-
 def cut(record: Record, seconds: float) -> list[Record]:
     """The record in pieces of about `seconds`, each with an unknown start of its own.
 

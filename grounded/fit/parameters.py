@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from grounded.engine import Engine, running
+from grounded.engine import Engine, running, steady
 from grounded.errors import GroundedError
 from grounded.estimate import Measurement, NoiseStd, Record, of_states
 from grounded.estimate.record import part, records_of
@@ -22,7 +22,6 @@ from grounded.frozen import Array
 from grounded.model import Model
 from grounded.progress import Stages, interruptible
 from grounded.task import Task
-from grounded.threads import steady
 from grounded.trial import Trial
 
 

@@ -1,21 +1,70 @@
-"""How sure an improvement is, given that a real system seldom does the same thing twice."""
+"""Which candidates improved, and how sure that is: real systems seldom do the same thing twice."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from grounded.search.candidate import Candidate, Tried
+from grounded.task import Task
 from grounded.trial import Trial
 
 if TYPE_CHECKING:
-    from grounded.search.candidate import Tried
-
+    from grounded.search.standing import SearchOptions
 
 FEW = 4.0  # degrees of freedom, with which two standard errors are no certainty
+
+
+def judged(
+    task: Task,
+    candidates: Sequence[Candidate],
+    trials: Sequence[Trial],
+    options: SearchOptions,
+    model: str,
+) -> tuple[tuple[Tried, ...], Tried | None, int]:
+    """Every candidate with its trials, accepted or not; the incumbent; iterations done."""
+    history: list[Tried] = []
+    incumbent: Tried | None = None
+    iteration = losses = 0  # accepted improvements; steps from the incumbent that did not improve
+    exact = False  # whether the system has repeated itself to the last bit
+    ids = {c.id for c in candidates}
+    spent = sum(t.candidate in ids for t in trials) >= options.max_trials
+    by_name: dict[str, list[Trial]] = {}
+    for trial in trials:
+        by_name.setdefault(trial.candidate, []).append(trial.whole(task.horizon))
+    for candidate in candidates:
+        own = tuple(by_name.get(candidate.id, ()))
+        utilities = tuple(task.utility(t) for t in own)
+        failed = any(u == -np.inf for u in utilities)
+        exact = exact or repeated_exactly(own)
+        enough = min(options.repeats, len(own)) if exact and own else options.repeats
+        if len(own) < enough and not failed:
+            history.append(Tried(candidate, own, utilities, None))
+            continue
+        better = incumbent is None or float(np.mean(utilities)) > incumbent.utility
+        accepted = better and not failed
+        tried = Tried(candidate, own, utilities, accepted)
+        if accepted:
+            iteration += incumbent is not None
+            incumbent, losses = tried, 0
+        elif incumbent is not None and (candidate.base, candidate.model) == (
+            incumbent.candidate.id,
+            model,
+        ):
+            losses += 1
+            if (
+                options.rerun_incumbent
+                and not (spent or exact)
+                and in_doubt(incumbent, tried, losses + options.repeats)
+            ):
+                tried = replace(tried, accepted=None, in_doubt=True)
+        history.append(tried)
+    return tuple(history), incumbent, iteration
 
 
 def repeated_exactly(trials: Sequence[Trial]) -> bool:

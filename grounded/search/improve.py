@@ -22,16 +22,15 @@ bit. `ask_tell` is the loop around it.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from grounded.errors import NextCommand
 from grounded.model import Model
 from grounded.search.candidate import Candidate, Tried
-from grounded.search.first_policy import Tick, first_policy
 from grounded.search.making import About, Maker, Proposal
 from grounded.search.planner import Planner
 from grounded.search.standing import (
@@ -46,23 +45,8 @@ from grounded.search.step_size import Step
 from grounded.task import Task
 from grounded.trial import Trial
 
-
-def model_fingerprint(task: Task) -> str:
-    """16 hex digits over the model that plans: its values, latency, smoothing and predictions.
-
-    Predictions at fixed points stand for the code of the dynamics, which has no other identity.
-    """
-    model, problem = task.model, task.problem(exact=True)
-    digest = hashlib.sha256()
-    digest.update(repr((model.state_names, model.input_names, model.param_names)).encode())
-    rng = np.random.default_rng(0)
-    x = task.start + rng.uniform(-0.5, 0.5, (8, model.n))
-    u = np.clip(task.past + rng.uniform(-0.5, 0.5, (8, model.m)), task.low, task.high)
-    with np.errstate(all="ignore"):
-        moved = problem.system.step(x, u, problem.p, problem.dt)
-    for array in (model.values, problem.delay, np.array([task.smoothing]), np.round(moved, 9)):
-        digest.update(np.ascontiguousarray(array + 0.0).tobytes())
-    return digest.hexdigest()[:16]
+if TYPE_CHECKING:
+    from grounded.search.first_policy import Tick
 
 
 def propose(
@@ -90,7 +74,7 @@ def propose(
         tick: told what is going on while planning takes its time.
     """
     planner = planner or Planner(task, task)
-    fingerprint = model_fingerprint(planner.plan)
+    fingerprint = planner.fingerprint
     now = standing(task, candidates, trials, options, fingerprint)
     if now.phase == "await-trial":
         return Proposal(now, now.outstanding, is_new=False)
@@ -100,6 +84,8 @@ def propose(
         planner = planner.with_model((refit or refitted)(planner.plan, trials))
     make = Maker(planner, now, identity or f"c{len(candidates) + 1:04d}", fingerprint)
     if now.incumbent is None:
+        from grounded.search.first_policy import first_policy
+
         policy, plan = first_policy(planner.plan, now.caution, tick)
         made = make.checked(make.candidate(policy, planner.plan.problem(exact=True), Step()))
         if plan.status == "converged":

@@ -12,7 +12,6 @@ from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.result import Result, document
 from grounded.search.candidate import Candidate, Tried, Way
-from grounded.search.first_policy import first_policy
 from grounded.search.planner import Planner, predicted
 from grounded.search.safety import objections, spread
 from grounded.search.standing import SearchOptions, Standing, losers_of, wild
@@ -131,6 +130,8 @@ class About:
         tried = losers_of(make.now.history, base.id, make.fingerprint, "own plan")
         if base.model == make.fingerprint or tried:
             return None
+        from grounded.search.first_policy import first_policy
+
         policy, _ = first_policy(make.planner.plan)
         made = self.candidate(policy, Step(), "own plan")
         promise = rival.candidate.predicted_gain if rival and rival.candidate else self.least

@@ -9,7 +9,9 @@ dropped; their part of the feed-forward stays), and the predicted run is the nar
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -28,6 +30,11 @@ class Planner:
 
     task: Task
     plan: Task
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Of the model that plans, see `model_fingerprint`."""
+        return model_fingerprint(self.plan)
 
     def lift(self, trial: Trial) -> Trial:
         """A trial with the planning model's memory states beside its own."""
@@ -56,6 +63,24 @@ class Planner:
     def with_model(self, model: Model) -> Planner:
         """The same with other parameter values of the planning model."""
         return dataclasses.replace(self, plan=self.plan.with_model(model))
+
+
+def model_fingerprint(task: Task) -> str:
+    """16 hex digits over the model that plans: its values, latency, smoothing and predictions.
+
+    Predictions at fixed points stand for the code of the dynamics, which has no other identity.
+    """
+    model, problem = task.model, task.problem(exact=True)
+    digest = hashlib.sha256()
+    digest.update(repr((model.state_names, model.input_names, model.param_names)).encode())
+    rng = np.random.default_rng(0)
+    x = task.start + rng.uniform(-0.5, 0.5, (8, model.n))
+    u = np.clip(task.past + rng.uniform(-0.5, 0.5, (8, model.m)), task.low, task.high)
+    with np.errstate(all="ignore"):
+        moved = problem.system.step(x, u, problem.p, problem.dt)
+    for array in (model.values, problem.delay, np.array([task.smoothing]), np.round(moved, 9)):
+        digest.update(np.ascontiguousarray(array + 0.0).tobytes())
+    return digest.hexdigest()[:16]
 
 
 def predicted(problem: Problem, policy: Policy) -> Rollout:

@@ -20,12 +20,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
-
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result, document
 from grounded.search.candidate import Candidate, Tried, Way
-from grounded.search.certainty import in_doubt, last_improvement, repeated_exactly
+from grounded.search.certainty import judged, last_improvement
 from grounded.search.step_size import Step, after_failure, after_success
 from grounded.task import Task
 from grounded.trial import Trial
@@ -209,7 +207,7 @@ def standing(
         options: the [search] table.
         model: fingerprint of the task's model now; a direction belongs to one model.
     """
-    history, incumbent, iteration = _judge(task, candidates, trials, options, model)
+    history, incumbent, iteration = judged(task, candidates, trials, options, model)
     total = sum(len(t.trials) for t in history)
     now = Standing(
         phase="propose",
@@ -368,50 +366,3 @@ def _next_step(
         if (step := options.due(history, incumbent, model, way)) is not None:
             return step, way
     return None, ways[-1]
-
-
-def _judge(
-    task: Task,
-    candidates: Sequence[Candidate],
-    trials: Sequence[Trial],
-    options: SearchOptions,
-    model: str,
-) -> tuple[tuple[Tried, ...], Tried | None, int]:
-    """Every candidate with its trials, accepted or not; the incumbent; iterations done."""
-    history: list[Tried] = []
-    incumbent: Tried | None = None
-    iteration = losses = 0  # accepted improvements; steps from the incumbent that did not improve
-    exact = False  # whether the system has repeated itself to the last bit
-    ids = {c.id for c in candidates}
-    spent = sum(t.candidate in ids for t in trials) >= options.max_trials
-    by_name: dict[str, list[Trial]] = {}
-    for trial in trials:
-        by_name.setdefault(trial.candidate, []).append(trial.whole(task.horizon))
-    for candidate in candidates:
-        own = tuple(by_name.get(candidate.id, ()))
-        utilities = tuple(task.utility(t) for t in own)
-        failed = any(u == -np.inf for u in utilities)
-        exact = exact or repeated_exactly(own)
-        enough = min(options.repeats, len(own)) if exact and own else options.repeats
-        if len(own) < enough and not failed:
-            history.append(Tried(candidate, own, utilities, None))
-            continue
-        better = incumbent is None or float(np.mean(utilities)) > incumbent.utility
-        accepted = better and not failed
-        tried = Tried(candidate, own, utilities, accepted)
-        if accepted:
-            iteration += incumbent is not None
-            incumbent, losses = tried, 0
-        elif incumbent is not None and (candidate.base, candidate.model) == (
-            incumbent.candidate.id,
-            model,
-        ):
-            losses += 1
-            if (
-                options.rerun_incumbent
-                and not (spent or exact)
-                and in_doubt(incumbent, tried, losses + options.repeats)
-            ):
-                tried = replace(tried, accepted=None, in_doubt=True)
-        history.append(tried)
-    return tuple(history), incumbent, iteration

@@ -20,7 +20,7 @@ from grounded_trials.store.documents import write_document
 from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace.diagnosing import _chosen, diagnosable, read_diagnosis
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.next_step import after_diagnosis
+from grounded_trials.workspace.next_step import to_adopt
 
 LAG = 0.12
 
@@ -147,7 +147,7 @@ def test_more_of_an_adopted_effect_changes_its_numbers(tmp_path):
     names = ["parameter:viscous_friction_omega_k", "parameter:l"]
     read = read_diagnosis(tmp_path / "ws" / "reports")
     assert read is not None
-    advice = after_diagnosis(Folder(tmp_path / "ws"), read)
+    advice = to_adopt(Folder(tmp_path / "ws"), read)
     assert advice == NextCommand("adopt", tuple(names))  # fit knows the model's own numbers only
     for _ in range(2):  # twice is once
         done = grounded("-C", tmp_path / "ws", "adopt", *names)

@@ -1,18 +1,18 @@
 """The filter against a dense Gaussian, the slopes against differences, claims against truth."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
+from consistency import consistency, merged
 from facts import holding
 from grounded.compile.problem import queue_of
 from grounded.errors import GroundedError
 from grounded.estimate import (
     NoiseStd,
     Tracker,
-    consistency,
     cut,
-    filter_trials,
-    merged,
     noise_of,
     of_function,
     of_states,
@@ -34,6 +34,7 @@ from grounded.models.car import model as car
 from grounded.trial import Trial
 
 DT = 0.05
+filter_trials = partial(smooth_trials, forward=True)
 
 
 def _spring(s, a, p):

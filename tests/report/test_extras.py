@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
 
 import pytest
@@ -55,3 +56,17 @@ def test_what_is_there_is_imported():
     assert needs("json", "all") is sys.modules["json"]
     with pytest.raises(GroundedError, match=r"no_such_module.*\.\[all\]"):
         needs("no_such_module", "all")
+
+
+@pytest.mark.parametrize(
+    ("module", "never"),
+    [
+        ("grounded_trials.report.page.page", ("grounded.diagnosis.likelihood", "grounded.effects")),
+        ("grounded_trials.workspace.proposing", ("grounded.diagnosis", "grounded.search.improve")),
+        ("grounded.search.improve", ("grounded.search.first_policy", "grounded.search.mispred")),
+    ],
+)
+def test_a_command_imports_what_it_needs(module, never):
+    code = f"import sys, {module}; print(*sys.modules)"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert not [name for name in found.stdout.split() if name.startswith(never)]

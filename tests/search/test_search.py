@@ -11,7 +11,8 @@ from facts import holding, holds
 from grounded.errors import GroundedError
 from grounded.plant import Noise, Plant
 from grounded.search.ask_tell import learn
-from grounded.search.improve import model_fingerprint, propose
+from grounded.search.improve import propose
+from grounded.search.planner import model_fingerprint
 from grounded.search.standing import MAX_CAUTION, OTHER_WAY, SearchOptions, standing
 from grounded.search.step_size import Step
 from grounded.trial import Trial, mean_trial

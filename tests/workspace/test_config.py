@@ -18,8 +18,8 @@ from grounded_trials.logs.log_table import log_mapping
 from grounded_trials.toml_table import Table
 from grounded_trials.workspace.config import ModelTable, SystemTable, TaskTable, read_config
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.foreign import EstimateTable, read_estimate
 from grounded_trials.workspace.running import simulated_plant
-from grounded_trials.workspace.unmeasured import EstimateTable, read_estimate
 from workspaces import CONFIG, make
 
 REFERENCE = Path(__file__).resolve().parents[2] / "docs" / "configuration.md"

@@ -14,7 +14,10 @@ from facts import holding
 from grounded.errors import GroundedError
 from grounded.policy import load
 from grounded_trials.workspace.exporting import RUNNER, export_candidate
+from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.ingest import ingest_log
 from grounded_trials.workspace.proposing import propose_in
+from grounded_trials.workspace.running import run_candidate
 from workspaces import CONFIG, make
 
 
@@ -120,3 +123,17 @@ def test_the_runner_beside_an_export_drives_without_grounded(tmp_path):
     assert [float(u) for u in found.split()] == expected
     with pytest.raises(GroundedError, match=holding("npz", "json")):
         export_candidate(w, "c0001", "json", tmp_path / "c.json", runner=True)
+
+
+def test_a_candidate_is_exported_beside_a_damaged_file_of_another(tmp_path):
+    w = make(tmp_path / "w")
+    ingest_log(w, run_candidate(w, propose_in(w).candidate.id).trial_file)
+    second = propose_in(w).candidate.id
+    ingest_log(w, run_candidate(w, second).trial_file)
+    damaged = w.store.list()[-1].path
+    damaged.chmod(0o644)
+    damaged.write_bytes(damaged.read_bytes()[:-100])
+    done = export_candidate(Folder(w.folder), "c0001", "json", tmp_path / "c.json")
+    assert done.file.is_file() and done.named == ("--candidate", "c0001")
+    with pytest.raises(GroundedError, match="damaged"):  # which one is best, nobody knows
+        export_candidate(Folder(w.folder), "best", "json", tmp_path / "b.json")

@@ -14,7 +14,7 @@ from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace.ingest import ingest_log
 from grounded_trials.workspace.proposing import propose_in
 from grounded_trials.workspace.running import run_candidate
-from grounded_trials.workspace.trial_check import evidence, follows, what_ran
+from grounded_trials.workspace.trial_check import evidence, follows, suspicion
 from workspaces import CONFIG, make
 
 FULL = CONFIG.replace("[search]", '[search]\nstep = "full"\nrerun_incumbent = false')
@@ -63,7 +63,7 @@ def noisy(made, share, seed, *, other):
 
 def refused(w, trial, made, candidates):
     """Why the run is not this candidate's, "" where it is taken for it."""
-    return what_ran(w.task, replace(trial, candidate=made.id), made, [*candidates.values()])
+    return suspicion(w.task, replace(trial, candidate=made.id), made, [*candidates.values()])[0]
 
 
 @pytest.mark.parametrize("other", [False, True])

@@ -11,7 +11,6 @@ import pytest
 from cli import grounded, plain, process
 from facts import holds
 from grounded.diagnosis.report import Diagnosis, Made
-from grounded_cli.diagnose import _follow
 from grounded_cli.main import COMMANDS, cli
 from grounded_cli.options import ELSEWHERE
 from grounded_trials import Workspace
@@ -19,7 +18,7 @@ from grounded_trials.store.documents import write_document
 from grounded_trials.wording import folded
 from grounded_trials.workspace.config import set_in_model
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.next_step import since_diagnosis
+from grounded_trials.workspace.next_step import DIAGNOSE, after_diagnosis, since_diagnosis
 from reported import DIAGNOSIS, cart, copied
 from workspaces import make
 
@@ -337,7 +336,7 @@ def test_after_a_verdict_of_none_the_search_goes_on(tmp_path):
     nothing = {"kind": "none", "effects": [], "sentence": "Nothing."}
     found = Diagnosis.from_json({**DIAGNOSIS, "verdict": nothing, "next_trial": ""})
     made = replace(Made(), params=dict(w.config.model.params))
-    assert _follow(w, replace(found, made=made)).verb == "propose"
+    assert after_diagnosis(w, replace(found, made=made)).verb == "propose"
 
 
 def test_after_a_verdict_of_none_a_search_that_has_ended_is_exported(cart, tmp_path):
@@ -346,4 +345,14 @@ def test_after_a_verdict_of_none_a_search_that_has_ended_is_exported(cart, tmp_p
     found = Diagnosis.from_json({**DIAGNOSIS, "verdict": nothing, "next_trial": ""})
     made = replace(Made(), params=dict(w.config.model.params))
     ended = w.status().standing.phase in ("converged", "stopped")
-    assert ended and _follow(w, replace(found, made=made)).verb == "export"
+    assert ended and after_diagnosis(w, replace(found, made=made)).verb == "export"
+
+
+def test_a_result_says_what_follows_it_without_the_command_line(cart, tmp_path):
+    w = Workspace(copied(cart, tmp_path / "w"))
+    run = w.run("best").trial_file
+    assert w.ingest(run).then == w.status().then  # the search has ended: not `propose`
+    assert w.ingest(run, data=True).then == DIAGNOSE
+    found = w.diagnose(max_effects=1)
+    assert found.then is not None and found.then == w.status().then
+    assert "then" not in found.to_json()

@@ -6,8 +6,9 @@ import pytest
 from grounded.effects import Library
 from grounded.errors import NextCommand
 from grounded_trials import Workspace
-from grounded_trials.workspace.diagnosing import _probe, probe_command
+from grounded_trials.workspace.diagnosing import _probe
 from grounded_trials.workspace.handover import checked_candidate
+from grounded_trials.workspace.proposing import to_run
 from workspaces import CONFIG, make
 
 NOISY = CONFIG + "[system.noise.measurement]\nx = 0.02\nv = 0.05\n"
@@ -49,9 +50,9 @@ def test_every_probe_that_is_offered_is_handed_over(diagnosed):
 
 def test_people_export_a_probe(diagnosed, tmp_path):
     w, found = diagnosed
-    assert probe_command(w, found.probe) == NextCommand("run", (found.probe,))
+    assert to_run(w, found.probe, found.probe) == NextCommand("run", (found.probe,))
     bare = make(tmp_path / "w", config=CONFIG.partition("[system]")[0])
-    assert probe_command(bare, "c0004") == NextCommand("export", ("c0004", "--runner"))
+    assert to_run(bare, "c0004", "c0004") == NextCommand("export", ("c0004", "--runner"))
 
 
 def test_without_safety_a_probe_stays_near_where_trials_have_been(diagnosed):

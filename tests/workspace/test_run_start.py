@@ -12,6 +12,7 @@ import pytest
 from cli import grounded
 from grounded.errors import GroundedError, NextCommand
 from grounded_trials import Workspace
+from grounded_trials.workspace import foreign
 from workspaces import CONFIG, make
 
 LOGGED = CONFIG + "".join(
@@ -92,6 +93,15 @@ def test_an_aborted_run_crashed_with_a_lead_in_too(w, tmp_path, until):
     found = w.ingest(record(w, tmp_path / "a.csv", policy, 1.0, until=until))
     assert (found.candidate, found.verdict) == ("c0002", "crashed")
     assert abs(w.trials()[-1].trial.steps - until / policy.dt) <= 1
+
+
+def test_a_log_whose_start_is_sought_is_read_once(w, tmp_path, monkeypatch):
+    reads = []
+    counted = lambda *a: reads.append(a) or read(*a)  # noqa: E731
+    read = foreign.mapped_signals
+    monkeypatch.setattr(foreign, "mapped_signals", counted)
+    found = w.ingest(record(w, tmp_path / "b.csv", w.candidate("c0002")[0].policy, 1.0))
+    assert found.notes and len(reads) == 1
 
 
 def test_the_operator_jogged_the_cart_first(w, tmp_path):

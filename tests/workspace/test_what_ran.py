@@ -19,7 +19,7 @@ from grounded_trials.store.trial_file import read_trial, write_trial
 from grounded_trials.workspace.ingest import ingest_log
 from grounded_trials.workspace.proposing import propose_in, standing_in
 from grounded_trials.workspace.running import run_candidate
-from grounded_trials.workspace.trial_check import suspicion, what_ran
+from grounded_trials.workspace.trial_check import suspicion
 from workspaces import CONFIG, make
 
 NOISY = CONFIG + "[system.noise.measurement]\nx = 0.002\nv = 0.01\n"
@@ -65,7 +65,7 @@ def test_a_run_is_recognised_though_the_log_is_not_perfect(learnt, kind):
     for own, trial, candidates in runs(learnt):
         states, inputs = HONEST[kind](np.array(trial.states), np.array(trial.inputs))
         logged = replace(trial, states=states, inputs=inputs)
-        assert what_ran(learnt.task, logged, own, candidates) == ""
+        assert suspicion(learnt.task, logged, own, candidates)[0] == ""
 
 
 @pytest.mark.parametrize("share", [0.01, 0.03])
@@ -83,20 +83,20 @@ def test_a_run_on_states_of_varying_age_with_noise_of_its_own_is_recognised(lear
                 states=clean + noise * rng.normal(size=clean.shape),
                 inputs=own.policy.commands(acted[None], own.policy.past)[0],
             )
-            assert what_ran(learnt.task, logged, own, [own]) == ""
+            assert suspicion(learnt.task, logged, own, [own])[0] == ""
 
 
 @pytest.mark.parametrize("kind", OTHERS)
 def test_other_commands_are_not_the_candidate_s(learnt, kind):
     for own, trial, candidates in runs(learnt):
         logged = replace(trial, inputs=OTHERS[kind](np.array(trial.inputs)))
-        assert "force" in what_ran(learnt.task, logged, own, candidates)
+        assert "force" in suspicion(learnt.task, logged, own, candidates)[0]
 
 
 def test_every_pair_of_candidates_is_told_apart(learnt):
     for own, trial, candidates in runs(learnt):
         for other in candidates:
-            why = what_ran(learnt.task, replace(trial, candidate=other.id), other, candidates)
+            why = suspicion(learnt.task, replace(trial, candidate=other.id), other, candidates)[0]
             assert why.endswith(f"those of {own.id}") if other.id != own.id else why == ""
 
 
@@ -104,7 +104,7 @@ def test_a_takeover_is_dated(learnt):
     own, trial, candidates = runs(learnt)[0]
     inputs = np.array(trial.inputs)
     inputs[25:] = -inputs[25:] + 2
-    why = what_ran(learnt.task, replace(trial, inputs=inputs), own, candidates)
+    why = suspicion(learnt.task, replace(trial, inputs=inputs), own, candidates)[0]
     assert re.search(r"up to 1\.[0-3] s", why)
 
 

@@ -126,11 +126,9 @@ class Workspace(Folder):
             anyway: run it though it is void.
             warn: told what is overridden, before the robot moves.
         """
-        from grounded_trials.workspace.proposing import candidate_named
         from grounded_trials.workspace.running import run_candidate
 
-        name = candidate_named(self._afresh(), candidate)
-        return run_candidate(self, name, anyway=anyway, warn=warn)
+        return run_candidate(self._afresh(), candidate, anyway=anyway, warn=warn)
 
     def ingest(
         self, path: str | Path, *, candidate: str | None = None, data: bool = False
@@ -144,11 +142,8 @@ class Workspace(Folder):
             data: the log ran no candidate: for fitting and diagnosis only.
         """
         from grounded_trials.workspace.ingest import ingest_log
-        from grounded_trials.workspace.proposing import candidate_named
 
-        here = self._afresh()
-        ran = candidate and candidate_named(here, candidate)
-        return ingest_log(here, Path(path), ran, data=data)
+        return ingest_log(self._afresh(), Path(path), candidate, data=data, ahead=True)
 
     def next(
         self, log: str | Path, *, candidate: str | None = None, runner: bool = True
@@ -161,11 +156,8 @@ class Workspace(Folder):
             runner: write the program that runs the candidate beside it, see `export`.
         """
         from grounded_trials.workspace.looping import next_in
-        from grounded_trials.workspace.proposing import candidate_named
 
-        here = self._afresh()
-        ran = candidate and candidate_named(here, candidate)
-        return next_in(here, Path(log), ran, runner=runner)
+        return next_in(self._afresh(), Path(log), candidate, runner=runner)
 
     def target(self, columns: Mapping[str, Array]) -> Path:
         """Writes target.csv and its length to grounded.toml; the old one is kept as target.csv.bak.

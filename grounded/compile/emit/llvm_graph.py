@@ -12,8 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 from grounded.compile.emit.llvm_math import Lanes
 from grounded.compile.emit.llvm_text import Writer
-from grounded.compile.trace.graph import Graph
-from grounded.compile.trace.operations import SATURATED
+from grounded.compile.trace.graph import SATURATED, Graph
 
 EPS, INVERSE, DT, FIRST = 0, 1, 2, 3  # slots of the table: eps, 1/eps or 0, dt, then nodes
 
@@ -127,7 +126,7 @@ class Body:
             self._settings[slot] = self.f.load_all(self.table, slot, self.width)
         return self._settings[slot]
 
-    # Indicator terms; see `operations.py` for what they mean.
+    # Indicator terms; see `graph.py` for what they mean.
 
     def pick(self, how: str, a: str, b: str, yes: str, no: str) -> str:
         """`yes` where a compares so to b."""

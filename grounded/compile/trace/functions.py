@@ -34,7 +34,7 @@ from grounded.compile.trace.expression import (
     remainder,
     weight_of,
 )
-from grounded.compile.trace.operations import PLAIN
+from grounded.compile.trace.graph import PLAIN
 
 
 def where(condition: Any, a: Any, b: Any) -> Any:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis.error_report import Credit, Remainder, RulerRow, RunChange, Split
+from grounded.diagnosis.error_report import ABOVE, Credit, Remainder, RulerRow, RunChange, Split
 from grounded.diagnosis.hypotheses.leftover import Leftover, leftovers
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.validation.decide import Decision, ordered, plain, shares
@@ -22,7 +22,7 @@ from grounded.diagnosis.validation.split import split
 from grounded.frozen import Array
 from grounded.trial import Trial
 
-ABOVE, FAR = 1.3, 3.0  # times the noise floor: what is left is stated; whatever the doubt
+FAR = 3.0  # times the noise floor: what is left is stated whatever the doubt
 COUNTS = (2.0, 0.03)  # scatters, and least gain, of a flexible correction that is stated
 
 

@@ -21,6 +21,7 @@ from grounded_trials.formats.mcap_records import (
     Metadata,
     Schema,
 )
+from grounded_trials.formats.protobuf import varint
 
 LIBRARY = "grounded"
 
@@ -184,13 +185,3 @@ def _bytes(number: int, data: bytes) -> bytes:
 
 def _integer(number: int, value: int) -> bytes:
     return varint(number << 3) + varint(value)
-
-
-def varint(value: int) -> bytes:
-    """Seven bits a byte, lowest first; all bytes but the last have their top bit set."""
-    parts = bytearray()
-    while value > 0x7F:
-        parts.append(value & 0x7F | 0x80)
-        value >>= 7
-    parts.append(value)
-    return bytes(parts)

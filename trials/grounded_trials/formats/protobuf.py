@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from grounded_trials.formats.budget import room, step
 from grounded_trials.formats.mcap_records import windows
-from grounded_trials.formats.mcap_writer import varint
 from grounded_trials.formats.messages import (
     ROW_BYTES,
     ROW_LIMIT,
@@ -189,6 +188,16 @@ def _content(buffer: bytes, wire: Ints, pos: Ints, limit: Ints, message: Ints) -
     if (end > limit).any():
         raise BadMessage(message[end > limit][0], "it ends inside a field")
     return start, end
+
+
+def varint(value: int) -> bytes:
+    """Seven bits a byte, lowest first; all bytes but the last have their top bit set."""
+    parts = bytearray()
+    while value > 0x7F:
+        parts.append(value & 0x7F | 0x80)
+        value >>= 7
+    parts.append(value)
+    return bytes(parts)
 
 
 def _varints(buffer: bytes, pos: Ints, limit: Ints, message: Ints) -> tuple[Words, Ints]:

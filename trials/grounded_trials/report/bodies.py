@@ -18,7 +18,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from grounded.adapters.stepper import Stepper
 from grounded.figures.body import Body, Part, Pose
 from grounded.frozen import Array
 from grounded.model import Model
@@ -58,8 +57,9 @@ def body_of(model: Model, scene: Scene, size: float) -> Body:
         scene: where it stands.
         size: the length of a body that has none of its own.
     """
-    if isinstance(model.step, Stepper) and model.step.body is not None:
-        return model.step.body
+    own: Body | None = getattr(model.step, "body", None)  # an adapter's
+    if own is not None:
+        return own
     for role, (zero, sign) in ZEROS.items():
         if angles := _columns(model, role):
             lengths = _lengths(model, len(angles))

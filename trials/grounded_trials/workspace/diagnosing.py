@@ -54,6 +54,8 @@ def diagnose_in(
     """
     from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
     from grounded.effects import Library
+    from grounded_trials.workspace.next_step import after_diagnosis
+    from grounded_trials.workspace.proposing import to_run
 
     effects = [dict(effect) for effect in workspace.config.model.effects]
     names = [str(effect["name"]) for effect in effects]
@@ -83,10 +85,10 @@ def diagnose_in(
     _keep(workspace, found)
     identity, words = _probe(workspace, found, lifted + second, library, write=probe)
     if words:
-        run = f" ({identity}: {rendered(probe_command(workspace, identity))})" * bool(identity)
+        run = f" ({identity}: {rendered(to_run(workspace, identity, identity))})" * bool(identity)
         found = replace(found, next_trial=f"{words}{run}", probe=identity)
         _keep(workspace, found)
-    return found
+    return replace(found, then=after_diagnosis(workspace, found))
 
 
 def instruments_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[Finding, ...]:
@@ -197,7 +199,6 @@ def _candidate_of(workspace: Folder, policy: Policy, base: str) -> Candidate:
     """A probe as the model predicts it, not stored yet."""
     from grounded.rollout import simulate
     from grounded.search.candidate import Candidate
-    from grounded.search.improve import model_fingerprint
 
     planner = workspace.planner
     task = planner.plan
@@ -208,7 +209,7 @@ def _candidate_of(workspace: Folder, policy: Policy, base: str) -> Candidate:
         iteration=0,
         alpha=1.0,
         base=base,
-        model=model_fingerprint(task),
+        model=planner.fingerprint,
         predicted_states=predicted.states[:, : planner.task.model.n],
         predicted_inputs=predicted.inputs,
         predicted_utility=predicted.utility,
@@ -243,14 +244,6 @@ def _narrower(task: Task, strays: Array) -> Task | None:
     assert task.safety_low is not None and task.safety_high is not None
     low, high = task.safety_low + room, task.safety_high - room
     return replace(task, safety_low=low, safety_high=high) if (low < high).all() else None
-
-
-def probe_command(workspace: Folder, identity: str) -> NextCommand:
-    """How a probe is run: by [system], or by people, who need its export."""
-    from grounded_trials.workspace.proposing import for_robot
-
-    here = workspace.config.system.reachable
-    return NextCommand("run", (identity,)) if here else for_robot(workspace, identity)
 
 
 def diagnosable(workspace: Folder) -> list[Trial]:

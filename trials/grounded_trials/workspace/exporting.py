@@ -71,8 +71,9 @@ def export_candidate(
         raise GroundedError(f"there is no format '{form}': {nearest(form, encoders)}")
     if runner and form != "npz":
         raise GroundedError(f"the runner reads npz, not {form}: leave the format out, or name npz")
-    identity = candidate_named(workspace, identity)
-    handed = checked_candidate(workspace, identity, anyway=anyway, other_task=True)
+    now = standing_in(workspace) if identity == "best" else None
+    identity = candidate_named(workspace, identity, now)
+    handed = checked_candidate(workspace, identity, anyway=anyway, other_task=True, now=now)
     meta = handed.meta
     about = {"candidate": identity, "task": meta["task"], "model": meta["model"]}
     about["created_by"] = "grounded"
@@ -80,7 +81,7 @@ def export_candidate(
     program = path.with_name(RUNNER) if runner else None
     if program is not None:
         write_atomically(program, Path(onboard.__file__).read_bytes())
-    waiting = standing_in(workspace).outstanding
+    waiting = handed.check.standing.outstanding
     how = () if waiting and waiting.id == identity else ("--candidate", identity)
     return Exported(identity, path, form, program, handed.notes, handed.overridden, how)
 

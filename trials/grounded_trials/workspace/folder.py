@@ -133,24 +133,6 @@ class Folder:
         """What the notes say."""
         return self._read_notes(None)
 
-    def note_handed(self, identity: str, data: bytes) -> None:
-        """Keeps that a candidate was handed out, as these bytes, after the trials there are.
-
-        Nothing is kept in a folder that can only be read.
-
-        Raises:
-            GroundedError: if it can't be written.
-        """
-        stored = self.store.list()
-        after = stored[-1].path.stem if stored else ""
-        note = {"note": "hand-out", "candidate": identity, "sha256": sha256(data), "after": after}
-        try:
-            self.notes.add(note, again=False)
-        except GroundedError:
-            if os.access(self.folder, os.W_OK):
-                raise
-        vars(self).pop("noted", None)
-
     def forget(self) -> None:
         """Everything is read again when it is asked for next."""
         for name in CACHED:

@@ -14,9 +14,11 @@ changed since a candidate was proposed, so nothing of that day is believed:
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,8 +27,11 @@ from grounded.policy import Policy
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial
-from grounded_trials.workspace.folder import Contents, Folder
-from grounded_trials.workspace.identity import candidate_of, sha256
+from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.identity import StoredTrial, candidate_of, sha256
+
+if TYPE_CHECKING:
+    from grounded.search.standing import Standing
 
 AGREES = 1e-6  # of an input's size: how well a policy repeats its own predicted inputs
 
@@ -38,8 +43,13 @@ class Handed:
     candidate: Candidate
     meta: dict[str, str]
     data: bytes
-    notes: tuple[str, ...] = ()  # what to know about it
+    check: Check
     overridden: tuple[str, ...] = ()  # why it would have been refused
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What to know about it."""
+        return tuple(self.check.notes())
 
 
 class Void(GroundedError):
@@ -55,7 +65,12 @@ class Void(GroundedError):
 
 
 def checked_candidate(
-    workspace: Folder, identity: str, *, anyway: bool = False, other_task: bool = False
+    workspace: Folder,
+    identity: str,
+    *,
+    anyway: bool = False,
+    other_task: bool = False,
+    now: Standing | None = None,
 ) -> Handed:
     """A candidate, checked against the workspace as it is now.
 
@@ -64,6 +79,7 @@ def checked_candidate(
         identity: c0003.
         anyway: hand it over all the same; what speaks against it is in `overridden`.
         other_task: a candidate of another task will do, such as the best of an earlier one.
+        now: where the search stands, where that is known.
 
     Raises:
         Void: if it must not be handed over, unless `anyway`.
@@ -71,13 +87,29 @@ def checked_candidate(
     """
     data = workspace.candidate_bytes(identity)
     candidate, meta = intact(data, identity)
-    check = _Check(workspace, candidate, meta, other_task)
+    check = Check(workspace, candidate, meta, other_task, now)
     check.refuse_foreign(sha256(data))
     reasons = tuple(check.reasons())
     if reasons and not anyway:
         raise Void(identity, reasons)
-    workspace.note_handed(identity, data)
-    return Handed(candidate, meta, data, tuple(check.notes()), reasons)
+    _note(workspace, identity, data)
+    return Handed(candidate, meta, data, check, reasons)
+
+
+def _note(workspace: Folder, identity: str, data: bytes) -> None:
+    """Keeps that a candidate was handed out, as these bytes, after the trials there are.
+
+    Nothing is kept in a folder that can only be read.
+    """
+    stored = workspace.store.list()
+    after = stored[-1].path.stem if stored else ""
+    note = {"note": "hand-out", "candidate": identity, "sha256": sha256(data), "after": after}
+    try:
+        workspace.notes.add(note, again=False)
+    except GroundedError:
+        if os.access(workspace.folder, os.W_OK):
+            raise
+    vars(workspace).pop("noted", None)
 
 
 def intact(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]:
@@ -111,28 +143,38 @@ def intact(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]:
 
 
 @dataclass(frozen=True)
-class _Check:
-    """A candidate against the workspace of today."""
+class Check:
+    """A candidate against the workspace of today; damaged files don't keep it from being used."""
 
     workspace: Folder
     candidate: Candidate
     meta: dict[str, str]
     other_task: bool
+    now: Standing | None
 
     @cached_property
-    def contents(self) -> Contents:
-        """The workspace's files; a damaged one doesn't keep the others from being used."""
+    def trials(self) -> tuple[StoredTrial, ...]:
+        """Those that are whole."""
         try:
-            return self.workspace.read()
+            return self.workspace.trials()
         except GroundedError:
-            return self.workspace.read(strict=False)
+            return self.workspace.read(strict=False).trials
 
     @cached_property
-    def fingerprint(self) -> str:
-        """Of the model that plans today."""
-        from grounded.search.improve import model_fingerprint
+    def standing(self) -> Standing:
+        """Where the search stands."""
+        from grounded.search.standing import standing
 
-        return model_fingerprint(self.workspace.planner.plan)
+        if self.now is not None:
+            return self.now
+        here = self.workspace
+        try:
+            candidates = here.read().candidates
+        except GroundedError:
+            candidates = here.read(strict=False).candidates
+        trials = [t.trial for t in self.trials if here.fits(t.trial)]
+        options, model = here.config.search, here.planner.fingerprint
+        return standing(here.task, candidates, trials, options, model)
 
     @property
     def same_task(self) -> bool:
@@ -162,7 +204,7 @@ class _Check:
                 "rewritten, or comes from another workspace; delete the file",
                 NextCommand("propose"),
             )
-        for one in self.contents.trials:
+        for one in self.trials:
             if one.trial.candidate == made.id and one.ran not in ("", found):
                 raise GroundedError(
                     f"candidates/{made.id}.mcap is not the policy that {one.stored.id} ran: it was "
@@ -209,7 +251,7 @@ class _Check:
 
     @property
     def _changed(self) -> bool:
-        return self.candidate.model != self.fingerprint
+        return self.candidate.model != self.workspace.planner.fingerprint
 
     @property
     def _predictable(self) -> bool:
@@ -218,23 +260,19 @@ class _Check:
         return policy.horizon == task.horizon and abs(policy.dt - task.dt) <= 1e-9
 
     def _trials(self, identity: str) -> list[Trial]:
-        found = [t.trial for t in self.contents.trials]
-        return [t for t in found if t.candidate == identity and self.workspace.fits(t)]
+        found = [t.trial for t in self.trials if t.trial.candidate == identity]
+        return [t for t in found if self.workspace.fits(t)]
 
     def _unsafe(self) -> list[str]:
         """What [safety] says; a step that no trial ran may stray as earlier ones did."""
         from grounded.search.safety import objections, spread
-        from grounded.search.standing import standing
 
         workspace, made = self.workspace, self.candidate
         if self._changed and self._predictable:
             made = self._predicted()
         strays = None
         if self._predictable and not self._trials(made.id):
-            trials = [t.trial for t in self.contents.trials if workspace.fits(t.trial)]
-            candidates, options = self.contents.candidates, workspace.config.search
-            now = standing(workspace.task, candidates, trials, options, self.fingerprint)
-            strays = spread(workspace.task, now.history, made.model)
+            strays = spread(workspace.task, self.standing.history, made.model)
         return objections(workspace.task, made, strays)
 
     def _predicted(self) -> Candidate:

@@ -11,28 +11,29 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
+from grounded.policy import Policy
 from grounded.result import Result
 from grounded.search.candidate import Candidate, Tried
 from grounded.trial import Trial, interpolate_gaps
-from grounded_trials.logs.log_files import kind_of, log_files, log_records
-from grounded_trials.logs.log_table import log_mapping, read_log
-from grounded_trials.logs.resample import Span
+from grounded_trials.logs.log_files import kind_of, log_files
 from grounded_trials.logs.samples import SignalReport
 from grounded_trials.plain_file import read_file
 from grounded_trials.store.own_files import CANDIDATE, FILE_LIMIT, TRIAL
-from grounded_trials.store.store import DIGITS, hash_file
+from grounded_trials.store.store import DIGITS
 from grounded_trials.store.trial_file import read_trial, trial_bytes
-from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.foreign import ForeignLog, mapping_of, read_foreign
 from grounded_trials.workspace.identity import sha256
-from grounded_trials.workspace.proposing import standing_in
-from grounded_trials.workspace.run_start import Recording, Start, recording
+from grounded_trials.workspace.next_step import PROPOSE, after_log
+from grounded_trials.workspace.proposing import candidate_named, standing_in
+from grounded_trials.workspace.run_start import Recording, Start
 from grounded_trials.workspace.trial_check import OTHERS, SAME, suspicion, warnings_about
 
 ALIGNED = 0.75  # of the time between samples: a start nearer than that is as good
@@ -53,12 +54,7 @@ class Ingested(Result):
     signals: tuple[SignalReport, ...]  # for a foreign log
     verdict: str = ""  # a word of `wording.verdict`, run again, probe; "" for data
     notes: tuple[str, ...] = ()  # where in a longer log the run was found
-
-    @property
-    def then(self) -> NextCommand:
-        """The command to type next."""
-        after_run = "diagnose" if self.verdict == "probe" else "propose"
-        return NextCommand(after_run if self.candidate else "diagnose")
+    then: NextCommand = PROPOSE
 
     def summary(self) -> str:
         """The trial, what it ran and what became of that."""
@@ -89,12 +85,22 @@ class _Read:
     signals: tuple[SignalReport, ...] = ()
     notes: tuple[str, ...] = ()
     bare: bool = False  # it ran a candidate, and carries no copy of it
+    log: ForeignLog | None = None
 
 
 def ingest_log(
-    workspace: Folder, path: Path, candidate: str | None = None, *, data: bool = False
+    workspace: Folder,
+    path: Path,
+    candidate: str | None = None,
+    *,
+    data: bool = False,
+    ahead: bool = False,
 ) -> Ingested:
-    """Checks a log and stores it as a trial, see `Workspace.ingest`; or else stores nothing."""
+    """Checks a log and stores it as a trial, see `Workspace.ingest`; or else stores nothing.
+
+    `ahead`: plan on where only that tells what follows, see `standing_in`.
+    """
+    candidate = candidate and candidate_named(workspace, candidate)
     kind = "" if path.is_dir() else kind_of(path)
     if kind == CANDIDATE:
         raise GroundedError(
@@ -106,7 +112,7 @@ def ingest_log(
         read = _own(workspace, path, candidate, data)
     else:
         read = _foreign(workspace, path, candidate, data)
-    read = _recognised(workspace, path, read, candidate, foreign=kind != TRIAL)
+    read = _recognised(workspace, path, read, candidate)
     before = _repeated(workspace, path, read)
     added = workspace.store.add(read.data, again=before != "")
     if read.bare:  # what it ran is kept beside it
@@ -121,7 +127,12 @@ def ingest_log(
         warnings = (*warnings, f"{repeat}, and no candidate is run a second time from now on")
     if added.known and added.sha256[:DIGITS] in workspace.noted.aside:
         warnings = (*warnings, f"{added.id} is set aside: `restore` takes that back")
-    tried = _tried(workspace, trial)
+    now = standing_in(workspace) if trial.candidate else None
+    history = now.history if now else ()
+    tried = next((t for t in history if t.candidate.id == trial.candidate), None)
+    verdict = _verdict(trial, tried, workspace.config.search.repeats)
+    if ahead and verdict == "run again":
+        now = standing_in(workspace, ahead=True)
     return Ingested(
         trial=added.id,
         sha256=added.sha256,
@@ -131,14 +142,13 @@ def ingest_log(
         accepted=tried.accepted if tried else None,
         warnings=warnings,
         signals=read.signals,
-        verdict=_verdict(trial, tried, workspace.config.search.repeats),
+        verdict=verdict,
         notes=read.notes,
+        then=after_log(workspace, verdict, now),
     )
 
 
-def _recognised(
-    workspace: Folder, path: Path, read: _Read, candidate: str | None, *, foreign: bool
-) -> _Read:
+def _recognised(workspace: Folder, path: Path, read: _Read, candidate: str | None) -> _Read:
     """Refuses a log whose commands are not its candidate's; with a warning if one was named.
 
     A foreign log without a [log.span] may begin before the run: it is taken from where that fits.
@@ -146,34 +156,38 @@ def _recognised(
     ran = read.trial.candidate
     if not ran or sha256(read.data)[:DIGITS] in workspace.store.digests():
         return read
-    own, _ = workspace.candidate(ran)
-    candidates, task = _latest(workspace), workspace.task
-    why, other = suspicion(task, interpolate_gaps(read.trial).trial, own, candidates)
-    log = recording(workspace, path) if foreign else None
-    found = log.start_of(own.policy) if log else None
-    if log and found and found.opens_alike:
-        beyond = abs(found.seconds - log.first) > ALIGNED * log.interval
-        if beyond and (why or found.apart < CLEAR * log.apart_at(own.policy, log.first)):
-            read = _foreign(workspace, path, ran, False, found.seconds)
-            said = f"the log begins {found.seconds:.3f} s before {ran} does: it is taken from there"
-            read = replace(read, notes=(said,))
-            why, other = suspicion(task, interpolate_gaps(read.trial).trial, own, candidates)
-    rival = _rival(log, found, own.id, candidates) if log else None
-    if rival is not None:  # as it lies where that one fits best
-        other_why, name = suspicion(task, rival, own, candidates)
-        why, other = (other_why, name) if name else (why or other_why, other)
-    if why and (candidate is None or (log and not (found and found.opens_alike))):
-        instead = ("--candidate", other) if other else ("--data",)
-        what = f"; with --candidate {other} for what it seems to have run" * bool(other)
-        force = f"with [log.span] start = SECONDS and --candidate {ran}" if log else ""
-        raise GroundedError(
-            f"{path} did not run {ran}: {why}. Take it in with --data for fitting and diagnosis"
-            f"{what}, or {force or f'with --candidate {ran}'} all the same"
-            + "; [log.span] says where the run begins"
-            * (foreign and not log),
-            NextCommand("ingest", (str(path), *instead)),
-        )
-    return replace(read, warnings=(*read.warnings, why)) if why else read
+    (own, _), candidates = workspace.candidate(ran), _latest(workspace)
+    judged = partial(suspicion, workspace.task, own=own, others=candidates)
+    why, other = judged(interpolate_gaps(read.trial).trial)
+    log, found = read.log.recording if read.log else None, None
+    if read.log and log:
+        found = log.start_of(own.policy)
+        if found and _elsewhere(log, found, own.policy, why):
+            note = f"the log begins {found.seconds:.3f} s before {ran} does: it is taken from there"
+            read = replace(_cut(read.log, ran, found.seconds), notes=(note,))
+            why, other = judged(interpolate_gaps(read.trial).trial)
+        if (rival := _rival(log, found, ran, candidates)) is not None:
+            other_why, name = judged(rival)  # as it lies where that one fits best
+            why, other = (other_why, name) if name else (why or other_why, other)
+    if not why:
+        return read
+    if candidate is not None and (log is None or (found and found.opens_alike)):
+        return replace(read, warnings=(*read.warnings, why))
+    what = f"; with --candidate {other} for what it seems to have run" * bool(other)
+    begins = "; [log.span] says where the run begins" * bool(read.log and not log)
+    raise GroundedError(
+        f"{path} did not run {ran}: {why}. Take it in with --data for fitting and diagnosis{what}, "
+        f"or with {'[log.span] start = SECONDS and ' * bool(log)}--candidate {ran} all the same"
+        f"{begins}",
+        NextCommand("ingest", (str(path), *(("--candidate", other) if other else ("--data",)))),
+    )
+
+
+def _elsewhere(log: Recording, found: Start, policy: Policy, why: str) -> bool:
+    """Whether a run begins where it was found, not with the log's first command."""
+    if not found.opens_alike or abs(found.seconds - log.first) <= ALIGNED * log.interval:
+        return False
+    return bool(why) or found.apart < CLEAR * log.apart_at(policy, log.first)
 
 
 def _latest(workspace: Folder) -> list[Candidate]:
@@ -220,14 +234,6 @@ def _verdict(trial: Trial, tried: Tried | None, repeats: int) -> str:
         return "probe" if trial.candidate else ""
     ran = [one.id for one in tried.trials[:repeats]]
     return "run again" if tried.accepted and trial.id not in ran else tried.verdict()
-
-
-def _tried(workspace: Folder, trial: Trial) -> Tried | None:
-    """How the trial's candidate fares now."""
-    if not trial.candidate:
-        return None
-    history = standing_in(workspace).history
-    return next((t for t in history if t.candidate.id == trial.candidate), None)
 
 
 def _own(workspace: Folder, path: Path, candidate: str | None, data: bool) -> _Read:
@@ -292,83 +298,21 @@ def _check_candidate(
         )
 
 
-def _foreign(
-    workspace: Folder, path: Path, candidate: str | None, data: bool, start: float | None = None
-) -> _Read:
-    """Somebody else's log, through [log]; from `start` on, seconds after its first sample."""
-    model, task = workspace.base_model, workspace.config.task
-    files = log_files(path)
-    mapping = log_mapping(workspace.config.log, model.state_names, model.input_names)
-    if mapping is None:
-        _check_is_log(path, files)
-        raise GroundedError(
-            f"{path} is not a trial that grounded wrote, and grounded.toml has no [log] table to "
-            "map it: `inspect` prints one",
-            NextCommand("inspect", (str(path),)),
-        )
-    if start is not None:
-        mapping = replace(mapping, span=Span(start=start))
+def _foreign(workspace: Folder, path: Path, candidate: str | None, data: bool) -> _Read:
+    """Somebody else's log, through [log]."""
+    mapping = mapping_of(workspace, path)
     chosen = "" if data else candidate or _outstanding(workspace, path)
-    states, estimate = model.state_names, None
-    if workspace.config.estimate.names():
-        from grounded_trials.workspace.unmeasured import read_estimate, smoothed
-
-        estimate = read_estimate(workspace.config.estimate, model)
-        states = tuple(estimate.measured)
-    missing = [s for s in states if s not in mapping.states]
-    missing += [i for i in model.input_names if i not in mapping.inputs]
-    if missing:
-        raise GroundedError(
-            f"[log] maps no '{missing[0]}': map it, or let the smoother find a state that is "
-            "not measured with an [estimate] table (docs/real-logs.md)"
-        )
-    found = read_log(
-        files,
-        mapping,
-        task.dt,
-        states=states,
-        inputs=model.input_names,
-        angles=model.angles,
-        steps=None if data else task.horizon,
-    )
-    if estimate:
-        found = smoothed(workspace, found, estimate)
-    if chosen and found.late_s > task.dt / 2:
-        raise GroundedError(
-            f"{path}: the run starts {found.late_s:.2f} s before every state is known: the "
-            "trial's time would not be the candidate's. Start recording before the run, or take "
-            "it in with --data"
-        )
-    trial = Trial(
-        states=found.states,
-        inputs=found.inputs,
-        dt=task.dt,
-        state_names=model.state_names,
-        input_names=model.input_names,
-        candidate=chosen,
-        start_inputs=found.start_inputs,
-    )
-    about = _about(workspace, chosen) | {"source": path.name, "source_sha256": _hashed(files)}
-    if set(states) < set(model.state_names):
-        about["estimated"] = ",".join(s for s in model.state_names if s not in states)
+    log = read_foreign(workspace, path, mapping)
     if chosen:
         _check_candidate(workspace, path, chosen)
-    encoded = _encode(workspace, trial, about, found.start_ns)
-    return _Read(trial, encoded, found.warnings, found.reports)
+    return _cut(log, chosen)
 
 
-def _check_is_log(path: Path, files: Sequence[Path]) -> None:
-    """Says of what is no log at all that it is none."""
-    if (path / FILE).is_file():
-        raise GroundedError(f"{path} is a workspace: name the log, or its folder, inside")
-    for file in files:
-        next(iter(log_records(file)), None)
-
-
-def _hashed(files: Sequence[Path]) -> str:
-    """SHA-256 over a log's files, or over their hashes when there are several."""
-    hashes = [hash_file(file) for file in files]
-    return hashes[0] if len(hashes) == 1 else sha256("".join(hashes).encode())
+def _cut(log: ForeignLog, candidate: str, start: float | None = None) -> _Read:
+    trial, found = log.cut(candidate, start)
+    about = _about(log.workspace, candidate) | log.source
+    encoded = _encode(log.workspace, trial, about, found.start_ns)
+    return _Read(trial, encoded, found.warnings, found.reports, log=log)
 
 
 def _outstanding(workspace: Folder, path: Path) -> str:

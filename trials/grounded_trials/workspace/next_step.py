@@ -10,12 +10,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from grounded.diagnosis.report import Diagnosis, Made
-from grounded.errors import NextCommand
+from grounded.errors import GroundedError, NextCommand
 from grounded.search.standing import Standing
 from grounded_trials.wording import rendered
 from grounded_trials.workspace.diagnosing import diagnosable
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.proposing import for_robot
+from grounded_trials.workspace.proposing import standing_in, status_of, to_run
 
 PROPOSE = NextCommand("propose")
 DIAGNOSE = NextCommand("diagnose")
@@ -39,7 +39,7 @@ def next_command(
         logs = usable and not now.history  # what they show comes before the first candidate
         return now.then or (PROPOSE if now.phase == "propose" and not logs else DIAGNOSE)
     since = since_diagnosis(workspace, diagnosis, usable)
-    follow = after_diagnosis(workspace, diagnosis)
+    follow = to_adopt(workspace, diagnosis)
     if now.phase == "propose":  # what logs have shown is adopted before the first candidate
         if now.history or since.changed or follow is None:
             return PROPOSE
@@ -56,12 +56,43 @@ def another_trial(workspace: Folder, now: Standing) -> NextCommand:
     waiting = now.phase == "await-trial"
     if not waiting and (now.phase == "propose" or now.incumbent is None):
         return PROPOSE
-    if not workspace.config.system.reachable:
-        return for_robot(workspace, now.outstanding.id if waiting and now.outstanding else "best")
-    return NextCommand("run", () if waiting else ("best",))
+    if waiting and now.outstanding is not None:
+        return to_run(workspace, now.outstanding.id)
+    return to_run(workspace, "best", "best")
 
 
-def after_diagnosis(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
+def after_log(workspace: Folder, verdict: str, now: Standing | None) -> NextCommand:
+    """What follows a log: the next candidate; a diagnosis of data, or of a probe's run.
+
+    Args:
+        workspace: that has stored it.
+        verdict: `Ingested.verdict`.
+        now: where its search stands with it, which says what follows an end; None for data.
+    """
+    if now is None or verdict == "probe":
+        return DIAGNOSE
+    return PROPOSE if now.phase in ("propose", "await-trial") else status_of(workspace, now).then
+
+
+def after_diagnosis(workspace: Folder, found: Diagnosis) -> NextCommand:
+    """What follows a diagnosis: adopt what was claimed, run another trial, or see the whole."""
+    if not found.no_cause:
+        if (follow := to_adopt(workspace, found)) is not None:
+            return follow
+        if found.probe:
+            return to_run(workspace, found.probe, found.probe)
+        if found.kind != "none" or not workspace.config.task.target:
+            return NextCommand("report", ("--html",))
+    try:
+        now = standing_in(workspace, ahead=True)
+    except GroundedError:  # it can't be planned with this model
+        now = standing_in(workspace)
+    if found.no_cause:
+        return another_trial(workspace, now)
+    return next_command(workspace, now, found, usable_ids(workspace))
+
+
+def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
     """What to do about the effects that a diagnosis claims, None where there is nothing to do."""
     new = diagnosis.open(workspace.config.model.effects)
     if diagnosis.kind not in ("effect", "several") or not new:

@@ -96,13 +96,14 @@ def propose_in(workspace: Folder) -> Proposed:
     proposal = replace(proposal, notes=(*proposal.notes, *notes))
     if candidate is None:
         return Proposed(proposal, None, status_of(workspace, proposal.standing).then)
-    here = workspace.config.system.reachable
-    then = NextCommand("run") if here else for_robot(workspace, candidate.id)
-    return Proposed(proposal, workspace.candidate_path(candidate.id), then)
+    path = workspace.candidate_path(candidate.id)
+    return Proposed(proposal, path, to_run(workspace, candidate.id))
 
 
-def for_robot(workspace: Folder, candidate: str) -> NextCommand:
-    """What follows where people run the robot: export for it, or once that is done, its log."""
+def to_run(workspace: Folder, candidate: str, *named: str) -> NextCommand:
+    """How a candidate is run: `run` with its name as given; by people: its export, then its log."""
+    if workspace.config.system.reachable:
+        return NextCommand("run", named)
     folders = (workspace.folder, Path())
     if any(any(folder.glob(f"{candidate}.*")) for folder in folders):
         return NextCommand("next", ("LOG",))
@@ -127,7 +128,7 @@ def _handed_over(workspace: Folder) -> tuple[Proposal, dict[str, str]]:
         else:
             workspace.bring_back(candidate.id)
         try:
-            handed = checked_candidate(workspace, candidate.id)
+            handed = checked_candidate(workspace, candidate.id, now=proposal.standing)
         except Void as error:
             if proposal.is_new:
                 raise
@@ -163,9 +164,7 @@ def _void(workspace: Folder, before: Sequence[str]) -> list[str]:
         return []
     made, meta = workspace.candidate(last)
     if meta.get("task") == workspace.task.hash:
-        from grounded.search.improve import model_fingerprint
-
-        same = made.model == model_fingerprint(workspace.planner.plan)
+        same = made.model == workspace.planner.fingerprint
         why = "the trial that it followed was set aside" if same else "the model was changed"
         why += " since it was made"
     elif (made.policy.state_names, made.policy.input_names) != (
@@ -193,15 +192,16 @@ def standing_in(
     Raises:
         GroundedError: if a stored file is damaged, or the task can't be planned.
     """
-    from grounded.search.improve import model_fingerprint, propose
     from grounded.search.standing import standing
 
     contents = contents or workspace.read()
     trials = [t.trial for t in contents.trials if workspace.fits(t.trial)]
     task, options, planner = workspace.task, workspace.config.search, workspace.planner
-    now = standing(task, contents.candidates, trials, options, model_fingerprint(planner.plan))
+    now = standing(task, contents.candidates, trials, options, planner.fingerprint)
     workspace.save_index()
     if ahead and now.phase == "propose" and now.incumbent is not None:
+        from grounded.search.improve import propose
+
         return propose(task, contents.candidates, trials, options, planner=planner).standing
     return now
 
@@ -251,8 +251,10 @@ def _namesakes(workspace: Folder) -> list[str]:
     ]
 
 
-def candidate_named(workspace: Folder, name: str | None) -> str:
+def candidate_named(workspace: Folder, name: str | None, now: Standing | None = None) -> str:
     """The id of a candidate: itself, that of the best so far for `best`, of the one that waits.
+
+    `now` is where the search stands, where that is known.
 
     Raises:
         GroundedError: if there is no best one yet, or none waits.
@@ -268,7 +270,7 @@ def candidate_named(workspace: Folder, name: str | None) -> str:
         return waiting.id
     if name != "best":
         return name
-    best = standing_in(workspace).incumbent
+    best = (now or standing_in(workspace)).incumbent
     if best is None:
         raise GroundedError("there is no best candidate yet: no trial was ingested")
     return best.candidate.id

@@ -10,20 +10,18 @@ as it goes, where it was quiet before.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.policy import Policy
+from grounded.task import Task
 from grounded.trial import LAST, Trial, interpolate_gaps
-from grounded_trials.logs.log_files import log_files
-from grounded_trials.logs.log_table import log_mapping, mapped_signals
 from grounded_trials.logs.resample import Gridded, Span, to_grid
 from grounded_trials.logs.signals import Series
-from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.trial_check import FINE, LEAST, UNLIKE, follows
 
 TRIED = 5  # instants at which the commands fit best
@@ -48,7 +46,7 @@ class Start:
 class Recording:
     """A foreign log, to be cut anywhere; on a grid of `parts` instants a control step."""
 
-    series: dict[str, Series]
+    series: Mapping[str, Series]
     names: tuple[tuple[str, ...], tuple[str, ...]]
     angles: tuple[str, ...]
     dt: float
@@ -159,31 +157,23 @@ def _close(policy: Policy, trial: Trial) -> bool:
     return bool((np.abs(sent - asked).mean(axis=0) <= UNLIKE * usual + finest).all())
 
 
-def recording(workspace: Folder, path: Path) -> Recording | None:
-    """A foreign log whose run may begin anywhere.
-
-    None where it can't be cut, states are estimated, or a [log.span] says where the run begins.
+def recording(series: Mapping[str, Series], task: Task) -> Recording | None:
+    """A log whose run may begin anywhere; None where it can't be cut.
 
     Args:
-        workspace: whose [log] maps it.
-        path: the log.
+        series: the samples of every state and input.
+        task: whose steps it is cut into.
     """
-    model, task, config = workspace.base_model, workspace.task, workspace.config
+    model, dt = task.model, task.dt
     names = (model.state_names, model.input_names)
-    mapping = log_mapping(config.log, *names)
-    if mapping is None or config.estimate.names() or config.log.sub("span").names():
-        return None
+    every = [float(np.median(np.diff(np.sort(s.t)))) for s in series.values() if len(s.t) > 1]
+    interval = max(every, default=dt * 1e9) * 1e-9
+    parts = 2 * int(np.clip(np.ceil(dt / max(interval, 1e-9) / 2 - 0.01), 1, FINEST / 2))
     try:
-        series = dict(mapped_signals(log_files(path), mapping, *names))
-        every = [float(np.median(np.diff(np.sort(s.t)))) for s in series.values() if len(s.t) > 1]
-        interval = max(every, default=task.dt * 1e9) * 1e-9
-        parts = 2 * int(np.clip(np.ceil(task.dt / max(interval, 1e-9) / 2 - 0.01), 1, FINEST / 2))
-        whole = to_grid(series, task.dt / parts, *names, angles=model.angles)
+        whole = to_grid(series, dt / parts, *names, angles=model.angles)
     except GroundedError:
         return None
     sent = [series[name] for name in model.input_names]
     at = np.concatenate([s.t[1:][np.diff(s.values) != 0] for s in sent])
     changes = (at - whole.origin_ns) * 1e-9
-    return Recording(
-        series, names, model.angles, task.dt, task.horizon, parts, whole, changes, interval
-    )
+    return Recording(series, names, model.angles, dt, task.horizon, parts, whole, changes, interval)

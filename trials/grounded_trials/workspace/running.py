@@ -30,6 +30,7 @@ from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.handover import Handed, checked_candidate
 from grounded_trials.workspace.model_file import load_module, model_in
+from grounded_trials.workspace.proposing import candidate_named
 
 TRIALS = 30  # of the search for the optimum
 
@@ -59,13 +60,13 @@ class Ran(Result):
 
 def run_candidate(
     workspace: Folder,
-    identity: str,
+    candidate: str | None,
     *,
     anyway: bool = False,
     warn: Callable[[str], None] | None = None,
 ) -> Ran:
     """Runs a candidate once; its trial file is runs/cNNNN-K.mcap. See `Workspace.run`."""
-    system = workspace.config.system
+    system, identity = workspace.config.system, candidate_named(workspace, candidate)
     handed = checked_candidate(workspace, identity, anyway=anyway)
     if warn is not None:
         for reason in handed.overridden:

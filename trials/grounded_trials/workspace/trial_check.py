@@ -219,11 +219,6 @@ def _steps_alike(noise: Array) -> float:
     return float(2 * power[:end].sum() / power[0] - 1)
 
 
-def what_ran(task: Task, trial: Trial, own: Candidate, others: Sequence[Candidate]) -> str:
-    """Why a trial is not a run of its candidate, "" where nothing says so; see `suspicion`."""
-    return suspicion(task, trial, own, others)[0]
-
-
 def suspicion(
     task: Task, trial: Trial, own: Candidate, others: Sequence[Candidate]
 ) -> tuple[str, str]:

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from grounded.errors import GroundedError, needs
-from grounded.figures.body import Body
+from grounded.figures.body import Body, Part
 from grounded.figures.figure import COLOURS as PAGE
 from grounded.figures.figure import rgb
 from grounded.frozen import Array
@@ -33,9 +33,7 @@ from grounded.trial import Trial
 from grounded_trials.report.bodies import body_in
 from grounded_trials.report.findings import Findings, Run, selection, tracked
 from grounded_trials.report.forecast import forecast
-from grounded_trials.report.recording.drawing import drawn
-from grounded_trials.report.recording.layout import blueprint
-from grounded_trials.report.recording.space import Space
+from grounded_trials.report.recording.layout import Space, blueprint
 from grounded_trials.report.scene import scene_of
 from grounded_trials.report.three_lines import three_lines
 from grounded_trials.wording import count, labelled, per_second, percent
@@ -46,6 +44,7 @@ SERIES = [COLOURS[role] for role in ("best", "limit", "accepted", "step2", "pred
 ITERATIONS = 4  # of the bias, in one plot
 FINE = 600  # steps; the bias of longer trials is averaged over a few steps, or files get large
 BAR = 24  # letters of a credit of 100 %
+Colour = tuple[int, int, int]
 FRAMES = 600  # poses of a body in an animation
 VERTICES = 1000  # of a path in space
 
@@ -320,3 +319,25 @@ def summary(findings: Findings) -> str:
     lines += ["", f"**{findings.standing.outcome}**: {findings.standing.sentence}", ""]
     lines += [f"**left out**: {one.file}: {one.reason}\n" for one in findings.lost]
     return "\n".join(lines)
+
+
+def drawn(part: Part, colour: Colour, ghost: bool = False) -> Any:
+    """The archetype of a part, in one colour; a ghost, what was only predicted, as its edges."""
+    import rerun as rr
+
+    modes, size = rr.components.FillMode, part.size
+    look = modes.MajorWireframe if ghost else modes.Solid
+    if part.shape == "box":
+        return rr.Boxes3D(half_sizes=[size], colors=colour, fill_mode=look)
+    if part.shape == "ellipsoid":
+        return rr.Ellipsoids3D(half_sizes=[size], colors=colour, fill_mode=look)
+    if part.shape == "capsule":
+        return rr.Capsules3D(radii=[size[0]], lengths=[size[1]], colors=colour, fill_mode=look)
+    if part.shape == "cylinder":
+        return rr.Cylinders3D(radii=[size[0]], lengths=[size[1]], colors=colour, fill_mode=look)
+    if part.shape == "mesh":
+        faces = part.faces.astype(np.uint32)
+        return rr.Mesh3D(vertex_positions=part.points, triangle_indices=faces, albedo_factor=colour)
+    if part.shape == "lines":
+        return rr.LineStrips3D(part.strips, colors=colour, radii=rr.Radius.ui_points(2))
+    return rr.Points3D([[0, 0, 0]], colors=colour, radii=rr.Radius.ui_points(6))

@@ -1,0 +1,137 @@
+"""Whether what a filter claims is true, of simulated trials whose states are known.
+
+    NIS   e_t' S_t^-1 e_t / ny         mean 1 if the innovations are as large as claimed
+    NEES  (x - xhat)' P^-1 (x - xhat) / n    mean 1 if the states are as uncertain as claimed
+    whiteness   correlation of neighbouring whitened innovations, 0 if nothing predictable is left
+
+Each mean is compared with the 95 % band that independent draws would give (chi squared; Bar-Shalom,
+Li & Kirubarajan 2001, ch. 5). States within a trial are correlated, so NEES is judged by trials.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from grounded.estimate import Estimated, Record
+from grounded.frozen import Array
+
+
+def merged(
+    times: Array,
+    measured: Array,
+    command_times: Array,
+    commands: Array,
+    past: Array | None = None,
+    *,
+    resolution: float = 1e-6,
+) -> Record:
+    """A record whose states live at the instants of measurements AND of commands.
+
+    For a camera and a controller of different rates; instants closer than `resolution` [s] are one.
+    The commands act exactly when they were sent, up to their latency.
+
+    Args:
+        times: of the measurements [s], (N,).
+        measured: (N, ny).
+        command_times: [s], (M,).
+        commands: (M, m).
+        past: held before the first command, (m,).
+        resolution: [s].
+    """
+    inside = (command_times >= times[0]) & (command_times <= times[-1])
+    ticks = np.unique(np.round(np.concatenate([times, command_times[inside]]) / resolution))
+    where = np.searchsorted(ticks, np.round(np.asarray(times) / resolution))
+    rows = np.full((len(ticks), measured.shape[1]), np.nan)
+    rows[where] = measured
+    return Record(np.asarray(ticks * resolution), rows, command_times, commands, past)
+
+
+@dataclass(frozen=True, eq=False)
+class Consistency:
+    """Means with the bands in which 95 % of consistent filters lie; NaN where not known."""
+
+    nis: float
+    nis_band: tuple[float, float]
+    lag_one: float
+    lag_one_band: tuple[float, float]
+    nees: float
+    nees_band: tuple[float, float]
+
+    @property
+    def consistent(self) -> bool:
+        """All that is known lies in its band."""
+        bands = (self.nis_band, self.lag_one_band, self.nees_band)
+        pairs = zip((self.nis, self.lag_one, self.nees), bands, strict=True)
+        return all(low <= value <= high for value, (low, high) in pairs if np.isfinite(value))
+
+
+def consistency(
+    estimated: Sequence[Estimated],
+    truth: Sequence[Array] | None = None,
+    states: Sequence[int] | None = None,
+) -> Consistency:
+    """Judges filtered trials.
+
+    Args:
+        estimated: of `smooth_trials` with `forward` (NEES without it too).
+        truth: the true states of each trial, (T + 1, n), where a simulation knows them.
+        states: index of the states that NEES judges; None: all.
+    """
+    squares, count, products, pairs = 0.0, 0, 0.0, 0
+    for trial in estimated:
+        eps = _whitened(trial)
+        seen = np.isfinite(eps)
+        squares, count = squares + float(np.nansum(eps**2)), count + int(seen.sum())
+        both = seen[1:] & seen[:-1]
+        products += float(np.sum((eps[1:] * eps[:-1])[both]))
+        pairs += int(both.sum())
+    nees, nees_band = np.nan, (np.nan, np.nan)
+    if truth is not None:
+        nees, nees_band = _nees(estimated, truth, states)
+    width = 1.96 / np.sqrt(max(pairs, 1))
+    return Consistency(
+        nis=squares / max(count, 1),
+        nis_band=_band(count),
+        lag_one=products / pairs if pairs else np.nan,
+        lag_one_band=(-width, width),
+        nees=nees,
+        nees_band=nees_band,
+    )
+
+
+def _whitened(trial: Estimated) -> Array:
+    C = np.linalg.inv(np.linalg.cholesky(trial.innovation_covariance))
+    seen = np.isfinite(trial.innovations)
+    eps = (C @ np.where(seen, trial.innovations, 0.0)[..., None])[..., 0]
+    return np.where(seen, eps, np.nan)
+
+
+def _band(count: int) -> tuple[float, float]:
+    if count == 0:
+        return (np.nan, np.nan)
+    from scipy.stats import chi2
+
+    low, high = chi2.ppf([0.025, 0.975], count) / count
+    return (float(low), float(high))
+
+
+def _nees(
+    estimated: Sequence[Estimated], truth: Sequence[Array], states: Sequence[int] | None
+) -> tuple[float, tuple[float, float]]:
+    means = []
+    for trial, x in zip(estimated, truth, strict=True):
+        pick = np.arange(x.shape[1]) if states is None else np.array(states)
+        error = (trial.states - x)[1:, pick]
+        P = trial.covariance[1:][:, pick][:, :, pick]
+        weighted = np.linalg.solve(P, error[..., None])[..., 0]
+        means.append(float(np.mean(np.sum(error * weighted, axis=1))) / len(pick))
+    if len(means) < 2:
+        return float(np.mean(means)), (-np.inf, np.inf)
+    from scipy.stats import t
+
+    quantile = float(t.ppf(0.975, len(means) - 1))
+    width = quantile * float(np.std(means, ddof=1)) / np.sqrt(len(means))
+    return float(np.mean(means)), (1 - width, 1 + width)

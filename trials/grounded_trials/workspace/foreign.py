@@ -1,0 +1,209 @@
+"""A log that grounded did not write: read once, mapped by [log], cut to the trial it holds.
+
+States that no sensor gives come from the smoother of `grounded.estimate`, never from bare
+differences:
+
+    [estimate]
+    measured = { x = 0.002, y = 0.002, psi = 0.005 }   # standard deviation of each measured state
+    process = { v = 0.05 }                             # optional, a control step; else estimated
+
+The measured states of [log] are filtered forth and back through the crude model, whose process
+noise is estimated from the same log by maximum likelihood. Measured states stay as they
+were measured.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from grounded.errors import GroundedError, NextCommand
+from grounded.model import Model
+from grounded.trial import Trial
+from grounded_trials.logs.log_files import log_files, log_records
+from grounded_trials.logs.log_table import LogMapping, log_mapping, mapped_signals
+from grounded_trials.logs.resample import Gridded, Span, to_grid
+from grounded_trials.logs.signals import Series
+from grounded_trials.store.store import hash_file
+from grounded_trials.toml_table import Table
+from grounded_trials.workspace.config import FILE
+from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.identity import sha256
+from grounded_trials.workspace.run_start import Recording, recording
+
+
+@dataclass(frozen=True, eq=False)
+class ForeignLog:
+    """The samples of somebody else's log, to be cut where its run begins."""
+
+    workspace: Folder
+    path: Path
+    mapping: LogMapping
+    states: tuple[str, ...]  # that are measured
+    estimate: EstimateTable | None
+    series: dict[str, Series]
+    source: dict[str, str]  # its name, hash and estimated states, for the trial's metadata
+
+    def cut(self, candidate: str, start: float | None = None) -> tuple[Trial, Gridded]:
+        """The trial in it, and how it was sampled.
+
+        Args:
+            candidate: that it ran; "" for data, which may be longer than the task.
+            start: where it begins, seconds after the log's first sample; None: as [log.span] says.
+
+        Raises:
+            GroundedError: if no whole trial is in it.
+        """
+        model, task = self.workspace.base_model, self.workspace.config.task
+        found = to_grid(
+            self.series,
+            task.dt,
+            self.states,
+            model.input_names,
+            self.mapping.span if start is None else Span(start=start),
+            angles=model.angles,
+            steps=task.horizon if candidate else None,
+        )
+        if self.estimate:
+            found = smoothed(self.workspace, found, self.estimate)
+        if candidate and found.late_s > task.dt / 2:
+            raise GroundedError(
+                f"{self.path}: the run starts {found.late_s:.2f} s before every state is known: "
+                "the trial's time would not be the candidate's. Start recording before the run, "
+                "or take it in with --data"
+            )
+        trial = Trial(
+            states=found.states,
+            inputs=found.inputs,
+            dt=task.dt,
+            state_names=model.state_names,
+            input_names=model.input_names,
+            candidate=candidate,
+            start_inputs=found.start_inputs,
+        )
+        return trial, found
+
+    @property
+    def recording(self) -> Recording | None:
+        """The log where its run may begin anywhere; None where [log.span] or [estimate] is set."""
+        if self.estimate or self.workspace.config.log.sub("span").names():
+            return None
+        return recording(self.series, self.workspace.task)
+
+
+def mapping_of(workspace: Folder, path: Path) -> LogMapping:
+    """The [log] table, for this log.
+
+    Raises:
+        GroundedError: if there is none, or the log is no log at all.
+    """
+    model, files = workspace.base_model, log_files(path)
+    mapping = log_mapping(workspace.config.log, model.state_names, model.input_names)
+    if mapping is not None:
+        return mapping
+    if (path / FILE).is_file():
+        raise GroundedError(f"{path} is a workspace: name the log, or its folder, inside")
+    for file in files:
+        next(iter(log_records(file)), None)
+    raise GroundedError(
+        f"{path} is not a trial that grounded wrote, and grounded.toml has no [log] table to map "
+        "it: `inspect` prints one",
+        NextCommand("inspect", (str(path),)),
+    )
+
+
+def read_foreign(workspace: Folder, path: Path, mapping: LogMapping) -> ForeignLog:
+    """Reads a log through the [log] table.
+
+    Raises:
+        GroundedError: if a state or an input is not mapped, or the log can't be read.
+    """
+    model, config, files = workspace.base_model, workspace.config, log_files(path)
+    estimate = read_estimate(config.estimate, model) if config.estimate.names() else None
+    states = tuple(estimate.measured) if estimate else model.state_names
+    missing = [s for s in states if s not in mapping.states]
+    missing += [i for i in model.input_names if i not in mapping.inputs]
+    if missing:
+        raise GroundedError(
+            f"[log] maps no '{missing[0]}': map it, or let the smoother find a state that is "
+            "not measured with an [estimate] table (docs/real-logs.md)"
+        )
+    source = {"source": path.name, "source_sha256": _hashed(files)}
+    if guessed := [name for name in model.state_names if name not in states]:
+        source["estimated"] = ",".join(guessed)
+    series = mapped_signals(files, mapping, states, model.input_names)
+    return ForeignLog(workspace, path, mapping, states, estimate, series, source)
+
+
+def _hashed(files: Sequence[Path]) -> str:
+    """SHA-256 over a log's files, or over their hashes when there are several."""
+    hashes = [hash_file(file) for file in files]
+    return hashes[0] if len(hashes) == 1 else sha256("".join(hashes).encode())
+
+
+@dataclass(frozen=True)
+class EstimateTable:
+    """[estimate]: which states are measured, and how well."""
+
+    measured: dict[str, float]
+    process: dict[str, float]
+
+
+def read_estimate(table: Table, model: Model) -> EstimateTable:
+    """The checked [estimate] table, what is measured in the model's order.
+
+    Raises:
+        GroundedError: for an unknown state, or a standard deviation that is not positive.
+    """
+    measured = table.numbers("measured", model.state_names)
+    process = table.numbers("process", model.state_names)
+    table.finish()
+    for kind, values in (("measured", measured), ("process", process)):
+        for name, std in values.items():
+            if std <= 0:
+                raise table.error(f"{kind}.{name}", f"must be a positive deviation, found {std:g}")
+    if not measured:
+        raise table.error("measured", "names no state; give { x = 0.002, ... }")
+    ordered = {name: measured[name] for name in model.state_names if name in measured}
+    return EstimateTable(ordered, process)
+
+
+def smoothed(workspace: Folder, found: Gridded, table: EstimateTable) -> Gridded:
+    """A log of the measured states with all states: the smoother's, the measured ones as they are.
+
+    Raises:
+        GroundedError: if the smoother fails on this log.
+    """
+    from grounded.estimate import NoiseStd, Record, noise_of, of_states, smooth_trials
+
+    model, task = workspace.base_model, workspace.task
+    measured, dt = list(table.measured), task.dt
+    times = np.arange(len(found.states), dtype=np.float64) * dt
+    record = Record(
+        times=times,
+        measured=found.states,
+        command_times=times[:-1],
+        commands=found.inputs,
+        past=found.start_inputs,
+    )
+    measurement = of_states(model, measured)
+    options = {"latency": task.latency, "measurement": measurement}
+    noise = noise_of(model, [record], **options).noise  # type: ignore[arg-type]
+    process = np.array(noise.process)
+    for name, std in table.process.items():
+        process[model.state_names.index(name)] = std
+    known = np.array(list(table.measured.values()))
+    noise = NoiseStd(process=process, measurement=known, dt=noise.dt)
+    smooth = smooth_trials(model, [record], noise, **options)[0]  # type: ignore[arg-type]
+    if not np.isfinite(smooth.states).all():
+        raise GroundedError(
+            f"the smoother finds no finite states for this log ({smooth.status}): the crude model "
+            "is too far off to tell what was not measured; check its units and the [log] mapping"
+        )
+    states = np.array(smooth.states)
+    for column, name in enumerate(measured):
+        states[:, model.state_names.index(name)] = found.states[:, column]
+    return replace(found, states=states)
