@@ -13,6 +13,7 @@ utility. theta is one of
 
     open loop    the inputs ubar (H, m) themselves
     feedback     ubar (H, m) and the gains K (H, m, nz) of u = ubar + K (z - zbar)
+    a class      a few named parameters of a function of the user's (`policy_class.py`)
 
 A gradient has a direction and no length. `ascent` measures inputs by the curvature 2 (R + S) of
 their own cost, and takes the length that gains most in the biased model.
@@ -20,8 +21,9 @@ their own cost, and takes the length that gains most in the biased model.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -37,6 +39,7 @@ if TYPE_CHECKING:
     from grounded.solve.bias import Grounding
     from grounded.task import Task
 
+Theta = TypeVar("Theta")
 LENGTHS = 2.0 ** np.arange(3, -25, -1)  # of a step, in units of the scaled gradient
 
 
@@ -55,7 +58,7 @@ def gradient(problem: Problem, z: Array, u: Array, policy: Policy | None = None)
         GroundedError: for arrays that do not fit, or a policy about another z.
     """
     local = linearised(problem, z, u)
-    free = ((u > problem.low) & (u < problem.high)).astype(float)  # strictly inside
+    free = free_inputs(problem, u)
     if policy is None or policy.gain is None or policy.reference is None:
         g, _ = adjoint(local, np.zeros((*u.shape, z.shape[1])), free)
         return Gradient(g * free)
@@ -97,6 +100,11 @@ def adjoint(local: Quadratic, answer: Array, free: Array) -> tuple[Array, Array]
     return g, slope
 
 
+def free_inputs(problem: Problem, u: Array) -> Array:
+    """1 where an input is strictly inside its limits."""
+    return ((u > problem.low) & (u < problem.high)).astype(float)
+
+
 def ascent(task: Task, policy: Policy, grounding: Grounding) -> Policy:
     """Step 5 by Eq. (4): theta' = theta + s (dU/dtheta), s the best length in the biased model.
 
@@ -120,13 +128,26 @@ def ascent(task: Task, policy: Policy, grounding: Grounding) -> Policy:
         forward = policy.feedforward + length * d
         return replace(policy, feedforward=np.clip(forward, *_room(policy, forward)), gain=gain)
 
-    best, most = policy, simulate(problem, policy).utility
+    return best_length(policy, moved, lambda theta: -simulate(problem, theta).utility)
+
+
+def best_length(
+    start: Theta, moved: Callable[[float], Theta], cost: Callable[[Theta], float]
+) -> Theta:
+    """The policy of least cost among the start and what steps of LENGTHS make of it.
+
+    Args:
+        start: theta.
+        moved: theta after a step of some length.
+        cost: of a theta, in the model.
+    """
+    best, lowest = start, cost(start)
     for length in LENGTHS.tolist():
-        tried = moved(length)
-        utility = simulate(problem, tried).utility
-        if utility > most:
-            best, most = tried, utility
-        elif best is not policy:
+        candidate = moved(length)
+        found = cost(candidate)
+        if found < lowest:
+            best, lowest = candidate, found
+        elif best is not start:
             break  # shorter ones gain less and less
     return best
 
