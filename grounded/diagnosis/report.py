@@ -62,6 +62,11 @@ class Estimate(Document):
     interval: tuple[float, float] | None = field(metadata=BRIEF, default=None)
     unit: str = ""
 
+    def moved(self, by: float) -> Estimate:
+        """The same of a quantity that is so much larger."""
+        ends = None if self.interval is None else (self.interval[0] + by, self.interval[1] + by)
+        return Estimate(self.value + by, self.std, ends, self.unit)
+
 
 @dataclass(frozen=True, eq=False)
 class Ranked(Document):
@@ -111,7 +116,10 @@ class Unconfirmed(Document):
         """One clause."""
         few, all_ = self.seen
         where = "" if self.region is None else f", mostly where {self.region.when}"
-        when = f"trial {self.trial}, {number(self.start)} to {number(self.end)} s{where}"
+        start, end = number(self.start), number(self.end)
+        when = (
+            f"trial {self.trial}, {f'{start} to {end}' if start != end else f'at {end}'} s{where}"
+        )
         return f"unconfirmed, seen in {few} of {all_} trials: {self.meaning} ({when})"
 
 

@@ -26,7 +26,9 @@ from grounded_trials.report.findings import (
     tracking_error,
 )
 from grounded_trials.report.forecast import SECONDS, forecast_error
+from grounded_trials.report.settled import so_far
 from grounded_trials.wording import (
+    ITERATION,
     count,
     figure,
     folded,
@@ -41,7 +43,7 @@ ROWS, SPARED = 12, 3  # candidates in the table; more than so many others are co
 ITERATIONS = 5  # of the bias
 EFFECTS = 5
 VALUES = 34  # columns for an effect's parameters
-LEGEND = "alpha: the part of the step that was run; +-: standard error"
+LEGEND = f"alpha: the part of the step that was run; +-: standard error; {ITERATION}"
 
 Table = Callable[[Sequence[Sequence[str]], Sequence[str]], str]
 
@@ -154,11 +156,10 @@ def _diagnosis(findings: Findings, table: Table) -> str:
         command = rendered(DIAGNOSE, findings.folder)
         return "\n".join(["gap to the model", *_wrapped(f"not diagnosed yet: {command}", "  ")])
     lines = ["gap to the model"]
-    lines += _wrapped(since.told(findings.folder), "  ")
-    then = "before that: " * bool(since.adopted)
+    shown = so_far(diagnosis, since, findings.settled, findings.folder)
     causes, others = verdict_lines(diagnosis)
-    for k, line in enumerate([*(f"- {cause}" for cause in causes), *others]):
-        lines += _wrapped(then * (k == 0) + line, "  ")
+    for line in (*shown, *(f"- {cause}" for cause in causes), *others):
+        lines += _wrapped(line, "  ")
     before = {} if since.changed else findings.values
     for title, text in error_lines(diagnosis, before):
         lines += _wrapped(f"{title}: {text}", "  ")
@@ -188,11 +189,11 @@ def _fitting(values: list[str], width: int) -> str:
 
 
 def _logs(findings: Findings, table: Table) -> str:
-    """How far the crude model is off 1 s ahead on logs that ran no candidate."""
+    """How far the crude model is off after each second of logs that ran no candidate."""
     logs = findings.logs[-ITERATIONS:]
     columns = [forecast_error(findings.crude, log.trial) for log in logs]
     rows = by_state(findings.task.model, columns)
-    title = f"data: error of the {findings.plain} {SECONDS:g} s ahead, rms\n"
+    title = f"data: what the {findings.plain}, set right every {SECONDS:g} s, misses by then, rms\n"
     return title + table(rows, ("state", "unit", *(log.trial.id for log in logs)))
 
 
