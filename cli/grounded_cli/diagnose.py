@@ -67,7 +67,7 @@ def command(
 ) -> None:
     """Explain the sim-to-real gap from the stored trials; keeps reports/diagnosis.json.
 
-    The verdict is one effect, several, none (the model explains the data down to the noise) or
+    The verdict is one effect, several, none (what is left is noise, or can't be told from it) or
     unknown (a gap that no known effect explains). Where two effects tie, a probe candidate that
     would tell them apart is written.
     """

@@ -52,7 +52,7 @@ from grounded.diagnosis.validation.limits import Limits, held, identifiable, kno
 from grounded.diagnosis.validation.measured import Measured, root_mean_square
 from grounded.diagnosis.validation.prediction_error import by_region, by_time, explained, horizon
 from grounded.diagnosis.validation.ruler import Ruler
-from grounded.diagnosis.verdict import missed, next_trial, verdict
+from grounded.diagnosis.verdict import next_trial, verdict
 from grounded.effects import Library
 from grounded.engine import Engine, running
 from grounded.errors import GroundedError
@@ -210,7 +210,7 @@ class _Writer:
         measured = self.measured
         remainder = measured.remainders()
         rows, credit = measured.prediction_error(), measured.credits()
-        off = remainder[0].channel if remainder else missed(self.ruler, rows)
+        off = remainder[0].channel if remainder else ""
         named = [row.effect for row in ranking if row.claimed]
         seen = unconfirmed(self.claims, self.decision.doubtful)
         values, agreement = by_trial(self.best, data, named) if named else ((), ())

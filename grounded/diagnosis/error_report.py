@@ -158,12 +158,12 @@ class RulerRow(Document):
     whole_trial: bool = False
     unit_by_channel: Mapping[str, str] = field(default_factory=dict)
     held_out: str = "trials"
-    outset: Mapping[str, float] = field(metadata=BRIEF, default_factory=dict)
     crude: Mapping[str, float] = field(default_factory=dict)
     calibrated: Mapping[str, float] = field(default_factory=dict)
     with_effects: Mapping[str, float] = field(default_factory=dict)
     noise_floor: Mapping[str, float] = field(default_factory=dict)
     floor_from: str = ""
+    outset: Mapping[str, float] = field(metadata=BRIEF, default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

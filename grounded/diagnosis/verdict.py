@@ -18,7 +18,6 @@ from grounded.diagnosis.error_report import (
 from grounded.diagnosis.report import Estimate, Kind, Ranked, Unconfirmed, Verdict, quantity
 from grounded.diagnosis.validation.claims import Claims
 from grounded.diagnosis.validation.measured import ABOVE
-from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Effect, ParamFamily, places
 from grounded.model import Model
 
@@ -57,13 +56,13 @@ def verdict(
     if claims.known.no_cause:
         return _said("unknown", f"No cause is named: {claims.known.sentences[0]}.")
     if not claimed:
-        above = rest(rows)
-        if remainder or (above and missed(claims.ruler, rows)):
-            text = f"A gap remains that no known effect explains: {left or above}."
-            return _said("unknown", text, *once)
-        if above:
-            return _said("none", f"The model explains what matters: {above}.", *once)
-        return _said("none", f"The model explains the data down to the noise{floor(row)}.", *once)
+        if remainder:
+            return _said("unknown", f"A gap remains that no known effect explains: {left}.", *once)
+        if above := rest(rows):
+            text = f"The model explains what these trials can show: {above}."
+        else:
+            text = f"The model explains the data down to the noise{floor(row)}."
+        return _said("none", text, *once)
     causes = _causes(claims, ranking, credit)
     several = len(causes) > 1
     shares = [f" ({percent(one.share)} of the gain)" * several for one in credit]
@@ -162,19 +161,6 @@ def floor(row: RulerRow | None) -> str:
     name = max(known, key=lambda n: known[n] / max(row.noise_floor.get(n, math.nan), 1e-300))
     ahead = f"{number(row.horizon_s)} s ahead"
     return f": {ahead} it misses {name} by {_measured(row, name, known[name])}{_noise(row, name)}"
-
-
-def missed(ruler: Ruler, rows: Sequence[RulerRow]) -> str:
-    """The channel that stays furthest above the noise at a short horizon; "": none that matters."""
-    fine = dict(zip(ruler.names, 2 * ruler.fine[ruler.shown], strict=True))
-    found = [
-        (row.with_effects[name] / noise, name)
-        for row in rows
-        if not row.whole_trial
-        for name, noise in row.noise_floor.items()
-        if noise > 0 and row.with_effects[name] > max(ABOVE * noise, fine[name])
-    ]
-    return max(found, default=(0.0, ""))[1]
 
 
 def rest(rows: Sequence[RulerRow]) -> str:
@@ -323,6 +309,14 @@ def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
     def kept(found: re.Match[str]) -> str:  # of a quantity that is estimated, or [left out]
         return found[1] if set(re.findall(r"\{(\w)[%}]", found[1])) <= set(params) else ""
 
+    if (
+        isinstance(effect.family, ParamFamily)
+        and "d" in params
+        and effect.site.target in model.params
+    ):
+        old = model.params[effect.site.target].value
+        new = quantity(params["d"].moved(old))
+        return f"the parameter {effect.site.target} should be {new} instead of {number(old)}"
     text = re.sub(r"\[([^]]*)\]", kept, effect.family.sentence)
     return re.sub(r"\{(\w+)(%)?(?:([^{}|]+)\|([^{}|]+))?\}", filled, text)
 

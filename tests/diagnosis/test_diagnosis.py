@@ -277,8 +277,7 @@ def test_the_cause_that_makes_most_is_named_first(effect_first):
 
 
 def test_leftovers_that_are_not_named_are_counted():
-    ruler = SimpleNamespace(names=["omega"], shown=[0], fine=np.zeros(1))
-    claims = SimpleNamespace(known=SimpleNamespace(no_cause=False), ruler=ruler)
+    claims = SimpleNamespace(known=SimpleNamespace(no_cause=False), blamed=(), names=())
     off = tuple(Remainder(name, 0.1, "m/s", 9.0, None) for name in "abcd")
     said = {k: verdict(claims, (), (), off[:k], (), ()).sentence for k in (1, 3)}
     assert said[1].endswith("a is off by 0.1 m/s rms.")

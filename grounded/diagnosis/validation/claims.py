@@ -114,7 +114,6 @@ class Claims:
         self, decision: Decision, credit: dict[str, float], known: Limits, ruler: Ruler
     ) -> None:
         self.search, self.best, self.known = decision.search, decision.fit, known
-        self.ruler = ruler
         search, best, self.credit = decision.search, decision.fit, credit
         self.predictor, self.data = search.predictor, search.data
         self.names = best.hypothesis.names
