@@ -103,6 +103,7 @@ start = {start}
 feedback = true
 [reward]
 state = {state}
+terminal = {terminal}
 input = {input}
 input_change = {input}
 [limits]
@@ -133,6 +134,7 @@ def arm(folder: Path) -> None:
     write(folder, columns, {
         "dt": 0.02, "steps": 75, "start": "{}",
         "state": "{ shoulder = 20.0, elbow = 20.0 }",
+        "terminal": "{ }",
         "input": "{ tau1 = 0.0001, tau2 = 0.0001 }",
         "limits": "tau1 = [-15.0, 15.0]\ntau2 = [-8.0, 8.0]",
         "noise": "{ measurement = { shoulder = 0.001, elbow = 0.001, shoulder_vel = 0.01, "
@@ -141,7 +143,7 @@ def arm(folder: Path) -> None:
 
 
 def crash(folder: Path) -> None:
-    """A quadrotor that its model's own policy, ignorant of the motors' lag, puts on the ground."""
+    """A quadrotor whose model is ignorant of the motors' lag, so that runs end on the ground."""
     (folder / "model.py").write_text(QUADROTOR.format(mass=1.0, **CRUDE))
     (folder / "real.py").write_text(QUADROTOR.format(mass=1.2, **REAL))
     t = 0.05 * np.arange(81)
@@ -149,7 +151,8 @@ def crash(folder: Path) -> None:
     write(folder, columns, {
         "dt": 0.05, "steps": 80, "start": "{ left = 4.905, right = 4.905 }",
         "state": "{ x = 10.0, z = 10.0, phi = 0.1 }",
-        "input": "{ left = 0.01, right = 0.01 }",
+        "terminal": "{ x = 100.0, z = 100.0 }",
+        "input": "{ left = 0.001, right = 0.001 }",
         "limits": "left = [0.0, 12.0]\nright = [0.0, 12.0]",
         "noise": "{ measurement = { x = 0.002, z = 0.002, phi = 0.003, vx = 0.01, vz = 0.01, "
         "w = 0.02 } }",
@@ -227,7 +230,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         for name in names or [*DEMOS, *MADE]:
             path = page_of(name, Path(folder))
-            Path(place, f"gallery-{name}.png").write_bytes(picture(path, "s0" if name in MADE else ""))
+            Path(place, f"gallery-{name}.png").write_bytes(
+                picture(path, "s0" if name in MADE else "")
+            )
             print(f"gallery-{name}.png", flush=True)
 
 

@@ -9,14 +9,14 @@ import click
 
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace, typed
 from grounded_cli.terminal import field, number, progress, remark, show, show_json, sparkline, table
-from grounded_trials.wording import ITERATION, count, wrapped
+from grounded_trials.wording import count, legend, wrapped
 
 if TYPE_CHECKING:
     from grounded.search.candidate import Tried
     from grounded.search.standing import Standing
     from grounded_trials.workspace.proposing import Status
 
-LEGEND = f"damp: penalty on leaving the last trial's inputs; +-: standard error; {ITERATION}"
+LEGEND = "damp: penalty on leaving the last trial's inputs; +-: standard error"
 
 
 @click.command("status")
@@ -71,7 +71,8 @@ def summary(status: Status) -> str:
     if standing.history:
         header = ("id", "iter", "alpha", "damp", "predicted", "utility", "+-", "runs", "")
         lines.append(table([_row(t, standing.verdict(t)) for t in standing.history], header))
-        lines += wrapped(LEGEND, "  ", "  ")
+        words = legend(LEGEND, [t.candidate.iteration for t in standing.history])
+        lines += wrapped(words, "  ", "  ")
         bars = sparkline([t.utility for t in standing.history if t.utilities])
         lines.append("\n" + field("utility", bars) if bars else "")
     if standing.incumbent is not None:

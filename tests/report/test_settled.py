@@ -14,6 +14,7 @@ from grounded_trials.report.gathering import gather
 from grounded_trials.report.page.tables import candidate_table, parameter_table
 from grounded_trials.report.settled import told
 from grounded_trials.store.documents import write_document
+from grounded_trials.wording import changed, legend
 from grounded_trials.workspace.folder import Folder
 from reported import DIAGNOSIS, cart, copied
 
@@ -103,15 +104,15 @@ def test_a_parameter_that_is_blamed_by_name_has_a_value(cart, tmp_path):
 
 def test_the_order_of_candidates_is_explained(cart):
     findings = gather(Folder(cart))
-    made, why, *_ = candidate_table(findings)
+    made, *rest = candidate_table(findings)
     bases = [row[made.header.index("from")] for row in made.rows]
     assert bases == [t.candidate.base or "-" for t in findings.history]
-    assert "falls" in why.text and "falls" in words(cart, "status")
+    iterations = [t.candidate.iteration for t in findings.history]
+    assert iterations == sorted(iterations) and not rest and "falls" not in words(cart, "status")
+    assert "falls" in legend("alpha", [0, 1, 2, 1]) and legend("alpha", [0, 1, 1]) == "alpha"
 
 
 def test_numbers_that_differ_are_told_apart():
-    from grounded_trials.wording import changed
-
     assert changed("l", 0.5, 0.4997, "m") == "l 0.5000 -> 0.4997 m"
     assert changed("g", 2.0, 2.0, "1") == "g 2.000 -> 2.000"
 

@@ -6,6 +6,8 @@ import math
 import re
 import shlex
 import shutil
+from collections.abc import Sequence
+from itertools import pairwise
 from textwrap import TextWrapper
 from typing import TYPE_CHECKING
 
@@ -68,6 +70,12 @@ def changed(name: str, old: float, new: float, unit: str) -> str:
     pairs = ((figure(old, digits), figure(new, digits)) for digits in range(3, 9))
     a, b = next((pair for pair in pairs if pair[0] != pair[1]), (figure(old), figure(new)))
     return with_unit(f"{name} {a} -> {b}", unit)
+
+
+def legend(text: str, iterations: Sequence[int]) -> str:
+    """What a table's columns mean; why iterations fall, where they do."""
+    falls = any(b < a for a, b in pairwise(iterations))
+    return "; ".join(part for part in (text, ITERATION * falls) if part)
 
 
 def labelled(name: str, unit: str) -> str:

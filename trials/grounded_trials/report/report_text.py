@@ -28,10 +28,10 @@ from grounded_trials.report.findings import (
 from grounded_trials.report.forecast import SECONDS, forecast_error
 from grounded_trials.report.settled import so_far
 from grounded_trials.wording import (
-    ITERATION,
     count,
     figure,
     folded,
+    legend,
     per_second,
     rendered,
     with_unit,
@@ -43,7 +43,7 @@ ROWS, SPARED = 12, 3  # candidates in the table; more than so many others are co
 ITERATIONS = 5  # of the bias
 EFFECTS = 5
 VALUES = 34  # columns for an effect's parameters
-LEGEND = f"alpha: the part of the step that was run; +-: standard error; {ITERATION}"
+LEGEND = "alpha: the part of the step that was run; +-: standard error"
 
 Table = Callable[[Sequence[Sequence[str]], Sequence[str]], str]
 
@@ -94,7 +94,11 @@ def _utilities(findings: Findings, table: Table, bars: Callable[[Sequence[float]
     shown, left = few(history, ROWS if len(history) > ROWS + SPARED else len(history))
     rows = [_candidate(t, findings.standing.verdict(t)) for t in shown]
     header = ("candidate", "iter.", "alpha", "predicted", "real", "+-", "trials", "")
-    lines = ["utility", table(rows, header), *_wrapped(LEGEND, "  ")]
+    lines = [
+        "utility",
+        table(rows, header),
+        *_wrapped(legend(LEGEND, [t.candidate.iteration for t in shown]), "  "),
+    ]
     if left:
         status = rendered(NextCommand("status"), findings.folder)
         lines += _wrapped(f"({left} more between them: {status} shows all)", "  ")

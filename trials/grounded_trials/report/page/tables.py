@@ -23,7 +23,7 @@ from grounded_trials.report.findings import (
     tracking_error,
 )
 from grounded_trials.report.forecast import SECONDS, forecast_error
-from grounded_trials.wording import ITERATION, figure, percent, rendered, shown, with_unit
+from grounded_trials.wording import figure, legend, percent, rendered, shown, with_unit
 from grounded_trials.workspace.next_step import Since
 
 WIDEST = 1e6  # an interval so many times its value, or so wide, says nothing
@@ -93,7 +93,8 @@ def candidate_table(findings: Findings) -> list[Block]:
     made = table("candidates", list(rows[0]), [list(cells.values()) for cells in rows], strong)
     words = f"{left} candidates between them are left out; this shows all:"
     more = [Block("text", words), Block("command", rendered(NextCommand("status")), "c-status")]
-    return [made, Block("soft", f"{ITERATION[:1].upper()}{ITERATION[1:]}."), *more * bool(left)]
+    why = legend("", [t.candidate.iteration for t in kept])
+    return [made, *[Block("soft", f"{why}.")] * bool(why), *more * bool(left)]
 
 
 def error_table(findings: Findings) -> list[Block]:
