@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 HERE = Path(__file__).resolve().parent
-TALL, WIDTHS, GAP, COLOURS = 1560, (1000, 390), 20, 128  # [px]
+TALL, WIDTHS, GAP, COLOURS = 1560, (1000, 390), 20, 256  # [px]
 SCROLL = """
 const part = document.getElementById(arguments[0]), time = document.getElementById("time");
 time.value = 0.6 * time.max;
@@ -220,7 +220,7 @@ def picture(path: Path, section: str) -> bytes:
             shot = base64.b64decode(window.devtools("Page.captureScreenshot", {})["data"])
             whole.paste(Image.open(io.BytesIO(shot)), (dark * (WIDTHS[0] + GAP), 0))
     made = io.BytesIO()
-    whole.quantize(COLOURS).save(made, "png", optimize=True)
+    whole.quantize(COLOURS, kmeans=1).save(made, "png", optimize=True)
     return made.getvalue()
 
 

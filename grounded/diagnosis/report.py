@@ -314,10 +314,20 @@ class Diagnosis(Document):
         lost = {i.parameter for i in self.identifiable if i.verdict == "not identifiable"}
         return {name: e for name, e in self.parameters.items() if name not in lost}
 
-    def open(self, adopted: Iterable[Mapping[str, Any]]) -> tuple[str, ...]:
-        """The claimed effects that the model with these adopted ones lacks as it did then."""
-        now = {str(effect["name"]): dict(effect) for effect in adopted}
-        then = self.made.effects if self.made is not None else {}
+    def open(
+        self, adopted: Iterable[Mapping[str, Any]], params: Mapping[str, float] | None = None
+    ) -> tuple[str, ...]:
+        """The claimed effects that the model with these adopted ones lacks as it did then.
+
+        Args:
+            adopted: effects, as [model] effects has them.
+            params: the model's parameters, as [model] params has them.
+        """
+        made = self.made or Made()
+        now: dict[str, Any] = {str(effect["name"]): dict(effect) for effect in adopted}
+        now |= {f"parameter:{name}": value for name, value in (params or {}).items()}
+        then: dict[str, Any] = dict(made.effects)
+        then |= {f"parameter:{name}": value for name, value in (made.params or {}).items()}
         return tuple(name for name in self.effects if now.get(name) == then.get(name))
 
 

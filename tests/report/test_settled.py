@@ -64,6 +64,20 @@ def test_a_gain_that_nobody_measured_is_not_claimed(cart, tmp_path):
     assert len(found["clauses"]) == 1 and found["gained"] == ""
 
 
+def test_a_parameter_that_was_adopted_by_name_is_not_missing(cart, tmp_path):
+    names = ["viscous_friction:v", "parameter:mass"]
+    blamed = {"effect": names[1], "claimed": True, "evidence": 9.0}
+    blamed["params"] = {"d": {"value": 0.4, "std": 0.02, "unit": "kg"}}
+    verdict = {"kind": "several", "effects": names, "sentence": "Two."}
+    ranking = [DIAGNOSIS["ranking"][0], blamed]
+    folder = copied(cart, tmp_path / "w")
+    written(folder, verdict=verdict, ranking=ranking, parameters={})
+    assert grounded("-C", folder, "adopt", *names).code == 0
+    found = grounded("-C", folder, "report", "--json").json
+    assert found["adopted"]["clauses"][1] == "mass 1.00 -> 1.40 kg" and found["adopted"]["gained"]
+    assert "parameter:mass" in found["outdated"] and "but not" not in found["outdated"]
+
+
 def test_a_new_diagnosis_measures_model_py_beside_what_plans_now(adopted):
     model = Folder(adopted).config.model
     now = {"adopted": [dict(e) for e in model.effects], "params": dict(model.params)}

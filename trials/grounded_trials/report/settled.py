@@ -10,18 +10,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from grounded.diagnosis.report import Diagnosis, Estimate
+from grounded.diagnosis.report import Diagnosis, Estimate, Made
 from grounded.errors import GroundedError
 from grounded.model import Model
 from grounded.task import Task
 from grounded_trials.report.diagnosis_words import made_from
 from grounded_trials.report.three_lines import gained, still_open, three_lines
 from grounded_trials.wording import changed
+from grounded_trials.workspace.adopting import joined
+from grounded_trials.workspace.config import ModelTable
 from grounded_trials.workspace.diagnosing import read_diagnosis
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.next_step import Since, since_diagnosis, usable_ids
 
-SAME = 1e-6  # of a value: it was written by `adopt`
+NOW = "the model now"
 
 
 @dataclass(frozen=True)
@@ -56,12 +58,12 @@ def settled_in(workspace: Folder, diagnosis: Diagnosis | None, since: Since) -> 
     if diagnosis is None or diagnosis.no_cause:
         return Settled(tuple(clauses))
     if not since.changed:
-        text = gained(diagnosis, task, now="crude", before="outset")
+        text = gained(diagnosis, task, now="crude", before="outset", who=NOW)
         return Settled(tuple(clauses), text, _still(diagnosis))
-    if since.missing or not _as_claimed(diagnosis, table.effects, table.params):
+    if not _as_claimed(diagnosis, table):
         return Settled(tuple(clauses))
     before = "outset" if gained(diagnosis, task, before="outset") else "crude"
-    text = gained(diagnosis, task, before=before)
+    text = gained(diagnosis, task, before=before, who=NOW)
     return Settled(tuple(clauses), text, still_open(diagnosis), closed=True)
 
 
@@ -112,21 +114,17 @@ def _still(diagnosis: Diagnosis) -> str:
     return diagnosis.verdict.lines[0]
 
 
-def _as_claimed(
-    diagnosis: Diagnosis, effects: tuple[Mapping[str, Any], ...], params: Mapping[str, float]
-) -> bool:
-    """Whether the model is the one that the diagnosis measured with its effects."""
-    now = {str(e["name"]): e for e in effects}
-    then = {} if diagnosis.made is None else diagnosis.made.effects
-    wanted = {f"{n} {q}": v for n in diagnosis.effects for q, v in diagnosis.values(n).items()}
-    has = {f"{n} {q}": e[q] for n, e in now.items() if n not in then for q in e}
-    wanted |= {name: e.value for name, e in diagnosis.known_parameters.items()}
-    has |= params
-    return bool(diagnosis.effects) and all(
-        abs(has.get(key, float("inf")) - value) <= SAME * abs(value)
-        for key, value in wanted.items()
-        if key.split(" ")[0] not in then and not key.startswith("parameter:")
-    )
+def _as_claimed(diagnosis: Diagnosis, table: ModelTable) -> bool:
+    """Whether the model is what `adopt` makes of all that the diagnosis claims."""
+    made, names = diagnosis.made or Made(), diagnosis.effects
+    try:
+        known = diagnosis.known_parameters
+        own, effects = joined(diagnosis, names, made.adopted, made.nominal, known)
+    except (GroundedError, KeyError):  # of an older document
+        return False
+    now = {str(effect["name"]): dict(effect) for effect in table.effects}
+    wanted = {str(effect["name"]): effect for effect in effects}
+    return bool(names) and now == wanted and dict(made.params or {}) | own == dict(table.params)
 
 
 def _clause(entry: Mapping[str, Any], model: Model) -> str:

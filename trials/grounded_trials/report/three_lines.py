@@ -45,7 +45,11 @@ def _wrong(diagnosis: Diagnosis) -> str:
 
 
 def gained(
-    diagnosis: Diagnosis, task: Task, now: str = "with_effects", before: str = "crude"
+    diagnosis: Diagnosis,
+    task: Task,
+    now: str = "with_effects",
+    before: str = "crude",
+    who: str = "the diagnosed model",
 ) -> str:
     """How far predictions are off now, and were: position first, in the units of the states.
 
@@ -54,6 +58,7 @@ def gained(
         task: whose weighed states are spoken of.
         now: the column of `RulerRow` that holds today's errors.
         before: the column of those before.
+        who: misses so much.
     """
     row, parts = _ahead(diagnosis), []
     if row is None:
@@ -65,7 +70,7 @@ def gained(
         parts.append(f"{what} by {' instead of '.join(ends)}")
     held = "" if row.held_out != "no" else ", not held out"
     ahead = f"{row.horizon_s:.3g} s ahead{held}"
-    return f"{ahead} the model now misses {' and '.join(parts)}." if parts else ""
+    return f"{ahead} {who} misses {' and '.join(parts)}." if parts else ""
 
 
 def gained_most(diagnosis: Diagnosis, task: Task) -> list[tuple[list[str], str]]:
