@@ -18,7 +18,7 @@ from grounded_cli.options import (
     typed,
 )
 from grounded_cli.terminal import field, names_in, number, show, show_json, stages, table, tinted
-from grounded_trials.wording import rendered, with_unit, wrapped
+from grounded_trials.wording import percent, rendered, with_unit, wrapped
 
 if TYPE_CHECKING:
     from grounded.diagnosis.report import Diagnosis, Ranked
@@ -65,7 +65,7 @@ def command(
 ) -> None:
     """Explain the sim-to-real gap from the stored trials; keeps reports/diagnosis.json.
 
-    The verdict is one effect, several, none (the model explains the data down to the noise) or
+    The verdict is one effect, several, none (what is left is noise, or can't be told from it) or
     unknown (a gap that no known effect explains). Where two effects tie, a probe candidate that
     would tell them apart is written.
     """
@@ -184,7 +184,7 @@ def _verdict(found: Diagnosis) -> str:
 def _places(found: Diagnosis) -> None:
     where = found.where
     channels = [
-        (c.name, f"{100 * c.share:.0f} %", with_unit(number(c.rms, 3), c.unit))
+        (c.name, percent(c.share), with_unit(number(c.rms, 3), c.unit))
         for c in where.channels
         if c.share >= 0.005
     ]
@@ -192,11 +192,11 @@ def _places(found: Diagnosis) -> None:
         show("\n" + table(channels, ("where", "share of the gap", "rms")))
         _note(
             "share: of the squared errors of single steps, in units of the noise, that causes and "
-            f"leftover make; rms: {found.gap.horizon_s:g} s ahead"
+            f"leftover make; rms: of the model as it was {found.gap.horizon_s:g} s ahead"
         )
     for region in where.regions[:3]:
-        share, time = 100 * region.share, 100 * region.occupancy
-        show(field("", f"{region.when}: {share:.0f} % of the gap in {time:.0f} % of the time"))
+        share, time = percent(region.share), percent(region.occupancy)
+        show(field("", f"{region.when}: {share} of the gap in {time} of the time"))
 
 
 def _effects(found: Diagnosis) -> None:

@@ -127,9 +127,11 @@ def _told(task: Task) -> list[str]:
 
 
 def _span(low: float, high: float) -> str:
-    """From the lowest to the highest value, to a hundredth or finer where all are small."""
+    """From the lowest to the highest value, to a hundredth, or a millionth where all are small."""
     size = max(abs(low), abs(high))
-    digits = 2 if size >= 1 or not 0 < size < float("inf") else 2 - math.floor(math.log10(size))
+    if size < 0.5e-6:
+        return "0"
+    digits = 2 if not size < 1 else min(2 - math.floor(math.log10(size)), 6)
     return f"{round(low, digits) + 0.0:.{digits}f} to {round(high, digits) + 0.0:.{digits}f}"
 
 

@@ -9,7 +9,7 @@ import click
 
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace, typed
 from grounded_cli.terminal import field, number, progress, remark, show, show_json, sparkline, table
-from grounded_trials.wording import count, wrapped
+from grounded_trials.wording import count, legend, wrapped
 
 if TYPE_CHECKING:
     from grounded.search.candidate import Tried
@@ -25,16 +25,21 @@ LEGEND = "damp: penalty on leaving the last trial's inputs; +-: standard error"
 def command(json_: bool) -> None:
     """Show where the search stands: derived from the stored trials, nothing is written."""
     workspace = open_workspace()
+    from grounded_trials.report.settled import settled_now
+
     with progress("reading trials"):
         status = workspace.status()
     if json_:
         show_json(status.to_json())
         return
     show(summary(status))
+    settled = settled_now(workspace)
     for note in status.notes:
         remark("note", note)
     for name, why in status.discarded.items():
         show(field("discarded", f"{name}{why and ': ' + why}"))
+    if settled:
+        show(field("model", " ".join(settled.lines)))
     if status.outdated:
         show(field("diagnosis", status.outdated))
     show(f"\n{next_line(status.then)}")
@@ -66,7 +71,8 @@ def summary(status: Status) -> str:
     if standing.history:
         header = ("id", "iter", "alpha", "damp", "predicted", "utility", "+-", "runs", "")
         lines.append(table([_row(t, standing.verdict(t)) for t in standing.history], header))
-        lines += wrapped(LEGEND, "  ", "  ")
+        words = legend(LEGEND, [t.candidate.iteration for t in standing.history])
+        lines += wrapped(words, "  ", "  ")
         bars = sparkline([t.utility for t in standing.history if t.utilities])
         lines.append("\n" + field("utility", bars) if bars else "")
     if standing.incumbent is not None:

@@ -23,7 +23,7 @@ LEAST = 1e-6  # [m] of a box's half edge
 class MujocoBody:
     """The body of a compiled model in a Model's coordinates."""
 
-    unit = "m"
+    unit, watched = "m", "the last body's centre of mass"
 
     def __init__(self, compiled: Any, data: Any, coordinates: Coordinates, kinematics: Any) -> None:
         self._model, self._data, self._coordinates = compiled, data, coordinates

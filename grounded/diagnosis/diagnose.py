@@ -25,7 +25,14 @@ from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis.error_report import Change, ChannelShare, Gap, UtilityPrediction, Where
+from grounded.diagnosis.error_report import (
+    Change,
+    ChannelShare,
+    Gap,
+    RulerRow,
+    UtilityPrediction,
+    Where,
+)
 from grounded.diagnosis.hypotheses.attribution import attribute, so_far
 from grounded.diagnosis.hypotheses.correction import correction
 from grounded.diagnosis.hypotheses.leftover import whiteness
@@ -36,7 +43,7 @@ from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.report import Diagnosis, Estimate, Identifiable, NoiseLevels
-from grounded.diagnosis.unconfirmed import unconfirmed
+from grounded.diagnosis.unconfirmed import lost, unconfirmed
 from grounded.diagnosis.validation.agreement import by_trial, changed
 from grounded.diagnosis.validation.claims import Claims
 from grounded.diagnosis.validation.decide import Decision, decide
@@ -202,13 +209,14 @@ class _Writer:
         measured = self.measured
         remainder = measured.remainders()
         rows, credit = measured.prediction_error(), measured.credits()
+        off = remainder[0].channel if remainder else ""
         named = [row.effect for row in ranking if row.claimed]
         seen = unconfirmed(self.claims, self.decision.doubtful)
         values, agreement = by_trial(self.best, data, named) if named else ((), ())
         return Diagnosis(
             verdict=verdict(self.claims, ranking, groups, remainder, rows, credit, seen, same),
             where=Where(
-                channels=self.channels(gain, shrunk.before, where.spread),
+                channels=self.channels(gain, rows),
                 times=tuple(by_time(gain.sum(axis=-1), data)),
                 regions=tuple(by_region(gain.sum(axis=-1), predictor, self.best)),
                 split=measured.split(),
@@ -233,7 +241,7 @@ class _Writer:
             leftover=remainder,
             unconfirmed=seen,
             correction=correction(predictor, self.best, self.left, where),
-            next_trial=next_trial(self.claims, self.left, groups, seen, same),
+            next_trial=next_trial(self.claims, off, groups, seen, same, self.lost()),
             unknowable=self.known.sentences,
             noise=self.noise(),
             parameters=self.claims.parameters(),
@@ -246,23 +254,26 @@ class _Writer:
             candidates=len(self.search.candidates),
         )
 
-    def channels(self, gain: Any, error: Any, spread: Any) -> tuple[ChannelShare, ...]:
-        """Each state's part of the gap."""
-        data = self.data
+    def lost(self) -> tuple[str, ...]:
+        """The trials that nobody should repeat."""
+        return () if self.task is None else lost(self.task, self.trials)
+
+    def channels(self, gain: Any, rows: Sequence[RulerRow]) -> tuple[ChannelShare, ...]:
+        """Each state's part of the gap, with the ruler's errors a second ahead."""
         excess = np.maximum(gain.sum(axis=(0, 1)), 0.0)
         share = excess / max(float(excess.sum()), 1e-12)
-        rms = root_mean_square(error)
-        rows = [
+        ahead = [row for row in rows if not row.whole_trial][-1]
+        found = [
             ChannelShare(
                 name,
                 share=float(share[i]),
-                rms=float(rms[i]),
-                unit=data.model.states[name],
-                noise=float(np.sqrt((spread[:, i] ** 2).mean())),
+                rms=ahead.crude[name],
+                unit=self.data.model.states[name],
+                noise=ahead.noise_floor[name],
             )
             for i, name in self.shown
         ]
-        return tuple(sorted(rows, key=lambda row: -row.share))
+        return tuple(sorted(found, key=lambda one: -one.share))
 
     def by_channel(self, before: Any, after: Any, spread: Any) -> dict[str, Change]:
         """The gap of each state, noise-normalised."""

@@ -149,6 +149,7 @@ class RulerRow(Document):
     """Rms errors of held-out open-loop predictions over one horizon, by channel in its unit.
 
     held_out: by "trials", by "pieces" of one long log, or "no" where there is too little.
+    outset: of the model before anything was adopted; empty where nothing was.
     calibrated: with the model's own parameters fitted; empty where none may move.
     floor_from: "repeats" of a candidate, trials whose commands are "alike", or the "short horizon",
         whose noise is carried on.
@@ -163,6 +164,7 @@ class RulerRow(Document):
     with_effects: Mapping[str, float] = field(default_factory=dict)
     noise_floor: Mapping[str, float] = field(default_factory=dict)
     floor_from: str = ""
+    outset: Mapping[str, float] = field(metadata=BRIEF, default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,6 +212,16 @@ class Remainder(Document):
 def number(value: float) -> str:
     """Three digits; a dash for what is no number."""
     return "-" if math.isnan(value) else f"{value:.3g}"
+
+
+def percent(share: float) -> str:
+    """A share as a percentage; a tenth of a percent where it is small or nearly all."""
+    if math.isnan(share):
+        return "-"
+    value = 100 * share
+    if 0 < value < 0.05 or 99.95 <= value < 100:
+        return "< 0.1 %" if value < 50 else "> 99.9 %"
+    return f"{value:.0f} %" if 10 <= value <= 90 else f"{value:.1f} %"
 
 
 def measured(value: float, unit: str) -> str:

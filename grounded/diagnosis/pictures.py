@@ -7,13 +7,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from grounded.diagnosis.error_report import RulerRow, measured, number
+from grounded.diagnosis.error_report import RulerRow, measured, number, percent
 from grounded.diagnosis.report import Diagnosis
 from grounded.figures.figure import Bar, Bars, Curve, Figure, Panel, legend
 
 MOST = 12
 CREDIT_S = 1.0  # how far ahead an effect's worth is measured
 MODELS = {  # keys of a prediction error: role, name
+    "outset": ("limit", "model.py"),
     "crude": ("model", "model"),
     "calibrated": ("step2", "calibrated"),
     "with_effects": ("best", "as diagnosed"),
@@ -89,7 +90,7 @@ def credit_figure(diagnosis: Diagnosis, channels: int = 1) -> Figure | None:
     credit, known = diagnosis.credit, _second_ahead(diagnosis)
     if not credit:
         return None
-    bars = tuple(Bar(c.of, c.share, f"{100 * c.share:.0f} %") for c in credit[:MOST])
+    bars = tuple(Bar(c.of, c.share, percent(c.share)) for c in credit[:MOST])
     panels = [Bars("Share of what predictions gain", bars)]
     for name in _improved(known)[:channels] if known else ():
         panels += worth_of([name], name, diagnosis)
@@ -141,9 +142,7 @@ def where_figure(diagnosis: Diagnosis) -> Figure | None:
     where = diagnosis.where
     by_channel = [(c.name, c.share, f", {measured(c.rms, c.unit)}") for c in where.channels]
     by_time = [(f"{t.start:g} to {t.end:g} s", t.share, "") for t in where.times]
-    by_region = [
-        (r.when, r.share, f", {100 * r.occupancy:.0f} % of the time") for r in where.regions
-    ]
+    by_region = [(r.when, r.share, f", {percent(r.occupancy)} of the time") for r in where.regions]
     panels = [
         Bars(f"Share of the gap by {word}", _shares(shares, role))
         for word, shares, role in (
@@ -159,16 +158,22 @@ def where_figure(diagnosis: Diagnosis) -> Figure | None:
         return None
     caption = (
         "Evidence is the gain in log-likelihood less its price. Blue: what it loses without a "
-        "claimed effect, from 3 nats on. Grey: what an effect would gain alone, in their place."
+        "claimed effect, from 3 nats on. Grey: what an effect would gain alone, in their place. "
+        f"Beside a channel's share: by how much the model misses it{_ahead(diagnosis)}."
     )
     return Figure("gap", "Where the gap lies", caption, tuple(panels))
+
+
+def _ahead(diagnosis: Diagnosis) -> str:
+    """How far ahead errors by channel are measured: the ruler's last row but the whole trial."""
+    rows = [row.horizon_s for row in diagnosis.prediction_error if not row.whole_trial]
+    return f" {rows[-1]:.3g} s ahead, rms" if rows else ", rms"
 
 
 def _shares(shares: Sequence[tuple[str, float, str]], role: str) -> tuple[Bar, ...]:
     """Bars of (label, share, what else is said of it)."""
     return tuple(
-        Bar(label, share, f"{100 * share:.0f} %{note}", role)
-        for label, share, note in shares[:MOST]
+        Bar(label, share, f"{percent(share)}{note}", role) for label, share, note in shares[:MOST]
     )
 
 

@@ -63,6 +63,11 @@ class Estimate(Document):
     interval: tuple[float, float] | None = field(metadata=BRIEF, default=None)
     unit: str = ""
 
+    def moved(self, by: float) -> Estimate:
+        """The same of a quantity that is so much larger."""
+        ends = None if self.interval is None else (self.interval[0] + by, self.interval[1] + by)
+        return Estimate(self.value + by, self.std, ends, self.unit)
+
 
 @dataclass(frozen=True, eq=False)
 class Ranked(Document):
@@ -112,7 +117,10 @@ class Unconfirmed(Document):
         """One clause."""
         few, all_ = self.seen
         where = "" if self.region is None else f", mostly where {self.region.when}"
-        when = f"trial {self.trial}, {number(self.start)} to {number(self.end)} s{where}"
+        start, end = number(self.start), number(self.end)
+        when = (
+            f"trial {self.trial}, {f'{start} to {end}' if start != end else f'at {end}'} s{where}"
+        )
         return f"unconfirmed, seen in {few} of {all_} trials: {self.meaning} ({when})"
 
 
@@ -308,10 +316,20 @@ class Diagnosis(Document):
         lost = {i.parameter for i in self.identifiable if i.verdict == "not identifiable"}
         return {name: e for name, e in self.parameters.items() if name not in lost}
 
-    def open(self, adopted: Iterable[Mapping[str, Any]]) -> tuple[str, ...]:
-        """The claimed effects that the model with these adopted ones lacks as it did then."""
-        now = {str(effect["name"]): dict(effect) for effect in adopted}
-        then = self.made.effects if self.made is not None else {}
+    def open(
+        self, adopted: Iterable[Mapping[str, Any]], params: Mapping[str, float] | None = None
+    ) -> tuple[str, ...]:
+        """The claimed effects that the model with these adopted ones lacks as it did then.
+
+        Args:
+            adopted: effects, as [model] effects has them.
+            params: the model's parameters, as [model] params has them.
+        """
+        made = self.made or Made()
+        now: dict[str, Any] = {str(effect["name"]): dict(effect) for effect in adopted}
+        now |= {f"parameter:{name}": value for name, value in (params or {}).items()}
+        then: dict[str, Any] = dict(made.effects)
+        then |= {f"parameter:{name}": value for name, value in (made.params or {}).items()}
         return tuple(name for name in self.effects if now.get(name) == then.get(name))
 
 

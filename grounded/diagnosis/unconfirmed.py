@@ -7,6 +7,7 @@ fault of the likelihood and is not told.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -18,9 +19,12 @@ from grounded.diagnosis.validation.decide import Doubtful
 from grounded.diagnosis.validation.prediction_error import by_region
 from grounded.diagnosis.verdict import meaning
 from grounded.frozen import Array
+from grounded.task import Task
+from grounded.trial import Trial
 
 MENTIONED = 2
 MOST = 0.8  # of all that it does, which few trials hold
+FAR_OFF = 2.0
 FEW = 4  # one of so many trials
 SURE = 2.0  # standard deviations that one of its numbers is from zero
 
@@ -60,6 +64,36 @@ def _seen(claims: Claims, one: Doubtful) -> Unconfirmed | None:
         (few, data.count),
         regions[0] if regions else None,
     )
+
+
+def lost(task: Task, trials: Sequence[Trial]) -> tuple[str, ...]:
+    """The runs that crashed: they ended early, left [safety], or went far from all others.
+
+    Far is where a state with a target strays from it by FAR_OFF times the range that the target
+    and the best run have.
+    """
+    assert task.safety_low is not None and task.safety_high is not None
+    ran = [trial for trial in trials if trial.candidate]
+    best = max(ran, key=task.utility, default=None)
+    found = []
+    for trial in ran:
+        states = trial.states[: task.horizon + 1]
+        outside = (states < task.safety_low) | (states > task.safety_high)
+        if trial is best or not (
+            math.isinf(task.utility(trial)) or outside.any() or _far(task, trial, best)
+        ):
+            continue
+        found.append(trial.id)
+    return tuple(found)
+
+
+def _far(task: Task, trial: Trial, best: Trial | None) -> bool:
+    if best is None:
+        return False
+    both = np.concatenate([best.states, task.target])
+    room = FAR_OFF * (np.nanmax(both, axis=0) - np.nanmin(both, axis=0))
+    off = task.model.difference(trial.states, task.target[: len(trial.states)])
+    return bool((np.abs(off) > room).any())
 
 
 def _acting(claims: Claims, one: Doubtful) -> Array:

@@ -4,15 +4,22 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from grounded.diagnosis.error_report import ABOVE, Credit, Remainder, RulerRow, measured, number
+from grounded.diagnosis.error_report import (
+    ABOVE,
+    Credit,
+    Remainder,
+    RulerRow,
+    measured,
+    number,
+    percent,
+)
 from grounded.diagnosis.report import Estimate, Kind, Ranked, Unconfirmed, Verdict, quantity
 
 if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
-    from grounded.diagnosis.hypotheses.leftover import Leftover
     from grounded.diagnosis.validation.claims import Claims
     from grounded.effects import Effect
     from grounded.model import Model
@@ -54,10 +61,14 @@ def verdict(
     if not claimed:
         if remainder:
             return _said("unknown", f"A gap remains that no known effect explains: {left}.", *once)
-        return _said("none", f"The model explains the data down to the noise{floor(row)}.", *once)
+        if above := rest(rows):
+            text = f"The model explains what these trials can show: {above}."
+        else:
+            text = f"The model explains the data down to the noise{floor(row)}."
+        return _said("none", text, *once)
     causes = _causes(claims, ranking, credit)
     several = len(causes) > 1
-    shares = [f" ({_percent(one.share)} of the gain)" * several for one in credit]
+    shares = [f" ({percent(one.share)} of the gain)" * several for one in credit]
     words = [sentence(map(str.__add__, causes, shares)), improvement(rows), worsened(rows)]
     words += [f"{told_apart(group, same)}." for group in groups[:1]]
     if remainder:
@@ -86,10 +97,6 @@ def _causes(claims: Claims, ranking: Sequence[Ranked], credit: Sequence[Credit])
             text = f"the model's own parameters are off: {_moved(claims)}"
         found.append(text)
     return tuple(found)
-
-
-def _percent(share: float) -> str:
-    return "under 1 %" if share < 0.01 else f"{100 * share:.0f} %"
 
 
 def _moved(claims: Claims) -> str:
@@ -164,7 +171,7 @@ def rest(rows: Sequence[RulerRow]) -> str:
     found = [
         (
             row.with_effects[name] / noise,
-            row.with_effects[name] / max(row.crude[name], 1e-300),
+            row.with_effects[name] / max((row.outset or row.crude)[name], 1e-300),
             f"{name} {_when(row)}",
         )
         for row in rows
@@ -195,12 +202,22 @@ def _noise(row: RulerRow, name: str) -> str:
 
 def next_trial(
     claims: Claims,
-    left: Sequence[Leftover],
+    left: str,
     groups: tuple[tuple[str, ...], ...],
     seen: Sequence[Unconfirmed] = (),
     same: tuple[tuple[str, ...], ...] = (),
+    lost: Collection[str] = (),
 ) -> str:
-    """A sentence; `excitation.probe` makes the trial itself."""
+    """A sentence; `excitation.probe` makes the trial itself.
+
+    Args:
+        claims: what is blamed.
+        left: the channel that is off without a cause, "" for none.
+        groups: what ties.
+        seen: what only one trial shows.
+        same: of the groups, what is one thing in the model.
+        lost: the trials that nobody should repeat.
+    """
     if claims.known.no_cause:
         return "Run two or more trials in which every input changes."
     if groups and groups[0] in same:
@@ -209,11 +226,18 @@ def next_trial(
         made = f"A trial made for it would tell {tied(groups[0])}."
         return " ".join([made, *distinguishing(groups[0])])
     if seen:
-        return f"Repeat trial {seen[0].trial}: hardly another one shows {seen[0].effect}."
+        one = seen[0]
+        if one.trial not in lost:
+            return f"Repeat trial {one.trial}: hardly another one shows {one.effect}."
+        there = "" if one.region is None else f", one that goes where {one.region.when}"
+        return (
+            f"Hardly a trial but {one.trial} shows {one.effect}, and that one was lost: don't "
+            f"repeat it, run a gentler one{there}."
+        )
     if not claims.names and left:
         return (
-            f"Repeat a trial twice with the same inputs to see whether the leftover in "
-            f"{left[0].channel} repeats."
+            f"Repeat the best trial twice with the same inputs to see whether the leftover in "
+            f"{left} repeats."
         )
     if not claims.names and not claims.blamed:
         return "Nothing is tied and nothing to adopt."
@@ -292,6 +316,14 @@ def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
     def kept(found: re.Match[str]) -> str:  # of a quantity that is estimated, or [left out]
         return found[1] if set(re.findall(r"\{(\w)[%}]", found[1])) <= set(params) else ""
 
+    if (
+        isinstance(effect.family, ParamFamily)
+        and "d" in params
+        and effect.site.target in model.params
+    ):
+        old = model.params[effect.site.target].value
+        new = quantity(params["d"].moved(old))
+        return f"the parameter {effect.site.target} should be {new} instead of {number(old)}"
     text = re.sub(r"\[([^]]*)\]", kept, effect.family.sentence)
     return re.sub(r"\{(\w+)(%)?(?:([^{}|]+)\|([^{}|]+))?\}", filled, text)
 

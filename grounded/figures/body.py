@@ -49,6 +49,10 @@ class Body(Protocol):
         """Of its positions; "" where nothing says how large it is."""
 
     @property
+    def watched(self) -> str:
+        """What the path is of: `the tip`."""
+
+    @property
     def parts(self) -> Sequence[Part]:
         """What it is made of."""
 

@@ -189,3 +189,12 @@ def test_the_best_one_is_run_again_by_that_name(cart, tmp_path):
     empty = make(tmp_path / "empty").folder
     refused = grounded("-C", empty, "run", "best")
     assert refused.code == 1 and holds(refused.err, "best")
+
+
+def test_a_range_is_rounded_to_what_a_person_measures():
+    from grounded_cli.propose import _span
+
+    assert _span(-3.46e-17, 2e-17) == "0"
+    assert _span(-3.46e-17, 0.5) == "0.000 to 0.500"
+    assert _span(0.0, 4.2e-5) == "0.000000 to 0.000042"
+    assert _span(0.0, 12.0) == "0.00 to 12.00"

@@ -235,7 +235,7 @@ def test_sentences_are_english():
     assert said("input_fade:throttle", k=0.05) == (
         "The throttle gets 5 % weaker every second (a battery that sags)."
     )
-    assert said("parameter:k", d=0.1) == "The parameter k is off by 0.1 1/s."
+    assert said("parameter:k", d=0.1) == "The parameter k should be 1.1 1/s instead of 1."
     for effect in Library().candidates(model):
         known = {q.name: Estimate(0.1, 0, (0.1, 0.1), q.unit) for q in effect.quantities}
         text = meaning(effect, known)

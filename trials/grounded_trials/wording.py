@@ -6,12 +6,20 @@ import math
 import re
 import shlex
 import shutil
+from collections.abc import Sequence
+from itertools import pairwise
 from textwrap import TextWrapper
 from typing import TYPE_CHECKING
+
+from grounded.diagnosis.error_report import percent as percent
 
 if TYPE_CHECKING:
     from grounded.errors import NextCommand
 
+ITERATION = (
+    "iter.: improvements that a candidate builds on; it falls where the search goes back to "
+    "an earlier one"
+)
 NARROW, WIDE = 60, 80  # columns: what every line can do with, and what a reader likes at most
 MARKS = "\ufdd0\ufdd1\ufdd2\ufdd3\ufdd4"  # of colours in a text: they take no column
 _WORD = re.compile(r"""(?:'[^']*'|"[^"]*"|\S)+""")  # of a command; what is quoted stays whole
@@ -42,16 +50,6 @@ def figure(value: float | None, digits: int = 4) -> str:
     return f"{value:,.{decimals}f}"
 
 
-def percent(share: float) -> str:
-    """A share as a percentage; a tenth of a percent where it is small or nearly all."""
-    if math.isnan(share):
-        return "-"
-    value = 100 * share
-    if 0 < value < 0.05 or 99.95 <= value < 100:
-        return "< 0.1 %" if value < 50 else "> 99.9 %"
-    return f"{value:.0f} %" if 10 <= value <= 90 else f"{value:.1f} %"
-
-
 def count(number: int, word: str, many: str = "") -> str:
     """`1 trial`, `2 trials`; `many` where the plural is another one."""
     return f"{number} {word if number == 1 else many or word + 's'}"
@@ -65,6 +63,19 @@ def shown(unit: str) -> str:
 def with_unit(text: str, unit: str) -> str:
     """A number and its unit."""
     return f"{text} {shown(unit)}".rstrip()
+
+
+def changed(name: str, old: float, new: float, unit: str) -> str:
+    """`m 1.00 -> 1.30 kg`, in as many digits as tell the two apart."""
+    pairs = ((figure(old, digits), figure(new, digits)) for digits in range(3, 9))
+    a, b = next((pair for pair in pairs if pair[0] != pair[1]), (figure(old), figure(new)))
+    return with_unit(f"{name} {a} -> {b}", unit)
+
+
+def legend(text: str, iterations: Sequence[int]) -> str:
+    """What a table's columns mean; why iterations fall, where they do."""
+    falls = any(b < a for a, b in pairwise(iterations))
+    return "; ".join(part for part in (text, ITERATION * falls) if part)
 
 
 def labelled(name: str, unit: str) -> str:

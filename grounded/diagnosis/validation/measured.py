@@ -92,7 +92,9 @@ class Measured:
     def prediction_error(self) -> tuple[RulerRow, ...]:
         """The ruler's table: 0.1, 0.5, 1 s and the whole trial."""
         calibrated = self.calibrated()
+        before = None if self.ruler.origin is None else self.ruler.outset.rms[:, self.ruler.shown]
         columns = {
+            "outset": before,
             "crude": self.rms(self.decision.crude),
             "calibrated": None if calibrated is None else self.rms(calibrated),
             "with_effects": self.rms(self.best),

@@ -95,6 +95,7 @@ class Vehicle:
 
     scene: Scene
     size: float
+    watched = "the position"
 
     @property
     def unit(self) -> str:
@@ -128,6 +129,7 @@ class Links:
     sign: int
     unit: str
     rail: tuple[int, ...] = ()  # a state, or none
+    watched = "the tip"
 
     @property
     def parts(self) -> Sequence[Part]:
@@ -175,6 +177,7 @@ class Cabin:
     height: int  # a state
     size: float
     unit: str
+    watched = "its middle"
 
     @property
     def parts(self) -> Sequence[Part]:

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping
 from grounded.diagnosis.error_report import Gap
 from grounded.diagnosis.report import Correction, Diagnosis, Estimate
 from grounded.instruments.finding import Finding
-from grounded_trials.wording import count, figure, percent, shown, with_unit
+from grounded_trials.wording import changed, count, figure, percent, shown, with_unit
 
 MOST = 3  # parameters that are named
 
@@ -43,6 +43,14 @@ def error_lines(diagnosis: Diagnosis, before: Mapping[str, float]) -> list[tuple
     return found
 
 
+def made_from(diagnosis: Diagnosis) -> str:
+    """`made from 6 trials, t0001 to t0006`."""
+    names = diagnosis.made.trials if diagnosis.made is not None else ()
+    number = count(len(names) or diagnosis.trials, "trial")
+    ends = " to ".join(dict.fromkeys([*names[:1], *names[-1:]]))
+    return f"made from {number}{f', {ends}' * bool(ends)}"
+
+
 Cells = tuple[str, ...]
 
 
@@ -50,20 +58,27 @@ def error_table(diagnosis: Diagnosis) -> tuple[list[Cells], Cells]:
     """(rows, header): held-out prediction errors a second ahead and over whole trials, in units."""
     ahead = [row for row in diagnosis.prediction_error if not row.whole_trial][-1:]
     whole = [row for row in diagnosis.prediction_error if row.whole_trial]
+    columns = {
+        "outset": "model.py",
+        "crude": "crude",
+        "calibrated": "calibrated",
+        "with_effects": "as diagnosed",
+        "noise_floor": "noise",
+    }
+    if any(row.outset for row in ahead):
+        columns["crude"] = "now"
+    for key in ("outset", "calibrated"):
+        if not any(getattr(row, key) for row in ahead):
+            del columns[key]
     rows: list[Cells] = []
     for row in (*ahead, *whole):
         when = "whole trial" if row.whole_trial else f"{row.horizon_s:.3g} s ahead"
         for name, unit in row.unit_by_channel.items():
             if math.isnan(row.crude.get(name, math.nan)):
                 continue  # never measured
-            columns = (row.crude, row.calibrated, row.with_effects, row.noise_floor)
-            figures = (_cell(column.get(name, math.nan)) for column in columns)
+            figures = (_cell(getattr(row, key).get(name, math.nan)) for key in columns)
             rows.append((f"{name}, {when}", *figures, shown(unit)))
-    calibrated = any(row.calibrated for row in ahead)
-    header: Cells = ("error (rms)", "crude", "calibrated", "as diagnosed", "noise", "unit")
-    if not calibrated:
-        return [(*r[:2], *r[3:]) for r in rows], (*header[:2], *header[3:])
-    return rows, header
+    return rows, ("error (rms)", *columns.values(), "unit")
 
 
 def _cell(value: float) -> str:
@@ -144,8 +159,7 @@ def calibrated_sentence(diagnosis: Diagnosis, before: Mapping[str, float]) -> st
         old = then.get(name, math.nan)
         if abs(e.value - old) > 1e-6 * max(abs(e.value), abs(old)):
             change = abs(e.value - old) / abs(old) if old else math.inf
-            text = with_unit(f"{name} {figure(old, 3)} -> {figure(e.value, 3)}", e.unit)
-            moved.append((-change, text))
+            moved.append((-change, changed(name, old, e.value, e.unit)))
     named = ", ".join(text for _, text in sorted(moved)[:MOST])
     others = len(moved) - MOST
     return f"calibrated beside them: {named}{f' (and {others} more)' * (others > 0)}" * bool(moved)

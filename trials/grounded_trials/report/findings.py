@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -27,6 +27,9 @@ from grounded_trials.wording import figure, rendered, shown
 from grounded_trials.workspace.adopting import Better
 from grounded_trials.workspace.folder import Lost
 from grounded_trials.workspace.next_step import Since
+
+if TYPE_CHECKING:
+    from grounded_trials.report.settled import Settled
 
 One = TypeVar("One")
 
@@ -75,6 +78,7 @@ class Findings:
     then: NextCommand
     better: Better | None = None  # the model as diagnosed, or with adopted effects
     since: Since = field(default_factory=Since)  # the diagnosis
+    settled: Settled | None = None  # what was adopted, and what it gained
     discarded: tuple[str, ...] = ()  # trials that were set aside
     left_runs: int = 0  # that are counted, but not read: there are too many to show
     left_logs: int = 0

@@ -22,6 +22,7 @@ from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.report.findings import Findings, Log, Run, selection
 from grounded_trials.report.forecast import anchored
+from grounded_trials.report.settled import settled_in
 from grounded_trials.store.documents import read_document
 from grounded_trials.workspace.adopting import Better, better_model
 from grounded_trials.workspace.diagnosing import LEAST_STEPS, read_diagnosis
@@ -51,10 +52,11 @@ def gather(workspace: Folder) -> Findings:
     diagnosis = _diagnosis(workspace, lost)
     better = _better(workspace, diagnosis, lost)
     usable = [t.id for t in fitting if t.known_steps >= LEAST_STEPS]
+    since = since_diagnosis(workspace, diagnosis, usable) if diagnosis else Since()
     return Findings(
         name=workspace.folder.resolve().name,
         task=task,
-        nominal={name: p.value for name, p in workspace.base_model.params.items()},
+        nominal={name: p.value for name, p in workspace.origin.model.params.items()},
         effects=tuple(str(e["name"]) for e in workspace.config.model.effects),
         method=_method(workspace),
         standing=now,
@@ -66,7 +68,8 @@ def gather(workspace: Folder) -> Findings:
         optimum=known_optimum(workspace.reports),
         then=next_command(workspace, now, diagnosis, usable),
         better=better,
-        since=since_diagnosis(workspace, diagnosis, usable) if diagnosis else Since(),
+        since=since,
+        settled=settled_in(workspace, diagnosis, since),
         discarded=tuple(workspace.discarded()),
         left_runs=len(own) - len(shown),
         left_logs=len(data) - len(logs),

@@ -26,10 +26,12 @@ from grounded_trials.report.findings import (
     tracking_error,
 )
 from grounded_trials.report.forecast import SECONDS, forecast_error
+from grounded_trials.report.settled import so_far
 from grounded_trials.wording import (
     count,
     figure,
     folded,
+    legend,
     per_second,
     rendered,
     with_unit,
@@ -92,7 +94,11 @@ def _utilities(findings: Findings, table: Table, bars: Callable[[Sequence[float]
     shown, left = few(history, ROWS if len(history) > ROWS + SPARED else len(history))
     rows = [_candidate(t, findings.standing.verdict(t)) for t in shown]
     header = ("candidate", "iter.", "alpha", "predicted", "real", "+-", "trials", "")
-    lines = ["utility", table(rows, header), *_wrapped(LEGEND, "  ")]
+    lines = [
+        "utility",
+        table(rows, header),
+        *_wrapped(legend(LEGEND, [t.candidate.iteration for t in shown]), "  "),
+    ]
     if left:
         status = rendered(NextCommand("status"), findings.folder)
         lines += _wrapped(f"({left} more between them: {status} shows all)", "  ")
@@ -154,11 +160,10 @@ def _diagnosis(findings: Findings, table: Table) -> str:
         command = rendered(DIAGNOSE, findings.folder)
         return "\n".join(["gap to the model", *_wrapped(f"not diagnosed yet: {command}", "  ")])
     lines = ["gap to the model"]
-    lines += _wrapped(since.told(findings.folder), "  ")
-    then = "before that: " * bool(since.adopted)
+    shown = so_far(diagnosis, since, findings.settled, findings.folder)
     causes, others = verdict_lines(diagnosis)
-    for k, line in enumerate([*(f"- {cause}" for cause in causes), *others]):
-        lines += _wrapped(then * (k == 0) + line, "  ")
+    for line in (*shown, *(f"- {cause}" for cause in causes), *others):
+        lines += _wrapped(line, "  ")
     before = {} if since.changed else findings.values
     for title, text in error_lines(diagnosis, before):
         lines += _wrapped(f"{title}: {text}", "  ")
@@ -188,11 +193,11 @@ def _fitting(values: list[str], width: int) -> str:
 
 
 def _logs(findings: Findings, table: Table) -> str:
-    """How far the crude model is off 1 s ahead on logs that ran no candidate."""
+    """How far the crude model is off after each second of logs that ran no candidate."""
     logs = findings.logs[-ITERATIONS:]
     columns = [forecast_error(findings.crude, log.trial) for log in logs]
     rows = by_state(findings.task.model, columns)
-    title = f"data: error of the {findings.plain} {SECONDS:g} s ahead, rms\n"
+    title = f"data: what the {findings.plain}, set right every {SECONDS:g} s, misses by then, rms\n"
     return title + table(rows, ("state", "unit", *(log.trial.id for log in logs)))
 
 

@@ -68,6 +68,12 @@ class Report(Result):
             verdict = {"kind": diagnosis.kind, "effects": diagnosis.effects}
             document["verdict"] = verdict | {"sentence": diagnosis.sentence}
             document["outdated"] = findings.since.sentence or None
+        settled = findings.settled
+        document["adopted"] = (
+            None
+            if settled is None
+            else {"clauses": settled.adopted, "gained": settled.gained, "left": settled.left}
+        )
         return document
 
 

@@ -26,7 +26,9 @@ def three_lines(diagnosis: Diagnosis, task: Task) -> list[str]:
     """
     if not diagnosis.verdict.causes:
         return list(diagnosis.verdict.lines)
-    return [_wrong(diagnosis), *_gained(diagnosis, task), _open(diagnosis)]
+    better = [gained(diagnosis, task), worsened(diagnosis.prediction_error)]
+    lines = [_wrong(diagnosis), " ".join(filter(None, better)), still_open(diagnosis)]
+    return [line for line in lines if line]
 
 
 def _wrong(diagnosis: Diagnosis) -> str:
@@ -42,45 +44,58 @@ def _wrong(diagnosis: Diagnosis) -> str:
     return f"{text[:1].upper()}{text[1:]}."
 
 
-def _gained(diagnosis: Diagnosis, task: Task) -> list[str]:
-    """How far predictions are off now, and were: position first, in the units of the states."""
+def gained(
+    diagnosis: Diagnosis,
+    task: Task,
+    now: str = "with_effects",
+    before: str = "crude",
+    who: str = "the diagnosed model",
+) -> str:
+    """How far predictions are off now, and were: position first, in the units of the states.
+
+    Args:
+        diagnosis: whose ruler says it.
+        task: whose weighed states are spoken of.
+        now: the column of `RulerRow` that holds today's errors.
+        before: the column of those before.
+        who: misses so much.
+    """
     row, parts = _ahead(diagnosis), []
     if row is None:
-        return []
-    for names, what in gained_most(diagnosis, task):
+        return ""
+    after, first = getattr(row, now), getattr(row, before)
+    for names, what in _improved(after, first, task):
         unit = shown(row.unit_by_channel[names[0]])
-        now, then = (_together(errors, names) for errors in (row.with_effects, row.crude))
-        parts.append(f"{what} by {measured(now, unit)} instead of {measured(then, unit)}")
+        ends = (measured(_together(errors, names), unit) for errors in (after, first))
+        parts.append(f"{what} by {' instead of '.join(ends)}")
     held = "" if row.held_out != "no" else ", not held out"
     ahead = f"{row.horizon_s:.3g} s ahead{held}"
-    told = [f"{ahead} it now misses {' and '.join(parts)}."] if parts else []
-    if worse := worsened(diagnosis.prediction_error):
-        told.append(worse)
-    return [" ".join(told)] if told else []
+    return f"{ahead} {who} misses {' and '.join(parts)}." if parts else ""
 
 
 def gained_most(diagnosis: Diagnosis, task: Task) -> list[tuple[list[str], str]]:
     """The weighed states that a verdict speaks of: the position, then what improved most."""
     row = _ahead(diagnosis)
-    if row is None:
-        return []
-    groups = [g for g in weighed_groups(task) if all(row.crude.get(n, 0.0) > 0 for n in g[0])]
-    return sorted(groups, key=lambda g: (len(g[0]) < 2, _ratio(row, g[0])))[:FEW]
+    return [] if row is None else _improved(row.with_effects, row.crude, task)
+
+
+def _improved(
+    now: Mapping[str, float], before: Mapping[str, float], task: Task
+) -> list[tuple[list[str], str]]:
+    groups = [g for g in weighed_groups(task) if all(before.get(n, 0.0) > 0 for n in g[0])]
+    ratio = {what: _together(now, names) / _together(before, names) for names, what in groups}
+    return sorted(groups, key=lambda g: (len(g[0]) < 2, ratio[g[1]]))[:FEW]
 
 
 def _ahead(diagnosis: Diagnosis) -> RulerRow | None:
     return next((r for r in reversed(diagnosis.prediction_error) if not r.whole_trial), None)
 
 
-def _ratio(row: RulerRow, names: list[str]) -> float:
-    return _together(row.with_effects, names) / _together(row.crude, names)
-
-
 def _together(errors: Mapping[str, float], names: list[str]) -> float:
     return math.hypot(*(errors.get(name, math.nan) for name in names))
 
 
-def _open(diagnosis: Diagnosis) -> str:
+def still_open(diagnosis: Diagnosis) -> str:
     """What ties, and what no known effect explains."""
     found = [told_apart(group, diagnosis.equivalent) for group in diagnosis.indistinguishable[:1]]
     found += [one.sentence() for one in diagnosis.unconfirmed[:1]]

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from grounded.diagnosis.report import Diagnosis
+from grounded.diagnosis.report import Diagnosis, Estimate
 from grounded.errors import GroundedError, NextCommand, nearest
 from grounded.result import Result
 from grounded.search.planner import Planner
@@ -59,23 +59,48 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
     known = [row.effect for row in found.ranking]
     _check(names, known + _curves(found), workspace, before)
     claimed = _claimed(found, names)
-    adopted: list[Effect] = [dict(effect) for effect in workspace.config.model.effects]
     calibrated = found.known_parameters if parameters and claimed else {}
+    nominal = {
+        target: _nominal(found, workspace, target)
+        for family, _, target in (name.partition(":") for name in names)
+        if family == "parameter"
+    }
+    own, adopted = joined(found, names, workspace.config.model.effects, nominal, calibrated)
+    whole = dict(workspace.config.model.params) | own
+    set_in_model(workspace.config.file, params=whole if own else None, effects=adopted or None)
+    return Adopted(tuple(adopted), own, claimed)
+
+
+def joined(
+    found: Diagnosis,
+    names: Sequence[str],
+    effects: Sequence[Mapping[str, Any]],
+    nominal: Mapping[str, float],
+    calibrated: Mapping[str, Estimate],
+) -> tuple[dict[str, float], list[Effect]]:
+    """The parameters that are set and all effects, once diagnosed ones have joined a model.
+
+    Args:
+        found: the diagnosis.
+        names: of its effects.
+        effects: that the model has already.
+        nominal: the value from which each parameter that is adopted by name counts.
+        calibrated: the parameters that come along.
+    """
+    before = {} if found.made is None else found.made.effects
+    adopted: list[Effect] = [dict(effect) for effect in effects]
     params = {key: _rounded(estimate.value) for key, estimate in calibrated.items()}
     for name in names:
         values = {key: _rounded(value) for key, value in found.values(name).items()}
         family, _, target = name.partition(":")
         if family == "parameter":
-            params[target] = _rounded(_nominal(found, workspace, target) + values["d"])
+            params[target] = _rounded(nominal[target] + values["d"])
         elif name in before:  # a delay more
             values["d"] = _rounded(float(before[name]["d"]) + values["d"])
             adopted = [e | values if e["name"] == name else e for e in adopted]
         else:
             adopted.append({"name": name, **values})
-    own, adopted = settled(params, adopted)
-    whole = dict(workspace.config.model.params) | own
-    set_in_model(workspace.config.file, params=whole if own else None, effects=adopted or None)
-    return Adopted(tuple(adopted), own, claimed)
+    return settled(params, adopted)
 
 
 def _curves(found: Diagnosis) -> list[str]:

@@ -69,7 +69,7 @@ def diagnose_in(
         max_effects=max_effects,
         hidden=tuple(memory),
         but=adopted,
-        origin=workspace.origin,
+        origin=workspace.origin if effects or workspace.config.model.params else None,
     )
     lifted, second = ([planner.lift(trial) for trial in some] for some in (used, others))
     made = Made(

@@ -94,7 +94,7 @@ def after_diagnosis(workspace: Folder, found: Diagnosis) -> NextCommand:
 
 def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
     """What to do about the effects that a diagnosis claims, None where there is nothing to do."""
-    new = diagnosis.open(workspace.config.model.effects)
+    new = diagnosis.open(workspace.config.model.effects, workspace.config.model.params)
     if diagnosis.kind not in ("effect", "several") or not new:
         return None
     own = {f"parameter:{name}" for name in workspace.base_model.params}
@@ -157,7 +157,7 @@ def since_diagnosis(workspace: Folder, diagnosis: Diagnosis, usable: Sequence[st
     model, made = workspace.config.model, diagnosis.made or Made()
     seen, params = set(made.trials), made.params
     last = max((k for k, name in enumerate(usable) if name in seen), default=-1)
-    missing = diagnosis.open(model.effects)
+    missing = diagnosis.open(model.effects, model.params)
     adopted = tuple(name for name in diagnosis.effects if name not in missing)
     same = [dict(e) for e in model.effects] == [dict(e) for e in made.adopted]
     return Since(

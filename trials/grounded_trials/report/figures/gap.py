@@ -14,6 +14,7 @@ import numpy as np
 from grounded.figures.figure import Band, Curve, Figure, Key, Panel, fitted, legend, without_astray
 from grounded.frozen import Array
 from grounded.trial import Trial
+from grounded_trials.report.diagnosis_words import made_from
 from grounded_trials.report.findings import Findings, Run
 from grounded_trials.report.forecast import SECONDS, forecast
 from grounded_trials.wording import labelled, per_second, percent, shown
@@ -32,11 +33,11 @@ def forecast_figures(findings: Findings) -> list[Figure]:
     found = []
     run = _unseen(findings) or findings.best or findings.latest
     if run is not None:
-        title = f"The model {SECONDS:g} s ahead, {run.label}"
+        title = f"The model, set right every {SECONDS:g} s, {run.label}"
         found.append(_figure(findings, "forecast", title, run.trial))
     longest = sorted(findings.logs, key=lambda log: -log.trial.finite_steps)[:LOGS]
     for log in longest:
-        title = f"The model {SECONDS:g} s ahead, data {log.trial.id}"
+        title = f"The model, set right every {SECONDS:g} s, data {log.trial.id}"
         found.append(_figure(findings, f"data-{log.trial.id}", title, log.trial))
     return [figure for figure in found if figure is not None]
 
@@ -79,10 +80,10 @@ def _figure(findings: Findings, name: str, title: str, trial: Trial) -> Figure |
         f"Every {SECONDS:g} s the model starts from the measured state and gets the inputs that "
         "were sent: where the lines part, the model is wrong."
     )
-    made = findings.diagnosis.made if findings.diagnosis is not None else None
-    if made is not None and better is not None:
-        seen = trial.id in made.trials
-        caption += f" The diagnosis was {'' if seen else 'not '}made from this trial."
+    diagnosis = findings.diagnosis
+    if diagnosis is not None and diagnosis.made is not None and better is not None:
+        saw = "saw this trial too" if trial.id in diagnosis.made.trials else "never saw this trial"
+        caption += f" The last diagnosis, {made_from(diagnosis)}, {saw}."
     if trial.steps < steps:
         caption += f" Drawn is its worst part, from {begin:g} s on."
     return Figure(name, title, caption, tuple(panels), legend(panels))

@@ -74,7 +74,10 @@ def path_figure(findings: Findings) -> Figure | None:
         if views[0].equal and findings.runs:
             panels += _enlarged(findings, views[0]) + _shaded(findings, views[0])
         if body is not None:
-            caption.append("Dark: real; pink: predicted for the same trial; dashed: desired.")
+            caption.append(
+                "Moving: real in black or white, predicted for the same trial in pink, desired "
+                f"dashed. The curves are paths of {body.watched}."
+            )
     if body is None and not scene.spatial:
         caption.append(f"No plane among the roles: {' and '.join(scene.names)}.")
     if body is not None and not body.unit:

@@ -11,6 +11,7 @@ from grounded.diagnosis.report import Diagnosis, TrialValue
 from grounded.diagnosis.verdict import told_apart
 from grounded_trials.report.diagnosis_words import (
     gap_sentence,
+    made_from,
     utility_sentence,
     verdict_lines,
 )
@@ -24,6 +25,7 @@ from grounded_trials.report.page.tables import (
     leftover_table,
     table,
 )
+from grounded_trials.report.settled import so_far
 from grounded_trials.wording import figure, glued, percent, rendered, with_unit
 from grounded_trials.workspace.next_step import DIAGNOSE, Since
 
@@ -42,7 +44,8 @@ def gap_section(findings: Findings) -> list[Block]:
         command = Block("command", rendered(DIAGNOSE), "c-diagnose")
         return [Block("text", words), command, *ahead, *forecast_table(findings), *lacking]
     causes, others = verdict_lines(diagnosis)
-    verdict = Block("verdict", lines=told_since([*causes, *others], findings.since))
+    shown = so_far(diagnosis, findings.since, findings.settled)
+    verdict = Block("verdict", lines=typeset_lines([*shown, *causes, *others]))
     if diagnosis.no_cause:  # with too little data, what was fitted is no finding
         return [verdict, *ahead, *forecast_table(findings), *lacking]
     proof = drawn(accuracy_figure(diagnosis), title=True)
@@ -51,11 +54,8 @@ def gap_section(findings: Findings) -> list[Block]:
     return [verdict, *proof, *lacking, *_details(diagnosis, findings.since)]
 
 
-def told_since(lines: Sequence[str], since: Since) -> list[str]:
-    """A verdict's lines; what happened since stands before them."""
-    before = "Before that: " * bool(since.adopted)
-    told = [f"{_begun(since.sentence)}."] if since.sentence else []
-    lines = [*told, before + lines[0], *lines[1:]]
+def typeset_lines(lines: Sequence[str]) -> list[str]:
+    """Lines in which no number is broken."""
     return [re.sub(r"-(?=\d)", "-\u2060", glued(line)) for line in lines]  # no break in 1e-05
 
 
@@ -69,6 +69,8 @@ def _details(diagnosis: Diagnosis, since: Since) -> list[Block]:
     found += _made_of(diagnosis.where.split) + _rest(diagnosis)
     if text := utility_sentence(diagnosis):
         found += [Block("heading", "Utility, predicted"), Block("text", f"{_begun(text)}.")]
+    if diagnosis.made is not None:
+        found.append(Block("soft", f"This diagnosis was {made_from(diagnosis)}."))
     if diagnosis.gap.measured:
         found.append(Block("soft", f"Gap: {gap_sentence(diagnosis.gap)}."))
     return found
@@ -149,7 +151,7 @@ def _made_of(splits: Mapping[str, Split]) -> list[Block]:
 
 def _shares(parts: Parts | ChannelParts) -> tuple[str, str, str]:
     shares = (parts.explained, parts.unexplained, parts.irreducible)
-    explained, unexplained, noise = (f"{100 * s:.1f} %" if s == s else "-" for s in shares)
+    explained, unexplained, noise = map(percent, shares)
     return explained, unexplained, noise
 
 

@@ -32,7 +32,7 @@ from grounded_trials.report.figures.runs import (
     state_figure,
 )
 from grounded_trials.report.findings import Findings, improvements_in
-from grounded_trials.report.page.diagnosed import gap_section, told_since
+from grounded_trials.report.page.diagnosed import gap_section, typeset_lines
 from grounded_trials.report.page.tables import (
     Block,
     candidate_table,
@@ -41,7 +41,8 @@ from grounded_trials.report.page.tables import (
     error_table,
     parameter_table,
 )
-from grounded_trials.report.three_lines import gained_most, three_lines
+from grounded_trials.report.settled import told
+from grounded_trials.report.three_lines import gained_most
 from grounded_trials.wording import count, figure, glued
 
 OPEN = 12  # candidates whose table is open
@@ -215,11 +216,13 @@ def _why(findings: Findings) -> dict[str, Any]:
     groups = gained_most(diagnosis, findings.task)
     worth = [p for g in groups for p in worth_of(*g, diagnosis)]
     credit = Figure("credit", "", "", tuple(worth)) if worth else credit_figure(diagnosis)
-    told = [] if credit else error_lines(diagnosis, before)
-    lines = [(title, text) for title, text in told if title == "parameters"]
+    known = [] if credit else error_lines(diagnosis, before)
+    lines = [(title, text) for title, text in known if title == "parameters"]
     return {
         "kind": diagnosis.kind,
-        "verdict": told_since(three_lines(diagnosis, findings.task), findings.since),
+        "verdict": typeset_lines(
+            told(diagnosis, findings.task, findings.since, findings.settled, None)
+        ),
         "preflight": instrument_lines(diagnosis.preflight),
         "lines": lines,
         "credit": credit,

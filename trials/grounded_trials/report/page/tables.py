@@ -23,7 +23,7 @@ from grounded_trials.report.findings import (
     tracking_error,
 )
 from grounded_trials.report.forecast import SECONDS, forecast_error
-from grounded_trials.wording import figure, rendered, shown, with_unit
+from grounded_trials.wording import figure, legend, percent, rendered, shown, with_unit
 from grounded_trials.workspace.next_step import Since
 
 WIDEST = 1e6  # an interval so many times its value, or so wide, says nothing
@@ -78,7 +78,8 @@ def candidate_table(findings: Findings) -> list[Block]:
         c = tried.candidate
         cells = {
             "candidate": c.id,
-            "iteration": str(c.iteration),
+            "from": c.base or "-",
+            "iter.": str(c.iteration),
             "alpha": f"{c.alpha:g}",
             "damping": f"{c.damping:.2g}" if c.base else "-",
             "predicted utility": figure(c.predicted_utility),
@@ -92,7 +93,8 @@ def candidate_table(findings: Findings) -> list[Block]:
     made = table("candidates", list(rows[0]), [list(cells.values()) for cells in rows], strong)
     words = f"{left} candidates between them are left out; this shows all:"
     more = [Block("text", words), Block("command", rendered(NextCommand("status")), "c-status")]
-    return [made, *more] if left else [made]
+    why = legend("", [t.candidate.iteration for t in kept])
+    return [made, *[Block("soft", f"{why}.")] * bool(why), *more * bool(left)]
 
 
 def error_table(findings: Findings) -> list[Block]:
@@ -108,7 +110,7 @@ def error_table(findings: Findings) -> list[Block]:
 
 
 def forecast_table(findings: Findings) -> list[Block]:
-    """Rms error of the model 1 s ahead, by state, for the best run and every log."""
+    """Rms error at the end of each second of the best run and every log: not the ruler's."""
     best = findings.best or findings.latest
     trials = ([best.trial] if best is not None else []) + [log.trial for log in findings.logs]
     if not trials:
@@ -118,7 +120,7 @@ def forecast_table(findings: Findings) -> list[Block]:
         planners.append((findings.better.name, findings.better.planner))
     names = [f"{t.id or t.candidate}, {words}" for t in trials for words, _ in planners]
     columns = [forecast_error(planner, t) for t in trials for _, planner in planners]
-    title = Block("heading", f"Error of the model {SECONDS:g} s ahead, rms")
+    title = Block("heading", f"What the model, set right every {SECONDS:g} s, misses by then, rms")
     rows = by_state(findings.task.model, columns)
     return [title, table("forecasts", ("state", "unit", *names), rows)]
 
@@ -130,7 +132,7 @@ def effect_table(diagnosis: Diagnosis, since: Since) -> Block:
             r.effect + " (adopted since)" * (r.effect in since.adopted),
             figure(r.evidence, 3),
             figure(r.gap_after, 3),
-            _hundredths(r.shrinkage),
+            percent(r.shrinkage),
             _params(r),
         )
         for r in diagnosis.ranking
@@ -157,10 +159,6 @@ def _interval(v: Estimate) -> str:
     return f"{figure(v.value)} ({figure(low, 3)} to {figure(high, 3)})" if known else UNKNOWN
 
 
-def _hundredths(share: float) -> str:
-    return f"{100 * share:.0f} %" if math.isfinite(share) else "-"
-
-
 def leftover_table(diagnosis: Diagnosis) -> Block:
     """What no known effect explains."""
     rows = [
@@ -168,7 +166,7 @@ def leftover_table(diagnosis: Diagnosis) -> Block:
             left.channel,
             with_unit(figure(left.size, 3), left.unit),
             "-" if left.region is None else left.region.when,
-            "-" if left.region is None else _hundredths(left.region.share),
+            "-" if left.region is None else percent(left.region.share),
             figure(left.evidence, 3),
         )
         for left in diagnosis.leftover
@@ -178,20 +176,32 @@ def leftover_table(diagnosis: Diagnosis) -> Block:
 
 
 def parameter_table(findings: Findings) -> list[Block]:
-    """The model's parameters, and what the diagnosis would make of them."""
-    estimated = findings.diagnosis.parameters if findings.diagnosis is not None else {}
+    """The model's parameters: in model.py, now, and as the diagnosis has them."""
+    estimated = _estimated(findings.diagnosis)
     rows = []
     for name, param in findings.task.model.params.items():
-        nominal = findings.nominal.get(name)
-        changed = "-" if nominal == param.value else figure(nominal)
         free = param.low is None and param.high is None
         limits = "free" if free else _range(param.low, param.high)
         found = _interval(estimated[name]) if name in estimated else "-"
-        rows.append((name, figure(param.value), shown(param.unit), changed, limits, found))
+        written = figure(findings.nominal.get(name))
+        rows.append((name, written, figure(param.value), found, shown(param.unit), limits))
     if not rows:
         return [Block("text", "The model has no parameters.")]
-    header = ("parameter", "value", "unit", "in model.py", "bounds", "diagnosed, 95 %")
+    header = ("parameter", "in model.py", "now", "diagnosed, 95 %", "unit", "bounds")
     return [table("parameters", header, rows)]
+
+
+def _estimated(diagnosis: Diagnosis | None) -> dict[str, Estimate]:
+    """What a diagnosis makes of parameters: calibrated, or blamed by name as an effect."""
+    if diagnosis is None:
+        return {}
+    found = dict(diagnosis.parameters)
+    then = {} if diagnosis.made is None else diagnosis.made.nominal
+    for row in diagnosis.ranking:
+        name = row.effect.removeprefix("parameter:")
+        if row.claimed and name in then and "d" in row.params and name not in found:
+            found[name] = row.params["d"].moved(then[name])
+    return found
 
 
 def channel_table(findings: Findings) -> Block:

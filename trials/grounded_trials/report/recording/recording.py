@@ -35,7 +35,7 @@ from grounded_trials.report.findings import Findings, Run, selection, tracked
 from grounded_trials.report.forecast import forecast
 from grounded_trials.report.recording.layout import Space, blueprint
 from grounded_trials.report.scene import scene_of
-from grounded_trials.report.three_lines import three_lines
+from grounded_trials.report.settled import told
 from grounded_trials.wording import count, labelled, per_second, percent
 
 COLOURS = {role: rgb(dark) for role, (_, dark) in PAGE.items()}
@@ -286,7 +286,12 @@ def verdict(findings: Findings) -> str:
     if diagnosis is None:
         lines.append("not diagnosed yet\n")
     else:
-        lines += [f"{line}\n" for line in three_lines(diagnosis, findings.task)]
+        lines += [
+            f"{line}\n"
+            for line in told(
+                diagnosis, findings.task, findings.since, findings.settled, findings.folder
+            )
+        ]
         if diagnosis.credit:
             lines += ["| credit | | of what predictions gain |", "|---|---|---|"]
         for one in diagnosis.credit:

@@ -1,0 +1,139 @@
+"""What was found and adopted stays in sight, with what it gained: text, page, JSON, status."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from cli import grounded, plain
+from grounded.diagnosis.report import Diagnosis
+from grounded_trials.report.gathering import gather
+from grounded_trials.report.page.tables import candidate_table, parameter_table
+from grounded_trials.report.settled import told
+from grounded_trials.store.documents import write_document
+from grounded_trials.wording import changed, legend
+from grounded_trials.workspace.folder import Folder
+from reported import DIAGNOSIS, cart, copied
+
+__all__ = ["cart"]
+
+ROW = {
+    "horizon_s": 1.0,
+    "unit_by_channel": {"x": "m", "v": "m/s"},
+    "crude": {"x": 0.25, "v": 0.31},
+    "with_effects": {"x": 0.012, "v": 0.02},
+    "noise_floor": {"x": 0.01, "v": 0.019},
+}
+MADE = {"trials": ["t0001", "t0002"], "adopted": [], "params": {}, "nominal": {"mass": 1.0}}
+
+
+def written(folder: Path, **more) -> Path:
+    document = DIAGNOSIS | {"prediction_error": [ROW], "diagnosed": MADE} | more
+    write_document(folder / "reports" / "diagnosis.json", document)
+    return folder
+
+
+@pytest.fixture
+def adopted(cart, tmp_path):
+    folder = written(copied(cart, tmp_path / "w"))
+    assert grounded("-C", folder, "adopt", "viscous_friction:v").code == 0
+    return folder
+
+
+def words(*command) -> str:
+    return " ".join(plain(grounded("-C", *command).out).split())
+
+
+def test_what_was_adopted_is_told_everywhere_with_what_it_gained(adopted):
+    found = grounded("-C", adopted, "report", "--html", "--json").json["adopted"]
+    assert "0.3 1/s" in found["clauses"][0] and found["clauses"][1] == "mass 1.00 -> 1.40 kg"
+    assert "x by 1.2 cm instead of 25 cm" in found["gained"] and "v" in found["left"]
+    page = (adopted / "reports" / "report.html").read_text().replace("\xa0", " ")
+    for text in (words(adopted, "report"), words(adopted, "status"), re.sub(r"<[^>]+>", "", page)):
+        assert "Found and adopted: " in text and "1.2 cm instead of 25 cm" in text
+    assert "2 trials, t0001 to t0002" in page
+
+
+def test_a_gain_that_nobody_measured_is_not_claimed(cart, tmp_path):
+    folder = written(copied(cart, tmp_path / "w"))
+    assert grounded("-C", folder, "adopt", "viscous_friction:v", "--effect-only").code == 0
+    found = grounded("-C", folder, "report", "--json").json["adopted"]
+    assert len(found["clauses"]) == 1 and found["gained"] == ""
+
+
+def test_a_parameter_that_was_adopted_by_name_is_not_missing(cart, tmp_path):
+    names = ["viscous_friction:v", "parameter:mass"]
+    blamed = {"effect": names[1], "claimed": True, "evidence": 9.0}
+    blamed["params"] = {"d": {"value": 0.4, "std": 0.02, "unit": "kg"}}
+    verdict = {"kind": "several", "effects": names, "sentence": "Two."}
+    ranking = [DIAGNOSIS["ranking"][0], blamed]
+    folder = copied(cart, tmp_path / "w")
+    written(folder, verdict=verdict, ranking=ranking, parameters={})
+    assert grounded("-C", folder, "adopt", *names).code == 0
+    found = grounded("-C", folder, "report", "--json").json
+    assert found["adopted"]["clauses"][1] == "mass 1.00 -> 1.40 kg" and found["adopted"]["gained"]
+    assert "parameter:mass" in found["outdated"] and "but not" not in found["outdated"]
+
+
+def test_a_new_diagnosis_measures_model_py_beside_what_plans_now(adopted):
+    model = Folder(adopted).config.model
+    now = {"adopted": [dict(e) for e in model.effects], "params": dict(model.params)}
+    row = ROW | {"outset": ROW["crude"], "crude": ROW["with_effects"]}
+    verdict = {"kind": "none", "effects": [], "sentence": "Down to the noise."}
+    again = {"verdict": verdict, "leftover": [], "indistinguishable": [], "ranking": []}
+    written(adopted, **again, prediction_error=[row], diagnosed=MADE | now)
+    findings = gather(Folder(adopted))
+    diagnosis = findings.diagnosis
+    assert isinstance(diagnosis, Diagnosis) and not findings.since.changed
+    lines = told(diagnosis, findings.task, findings.since, findings.settled, None)
+    assert lines[0].startswith("Found and adopted") and "1.2 cm instead of 25 cm" in lines[1]
+    assert lines[-1] == "Down to the noise." and lines.count("Down to the noise.") == 1
+    assert "model.py" in words(adopted, "report") and "now" in words(adopted, "report")
+
+
+def test_nothing_adopted_nothing_said(cart):
+    assert grounded("-C", cart, "report", "--json").json["adopted"] is None
+    assert "Found and adopted" not in words(cart, "status")
+
+
+def test_parameters_stand_before_now_and_as_diagnosed(adopted):
+    (block,) = parameter_table(gather(Folder(adopted)))
+    row = dict(zip(block.header, next(r for r in block.rows if r[0] == "mass"), strict=True))
+    assert (row["in model.py"], row["now"]) == ("1.000", "1.400")
+    assert row["diagnosed, 95 %"].startswith("1.400 (1.36")
+
+
+def test_a_parameter_that_is_blamed_by_name_has_a_value(cart, tmp_path):
+    blamed = {"effect": "parameter:mass", "claimed": True, "evidence": 9.0}
+    blamed["params"] = {"d": {"value": 0.4, "std": 0.02, "interval": [0.36, 0.44], "unit": "kg"}}
+    verdict = {"kind": "effect", "effects": ["parameter:mass"], "sentence": "One."}
+    folder = written(copied(cart, tmp_path / "w"), verdict=verdict, ranking=[blamed], parameters={})
+    (block,) = parameter_table(gather(Folder(folder)))
+    row = dict(zip(block.header, next(r for r in block.rows if r[0] == "mass"), strict=True))
+    assert row["diagnosed, 95 %"] == "1.400 (1.36 to 1.44)"
+
+
+def test_the_order_of_candidates_is_explained(cart):
+    findings = gather(Folder(cart))
+    made, *rest = candidate_table(findings)
+    bases = [row[made.header.index("from")] for row in made.rows]
+    assert bases == [t.candidate.base or "-" for t in findings.history]
+    iterations = [t.candidate.iteration for t in findings.history]
+    assert iterations == sorted(iterations) and not rest and "falls" not in words(cart, "status")
+    assert "falls" in legend("alpha", [0, 1, 2, 1]) and legend("alpha", [0, 1, 1]) == "alpha"
+
+
+def test_numbers_that_differ_are_told_apart():
+    assert changed("l", 0.5, 0.4997, "m") == "l 0.5000 -> 0.4997 m"
+    assert changed("g", 2.0, 2.0, "1") == "g 2.000 -> 2.000"
+
+
+def test_a_gain_needs_the_values_that_were_diagnosed(adopted):
+    text = (adopted / "grounded.toml").read_text()
+    (adopted / "grounded.toml").write_text(re.sub(r"k = 0\.3\b", "k = 0.7", text))
+    findings = gather(Folder(adopted))
+    assert findings.settled is not None and not findings.settled.closed
+    assert replace(findings.settled, left="").lines == [findings.settled.lines[0]]
