@@ -12,6 +12,7 @@ from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.result import Result, document
 from grounded.search.candidate import Candidate, Tried, Way
+from grounded.search.feedback import Alternative
 from grounded.search.first_policy import first_policy
 from grounded.search.planner import Planner, predicted
 from grounded.search.safety import objections, spread
@@ -52,10 +53,12 @@ class About:
         self.run = (own.states[:, : planner.task.model.n], own.inputs)
         self.corrected: Corrected | None = None
         self.missed = 0.0  # share of its movements that the model is likely to be off by
+        self.alternatives: tuple[Alternative, ...] = ()
         if options.damps and len(make.now.history) > 1 and not self._kept():
             from grounded.search.mispredictions import believed
 
             found = believed(planner, incumbent, make.now.history, self.real)
+            self.alternatives = found.alternatives
             self.real, self.corrected, self.missed = found.problem, found.corrected, found.missed
         already = predicted(self.real, incumbent.candidate.policy).utility
         self.already = already if np.isfinite(already) else incumbent.utility
@@ -75,6 +78,16 @@ class About:
         """A candidate with what this model promises of it."""
         made = self.make.candidate(policy, self.real, step, self.already, way)
         return replace(made, slopes="corrected" if self.corrected else "")
+
+    def steadied(self, made: Candidate) -> Candidate:
+        """The same run with the incumbent's gains, where the new ones may not hold (`feedback`)."""
+        new, run = made.policy, self.incumbent.candidate.policy
+        if not self.alternatives or new.gain is None or run.gain is None:
+            return made
+        old = replace(new, gain=run.laid_out(new.state_names, new.angles, new.depths).gain)
+        if sum(a.cost(new) - a.cost(old) for a in self.alternatives) <= self.least:
+            return made
+        return self.make.foretold(made, old, self.real, self.already)
 
     def _expected(self, made: Candidate) -> float:
         """The predicted gain less what the model is likely to miss of the step."""
@@ -107,6 +120,7 @@ class About:
             policy = self.theta.toward(directions[step.damping], step.alpha)
             made = self.candidate(policy, step, self.way)
             if made.predicted_gain > self.least:
+                made = self.steadied(made)
                 proposal = make.checked(made)
                 if proposal.candidate is None:
                     unsafe = proposal
@@ -164,21 +178,34 @@ class Maker:
             caution = base.candidate.caution if base and follows else self.now.caution
         if caution and base is not None:
             policy = self._gently(policy, problem, caution)
-        run = predicted(problem, policy)
-        return Candidate(
+        made = Candidate(
             id=self.identity,
             policy=policy,
             iteration=0 if base is None else self.now.iteration + 1,
             alpha=step.alpha,
             damping=step.damping,
-            predicted_gain=run.utility - already,
             base="" if base is None else base.candidate.id,
             model=self.fingerprint,
+            predicted_states=policy.feedforward,
+            predicted_inputs=policy.feedforward,
+            predicted_utility=already,
+            caution=caution,
+            way=way,
+        )
+        return self.foretold(made, policy, problem, already)
+
+    def foretold(
+        self, made: Candidate, policy: Policy, problem: Problem, already: float
+    ) -> Candidate:
+        """A candidate with this policy and what a model predicts of it."""
+        run = predicted(problem, policy)
+        return replace(
+            made,
+            policy=policy,
+            predicted_gain=run.utility - already,
             predicted_states=run.states[:, : self.planner.task.model.n],
             predicted_inputs=run.inputs,
             predicted_utility=run.utility,
-            caution=caution,
-            way=way,
         )
 
     def gentler(self, incumbent: Tried) -> Candidate | None:

@@ -41,6 +41,7 @@ from grounded.policy import Policy
 from grounded.rollout import augmented
 from grounded.search.candidate import Tried
 from grounded.search.corrected import Corrected
+from grounded.search.feedback import Alternative
 from grounded.search.planner import Planner, predicted
 from grounded.solve.bias import input_span
 from grounded.trial import mean_trial
@@ -76,6 +77,7 @@ class Believed:
     problem: Problem
     corrected: Corrected | None = None
     missed: float = 0.0
+    alternatives: tuple[Alternative, ...] = ()
 
 
 def believed(
@@ -107,10 +109,17 @@ def believed(
         share = 1.0 if law is None else unforetold(_with(law, own, grounded).problem, own, other)
         corrected.append(share if rest else max(share, left))
     missed = float(np.mean(corrected))
-    if (own_share := float(np.mean(crude))) <= missed:
-        return Believed(grounded, missed=own_share)
+    near = others[:ASKED]
+    off, own_share = tuple(o.y for o in near), float(np.mean(crude))
+    if own_share <= missed:
+        return Believed(grounded, None, own_share, (Alternative(1.0, grounded, off),))
     law, _ = laws(own, others, grounded)
-    return replace(_with(law, own, grounded), missed=missed)
+    made = _with(law, own, grounded)
+    left = off if law is None else tuple(
+        o.y - np.einsum("tnq,tq->tn", law, _features(own, o, grounded)) for o in near
+    )
+    both = (Alternative(missed, grounded, off), Alternative(1.0 - missed, made.problem, left))
+    return replace(made, missed=missed, alternatives=both)
 
 
 def _with(law: Array | None, own: Seen, grounded: Problem) -> Believed:
