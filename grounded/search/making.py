@@ -75,28 +75,24 @@ class About:
         return not lost and abs(off) <= (1 - KEPT) * made.predicted_gain
 
     def candidate(self, policy: Policy, step: Step, way: Way) -> Candidate:
-        """A candidate with what this model promises of it."""
+        """A candidate with what this model promises of it, and how far that is likely to be off."""
         made = self.make.candidate(policy, self.real, step, self.already, way)
-        return replace(made, slopes="corrected" if self.corrected else "")
+        made = replace(made, slopes="corrected" if self.corrected else "")
+        return self._steadied(made) if made.predicted_gain > self.least else made
 
-    def steadied(self, made: Candidate) -> Candidate:
+    def _steadied(self, made: Candidate) -> Candidate:
         """The same run with the incumbent's gains, where the new ones may not hold (`feedback`)."""
         new, run = made.policy, self.incumbent.candidate.policy
-        if not self.alternatives or new.gain is None or run.gain is None:
-            return made
-        old = replace(new, gain=run.laid_out(new.state_names, new.angles, new.depths).gain)
-        if sum(a.cost(new) - a.cost(old) for a in self.alternatives) <= self.least:
-            return made
-        return self.make.foretold(made, old, self.real, self.already)
-
-    def _expected(self, made: Candidate) -> float:
-        """The predicted gain less what the model is likely to miss of the step."""
+        if self.alternatives and new.gain is not None and run.gain is not None:
+            old = replace(new, gain=run.laid_out(new.state_names, new.angles, new.depths).gain)
+            if sum(a.cost(new) - a.cost(old) for a in self.alternatives) > self.least:
+                made = self.make.foretold(made, old, self.real, self.already)
         if not self.missed:
-            return made.predicted_gain
+            return made
         from grounded.search.mispredictions import apart
 
-        run = (made.predicted_states, made.predicted_inputs)
-        return made.predicted_gain - self.missed * apart(self.real, run, self.run)
+        moved = apart(self.real, (made.predicted_states, made.predicted_inputs), self.run)
+        return replace(made, likely_off=self.missed * moved)
 
     def step_from(self, first: Step, promised: list[float]) -> Proposal | None:
         """The first step worth a trial; one that is not allowed, or None; adds to the promises.
@@ -120,11 +116,10 @@ class About:
             policy = self.theta.toward(directions[step.damping], step.alpha)
             made = self.candidate(policy, step, self.way)
             if made.predicted_gain > self.least:
-                made = self.steadied(made)
                 proposal = make.checked(made)
                 if proposal.candidate is None:
                     unsafe = proposal
-                elif self._expected(made) > self.least:
+                elif expected(proposal.candidate) > self.least:
                     return proposal
                 else:
                     doubted = doubted or proposal
@@ -138,8 +133,9 @@ class About:
         """A model that was changed since: its own new plan, where more is promised of that.
 
         The plan of a crude model may sit in another valley than that of the better one: going on
-        from it ends where it began. Both are judged by the grounded prediction, unless the
-        incumbent's trial was wild: a bias measured there says nothing of other runs.
+        from it ends where it began. Both are judged by the grounded prediction, less what it is
+        likely to be off by so far away, unless the incumbent's trial was wild: a bias measured
+        there says nothing of other runs.
         """
         make, base = self.make, self.incumbent.candidate
         tried = losers_of(make.now.history, base.id, make.fingerprint, "own plan")
@@ -147,10 +143,15 @@ class About:
             return None
         policy, _ = first_policy(make.planner.plan)
         made = self.candidate(policy, Step(), "own plan")
-        promise = rival.candidate.predicted_gain if rival and rival.candidate else self.least
-        better = made.predicted_gain > promise or wild(self.incumbent)
+        promise = expected(rival.candidate) if rival and rival.candidate else self.least
+        better = expected(made) > max(promise, self.least) or wild(self.incumbent)
         proposal = make.checked(made) if better else None
         return proposal if proposal is not None and proposal.candidate is not None else None
+
+
+def expected(made: Candidate) -> float:
+    """The promised gain less what the model is likely to miss of it."""
+    return made.predicted_gain - made.likely_off
 
 
 @dataclass(frozen=True, eq=False)

@@ -41,8 +41,16 @@ _FIELDS: Mapping[str, Callable[[str], Any]] = {
     "caution": int,
     "way": str,
     "slopes": str,
+    "likely_off": float,
 }
-_ABSENT = {"predicted_gain": "nan", "damping": "1.0", "caution": "0", "way": "", "slopes": ""}
+_ABSENT = {
+    "predicted_gain": "nan",
+    "damping": "1.0",
+    "caution": "0",
+    "way": "",
+    "slopes": "",
+    "likely_off": "0.0",
+}
 
 
 @dataclass(frozen=True, eq=False)
