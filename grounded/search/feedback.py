@@ -8,7 +8,7 @@ fitted to noise. So a policy is run in models that replay OTHER trials,
     x_{t+1} = f(x_t, u_t) + bias_t + y_jt,     y_j what the model mispredicts of trial j,
 
 the same for all policies (Ng & Jordan, "PEGASUS", UAI 2000), with the corrected slopes and with the
-model's own. The latter count by the share of the movements that the former miss.
+model's own. Each counts the more, the less it misses of trials that were left out.
 """
 
 from __future__ import annotations

@@ -108,18 +108,17 @@ def believed(
         crude.append(unforetold(grounded, own, other))
         share = 1.0 if law is None else unforetold(_with(law, own, grounded).problem, own, other)
         corrected.append(share if rest else max(share, left))
-    missed = float(np.mean(corrected))
-    near = others[:ASKED]
-    off, own_share = tuple(o.y for o in near), float(np.mean(crude))
-    if own_share <= missed:
-        return Believed(grounded, None, own_share, (Alternative(1.0, grounded, off),))
     law, _ = laws(own, others, grounded)
-    made = _with(law, own, grounded)
-    left = off if law is None else tuple(
-        o.y - np.einsum("tnq,tq->tn", law, _features(own, o, grounded)) for o in near
-    )
-    both = (Alternative(missed, grounded, off), Alternative(1.0 - missed, made.problem, left))
-    return replace(made, missed=missed, alternatives=both)
+    made, near = _with(law, own, grounded), others[:ASKED]
+    off = left = tuple(o.y for o in near)
+    if law is not None:
+        told = [np.einsum("tnq,tq->tn", law, _features(own, o, grounded)) for o in near]
+        left = tuple(y - explained for y, explained in zip(off, told, strict=True))
+    misses = float(np.mean(crude)), float(np.mean(corrected))
+    share = misses[1] / (sum(misses) + 1e-300)
+    both = (Alternative(share, grounded, off), Alternative(1.0 - share, made.problem, left))
+    model = Believed(grounded) if misses[0] <= misses[1] else made
+    return replace(model, missed=min(misses), alternatives=both)
 
 
 def _with(law: Array | None, own: Seen, grounded: Problem) -> Believed:
