@@ -31,7 +31,7 @@ import numpy as np
 from grounded.errors import NextCommand
 from grounded.model import Model
 from grounded.search.candidate import Candidate, Tried
-from grounded.search.first_policy import Tick, first_policy
+from grounded.search.first_policy import Tick
 from grounded.search.making import About, Maker, Proposal
 from grounded.search.planner import Planner
 from grounded.search.standing import (
@@ -100,7 +100,7 @@ def propose(
         planner = planner.with_model((refit or refitted)(planner.plan, trials))
     make = Maker(planner, now, identity or f"c{len(candidates) + 1:04d}", fingerprint)
     if now.incumbent is None:
-        policy, plan = first_policy(planner.plan, now.caution, tick)
+        policy, plan = planner.first_policy(now.caution, tick)
         made = make.checked(make.candidate(policy, planner.plan.problem(exact=True), Step()))
         if plan.status == "converged":
             return made

@@ -13,7 +13,6 @@ from grounded.policy import Policy
 from grounded.result import Result, document
 from grounded.search.candidate import Candidate, Tried, Way
 from grounded.search.feedback import Alternative
-from grounded.search.first_policy import first_policy
 from grounded.search.planner import Planner, predicted
 from grounded.search.safety import objections, spread
 from grounded.search.standing import SearchOptions, Standing, losers_of, wild
@@ -141,7 +140,7 @@ class About:
         tried = losers_of(make.now.history, base.id, make.fingerprint, "own plan")
         if base.model == make.fingerprint or tried:
             return None
-        policy, _ = first_policy(make.planner.plan)
+        policy, _ = make.planner.first_policy()
         made = self.candidate(policy, Step(), "own plan")
         promise = expected(rival.candidate) if rival and rival.candidate else self.least
         better = expected(made) > max(promise, self.least) or wild(self.incumbent)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,6 +22,10 @@ from grounded.task import Task
 from grounded.trial import Trial
 from grounded.utility import Reward
 
+if TYPE_CHECKING:
+    from grounded.search.first_policy import Tick
+    from grounded.solve.ddp import Solution
+
 
 @dataclass(frozen=True, eq=False)
 class Planner:
@@ -28,6 +33,7 @@ class Planner:
 
     task: Task
     plan: Task
+    widths: tuple[str, ...] = ()  # parameters of the plan's model: speeds a friction builds up over
 
     def lift(self, trial: Trial) -> Trial:
         """A trial with the planning model's memory states beside its own."""
@@ -52,6 +58,12 @@ class Planner:
         model = self.task.model
         angles = tuple(bool(a) for a in model.angle_mask)
         return policy.laid_out(model.state_names, angles, policy.depths)
+
+    def first_policy(self, caution: int = 0, tick: Tick | None = None) -> tuple[Policy, Solution]:
+        """The planning model's own policy, see `first_policy`."""
+        from grounded.search.first_policy import first_policy
+
+        return first_policy(self.plan, caution, tick, self.widths)
 
     def with_model(self, model: Model) -> Planner:
         """The same with other parameter values of the planning model."""
