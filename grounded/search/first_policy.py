@@ -10,7 +10,7 @@ until it has converged, and the plan with the lowest cost wins:
     smooth inputs    random, by fixed seeds: only where a solve takes milliseconds
     more of them     where those have shown local optima that are nearly as good; every other one
                      the best plan so far, kicked for a while, which leads to other valleys
-    a wider kink     of an adopted dry friction, narrowed again step by step: what sticks has no slope
+    a wider kink     of an adopted dry friction, narrowed step by step: what sticks has no slope
 """
 
 from __future__ import annotations

@@ -195,8 +195,8 @@ class _Check:
         made, name = self.candidate, self.candidate.id
         if made.doubtful and not self._trials(name):
             yield (
-                f"{name} may well lose: it promises {made.predicted_gain:.3g} over {made.base}, and "
-                f"its model is likely to be off by {made.likely_off:.3g} there, as it was for "
+                f"{name} may well lose: it promises {made.predicted_gain:.3g} over {made.base}, "
+                f"and its model is likely to be off by {made.likely_off:.3g} there, as it was for "
                 "earlier trials"
             )
         if "sha256" not in self.meta:
