@@ -1,4 +1,4 @@
-"""python -m benchmarks.foreign [--only NAME] [--json] [--optimum] [--list].
+"""python -m benchmarks.foreign [--only NAME] [--json] [--optimum] [--adopt TRIALS] [--list].
 
 Needs mujoco, jsbsim, commonroad-vehicle-models; the set-ups of a simulator that is missing are
 left out with a word.
@@ -12,7 +12,7 @@ import sys
 
 from benchmarks.foreign.optimum import optimum, remember
 from benchmarks.foreign.setups import SETUPS, setup
-from benchmarks.foreign.study import measured, table
+from benchmarks.foreign.study import adopting, measured, table
 
 
 def main() -> int:
@@ -20,6 +20,7 @@ def main() -> int:
     parser.add_argument("--only", action="append", help="set-ups whose names begin so")
     parser.add_argument("--json", action="store_true", help="one JSON document on stdout")
     parser.add_argument("--optimum", action="store_true", help="compute optima.json, which is slow")
+    parser.add_argument("--adopt", type=int, help="diagnose after so many trials, and adopt")
     parser.add_argument("--list", action="store_true", help="the names")
     asked = parser.parse_args()
     names = [n for n in SETUPS if not asked.only or n.startswith(tuple(asked.only))]
@@ -36,6 +37,8 @@ def main() -> int:
         say(f"{name}: {one.withheld} withheld ...")
         if asked.optimum:
             remember(name, *optimum(one, say))
+        elif asked.adopt:
+            print(adopting(one, asked.adopt), flush=True)
         else:
             rows.append(measured(one))
             say(table(rows[-1:]).splitlines()[-1])

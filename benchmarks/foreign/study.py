@@ -11,19 +11,23 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
 from benchmarks.foreign.optimum import known
 from benchmarks.foreign.setups import Setup
+from grounded.diagnosis.diagnose import diagnose
 from grounded.experiments.baselines import learning_control, refit_alone
 from grounded.experiments.bench import Kept
 from grounded.policy import Policy
 from grounded.search.ask_tell import learn
 from grounded.search.candidate import Candidate
+from grounded.search.improve import propose
+from grounded.search.planner import Planner
 from grounded.search.standing import SearchOptions
 from grounded.trial import Trial
+from grounded_trials.workspace.adopted import planner_with
 
 SHARES = (0.9, 0.97, 0.99)
 CLOSE = 0.005
@@ -119,6 +123,33 @@ def measured(setup: Setup) -> Row:
         phase=phase,
         sentence=sentence,
     )
+
+
+def adopting(setup: Setup, after: int) -> str:
+    """The search, with what a diagnosis of the first `after` trials claims adopted; as a line."""
+    task, options = setup.task, SearchOptions()
+    candidates: list[Candidate] = []
+    trials: list[Trial] = []
+    planner, claimed = Planner(task, task), "ended before"
+    while True:
+        if len(trials) == after and claimed == "ended before":
+            found = diagnose(task, trials)
+            own = {k: e.value for k, e in found.known_parameters.items() if k in task.model.params}
+            named = [n for n in found.effects if not n.startswith("parameter:")]
+            fitted = task.with_model(task.model.with_values(own))
+            planner = planner_with(fitted, [{"name": n, **found.values(n)} for n in named])
+            planner, claimed = replace(planner, task=task), " + ".join([*named, *own]) or "nothing"
+        proposal = propose(task, candidates, trials, options, planner=planner)
+        if (made := proposal.candidate) is None:
+            break
+        candidates += [made] * proposal.is_new
+        trials.append(replace(setup.run(made), candidate=made.id, id=f"t{len(trials)}"))
+    utilities = [task.utility(trial) for trial in trials]
+    best, final = known().get(setup.name, {}).get("utility"), max(utilities)
+    reached = "/".join("-" if t is None else str(t) for t in trials_to(setup, utilities, best))
+    off = "-" if best is None else f"{100 * (best - final) / abs(best):.1f} %"
+    cells = (setup.name, claimed, f"{final:.4g}", off, str(len(trials)), reached)
+    return f"| {' | '.join(cells)} |"
 
 
 def other(setup: Setup, method: Callable[[Setup, SearchOptions], list[Kept]]) -> Other:

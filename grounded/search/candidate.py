@@ -48,11 +48,17 @@ class Candidate(Result):
     caution: int = 0  # how often the first policy, or its gains, were designed more gently
     way: Way = ""  # how it was made
     slopes: Slopes = ""  # of the model that it was planned in
+    likely_off: float = 0.0  # of predicted_gain, as trials that were left out say; 0: not known
 
     @property
     def grounded(self) -> bool:
         """Whether a model that replays a trial has predicted it: a step along a direction."""
         return bool(self.base) and self.way in ("", "recorded inputs")
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether its model is likely to be off by more than it promises."""
+        return 0 < self.likely_off >= self.predicted_gain
 
     def summary(self) -> str:
         """Its name, its step and what the model predicts."""

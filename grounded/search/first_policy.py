@@ -10,11 +10,12 @@ until it has converged, and the plan with the lowest cost wins:
     smooth inputs    random, by fixed seeds: only where a solve takes milliseconds
     more of them     where those have shown local optima that are nearly as good; every other one
                      the best plan so far, kicked for a while, which leads to other valleys
+    a wider kink     of an adopted dry friction, narrowed step by step: what sticks has no slope
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -38,6 +39,8 @@ WORSE = 1.01  # times the best cost: a plan above it has converged somewhere els
 WORK = 4e7  # iterations x H x (n + m)^2 that all rivals of the reference may take
 SKETCH, PROMISING = 40, 1.3  # iterations after which a plan of so many times the cost is dropped
 MORE_WORK = 2e8  # the same for MANY
+WIDER = (64.0, 32.0, 16.0, 8.0, 4.0, 2.0, 1.0)  # times the speed a dry friction builds up over
+FOLLOWED = 200  # iterations of DDP for each of them
 FEWEST = 10  # iterations: a rival that gets no more is not started
 HOPELESS, HOPELESS_SLOW = 1e6, 1e3  # times the best cost: a start above it is not pursued
 
@@ -45,7 +48,7 @@ Tick = Callable[[str], None]
 
 
 def first_policy(
-    task: Task, caution: int = 0, tick: Tick | None = None
+    task: Task, caution: int = 0, tick: Tick | None = None, widths: Sequence[str] = ()
 ) -> tuple[Policy, ddp.Solution]:
     """The best converged plan of the crude model, as a policy.
 
@@ -53,6 +56,7 @@ def first_policy(
         task: the manoeuvre and the crude model.
         caution: how often a first policy has crashed; each time penalises inputs CAUTION x more.
         tick: told what is going on, about once a second.
+        widths: parameters of the model, speeds over which a dry friction builds up.
 
     Returns:
         The policy, and the result of DDP that it is made of: its `status` says whether the plan
@@ -78,10 +82,27 @@ def first_policy(
         best = _better(found, best)
     if elsewhere and share >= FEWEST and task.model.system.how == "compiled":
         best = _hopped(task, problem, best, most, tick)
+    if widths and task.model.system.how == "compiled":
+        best = _better(_followed(task, widths, tick), best)
     if best.status == "max iterations" and len(best.trace) < ITERATIONS:
         more = finished(problem, best.u, best.K, best.z[:-1], tick=tick)
         best = replace(more, trace=(*best.trace, *more.trace))
     return task.policy(best.u, best.K, best.z[:-1]), best
+
+
+def _followed(task: Task, widths: Sequence[str], tick: Tick | None) -> ddp.Solution:
+    """The plan of a model whose dry friction builds up slowly, followed as that gets quicker."""
+    found: ddp.Solution | None = None
+    for factor in WIDER:
+        wider = {name: factor * task.model.params[name].value for name in widths}
+        easier = replace(task, model=task.model.with_values(wider))
+        if found is None:
+            _, found = first_policy(easier, tick=tick)
+        else:
+            start = (found.u, found.K, found.z[:-1])
+            found = finished(easier.problem(), *start, most=FOLLOWED, tick=tick)
+    assert found is not None
+    return found
 
 
 def _hopped(

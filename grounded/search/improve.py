@@ -84,9 +84,7 @@ def propose(
         planner = planner.with_model((refit or refitted)(planner.plan, trials))
     make = Maker(planner, now, identity or f"c{len(candidates) + 1:04d}", fingerprint)
     if now.incumbent is None:
-        from grounded.search.first_policy import first_policy
-
-        policy, plan = first_policy(planner.plan, now.caution, tick)
+        policy, plan = planner.first_policy(now.caution, tick)
         made = make.checked(make.candidate(policy, planner.plan.problem(exact=True), Step()))
         if plan.status == "converged":
             return made

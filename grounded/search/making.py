@@ -12,6 +12,7 @@ from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.result import Result, document
 from grounded.search.candidate import Candidate, Tried, Way
+from grounded.search.feedback import Alternative
 from grounded.search.planner import Planner, predicted
 from grounded.search.safety import objections, spread
 from grounded.search.standing import SearchOptions, Standing, losers_of, wild
@@ -51,10 +52,12 @@ class About:
         self.run = (own.states[:, : planner.task.model.n], own.inputs)
         self.corrected: Corrected | None = None
         self.missed = 0.0  # share of its movements that the model is likely to be off by
+        self.alternatives: tuple[Alternative, ...] = ()
         if options.damps and len(make.now.history) > 1 and not self._kept():
             from grounded.search.mispredictions import believed
 
             found = believed(planner, incumbent, make.now.history, self.real)
+            self.alternatives = found.alternatives
             self.real, self.corrected, self.missed = found.problem, found.corrected, found.missed
         already = predicted(self.real, incumbent.candidate.policy).utility
         self.already = already if np.isfinite(already) else incumbent.utility
@@ -71,18 +74,24 @@ class About:
         return not lost and abs(off) <= (1 - KEPT) * made.predicted_gain
 
     def candidate(self, policy: Policy, step: Step, way: Way) -> Candidate:
-        """A candidate with what this model promises of it."""
+        """A candidate with what this model promises of it, and how far that is likely to be off."""
         made = self.make.candidate(policy, self.real, step, self.already, way)
-        return replace(made, slopes="corrected" if self.corrected else "")
+        made = replace(made, slopes="corrected" if self.corrected else "")
+        return self._steadied(made) if made.predicted_gain > self.least else made
 
-    def _expected(self, made: Candidate) -> float:
-        """The predicted gain less what the model is likely to miss of the step."""
+    def _steadied(self, made: Candidate) -> Candidate:
+        """The same run with the incumbent's gains, where the new ones may not hold (`feedback`)."""
+        new, run = made.policy, self.incumbent.candidate.policy
+        if self.alternatives and new.gain is not None and run.gain is not None:
+            old = replace(new, gain=run.laid_out(new.state_names, new.angles, new.depths).gain)
+            if sum(a.cost(new) - a.cost(old) for a in self.alternatives) > self.least:
+                made = self.make.foretold(made, old, self.real, self.already)
         if not self.missed:
-            return made.predicted_gain
+            return made
         from grounded.search.mispredictions import apart
 
-        run = (made.predicted_states, made.predicted_inputs)
-        return made.predicted_gain - self.missed * apart(self.real, run, self.run)
+        moved = apart(self.real, (made.predicted_states, made.predicted_inputs), self.run)
+        return replace(made, likely_off=self.missed * moved)
 
     def step_from(self, first: Step, promised: list[float]) -> Proposal | None:
         """The first step worth a trial; one that is not allowed, or None; adds to the promises.
@@ -109,7 +118,7 @@ class About:
                 proposal = make.checked(made)
                 if proposal.candidate is None:
                     unsafe = proposal
-                elif self._expected(made) > self.least:
+                elif expected(proposal.candidate) > self.least:
                     return proposal
                 else:
                     doubted = doubted or proposal
@@ -123,21 +132,25 @@ class About:
         """A model that was changed since: its own new plan, where more is promised of that.
 
         The plan of a crude model may sit in another valley than that of the better one: going on
-        from it ends where it began. Both are judged by the grounded prediction, unless the
-        incumbent's trial was wild: a bias measured there says nothing of other runs.
+        from it ends where it began. Both are judged by the grounded prediction, less what it is
+        likely to be off by so far away, unless the incumbent's trial was wild: a bias measured
+        there says nothing of other runs.
         """
         make, base = self.make, self.incumbent.candidate
         tried = losers_of(make.now.history, base.id, make.fingerprint, "own plan")
         if base.model == make.fingerprint or tried:
             return None
-        from grounded.search.first_policy import first_policy
-
-        policy, _ = first_policy(make.planner.plan)
+        policy, _ = make.planner.first_policy()
         made = self.candidate(policy, Step(), "own plan")
-        promise = rival.candidate.predicted_gain if rival and rival.candidate else self.least
-        better = made.predicted_gain > promise or wild(self.incumbent)
+        promise = expected(rival.candidate) if rival and rival.candidate else self.least
+        better = expected(made) > max(promise, self.least) or wild(self.incumbent)
         proposal = make.checked(made) if better else None
         return proposal if proposal is not None and proposal.candidate is not None else None
+
+
+def expected(made: Candidate) -> float:
+    """The promised gain less what the model is likely to miss of it."""
+    return made.predicted_gain - made.likely_off
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,21 +178,34 @@ class Maker:
             caution = base.candidate.caution if base and follows else self.now.caution
         if caution and base is not None:
             policy = self._gently(policy, problem, caution)
-        run = predicted(problem, policy)
-        return Candidate(
+        made = Candidate(
             id=self.identity,
             policy=policy,
             iteration=0 if base is None else self.now.iteration + 1,
             alpha=step.alpha,
             damping=step.damping,
-            predicted_gain=run.utility - already,
             base="" if base is None else base.candidate.id,
             model=self.fingerprint,
+            predicted_states=policy.feedforward,
+            predicted_inputs=policy.feedforward,
+            predicted_utility=already,
+            caution=caution,
+            way=way,
+        )
+        return self.foretold(made, policy, problem, already)
+
+    def foretold(
+        self, made: Candidate, policy: Policy, problem: Problem, already: float
+    ) -> Candidate:
+        """A candidate with this policy and what a model predicts of it."""
+        run = predicted(problem, policy)
+        return replace(
+            made,
+            policy=policy,
+            predicted_gain=run.utility - already,
             predicted_states=run.states[:, : self.planner.task.model.n],
             predicted_inputs=run.inputs,
             predicted_utility=run.utility,
-            caution=caution,
-            way=way,
         )
 
     def gentler(self, incumbent: Tried) -> Candidate | None:

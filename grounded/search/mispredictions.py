@@ -41,6 +41,7 @@ from grounded.policy import Policy
 from grounded.rollout import augmented
 from grounded.search.candidate import Tried
 from grounded.search.corrected import Corrected
+from grounded.search.feedback import Alternative
 from grounded.search.planner import Planner, predicted
 from grounded.solve.bias import input_span
 from grounded.trial import mean_trial
@@ -76,6 +77,7 @@ class Believed:
     problem: Problem
     corrected: Corrected | None = None
     missed: float = 0.0
+    alternatives: tuple[Alternative, ...] = ()
 
 
 def believed(
@@ -106,11 +108,17 @@ def believed(
         crude.append(unforetold(grounded, own, other))
         share = 1.0 if law is None else unforetold(_with(law, own, grounded).problem, own, other)
         corrected.append(share if rest else max(share, left))
-    missed = float(np.mean(corrected))
-    if (own_share := float(np.mean(crude))) <= missed:
-        return Believed(grounded, missed=own_share)
     law, _ = laws(own, others, grounded)
-    return replace(_with(law, own, grounded), missed=missed)
+    made, near = _with(law, own, grounded), others[:ASKED]
+    off = left = tuple(o.y for o in near)
+    if law is not None:
+        told = [np.einsum("tnq,tq->tn", law, _features(own, o, grounded)) for o in near]
+        left = tuple(y - explained for y, explained in zip(off, told, strict=True))
+    misses = float(np.mean(crude)), float(np.mean(corrected))
+    share = misses[1] / (sum(misses) + 1e-300)
+    both = (Alternative(share, grounded, off), Alternative(1.0 - share, made.problem, left))
+    model = Believed(grounded) if misses[0] <= misses[1] else made
+    return replace(model, missed=min(misses), alternatives=both)
 
 
 def _with(law: Array | None, own: Seen, grounded: Problem) -> Believed:

@@ -12,6 +12,7 @@ import dataclasses
 import hashlib
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -23,6 +24,10 @@ from grounded.task import Task
 from grounded.trial import Trial
 from grounded.utility import Reward
 
+if TYPE_CHECKING:
+    from grounded.search.first_policy import Tick
+    from grounded.solve.ddp import Solution
+
 
 @dataclass(frozen=True, eq=False)
 class Planner:
@@ -30,6 +35,7 @@ class Planner:
 
     task: Task
     plan: Task
+    widths: tuple[str, ...] = ()  # parameters of the plan's model: speeds a friction builds up over
 
     @cached_property
     def fingerprint(self) -> str:
@@ -59,6 +65,12 @@ class Planner:
         model = self.task.model
         angles = tuple(bool(a) for a in model.angle_mask)
         return policy.laid_out(model.state_names, angles, policy.depths)
+
+    def first_policy(self, caution: int = 0, tick: Tick | None = None) -> tuple[Policy, Solution]:
+        """The planning model's own policy, see `first_policy`."""
+        from grounded.search.first_policy import first_policy
+
+        return first_policy(self.plan, caution, tick, self.widths)
 
     def with_model(self, model: Model) -> Planner:
         """The same with other parameter values of the planning model."""

@@ -75,6 +75,17 @@ def refused(w, tmp_path, *parts, **how):
     assert not list((w.folder / "runs").glob("*.mcap")) and not (tmp_path / "c.json").exists()
 
 
+def test_a_step_that_may_well_lose_is_handed_over_with_a_word(ran):
+    """It was handed over as any other, though the search itself had put it last."""
+    made = ran.propose().candidate
+    assert checked_candidate(ran, made.id).notes == ()
+    doubted = replace(made, id="c0003", predicted_gain=0.07, likely_off=0.3)
+    ran.save_candidate(doubted)
+    assert ran.candidate("c0003")[0].likely_off == 0.3
+    (note,) = checked_candidate(ran, "c0003").notes
+    assert all(part in note for part in ("c0003", "0.07", "0.3", made.base))
+
+
 def test_what_was_just_proposed_is_handed_over_without_a_word(w, tmp_path):
     assert w.propose().proposal.notes == ()
     ran, exported = w.run("c0001"), w.export("c0001", tmp_path / "c.json")

@@ -12,13 +12,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from grounded.effects.family import Effect, Family, Scales, Site, wrapping_order
 from grounded.effects.registry import Library
-from grounded.effects.wrap import wrap
+from grounded.effects.wrap import param_name, wrap
 from grounded.errors import GroundedError
 from grounded.model import Model
 from grounded.search.planner import Planner, planner_for
@@ -73,7 +74,8 @@ def planner_with(task: Task, effects: Sequence[Mapping[str, Any]]) -> Planner:
             continue
         effect = library.effect(name, model)
         model = wrap(effect, _checked(effect, entry), task.dt)
-    return planner_for(task, model, latency)
+    widths = tuple(param_name(str(e["name"]), "width") for e in effects if "width" in e)
+    return replace(planner_for(task, model, latency), widths=widths)
 
 
 def _checked(effect: Effect, entry: Mapping[str, Any]) -> Mapping[str, float]:

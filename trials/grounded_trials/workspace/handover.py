@@ -234,7 +234,13 @@ class Check:
 
     def notes(self) -> Iterator[str]:
         """What a person should know of it, though nothing speaks against it."""
-        name = self.candidate.id
+        made, name = self.candidate, self.candidate.id
+        if made.doubtful and not self._trials(name):
+            yield (
+                f"{name} may well lose: it promises {made.predicted_gain:.3g} over {made.base}, "
+                f"and its model is likely to be off by {made.likely_off:.3g} there, as it was for "
+                "earlier trials"
+            )
         if "sha256" not in self.meta:
             yield f"{name} was written by an older version: its file has no checksum of its own"
         if not self.same_task:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,8 +42,16 @@ _FIELDS: Mapping[str, Callable[[str], Any]] = {
     "caution": int,
     "way": str,
     "slopes": str,
+    "likely_off": float,
 }
-_ABSENT = {"predicted_gain": "nan", "damping": "1.0", "caution": "0", "way": "", "slopes": ""}
+_ABSENT = {
+    "predicted_gain": "nan",
+    "damping": "1.0",
+    "caution": "0",
+    "way": "",
+    "slopes": "",
+    "likely_off": "0.0",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,6 +159,7 @@ def set_aside(workspace: Folder, note: str, trials: Sequence[str], why: str) -> 
     return SetAside(tuple(one.id for one in found), workspace.discarded())
 
 
+@lru_cache(maxsize=4)
 def sha256(data: bytes) -> str:
     """The hash that names a candidate's file."""
     return hashlib.sha256(data).hexdigest()
@@ -215,6 +225,13 @@ def candidate_of(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]
     Raises:
         GroundedError: if the file is damaged, rewritten, or another candidate's.
     """
+    candidate, meta = _proven(data, identity)
+    return candidate, dict(meta)
+
+
+@lru_cache(maxsize=4)
+def _proven(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]:
+    """The same, kept: one command meets the bytes of a candidate up to three times."""
     name = f"candidates/{identity}.mcap"
     policy, states, inputs, meta = read_candidate(data, name)
     try:
