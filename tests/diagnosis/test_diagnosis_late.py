@@ -1,4 +1,4 @@
-"""A late measurement: the filter's likelihood is the exact one, the log comes back as it was."""
+"""A late or filtered measurement: the filter's likelihood is the exact one, the log comes back as it was."""
 
 import numpy as np
 import pytest
@@ -18,22 +18,25 @@ from grounded.models.pendulum import model as pendulum
 from grounded.trial import Trial
 
 L, B, n = 12, 2, 3
-# late channels of each run, p of each, colour, noise through G, missing samples
+# late channels of each run, p of each (or a, b, c), colour, noise through G, missing samples
 CASES = [
     ([[1], [1]], [[0.0], [0.0]], None, False, False),
     ([[1], [1]], [[0.4], [0.4]], None, True, False),
     ([[0], [2]], [[0.4], [0.9]], 0.8, False, True),
     ([[0, 2], [0, 1]], [[0.0, 0.7], [0.4, 0.4]], 0.9, True, True),
     ([[2, 1], [2, 1]], [[0.5, 0.2], [0.1, 0.3]], None, True, True),
+    ([[1], [1]], [[(0.2, 0.1, 0.7)], [(0.4, 0.3, 0.3)]], None, True, False),
+    ([[0, 2], [0, 1]], [[(0.7, 0.3, 0.0), (0.2, 0.1, 0.7)]] * 2, 0.9, True, True),
 ]
 
 
 class Problem:
-    """A random linear system whose measurements of some channels are late by part of a step."""
+    """A random linear system, measurements of some channels late by part of a step, or filtered."""
 
     def __init__(self, channel, part, phi, through, missing, steps=L):
         rng = np.random.default_rng(n)
-        self.L, self.phi, self.late = steps, phi, Delayed(np.array(channel), np.array(part))
+        weights = [[w if isinstance(w, tuple) else (1 - w, w, 0.0) for w in run] for run in part]
+        self.L, self.phi, self.late = steps, phi, Delayed(np.array(channel), np.array(weights))
         self.F = 0.9 * np.eye(n) + 0.1 * rng.standard_normal((steps, B, n, n))
         self.G = None
         if through:
@@ -67,17 +70,19 @@ class Problem:
         G = np.tile(np.eye(n), (self.L, 1, 1)) if self.G is None else self.G[:, b]
         power = self.q[:n] + (self.start[b] if n < self.N else 0.0)
         first = self.first[b].copy()
-        late = dict(zip(self.late.channel[b], self.late.part[b], strict=True))
-        for i, p in late.items():
-            first[i] += p**2 * float(G[0][i] ** 2 @ power)
-        variances = [*first, *self.start[b], *np.tile(self.q, self.L)]
+        late = dict(zip(self.late.channel[b], self.late.weights[b], strict=True))
+        for i, (now, _, kept) in late.items():
+            first[i] += (1 - now) ** 2 / (1 - kept**2) * float(G[0][i] ** 2 @ power)
+        variances = [*first, *self.start[b], *np.tile(self.q, self.L), *self.first[b]]
         sources = len(variances)
+        shown = np.eye(n, sources, sources - n)  # what was shown at first is known by itself
         e = np.zeros((n, sources))
         e[:, :n] = np.eye(n)
         c = np.zeros((n, sources))
         if n < self.N:
             c[:, n : 2 * n] = np.eye(n)
         mean, at = self.r[0, b, :, 0] * self.seen[0, b], self.N
+        mean_shown = mean.copy()
         rows, missed, noise = [], [], []
         for t in range(self.L):
             before, mean_before = e, mean
@@ -90,10 +95,12 @@ class Problem:
                 c[:, at + n : at + 2 * n] += np.eye(n)
             at += self.N
             for i in range(n):
+                w = late.get(i, (1.0, 0.0, 0.0))
+                shown[i] = w @ np.array([e[i], before[i], shown[i]])
+                mean_shown[i] = w @ np.array([mean[i], mean_before[i], mean_shown[i]])
                 if self.seen[t + 1, b, i]:
-                    p = late.get(i, 0.0)
-                    rows.append((1 - p) * e[i] + p * before[i])
-                    missed.append(self.r[t + 1, b, i, 0] - (1 - p) * mean[i] - p * mean_before[i])
+                    rows.append(shown[i].copy())
+                    missed.append(self.r[t + 1, b, i, 0] - mean_shown[i])
                     noise.append(self.v[i])
         H, nu = np.array(rows), np.array(missed)
         S = (H * np.array(variances)) @ H.T + np.diag(noise)

@@ -20,6 +20,7 @@ import numpy as np
 from grounded.compile import Named
 from grounded.compile.run.differenced import DifferencedSystem
 from grounded.diagnosis.likelihood.data import Data, shifted
+from grounded.diagnosis.likelihood.delays import behind
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.effects import (
     Effect,
@@ -36,7 +37,6 @@ from grounded.effects import (
 from grounded.effects.family import braked, coupled
 from grounded.effects.joint import Loads, loads, solved
 from grounded.effects.registry import partner
-from grounded.effects.sensor import lagging
 from grounded.engine import SentOnce
 from grounded.frozen import Array
 
@@ -259,16 +259,15 @@ class Predictor(SentOnce):
         """The log minus the state along a track (L + 1, B, n); 0.0 where sensors are right."""
         names, dt, old = self.data.model.state_names, self.data.dt, track
         for effect, values in h.pairs:
-            if isinstance(effect.family, SensorDelayFamily):
+            if isinstance(effect.family, SensorDelayFamily | SensorLagFamily):
                 i, old = names.index(effect.site.target), old.copy()
-                old[..., i] += sensor_offset(effect, values, track[..., i], dt)
+                old[..., i] += sensor_offset(effect, values, old[..., i], dt)
         standing = self.standing(h, old)
         return standing if old is track else standing + old - track
 
     def standing(self, h: Hypothesis, shown: Array) -> Array | float:
         """What sensors add to what they are shown (..., n), however old it is; 0.0 if nothing."""
-        kinds = SensorFamily | SensorLagFamily
-        sensors = [(e, v) for e, v in h.pairs if isinstance(e.family, kinds)]
+        sensors = [(e, v) for e, v in h.pairs if isinstance(e.family, SensorFamily)]
         if not sensors:
             return 0.0
         names, total = self.data.model.state_names, np.zeros_like(shown)
@@ -298,7 +297,7 @@ def sensor_offset(effect: Effect, values: Mapping[str, float], track: Array, dt:
     if isinstance(effect.family, SensorFamily):
         return np.asarray(effect.family.measure(track, values) - track)
     if isinstance(effect.family, SensorLagFamily):
-        return _behind(track, values["tau"], dt)
+        return behind(track, values["tau"] / dt)
     steps = values["d"] / dt
     slope = np.vstack([track[1:2] - track[:1], np.diff(track, axis=0)])
     whole, part = int(np.floor(steps)), steps - np.floor(steps)
@@ -307,15 +306,6 @@ def sensor_offset(effect: Effect, values: Mapping[str, float], track: Array, dt:
     count = len(track)
     old = (1 - part) * line[1 : count + 1] + part * line[:count]
     return np.asarray(old - track)
-
-
-def _behind(track: Array, tau: float, dt: float) -> Array:
-    """How far a filtered sensor is off along a track (L + 1, B) that moved before as it begins."""
-    moved = np.diff(track, axis=0)
-    off = [-moved[0] * tau / dt]
-    for step in moved:
-        off.append(lagging(off[-1], step, tau, dt))
-    return np.array(off)
 
 
 def transformed(effect: Effect, values: Mapping[str, float], u: Array, data: Data) -> Array:

@@ -41,7 +41,7 @@ from grounded.diagnosis.likelihood.noise import (
 )
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.step import ProposedStep, inside, proposed
-from grounded.effects import SensorDelayFamily
+from grounded.effects import SensorDelayFamily, SensorLagFamily
 from grounded.engine import each
 from grounded.filter import kalman
 from grounded.filter.augmented import Delayed, joined
@@ -52,6 +52,7 @@ MOST_NUMBERS = 1e5  # of one (L, B, N, N) array: what fits in the cache goes fas
 SHORTEST = 0.05  # part of a step that is still tried
 HALVED = 4  # iterations after which only the better half of rivals goes on
 CLOSE = 10.0  # nats behind the best within which all go on
+LATE = SensorDelayFamily | SensorLagFamily
 LITTLE = 0.05  # nats that a step must promise to be tried in part where it fails
 
 
@@ -172,8 +173,8 @@ def _of_one_shape(works: list[Work]) -> list[list[int]]:
     for i, work in enumerate(works):
         if work.still:
             continue
-        count = sum(isinstance(e.family, SensorDelayFamily) for e in work.h.effects)
-        groups.setdefault(count, []).append(i)
+        late = {e.site.target for e in work.h.effects if isinstance(e.family, LATE)}
+        groups.setdefault(len(late), []).append(i)
     return [groups[count] for count in sorted(groups)]
 
 

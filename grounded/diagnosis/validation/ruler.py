@@ -249,7 +249,7 @@ class Ruler:
         trial = data.trial_of[run]
         step = data.step_at[run, 0] - self.step0[trial] + at
         received, delays = predictor.received(h), delays_of(h, data)
-        oldest = 0 if delays is None else max(delays.whole) + 1  # what sensors may still show
+        oldest = 0 if delays is None else delays.oldest  # what sensors may still show
         path = [track[np.maximum(at - j, 0), run] for j in range(oldest, -1, -1)]
         last, advance = data.lengths[trial], predictor.stepper(h)
         t = np.minimum(step + np.arange(steps)[:, None], last - 1)
