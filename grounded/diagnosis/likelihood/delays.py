@@ -216,8 +216,8 @@ def delays_of(h: Hypothesis, data: Data) -> Delays | None:
 
 
 def _named(h: Hypothesis, data: Data) -> dict[int, list[float]]:
-    """By late channel its delay and its time constant, in steps."""
-    found: dict[int, list[float]] = {}
+    """By late channel its delay and its time constant, in steps; the instruments' filters first."""
+    found = {i: [0.0, tau / data.dt] for i, tau in data.filters.items()}
     for effect, values in h.pairs:
         if isinstance(effect.family, SensorDelayFamily | SensorLagFamily):
             steps = found.setdefault(data.model.state_names.index(effect.site.target), [0.0, 0.0])

@@ -258,6 +258,9 @@ class Predictor(SentOnce):
     def offset(self, h: Hypothesis, track: Array) -> Array | float:
         """The log minus the state along a track (L + 1, B, n); 0.0 where sensors are right."""
         names, dt, old = self.data.model.state_names, self.data.dt, track
+        for i, tau in self.data.filters.items():
+            old = old.copy()
+            old[..., i] += behind(old[..., i], tau / dt)
         for effect, values in h.pairs:
             if isinstance(effect.family, SensorDelayFamily | SensorLagFamily):
                 i, old = names.index(effect.site.target), old.copy()
