@@ -64,7 +64,8 @@ def verdict(
         words.append(sentence([above]))
     words += once
     kind: Kind = "effect" if len(claimed) == 1 else "several"
-    return replace(_said(kind, *words), effects=tuple(r.effect for r in claimed), causes=causes)
+    effects, off = tuple(r.effect for r in claimed), tuple(_off(claims))
+    return replace(_said(kind, *words), effects=effects, causes=causes, parameters=off)
 
 
 def _said(kind: Kind, *words: str) -> Verdict:
@@ -90,11 +91,15 @@ def _percent(share: float) -> str:
     return "under 1 %" if share < 0.01 else f"{100 * share:.0f} %"
 
 
+def _off(claims: Claims) -> list[str]:
+    """The parameters that have to differ, most important first."""
+    return [claims.data.model.param_names[one.index] for one in claims.moved]
+
+
 def _moved(claims: Claims) -> str:
     """`L should be 0.166 m (+11 %)` of the parameters that have to differ."""
     params, known = claims.data.model.params, claims.parameters()
-    named = [claims.data.model.param_names[one.index] for one in claims.moved]
-    texts = []
+    named, texts = _off(claims), []
     for name in named[:NAMED]:
         old = params[name].value
         change = 100 * (known[name].value - old) / abs(old) if old else 0.0
