@@ -11,17 +11,18 @@ The very equations that `grounded.effects.wrap` adopts, evaluated on arrays.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from hashlib import blake2b
 from typing import Any
 
 import numpy as np
 
 from grounded.compile import Named
-from grounded.compile.run.differenced import DifferencedSystem
 from grounded.diagnosis.likelihood.data import Data, shifted
 from grounded.diagnosis.likelihood.delays import behind
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
+from grounded.diagnosis.likelihood.simulated import Slopes, simulated
 from grounded.effects import (
     Effect,
     InputFamily,
@@ -51,6 +52,21 @@ class Predictor(SentOnce):
     data: Data
     _inputs: dict[Any, Array] = field(default_factory=dict)
     _steps: dict[bytes, Array] = field(default_factory=dict)
+    _taken: Slopes | None = None
+
+    @cached_property
+    def taken(self) -> Slopes:
+        """The slopes of a simulator that were taken."""
+        model, scales = self.data.model, self.data.scales
+        spreads = np.array([scales.spread(n) for n in model.state_names])
+        peaks = np.array([scales.peak(n) for n in model.input_names])
+        return self._taken or Slopes((spreads, peaks, np.abs(model.values) + param_scale(model)))
+
+    def following(self) -> Predictor:
+        """One that keeps to the track of one hypothesis, where the model is a simulator."""
+        if not simulated(self.data.model):
+            return self
+        return replace(self, _taken=self.taken.following())
 
     def inputs(self, h: Hypothesis) -> Array:
         """What the actuators receive under a hypothesis, by run (L, B, m)."""
@@ -98,7 +114,7 @@ class Predictor(SentOnce):
     def step(self, x: Array, u: Array, p: Array, dt: float | None = None) -> Array:
         """The model's own step at any leading shape."""
         rows, system = self.flat(x, u), self.data.model.system
-        if not isinstance(system, DifferencedSystem):
+        if not simulated(self.data.model):
             return system.step(*rows, p, dt or self.data.dt).reshape(x.shape)
         parts = (*rows, p, np.array(dt or self.data.dt))  # a simulator is slow: losses ask again
         key = blake2b(b"".join(part.tobytes() for part in parts)).digest()
@@ -110,7 +126,15 @@ class Predictor(SentOnce):
 
     def slopes(self, x: Array, u: Array, p: Array, dt: float | None = None) -> tuple[Array, Array]:
         """Slopes of the model's own step at any leading shape: f_x (..., n, n), f_u (..., n, m)."""
-        found = self.data.model.system.linearise(*self.flat(x, u), p, dt or self.data.dt)
+        system = self.data.model.system
+
+        def take(x: Array, u: Array) -> tuple[Array, ...]:
+            return system.linearise(x, u, p, dt or self.data.dt)
+
+        if dt is None and simulated(self.data.model):
+            found = self.taken.at(take, *self.flat(x, u), p, False)
+        else:
+            found = take(*self.flat(x, u))
         f_x, f_u = (f.reshape(*x.shape, f.shape[-1]) for f in found)
         return f_x, f_u
 

@@ -68,6 +68,7 @@ class Work:
     part: float = 1.0  # of the step that is taken
     still: bool = False  # it no longer rises
     moving: bool = True  # the track too: where the model has kinks that may not help
+    along: Predictor | None = None  # of its own track, while it climbs
 
     def shorten(self, data: Data) -> None:
         """The same step about the track as it was; then parts of it; then the end."""
@@ -150,11 +151,11 @@ def _after(
 def _climb(predictor: Predictor, works: list[Work], how: tuple[int, bool]) -> list[Work]:
     """Refines hypotheses of one shape, side by side."""
     iterations, fixed_noise = how
-    works = [replace(work) for work in works]
+    works = [replace(work, along=predictor.following()) for work in works]
     for _ in range(iterations):
         if moving := [work for work in works if not work.still]:
             _iterate(predictor, moving, fixed_noise)
-    return works
+    return [replace(work, along=None) for work in works]
 
 
 def _halve(works: list[Work], worth: Callable[[Fitted], float]) -> None:
@@ -182,7 +183,7 @@ def _iterate(predictor: Predictor, works: list[Work], fixed_noise: bool) -> None
     data = predictor.data
     B = data.time.shape[1]
     late = [delays_of(work.h, data) for work in works]
-    parts = [linearise(predictor, work.h, work.track) for work in works]
+    parts = [linearise(work.along or predictor, work.h, work.track) for work in works]
     width = kalman.whole(max(part[1].shape[-1] for part in parts), data.model.n)
     d, r = (_side_by_side([part[k] for part in parts], width) for k in (1, 2))
     systems = [

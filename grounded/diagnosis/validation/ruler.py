@@ -10,7 +10,9 @@ Two hypotheses are compared by the mean logarithm of the ratio of their errors o
 horizons; its scatter is the jackknife's over runs. Runs differ most in how much of an effect they
 hold: what two trials of eight show in full is 1.5 of that scatter, and would be with no noise at
 all. So the short horizons are also compared piece by piece of a second: where an effect is not
-visited they add nothing, neither gain nor scatter.
+visited they add nothing, neither gain nor scatter. And the sums are those of the runs that miss
+most: of a pendulum that once came to a halt near the top one run makes most of them, and of their
+scatter. So every trial is also asked by itself, and all count alike.
 
 No model predicts better than the noise floor. Where a manoeuvre was repeated, by a candidate or by
 commands that are the same, predictions of the repeats miss by the same model error and by different
@@ -32,12 +34,13 @@ from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted, leave_one_out, moved
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
+from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.frozen import Array
 from grounded.task import Task
 from grounded.trial import Trial
 
 SECONDS = (0.1, 0.5, 1.0)
-MOST_STARTS = 400
+MOST_STARTS, FEWER_STARTS = 400, 150  # the fewer of a simulator, whose steps are slow
 MOST_WHOLE = 8  # trials that are predicted from beginning to end
 WHOLE_STEPS = 4000  # of them together, where that leaves LEAST_WHOLE
 LEAST_WHOLE = 3
@@ -45,6 +48,7 @@ FINE = 2e-3  # of a channel's spread: errors below it do not matter
 SLIGHT = 1e-2  # nor below this part of the crude model's, or of the spread where that is less
 FAR = 1e6  # a state beyond it has diverged
 AGAIN = 2.0  # scatters that a gain has without its best trial, where it was seen again
+CHANCE = 0.01  # of what trials gain by themselves, below which it is no chance
 MOMENTS = 20  # at which repeats are compared
 ALIKE = 0.02  # of a command's spread: how much commands of repeats may differ, rms
 
@@ -88,6 +92,17 @@ class Gain:
     scatters: Array  # (n',) of these
     pieces: Array = field(default_factory=lambda: np.zeros(0))  # (P,) gained in each, up to 1 s
     trial: Array = field(default_factory=lambda: np.zeros(0, int))  # (P,) that it is of
+    own: Array = field(default_factory=lambda: np.zeros(0))  # (S,) what each trial gains by itself
+
+    @property
+    def chance(self) -> float:
+        """That trials which gain nothing gain as much on average, each by itself (Student's t)."""
+        from scipy.special import stdtr
+
+        count, spread = len(self.own), float(self.own.std(ddof=1)) if len(self.own) > 1 else 0.0
+        if not spread > 0:
+            return 1.0
+        return float(stdtr(count - 1, -float(self.own.mean()) * np.sqrt(count) / spread))
 
     @property
     def again(self) -> float:
@@ -102,13 +117,14 @@ class Gain:
         return self.mean > scatters * self.scatter and self.largest > least
 
     def pays(self, scatters: float, least: float) -> bool:
-        """Whether it is worth a claim: in all, again without its best trial, or in one channel.
+        """Whether it is worth a claim: in all, again without its best trial, trial by trial, or in
+        one channel.
 
         There by a scatter more: an effect of one channel is lost in the mean over a dozen, and in
         their scatter.
         """
         one = (self.channels > (scatters + 1) * self.scatters) & (self.channels > least)
-        again = self.again > AGAIN and self.largest > least
+        again = (self.again > AGAIN or self.chance < CHANCE) and self.largest > least
         return self.beyond(scatters, least) or (self.mean > 0 and (again or bool(one.any())))
 
 
@@ -143,7 +159,8 @@ class Ruler:
         pairs = [
             (t, b) for b in range(len(lengths)) for t in range(1, min(lengths[b], room[b] + 1))
         ] or [(0, 0)]
-        at, run = np.array(pairs[:: max(1, len(pairs) // MOST_STARTS)]).T
+        most = MOST_STARTS if not simulated(data.model) else FEWER_STARTS
+        at, run = np.array(pairs[:: max(1, len(pairs) // most)]).T
         return at, run
 
     @cached_property
@@ -311,6 +328,7 @@ class Ruler:
             _jackknife(by / counts),
             self._pieces(before, after),
             self.data.trial_of[self.run_of],
+            self._by_trial(before, after),
         )
 
     def _matters(self) -> Array:
@@ -324,6 +342,16 @@ class Ruler:
         all_n = np.maximum(n.sum(axis=1, keepdims=True), 1)
         usual = n * (b.sum(axis=1, keepdims=True) / all_n + self.fine[self.shown] ** 2) + 1e-300
         return np.asarray((n / all_n * np.log((a + usual) / (b + usual))).sum(axis=(0, 2)))
+
+    def _by_trial(self, before: Errors, after: Errors) -> Array:
+        """What each trial gains by itself, the mean over channels and horizons, (S,)."""
+        a, b, n = (
+            np.stack([self.by_run(e)[:, self.data.trial_of == i].sum(axis=1) for i in self.data.used])
+            for e in (x[..., self.shown] for x in (before.total, after.total, before.count))
+        )
+        least, seen = n * self._matters() ** 2 + 1e-300, n > 0
+        each = np.where(seen, 0.5 * np.log((a + least) / (b + least)), 0.0)
+        return np.asarray(each.sum(axis=(1, 2)) / np.maximum(seen.sum(axis=(1, 2)), 1))
 
     def by_run(self, pieces: Array) -> Array:
         """Sums of pieces (K, P, n) by run (K, B, n)."""
