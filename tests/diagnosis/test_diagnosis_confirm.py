@@ -11,8 +11,9 @@ from grounded.diagnosis.report import Unconfirmed
 from grounded.diagnosis.unconfirmed import unconfirmed
 from grounded.diagnosis.validation.claims import Claims
 from grounded.diagnosis.validation.decide import causes, decide, shares
+from grounded.diagnosis.validation.gain import Gain
 from grounded.diagnosis.validation.limits import limits
-from grounded.diagnosis.validation.ruler import Gain, Ruler, folds
+from grounded.diagnosis.validation.ruler import Ruler, folds
 from grounded.diagnosis.verdict import verdict
 from grounded.effects import Library
 

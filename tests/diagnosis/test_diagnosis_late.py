@@ -1,4 +1,4 @@
-"""A late or filtered measurement: the filter's likelihood is the exact one, the log comes back as it was."""
+"""A late or filtered sensor: the filter's likelihood is the exact one, the log comes back."""
 
 import numpy as np
 import pytest

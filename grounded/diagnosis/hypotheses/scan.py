@@ -25,7 +25,6 @@ import numpy as np
 from grounded.compile import Named
 from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.linearise import base_columns, filter_system, sensitivities_of
 from grounded.diagnosis.likelihood.predictor import Predictor, sensor_offset
 from grounded.diagnosis.likelihood.tangent import tangent

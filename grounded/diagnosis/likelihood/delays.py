@@ -11,10 +11,10 @@ as it is old, with x a straight line from sample to sample:
                                                     c = exp(-dt / tau),   m = (1 - c) tau / dt
 
 Both act on the process noise too: taken for the present state less an offset, a late sample would
-contradict every disturbance, and its delay would go to whatever slows the motion. The first k samples of a trial show what was before it,
-which no model predicts. All hypotheses are judged by the same data, so they count too (`before`):
-as samples of a state that drifted into the trial at rest, or at the pace of its beginning,
-whichever is likelier.
+contradict every disturbance, and its delay would go to whatever slows the motion. The first k
+samples of a trial show what was before it, which no model predicts. All hypotheses are judged by
+the same data, so they count too (`before`): as samples of a state that drifted into the trial at
+rest, or at the pace of its beginning, whichever is likelier.
 
 Noise (its weights) and adjoints belong to samples: outside the filter they stay in the log's order.
 """

@@ -74,7 +74,6 @@ def linearise(predictor: Predictor, h: Hypothesis, track: Array) -> tuple[Array,
                 continue
             nudged = near.advance(other, x, near.inputs(other), data.time)
             by_d = model.difference(nudged, base) / moved
-            ahead_too = nudged if base is after else after + nudged - base
             other_shown = shown if delays is None else delays.moved(other).shown(ahead, track)
             shifted = predictor.standing(other, other_shown)
             by_r = (shown - other_shown + offset - shifted) / moved

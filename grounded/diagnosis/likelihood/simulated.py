@@ -21,12 +21,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from grounded.compile.run.differenced import DifferencedSystem
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.frozen import Array
 from grounded.model import Model
 
 if TYPE_CHECKING:
-    from grounded.diagnosis.likelihood.predictor import Predictor
+    pass
 
 NEAR = 0.01  # of the spread of a state, the peak of an input, the size of a parameter
 KEPT = 8  # sets of slopes

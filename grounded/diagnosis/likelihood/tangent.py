@@ -14,7 +14,7 @@ from grounded.frozen import Array
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Tangent(Predictor):
-    """A predictor whose model is linear about x (L, B, n), u (L, B, m): compare only with itself."""
+    """A predictor whose model is linear about x (L, B, n), u (L, B, m); to compare with itself."""
 
     x: Array
     u: Array
@@ -32,7 +32,7 @@ class Tangent(Predictor):
 
 
 def tangent(predictor: Predictor, h: Hypothesis, x: Array, u: Array) -> Predictor:
-    """What steps from near x (L, B, n) with inputs near u (L, B, m); a compiled model's is exact."""
+    """Predicts from near x (L, B, n) with inputs near u (L, B, m); a compiled model as ever."""
     if not simulated(predictor.data.model):
         return predictor
     left, p = predictor.left(h, x, u), predictor.params(h)
