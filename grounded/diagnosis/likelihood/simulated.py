@@ -67,7 +67,8 @@ class Slopes:
         if old is None or old.x.shape != x.shape or self._far(2, p, old.p).any():
             found = self._same(take, x, u, p, full)
         else:
-            moved = self._far(0, x, old.x).any(axis=1) | self._far(1, u, old.u).any(axis=1)
+            far = np.hstack([self._far(0, x, old.x), self._far(1, u, old.u)])
+            moved = np.asarray(far.any(axis=1))
             found = old.found if full else old.found[:2]
             if moved.any():
                 found = tuple(f.copy() for f in found)

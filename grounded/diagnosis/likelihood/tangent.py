@@ -35,7 +35,6 @@ def tangent(predictor: Predictor, h: Hypothesis, x: Array, u: Array) -> Predicto
     """Predicts from near x (L, B, n) with inputs near u (L, B, m); a compiled model as ever."""
     if not simulated(predictor.data.model):
         return predictor
-    left, p = predictor.left(h, x, u), predictor.params(h)
-    about = {"x": x, "u": left, "p": p, "after": predictor.step(x, left, p)}
-    slopes = predictor.slopes(x, left, p)
-    return Tangent(predictor.data, predictor._inputs, **about, slopes_there=slopes)
+    left, p, kept = predictor.left(h, x, u), predictor.params(h), predictor._inputs
+    after, slopes = predictor.step(x, left, p), predictor.slopes(x, left, p)
+    return Tangent(predictor.data, kept, x=x, u=left, p=p, after=after, slopes_there=slopes)
