@@ -175,6 +175,16 @@ class Predictor(SentOnce):
         step, p, dt = self.data.model.system.step, self.params(h), self.data.dt
         return lambda x, u, t: step(x, u, p, dt)
 
+    def marched(self, h: Hypothesis, x: Array, u: Array) -> Array | None:
+        """States (T + 1, M, n) from x (M, n) through u (T, M, m), of the model's steps alone.
+
+        None where a hypothesis adds to them, or the model is not compiled.
+        """
+        march = getattr(self.data.model.system, "march", None)
+        if march is None or rates_of(h) or limits_of(h) or losses_of(h):
+            return None
+        return np.asarray(march(x, u, self.params(h), self.data.dt))
+
     def moved(self, h: Hypothesis, x: Array, u: Array, dt: float | None = None) -> Array:
         """The model's step with what its motion takes off the inputs, without further rates."""
         return self.step(x, self.left(h, x, u, dt), self.params(h), dt)

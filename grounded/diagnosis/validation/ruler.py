@@ -202,7 +202,12 @@ class Ruler:
         path = [track[np.maximum(at - j, 0), run] for j in range(oldest, -1, -1)]
         last, advance = data.lengths[trial], predictor.stepper(h)
         t = np.minimum(step + np.arange(steps)[:, None], last - 1)
-        for j, (u, now) in enumerate(zip(received[trial, t], t * data.dt, strict=True)):
+        u_all, z = received[trial, t], None
+        if added is None:
+            z = predictor.marched(h, path[-1], u_all)
+        if z is not None and (np.abs(z) < FAR).all():
+            path, u_all = [*path, *z[1:]], u_all[:0]
+        for j, (u, now) in enumerate(zip(u_all, t * data.dt, strict=False)):
             x = advance(path[-1], u, now)
             if added is not None:
                 inside = (at + j < len(added))[:, None]
