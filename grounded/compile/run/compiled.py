@@ -147,7 +147,9 @@ class CompiledSystem(TracedSystem):
         at |= {"dt": word(float(dt)), "eps": word(0.0), "N": len(x)}
         words = (ctypes.c_int64 * len(BATCH))(*[at.get(name, 0) for name in BATCH])
         kernel, per = self._compiled(p, dt).batch()["step"], 8 * len(x)
-        each = [(BATCH.index(k), per * w) for k, w in (("x", self.n), ("out", self.n), ("u", self.m))]
+        each = [
+            (BATCH.index(k), per * w) for k, w in (("x", self.n), ("out", self.n), ("u", self.m))
+        ]
         for _ in range(steps if len(x) else 0):
             run(kernel, words)
             for i, size in each:

@@ -20,7 +20,7 @@ from grounded.diagnosis.likelihood.noise import NoiseModel, Structure, noise_gue
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.refine import refine
 from grounded.diagnosis.likelihood.simulated import simulated
-from grounded.effects import Effect, ParamFamily
+from grounded.effects import Effect, ParamFamily, SensorLagFamily
 from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import Array
 
@@ -232,6 +232,12 @@ class HypothesisSearch(FittedHypotheses):
                 (h.plus(look.effect, values), fit.noise, fit.track)
                 for values in (look.values, *look.others)
             ]
+            if isinstance(look.effect.family, SensorLagFamily):
+                # what passes a filter is far quicker than what it shows: so is its noise
+                late, noise, track = self.fresh(h.plus(look.effect, look.values))
+                noise = noise.allowing(fit.noise.structure, self.data.dt)
+                weights = {"weight_w": fit.noise.weight_w, "weight_v": fit.noise.weight_v}
+                starts.append((late, replace(noise, **weights), track))
         return self.refined(starts, iterations, rivals=True)[1:]
 
     def without(self, fit: Fitted, name: str) -> Fitted:
