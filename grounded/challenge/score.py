@@ -137,7 +137,8 @@ def judge(
     truth = [e["effect"] for e in label["effects"]]
     mended = [f for f in diagnosis.get("preflight", ()) if f["corrected"] and f["kind"] in LATE]
     sensors = [f"{LATE[f['kind']]}:{f['signal']}" for f in mended]  # found before any physics
-    named = sensors + list(diagnosis["verdict"]["effects"])
+    off = [f"parameter:{name}" for name in diagnosis["verdict"].get("parameters", ())]
+    named = list(dict.fromkeys([*sensors, *diagnosis["verdict"]["effects"], *off]))
     order = sensors + [r["effect"] for r in diagnosis["ranking"]]
     group = set(order[:1])
     for g in diagnosis["indistinguishable"]:
@@ -154,6 +155,7 @@ def judge(
         "in_group": bool(truth) and truth[0] in group,
         "top3": bool(truth) and truth[0] in order[:3],
         "both": set(truth) <= set(named),
+        "both_in_group": _matched(truth, named, diagnosis["indistinguishable"]),
         "leftover": bool(diagnosis["leftover"]),
         "gap_after": diagnosis["gap"]["after"],
         "system": label["system"],
@@ -182,6 +184,17 @@ def _physical(named: Sequence[str], label: Mapping[str, Any]) -> list[str]:
 def _spare(truth: Sequence[str], named: Sequence[str], label: Mapping[str, Any]) -> int:
     """How many names are claimed beside the true ones, or beside one that stands for each."""
     return len(set(_physical(named, label)) | (set(truth) & set(named))) - len(truth)
+
+
+def _matched(truth: Sequence[str], named: Sequence[str], ties: Sequence[Sequence[str]]) -> bool:
+    """Whether each true effect is named, or tied with a name that stands for no other."""
+    free = [name for name in named if name not in truth]
+    for effect in (effect for effect in truth if effect not in named):
+        place = next((g[0] for g in ties if effect in g[:3] and g[0] in free), None)
+        if place is None:
+            return False
+        free.remove(place)
+    return True
 
 
 def _misplaced(truth: Sequence[str], order: Sequence[str]) -> bool:
@@ -264,7 +277,8 @@ def _single(some: Marks) -> dict[str, Any]:
 
 def _double(some: Marks) -> dict[str, Any]:
     seen = [m for m in some if m.get("each_detectable")]
-    return {"both": _part(seen, "both"), **_of_effects(some)}
+    both = {key: _part(seen, key) for key in ("both", "both_in_group")}
+    return {**both, **_of_effects(some)}
 
 
 def _of_effects(some: Marks) -> dict[str, Any]:

@@ -124,6 +124,8 @@ def diagnose(
     looked = preflight(subject, [*trials, *compare], options.hidden)
     trials = looked.trials
     data = prepare(model, trials, latency, past, options.hidden)
+    filters = {model.state_names.index(name): tau for name, tau in looked.filters.items()}
+    data = replace(data, filters=filters)
     known = limits(data)
     tick("candidates")
     uncertain = Predictor(data)

@@ -39,7 +39,8 @@ class Verdict(Document):
     """The answer: its kind, the effects that it claims, and why.
 
     `sentences` is a line each and `sentence` their join; the first tells `causes`, a clause each
-    in the order of `Diagnosis.credit`.
+    in the order of `Diagnosis.credit`. `parameters` are the model's own that it calls off, beside
+    effects or alone.
     """
 
     kind: str  # one of `Kind`
@@ -47,6 +48,7 @@ class Verdict(Document):
     sentence: str = ""
     causes: tuple[str, ...] = ()
     sentences: tuple[str, ...] = ()
+    parameters: tuple[str, ...] = ()
 
     @property
     def lines(self) -> tuple[str, ...]:

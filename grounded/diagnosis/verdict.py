@@ -77,7 +77,8 @@ def verdict(
         words.append(sentence([above]))
     words += once
     kind: Kind = "effect" if len(claimed) == 1 else "several"
-    return replace(_said(kind, *words), effects=tuple(r.effect for r in claimed), causes=causes)
+    effects, off = tuple(r.effect for r in claimed), tuple(_off(claims))
+    return replace(_said(kind, *words), effects=effects, causes=causes, parameters=off)
 
 
 def _said(kind: Kind, *words: str) -> Verdict:
@@ -99,11 +100,15 @@ def _causes(claims: Claims, ranking: Sequence[Ranked], credit: Sequence[Credit])
     return tuple(found)
 
 
+def _off(claims: Claims) -> list[str]:
+    """The parameters that have to differ, most important first."""
+    return [claims.data.model.param_names[one.index] for one in claims.moved]
+
+
 def _moved(claims: Claims) -> str:
     """`L should be 0.166 m (+11 %)` of the parameters that have to differ."""
     params, known = claims.data.model.params, claims.parameters()
-    named = [claims.data.model.param_names[one.index] for one in claims.moved]
-    texts = []
+    named, texts = _off(claims), []
     for name in named[:NAMED]:
         old = params[name].value
         change = 100 * (known[name].value - old) / abs(old) if old else 0.0

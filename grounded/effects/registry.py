@@ -246,6 +246,10 @@ class _Rates:
                 f"offset:{name}": one[:, kept],
                 f"rate_gain:{name}": (one * own)[:, kept],
             }
+        for pair in joint.pairs_of(model):  # an armature of a cart is the cart's mass
+            tau, _, w = pair.partition("<-")
+            by, rate = f_u[:, :, model.input_names.index(tau)], own[:, [model.state_names.index(w)]]
+            self.named[f"added_inertia:{pair}"] = (by * rate)[:, kept]
         inputs = {f"input_bias:{n}": f_u[:, kept, j] for j, n in enumerate(model.input_names)}
         params = {f"parameter:{n}": f_p[:, kept, k] for k, n in enumerate(model.param_names)}
         self.slopes = inputs | params

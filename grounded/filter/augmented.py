@@ -4,19 +4,20 @@ Coloured noise, c_{t+1} = phi c_t + eta, enters each step as white noise does, t
 
     A = [[F, G], [0, phi]]
 
-A delayed measurement shows the state of an earlier moment, and one more state remembers it:
+A late measurement shows the state of earlier moments, and one more state remembers them:
 
-    r_i(s) = (1 - p) e_i(s) + p e_i(s - 1) + v(s)         of a delayed channel i, 0 <= p < 1
+    r_i(s) = z_i(s) + v(s),   z_i(s) = a e_i(s) + b e_i(s - 1) + c z_i(s - 1),   a + b + c = 1
 
-Slot i of the widened state is what is measured, z_i(s) = (1 - p) e_i(s) + p e_i(s - 1); slot n + j
-is e_i(s) itself, as a channel that is never measured. So H stays the identity of what is seen, and
+of a channel i that is delayed by the part b of a step (c = 0), or filtered. Slot i of the widened
+state is what is measured, z_i; slot n + j is e_i(s) itself, as a channel that is never measured. So
+H stays the identity of what is seen, and
 
     e_i(s + 1) = (F e + d + G w)_i        into slot n + j
-    z_i(s + 1) = (1 - p) (F e + d + G w)_i + p e_i(s)        into slot i
+    z_i(s + 1) = a (F e + d + G w)_i + b e_i(s) + c z_i(s)        into slot i
 
 where F takes e_i from slot n + j. Noise enters by G of n + D rows. Coloured noise follows, as ever.
 
-Shapes: L steps, B runs, n channels, D delayed ones, n' = n + D, N' = n' or 2 n'.
+Shapes: L steps, B runs, n channels, D late ones, n' = n + D, N' = n' or 2 n'.
 """
 
 from __future__ import annotations
@@ -45,10 +46,10 @@ def coloured(F: Array, phi: float | None, G: Array | None = None) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Delayed:
-    """Late channels of every run: which (B, D) of int, and p (B, D)."""
+    """Late channels of every run: which (B, D) of int; a, b and c (B, D, 3)."""
 
     channel: Any
-    part: Array
+    weights: Array
 
     @property
     def count(self) -> int:
@@ -62,11 +63,12 @@ class Delayed:
         still = np.zeros((*of.seen.shape[:-1], D))
         seen, R = np.concatenate([of.seen, still], axis=-1), np.concatenate([of.R, still], axis=-1)
         seen[:1, :, n:] = np.take_along_axis(of.seen[:1], self.channel[None], axis=-1)
-        # the first measurement shows x(-p): since then a part of a step's noise has come
+        # the first measurement shows what was before: noise has come since, most of it lately
+        since_then = (1 - self.weights[..., 0]) ** 2 / (1 - self.weights[..., 2] ** 2)
         first, colour = of.start[:, :n], of.start[:, n:]
         power = of.Q[0, :, :n] + colour if colour.size else of.Q[0, :, :n]
         since = np.einsum("bdk,bk->bd", G[0, :, n:, :n] ** 2, power)
-        parts = [first, np.take_along_axis(first, self.channel, axis=-1) + self.part**2 * since]
+        parts = [first, np.take_along_axis(first, self.channel, axis=-1) + since_then * since]
         parts += [colour, np.zeros((len(colour), D))] if colour.size else []
         start = np.concatenate(parts, axis=-1)
         return LinearSystem(self._transition(of, G), self.noises(of.Q, n), R, seen, start, G)
@@ -89,18 +91,20 @@ class Delayed:
             A[:, run, :, self.channel[:, j]] = 0.0
         A[:, :, :wide, :wide] = self._led(A[:, :, :wide, :wide], n)
         for j in range(D):
-            A[:, run, self.channel[:, j], n + j] += self.part[:, j]
+            i = self.channel[:, j]
+            A[:, run, i, n + j] += self.weights[:, j, 1]
+            A[:, run, i, i] += self.weights[:, j, 2]
         if n < N:
             A[:, :, :wide, wide:] = G
             A[:, :, wide : wide + n, wide : wide + n] = of.A[:, :, n:, n:]
         return A
 
     def _led(self, rows: Array, n: int) -> Array:
-        """Rows of e (L, B, n', C), delayed channels led to slot n + j and, times 1 - p, to i."""
+        """Rows of e (L, B, n', C), late channels led to slot n + j and, times a, to i."""
         found, run = rows.copy(), np.arange(rows.shape[1])
         found[:, :, n:] = np.take_along_axis(rows, self.channel[None, :, :, None], 2)
         for j in range(self.count):
-            found[:, run, self.channel[:, j]] *= (1 - self.part[:, j])[:, None]
+            found[:, run, self.channel[:, j]] *= self.weights[:, j, :1]
         return found
 
     def columns(self, d: Array, r: Array) -> tuple[Array, Array]:
@@ -144,5 +148,5 @@ def joined(
     each = [delayed for _, delayed in parts if delayed is not None]
     if not each:
         return whole, None
-    channel, part = [delayed.channel for delayed in each], [delayed.part for delayed in each]
-    return whole, Delayed(np.concatenate(channel), np.concatenate(part))
+    channel, weights = ([getattr(one, k) for one in each] for k in ("channel", "weights"))
+    return whole, Delayed(np.concatenate(channel), np.concatenate(weights))

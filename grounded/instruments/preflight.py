@@ -5,7 +5,8 @@ kinematics    velocities against the rates of their positions, courses against h
 inputs        copies of one another, at their limits, constant within each trial
 
 What is certain from sensors alone is put right in the trials that the diagnosis then takes: a late
-signal is moved, a wrong sign or unit undone, samples that show nothing become missing ones. What
+signal is moved, a wrong sign or unit undone, samples that show nothing become missing ones; what a
+sensor filters, the diagnosis' own filter knows (`Preflight.filters`). What
 could be physics as well, a scale a few percent off, a slipping wheel, is stated and left alone.
 """
 
@@ -53,6 +54,11 @@ class Preflight:
     findings: tuple[Finding, ...]
     trials: tuple[Trial, ...]
     in_step: frozenset[str] = frozenset()  # states whose sensors were seen to show one moment
+
+    @property
+    def filters(self) -> dict[str, float]:
+        """Time constants of the sensors that filter, by state [s]."""
+        return {f.signal: f.delay_s for f in self.findings if f.corrected and f.kind == "lag"}
 
     @property
     def settled(self) -> frozenset[str]:
@@ -166,14 +172,14 @@ class _Bench:
         if lag.delay > 0:
             i, name, other = (relation.j, w, f"the derivative of {q}")
         text = f"{d:.3g} s later than {other}"
-        if lag.filtered:
-            text = f"follows {other} through a filter of {d:.3g} s"
         if i == relation.i and not relation.exact:  # a disturbed heading looks late as well
             yield Finding(name, text, "delay", d, lag.std)
-            return
-        self.put(i, [_earlier(x, d / self.dt) for x in self.column(i)])
-        kind, log = "lag" if lag.filtered else "delay", f"delay_s = {d:.3g}"
-        yield _mended(name, text, kind, log, delay_s=d, std_s=lag.std)
+        elif lag.filtered:  # the samples stay: moved, they would be too small wherever it is quick
+            text = f"follows {other} through a filter of {d:.3g} s"
+            yield _mended(name, text, "lag", "", delay_s=d, std_s=lag.std)
+        else:
+            self.put(i, [_earlier(x, d / self.dt) for x in self.column(i)])
+            yield _mended(name, text, "delay", f"delay_s = {d:.3g}", delay_s=d, std_s=lag.std)
 
     def plane(self) -> Iterator[Finding]:
         """Of a heading and a speed with the way that was travelled."""

@@ -150,3 +150,18 @@ def test_what_instruments_found_counts_as_the_sensor_that_it_is():
     for kind, first in (("lag", True), ("delay", False)):
         finding = {"kind": kind, "signal": "w", "corrected": True}
         assert judge(label, found | {"preflight": [finding]}, None)["first"] is first
+
+
+def test_parameters_that_the_sentence_calls_off_and_ties_count_for_both_of_a_double():
+    def both(named, ties=(), off=()):
+        label = {"effects": [{"effect": n, "params": {}} for n in ("delay:a", "parameter:L")]}
+        label |= {"case": "x", "kind": "double", "noise": "white", "system": "car"}
+        found = {"verdict": {"kind": "several", "effects": named, "parameters": off}}
+        found |= {"ranking": [], "indistinguishable": ties, "gap": {"after": 1.0}, "leftover": []}
+        marks = judge(label | {"param_error": 0.0}, found, None)
+        return marks["both"], marks["both_in_group"], marks["false_second"]
+
+    assert both(["delay:a"], off=["L"]) == (True, True, False)
+    assert both(["lag:a"], [["lag:a", "delay:a"]], ["L"]) == (False, True, False)
+    assert both(["lag:a"], [["lag:a", "delay:a"]]) == (False, False, False)
+    assert both(["delay:a"], off=["L", "m"]) == (True, True, True)

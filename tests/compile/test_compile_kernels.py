@@ -220,3 +220,15 @@ def test_a_hundred_states_are_interpreted_and_forty_run_in_a_thread():
     with running(Engine(2)):
         costs = each(lambda p: solve(replace(forty, p=p), u).cost, [forty.p] * 2)
     assert costs[0] == costs[1] == solve(forty, u).cost
+
+
+def test_steps_one_after_the_other_are_those_steps():
+    from grounded.models.pendulum import model
+
+    rng = np.random.default_rng(0)
+    x, u = rng.standard_normal((7, model.n)), rng.standard_normal((30, 7, model.m))
+    found = model.system.march(x, u, model.values, 0.02)
+    for t in range(30):
+        x = model.system.step(x, u[t], model.values, 0.02)
+        assert (found[t + 1] == x).all()
+    assert model.system.march(x, u[:0], model.values, 0.02).shape == (1, 7, model.n)

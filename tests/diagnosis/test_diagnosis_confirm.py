@@ -11,8 +11,9 @@ from grounded.diagnosis.report import Unconfirmed
 from grounded.diagnosis.unconfirmed import unconfirmed
 from grounded.diagnosis.validation.claims import Claims
 from grounded.diagnosis.validation.decide import causes, decide, shares
+from grounded.diagnosis.validation.gain import Gain
 from grounded.diagnosis.validation.limits import limits
-from grounded.diagnosis.validation.ruler import Gain, Ruler, folds
+from grounded.diagnosis.validation.ruler import Ruler, folds
 from grounded.diagnosis.verdict import verdict
 from grounded.effects import Library
 
@@ -224,3 +225,12 @@ def test_what_one_trial_shows_is_told_with_its_place_and_is_no_cause(rare, neede
     told = verdict(claims, (), (), (), (), (), found)
     assert told.effects == () and one.meaning in told.lines[-1] and "t3" in told.lines[-1]
     assert Unconfirmed.from_json(one.to_json()) == one
+
+
+def test_trials_that_each_gain_outweigh_one_that_rules_the_sums():
+    def gain(own):
+        return Gain(0.2, 0.25, 0.5, np.zeros(2), np.ones(2), own=np.array(own))
+
+    assert gain([0.3, 0.2, 0.4, 0.3, 0.2]).pays(2.0, 0.01)
+    assert not gain([1.5, 0.0, -0.1, 0.1, 0.0]).pays(2.0, 0.01)
+    assert gain([0.3]).chance == gain([0.0, 0.0, 0.0]).chance == 1.0

@@ -1,4 +1,4 @@
-"""A late measurement: the filter's likelihood is the exact one, the log comes back as it was."""
+"""A late or filtered sensor: the filter's likelihood is the exact one, the log comes back."""
 
 import numpy as np
 import pytest
@@ -18,22 +18,25 @@ from grounded.models.pendulum import model as pendulum
 from grounded.trial import Trial
 
 L, B, n = 12, 2, 3
-# late channels of each run, p of each, colour, noise through G, missing samples
+# late channels of each run, p of each (or a, b, c), colour, noise through G, missing samples
 CASES = [
     ([[1], [1]], [[0.0], [0.0]], None, False, False),
     ([[1], [1]], [[0.4], [0.4]], None, True, False),
     ([[0], [2]], [[0.4], [0.9]], 0.8, False, True),
     ([[0, 2], [0, 1]], [[0.0, 0.7], [0.4, 0.4]], 0.9, True, True),
     ([[2, 1], [2, 1]], [[0.5, 0.2], [0.1, 0.3]], None, True, True),
+    ([[1], [1]], [[(0.2, 0.1, 0.7)], [(0.4, 0.3, 0.3)]], None, True, False),
+    ([[0, 2], [0, 1]], [[(0.7, 0.3, 0.0), (0.2, 0.1, 0.7)]] * 2, 0.9, True, True),
 ]
 
 
 class Problem:
-    """A random linear system whose measurements of some channels are late by part of a step."""
+    """A random linear system, measurements of some channels late by part of a step, or filtered."""
 
     def __init__(self, channel, part, phi, through, missing, steps=L):
         rng = np.random.default_rng(n)
-        self.L, self.phi, self.late = steps, phi, Delayed(np.array(channel), np.array(part))
+        weights = [[w if isinstance(w, tuple) else (1 - w, w, 0.0) for w in run] for run in part]
+        self.L, self.phi, self.late = steps, phi, Delayed(np.array(channel), np.array(weights))
         self.F = 0.9 * np.eye(n) + 0.1 * rng.standard_normal((steps, B, n, n))
         self.G = None
         if through:
@@ -67,17 +70,19 @@ class Problem:
         G = np.tile(np.eye(n), (self.L, 1, 1)) if self.G is None else self.G[:, b]
         power = self.q[:n] + (self.start[b] if n < self.N else 0.0)
         first = self.first[b].copy()
-        late = dict(zip(self.late.channel[b], self.late.part[b], strict=True))
-        for i, p in late.items():
-            first[i] += p**2 * float(G[0][i] ** 2 @ power)
-        variances = [*first, *self.start[b], *np.tile(self.q, self.L)]
+        late = dict(zip(self.late.channel[b], self.late.weights[b], strict=True))
+        for i, (now, _, kept) in late.items():
+            first[i] += (1 - now) ** 2 / (1 - kept**2) * float(G[0][i] ** 2 @ power)
+        variances = [*first, *self.start[b], *np.tile(self.q, self.L), *self.first[b]]
         sources = len(variances)
+        shown = np.eye(n, sources, sources - n)  # what was shown at first is known by itself
         e = np.zeros((n, sources))
         e[:, :n] = np.eye(n)
         c = np.zeros((n, sources))
         if n < self.N:
             c[:, n : 2 * n] = np.eye(n)
         mean, at = self.r[0, b, :, 0] * self.seen[0, b], self.N
+        mean_shown = mean.copy()
         rows, missed, noise = [], [], []
         for t in range(self.L):
             before, mean_before = e, mean
@@ -90,10 +95,12 @@ class Problem:
                 c[:, at + n : at + 2 * n] += np.eye(n)
             at += self.N
             for i in range(n):
+                w = late.get(i, (1.0, 0.0, 0.0))
+                shown[i] = w @ np.array([e[i], before[i], shown[i]])
+                mean_shown[i] = w @ np.array([mean[i], mean_before[i], mean_shown[i]])
                 if self.seen[t + 1, b, i]:
-                    p = late.get(i, 0.0)
-                    rows.append((1 - p) * e[i] + p * before[i])
-                    missed.append(self.r[t + 1, b, i, 0] - (1 - p) * mean[i] - p * mean_before[i])
+                    rows.append(shown[i].copy())
+                    missed.append(self.r[t + 1, b, i, 0] - mean_shown[i])
                     noise.append(self.v[i])
         H, nu = np.array(rows), np.array(missed)
         S = (H * np.array(variances)) @ H.T + np.diag(noise)
@@ -212,7 +219,24 @@ def test_samples_of_what_was_before_a_trial_count_like_those_of_a_state_that_dri
     )
 
 
-def test_a_delay_is_found_where_the_state_is_disturbed_and_predictions_reach_the_noise():
+def delayed(x, steps):
+    at = np.maximum(np.arange(len(x)) - steps, 0.0)
+    return np.interp(at, np.arange(len(x)), x)
+
+
+def filtered(x, steps):
+    """A first-order filter of what goes straight from sample to sample, in a hundred parts each."""
+    fine = np.interp(np.arange(100 * len(x)) / 100, np.arange(len(x)), x)
+    for k in range(1, len(fine)):
+        fine[k] = fine[k - 1] + (fine[k] - fine[k - 1]) * (1 - np.exp(-0.01 / steps))
+    return fine[::100]
+
+
+@pytest.mark.parametrize(
+    ("sensor", "shown", "start"),
+    [("sensor_delay", delayed, {"d": 0.03}), ("sensor_lag", filtered, {"tau": 0.03})],
+)
+def test_a_late_sensor_is_found_where_the_state_is_disturbed(sensor, shown, start):
     rng, dt, late = np.random.default_rng(3), 0.02, 2.4
     trials = []
     for _ in range(4):
@@ -222,19 +246,20 @@ def test_a_delay_is_found_where_the_state_is_disturbed_and_predictions_reach_the
         for t in range(T):
             after = pendulum.system.step(x[-1][None], u[t][None], pendulum.values, dt)[0]
             x.append(after + [0.0, 0.03] * rng.standard_normal(2))
-        log, at = np.array(x), np.maximum(np.arange(T + 1) - late, 0.0)
-        log[:, 1] = np.interp(at, np.arange(T + 1), log[:, 1])
+        log = np.array(x)
+        log[:, 1] = shown(log[:, 1], late)
         log += [0.002, 0.01] * rng.standard_normal(log.shape)
         trials.append(Trial(log, u, dt, pendulum.state_names, pendulum.input_names))
     data = prepare(pendulum, trials)
     search, found = HypothesisSearch(data, ()), {}
     (null,) = search.refined([search.fresh(Hypothesis())], 20)
-    for name, values in (("sensor_delay", {"d": 0.03}), ("viscous_friction", {"k": 0.1})):
+    for name, values in ((sensor, start), ("viscous_friction", {"k": 0.1})):
         effect = Library().effect(f"{name}:omega", pendulum, data.scales)
         h = null.hypothesis.plus(effect, values)
-        (found[name],) = search.refined([(h, null.noise, null.track)], 25)
-    fit = found["sensor_delay"]
-    assert fit.hypothesis.values[0]["d"] == pytest.approx(late * dt, abs=0.05 * dt)
+        starts = [(h, null.noise, null.track), search.fresh(h)]
+        found[name] = max(search.refined(starts, 25), key=search.score)
+    fit = found[sensor]
+    assert fit.hypothesis.theta == pytest.approx([late * dt], abs=0.05 * dt)
     assert fit.loglik > max(null.loglik, found["viscous_friction"].loglik) + 300
     assert np.exp(0.5 * fit.noise.log_q[1]) == pytest.approx(0.03, rel=0.1)
     where = horizon(search.predictor, fit, 0.5)

@@ -138,6 +138,24 @@ class CompiledSystem(TracedSystem):
         self._batch(library["step"], (x, u, p, dt, smoothing), {"out": out})
         return out
 
+    def march(self, x: Array, u: Array, p: Array, dt: float) -> Array:
+        """Steps one after the other: x (N, n), u (T, N, m) -> states (T + 1, N, n)."""
+        steps, u, p = len(u), plain(u), plain(p)
+        z = np.empty((steps + 1, *x.shape))
+        z[0] = x
+        at = {"x": address(z), "u": word(u), "p": word(p), "out": address(z[1:]) if steps else 0}
+        at |= {"dt": word(float(dt)), "eps": word(0.0), "N": len(x)}
+        words = (ctypes.c_int64 * len(BATCH))(*[at.get(name, 0) for name in BATCH])
+        kernel, per = self._compiled(p, dt).batch()["step"], 8 * len(x)
+        each = [
+            (BATCH.index(k), per * w) for k, w in (("x", self.n), ("out", self.n), ("u", self.m))
+        ]
+        for _ in range(steps if len(x) else 0):
+            run(kernel, words)
+            for i, size in each:
+                words[i] += size
+        return z
+
     def linearise(
         self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
     ) -> tuple[Array, Array]:

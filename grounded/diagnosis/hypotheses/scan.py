@@ -23,12 +23,11 @@ from typing import Any
 import numpy as np
 
 from grounded.compile import Named
-from grounded.compile.run.differenced import DifferencedSystem
 from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.linearise import base_columns, filter_system, sensitivities_of
 from grounded.diagnosis.likelihood.predictor import Predictor, sensor_offset
+from grounded.diagnosis.likelihood.tangent import tangent
 from grounded.effects import (
     Effect,
     InputFamily,
@@ -188,22 +187,23 @@ class _Context(SentOnce):
         return self.predictor.named(start), self.predictor.named(end)
 
     @cached_property
-    def stepping(self) -> Predictor:
-        """What makes a step with a candidate: a black box is asked for its slopes once."""
-        if isinstance(self.predictor.data.model.system, DifferencedSystem):
-            return _by_input(self.predictor, self.fit.hypothesis, self.x, self.u)
-        return self.predictor
+    def stepping(self) -> tuple[Predictor, Array]:
+        """What makes a step with a candidate, and what it makes without: slopes of a simulator."""
+        near = tangent(self.predictor, h := self.fit.hypothesis, self.x, self.u)
+        if near is self.predictor:
+            return near, self.after
+        return near, near.advance(h, self.x, self.u, self.predictor.data.time)
 
     def _step(self, i: int, point: int, effect: Effect, grid: dict[str, float]) -> list[_Column]:
         """The whole step again, with the candidate in it."""
-        data, predictor = self.predictor.data, self.stepping
+        data, (predictor, base) = self.predictor.data, self.stepping
         found = []
         for name, amount, values in self._tried(effect, grid):
             h = self.fit.hypothesis.plus(effect, values)
             acts = isinstance(effect.family, InputFamily | MemoryFamily)
             received = data.runs(predictor.received(h)) if acts else self.u
             after = predictor.advance(h, self.x, received, data.time)
-            d = data.model.difference(after, self.after) / amount
+            d = data.model.difference(after, base) / amount
             found.append(_Column(i, point, name, d, _EMPTY))
         return found
 
@@ -285,34 +285,6 @@ class _Context(SentOnce):
             return Look(effect, {}, 0.0)
         looks.sort(key=lambda look: -look[0])
         return Look(effect, looks[0][1], looks[0][0], elsewhere(effect, looks))
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _ByInput(Predictor):
-    """A predictor whose model is of first order in its inputs, at the steps of one track.
-
-    A simulator makes a step in microseconds where a compiled model needs nanoseconds, and a scan
-    takes thousands of them along the same track, with other inputs each.
-    """
-
-    x: Array
-    u: Array
-    p: Array
-    after: Array
-    f_u: Array
-
-    def step(self, x: Array, u: Array, p: Array, dt: float | None = None) -> Array:
-        """The model's own step, by slopes where it is one of the track's."""
-        if x is not self.x or dt is not None or not np.array_equal(p, self.p):
-            return super().step(x, u, p, dt)
-        return np.asarray(self.after + (self.f_u @ (u - self.u)[..., None])[..., 0])
-
-
-def _by_input(predictor: Predictor, h: Hypothesis, x: Array, u: Array) -> _ByInput:
-    left, p = predictor.left(h, x, u), predictor.params(h)
-    _, f_u = predictor.slopes(x, left, p)
-    after = predictor.step(x, left, p)
-    return _ByInput(predictor.data, predictor._inputs, x=x, u=left, p=p, after=after, f_u=f_u)
 
 
 def inside(effect: Effect, names: Sequence[str], value: Array) -> Array:

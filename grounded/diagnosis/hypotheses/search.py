@@ -19,7 +19,8 @@ from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.noise import NoiseModel, Structure, noise_guess
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.refine import refine
-from grounded.effects import Effect, ParamFamily
+from grounded.diagnosis.likelihood.simulated import simulated
+from grounded.effects import Effect, ParamFamily, SensorLagFamily
 from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import Array
 
@@ -33,7 +34,7 @@ FIRST, COARSE, LAST = 3.0, 1.4, 1.05  # factors by which a constant is moved
 ROUNDS = 12
 LARGE_GAIN = 50.0  # nats from which a hypothesis is also started by itself
 TO_THE_TOP = 25  # iterations of fits that decide: most need fewer, and stop by themselves
-LARGE = 8  # states, above which one correlation time and half the shortlist have to do
+LARGE = 8  # states; above, or of a simulator, one correlation time and half the shortlist do
 
 
 class HypothesisSearch(FittedHypotheses):
@@ -47,7 +48,7 @@ class HypothesisSearch(FittedHypotheses):
     ) -> None:
         super().__init__(data, candidates)
         self.tick = tick or (lambda what: None)
-        large = data.model.n > LARGE
+        large = data.model.n > LARGE or simulated(data.model)
         taus = TAUS[1:2] if large else TAUS
         self.taus = [tau for tau in taus if tau > 0.7 * data.dt]
         self.taus = self.taus or [k * data.dt for k in SLOW[: len(taus)]]
@@ -231,6 +232,12 @@ class HypothesisSearch(FittedHypotheses):
                 (h.plus(look.effect, values), fit.noise, fit.track)
                 for values in (look.values, *look.others)
             ]
+            if isinstance(look.effect.family, SensorLagFamily):
+                # what passes a filter is far quicker than what it shows: so is its noise
+                late, noise, track = self.fresh(h.plus(look.effect, look.values))
+                noise = noise.allowing(fit.noise.structure, self.data.dt)
+                weights = {"weight_w": fit.noise.weight_w, "weight_v": fit.noise.weight_v}
+                starts.append((late, replace(noise, **weights), track))
         return self.refined(starts, iterations, rivals=True)[1:]
 
     def without(self, fit: Fitted, name: str) -> Fitted:

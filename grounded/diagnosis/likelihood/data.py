@@ -11,8 +11,8 @@ the other: states (sum T + S, n), steps (sum T, ...).
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -49,6 +49,7 @@ class Data:
     skipped: int  # runs left out because there are too many
     ids: tuple[str, ...]
     hidden: tuple[int, ...] = ()  # states that no sensor has: only their start is known
+    filters: Mapping[int, float] = field(default_factory=dict)  # sensors' time constants [s]
 
     @property
     def count(self) -> int:

@@ -1,13 +1,20 @@
-"""A sensor's delay: which sample of the log shows which state.
+"""A late sensor, delayed or filtered: which sample of the log shows which state.
 
     y_i(t) = x_i(t - d),   d = (k + p) dt
     y_i(s + k) = (1 - p) x_i(s) + p x_i(s - 1)
 
 So under a hypothesis with a delay the log of its channel is moved by k steps, and the filter takes
-care of p (`grounded.filter.augmented`). The first k samples of a trial show what was before it,
-which no model predicts. All hypotheses are judged by the same data, so they count too (`before`):
-as samples of a state that drifted into the trial at rest, or at the pace of its beginning,
-whichever is likelier.
+care of p (`grounded.filter.augmented`). What a sensor filters, tau y' = x - y, is kept by as much
+as it is old, with x a straight line from sample to sample:
+
+    y_i(s) = (1 - m) x_i(s) + (m - c) x_i(s - 1) + c y_i(s - 1)
+                                                    c = exp(-dt / tau),   m = (1 - c) tau / dt
+
+Both act on the process noise too: taken for the present state less an offset, a late sample would
+contradict every disturbance, and its delay would go to whatever slows the motion. The first k
+samples of a trial show what was before it, which no model predicts. All hypotheses are judged by
+the same data, so they count too (`before`): as samples of a state that drifted into the trial at
+rest, or at the pace of its beginning, whichever is likelier.
 
 Noise (its weights) and adjoints belong to samples: outside the filter they stay in the log's order.
 """
@@ -23,41 +30,60 @@ import numpy as np
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.noise import NoiseModel
-from grounded.effects import SensorDelayFamily
+from grounded.effects import SensorDelayFamily, SensorLagFamily
+from grounded.effects.sensor import lagging
 from grounded.filter.augmented import Delayed
 from grounded.filter.kalman import Adjoint
 from grounded.frozen import Array
 
 UNKNOWN = 1e6  # variances: how little is known of a state that was not measured at first
+SETTLED = 3.0  # time constants after which a filtered sensor has forgotten where it began
 UNLIKE = 1.0  # nats that a sample of what was before a trial costs at most more than others
 
 
 @dataclass(frozen=True, eq=False)
 class Delays:
-    """The delayed channels of a hypothesis, D of them: which, k and p of each."""
+    """The late channels of a hypothesis, D of them: which, k, p and tau / dt of each."""
 
     data: Data
     channel: tuple[int, ...]
     whole: tuple[int, ...]
     part: Array  # (D,)
+    tau: Array  # (D,) 0: not filtered
+
+    @property
+    def weights(self) -> Array:
+        """Of the state, of that a step before, of what was shown then, (D, 3)."""
+        kept = np.exp(-1 / np.maximum(self.tau, 1e-9))
+        mean, p = self.tau * (1 - kept), self.part
+        return np.stack([(1 - p) * (1 - mean), p * (1 - mean) + mean - kept, kept], axis=-1)
+
+    @property
+    def oldest(self) -> int:
+        """How many steps before a moment its sample may still show."""
+        return int(max(self.whole + np.ceil(SETTLED * self.tau))) + 1
 
     def in_filter(self) -> Delayed:
         """For the filter, every run the same."""
         B = len(self.data.valid)
-        return Delayed(np.tile(self.channel, (B, 1)), np.tile(self.part, (B, 1)))
+        return Delayed(np.tile(self.channel, (B, 1)), np.tile(self.weights, (B, 1, 1)))
 
     def moved(self, h: Hypothesis) -> Delays:
         """With the delays of another hypothesis but the samples of this one: p may leave 0 .. 1."""
-        steps = [d / self.data.dt for _, d in _named(h, self.data)]
-        return replace(self, part=np.array(steps) - np.array(self.whole))
+        steps = np.array(list(_named(h, self.data).values()))
+        return replace(self, part=steps[:, 0] - np.array(self.whole), tau=steps[:, 1])
 
     def shown(self, now: Array, track: Array) -> Array:
-        """(1 - p) now + p before, (L + 1, B, n): before each state comes that of the track."""
+        """What sensors show of states `now` (L + 1, B, n) that followed those of the track."""
         found = now.copy()
-        for i, p in zip(self.channel, self.part, strict=True):
-            first = 2 * track[:1, :, i] - track[1:2, :, i]  # as if it came so
-            before = np.concatenate([first, track[:-1, :, i]])
-            found[..., i] = (1 - p) * now[..., i] + p * before
+        for i, tau, (a, b, c) in zip(self.channel, self.tau, self.weights, strict=True):
+            own = track[..., i]
+            before = np.concatenate([2 * own[:1] - own[1:2], own[:-1]])  # as if it came so
+            found[..., i] = a * now[..., i] + b * before
+            if c > 0:
+                shown = own + behind(own, tau, self.first)
+                found[0, :, i] = shown[0]
+                found[1:, :, i] += c * shown[:-1]
         return found
 
     def samples(self) -> tuple[Array, Array]:
@@ -114,7 +140,8 @@ class Delays:
         power = noise.process(self.data.dt)[..., :n] + (np.exp(noise.log_c) if colour else 0.0)
         power, total = np.broadcast_to(power, (L, B, n)), 0.0
         for i, k in zip(self.channel, self.whole, strict=True):
-            k = min(k, L)
+            if (k := min(k, L)) == 0:
+                continue
             through = np.eye(n)[i] if entry is None else entry[:k, :, i]
             drift = (through**2 * power[:k]).sum(axis=-1)
             pace = (track[k] - track[0])[:, i] / max(k, 1)
@@ -182,16 +209,32 @@ def delays_of(h: Hypothesis, data: Data) -> Delays | None:
     named = _named(h, data)
     if not named:
         return None
-    steps = np.array([d / data.dt for _, d in named])
+    steps, tau = np.array(list(named.values())).T
     whole = np.floor(steps + 1e-9)
     part = np.maximum(steps - whole, 0.0)
-    return Delays(data, tuple(i for i, _ in named), tuple(int(k) for k in whole), part)
+    return Delays(data, tuple(named), tuple(int(k) for k in whole), part, tau)
 
 
-def _named(h: Hypothesis, data: Data) -> list[tuple[int, float]]:
-    """Channels and delays [s]."""
-    return [
-        (data.model.state_names.index(effect.site.target), float(values["d"]))
-        for effect, values in h.pairs
-        if isinstance(effect.family, SensorDelayFamily)
-    ]
+def _named(h: Hypothesis, data: Data) -> dict[int, list[float]]:
+    """By late channel its delay and its time constant, in steps; the instruments' filters first."""
+    found = {i: [0.0, tau / data.dt] for i, tau in data.filters.items()}
+    for effect, values in h.pairs:
+        if isinstance(effect.family, SensorDelayFamily | SensorLagFamily):
+            steps = found.setdefault(data.model.state_names.index(effect.site.target), [0.0, 0.0])
+            late = isinstance(effect.family, SensorDelayFamily)
+            steps[0 if late else 1] = float(values["d" if late else "tau"]) / data.dt
+    return found
+
+
+def behind(track: Array, tau: float, settled: Any = ()) -> Array:
+    """How far a filtered sensor is off along a track (L + 1, B), tau in steps.
+
+    A run that goes on moved before as it does in its first two time constants; in those that begin
+    a trial, `settled`, the sensor has settled.
+    """
+    count = int(np.clip(np.ceil(2 * tau), 1, len(track) - 1))
+    off = [-(track[count] - track[0]) / count * tau]
+    off[0][list(settled)] = 0.0
+    for step in np.diff(track, axis=0):
+        off.append(lagging(off[-1], step, tau, 1.0))
+    return np.array(off)

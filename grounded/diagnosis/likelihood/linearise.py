@@ -38,6 +38,8 @@ from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.noise import NoiseModel
 from grounded.diagnosis.likelihood.predictor import Predictor, limits_of, rates_of
+from grounded.diagnosis.likelihood.simulated import simulated
+from grounded.diagnosis.likelihood.tangent import tangent
 from grounded.effects import ParamFamily
 from grounded.filter import kalman
 from grounded.filter.augmented import Delayed, coloured
@@ -61,15 +63,17 @@ def linearise(predictor: Predictor, h: Hypothesis, track: Array) -> tuple[Array,
     offset = predictor.standing(h, shown)
     columns_d = [model.difference(after, track[1:])]
     columns_r = [model.difference(y - here, np.asarray(offset))]
-    theta = h.theta
+    F, of_shifts = _sensitivities(predictor, h, x, u)
+    theta, near = h.theta, tangent(predictor, h, x, u) if h.effects else predictor
+    base = after if near is predictor else near.advance(h, x, u, data.time)
     for j, sizes in enumerate(_tried(h)):
         by_d, by_r = np.zeros_like(after), np.zeros_like(track)
         for size in sizes:
             other, moved = _nudged(h, theta, j, size)
             if moved == 0:
                 continue
-            ahead_too = predictor.advance(other, x, predictor.inputs(other), data.time)
-            by_d = model.difference(ahead_too, after) / moved
+            nudged = near.advance(other, x, near.inputs(other), data.time)
+            by_d = model.difference(nudged, base) / moved
             other_shown = shown if delays is None else delays.moved(other).shown(ahead, track)
             shifted = predictor.standing(other, other_shown)
             by_r = (shown - other_shown + offset - shifted) / moved
@@ -77,7 +81,6 @@ def linearise(predictor: Predictor, h: Hypothesis, track: Array) -> tuple[Array,
                 break
         columns_d.append(by_d)
         columns_r.append(by_r)
-    F, of_shifts = _sensitivities(predictor, h, x, u)
     more = np.zeros((*track.shape, of_shifts.shape[-1]))
     d = np.concatenate([np.stack(columns_d, axis=-1), of_shifts], axis=-1)
     return F, d, np.concatenate([np.stack(columns_r, axis=-1), more], axis=-1)
@@ -97,8 +100,12 @@ def sensitivities_of(
 ) -> tuple[Array, Array]:
     """Of a hypothesis' steps from x (L, B, n): F (L, B, n, n), slope in all parameters (..., k)."""
     data = predictor.data
-    flat = predictor.flat(x, predictor.left(h, x, u))
-    slopes = sensitivities(data.model, *flat, predictor.params(h), data.dt)
+    flat, p = predictor.flat(x, predictor.left(h, x, u)), predictor.params(h)
+
+    def take(x: Array, u: Array) -> tuple[Array, ...]:
+        return sensitivities(data.model, x, u, p, data.dt)
+
+    slopes = predictor.taken.at(take, *flat, p, True) if simulated(data.model) else take(*flat)
     f_x, f_u, f_p = (f.reshape(*x.shape, f.shape[-1]) for f in slopes)
     by_x, by_p = predictor.loss_slopes(h, x, u, f_x, f_p)
     F = with_effects(predictor, h, x, u, f_x - f_u @ by_x)

@@ -11,16 +11,18 @@ The very equations that `grounded.effects.wrap` adopts, evaluated on arrays.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from hashlib import blake2b
 from typing import Any
 
 import numpy as np
 
 from grounded.compile import Named
-from grounded.compile.run.differenced import DifferencedSystem
 from grounded.diagnosis.likelihood.data import Data, shifted
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.likelihood.delays import behind
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
+from grounded.diagnosis.likelihood.simulated import Slopes, simulated
 from grounded.effects import (
     Effect,
     InputFamily,
@@ -36,7 +38,6 @@ from grounded.effects import (
 from grounded.effects.family import braked, coupled
 from grounded.effects.joint import Loads, loads, solved
 from grounded.effects.registry import partner
-from grounded.effects.sensor import lagging
 from grounded.engine import SentOnce
 from grounded.frozen import Array
 
@@ -51,6 +52,21 @@ class Predictor(SentOnce):
     data: Data
     _inputs: dict[Any, Array] = field(default_factory=dict)
     _steps: dict[bytes, Array] = field(default_factory=dict)
+    _taken: Slopes | None = None
+
+    @cached_property
+    def taken(self) -> Slopes:
+        """The slopes of a simulator that were taken."""
+        model, scales = self.data.model, self.data.scales
+        spreads = np.array([scales.spread(n) for n in model.state_names])
+        peaks = np.array([scales.peak(n) for n in model.input_names])
+        return self._taken or Slopes((spreads, peaks, np.abs(model.values) + param_scale(model)))
+
+    def following(self) -> Predictor:
+        """One that keeps to the track of one hypothesis, where the model is a simulator."""
+        if not simulated(self.data.model):
+            return self
+        return replace(self, _taken=self.taken.following())
 
     def inputs(self, h: Hypothesis) -> Array:
         """What the actuators receive under a hypothesis, by run (L, B, m)."""
@@ -98,7 +114,7 @@ class Predictor(SentOnce):
     def step(self, x: Array, u: Array, p: Array, dt: float | None = None) -> Array:
         """The model's own step at any leading shape."""
         rows, system = self.flat(x, u), self.data.model.system
-        if not isinstance(system, DifferencedSystem):
+        if not simulated(self.data.model):
             return system.step(*rows, p, dt or self.data.dt).reshape(x.shape)
         parts = (*rows, p, np.array(dt or self.data.dt))  # a simulator is slow: losses ask again
         key = blake2b(b"".join(part.tobytes() for part in parts)).digest()
@@ -110,7 +126,15 @@ class Predictor(SentOnce):
 
     def slopes(self, x: Array, u: Array, p: Array, dt: float | None = None) -> tuple[Array, Array]:
         """Slopes of the model's own step at any leading shape: f_x (..., n, n), f_u (..., n, m)."""
-        found = self.data.model.system.linearise(*self.flat(x, u), p, dt or self.data.dt)
+        system = self.data.model.system
+
+        def take(x: Array, u: Array) -> tuple[Array, ...]:
+            return system.linearise(x, u, p, dt or self.data.dt)
+
+        if dt is None and simulated(self.data.model):
+            found = self.taken.at(take, *self.flat(x, u), p, False)
+        else:
+            found = take(*self.flat(x, u))
         f_x, f_u = (f.reshape(*x.shape, f.shape[-1]) for f in found)
         return f_x, f_u
 
@@ -150,6 +174,16 @@ class Predictor(SentOnce):
             return lambda x, u, t: self.advance(h, x, u, t)
         step, p, dt = self.data.model.system.step, self.params(h), self.data.dt
         return lambda x, u, t: step(x, u, p, dt)
+
+    def marched(self, h: Hypothesis, x: Array, u: Array) -> Array | None:
+        """States (T + 1, M, n) from x (M, n) through u (T, M, m), of the model's steps alone.
+
+        None where a hypothesis adds to them, or the model is not compiled.
+        """
+        march = getattr(self.data.model.system, "march", None)
+        if march is None or rates_of(h) or limits_of(h) or losses_of(h):
+            return None
+        return np.asarray(march(x, u, self.params(h), self.data.dt))
 
     def moved(self, h: Hypothesis, x: Array, u: Array, dt: float | None = None) -> Array:
         """The model's step with what its motion takes off the inputs, without further rates."""
@@ -258,17 +292,19 @@ class Predictor(SentOnce):
     def offset(self, h: Hypothesis, track: Array) -> Array | float:
         """The log minus the state along a track (L + 1, B, n); 0.0 where sensors are right."""
         names, dt, old = self.data.model.state_names, self.data.dt, track
+        for i, tau in self.data.filters.items():
+            old = old.copy()
+            old[..., i] += behind(old[..., i], tau / dt)
         for effect, values in h.pairs:
-            if isinstance(effect.family, SensorDelayFamily):
+            if isinstance(effect.family, SensorDelayFamily | SensorLagFamily):
                 i, old = names.index(effect.site.target), old.copy()
-                old[..., i] += sensor_offset(effect, values, track[..., i], dt)
+                old[..., i] += sensor_offset(effect, values, old[..., i], dt)
         standing = self.standing(h, old)
         return standing if old is track else standing + old - track
 
     def standing(self, h: Hypothesis, shown: Array) -> Array | float:
         """What sensors add to what they are shown (..., n), however old it is; 0.0 if nothing."""
-        kinds = SensorFamily | SensorLagFamily
-        sensors = [(e, v) for e, v in h.pairs if isinstance(e.family, kinds)]
+        sensors = [(e, v) for e, v in h.pairs if isinstance(e.family, SensorFamily)]
         if not sensors:
             return 0.0
         names, total = self.data.model.state_names, np.zeros_like(shown)
@@ -298,7 +334,7 @@ def sensor_offset(effect: Effect, values: Mapping[str, float], track: Array, dt:
     if isinstance(effect.family, SensorFamily):
         return np.asarray(effect.family.measure(track, values) - track)
     if isinstance(effect.family, SensorLagFamily):
-        return _behind(track, values["tau"], dt)
+        return behind(track, values["tau"] / dt)
     steps = values["d"] / dt
     slope = np.vstack([track[1:2] - track[:1], np.diff(track, axis=0)])
     whole, part = int(np.floor(steps)), steps - np.floor(steps)
@@ -307,15 +343,6 @@ def sensor_offset(effect: Effect, values: Mapping[str, float], track: Array, dt:
     count = len(track)
     old = (1 - part) * line[1 : count + 1] + part * line[:count]
     return np.asarray(old - track)
-
-
-def _behind(track: Array, tau: float, dt: float) -> Array:
-    """How far a filtered sensor is off along a track (L + 1, B) that moved before as it begins."""
-    moved = np.diff(track, axis=0)
-    off = [-moved[0] * tau / dt]
-    for step in moved:
-        off.append(lagging(off[-1], step, tau, dt))
-    return np.array(off)
 
 
 def transformed(effect: Effect, values: Mapping[str, float], u: Array, data: Data) -> Array:

@@ -41,7 +41,7 @@ from grounded.diagnosis.likelihood.noise import (
 )
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.step import ProposedStep, inside, proposed
-from grounded.effects import SensorDelayFamily
+from grounded.effects import SensorDelayFamily, SensorLagFamily
 from grounded.engine import each
 from grounded.filter import kalman
 from grounded.filter.augmented import Delayed, joined
@@ -52,6 +52,7 @@ MOST_NUMBERS = 1e5  # of one (L, B, N, N) array: what fits in the cache goes fas
 SHORTEST = 0.05  # part of a step that is still tried
 HALVED = 4  # iterations after which only the better half of rivals goes on
 CLOSE = 10.0  # nats behind the best within which all go on
+LATE = SensorDelayFamily | SensorLagFamily
 LITTLE = 0.05  # nats that a step must promise to be tried in part where it fails
 
 
@@ -67,6 +68,7 @@ class Work:
     part: float = 1.0  # of the step that is taken
     still: bool = False  # it no longer rises
     moving: bool = True  # the track too: where the model has kinks that may not help
+    along: Predictor | None = None  # of its own track, while it climbs
 
     def shorten(self, data: Data) -> None:
         """The same step about the track as it was; then parts of it; then the end."""
@@ -149,11 +151,11 @@ def _after(
 def _climb(predictor: Predictor, works: list[Work], how: tuple[int, bool]) -> list[Work]:
     """Refines hypotheses of one shape, side by side."""
     iterations, fixed_noise = how
-    works = [replace(work) for work in works]
+    works = [replace(work, along=predictor.following()) for work in works]
     for _ in range(iterations):
         if moving := [work for work in works if not work.still]:
             _iterate(predictor, moving, fixed_noise)
-    return works
+    return [replace(work, along=None) for work in works]
 
 
 def _halve(works: list[Work], worth: Callable[[Fitted], float]) -> None:
@@ -172,8 +174,8 @@ def _of_one_shape(works: list[Work]) -> list[list[int]]:
     for i, work in enumerate(works):
         if work.still:
             continue
-        count = sum(isinstance(e.family, SensorDelayFamily) for e in work.h.effects)
-        groups.setdefault(count, []).append(i)
+        late = {e.site.target for e in work.h.effects if isinstance(e.family, LATE)}
+        groups.setdefault(len(late), []).append(i)
     return [groups[count] for count in sorted(groups)]
 
 
@@ -181,7 +183,7 @@ def _iterate(predictor: Predictor, works: list[Work], fixed_noise: bool) -> None
     data = predictor.data
     B = data.time.shape[1]
     late = [delays_of(work.h, data) for work in works]
-    parts = [linearise(predictor, work.h, work.track) for work in works]
+    parts = [linearise(work.along or predictor, work.h, work.track) for work in works]
     width = kalman.whole(max(part[1].shape[-1] for part in parts), data.model.n)
     d, r = (_side_by_side([part[k] for part in parts], width) for k in (1, 2))
     systems = [

@@ -16,8 +16,9 @@ from grounded.diagnosis.error_report import ABOVE, Credit, Remainder, RulerRow, 
 from grounded.diagnosis.hypotheses.leftover import Leftover, leftovers
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.validation.decide import Decision, ordered, plain, shares
+from grounded.diagnosis.validation.gain import Errors
 from grounded.diagnosis.validation.prediction_error import by_region, horizon
-from grounded.diagnosis.validation.ruler import Errors, Ruler, repeated
+from grounded.diagnosis.validation.ruler import Ruler, repeated
 from grounded.diagnosis.validation.split import split
 from grounded.frozen import Array
 from grounded.trial import Trial

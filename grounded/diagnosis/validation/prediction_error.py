@@ -100,7 +100,7 @@ def errors(predictor: Predictor, h: Hypothesis, track: Array, where: Horizon) ->
     x = track[where.at, where.run]
     u, t = predictor.inputs(h), data.time
     delays = delays_of(h, data)
-    oldest = 0 if delays is None else max(delays.whole) + 1  # what delayed sensors may still show
+    oldest = 0 if delays is None else delays.oldest  # what delayed sensors may still show
     path = [track[np.maximum(where.at - j, 0), where.run] for j in range(oldest, -1, -1)]
     advance = predictor.stepper(h)
     for j in range(where.steps):

@@ -6,11 +6,7 @@ over whole trials, are what an engineer would measure; values come from the othe
 the other pieces of one long log. The noise that a diagnosis estimates has no part in them, so they
 compare between hypotheses, models and days.
 
-Two hypotheses are compared by the mean logarithm of the ratio of their errors over channels and
-horizons; its scatter is the jackknife's over runs. Runs differ most in how much of an effect they
-hold: what two trials of eight show in full is 1.5 of that scatter, and would be with no noise at
-all. So the short horizons are also compared piece by piece of a second: where an effect is not
-visited they add nothing, neither gain nor scatter.
+Two hypotheses are compared by what one gains (`gain`).
 
 No model predicts better than the noise floor. Where a manoeuvre was repeated, by a candidate or by
 commands that are the same, predictions of the repeats miss by the same model error and by different
@@ -21,7 +17,7 @@ leaves, as white noise, carried on by the model.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -32,19 +28,20 @@ from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted, leave_one_out, moved
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
+from grounded.diagnosis.likelihood.simulated import simulated
+from grounded.diagnosis.validation.gain import Errors, Gain
 from grounded.frozen import Array
 from grounded.task import Task
 from grounded.trial import Trial
 
 SECONDS = (0.1, 0.5, 1.0)
-MOST_STARTS = 400
+MOST_STARTS, FEWER_STARTS = 400, 150  # the fewer of a simulator, whose steps are slow
 MOST_WHOLE = 8  # trials that are predicted from beginning to end
 WHOLE_STEPS = 4000  # of them together, where that leaves LEAST_WHOLE
 LEAST_WHOLE = 3
 FINE = 2e-3  # of a channel's spread: errors below it do not matter
 SLIGHT = 1e-2  # nor below this part of the crude model's, or of the spread where that is less
 FAR = 1e6  # a state beyond it has diverged
-AGAIN = 2.0  # scatters that a gain has without its best trial, where it was seen again
 MOMENTS = 20  # at which repeats are compared
 ALIKE = 0.02  # of a command's spread: how much commands of repeats may differ, rms
 
@@ -61,55 +58,6 @@ def folds(data: Data) -> Any:
     share = data.lengths[data.trial_of] / data.lengths.sum()
     whole = data.trial_of * min(data.count, MOST_FOLDS) // data.count
     return np.where(share > MOST_LEFT_OUT, data.count + np.arange(len(share)), whole)
-
-
-@dataclass(frozen=True, eq=False)
-class Errors:
-    """Sums of squared errors and their counts by horizon, piece and state, (K, P, n) each."""
-
-    total: Array
-    count: Array
-
-    @cached_property
-    def rms(self) -> Array:
-        """By horizon and state, (K, n); NaN where nothing was measured."""
-        total, count = self.total.sum(axis=1), self.count.sum(axis=1)
-        return np.where(count > 0, np.sqrt(total / np.maximum(count, 1)), np.nan)
-
-
-@dataclass(frozen=True)
-class Gain:
-    """What one hypothesis predicts better than another: log ratio of errors, and its scatter."""
-
-    mean: float
-    scatter: float
-    largest: float  # of a single channel and horizon
-    channels: Array  # (n',) the mean over horizons by shown state
-    scatters: Array  # (n',) of these
-    pieces: Array = field(default_factory=lambda: np.zeros(0))  # (P,) gained in each, up to 1 s
-    trial: Array = field(default_factory=lambda: np.zeros(0, int))  # (P,) that it is of
-
-    @property
-    def again(self) -> float:
-        """What pieces gain without the trial that gains most, in the scatters of their sum."""
-        by = np.bincount(self.trial, self.pieces) if len(self.pieces) else np.zeros(1)
-        each = self.pieces[self.trial != int(by.argmax())]
-        scatter = np.sqrt(len(each) * each.var()) if len(each) > 1 else 0.0
-        return float(each.sum() / scatter) if scatter > 0 else 0.0
-
-    def beyond(self, scatters: float, least: float) -> bool:
-        """Whether it is more than its scatter in all."""
-        return self.mean > scatters * self.scatter and self.largest > least
-
-    def pays(self, scatters: float, least: float) -> bool:
-        """Whether it is worth a claim: in all, again without its best trial, or in one channel.
-
-        There by a scatter more: an effect of one channel is lost in the mean over a dozen, and in
-        their scatter.
-        """
-        one = (self.channels > (scatters + 1) * self.scatters) & (self.channels > least)
-        again = self.again > AGAIN and self.largest > least
-        return self.beyond(scatters, least) or (self.mean > 0 and (again or bool(one.any())))
 
 
 class Ruler:
@@ -143,7 +91,8 @@ class Ruler:
         pairs = [
             (t, b) for b in range(len(lengths)) for t in range(1, min(lengths[b], room[b] + 1))
         ] or [(0, 0)]
-        at, run = np.array(pairs[:: max(1, len(pairs) // MOST_STARTS)]).T
+        most = MOST_STARTS if not simulated(data.model) else FEWER_STARTS
+        at, run = np.array(pairs[:: max(1, len(pairs) // most)]).T
         return at, run
 
     @cached_property
@@ -249,11 +198,16 @@ class Ruler:
         trial = data.trial_of[run]
         step = data.step_at[run, 0] - self.step0[trial] + at
         received, delays = predictor.received(h), delays_of(h, data)
-        oldest = 0 if delays is None else max(delays.whole) + 1  # what sensors may still show
+        oldest = 0 if delays is None else delays.oldest  # what sensors may still show
         path = [track[np.maximum(at - j, 0), run] for j in range(oldest, -1, -1)]
         last, advance = data.lengths[trial], predictor.stepper(h)
         t = np.minimum(step + np.arange(steps)[:, None], last - 1)
-        for j, (u, now) in enumerate(zip(received[trial, t], t * data.dt, strict=True)):
+        u_all, z = received[trial, t], None
+        if added is None:
+            z = predictor.marched(h, path[-1], u_all)
+        if z is not None and (np.abs(z) < FAR).all():
+            path, u_all = [*path, *z[1:]], u_all[:0]
+        for j, (u, now) in enumerate(zip(u_all, t * data.dt, strict=False)):
             x = advance(path[-1], u, now)
             if added is not None:
                 inside = (at + j < len(added))[:, None]
@@ -311,6 +265,7 @@ class Ruler:
             _jackknife(by / counts),
             self._pieces(before, after),
             self.data.trial_of[self.run_of],
+            self._by_trial(before, after),
         )
 
     def _matters(self) -> Array:
@@ -324,6 +279,17 @@ class Ruler:
         all_n = np.maximum(n.sum(axis=1, keepdims=True), 1)
         usual = n * (b.sum(axis=1, keepdims=True) / all_n + self.fine[self.shown] ** 2) + 1e-300
         return np.asarray((n / all_n * np.log((a + usual) / (b + usual))).sum(axis=(0, 2)))
+
+    def _by_trial(self, before: Errors, after: Errors) -> Array:
+        """What each trial gains by itself, the mean over channels and horizons, (S,)."""
+        trials = [self.data.trial_of == i for i in self.data.used]
+        a, b, n = (
+            np.stack([self.by_run(e[..., self.shown])[:, own].sum(axis=1) for own in trials])
+            for e in (before.total, after.total, before.count)
+        )
+        least, seen = n * self._matters() ** 2 + 1e-300, n > 0
+        each = np.where(seen, 0.5 * np.log((a + least) / (b + least)), 0.0)
+        return np.asarray(each.sum(axis=(1, 2)) / np.maximum(seen.sum(axis=(1, 2)), 1))
 
     def by_run(self, pieces: Array) -> Array:
         """Sums of pieces (K, P, n) by run (K, B, n)."""

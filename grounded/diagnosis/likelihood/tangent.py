@@ -1,0 +1,40 @@
+"""Steps of a simulator to first order: what a nudged value does, without asking it again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.likelihood.predictor import Predictor
+from grounded.diagnosis.likelihood.simulated import simulated
+from grounded.frozen import Array
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Tangent(Predictor):
+    """A predictor whose model is linear about x (L, B, n), u (L, B, m); to compare with itself."""
+
+    x: Array
+    u: Array
+    p: Array
+    after: Array
+    slopes_there: tuple[Array, Array]
+
+    def step(self, x: Array, u: Array, p: Array, dt: float | None = None) -> Array:
+        """The model's own step, by slopes where it is one of this track's."""
+        if dt is not None or x.shape != self.x.shape or not np.array_equal(p, self.p):
+            return super().step(x, u, p, dt)
+        f_x, f_u = self.slopes_there
+        by_state, by_input = f_x @ (x - self.x)[..., None], f_u @ (u - self.u)[..., None]
+        return np.asarray(self.after + (by_state + by_input)[..., 0])
+
+
+def tangent(predictor: Predictor, h: Hypothesis, x: Array, u: Array) -> Predictor:
+    """Predicts from near x (L, B, n) with inputs near u (L, B, m); a compiled model as ever."""
+    if not simulated(predictor.data.model):
+        return predictor
+    left, p, kept = predictor.left(h, x, u), predictor.params(h), predictor._inputs
+    after, slopes = predictor.step(x, left, p), predictor.slopes(x, left, p)
+    return Tangent(predictor.data, kept, x=x, u=left, p=p, after=after, slopes_there=slopes)

@@ -1,0 +1,80 @@
+"""A simulator as the crude model: what it was asked is used again, where it is the same or near."""
+
+import math
+
+import numpy as np
+
+from grounded.diagnosis.likelihood.data import prepare
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.likelihood.linearise import linearise
+from grounded.diagnosis.likelihood.predictor import Predictor
+from grounded.diagnosis.likelihood.simulated import NEAR, Slopes, simulated
+from grounded.effects import Library
+from grounded.model import Model, Param
+from grounded.trial import Trial
+
+
+def swinging(s, a, p, dt):
+    """A pendulum that no tracer reads: it looks at a sample before it steps."""
+    push = a["torque"] if s["theta"] < 1e3 else 0.0
+    rate = push - p["g"] * math.sin(s["theta"]) - 0.1 * s["omega"]
+    return {"theta": s["theta"] + dt * s["omega"], "omega": s["omega"] + dt * rate}
+
+
+MODEL = Model(
+    states={"theta": "rad", "omega": "rad/s"},
+    inputs={"torque": "N m"},
+    params={"g": Param(9.0, "1/s^2", 5.0, 15.0)},
+    step=swinging,
+)
+
+
+def data_of():
+    rng, x, u = (
+        np.random.default_rng(0),
+        np.cumsum(np.ones((61, 2)), axis=0) / 30,
+        np.zeros((60, 1)),
+    )
+    x[:, 1] = np.sin(x[:, 0])
+    names = MODEL.state_names, MODEL.input_names
+    runs = [Trial(x + 0.01 * rng.standard_normal(x.shape), u + k, 0.02, *names) for k in range(2)]
+    return prepare(MODEL, runs)
+
+
+def test_slopes_are_taken_anew_where_a_track_moved():
+    asked = []
+
+    def take(x, u):
+        asked.append(len(x))
+        return x[:, :, None] * np.ones((1, 1, 2)), u[:, None, :] * np.ones((1, 2, 1))
+
+    unit = np.ones(2), np.ones(1), np.ones(1)
+    x, u, p = np.zeros((5, 2)), np.ones((5, 1)), np.ones(1)
+    whole = Slopes(unit)
+    one, other = whole.following(), whole.following()
+    first = one.at(take, x, u, p, False)
+    assert asked == [5] and other.at(take, x, u, p, False) is first and asked == [5]
+    near = x + 0.5 * NEAR
+    assert one.at(take, near, u, p, False)[0] is first[0] and asked == [5]
+    near[3] += 1.0
+    found = one.at(take, near, u, p, False)
+    assert asked == [5, 1] and (found[0][3] == near[3][:, None]).all()
+    assert (found[0][[0, 1, 2, 4]] == 0).all() and (first[0] == 0).all()
+    one.at(take, near, u, p + 1.0, False)
+    assert asked == [5, 1, 5]
+    whole.at(take, x + 0.5 * NEAR, u, p, False)  # by itself it keeps what is the same, no more
+    assert asked == [5, 1, 5, 5]
+
+
+def test_columns_by_slopes_are_those_of_steps(monkeypatch):
+    data = data_of()
+    assert simulated(data.model)
+    h = Hypothesis()
+    for name, values in (("input_gain:torque", {"g": 0.1}), ("coulomb_friction:omega", {"c": 0.2})):
+        h = h.plus(Library().effect(name, MODEL, data.scales), values)
+    F, d, _ = linearise(Predictor(data), h, data.y)
+    monkeypatch.setattr("grounded.diagnosis.likelihood.linearise.tangent", lambda p, *more: p)
+    exact_F, exact, _ = linearise(Predictor(data), h, data.y)
+    assert (exact_F == F).all() and (d[..., 0] == exact[..., 0]).all()
+    size = np.abs(exact[..., 1:]).max(axis=(0, 1, 2))
+    assert (size > 0).all() and (np.abs(d - exact)[..., 1:].max(axis=(0, 1, 2)) < 0.02 * size).all()
