@@ -12,9 +12,9 @@ from grounded.model import Model, Param
 from grounded.plant import Noise, Plant
 from grounded.search.candidate import Candidate
 from grounded.search.first_policy import first_policy
-from grounded.search.improve import model_fingerprint, propose
+from grounded.search.improve import propose
 from grounded.search.making import About, Maker, expected
-from grounded.search.planner import Planner, planner_for
+from grounded.search.planner import Planner, model_fingerprint, planner_for
 from grounded.search.standing import SearchOptions, standing
 from grounded.search.step_size import Step
 from grounded.utility import Reward
