@@ -25,13 +25,13 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from grounded.errors import NextCommand
 from grounded.model import Model
 from grounded.search.candidate import Candidate, Tried
-from grounded.search.first_policy import Tick
 from grounded.search.making import About, Maker, Proposal
 from grounded.search.planner import Planner
 from grounded.search.standing import (
@@ -45,6 +45,9 @@ from grounded.search.standing import (
 from grounded.search.step_size import Step
 from grounded.task import Task
 from grounded.trial import Trial
+
+if TYPE_CHECKING:
+    from grounded.search.first_policy import Tick
 
 
 def model_fingerprint(task: Task) -> str:

@@ -12,7 +12,6 @@ from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.result import Result, document
 from grounded.search.candidate import Candidate, Tried, Way
-from grounded.search.feedback import Alternative
 from grounded.search.planner import Planner, predicted
 from grounded.search.safety import objections, spread
 from grounded.search.standing import SearchOptions, Standing, losers_of, wild
@@ -23,6 +22,7 @@ from grounded.trial import mean_trial
 
 if TYPE_CHECKING:
     from grounded.search.corrected import Corrected
+    from grounded.search.feedback import Alternative
     from grounded.solve.bias import Grounding
 
 PLANNING = DescentOptions(max_iterations=30, tolerance=1e-6)  # a direction needs no more digits
