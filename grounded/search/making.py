@@ -12,7 +12,6 @@ from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.result import Result, document
 from grounded.search.candidate import Candidate, Tried, Way
-from grounded.search.feedback import Alternative
 from grounded.search.planner import Planner, predicted
 from grounded.search.safety import objections, spread
 from grounded.search.standing import SearchOptions, Standing, losers_of, wild
@@ -23,6 +22,7 @@ from grounded.trial import mean_trial
 
 if TYPE_CHECKING:
     from grounded.search.corrected import Corrected
+    from grounded.search.feedback import Alternative
     from grounded.solve.bias import Grounding
 
 PLANNING = DescentOptions(max_iterations=30, tolerance=1e-6)  # a direction needs no more digits
@@ -119,14 +119,24 @@ class About:
                 if proposal.candidate is None:
                     unsafe = proposal
                 elif expected(proposal.candidate) > self.least:
-                    return proposal
+                    return replace(proposal, candidate=self._told(proposal.candidate))
                 else:
                     doubted = doubted or proposal
                 continue
             promised.append(made.predicted_gain)
             if abs(made.predicted_gain) <= self.least:
                 break
-        return doubted or unsafe
+        if doubted is not None and doubted.candidate is not None:
+            return replace(doubted, candidate=self._told(doubted.candidate))
+        return unsafe
+
+    def _told(self, made: Candidate) -> Candidate:
+        """The same; what it is likely to be off by is no less than what the alternatives say."""
+        run = self.incumbent.candidate.policy
+        if not self.alternatives:
+            return made
+        gain = sum(a.cost(run) - a.cost(made.policy) for a in self.alternatives)
+        return replace(made, likely_off=max(made.likely_off, made.predicted_gain - gain))
 
     def own_plan(self, rival: Proposal | None) -> Proposal | None:
         """A model that was changed since: its own new plan, where more is promised of that.
@@ -141,7 +151,7 @@ class About:
         if base.model == make.fingerprint or tried:
             return None
         policy, _ = make.planner.first_policy()
-        made = self.candidate(policy, Step(), "own plan")
+        made = self._told(self.candidate(policy, Step(), "own plan"))
         promise = expected(rival.candidate) if rival and rival.candidate else self.least
         better = expected(made) > max(promise, self.least) or wild(self.incumbent)
         proposal = make.checked(made) if better else None

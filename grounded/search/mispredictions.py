@@ -110,13 +110,17 @@ def believed(
         corrected.append(share if rest else max(share, left))
     law, _ = laws(own, others, grounded)
     made, near = _with(law, own, grounded), others[:ASKED]
-    off = left = tuple(o.y for o in near)
+    off = unexplained = tuple(o.y for o in near)
     if law is not None:
-        told = [np.einsum("tnq,tq->tn", law, _features(own, o, grounded)) for o in near]
-        left = tuple(y - explained for y, explained in zip(off, told, strict=True))
+        unexplained = tuple(
+            o.y - np.einsum("tnq,tq->tn", law, _features(own, o, grounded)) for o in near
+        )
     misses = float(np.mean(crude)), float(np.mean(corrected))
     share = misses[1] / (sum(misses) + 1e-300)
-    both = (Alternative(share, grounded, off), Alternative(1.0 - share, made.problem, left))
+    both = (
+        Alternative(share, grounded, off),
+        Alternative(1.0 - share, made.problem, unexplained),
+    )
     model = Believed(grounded) if misses[0] <= misses[1] else made
     return replace(model, missed=min(misses), alternatives=both)
 

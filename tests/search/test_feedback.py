@@ -93,7 +93,9 @@ def test_an_own_plan_must_promise_more_than_it_is_likely_off_by(noisy):
     better = planner_for(task, task.model.with_values({"mass": 1.2}), np.zeros(1))
     fingerprint = model_fingerprint(better.plan)
     about.make = Maker(better, about.make.now, "c0099", fingerprint)
-    about.already, about.least, about.missed = -1e3, 1.0, 0.0
+    about.already, about.least, about.missed = -1e3, 1.0, 0.0  # so that it promises 999
+    assert about.own_plan(None) is None  # of which the alternatives see nothing
+    about.alternatives = ()
     assert about.own_plan(None).candidate.way == "own plan"
     about.missed = 1e9
     assert about.own_plan(None) is None
