@@ -236,8 +236,9 @@ class HypothesisSearch(FittedHypotheses):
                 # what passes a filter is far quicker than what it shows: so is its noise
                 late, noise, track = self.fresh(h.plus(look.effect, look.values))
                 noise = noise.allowing(fit.noise.structure, self.data.dt)
-                weights = {"weight_w": fit.noise.weight_w, "weight_v": fit.noise.weight_v}
-                starts.append((late, replace(noise, **weights), track))
+                weight_w, weight_v = fit.noise.weight_w, fit.noise.weight_v
+                noise = replace(noise, weight_w=weight_w, weight_v=weight_v)
+                starts.append((late, noise, track))
         return self.refined(starts, iterations, rivals=True)[1:]
 
     def without(self, fit: Fitted, name: str) -> Fitted:

@@ -283,10 +283,8 @@ class Ruler:
     def _by_trial(self, before: Errors, after: Errors) -> Array:
         """What each trial gains by itself, the mean over channels and horizons, (S,)."""
         trials = [self.data.trial_of == i for i in self.data.used]
-        a, b, n = (
-            np.stack([self.by_run(e[..., self.shown])[:, own].sum(axis=1) for own in trials])
-            for e in (before.total, after.total, before.count)
-        )
+        runs = [self.by_run(e[..., self.shown]) for e in (before.total, after.total, before.count)]
+        a, b, n = (np.stack([e[:, own].sum(axis=1) for own in trials]) for e in runs)
         least, seen = n * self._matters() ** 2 + 1e-300, n > 0
         each = np.where(seen, 0.5 * np.log((a + least) / (b + least)), 0.0)
         return np.asarray(each.sum(axis=(1, 2)) / np.maximum(seen.sum(axis=(1, 2)), 1))
