@@ -1,10 +1,11 @@
-"""CasADi: multiple shooting, exact sparse derivatives in its virtual machine, IPOPT.
+"""CasADi: multiple shooting, exact sparse derivatives in its virtual machine, IPOPT or fatrop.
 
 The z of each node includes the previous input, as everywhere in the benchmark.
 """
 
 from __future__ import annotations
 
+import sys
 import time
 
 import casadi as ca
@@ -13,6 +14,7 @@ from peer_data import fastest, load, reached, report, rk4
 
 ca.abs = ca.fabs  # NumPy's name
 case = load(ca)
+solver_name = sys.argv[3] if len(sys.argv) > 3 else "ipopt"
 n, m, H = case.n, case.m, case.H
 started = time.process_time()
 
@@ -39,15 +41,23 @@ for t in range(H + 1):
     guess.append(case.u[t])
 nlp = {"x": ca.vertcat(*w), "f": cost, "g": ca.vertcat(*g)}
 options = {"print_time": False, "expand": False}
-options |= {"ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.tol": 1e-6}
-solver = ca.nlpsol("solver", "ipopt", nlp, options)
+if solver_name == "ipopt":
+    options |= {"ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.tol": 1e-6}
+else:
+    options |= {
+        "structure_detection": "auto",
+        "equality": [True] * int(nlp["g"].numel()),
+        "fatrop.print_level": 0,
+        "fatrop.tol": 1e-6,
+    }
+solver = ca.nlpsol("solver", solver_name, nlp, options)
 built = time.process_time() - started
 start = np.concatenate(guess)
 found = solver(x0=start, lbg=0, ubg=0)
 value = float(found["f"])
 stats = solver.stats()
 report(
-    peer="CasADi + IPOPT",
+    peer=f"CasADi + {solver_name}",
     version=ca.__version__,
     case=case.name,
     ms=1e3 * fastest(lambda: solver(x0=start, lbg=0, ubg=0), case.repeats),

@@ -1,11 +1,12 @@
 """The engine against its peers: ratios in one run, by hand.
 
-    python -m venv /tmp/peers && /tmp/peers/bin/pip install numpy casadi crocoddyl
+    python -m venv /tmp/peers && /tmp/peers/bin/pip install numpy casadi crocoddyl jax
     python benchmarks/run.py --peers /tmp/peers/bin/python
 
 Every solver gets the same problem (cases.py), the same start, and has to reach the best known cost
 to a part in 10^4. Times are CPU times of the solve alone, least of several; building a problem,
-tracing and compiling are told apart. Parts: solve, horizon, size, process; all by default.
+tracing and compiling are told apart. trajax is not in the registry: its place is taken by the same
+algorithm written in JAX. Parts: solve, horizon, size, swarm, memory, process; all by default.
 """
 
 from __future__ import annotations
@@ -25,8 +26,15 @@ from pathlib import Path
 import numpy as np
 
 HERE = Path(__file__).parent
-PARTS = ("solve", "horizon", "size", "process")
-PEERS = ("crocoddyl", "casadi")
+PARTS = ("solve", "horizon", "size", "swarm", "memory", "process")
+PEERS = ("crocoddyl", "casadi", "jax")
+
+
+def cpu(function, repeats=20):
+    """Least CPU seconds of a few calls."""
+    from peer_data import fastest
+
+    return fastest(function, repeats)
 
 
 def our_solve(case, iterations, tolerance=0.0):
@@ -42,17 +50,17 @@ def our_row(case):
 
     It is measured inside a solve: what that takes beyond its first rollout and its last sweep.
     """
-    from peer_data import CLOSE, fastest
+    from peer_data import CLOSE
 
     from grounded.compile import DescentOptions
     from grounded.solve.ddp import solve
 
     best = our_solve(case, 50, 1e-10).cost
     iterations = next(i for i in range(1, 50) if our_solve(case, i).cost <= best * (1 + CLOSE))
-    ms = 1e3 * fastest(lambda: our_solve(case, iterations), 50)
+    ms = 1e3 * cpu(lambda: our_solve(case, iterations), 50)
     found = our_solve(case, iterations)
     start, settings = (case.problem, case.u), DescentOptions(max_iterations=0)
-    first = 1e3 * fastest(lambda: solve(*start, options=settings), 50)  # a rollout and a sweep
+    first = 1e3 * cpu(lambda: solve(*start, options=settings), 50)  # a rollout and a sweep
     return best, {
         "peer": "grounded",
         "case": case.name,
@@ -63,11 +71,12 @@ def our_row(case):
     }
 
 
-def peer_rows(case, best, python, folder):
+def peer_rows(case, best, python, folder, fatrop):
     """What each peer prints, or why it printed nothing."""
     path = case.save(folder)
-    for peer in PEERS:
-        command = [python, f"peer_{peer}.py", str(path), repr(best)]
+    calls = [[peer] for peer in PEERS] + ([["casadi", "fatrop"]] if fatrop else [])
+    for peer, *extra in calls:
+        command = [python, f"peer_{peer}.py", str(path), repr(best), *extra]
         environment = os.environ | {"PYTHONPATH": str(HERE.parent)}
         done = subprocess.run(command, cwd=HERE, env=environment, capture_output=True, text=True)
         if done.returncode == 0:
@@ -86,7 +95,7 @@ def solve_part(options):
             print(f"\n{case.name}: H = {case.problem.horizon}, nz = {case.problem.nz}")
             show(ours, ours)
             if options.peers:
-                rows = peer_rows(case, best, options.peers, Path(folder))
+                rows = peer_rows(case, best, options.peers, Path(folder), options.fatrop)
                 for row in rows:
                     show(row, ours)
 
@@ -132,7 +141,6 @@ def stretched(problem, H):
 
 def horizon_part(options):
     from cases import cases
-    from peer_data import fastest
 
     from grounded.compile import DescentOptions
     from grounded.solve.ddp import solve
@@ -142,7 +150,7 @@ def horizon_part(options):
     for H in (200, 500, 1000, 2000, 5000, 10_000, 20_000):
         start = stretched(case.problem, H)
         assert [line.alpha for line in solve(*start, options=settings).trace] == [1.0] * 3
-        seconds = fastest(lambda start=start: solve(*start, options=settings), 5)
+        seconds = cpu(lambda start=start: solve(*start, options=settings), 5)
         print(f"  H = {H:6d}  {1e3 * seconds:9.3f} ms  {1e6 * seconds / H:6.3f} us a step")
 
 
@@ -172,8 +180,6 @@ def network(n, m=4, H=300):
 
 
 def size_part(options):
-    from peer_data import fastest
-
     from grounded.solve.ddp import solve
 
     print("\nCPU of a whole solve against the state (a chain, m = 4, H = 300)")
@@ -183,9 +189,41 @@ def size_part(options):
         start = time.process_time()
         result = solve(problem, u)
         first = time.process_time() - start
-        ms = 1e3 * fastest(lambda p=problem, u=u: solve(p, u), 5)
+        ms = 1e3 * cpu(lambda p=problem, u=u: solve(p, u), 5)
         turns = f"{len(result.trace)} iterations"
         print(f"  n = {n:3d}  {ms:8.3f} ms  {turns}; first call {first:.2f} s")
+
+
+def swarm_part(options):
+    from cases import cases
+
+    from grounded.compile import DescentOptions
+    from grounded.solve.ddp import solve
+
+    case, rng = cases(["car"])[0], np.random.default_rng(0)
+    p = case.problem.p
+    models = [p * rng.uniform(0.95, 1.05, len(p)) for _ in range(1000)]
+
+    def all_of_them():
+        for values in models:
+            problem = dataclasses.replace(case.problem, p=values)
+            solve(problem, case.u, options=DescentOptions(tolerance=1e-6))
+
+    print(f"\n1000 perturbed cars solved in one process: {cpu(all_of_them, 3):.3f} s of CPU")
+
+
+def memory_part(options):
+    code = (
+        "import resource, sys; sys.path[:0] = sys.argv[1:]\n"
+        "import numpy as np\nfrom cases import cases\nfrom run import stretched\n"
+        "from grounded.compile import DescentOptions\nfrom grounded.solve.ddp import solve\n"
+        "case = cases(['aircraft'])[0]\n"
+        "solve(*stretched(case.problem, 20_000), options=DescentOptions(max_iterations=10))\n"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)"
+    )
+    command = [sys.executable, "-c", code, str(HERE), str(HERE.parent)]
+    peak = subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    print(f"\nPeak memory of a process that solves H = 20,000, n = 16: {float(peak):.0f} MB")
 
 
 def spent(command, environment):
@@ -238,6 +276,7 @@ def process_part(options):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--peers", help="a Python that has the peers")
+    parser.add_argument("--fatrop", action="store_true", help="CasADi's fatrop too (slow to build)")
     parser.add_argument("parts", nargs="*", help=f"of {', '.join(PARTS)}")
     options = parser.parse_args()
     sys.path[:0] = [str(HERE.parent / folder) for folder in ("", "cli", "trials")]
