@@ -14,7 +14,9 @@ from grounded_cli.terminal import field, number, progress, remark, show, show_js
 from grounded_trials.wording import count, percent, with_unit
 
 if TYPE_CHECKING:
-    from grounded.search.candidate import Candidate
+    from collections.abc import Sequence
+
+    from grounded.search.candidate import Candidate, Tried
     from grounded.search.standing import Standing
     from grounded.task import Task
     from grounded_trials import Workspace
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
 
 
 MOST = 3  # target states whose range is told
+LAST = 3  # predictions whose misses are told
 
 
 @click.command("propose")
@@ -63,7 +66,7 @@ def tell_proposed(workspace: Workspace, proposed: Proposed, *, last: bool = True
     if standing.incumbent is not None:
         best = standing.incumbent
         show(field("so far", f"{number(best.utility)} by {best.candidate.id}", "  "))
-    show(field("trust", _trust(standing, workspace), "  "))
+    show(field("trust", _trust(candidate, standing, workspace), "  "))
     for name, text in _extent(candidate, workspace.task):
         show(field(name, text, "  "))
     if last:
@@ -135,24 +138,57 @@ def _span(low: float, high: float) -> str:
     return f"{round(low, digits) + 0.0:.{digits}f} to {round(high, digits) + 0.0:.{digits}f}"
 
 
-def _trust(standing: Standing, workspace: Workspace) -> str:
-    """How the last prediction came true; before that, what the model was compared with."""
+def _trust(candidate: Candidate, standing: Standing, workspace: Workspace) -> str:
+    """How predictions came true, and whether this one's gain is more than they missed by.
+
+    Before a run has tested the model that plans now: what it was compared with.
+    """
     ran = [tried for tried in standing.history if tried.utilities]
     same = [tried for tried in ran if tried.candidate.model == workspace.planner.fingerprint]
-    if ran and not same:
-        return "unknown: the model was changed since the last run, none has tested it as it is now"
-    if not ran:
-        logs = len(workspace.trials()) - sum(len(tried.trials) for tried in standing.history)
-        if not logs:
-            return "unknown: the crude model was never compared with the real system"
-        config = workspace.config.model
-        done = " and ".join(
-            ["fitted"] * bool(config.params) + ["given effects"] * bool(config.effects)
-        )
-        by = f"was {done} with" if done else "can be judged by"
-        return (
-            f"the model {by} {count(logs, 'log')} of data (`grounded diagnose` says how far it "
-            "predicts), but it was never tried on this manoeuvre"
-        )
-    promised = number(same[-1].candidate.predicted_utility)
-    return f"the last prediction was {promised}, the real run gave {number(same[-1].utility)}"
+    if same:
+        return _came_true(candidate, same, standing)
+    measured = _measured(workspace)
+    if ran:
+        since = "the model was changed since the last run"
+        if not measured:
+            return f"unknown: {since}, none has tested it as it is now"
+        return f"{since}: {measured}; no run has tested its plans yet"
+    logs = len(workspace.trials()) - sum(len(tried.trials) for tried in standing.history)
+    if measured:
+        return f"{measured}, by its diagnosis; it was never tried on this manoeuvre"
+    if not logs:
+        return "unknown: the crude model was never compared with the real system"
+    config = workspace.config.model
+    done = " and ".join(["fitted"] * bool(config.params) + ["given effects"] * bool(config.effects))
+    by = f"was {done} with" if done else "can be judged by"
+    return (
+        f"the model {by} {count(logs, 'log')} of data (`grounded diagnose` says how far it "
+        "predicts), but it was never tried on this manoeuvre"
+    )
+
+
+def _came_true(candidate: Candidate, same: Sequence[Tried], standing: Standing) -> str:
+    """By how much the last predictions missed, beside the gain that this one promises."""
+    last = sorted(same, key=lambda tried: max(trial.id for trial in tried.trials))[-LAST:]
+    missed = [abs(one.candidate.predicted_utility - one.utility) for one in last]
+    promised, real = last[-1].candidate.predicted_utility, last[-1].utility
+    if len(missed) == 1:
+        text = f"the last prediction was {number(promised)}, the real run gave {number(real)}"
+    else:
+        told = [number(off) if math.isfinite(off) else "a crash" for off in missed]
+        text = f"the last {len(told)} predictions missed by {', '.join(told[:-1])} and {told[-1]}"
+    best, own = standing.incumbent, any(one.candidate.id == candidate.id for one in same)
+    if best is None or own or not math.isfinite(missed[-1]):
+        return text
+    gain = candidate.predicted_utility - best.utility
+    within = gain < max(missed[-1], candidate.likely_off)
+    doubt = ", which is no more than such a miss" * within
+    return f"{text}; this one promises a gain of {number(gain)}{doubt}"
+
+
+def _measured(workspace: Workspace) -> str:
+    """How far the model that plans now predicts, by the last diagnosis; "" where none says it."""
+    from grounded_trials.report.settled import measured_now
+
+    text = measured_now(workspace)
+    return f"{text[:1].lower()}{text[1:]}".rstrip(".")

@@ -19,6 +19,7 @@ from grounded_trials.wording import folded
 from grounded_trials.workspace.config import set_in_model
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.next_step import DIAGNOSE, after_diagnosis, since_diagnosis
+from grounded_trials.workspace.proposing import standing_in
 from reported import DIAGNOSIS, cart, copied
 from workspaces import make
 
@@ -356,3 +357,17 @@ def test_a_result_says_what_follows_it_without_the_command_line(cart, tmp_path):
     found = w.diagnose(max_effects=1)
     assert found.then is not None and found.then == w.status().then
     assert "then" not in found.to_json()
+
+
+def test_trust_sets_the_promised_gain_against_the_last_misses(tmp_path):
+    folder, said = make(tmp_path / "w", "car-turn").folder, []
+    for _ in range(3):
+        out = grounded("-C", folder, "propose").out
+        said += re.findall(r"^  trust +(.*(?:\n {10,}.*)*)", out, re.M)
+        grounded("-C", folder, "learn", "--trials", "1")
+    ran = standing_in(Workspace(folder)).history
+    missed = [abs(one.candidate.predicted_utility - one.utility) for one in ran]
+    gain = ran[2].candidate.predicted_utility - ran[1].utility
+    assert holds(said[1], f"{ran[0].utility:.4g}", "promises")
+    assert holds(said[2], f"{missed[0]:.4g}", f"{missed[1]:.4g}", f"{gain:.4g}")
+    assert ("no more than" in " ".join(said[2].split())) == (gain < missed[1])

@@ -119,6 +119,17 @@ def test_the_log_of_another_candidate_is_not_credited_wherever_it_begins(w, tmp_
     assert w.ingest(path, candidate="c0001").candidate == "c0001"
 
 
+@pytest.mark.parametrize("before", [0.0, 1.0])
+def test_a_log_that_was_stored_before_is_no_run_of_the_candidate_that_waits_now(
+    w, tmp_path, before
+):
+    path = record(w, tmp_path / "b.csv", w.candidate("c0002")[0].policy, before)
+    first, waiting = w.ingest(path), w.propose().candidate.id
+    assert first.candidate == "c0002" and not first.known and waiting != "c0002"
+    again = w.ingest(path)
+    assert again.known and (again.trial, again.candidate) == (first.trial, "c0002")
+
+
 def test_the_log_of_a_probe_is_not_credited_and_its_export_says_how_it_is_taken_in(w, tmp_path):
     made, _ = w.candidate("c0002")
     turned = replace(made.policy, feedforward=np.array(made.policy.feedforward[::-1]))

@@ -69,12 +69,24 @@ def settled_in(workspace: Folder, diagnosis: Diagnosis | None, since: Since) -> 
 
 def settled_now(workspace: Folder) -> Settled | None:
     """The same, of the last diagnosis as it is kept; a damaged one counts as none."""
+    return settled_in(workspace, *_last(workspace))
+
+
+def measured_now(workspace: Folder) -> str:
+    """How far the model that plans now predicts, as the last diagnosis measured it, or ""."""
+    found, since = _last(workspace)
+    settled = settled_in(workspace, found, since)
+    if settled is not None or found is None or since.changed:
+        return settled.gained if settled is not None else ""
+    return gained(found, workspace.origin, now="crude", before="crude", who=NOW)
+
+
+def _last(workspace: Folder) -> tuple[Diagnosis | None, Since]:
     try:
         found = read_diagnosis(workspace.reports)
     except GroundedError:
         found = None
-    since = since_diagnosis(workspace, found, usable_ids(workspace)) if found else Since()
-    return settled_in(workspace, found, since)
+    return found, since_diagnosis(workspace, found, usable_ids(workspace)) if found else Since()
 
 
 def told(

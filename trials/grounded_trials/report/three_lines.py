@@ -57,7 +57,7 @@ def gained(
         diagnosis: whose ruler says it.
         task: whose weighed states are spoken of.
         now: the column of `RulerRow` that holds today's errors.
-        before: the column of those before.
+        before: the column of those before; that of today says nothing of before.
         who: misses so much.
     """
     row, parts = _ahead(diagnosis), []
@@ -66,7 +66,8 @@ def gained(
     after, first = getattr(row, now), getattr(row, before)
     for names, what in _improved(after, first, task):
         unit = shown(row.unit_by_channel[names[0]])
-        ends = (measured(_together(errors, names), unit) for errors in (after, first))
+        told = (after,) if now == before else (after, first)
+        ends = (measured(_together(errors, names), unit) for errors in told)
         parts.append(f"{what} by {' instead of '.join(ends)}")
     held = "" if row.held_out != "no" else ", not held out"
     ahead = f"{row.horizon_s:.3g} s ahead{held}"

@@ -173,6 +173,13 @@ def _recognised(workspace: Folder, path: Path, read: _Read, candidate: str | Non
         return read
     if candidate is not None and (log is None or (found and found.opens_alike)):
         return replace(read, warnings=(*read.warnings, why))
+    if (
+        other
+        and candidate is None
+        and read.log
+        and (stored := _stored(workspace, path, read, other))
+    ):
+        return stored
     what = f"; with --candidate {other} for what it seems to have run" * bool(other)
     begins = "; [log.span] says where the run begins" * bool(read.log and not log)
     raise GroundedError(
@@ -181,6 +188,18 @@ def _recognised(workspace: Folder, path: Path, read: _Read, candidate: str | Non
         f"{begins}",
         NextCommand("ingest", (str(path), *(("--candidate", other) if other else ("--data",)))),
     )
+
+
+def _stored(workspace: Folder, path: Path, read: _Read, other: str) -> _Read | None:
+    """The log as the run of another candidate that it was stored as before; None if it was not."""
+    if not other or read.log is None:
+        return None
+    with suppress(GroundedError):  # it did not run that one either, or is no run of this task
+        _check_candidate(workspace, path, other)
+        found = _recognised(workspace, path, _cut(read.log, other), other)
+        if sha256(found.data)[:DIGITS] in workspace.store.digests():
+            return found
+    return None
 
 
 def _elsewhere(log: Recording, found: Start, policy: Policy, why: str) -> bool:
