@@ -44,6 +44,7 @@ SAME, DEGREE, SLOPE = 0.15, 180 / np.pi, 0.01
 FOLLOWS = 0.8  # correlation of a rate with the derivative of its position
 BETTER = 0.9  # of the rival's error: less decides
 COMBINATIONS, SPAN, LONGEST = 64, 5, 20_000  # tried at most; samples a slope is taken over; grid
+FEW = 8  # numbers without a name that are tried as a position or a rate
 
 
 def weigh(
@@ -72,9 +73,9 @@ def weigh(
     turning = [guesses[name] for name in model.state_names if units[name] in ("rad", "deg")]
     signals = _Signals(log, guesses.values(), {p for g in turning for p in (g.path, *g.others)})
     guesses |= _speed(guesses, model, signals)
-    for position, rate in velocities(model).items():
-        if position in guesses and rate in guesses:
-            guesses |= _derivative(guesses[position], guesses[rate], signals, units[rate])
+    pairs = [(q, w) for q, w in velocities(model).items() if q in guesses and w in guesses]
+    for pair in sorted(pairs, key=lambda qw: not any(guesses[name].path for name in qw)):
+        guesses |= _paired(guesses, pair, signals, units, log)
     guesses |= _steps(model, guesses, signals)
     guesses |= _taken_by_inputs(guesses, model)
     guesses = {name: _as_logged(guess, log) for name, guess in guesses.items()}
@@ -137,22 +138,27 @@ class _Signals:
     """The samples of everything that was guessed, read once, and put on one grid when asked."""
 
     def __init__(self, log: LogReport, guesses: Iterable[Guess], angles: Collection[str]) -> None:
-        clocks = {t.topic: "header" if t.stamped else "log" for t in log.topics}
+        self._clocks = {t.topic: "header" if t.stamped else "log" for t in log.topics}
         if any(t.skew_s is not None and abs(t.skew_s) > SIMULATED_S for t in log.topics):
-            clocks = dict.fromkeys(clocks, "log")
-        paths = [p for g in guesses for p in (g.path, *g.others) if p]
-        specs = {p: SignalSpec(p, clock=_clock(p, clocks)) for p in paths}  # type: ignore[arg-type]
+            self._clocks = dict.fromkeys(self._clocks, "log")
+        self._files, self._angles = log.files, angles
         self.found: dict[str, Samples] = {}
+        self.read([p for g in guesses for p in (g.path, *g.others) if p])
+
+    def read(self, paths: Iterable[str]) -> None:
+        """The samples of these as well."""
+        more = (p for p in paths if p not in self.found)
+        specs = {p: SignalSpec(p, clock=_clock(p, self._clocks)) for p in more}  # type: ignore[arg-type]
         try:
-            series = read_signals(log.files, specs) if specs else {}
+            series = read_signals(self._files, specs) if specs else {}
         except GroundedError:
-            series = _one_by_one(log.files, specs)
+            series = _one_by_one(self._files, specs)
         for path, one in series.items():
             try:
                 found = tidy(path, one, unwrap="@rpy" in path)
             except GroundedError:
                 continue
-            self.found[path] = _unwound(found) if path in angles else found
+            self.found[path] = _unwound(found) if path in self._angles else found
 
     def grid(self, paths: Sequence[str]) -> tuple[float, list[Floats]] | None:
         """These signals on a common grid: its step [s] and the columns; None if they don't meet."""
@@ -249,6 +255,37 @@ def _follows(q: Floats, w: Floats, step: float) -> _Follows:
         return _Follows(0.0, 1.0)
     a, b = a - a.mean(), b - b.mean()
     return _Follows(float(a @ b / np.sqrt((a @ a) * (b @ b))), float(a @ b / (a @ a)))
+
+
+def _paired(
+    guesses: Mapping[str, Guess],
+    pair: tuple[str, str],
+    signals: _Signals,
+    units: Mapping[str, str],
+    log: LogReport,
+) -> dict[str, Guess]:
+    """A position and its rate; what no name gives is sought among the numbers nobody has taken."""
+    taken = {guess.path for guess in guesses.values()}
+    free = [f.path for t in log.topics for f in t.fields if f.low != f.high and f.path not in taken]
+    own = {name: guesses[name] for name in pair}
+    bare = [name for name, guess in own.items() if not guess.path]
+    if not bare:
+        return _derivative(own[pair[0]], own[pair[1]], signals, units[pair[1]])
+    if len(free) > FEW or not free:
+        return {}
+    tried = {
+        name: replace(own[name], others=tuple(free)) if name in bare else own[name] for name in pair
+    }
+    signals.read(free)
+    found = _derivative(tried[pair[0]], tried[pair[1]], signals, units[pair[1]])
+    if len(found) < 2:
+        return {}
+    known = len(bare) == 1 and all(own[name].sure for name in pair if name not in bare)
+    why = "no name says it" + "; of what is left only this pair fits" * (len(bare) == 2)
+    for name in bare:
+        reasons = (why, *found[name].reasons)
+        found[name] = replace(found[name], sure=known and found[name].scale == 1, reasons=reasons)
+    return found
 
 
 def _derivative(q: Guess, w: Guess, signals: _Signals, unit: str) -> dict[str, Guess]:
