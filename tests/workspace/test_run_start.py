@@ -12,7 +12,7 @@ import pytest
 from cli import grounded
 from grounded.errors import GroundedError, NextCommand
 from grounded_trials import Workspace
-from grounded_trials.workspace import foreign
+from grounded_trials.workspace import foreign, ingest
 from workspaces import CONFIG, make
 
 LOGGED = CONFIG + "".join(
@@ -121,13 +121,20 @@ def test_the_log_of_another_candidate_is_not_credited_wherever_it_begins(w, tmp_
 
 @pytest.mark.parametrize("before", [0.0, 1.0])
 def test_a_log_that_was_stored_before_is_no_run_of_the_candidate_that_waits_now(
-    w, tmp_path, before
+    w, tmp_path, before, monkeypatch
 ):
     path = record(w, tmp_path / "b.csv", w.candidate("c0002")[0].policy, before)
     first, waiting = w.ingest(path), w.propose().candidate.id
     assert first.candidate == "c0002" and not first.known and waiting != "c0002"
     again = w.ingest(path)
     assert again.known and (again.trial, again.candidate) == (first.trial, "c0002")
+    copy = tmp_path / "copy.csv"
+    copy.write_bytes(path.read_bytes())
+    renamed = w.ingest(copy, candidate="c0002")
+    assert renamed.known and renamed.trial == first.trial and len(w.trials()) == 2
+    with monkeypatch.context() as nothing:  # the search has ended
+        nothing.setattr(ingest, "_outstanding", lambda *_: pytest.fail("asked for"))
+        assert w.ingest(copy).trial == first.trial
 
 
 def test_the_log_of_a_probe_is_not_credited_and_its_export_says_how_it_is_taken_in(w, tmp_path):

@@ -30,7 +30,7 @@ from grounded_trials.store.store import DIGITS
 from grounded_trials.store.trial_file import read_trial, trial_bytes
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.foreign import ForeignLog, mapping_of, read_foreign
-from grounded_trials.workspace.identity import sha256
+from grounded_trials.workspace.identity import StoredTrial, sha256
 from grounded_trials.workspace.next_step import PROPOSE, after_log
 from grounded_trials.workspace.proposing import candidate_named, standing_in
 from grounded_trials.workspace.run_start import Recording, Start
@@ -112,7 +112,7 @@ def ingest_log(
         read = _own(workspace, path, candidate, data)
     else:
         read = _foreign(workspace, path, candidate, data)
-    read = _recognised(workspace, path, read, candidate)
+    read = _renamed(workspace, _recognised(workspace, path, read, candidate))
     before = _repeated(workspace, path, read)
     added = workspace.store.add(read.data, again=before != "")
     if read.bare:  # what it ran is kept beside it
@@ -173,13 +173,6 @@ def _recognised(workspace: Folder, path: Path, read: _Read, candidate: str | Non
         return read
     if candidate is not None and (log is None or (found and found.opens_alike)):
         return replace(read, warnings=(*read.warnings, why))
-    if (
-        other
-        and candidate is None
-        and read.log
-        and (stored := _stored(workspace, path, read, other))
-    ):
-        return stored
     what = f"; with --candidate {other} for what it seems to have run" * bool(other)
     begins = "; [log.span] says where the run begins" * bool(read.log and not log)
     raise GroundedError(
@@ -188,18 +181,6 @@ def _recognised(workspace: Folder, path: Path, read: _Read, candidate: str | Non
         f"{begins}",
         NextCommand("ingest", (str(path), *(("--candidate", other) if other else ("--data",)))),
     )
-
-
-def _stored(workspace: Folder, path: Path, read: _Read, other: str) -> _Read | None:
-    """The log as the run of another candidate that it was stored as before; None if it was not."""
-    if not other or read.log is None:
-        return None
-    with suppress(GroundedError):  # it did not run that one either, or is no run of this task
-        _check_candidate(workspace, path, other)
-        found = _recognised(workspace, path, _cut(read.log, other), other)
-        if sha256(found.data)[:DIGITS] in workspace.store.digests():
-            return found
-    return None
 
 
 def _elsewhere(log: Recording, found: Start, policy: Policy, why: str) -> bool:
@@ -319,12 +300,28 @@ def _check_candidate(
 
 def _foreign(workspace: Folder, path: Path, candidate: str | None, data: bool) -> _Read:
     """Somebody else's log, through [log]."""
-    mapping = mapping_of(workspace, path)
-    chosen = "" if data else candidate or _outstanding(workspace, path)
-    log = read_foreign(workspace, path, mapping)
+    log = read_foreign(workspace, path, mapping_of(workspace, path))
+    before = [one.trial.candidate for one in _same_log(workspace, log)]
+    chosen = "" if data else candidate or (before or [""])[-1] or _outstanding(workspace, path)
     if chosen:
         _check_candidate(workspace, path, chosen)
     return _cut(log, chosen)
+
+
+def _same_log(workspace: Folder, log: ForeignLog) -> list[StoredTrial]:
+    """The trials that were made from a file of the same bytes, whatever its name was."""
+    own = log.source["source_sha256"]
+    return [one for one in workspace.trials() if one.meta.get("source_sha256") == own]
+
+
+def _renamed(workspace: Folder, read: _Read) -> _Read:
+    """The log as it was stored where only its name is another."""
+    for one in _same_log(workspace, read.log) if read.log else ():
+        same = one.trial.candidate == read.trial.candidate
+        pairs = ((one.measured.states, read.trial.states), (one.measured.inputs, read.trial.inputs))
+        if same and all(np.array_equal(a, b, equal_nan=True) for a, b in pairs):
+            return replace(read, data=workspace.store.read(one.stored))
+    return read
 
 
 def _cut(log: ForeignLog, candidate: str, start: float | None = None) -> _Read:
