@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin
 
+import workspaces
 from cli import grounded
 from grounded.errors import GroundedError
 from grounded_trials import Workspace
@@ -292,6 +293,18 @@ def test_a_joint_by_its_behaviour_where_no_name_fits(swung, tmp_path):
     done = grounded("-C", tmp_path / "w", found.then.verb, *found.then.arguments)
     assert found.then.verb == "ingest" and done.code == 0
     assert "log's commands" in (tmp_path / "w/grounded.toml").read_text()
+
+
+def test_a_position_is_the_one_whose_derivative_the_named_speed_is(swung, tmp_path):
+    model = tmp_path / "cart.py"
+    model.write_text(workspaces.MODEL)
+    found = begin(tmp_path / "w", swung("aa,cart_vel,force"), model=model)
+    assert [g.path for g in found.states] == ["/csv.aa", "/csv.cart_vel"]
+    assert (
+        not begin(tmp_path / "n", swung("aa,cart_vel,force", linked=False), model=model)
+        .states[0]
+        .path
+    )
 
 
 def test_a_kind_whose_states_are_not_there_gives_way_to_the_log_s_names(swung, tmp_path):

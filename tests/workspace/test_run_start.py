@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 from cli import grounded
+from facts import holds
 from grounded.errors import GroundedError, NextCommand
 from grounded_trials import Workspace
+from grounded_trials.store.trial_file import read_trial
 from grounded_trials.workspace import foreign, ingest
 from workspaces import CONFIG, make
 
@@ -164,3 +166,24 @@ def test_a_strange_log_has_no_start_forced_or_not(w, tmp_path, forced):
     with pytest.raises(GroundedError, match="c0002"):
         w.ingest(path, candidate="c0002" if forced else None)
     assert len(w.trials()) == 1
+
+
+def test_a_run_logged_in_degrees_says_so_and_a_name_that_is_none_is_answered(tmp_path):
+    folder = make(tmp_path / "w", "pendulum").folder
+    with (folder / "grounded.toml").open("a") as file:
+        for kind, name in (("state", "theta"), ("state", "omega"), ("input", "torque")):
+            file.write(f'\n[log.{kind}.{name}]\npath = "/csv.{name}"\n')
+    w = Workspace(folder)
+    w.propose()
+    w.run()
+    log = next((folder / "runs").iterdir())
+    trial = read_trial(log.read_bytes(), str(log))[0]
+    t = trial.dt * np.arange(trial.steps)
+    table = np.column_stack([t, np.rad2deg(trial.states[:-1]), trial.inputs])
+    path = tmp_path / "run.csv"
+    np.savetxt(path, table, "%.9f", ",", header="t,theta,omega,torque", comments="")
+    with pytest.raises(GroundedError) as refused:
+        w.ingest(path)
+    assert holds(str(refused.value), "theta", "omega", "degrees", "0.0174533")
+    with pytest.raises(GroundedError, match="no candidate 'c0009'"):
+        w.ingest(path, candidate="c0009")

@@ -268,10 +268,10 @@ def _paired(
     taken = {guess.path for guess in guesses.values()}
     free = [f.path for t in log.topics for f in t.fields if f.low != f.high and f.path not in taken]
     own = {name: guesses[name] for name in pair}
-    bare = [name for name, guess in own.items() if not guess.path]
+    bare = [name for name, guess in own.items() if not guess.path and not guess.others]
     if not bare:
         return _derivative(own[pair[0]], own[pair[1]], signals, units[pair[1]])
-    if len(free) > FEW or not free:
+    if not 0 < len(free) <= FEW or not any(guess.path for guess in guesses.values()):
         return {}
     tried = {
         name: replace(own[name], others=tuple(free)) if name in bare else own[name] for name in pair

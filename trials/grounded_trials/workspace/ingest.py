@@ -28,13 +28,20 @@ from grounded_trials.plain_file import read_file
 from grounded_trials.store.own_files import CANDIDATE, FILE_LIMIT, TRIAL
 from grounded_trials.store.store import DIGITS
 from grounded_trials.store.trial_file import read_trial, trial_bytes
+from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.foreign import ForeignLog, mapping_of, read_foreign
 from grounded_trials.workspace.identity import StoredTrial, sha256
 from grounded_trials.workspace.next_step import PROPOSE, after_log
 from grounded_trials.workspace.proposing import candidate_named, standing_in
 from grounded_trials.workspace.run_start import Recording, Start
-from grounded_trials.workspace.trial_check import OTHERS, SAME, suspicion, warnings_about
+from grounded_trials.workspace.trial_check import (
+    OTHERS,
+    SAME,
+    in_degrees,
+    suspicion,
+    warnings_about,
+)
 
 ALIGNED = 0.75  # of the time between samples: a start nearer than that is as good
 CLEAR = 0.7  # of the commands' difference at the first command: the start is elsewhere
@@ -173,6 +180,12 @@ def _recognised(workspace: Folder, path: Path, read: _Read, candidate: str | Non
         return read
     if candidate is not None and (log is None or (found and found.opens_alike)):
         return replace(read, warnings=(*read.warnings, why))
+    if turned := in_degrees(workspace.task, interpolate_gaps(read.trial).trial, own):
+        raise GroundedError(
+            f"{path} ran {ran}, with {' and '.join(turned)} in degrees where the model has "
+            f"radians: give {'it' if len(turned) == 1 else 'them'} scale = {np.pi / 180:.6g} in "
+            f"{FILE}'s [log]"
+        )
     what = f"; with --candidate {other} for what it seems to have run" * bool(other)
     begins = "; [log.span] says where the run begins" * bool(read.log and not log)
     raise GroundedError(

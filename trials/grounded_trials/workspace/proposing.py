@@ -257,7 +257,7 @@ def candidate_named(workspace: Folder, name: str | None, now: Standing | None = 
     `now` is where the search stands, where that is known.
 
     Raises:
-        GroundedError: if there is no best one yet, or none waits.
+        GroundedError: if there is none of that name, no best one yet, or none waits.
     """
     if name is None:
         waiting = standing_in(workspace).outstanding
@@ -269,6 +269,7 @@ def candidate_named(workspace: Folder, name: str | None, now: Standing | None = 
             )
         return waiting.id
     if name != "best":
+        workspace.candidate_bytes(name)  # or says which names there are
         return name
     best = (now or standing_in(workspace)).incumbent
     if best is None:

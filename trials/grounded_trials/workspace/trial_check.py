@@ -8,7 +8,7 @@ noisy, or resampled; a person's driving, or another candidate, is something else
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -253,6 +253,19 @@ def suspicion(
         f"its commands are not what {own.id} sends on the logged states: {found.input} differs by "
         f"{differs} (rms); {looks}"
     ), name
+
+
+def in_degrees(task: Task, trial: Trial, own: Candidate) -> tuple[str, ...]:
+    """The states with which a log is a run of its candidate once they are taken for degrees."""
+    trial, latest = trial.until(task.horizon), _latest(task)
+    names = np.array(task.model.state_names)
+    units = np.array(list(task.model.states.values()))
+    for wrong in (np.isin(units, ("rad", "rad/s")), units == "rad", units == "rad/s"):
+        turned = replace(trial, states=np.where(wrong, np.deg2rad(trial.states), trial.states))
+        found = follows(own.policy, turned, latest) if wrong.any() else None
+        if found is not None and found.alike:
+            return tuple(names[wrong])
+    return ()
 
 
 def _latest(task: Task) -> int:
