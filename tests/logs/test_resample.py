@@ -106,6 +106,18 @@ def test_held_inputs_grow_old() -> None:
         grid(pose(np.sin), strict)
 
 
+def test_a_command_that_is_no_number_for_long_is_a_gap() -> None:
+    u, x = command(), pose(np.sin)
+    for count, refused in ((2, False), (8, True)):  # 5 intervals of 0.05 s may be bridged
+        u.values[10 : 10 + count] = np.nan
+        if refused:
+            with pytest.raises(GroundedError, match="has a gap of"):
+                grid(x, u)
+        else:
+            assert grid(x, u).inputs[10:13, 0].tolist() == [9, 9, 12]
+    assert len(grid(x, u, span=Span(end=0.4)).inputs) == 8  # outside the span it does not matter
+
+
 def test_one_shot_topics() -> None:
     u = series(np.array([0.0]), np.array([0.3]), SignalSpec("/u", "log"))
     found = grid(pose(np.sin), u)

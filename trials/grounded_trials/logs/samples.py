@@ -38,6 +38,7 @@ class Samples:
     repeated: int
     out_of_order: int
     unstamped: int  # stamp 0 among others that are not
+    lost: Ints  # (K,) [ns] where a sample came that is not a finite number
 
     @cached_property
     def interval(self) -> float:
@@ -73,7 +74,8 @@ class Samples:
         """Values at times [ns], those of the last sample before.
 
         Raises:
-            GroundedError: where there is none, or it is older than max_age_s.
+            GroundedError: where there is none, or it is older than max_age_s, or than a gap may be
+                where the newer ones were not finite.
         """
         i = np.searchsorted(self.t, at, "right") - 1
         if (i < 0).any():
@@ -84,9 +86,11 @@ class Samples:
             )
         limit = np.inf if self.spec.max_age_s is None else self.spec.max_age_s
         age = (at - self.t[i]) * 1e-9
-        if (age > limit).any():
-            k = int(np.argmax(age > limit))
-            self._refuse(self.t[i[k]], at[k], limit, origin)
+        lost = np.searchsorted(self.lost, at, "right") > np.searchsorted(self.lost, self.t[i])
+        limits = np.where(lost, min(limit, self.max_gap(dt)), limit)
+        if (age > limits).any():
+            k = int(np.argmax(age > limits))
+            self._refuse(self.t[i[k]], at[k], limits[k], origin)
         return self.y[i]
 
     def before(self, at: int) -> float:
@@ -162,6 +166,7 @@ def tidy(name: str, series: Series, *, unwrap: bool) -> Samples:
         repeated=int((~last_of_stamp).sum()),
         out_of_order=int((back < 0).sum()),
         unstamped=int((~stamped).sum()),
+        lost=np.sort(series.t[stamped & ~finite]) - round(spec.delay_s * 1e9),
     )
 
 
