@@ -13,6 +13,10 @@ UNCLAIMED = (
     "was not claimed by the last diagnosis: its values were fitted by themselves, in place of what "
     "was claimed; the model's own parameters stay as they are"
 )
+BESIDE = (
+    "was adopted from the same diagnosis, and stays in the model: its values were fitted in place "
+    "of these, not beside them. Take it out of [model] effects in grounded.toml, or diagnose again"
+)
 
 
 @click.command("adopt")
@@ -43,6 +47,8 @@ def command(effects: tuple[str, ...], effect_only: bool, json_: bool) -> None:
         sentence(f"{name} is part of the model now ({workspace.config.file})")
     if not done.claimed:
         remark("note", f"{effects[0]} {UNCLAIMED}")
+    if done.beside:
+        remark("warning", f"{', '.join(done.beside)} {BESIDE}")
     if done.params:
         show("written to [model] params, calibrated beside the effects:")
     for name, value in done.params.items():

@@ -115,7 +115,7 @@ def test_a_command_that_is_no_number_for_long_is_a_gap() -> None:
                 grid(x, u)
         else:
             assert grid(x, u).inputs[10:13, 0].tolist() == [9, 9, 12]
-    assert len(grid(x, u, span=Span(end=0.4)).inputs) == 8  # outside the span it does not matter
+    assert len(grid(x, u, span=Span(end=0.9)).inputs) == 8  # outside the span it does not matter
 
 
 def test_one_shot_topics() -> None:

@@ -33,6 +33,9 @@ class Adopted(Result):
     params: Mapping[str, float]  # of the model, written with them
     claimed: bool  # the diagnosis claims the new ones; else one was taken by itself
     then: NextCommand = PROPOSE
+    beside: tuple[
+        str, ...
+    ] = ()  # adopted since the diagnosis, which claims them no more than these
 
     def summary(self) -> str:
         """The effects that the model has now."""
@@ -41,7 +44,12 @@ class Adopted(Result):
     def to_json(self) -> dict[str, Any]:
         """The document of `adopt --json`."""
         effects = [dict(effect) for effect in self.effects]
-        return {"effects": effects, "params": dict(self.params), "claimed": self.claimed}
+        return {
+            "effects": effects,
+            "params": dict(self.params),
+            "claimed": self.claimed,
+            "beside": list(self.beside),
+        }
 
 
 def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool = True) -> Adopted:
@@ -68,7 +76,9 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
     own, adopted = joined(found, names, workspace.config.model.effects, nominal, calibrated)
     whole = dict(workspace.config.model.params) | own
     set_in_model(workspace.config.file, params=whole if own else None, effects=adopted or None)
-    return Adopted(tuple(adopted), own, claimed)
+    fitted = {*names, *before, *(found.effects if claimed else ())}
+    beside = (str(effect["name"]) for effect in adopted)
+    return Adopted(tuple(adopted), own, claimed, beside=tuple(n for n in beside if n not in fitted))
 
 
 def joined(
