@@ -58,6 +58,16 @@ def test_all_claimed_effects_are_adopted_at_once(cart, tmp_path):
     assert last(grounded("-C", folder, "status")) == "grounded diagnose"  # with the model as it is
 
 
+def test_an_effect_that_was_fitted_in_place_of_what_is_adopted_now_is_named(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    late = {"effect": "delay:force", "params": {"d": {"value": 0.02, "std": 0.01, "unit": "s"}}}
+    diagnosed(folder, ranking=[DIAGNOSIS["ranking"][0], DIAGNOSIS["ranking"][1] | late])
+    first = grounded("-C", folder, "adopt", "delay:force", "--json").json
+    assert first["beside"] == [] and not first["claimed"]
+    done = grounded("-C", folder, "adopt", "viscous_friction:v")
+    assert "delay:force" in done.err and "warning" in done.err
+
+
 def test_nothing_is_adopted_where_one_name_is_wrong(cart, tmp_path):
     folder = copied(cart, tmp_path / "w")
     before = (folder / "grounded.toml").read_text()
