@@ -15,6 +15,11 @@ if TYPE_CHECKING:
     from grounded.fit import Fit
     from grounded.model import Model
 
+STANDS_IN = (
+    "numbers fitted alone also stand in for what the equations lack (a mass for a friction): "
+    "`grounded diagnose` tells the two apart, on the same trials"
+)
+
 
 @click.command("fit")
 @click.option("--params", metavar="A,B,...", help="Fit only these; the others keep their values.")
@@ -49,6 +54,7 @@ def command(params: str | None, latency: bool, apply_: bool, engine: Engine, jso
     if apply_:
         show("\nwritten to grounded.toml [model] params")
     elif found.helps:
+        remark("note", STANDS_IN)
         show("\nto write the values to grounded.toml, add --apply")
     else:
         show("\nnothing was written: these values don't lower the held-out errors")
