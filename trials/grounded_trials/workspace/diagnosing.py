@@ -83,7 +83,12 @@ def diagnose_in(
     )
     found = replace(found, made=made)
     _keep(workspace, found)
-    identity, words = _probe(workspace, found, lifted + second, library, write=probe)
+    try:
+        identity, words = _probe(workspace, found, lifted + second, library, write=probe)
+    except Exception as error:  # it must not cost the diagnosis, which is told whatever it is
+        why = f"{type(error).__name__} {error}" if str(error) else type(error).__name__
+        why = str(error) if isinstance(error, GroundedError) else f"{why}: please report it"
+        identity, words = "", f"{found.next_trial.rstrip('.')}; no probe could be computed ({why})"
     if words:
         run = f" ({identity}: {rendered(to_run(workspace, identity, identity))})" * bool(identity)
         found = replace(found, next_trial=f"{words}{run}", probe=identity)
