@@ -336,9 +336,7 @@ def _safe(task: Task, run: Trial | None) -> bool:
     return bool(inside.all())
 
 
-def _evidence(
-    task: Task, run: Trial, true: Hypothesis, rival: Hypothesis, noise: _Noise
-) -> float:
+def _evidence(task: Task, run: Trial, true: Hypothesis, rival: Hypothesis, noise: _Noise) -> float:
     """What the rival, its values free, fails to explain of a run [nats]."""
     data = noise.data(task, [run])
     predictor = Predictor(data)
