@@ -43,7 +43,7 @@ from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.report import Diagnosis, Estimate, Identifiable, NoiseLevels
-from grounded.diagnosis.unconfirmed import lost, unconfirmed
+from grounded.diagnosis.unconfirmed import unconfirmed, unrepeatable
 from grounded.diagnosis.validation.agreement import by_trial, changed
 from grounded.diagnosis.validation.claims import Claims
 from grounded.diagnosis.validation.decide import Decision, decide
@@ -213,7 +213,7 @@ class _Writer:
         rows, credit = measured.prediction_error(), measured.credits()
         off = remainder[0].channel if remainder else ""
         named = [row.effect for row in ranking if row.claimed]
-        seen = unconfirmed(self.claims, self.decision.doubtful)
+        seen = unconfirmed(self.claims, self.decision.doubtful, groups)
         values, agreement = by_trial(self.best, data, named) if named else ((), ())
         return Diagnosis(
             verdict=verdict(self.claims, ranking, groups, remainder, rows, credit, seen, same),
@@ -243,7 +243,7 @@ class _Writer:
             leftover=remainder,
             unconfirmed=seen,
             correction=correction(predictor, self.best, self.left, where),
-            next_trial=next_trial(self.claims, off, groups, seen, same, self.lost()),
+            next_trial=next_trial(self.claims, off, groups, seen, same, self.unrepeatable()),
             unknowable=self.known.sentences,
             noise=self.noise(),
             parameters=self.claims.parameters(),
@@ -256,9 +256,9 @@ class _Writer:
             candidates=len(self.search.candidates),
         )
 
-    def lost(self) -> tuple[str, ...]:
-        """The trials that nobody should repeat."""
-        return () if self.task is None else lost(self.task, self.trials)
+    def unrepeatable(self) -> dict[str, str]:
+        """The trials that nobody can or should repeat."""
+        return {} if self.task is None else unrepeatable(self.task, self.trials)
 
     def channels(self, gain: Any, rows: Sequence[RulerRow]) -> tuple[ChannelShare, ...]:
         """Each state's part of the gap, with the ruler's errors a second ahead."""

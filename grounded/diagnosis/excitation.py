@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis.hypotheses.explored import TIE
-from grounded.diagnosis.likelihood.data import prepare, shifted
+from grounded.diagnosis.likelihood.data import Data, prepare, shifted
 from grounded.diagnosis.likelihood.fitted import calibrated
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.noise import NoiseModel, Structure
@@ -62,6 +62,27 @@ class Probe:
     sentence: str
 
 
+@dataclass(frozen=True, eq=False)
+class _Noise:
+    """The noise of a diagnosis; nothing disturbs or measures `hidden` states, adopted memories."""
+
+    model: NoiseModel
+    hidden: tuple[str, ...]
+
+    @classmethod
+    def of(cls, model: Model, diagnosis: Diagnosis) -> _Noise:
+        def logs(levels: Mapping[str, float]) -> Array:
+            return np.array([2 * np.log(levels.get(n, 0.0) + 1e-12) for n in model.state_names])
+
+        known = diagnosis.noise
+        q, r = logs(known.process), logs(known.measurement)
+        noise = NoiseModel(Structure(), q, r, q.copy(), np.full(model.n, -60.0))
+        return cls(noise, tuple(n for n in model.state_names if n not in known.process))
+
+    def data(self, task: Task, runs: Sequence[Trial]) -> Data:
+        return prepare(task.model, runs, task.latency, task.past, self.hidden)
+
+
 def probe(
     task: Task,
     policy: Policy,
@@ -86,7 +107,7 @@ def probe(
         return _teaching(task, policy, diagnosis, trials, library or Library())
     group = ties[0]
     task, first, second = _rivals(task, diagnosis, trials, library or Library(), group[:2])
-    noise = _noise(task.model, diagnosis)
+    noise = _Noise.of(task.model, diagnosis)
     again = [run for t in trials[-REPLAYED:] if (run := _run(task, first, policy, t)) is not None]
     if again:
         second = _adapted(task, again, second, noise)
@@ -133,7 +154,8 @@ def _teaching(
             return None
         h = h.plus(effect, row.values)
         spreads |= {f"{q.name} of {name}": (row.params[q.name].std, q.unit) for q in effect.free}
-    data = prepare(task.model, trials, task.latency, task.past)
+    noise, best = _Noise.of(task.model, diagnosis), None
+    data = noise.data(task, trials)
     sizes = {data.model.param_names[i]: float(param_scale(data.model)[i]) for i in calibrated(data)}
     if known:
         h = replace(h, shift=np.zeros(data.model.system.k), spread=1.0)
@@ -142,7 +164,6 @@ def _teaching(
     std = np.array([s if np.isfinite(s) else 0.0 for s, _ in spreads.values()])
     if not std.any():
         return None
-    noise, best = _noise(task.model, diagnosis), None
     F = _information(task, trials, h, noise)
     if F.shape != (len(std), len(std)) or not np.isfinite(F).all():
         return None
@@ -174,10 +195,11 @@ def _teaching(
     return Probe(chosen, gain, (name,), sentence)
 
 
-def _information(task: Task, runs: Sequence[Trial], h: Hypothesis, noise: NoiseModel) -> Array:
+def _information(task: Task, runs: Sequence[Trial], h: Hypothesis, noise: _Noise) -> Array:
     """Fisher information (C, C) on a hypothesis' values that runs hold, or would."""
-    data = prepare(task.model, runs, task.latency, task.past)
-    fits = refine(Predictor(data), [(h, noise, data.y.copy())], iterations=1, fixed_noise=True)
+    data = noise.data(task, runs)
+    start = [(h, noise.model, data.y.copy())]
+    fits = refine(Predictor(data), start, iterations=1, fixed_noise=True)
     return np.asarray(fits[0].gram.sum(axis=0)) if fits else np.zeros((0, 0))
 
 
@@ -251,10 +273,10 @@ def _rivals(
     return task, one, other
 
 
-def _adapted(task: Task, runs: list[Trial], h: Hypothesis, noise: NoiseModel) -> Hypothesis:
+def _adapted(task: Task, runs: list[Trial], h: Hypothesis, noise: _Noise) -> Hypothesis:
     """A hypothesis with the values that explain runs best: as the trials left it."""
-    data = prepare(task.model, runs, task.latency, task.past)
-    start = [(h, noise, data.y.copy())]
+    data = noise.data(task, runs)
+    start = [(h, noise.model, data.y.copy())]
     fits = refine(Predictor(data), start, iterations=ADAPTED, fixed_noise=True)
     return fits[0].hypothesis if fits else h
 
@@ -264,14 +286,6 @@ def _scales(task: Task, trials: Sequence[Trial]) -> Scales:
     inputs = np.concatenate([trial.inputs for trial in trials])
     duration = max(trial.steps for trial in trials) * task.dt
     return scales_of(task.model, states, inputs, task.dt, duration)
-
-
-def _noise(model: Model, diagnosis: Diagnosis) -> NoiseModel:
-    def logs(levels: Mapping[str, float]) -> Array:
-        return np.array([2 * np.log(levels[n] + 1e-12) for n in model.state_names])
-
-    q, r = logs(diagnosis.noise.process), logs(diagnosis.noise.measurement)
-    return NoiseModel(Structure(), q, r, q.copy(), np.full(model.n, -60.0))
 
 
 def _run(task: Task, h: Hypothesis, policy: Policy, like: Trial | None = None) -> Trial | None:
@@ -322,15 +336,13 @@ def _safe(task: Task, run: Trial | None) -> bool:
     return bool(inside.all())
 
 
-def _evidence(
-    task: Task, run: Trial, true: Hypothesis, rival: Hypothesis, noise: NoiseModel
-) -> float:
+def _evidence(task: Task, run: Trial, true: Hypothesis, rival: Hypothesis, noise: _Noise) -> float:
     """What the rival, its values free, fails to explain of a run [nats]."""
-    data = prepare(task.model, [run], task.latency, task.past)
+    data = noise.data(task, [run])
     predictor = Predictor(data)
     rss = []
     for h in (true, rival):
-        start = [(h, noise, data.y.copy())]
+        start = [(h, noise.model, data.y.copy())]
         fits = refine(predictor, start, iterations=ADAPTED, fixed_noise=True)
         rss.append(float(fits[0].rss.sum()) if fits else np.inf)
     return max(0.5 * (rss[1] - rss[0]), 0.0)

@@ -2,7 +2,7 @@
 
 They are never causes. Each is told with the trial, the time and the region that show it, where a
 further trial would have to go. What most trials show as likely, and none predicts better by, is a
-fault of the likelihood and is not told.
+fault of the likelihood and is not told; nor is what ties with a cause, which is told as that.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from grounded.diagnosis.report import Unconfirmed
 from grounded.diagnosis.validation.claims import Claims
 from grounded.diagnosis.validation.decide import Doubtful
 from grounded.diagnosis.validation.prediction_error import by_region
-from grounded.diagnosis.verdict import meaning
+from grounded.diagnosis.verdict import LOG, LOST, meaning
 from grounded.frozen import Array
 from grounded.task import Task
 from grounded.trial import Trial
@@ -26,24 +26,34 @@ MENTIONED = 2
 MOST = 0.8  # of all that it does, which few trials hold
 FAR_OFF = 2.0
 FEW = 4  # one of so many trials
+ALIKE = 0.5  # of what it does in their steps: where others hold as much, no place shows it
+MEMORY = 1e-2  # of a memory's spread: what counts as noise there, where there is none
 SURE = 2.0  # standard deviations that one of its numbers is from zero
 
 
-def unconfirmed(claims: Claims, doubtful: Sequence[Doubtful]) -> tuple[Unconfirmed, ...]:
-    """The likeliest effects that a decision dropped, of those that few trials show."""
+def unconfirmed(
+    claims: Claims, doubtful: Sequence[Doubtful], groups: Sequence[Sequence[str]] = ()
+) -> tuple[Unconfirmed, ...]:
+    """The likeliest effects that a decision dropped, that few trials show; no tied ones."""
     if claims.known.no_cause:
         return ()
-    found = [_seen(claims, one) for one in doubtful]
+    tied = {name for group in groups for name in group}
+    found = [_seen(claims, one) for one in doubtful if one.name not in tied]
     return tuple([one for one in found if one is not None][:MENTIONED])
 
 
 def _seen(claims: Claims, one: Doubtful) -> Unconfirmed | None:
     data, acts = claims.data, _acting(claims, one)
     by = np.bincount(data.trial_of, acts.sum(axis=0), data.count)
-    held = np.cumsum(np.sort(by)[::-1])
+    steps = np.bincount(data.trial_of, data.valid.sum(axis=1), data.count)
+    order = np.argsort(-by)
+    held = np.cumsum(by[order])
     few = 1 + int(np.searchsorted(held, MOST * held[-1]))
-    if data.count < 2 or few > max(data.count // FEW, 1):
+    if not held[-1] > 0 or few > max(data.count // FEW, 1) or few == data.count:
         return None
+    there, rest = order[:few], order[few:]
+    if by[rest].sum() * steps[there].sum() > ALIKE * by[there].sum() * steps[rest].sum():
+        return None  # the few are long, not special
     trial = int(by.argmax())
     own = np.flatnonzero(data.trial_of == trial)
     run = int(own[acts[:, own].sum(axis=0).argmax()])
@@ -66,33 +76,33 @@ def _seen(claims: Claims, one: Doubtful) -> Unconfirmed | None:
     )
 
 
-def lost(task: Task, trials: Sequence[Trial]) -> tuple[str, ...]:
-    """The runs that crashed: they ended early, left [safety], or went far from all others.
+def unrepeatable(task: Task, trials: Sequence[Trial]) -> dict[str, str]:
+    """The trials that can't or should not be run again, and why: logs, and runs that crashed.
 
-    Far is where a state with a target strays from it by FAR_OFF times the range that the target
-    and the best run have.
+    Only a candidate's run can be repeated. One crashed that ended early, left [safety], or went far
+    from all others: where a state with a target strays from it by FAR_OFF times the range that the
+    target and the best run have.
     """
     assert task.safety_low is not None and task.safety_high is not None
     ran = [trial for trial in trials if trial.candidate]
     best = max(ran, key=task.utility, default=None)
-    found = []
+    found = {trial.id: LOG for trial in trials if not trial.candidate}
     for trial in ran:
         states = trial.states[: task.horizon + 1]
         outside = (states < task.safety_low) | (states > task.safety_high)
-        if trial is best or not (
-            math.isinf(task.utility(trial)) or outside.any() or _far(task, trial, best)
-        ):
-            continue
-        found.append(trial.id)
-    return tuple(found)
+        lost = math.isinf(task.utility(trial)) or outside.any() or _far(task, trial, best)
+        if trial is not best and lost:
+            found[trial.id] = LOST
+    return found
 
 
 def _far(task: Task, trial: Trial, best: Trial | None) -> bool:
     if best is None:
         return False
-    both = np.concatenate([best.states, task.target])
+    both = np.concatenate([best.states[: len(task.target)], task.target])
     room = FAR_OFF * (np.nanmax(both, axis=0) - np.nanmin(both, axis=0))
-    off = task.model.difference(trial.states, task.target[: len(trial.states)])
+    steps = min(len(trial.states), len(task.target))  # an older task may have been longer
+    off = task.model.difference(trial.states[:steps], task.target[:steps])
     return bool((np.abs(off) > room).any())
 
 
@@ -103,7 +113,10 @@ def _acting(claims: Claims, one: Doubtful) -> Array:
     less = h.minus(one.name)
     moved = data.model.difference(predictor.next(less, x[:-1]), predictor.next(h, x[:-1]))
     shown = np.zeros_like(x) + predictor.offset(h, x) - predictor.offset(less, x)
-    square = moved**2 / np.exp(fit.noise.log_q) + shown[1:] ** 2 / np.exp(fit.noise.log_r)
+    log_q, log_r = fit.noise.log_q.copy(), fit.noise.log_r.copy()
+    for i in data.hidden:  # no noise disturbs it, and by none nothing can be divided
+        log_q[i] = log_r[i] = 2 * np.log(MEMORY * data.scales.spread(data.model.state_names[i]))
+    square = moved**2 / np.exp(log_q) + shown[1:] ** 2 / np.exp(log_r)
     return np.asarray(square.sum(axis=-1) * data.valid.T)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -24,6 +24,7 @@ if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
     from grounded.effects import Effect
     from grounded.model import Model
 
+LOG, LOST = "is a log that no candidate made", "was lost"  # why a trial can't be run again
 NAMED = 3  # parameters, channels and leftovers that a sentence names at most
 MATTERS = 0.05  # of the crude model's error: a rest below it is told as its share
 SHOWS = 0.1  # of the error: a channel that improves by less is not named
@@ -211,7 +212,7 @@ def next_trial(
     groups: tuple[tuple[str, ...], ...],
     seen: Sequence[Unconfirmed] = (),
     same: tuple[tuple[str, ...], ...] = (),
-    lost: Collection[str] = (),
+    unrepeatable: Mapping[str, str] | None = None,
 ) -> str:
     """A sentence; `excitation.probe` makes the trial itself.
 
@@ -221,24 +222,26 @@ def next_trial(
         groups: what ties.
         seen: what only one trial shows.
         same: of the groups, what is one thing in the model.
-        lost: the trials that nobody should repeat.
+        unrepeatable: the trials that can't or should not be run again, and why.
     """
+    from grounded.effects import places
+
     if claims.known.no_cause:
         return "Run two or more trials in which every input changes."
     if groups and groups[0] in same:
         return f"{told_apart(groups[0], same)}: no trial tells them apart, adopt either."
     if groups:
         made = f"A trial made for it would tell {tied(groups[0])}."
-        return " ".join([made, *distinguishing(groups[0])])
+        turns = bool(places.plane(claims.data.model))
+        return " ".join([made, *distinguishing(groups[0], turns=turns)])
     if seen:
         one = seen[0]
-        if one.trial not in lost:
+        why = (unrepeatable or {}).get(one.trial)
+        if why is None:
             return f"Repeat trial {one.trial}: hardly another one shows {one.effect}."
-        there = "" if one.region is None else f", one that goes where {one.region.when}"
-        return (
-            f"Hardly a trial but {one.trial} shows {one.effect}, and that one was lost: don't "
-            f"repeat it, run a gentler one{there}."
-        )
+        there = "" if one.region is None else f" that goes where {one.region.when}"
+        better = f"run a gentler one{there}" if why == LOST else f"record another one{there}"
+        return f"Hardly a trial but {one.trial} shows {one.effect}, and that one {why}: {better}."
     if not claims.names and left:
         return (
             f"Repeat the best trial twice with the same inputs to see whether the leftover in "
@@ -268,6 +271,11 @@ HINTS = {
     "sensor_bias": "start from different headings and reverse direction",
     "patch": "cross the same places at other speeds and directions",
     "slope": "drive the same way in several headings",
+}
+
+STRAIGHT = {  # where nothing has a heading or drives a curve
+    "sensor_bias": "hold still before and after the run, and move both ways",
+    "rate_gain": "make the same motion slowly and fast",
 }
 
 GREEK = (
@@ -351,12 +359,13 @@ def tied(group: Sequence[str]) -> str:
     return f"{group[0]} from {' or '.join(group[1:])}"
 
 
-def distinguishing(group: Sequence[str]) -> list[str]:
-    """What to do in a trial that tells a group apart, in sentences."""
+def distinguishing(group: Sequence[str], *, turns: bool = True) -> list[str]:
+    """What to do in a trial that tells a group apart, in sentences; turns: there is a heading."""
     found = []
     for name in group:
         family, _, target = name.partition(":")
-        hint = HINTS.get(family)
+        hint = STRAIGHT.get(family) if not turns else None
+        hint = hint or HINTS.get(family)
         text = f"{hint[0].upper()}{hint[1:]} ({target})." if hint else ""
         if text and text not in found:
             found.append(text)

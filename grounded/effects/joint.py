@@ -34,6 +34,7 @@ import numpy as np
 from grounded.compile.names import Named
 from grounded.effects import places
 from grounded.effects.family import Effect, LossFamily, Quantity, Site, coupled, width
+from grounded.frozen import Array
 from grounded.model import Model
 
 SWEEPS = 3
@@ -41,6 +42,7 @@ PARTS = 4  # of a step
 NUDGE = 1e-2  # of the input's unit: the difference that B is taken over
 ALIKE = 0.999  # cosine from which two slopes are one
 ONLY = 2e-3  # of a speed's answer: what an input may do besides
+TURNS = 4  # times as many samples where axes stand anywhere
 FORCES = ("N", "V", "A")  # what a unit of an effort begins with: N m, V ...
 
 Pairs = Sequence[tuple[Effect, Mapping[str, Any]]]
@@ -107,7 +109,7 @@ def dry(w: Any, free: Any, gain: Any, c: Any, b: Any, width: Any) -> Any:
 def _friction(site: Site) -> tuple[Quantity, ...]:
     tau, w = coupled(site)
     unit, most = site.unit(tau), _strongest(site)
-    by = f"{unit} s/{site.unit(w).removesuffix('/s')}"
+    by = f"{unit} s/{site.unit(w).removesuffix('/s')}".removeprefix("1 ")
     viscous = Quantity("b", by, low=0.0, fixed=has_viscous(site.model, tau, w))
     return (Quantity("c", unit, low=0.0, high=most), viscous, width(site, w))
 
@@ -115,7 +117,8 @@ def _friction(site: Site) -> tuple[Quantity, ...]:
 def _per_acceleration(site: Site) -> str:
     """N m by rad/s is kg m^2, N by m/s kg; others as a fraction."""
     tau, w = (site.unit(name) for name in coupled(site))
-    return {"N m": "kg m^2", "N": "kg"}.get(tau, f"{tau} s^2/{w.removesuffix('/s')}")
+    other = f"{tau} s^2/{w.removesuffix('/s')}".removeprefix("1 ")
+    return {"N m": "kg m^2", "N": "kg"}.get(tau, other)
 
 
 def has_viscous(model: Model, tau: str, w: str) -> bool:
@@ -139,24 +142,54 @@ def _strongest(site: Site) -> float:
 
 
 def pairs_of(model: Model) -> list[str]:
-    """`tau<-w` for every effort and the velocity that it always pushes the same way."""
-    if not any(unit.startswith(FORCES) for unit in model.inputs.values()):
-        efforts = list(model.input_names) if getattr(model.step, "timestep", 0.0) else []
-    else:
-        efforts = [n for n, unit in model.inputs.items() if unit.startswith(FORCES)]
+    """`tau<-w` for every effort and the velocity that it always pushes the same way.
+
+    Efforts are inputs in N, N m, V or A, and whatever moves several velocities through an inertia.
+    """
+    own, units = getattr(model.step, "timestep", 0.0), model.inputs.items()
+    efforts = [n for n, unit in units if unit.startswith(FORCES)]
+    if own and not efforts:
+        efforts = list(model.input_names)
     velocities = places.velocities(model)
-    if not efforts or not velocities:
-        return []
-    dt = places.probe(model, 1e-2)
-    _, f_u = model.system.linearise(*places.samples(model, 8), model.values, dt)
-    found = []
-    for tau in efforts:
+    dt, (x, u) = places.probe(model, 1e-2), places.samples(model, 8)
+    found = {}
+    if efforts and velocities:
+        _, f_u = model.system.linearise(x, u, model.values, dt)
+        found = {tau: _pushed(model, f_u, tau, velocities) for tau in efforts}
+    if not own and len(found) < model.m:
+        found |= _coupled(model, [n for n in model.input_names if n not in found])
+    return [f"{tau}<-{found[tau]}" for tau in model.input_names if found.get(tau)]
+
+
+def _pushed(model: Model, f_u: Array, tau: str, velocities: Sequence[str]) -> str | None:
+    """The velocity that an input always pushes the same way, most of all."""
+    by = {w: f_u[:, model.state_names.index(w), model.input_names.index(tau)] for w in velocities}
+    least = {w: float(g.min()) for w, g in by.items() if g.min() > 1e-9}
+    return max(least, key=lambda w: least[w], default=None)
+
+
+def _coupled(model: Model, inputs: Sequence[str]) -> dict[str, str | None]:
+    """The same for inputs of any unit that move a second velocity too, wherever the axes stand.
+
+    Velocities are those of a position (q' = w). A diagonal of an inertia matrix is positive for all
+    q: what pushes one way here and the other there (a thrust that is tilted) is no joint's motor.
+    """
+    axes = places.integrated(model)
+    velocities = list(dict.fromkeys(w for w, _ in axes.values()))
+    if len(velocities) < 2:
+        return {}
+    x, u = places.samples(model, 8 * TURNS)
+    for i, name in enumerate(model.state_names):
+        if name in axes:
+            x[:, i] = np.linspace(-np.pi, np.pi, len(x)) * (1 + i)
+    _, f_u = model.system.linearise(x, u, model.values, 1e-2)
+    found = {tau: _pushed(model, f_u, tau, velocities) for tau in inputs}
+    size = np.abs(f_u).max(axis=0)
+    for tau, w in found.items():
         j = model.input_names.index(tau)
-        by = {w: f_u[:, model.state_names.index(w), j] for w in velocities}
-        least = {w: float(g.min()) for w, g in by.items() if g.min() > 1e-9}
-        best = max(least, key=lambda w: least[w], default=None)
-        if best is not None:
-            found.append(f"{tau}<-{best}")
+        by = {v: size[model.state_names.index(v), j] for v in velocities}
+        if w is not None and not any(by[v] > ONLY * by[w] for v in velocities if v != w):
+            found[tau] = None  # coulomb_friction:w says the same
     return found
 
 

@@ -17,6 +17,7 @@ from grounded.model import Model
 
 POSITIONS = (("x", "y"), ("north", "east"), ("px", "py"), ("pos_x", "pos_y"))
 HEADINGS = ("psi", "yaw", "heading", "theta")
+SHORT = 1e-5  # [s], a step that shows the rates
 SPEEDS = ("v", "speed", "velocity", "vx", "u")
 
 
@@ -119,6 +120,37 @@ def probe(model: Model, dt: float) -> float:
     """A step to look at a model with [s]: dt, or the nearest that its simulator can make."""
     own = float(getattr(model.step, "timestep", 0.0))
     return max(1, round(dt / own)) * own if own else dt
+
+
+def integrated(model: Model) -> dict[str, tuple[str, float]]:
+    """States whose rate is c times another state: {angle: (angular velocity, c)}.
+
+    A simulator that can't make a short step adds the velocity that it has after its own step.
+    """
+    (x, u), dt = samples(model), probe(model, 1e-8)
+    after = model.system.step(x, u, model.values, dt)
+    moved, names, found = (after - x) / dt, model.state_names, {}
+    if dt > SHORT:
+        for i, name in enumerate(names):
+            with np.errstate(divide="ignore", invalid="ignore"):
+                ratio = moved[:, [i]] / after
+            same = np.isfinite(ratio).all(axis=0) & (np.ptp(ratio, axis=0) < 1e-6 * abs(ratio[0]))
+            for j in map(int, np.flatnonzero(same)):
+                if j != i:
+                    found[name] = names[j], float(ratio[0, j])
+        return found
+    f_x, f_u = model.system.linearise(x, u, model.values, dt)
+    rates = (f_x - np.eye(model.n)) / dt
+    for i, name in enumerate(names):
+        j = int(np.argmax(np.abs(rates[0, i])))
+        c = rates[0, i, j]
+        small = 1e-4 * abs(c)
+        alone = np.abs(np.delete(rates[:, i], j, axis=1)).max(initial=0.0) < small
+        steady = np.abs(rates[:, i, j] - c).max() < small and np.abs(f_u[:, i]).max() / dt < small
+        straight = np.allclose(moved[:, i], c * x[:, j], rtol=1e-4)
+        if i != j and c != 0 and alone and steady and straight:
+            found[name] = names[j], float(np.mean(moved[:, i] / x[:, j]))
+    return found
 
 
 def following(model: Model) -> list[str]:

@@ -118,7 +118,7 @@ class Library:
         """Every effect that can apply to a model, in the library's order."""
         found, offered = [], [family.name for family in self.families]
         idle, outright = derived_states(model), outright_states(model)
-        integrals = integrated_states(model)
+        integrals = places.integrated(model)
         geometric = set(integrals) - set(places.velocities(model))
         same = aliases(model, idle | outright) | joint.renamed(model)
         for family in self.families:
@@ -157,37 +157,6 @@ def derived_states(model: Model) -> set[str]:
     return {named[0]} if float(np.abs(others).max()) < 1e-12 else set()
 
 
-def integrated_states(model: Model) -> dict[str, tuple[str, float]]:
-    """States whose rate is c times another state: {angle: (angular velocity, c)}.
-
-    A simulator that can't make a short step adds the velocity that it has after its own step.
-    """
-    (x, u), dt = places.samples(model), places.probe(model, 1e-8)
-    after = model.system.step(x, u, model.values, dt)
-    moved, names, found = (after - x) / dt, model.state_names, {}
-    if dt > SHORT:
-        for i, name in enumerate(names):
-            with np.errstate(divide="ignore", invalid="ignore"):
-                ratio = moved[:, [i]] / after
-            same = np.isfinite(ratio).all(axis=0) & (np.ptp(ratio, axis=0) < 1e-6 * abs(ratio[0]))
-            for j in map(int, np.flatnonzero(same)):
-                if j != i:
-                    found[name] = names[j], float(ratio[0, j])
-        return found
-    f_x, f_u = model.system.linearise(x, u, model.values, dt)
-    rates = (f_x - np.eye(model.n)) / dt
-    for i, name in enumerate(names):
-        j = int(np.argmax(np.abs(rates[0, i])))
-        c = rates[0, i, j]
-        small = 1e-4 * abs(c)
-        alone = np.abs(np.delete(rates[:, i], j, axis=1)).max(initial=0.0) < small
-        steady = np.abs(rates[:, i, j] - c).max() < small and np.abs(f_u[:, i]).max() / dt < small
-        straight = np.allclose(moved[:, i], c * x[:, j], rtol=1e-4)
-        if i != j and c != 0 and alone and steady and straight:
-            found[name] = names[j], float(np.mean(moved[:, i] / x[:, j]))
-    return found
-
-
 def outright_states(model: Model) -> set[str]:
     """States that the model sets outright, whatever they were: they have no rate of their own."""
     f_x, _ = model.system.linearise(*places.samples(model), model.values, places.probe(model, 0.01))
@@ -205,7 +174,6 @@ def partner(model: Model, target: str) -> str | None:
 
 SAMPLES = 40
 SAME = 1e-7  # of the squared length: what may differ
-SHORT = 1e-5  # [s], a step that shows the rates
 BESIDE = 1.3  # times the parameters: where the slopes must agree too
 
 
@@ -234,7 +202,7 @@ class _Rates:
     """Rates (SAMPLES, n) that named rate effects add, slopes of the model's rates by name."""
 
     def __init__(self, model: Model, x: Array, u: Array, p: Array, kept: list[int]) -> None:
-        dt = places.probe(model, SHORT)
+        dt = places.probe(model, places.SHORT)
         own = (model.system.step(x, u, p, dt) - x) / dt
         _, f_u, f_p = model.system.sensitivities(x, u, p, dt)
         self.named: dict[str, Array] = {}

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from grounded.effects import places
-from grounded.effects.registry import integrated_states, partner
+from grounded.effects.registry import partner
 from grounded.frozen import Array, wrapped
 from grounded.instruments.lag import Lag, lag_between
 from grounded.model import Model
@@ -42,7 +42,7 @@ def integrals(model: Model) -> list[Integral]:
     names = model.state_names
     found = [
         Integral(names.index(name), names.index(other), c)
-        for name, (other, c) in integrated_states(model).items()
+        for name, (other, c) in places.integrated(model).items()
     ]
     carried = [(i, k) for i, n in enumerate(names) if (k := partner(model, n))]
     return found + [Integral(i, names.index(k), 1.0, exact=False) for i, k in carried]

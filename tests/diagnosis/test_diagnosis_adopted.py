@@ -3,6 +3,7 @@
 import json
 import tomllib
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,11 +12,19 @@ from test_diagnosis import DT, cart
 from cli import grounded
 from grounded import Trial
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
+from grounded.diagnosis.excitation import probe
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.report import Estimate
+from grounded.diagnosis.unconfirmed import unconfirmed
+from grounded.diagnosis.validation.decide import Doubtful
 from grounded.diagnosis.validation.limits import limits
 from grounded.effects import Library, memory_of, wrap
 from grounded.errors import NextCommand
+from grounded.policy import Policy
+from grounded.task import Task
+from grounded.utility import Reward
 from grounded_trials.store.documents import write_document
 from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace.diagnosing import _chosen, diagnosable, read_diagnosis
@@ -79,6 +88,39 @@ def test_nothing_is_left_beside_what_is_all():
     better, lifted, memory = adopted(model, runs)
     found = diagnose(better, lifted, DiagnosisOptions(hidden=memory, but={"first_order_lag:u"}))
     assert found.kind == "none" and not found.leftover and found.gap.after < 1.2
+    tied = tuple(row.effect for row in found.ranking if ":v" in row.effect)[:2]
+    weights, three, one = np.array([1.0, 1.0, 0.0]), np.zeros(3), np.ones(1)
+    reward = Reward(weights, three, 0 * one, 0 * one)
+    task = Task(better, DT, np.zeros((41, 3)), reward, three, 0 * one, -one, one)
+    names, angles = (better.state_names, better.input_names), (False,) * 3
+    policy = Policy(0.3 * np.ones((40, 1)), -one, one, DT, *names, (1,), angles, 0 * one)
+    made = probe(task, policy, replace(found, indistinguishable=(tied,)), lifted)
+    assert made is not None and made.about == tied and np.isfinite(made.expected)
+
+
+def test_an_effect_of_every_run_is_not_unconfirmed_because_one_log_is_long():
+    """Seen on a crane: a gyro's bias told as what one of eleven trials shows, the long log."""
+    model, runs = lagging(0.0)
+    better, lifted, memory = adopted(model, [runs[0], *(run.until(12) for run in runs[1:])])
+    data = prepare(better, lifted, hidden=memory)
+    search = HypothesisSearch(data, ())
+    claims = SimpleNamespace(known=SimpleNamespace(no_cause=False), data=data)
+    claims.predictor = search.predictor
+    claims.estimates = lambda fit: [{"b": Estimate(0.3, 0.01)}]
+
+    def seen(name, values, groups=()):
+        effect = Library().effect(name, better, data.scales)
+        (fit,) = search.refined([search.fresh(Hypothesis().plus(effect, values))], 1)
+        return unconfirmed(claims, [Doubtful(name, 50.0, fit)], groups)
+
+    assert seen("sensor_bias:v", {"b": 0.3}) == ()
+    once = replace(lifted[0], inputs=0 * lifted[0].inputs)
+    data = claims.data = prepare(better, [once, once, once, lifted[1]], hidden=memory)
+    search = HypothesisSearch(data, ())
+    claims.predictor = search.predictor
+    (gain,) = seen("input_gain:u", {"g": 0.3})
+    assert gain.seen == (1, 4) and gain.trial == "4"
+    assert seen("input_gain:u", {"g": 0.3}, [("parameter:k", "input_gain:u")]) == ()
 
 
 def test_a_memory_is_known_at_the_start_and_disturbed_by_nothing():

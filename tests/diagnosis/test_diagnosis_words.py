@@ -9,9 +9,10 @@ import numpy as np
 from grounded import Trial
 from grounded.diagnosis.error_report import Credit, Region, RulerRow
 from grounded.diagnosis.report import Estimate, Ranked, Unconfirmed
-from grounded.diagnosis.unconfirmed import lost
-from grounded.diagnosis.verdict import next_trial, verdict, worsened
+from grounded.diagnosis.unconfirmed import unrepeatable
+from grounded.diagnosis.verdict import LOG, LOST, next_trial, verdict, worsened
 from grounded.effects import Library
+from grounded.models import car, pendulum
 from small_tasks import cart_task
 
 UNITS = {"x": "m", "v": "m/s"}
@@ -74,11 +75,21 @@ def test_a_share_in_a_sentence_is_the_share_of_the_table():
     assert f"{percent(0.074)} of the gain" in verdict(claims, ranked, (), (), (), credit).sentence
 
 
-def test_a_crash_is_never_to_be_repeated():
+def test_neither_a_crash_nor_a_log_by_hand_is_to_be_repeated():
     seen = Unconfirmed("patch:v", trial="t0001", region=Region("v > 2"))
     assert "Repeat trial t0001" in next_trial(_claims(), "", (), (seen,))
-    lost_one = next_trial(_claims(), "", (), (seen,), lost=("t0001",))
-    assert "Repeat" not in lost_one and "v > 2" in lost_one
+    said = {why: next_trial(_claims(), "", (), (seen,), (), {"t0001": why}) for why in (LOG, LOST)}
+    assert all("Repeat" not in text and "v > 2" in text for text in said.values())
+    assert "gentler" in said[LOST] and "gentler" not in said[LOG]
+
+
+def test_headings_are_spoken_of_where_there_are_some():
+    def advice(model):
+        claims = _claims(data=SimpleNamespace(model=model))
+        return next_trial(claims, "", (("viscous_friction:v", "sensor_bias:v"),))
+
+    assert "heading" in advice(car.model)
+    assert "heading" not in advice(cart_task().model) + advice(pendulum.model)
 
 
 def test_what_ended_early_left_safety_or_ran_far_is_lost():
@@ -93,7 +104,9 @@ def test_what_ended_early_left_safety_or_ran_far_is_lost():
     good = np.where(np.isfinite(task.target), task.target, 0.0).reshape(H + 1, n)
     trials = [ran("good", good), ran("off", good + 0.1), ran("early", good[: H // 2])]
     trials.append(ran("far", good + 50.0 * np.linspace(0, 1, H + 1)[:, None]))
-    assert lost(task, trials) == ("early", "far")
+    assert unrepeatable(task, trials) == {"early": LOST, "far": LOST}
     fenced = replace(task, safety_high=np.array([float(good[:, 0].max()) + 0.05, np.inf]))
-    assert lost(fenced, trials) == ("off", "early", "far")
-    assert lost(task, [replace(trials[2], candidate="")]) == ()
+    assert list(unrepeatable(fenced, trials)) == ["off", "early", "far"]
+    assert unrepeatable(task, [replace(trials[2], candidate="")]) == {"early": LOG}
+    longer = np.vstack([good, 50.0 + good])  # ran for the target of before
+    assert list(unrepeatable(task, [*trials, ran("longer", longer)])) == ["early", "far"]

@@ -15,6 +15,8 @@ from grounded.diagnosis.likelihood.linearise import sensitivities_of, step_jacob
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects import Library, wrap
 from grounded.effects.joint import dry, has_viscous, pairs_of
+from grounded.models.aircraft import model as aircraft
+from grounded.models.car import model as car
 from grounded.models.pendulum import model as pendulum
 
 DT = 0.02
@@ -173,6 +175,44 @@ def test_an_inertia_that_was_left_out_is_found():
     found = gr.diagnose(arm, real_trials(J=(0.08, 0.0)))
     assert found.effects == ("added_inertia:t1<-w1",)
     assert found.ranking[0].params["J"].value == pytest.approx(0.08, rel=0.03)
+
+
+def crane(unit):
+    """A trolley with a hanging load, its command in any unit."""
+
+    def rates(s, a, p):
+        sn, cs = np.sin(s.theta), np.cos(s.theta)
+        acc = (p.k * a.motor + 0.6 * s.omega**2 * sn + 9.81 * sn * cs) / (2 + sn**2)
+        return {"x": s.v, "v": acc, "theta": s.omega, "omega": -(acc * cs + 9.81 * sn) / 0.6}
+
+    states = {"x": "m", "v": "m/s", "theta": "rad", "omega": "rad/s"}
+    return Model(states=states, inputs={"motor": unit}, params={"k": Param(15.0)}, derivative=rates)
+
+
+@pytest.mark.parametrize("unit", ["1", "%", "m/s", "N", "V"])
+def test_what_a_motor_loses_is_offered_whatever_its_commands_unit(unit):
+    """Seen on a crane: with the unit 1 its dry friction was told as a coupling of the load."""
+    assert pairs_of(crane(unit)) == ["motor<-v"]
+    effect = Library().effect("joint_friction:motor<-v", crane(unit))
+    lost = effect.free[0]
+    assert lost.name == "c" and lost.unit == unit
+    better = wrap(Library().effect("first_order_lag:motor", crane(unit)), {"tau": 0.05}, DT)
+    assert pairs_of(better) == ["motor<-v"]
+
+
+def test_no_joint_is_made_of_what_drives_one_axis_or_is_tilted():
+    def flown(s, a, p):
+        lift = a.left + a.right
+        return {
+            "x": s.vx, "z": s.vz, "tilt": s.w,
+            "vx": -lift * np.sin(s.tilt), "vz": lift * np.cos(s.tilt) - 9.81, "w": a.turn,
+        }  # fmt: skip
+
+    states = {"x": "m", "z": "m", "tilt": "rad", "vx": "m/s", "vz": "m/s", "w": "rad/s"}
+    inputs = {"left": "1", "right": "1", "turn": "1"}
+    assert pairs_of(Model(states=states, inputs=inputs, derivative=flown)) == []
+    for model in (car, aircraft, replace(pendulum, inputs={"torque": "1"})):
+        assert pairs_of(model) == []
 
 
 MJCF = """

@@ -4,6 +4,7 @@ import re
 import shlex
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace as NS
 
 import click
 import pytest
@@ -17,11 +18,12 @@ from grounded_trials import Workspace
 from grounded_trials.store.documents import write_document
 from grounded_trials.wording import folded
 from grounded_trials.workspace.config import set_in_model
+from grounded_trials.workspace.diagnosing import _in_vain
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.next_step import DIAGNOSE, after_diagnosis, since_diagnosis
 from grounded_trials.workspace.proposing import standing_in
 from reported import DIAGNOSIS, cart, copied
-from workspaces import make
+from workspaces import CONFIG, make
 
 __all__ = ["cart"]
 
@@ -381,3 +383,23 @@ def test_trust_sets_the_promised_gain_against_the_last_misses(tmp_path):
     assert holds(said[1], f"{ran[0].utility:.4g}", "promises")
     assert holds(said[2], f"{missed[0]:.4g}", f"{missed[1]:.4g}", f"{gain:.4g}")
     assert ("no more than" in " ".join(said[2].split())) == (gain < missed[1])
+
+
+def test_an_adoption_in_vain_is_told_how_to_be_undone(tmp_path, monkeypatch):
+    """Seen on a crane: three runs lost after a wrong cause was adopted, and nothing said so."""
+    effect = '\neffects = [{name = "viscous_friction:v", k = 0.3}]\n\n[task]'
+    w = make(tmp_path / "w", config=CONFIG.replace("\n\n[task]", effect))
+
+    def said(kind, *accepted, model=w.planner.fingerprint):
+        found = Diagnosis.from_json(DIAGNOSIS | {"verdict": {"kind": kind, "effects": []}})
+        made = [(None, "other", True), *(("a", model, one) for one in accepted)]
+        history = [NS(candidate=NS(id=i, model=m), accepted=one) for i, m, one in made]
+        module = "grounded_trials.workspace.proposing.standing_in"
+        monkeypatch.setattr(module, lambda _: NS(history=tuple(history)))
+        return _in_vain(w, found)
+
+    told = said("unknown", False, None, False)
+    assert "last 2" in told and "viscous_friction:v" in told and "[model] effects" in told
+    assert said("none", False, False) == said("unknown", False) == ""
+    assert said("unknown", False, False, True) == ""
+    assert said("unknown", False, False, model="of yesterday") == ""

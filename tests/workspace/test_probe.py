@@ -6,7 +6,7 @@ import pytest
 from grounded.effects import Library
 from grounded.errors import NextCommand
 from grounded_trials import Workspace
-from grounded_trials.workspace.diagnosing import _probe
+from grounded_trials.workspace.diagnosing import _probe, read_diagnosis
 from grounded_trials.workspace.handover import checked_candidate
 from grounded_trials.workspace.proposing import to_run
 from workspaces import CONFIG, make
@@ -62,3 +62,18 @@ def test_without_safety_a_probe_stays_near_where_trials_have_been(diagnosed):
     room = 0.5 * np.ptp(been, axis=0) + 1e-9
     made = w.candidate(found.probe)[0].predicted_states
     assert (made > been.min(axis=0) - room).all() and (made < been.max(axis=0) + room).all()
+
+
+def test_a_probe_that_fails_costs_no_diagnosis(diagnosed, monkeypatch):
+    """Seen on a crane: diagnosis.json was written, the terminal showed a traceback alone."""
+    w, before = diagnosed
+
+    def broken(*args):
+        raise KeyError("lag_1")
+
+    monkeypatch.setattr("grounded.diagnosis.excitation.probe", broken)
+    found = w.diagnose(probe=True)
+    assert found.verdict == before.verdict and found.probe == ""
+    assert "KeyError" in found.next_trial and "lag_1" in found.next_trial
+    kept = read_diagnosis(w.reports)
+    assert kept is not None and kept.next_trial == found.next_trial

@@ -83,12 +83,42 @@ def diagnose_in(
     )
     found = replace(found, made=made)
     _keep(workspace, found)
-    identity, words = _probe(workspace, found, lifted + second, library, write=probe)
+    try:
+        identity, words = _probe(workspace, found, lifted + second, library, write=probe)
+    except Exception as error:  # it must not cost the diagnosis, which is told whatever it is
+        why = f"{type(error).__name__} {error}" if str(error) else type(error).__name__
+        why = str(error) if isinstance(error, GroundedError) else f"{why}: please report it"
+        identity, words = "", f"{found.next_trial.rstrip('.')}; no probe could be computed ({why})"
     if words:
         run = f" ({identity}: {rendered(to_run(workspace, identity, identity))})" * bool(identity)
         found = replace(found, next_trial=f"{words}{run}", probe=identity)
         _keep(workspace, found)
+    if undo := _in_vain(workspace, found):
+        found = replace(found, next_trial=f"{undo} {found.next_trial}")
+        _keep(workspace, found)
     return replace(found, then=after_diagnosis(workspace, found))
+
+
+def _in_vain(workspace: Folder, found: Diagnosis) -> str:
+    """How to undo an adoption after which candidates lost in a row, and no cause is known."""
+    from grounded.search.standing import LOST
+    from grounded_trials.workspace.proposing import standing_in
+
+    names = [str(effect["name"]) for effect in workspace.config.model.effects]
+    if not names or found.no_cause or found.kind != "unknown":
+        return ""
+    lost, model = 0, workspace.planner.fingerprint
+    for tried in reversed(standing_in(workspace).history):
+        if tried.accepted or tried.candidate.model != model:
+            break
+        lost += tried.accepted is False
+    if lost < LOST:
+        return ""
+    return (
+        f"The last {lost} candidates planned with the adopted {', '.join(names)} lost: to undo it, "
+        "take effects out of [model] effects in grounded.toml, and what came with them out of "
+        "[model] params, and diagnose again."
+    )
 
 
 def instruments_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[Finding, ...]:
