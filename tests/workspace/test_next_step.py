@@ -14,6 +14,7 @@ from grounded.diagnosis.report import Diagnosis, Made
 from grounded_cli.main import COMMANDS, cli
 from grounded_cli.options import ELSEWHERE
 from grounded_trials import Workspace
+from grounded_trials.report.gathering import gather
 from grounded_trials.store.documents import write_document
 from grounded_trials.wording import folded
 from grounded_trials.workspace.config import set_in_model
@@ -356,3 +357,20 @@ def test_a_result_says_what_follows_it_without_the_command_line(cart, tmp_path):
     found = w.diagnose(max_effects=1)
     assert found.then is not None and found.then == w.status().then
     assert "then" not in found.to_json()
+
+
+def test_what_a_fresh_diagnosis_claims_is_adopted_while_a_candidate_waits(tmp_path):
+    """`diagnose` said adopt; status, page and report said run, and never spoke of adopting."""
+    folder = make(tmp_path / "w").folder
+    assert grounded("-C", folder, "learn", "--trials", 2).code == 0
+    assert grounded("-C", folder, "propose").code == 0
+    assert last(grounded("-C", folder, "status")) == "grounded run"
+    (folder / "reports").mkdir(exist_ok=True)
+    diagnosed(folder, diagnosed={"trials": ["t0001", "t0002"], "adopted": [], "params": {}})
+    for command in ("status", "report"):
+        assert last(grounded("-C", folder, command)) == "grounded adopt viscous_friction:v"
+    found = gather(Folder(folder))
+    assert found.standing.phase == "await-trial"
+    assert found.next_command == "grounded adopt viscous_friction:v"
+    assert grounded("-C", folder, "learn", "--trials", 1).code == 0  # a later trial outdates it
+    assert "adopt" not in last(grounded("-C", folder, "status"))

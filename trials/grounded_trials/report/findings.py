@@ -131,6 +131,12 @@ class Findings:
         return self.runs[-1] if self.runs else None
 
     @cached_property
+    def lately(self) -> Run | None:
+        """A single trial, the best candidate's latest: a model replays no mean of several."""
+        best = self.best and self.runs_of(self.best.candidate.id)[-1]
+        return best or self.latest
+
+    @cached_property
     def improvements(self) -> tuple[Run, ...]:
         """The accepted candidates, by iteration: the model's policy, then each better one."""
         found = [self._mean(t.candidate.id) for t in self.history if t.accepted]
@@ -229,11 +235,6 @@ def by_state(
         (name, unit(each), *(figure(float(column[i]), 3) for column in columns))
         for i, (name, each) in enumerate(model.states.items())
     ]
-
-
-def standard_error(tried: Tried) -> float:
-    """Of a candidate's mean utility; NaN for fewer than two trials, or when one of them failed."""
-    return tried.standard_error if np.isfinite(tried.utility) else float("nan")
 
 
 def tracked(task: Task) -> list[int]:

@@ -22,7 +22,6 @@ from grounded_trials.report.findings import (
     prediction_error,
     rms,
     selection,
-    standard_error,
     tracking_error,
 )
 from grounded_trials.report.forecast import SECONDS, forecast_error
@@ -118,14 +117,13 @@ def _utilities(findings: Findings, table: Table, bars: Callable[[Sequence[float]
 
 
 def _candidate(tried: Tried, verdict: str) -> tuple[str, ...]:
-    error = standard_error(tried)
     return (
         tried.candidate.id,
         str(tried.candidate.iteration),
         f"{tried.candidate.alpha:g}",
         figure(tried.candidate.predicted_utility),
         figure(tried.utility),
-        figure(error, 2),
+        figure(tried.standard_error, 2),
         str(len(tried.trials)),
         verdict,
     )

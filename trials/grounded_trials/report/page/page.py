@@ -11,6 +11,7 @@ import base64
 import hashlib
 import json
 import math
+import re
 from functools import cache
 from importlib.resources import files
 from typing import Any
@@ -32,7 +33,7 @@ from grounded_trials.report.figures.runs import (
     state_figure,
 )
 from grounded_trials.report.findings import Findings, improvements_in
-from grounded_trials.report.page.diagnosed import gap_section, typeset_lines
+from grounded_trials.report.page.diagnosed import gap_section
 from grounded_trials.report.page.tables import (
     Block,
     candidate_table,
@@ -62,7 +63,7 @@ def page(findings: Findings, watched: int = 0) -> str:
     from jinja2 import Environment
 
     jinja = Environment(autoescape=True, finalize=typeset, trim_blocks=True, lstrip_blocks=True)
-    jinja.filters["glued"] = glued
+    jinja.filters["glued"] = _unbroken
     scripts = [_own("plotly-basic.min.js"), _own("page.js")]
     panels: list[dict[str, Any]] = []
 
@@ -89,6 +90,11 @@ def page(findings: Findings, watched: int = 0) -> str:
         data=data,
         watched=watched,
     )
+
+
+def _unbroken(text: str) -> str:
+    """Text in which a browser breaks no quantity: neither 0.05 kg nor 1e-05 nor |motor|."""
+    return re.sub(r"-(?=\d)|\|(?=\S)", "\\g<0>\u2060", glued(text))
 
 
 @cache
@@ -180,7 +186,7 @@ def _improved(findings: Findings) -> list[tuple[str, str]]:
     if first is not None and best is not None and best is not first:
         gain = ""
         if -math.inf < first.utility < 0 and best.utility <= 0:
-            gain = f": {100 * (1 - best.utility / first.utility):.1f} % of the first loss is gone"
+            gain = f": {100 * (1 - best.utility / first.utility):.1f} % of the first cost is gone"
         moved = f"{figure(first.utility)} → {figure(best.utility)}"
         rows.append((moved, f"utility, the model’s own policy to {best.candidate.id}{gain}"))
     elif best is not None:
@@ -220,9 +226,7 @@ def _why(findings: Findings) -> dict[str, Any]:
     lines = [(title, text) for title, text in known if title == "parameters"]
     return {
         "kind": diagnosis.kind,
-        "verdict": typeset_lines(
-            told(diagnosis, findings.task, findings.since, findings.settled, None)
-        ),
+        "verdict": told(diagnosis, findings.task, findings.since, findings.settled, None),
         "preflight": instrument_lines(diagnosis.preflight),
         "lines": lines,
         "credit": credit,

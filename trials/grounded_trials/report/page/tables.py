@@ -19,7 +19,6 @@ from grounded_trials.report.findings import (
     compared,
     prediction_error,
     rms,
-    standard_error,
     tracking_error,
 )
 from grounded_trials.report.forecast import SECONDS, forecast_error
@@ -81,10 +80,10 @@ def candidate_table(findings: Findings) -> list[Block]:
             "from": c.base or "-",
             "iter.": str(c.iteration),
             "alpha": f"{c.alpha:g}",
-            "damping": f"{c.damping:.2g}" if c.base else "-",
+            "damping": figure(c.damping, 2) if c.base else "-",
             "predicted utility": figure(c.predicted_utility),
             "real utility": figure(tried.utility),
-            "std. error": figure(standard_error(tried), 2),
+            "std. error": figure(tried.standard_error, 2),
             "verdict ": findings.standing.verdict(tried),
             "trials ": " ".join(t.id for t in tried.trials) or "none",
         }
@@ -111,8 +110,8 @@ def error_table(findings: Findings) -> list[Block]:
 
 def forecast_table(findings: Findings) -> list[Block]:
     """Rms error at the end of each second of the best run and every log: not the ruler's."""
-    best = findings.best or findings.latest
-    trials = ([best.trial] if best is not None else []) + [log.trial for log in findings.logs]
+    run = findings.lately
+    trials = ([run.trial] if run is not None else []) + [log.trial for log in findings.logs]
     if not trials:
         return []
     planners = [("without adopted effects" if findings.effects else "crude", findings.crude)]
