@@ -181,9 +181,7 @@ def _information(task: Task, runs: Sequence[Trial], h: Hypothesis, noise: NoiseM
     return np.asarray(fits[0].gram.sum(axis=0)) if fits else np.zeros((0, 0))
 
 
-def probes(
-    policy: Policy, model: Model, inputs: Sequence[int]
-) -> Iterator[tuple[str, Policy]]:
+def probes(policy: Policy, model: Model, inputs: Sequence[int]) -> Iterator[tuple[str, Policy]]:
     """The base policy itself, then with each pattern added to each input."""
     yield "the base policy once more", policy
     t = np.arange(policy.horizon, dtype=float) * policy.dt

@@ -45,7 +45,9 @@ class Step:
     alpha: float = 1.0
 
     def __str__(self) -> str:
-        return f"alpha = {self.alpha:g}" + f", damping {figure(self.damping, 2)}" * (self.damping > 0)
+        return f"alpha = {self.alpha:g}" + f", damping {figure(self.damping, 2)}" * (
+            self.damping > 0
+        )
 
 
 def after_success(step: Step, predicted: float, real: float) -> Step:

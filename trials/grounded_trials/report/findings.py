@@ -32,6 +32,13 @@ if TYPE_CHECKING:
     from grounded_trials.report.settled import Settled
 
 One = TypeVar("One")
+SHOWN = 4  # numbers of what improved
+TERMS = {  # tables of [reward]
+    "state": "states, along the way",
+    "terminal": "states, at the end",
+    "input": "inputs",
+    "input_change": "changes of inputs",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,28 +210,44 @@ def weighed_groups(task: Task) -> list[tuple[list[str], str]]:
 
 
 def improvements_in(findings: Findings) -> list[Improved]:
-    """What the reward weighs, rms over the run: of the model's own policy, and of the best trial.
+    """How far the model's own policy missed the target, and the best trial does, rms over the run.
 
-    The position comes first, as one distance; then the other weighted states that have a target.
+    Where the reward weighs the last state, that one too. What moved the utility most comes first.
     """
     task, runs, found = findings.task, compared(findings), []
+    if not runs:
+        return []
+    short = [r.label for _, r in runs if r.trial.finite_steps < task.horizon]
+    note = f"; {', '.join(short)} ended early" if short else ""
     for names, what in weighed_groups(task):
         states = [task.model.state_names.index(name) for name in names]
-        missed = [
-            float(np.linalg.norm(rms(tracking_error(task, r.trial)[:, states]))) for _, r in runs
-        ]
-        if missed:
-            short = [r.label for _, r in runs if r.trial.finite_steps < task.horizon]
-            note = f"; {', '.join(short)} ended early" if short else ""
+        errors = [tracking_error(task, r.trial)[:, states] for _, r in runs]
+        unit = shown(task.model.states[names[0]])
+        far = "distance from the desired position" if len(names) > 1 else f"{what}, off its target"
+        running, terminal = task.reward.state[states], task.reward.terminal[states]
+        views = [(errors, running, f"{far}, rms")] * bool(running.any() or not terminal.any())
+        if terminal.any() and not short:
+            views.append(([e[[task.horizon]] for e in errors], terminal, f"at the end: {far}"))
+        for parts, weights, words in views:
+            missed = [float(np.linalg.norm(rms(part))) for part in parts]
+            costs = [float(np.nansum(part**2 @ weights)) for part in parts]
             before = missed[0] if len(missed) > 1 else float("nan")
-            unit = shown(task.model.states[names[0]])
-            off = (
-                "distance from the desired position"
-                if len(names) > 1
-                else f"{what}, off its target"
-            )
-            found.append(Improved(f"{off}, rms{note}", unit, before, missed[-1]))
-    return found
+            moved = abs(costs[0] - costs[-1]) if len(costs) > 1 else costs[0]
+            found.append((moved, Improved(words + note, unit, before, missed[-1])))
+    return [one for _, one in sorted(found, key=lambda each: -each[0])[:SHOWN]]
+
+
+def utility_terms(findings: Findings) -> tuple[list[tuple[str, ...]], tuple[str, ...]]:
+    """(rows, header): the utility of what is compared, by the terms of the reward."""
+    task, runs = findings.task, [run for _, run in compared(findings)]
+    each = [[task.terms(one.trial) for one in findings.runs_of(run.candidate.id)] for run in runs]
+    rows = [
+        (words, *(figure(float(np.mean([terms[name] for terms in own]))) for own in each))
+        for name, words in TERMS.items()
+        if each and name in each[0][0]
+    ]
+    rows.append(("utility", *(figure(run.utility) for run in runs)))
+    return rows, ("term of the reward ", *(run.candidate.id for run in runs))
 
 
 def by_state(

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis.pictures import credit_figure, worth_of
+from grounded.diagnosis.pictures import credit_figure, worth_figure
 from grounded.errors import needs
 from grounded.figures.body import Motion
 from grounded.figures.figure import Bars, Figure, Panel, typeset
@@ -32,7 +32,7 @@ from grounded_trials.report.figures.runs import (
     input_figure,
     state_figure,
 )
-from grounded_trials.report.findings import Findings, improvements_in
+from grounded_trials.report.findings import Findings, improvements_in, utility_terms
 from grounded_trials.report.page.diagnosed import gap_section
 from grounded_trials.report.page.tables import (
     Block,
@@ -41,6 +41,7 @@ from grounded_trials.report.page.tables import (
     drawn,
     error_table,
     parameter_table,
+    table,
 )
 from grounded_trials.report.settled import told
 from grounded_trials.report.three_lines import gained_most
@@ -220,8 +221,7 @@ def _why(findings: Findings) -> dict[str, Any]:
         return {}
     before = {} if findings.since.changed else findings.values
     groups = gained_most(diagnosis, findings.task)
-    worth = [p for g in groups for p in worth_of(*g, diagnosis)]
-    credit = Figure("credit", "", "", tuple(worth)) if worth else credit_figure(diagnosis)
+    credit = worth_figure(diagnosis, groups) or credit_figure(diagnosis)
     known = [] if credit else error_lines(diagnosis, before)
     lines = [(title, text) for title, text in known if title == "parameters"]
     return {
@@ -242,9 +242,11 @@ def _utility(findings: Findings) -> list[Block]:
     sure = last_improvement(findings.history)
     begun = sure[:1].upper() + sure[1:]
     few = len(findings.history) <= OPEN
+    rows, header = utility_terms(findings)
     return [
         *drawn(search_figure(findings.standing, findings.optimum)),
         *([Block("text", f"{begun}.")] if sure else []),
+        *([table("terms", header, rows)] if len(rows) > 2 else []),
         Block("folded", "All candidates", blocks=candidate_table(findings), wide=few),
     ]
 
