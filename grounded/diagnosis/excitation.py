@@ -170,7 +170,7 @@ def _teaching(
     unit = f" {spreads[name][1]}" * (spreads[name][1] != "1")
     now = float(std[k]) * sizes.get(name, 1.0)
     then = now * float(shrunk[k])
-    sentence = f"{words}: would tell {name} to +- {then:.2g}{unit} (now +- {now:.2g})"
+    sentence = f"{words}: would tell {name} to +- {then:.2g}{unit} (now +- {now:.2g}{unit})"
     return Probe(chosen, gain, (name,), sentence)
 
 

@@ -126,11 +126,15 @@ def worth_figure(
         else:
             hidden.append(credit.of)
     panels = [panel for names, what in drawn for panel in worth_of(names, what, diagnosis)]
+    known = [_loss(c, error, names) for c in diagnosis.credit[:MOST] for names, _ in drawn]
     caption = (
-        f"In no state {error.horizon_s:g} s ahead do predictions lose anything without "
-        f"{', '.join(hidden)}: it shows in the mean over all states and horizons."
+        "A cause is claimed for the mean over all states and horizons; where predictions of one "
+        "state are better without it, its bar is the shorter one."
+    ) * any(0 < loss < 1 for loss in known)
+    caption += (
+        f" No state shows 1 s ahead what {', '.join(hidden)} is worth: other horizons do."
     ) * bool(hidden)
-    return Figure("credit", "", caption, tuple(panels)) if panels else None
+    return Figure("credit", "", caption.strip(), tuple(panels)) if panels else None
 
 
 def _loss(credit: Credit, error: RulerRow, names: Sequence[str]) -> float:

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
 One = TypeVar("One")
 SHOWN = 4  # numbers of what improved
+MOVED = 0.02  # of what the utility gained: a number that moved it less is left out
 TERMS = {  # tables of [reward]
     "state": "states, along the way",
     "terminal": "states, at the end",
@@ -217,24 +218,28 @@ def improvements_in(findings: Findings) -> list[Improved]:
     task, runs, found = findings.task, compared(findings), []
     if not runs:
         return []
-    short = [r.label for _, r in runs if r.trial.finite_steps < task.horizon]
+    each = [one for _, r in runs for one in findings.runs_of(r.candidate.id)]
+    short = [one.label for one in each if one.trial.finite_steps < task.horizon]
     note = f"; {', '.join(short)} ended early" if short else ""
     for names, what in weighed_groups(task):
         states = [task.model.state_names.index(name) for name in names]
-        errors = [tracking_error(task, r.trial)[:, states] for _, r in runs]
+        errors = [[e[:, states] for e in off_target(findings, r)] for _, r in runs]
         unit = shown(task.model.states[names[0]])
         far = "distance from the desired position" if len(names) > 1 else f"{what}, off its target"
         running, terminal = task.reward.state[states], task.reward.terminal[states]
         views = [(errors, running, f"{far}, rms")] * bool(running.any() or not terminal.any())
         if terminal.any() and not short:
-            views.append(([e[[task.horizon]] for e in errors], terminal, f"at the end: {far}"))
+            last = [[e[[task.horizon]] for e in own] for own in errors]
+            views.append((last, terminal, f"at the end: {far}"))
         for parts, weights, words in views:
             missed = [float(np.linalg.norm(rms(part))) for part in parts]
-            costs = [float(np.nansum(part**2 @ weights)) for part in parts]
+            costs = [float(np.nansum(np.vstack(p) ** 2 @ weights)) / len(p) for p in parts]
             before = missed[0] if len(missed) > 1 else float("nan")
             moved = abs(costs[0] - costs[-1]) if len(costs) > 1 else costs[0]
             found.append((moved, Improved(words + note, unit, before, missed[-1])))
-    return [one for _, one in sorted(found, key=lambda each: -each[0])[:SHOWN]]
+    found.sort(key=lambda each: -each[0])
+    least = MOVED * sum(moved for moved, _ in found)
+    return [one for k, (moved, one) in enumerate(found[:SHOWN]) if not k or moved >= least]
 
 
 def utility_terms(findings: Findings) -> tuple[list[tuple[str, ...]], tuple[str, ...]]:
@@ -276,8 +281,21 @@ def prediction_error(task: Task, run: Run) -> Array:
     return task.model.difference(run.trial.states, run.candidate.predicted_states[: T + 1])
 
 
-def rms(values: Array) -> Array:
-    """Root mean square of each column over its finite rows; NaN where there is none."""
+def off_target(findings: Findings, run: Run) -> list[Array]:
+    """The tracking errors of each trial of a run's candidate: those of their mean are smaller."""
+    runs = findings.runs_of(run.candidate.id)
+    return [tracking_error(findings.task, one.trial) for one in runs]
+
+
+def off_prediction(findings: Findings, run: Run) -> list[Array]:
+    """What each trial of a run's candidate misses its prediction by."""
+    runs = findings.runs_of(run.candidate.id)
+    return [prediction_error(findings.task, one) for one in runs]
+
+
+def rms(values: Array | list[Array]) -> Array:
+    """Root mean square of each column over all finite rows; NaN where there is none."""
+    values = np.vstack(values) if isinstance(values, list) else values
     finite = np.isfinite(values)
     count = finite.sum(axis=0)
     total = np.where(finite, values, 0.0) ** 2

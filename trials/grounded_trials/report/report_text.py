@@ -19,10 +19,10 @@ from grounded_trials.report.findings import (
     Findings,
     by_state,
     compared,
-    prediction_error,
+    off_prediction,
+    off_target,
     rms,
     selection,
-    tracking_error,
 )
 from grounded_trials.report.forecast import SECONDS, forecast_error
 from grounded_trials.report.settled import so_far
@@ -132,8 +132,8 @@ def _candidate(tried: Tried, verdict: str) -> tuple[str, ...]:
 def _trajectories(findings: Findings, table: Table) -> str:
     """Distance to the target, and what the model had promised, rms over the run."""
     task, runs = findings.task, [run for _, run in compared(findings)]
-    columns = [rms(tracking_error(task, run.trial)) for run in runs]
-    columns += [rms(prediction_error(task, run)) for run in runs]
+    columns = [rms(off_target(findings, run)) for run in runs]
+    columns += [rms(off_prediction(findings, run)) for run in runs]
     rows = by_state(task.model, columns)
     ids = [run.candidate.id for run in runs]
     header = ("state", "unit", *(f"{i} off" for i in ids), *(f"{i} gap" for i in ids))

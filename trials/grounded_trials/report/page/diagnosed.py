@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 from grounded.diagnosis.error_report import ChannelParts, Parts, Split
 from grounded.diagnosis.pictures import accuracy_figure, credit_figure, where_figure

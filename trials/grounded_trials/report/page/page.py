@@ -21,7 +21,7 @@ import numpy as np
 from grounded.diagnosis.pictures import credit_figure, worth_figure
 from grounded.errors import needs
 from grounded.figures.body import Motion
-from grounded.figures.figure import Bars, Figure, Panel, typeset
+from grounded.figures.figure import Bars, Panel, typeset
 from grounded.figures.interactive import packed, palette, plotted
 from grounded.search.pictures import search_figure
 from grounded_trials.report.diagnosis_words import error_lines, instrument_lines

@@ -17,9 +17,9 @@ from grounded_trials.report.findings import (
     Findings,
     by_state,
     compared,
-    prediction_error,
+    off_prediction,
+    off_target,
     rms,
-    tracking_error,
 )
 from grounded_trials.report.forecast import SECONDS, forecast_error
 from grounded_trials.wording import figure, legend, percent, rendered, shown, with_unit
@@ -101,8 +101,8 @@ def error_table(findings: Findings) -> list[Block]:
     task, runs = findings.task, [run for _, run in compared(findings)]
     if findings.best is None:
         return []
-    columns = {f"off target, {r.candidate.id}": rms(tracking_error(task, r.trial)) for r in runs}
-    columns |= {f"off prediction, {r.candidate.id}": rms(prediction_error(task, r)) for r in runs}
+    columns = {f"off target, {r.candidate.id}": rms(off_target(findings, r)) for r in runs}
+    columns |= {f"off prediction, {r.candidate.id}": rms(off_prediction(findings, r)) for r in runs}
     columns |= {f"bias per s, {r.candidate.id}": rms(r.residual) / task.dt for r in runs}
     rows = by_state(task.model, [*columns.values()])
     return [table("errors", ("state", "unit", *columns), rows)]
