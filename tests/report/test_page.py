@@ -173,6 +173,16 @@ def test_page_of_an_older_diagnosis_leaves_out_what_it_lacks(cart):
         assert words not in text
 
 
+@pytest.mark.parametrize("whole", ["|motor| > 0.477", "1e-05 kg", "-4.2 -> -2.5"])
+def test_a_browser_breaks_no_quantity(cart, whole):
+    """A line ended behind "|motor|", another began with "> 0.477"."""
+    findings = gather(Folder(cart))
+    document = DIAGNOSIS | {"verdict": DIAGNOSIS["verdict"] | {"sentence": f"It is {whole}."}}
+    text = "".join(_parsed(page(replace(findings, diagnosis=Diagnosis.from_json(document)))).text)
+    kept = whole.replace("->", "→").replace(" ", "\xa0")
+    assert re.sub(r"-(?=\d)|\|", "\\g<0>\u2060", kept) in text
+
+
 def test_page_without_a_diagnosis_names_the_command(car):
     assert "grounded diagnose" in page(gather(Folder(car)))
 

@@ -95,7 +95,7 @@ def page(findings: Findings, watched: int = 0) -> str:
 
 def _unbroken(text: str) -> str:
     """Text in which a browser breaks no quantity: neither 0.05 kg nor 1e-05 nor |motor|."""
-    return re.sub(r"-(?=\d)|\|(?=\S)", "\\g<0>\u2060", glued(text))
+    return re.sub(r"-(?=\d)|\|", "\\g<0>\u2060", glued(text))
 
 
 @cache
