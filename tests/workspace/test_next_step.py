@@ -105,6 +105,23 @@ def test_what_logs_have_shown_is_adopted_before_the_first_candidate(cart, tmp_pa
     assert last(grounded("-C", folder, "status")) == "grounded propose"
 
 
+def test_what_a_fresh_diagnosis_claims_is_adopted_while_a_candidate_waits(tmp_path):
+    """`diagnose` said adopt; status, page and report said run, and never spoke of adopting."""
+    folder = make(tmp_path / "w").folder
+    assert grounded("-C", folder, "learn", "--trials", 2).code == 0
+    assert grounded("-C", folder, "propose").code == 0
+    assert last(grounded("-C", folder, "status")) == "grounded run"
+    (folder / "reports").mkdir(exist_ok=True)
+    diagnosed(folder, diagnosed={"trials": ["t0001", "t0002"], "adopted": [], "params": {}})
+    for command in ("status", "report"):
+        assert last(grounded("-C", folder, command)) == "grounded adopt viscous_friction:v"
+    found = gather(Folder(folder))
+    assert found.standing.phase == "await-trial"
+    assert found.next_command == "grounded adopt viscous_friction:v"
+    assert grounded("-C", folder, "learn", "--trials", 1).code == 0  # a later trial outdates it
+    assert "adopt" not in last(grounded("-C", folder, "status"))
+
+
 def test_a_long_command_is_broken_where_a_shell_allows_it():
     names = [f"first_order_lag:input_number_{k}" for k in range(6)]
     command = " ".join(["grounded adopt", *names])
@@ -357,20 +374,3 @@ def test_a_result_says_what_follows_it_without_the_command_line(cart, tmp_path):
     found = w.diagnose(max_effects=1)
     assert found.then is not None and found.then == w.status().then
     assert "then" not in found.to_json()
-
-
-def test_what_a_fresh_diagnosis_claims_is_adopted_while_a_candidate_waits(tmp_path):
-    """`diagnose` said adopt; status, page and report said run, and never spoke of adopting."""
-    folder = make(tmp_path / "w").folder
-    assert grounded("-C", folder, "learn", "--trials", 2).code == 0
-    assert grounded("-C", folder, "propose").code == 0
-    assert last(grounded("-C", folder, "status")) == "grounded run"
-    (folder / "reports").mkdir(exist_ok=True)
-    diagnosed(folder, diagnosed={"trials": ["t0001", "t0002"], "adopted": [], "params": {}})
-    for command in ("status", "report"):
-        assert last(grounded("-C", folder, command)) == "grounded adopt viscous_friction:v"
-    found = gather(Folder(folder))
-    assert found.standing.phase == "await-trial"
-    assert found.next_command == "grounded adopt viscous_friction:v"
-    assert grounded("-C", folder, "learn", "--trials", 1).code == 0  # a later trial outdates it
-    assert "adopt" not in last(grounded("-C", folder, "status"))
