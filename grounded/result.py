@@ -23,6 +23,20 @@ if TYPE_CHECKING:
 MALFORMED = (ValueError, TypeError, AttributeError, KeyError, OverflowError, RecursionError)
 
 
+def figure(value: float | None, digits: int = 4) -> str:
+    """`digits` significant digits; "failed" for minus infinity, "-" where there is none."""
+    if value is None or math.isnan(value):
+        return "-"
+    if value == 0:
+        return "0"
+    if value == -math.inf:
+        return "failed"
+    if not 1e-3 <= abs(value) < 1e6:
+        return f"{value:.{digits - 1}e}"
+    decimals = max(digits - 1 - math.floor(math.log10(abs(value))), 0)
+    return f"{value:,.{decimals}f}"
+
+
 class Result:
     """Base of frozen results, dataclasses with `repr=False`: what a notebook shows of them."""
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
@@ -191,17 +191,18 @@ class Task:
             reference=reference if self.feedback else None,
         )
 
-    def rewards(self, trial: Trial) -> Array:
+    def rewards(self, trial: Trial, reward: Reward | None = None) -> Array:
         """The reward of every step of a trial, (T + 1,); NaN where the trial is not finite.
 
-        What a log holds after the horizon is not judged.
+        What a log holds after the horizon is not judged. With `reward`, by other weights.
         """
         trial = trial.whole(self.horizon)
         T = trial.steps
         assert self.input_target is not None
         error = self.model.difference(trial.states, self.target[: T + 1])
         past = self.past if trial.start_inputs is None else trial.start_inputs
-        return step_rewards(self.reward, error, trial.inputs, self.input_target[:T], past)
+        reward = reward or self.reward
+        return step_rewards(reward, error, trial.inputs, self.input_target[:T], past)
 
     def utility(self, trial: Trial) -> float:
         """U of a real trial (section 2); -inf for one that ended early or is not finite.
@@ -210,6 +211,15 @@ class Task:
         """
         judge = lambda: self._utility(trial.whole(self.horizon))  # noqa: E731
         return trial.worth(f"{self.hash}{self.model.angles}whole", judge)
+
+    def terms(self, trial: Trial) -> dict[str, float]:
+        """What each table of [reward] takes from a trial's utility, which is their sum; <= 0."""
+        none = {one.name: 0 * getattr(self.reward, one.name) for one in fields(Reward)}
+        return {
+            name: float(self.rewards(trial, Reward(**none | {name: own})).sum())
+            for name in none
+            if (own := getattr(self.reward, name)).any()
+        }
 
     def _utility(self, trial: Trial) -> float:
         if trial.steps < self.horizon or trial.finite_steps < self.horizon:

@@ -117,7 +117,7 @@ def probe(
     apart = [row.evidence for row in rows if row is not None]
     trust = min(1.0, max(TIE, float(np.ptp(apart))) / max(told, 1e-12))
     best: tuple[float, Policy, str] | None = None
-    for words, candidate in probes(policy, _inputs_of(task.model, group[:2])):
+    for words, candidate in probes(policy, task.model, _inputs_of(task.model, group[:2])):
         runs = [_run(task, h, candidate) for h in (first, second)]
         if any(run is None or not _safe(task, run) for run in runs):
             continue
@@ -170,7 +170,7 @@ def _teaching(
     own = np.maximum(np.diag(F), 1 / np.maximum(std, LITTLE) ** 2)  # or what is known beforehand
     unit_of = 1 / np.sqrt(own)
     F = (F + np.diag(own - np.diag(F))) * np.outer(unit_of, unit_of) + LITTLE * np.eye(len(std))
-    for words, candidate in probes(policy, range(task.model.m)):
+    for words, candidate in probes(policy, task.model, range(task.model.m)):
         run = _run(task, h, candidate)
         if not _safe(task, run):
             continue
@@ -191,7 +191,7 @@ def _teaching(
     unit = f" {spreads[name][1]}" * (spreads[name][1] != "1")
     now = float(std[k]) * sizes.get(name, 1.0)
     then = now * float(shrunk[k])
-    sentence = f"{words}: would tell {name} to +- {then:.2g}{unit} (now +- {now:.2g})"
+    sentence = f"{words}: would tell {name} to +- {then:.2g}{unit} (now +- {now:.2g}{unit})"
     return Probe(chosen, gain, (name,), sentence)
 
 
@@ -203,22 +203,23 @@ def _information(task: Task, runs: Sequence[Trial], h: Hypothesis, noise: _Noise
     return np.asarray(fits[0].gram.sum(axis=0)) if fits else np.zeros((0, 0))
 
 
-def probes(policy: Policy, inputs: Sequence[int]) -> Iterator[tuple[str, Policy]]:
+def probes(policy: Policy, model: Model, inputs: Sequence[int]) -> Iterator[tuple[str, Policy]]:
     """The base policy itself, then with each pattern added to each input."""
     yield "the base policy once more", policy
     t = np.arange(policy.horizon, dtype=float) * policy.dt
     for j in inputs:
         low, high = policy.low[j], policy.high[j]
         room = float(high - low) if np.isfinite(high - low) else 2.0
+        limits = f" (limits {low:g} to {high:g})" * bool(np.isfinite(high - low))
         for size in SIZES:
             for words, shape in patterns(t):
                 feedforward = policy.feedforward.copy()
                 feedforward[:, j] = np.clip(feedforward[:, j] + size * room * shape, low, high)
                 name = policy.input_names[j]
-                yield (
-                    f"{words} of {size * room:.2g} on {name}",
-                    replace(policy, feedforward=feedforward),
-                )
+                unit = model.inputs[name]
+                of = f"{size * room:.2g} {unit}" if unit != "1" else f"{size * room:.2g}{limits}"
+                made = replace(policy, feedforward=feedforward)
+                yield f"{words} of {of} added to {name}", made
 
 
 def patterns(t: Any) -> list[tuple[str, Array]]:

@@ -7,11 +7,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from grounded.diagnosis.error_report import RulerRow, measured, number, percent
+from grounded.diagnosis.error_report import Credit, RulerRow, measured, number, percent
 from grounded.diagnosis.report import Diagnosis
 from grounded.figures.figure import Bar, Bars, Curve, Figure, Panel, legend
 
 MOST = 12
+SHOWS = 1.02  # times the error without a cause, from which on bars show its worth
 CREDIT_S = 1.0  # how far ahead an effect's worth is measured
 MODELS = {  # keys of a prediction error: role, name
     "outset": ("limit", "model.py"),
@@ -95,6 +96,55 @@ def credit_figure(diagnosis: Diagnosis, channels: int = 1) -> Figure | None:
     for name in _improved(known)[:channels] if known else ():
         panels += worth_of([name], name, diagnosis)
     return Figure("credit", "What each is worth", "", tuple(panels))
+
+
+def worth_figure(
+    diagnosis: Diagnosis, groups: Sequence[tuple[Sequence[str], str]]
+) -> Figure | None:
+    """What predictions lose without each cause: of some states, and where these don't show it.
+
+    A cause is claimed for the mean over all states and horizons. Where predictions of the given
+    states lose nothing without it, the one that loses most is drawn too; one that shows in none
+    a second ahead is named.
+
+    Args:
+        diagnosis: what was found.
+        groups: names of states in one unit, and what they are called together.
+
+    Returns:
+        The figure, None where no error a second ahead is known.
+    """
+    error, drawn, hidden = _second_ahead(diagnosis), list(groups), []
+    if error is None:
+        return None
+    for credit in diagnosis.credit[:MOST]:
+        if any(_loss(credit, error, names) > SHOWS for names, _ in drawn):
+            continue
+        most = max(error.with_effects, key=lambda name: _loss(credit, error, [name]), default="")
+        if most and _loss(credit, error, [most]) > SHOWS:
+            drawn.append(([most], most))
+        else:
+            hidden.append(credit.of)
+    panels = [panel for names, what in drawn for panel in worth_of(names, what, diagnosis)]
+    known = [_loss(c, error, names) for c in diagnosis.credit[:MOST] for names, _ in drawn]
+    caption = (
+        "A cause is claimed for the mean over all states and horizons; where predictions of one "
+        "state are better without it, its bar is the shorter one."
+    ) * any(0 < loss < 1 for loss in known)
+    caption += (
+        f" No state shows 1 s ahead what {', '.join(hidden)} is worth: other horizons do."
+    ) * bool(hidden)
+    return Figure("credit", "", caption.strip(), tuple(panels)) if panels else None
+
+
+def _loss(credit: Credit, error: RulerRow, names: Sequence[str]) -> float:
+    """How many times as far off states are without a cause; 0 where that is not known."""
+    if not set(names) <= set(credit.without_it) & set(error.with_effects):
+        return 0.0
+    without, whole = (
+        math.hypot(*(v[n] for n in names)) for v in (credit.without_it, error.with_effects)
+    )
+    return without / whole if whole > 0 else 0.0
 
 
 def worth_of(names: Sequence[str], what: str, diagnosis: Diagnosis) -> list[Bars]:

@@ -91,7 +91,11 @@ def in_doubt(incumbent: Tried, loser: Tried, most: int) -> bool:
 
 
 def utility_noise(history: Sequence[Tried]) -> tuple[float, int]:
-    """Standard deviation of a single trial's utility, pooled, and its degrees of freedom."""
+    """Standard deviation of a single trial's utility, pooled, and its degrees of freedom.
+
+    It stands in for a candidate's own where that was run once. `Tried.standard_error` is every
+    other error: that of tables, bands and dots.
+    """
     square, freedom = 0.0, 0
     for tried in history:
         known = [u for u in tried.utilities if math.isfinite(u)]
@@ -106,8 +110,8 @@ def last_improvement(history: Sequence[Tried], again: str = "run the best one ag
 
     Welch's t-test of the two candidates' own trials, whose standard errors stand beside them in the
     table. Where one was run once, the other's scatter stands in for its own; where both were, that
-    of the other candidates, but not of the model's own policy: how wildly that one scatters says
-    nothing of those that came after it.
+    of the other candidates, but not of the model's own policies: how wildly those scatter says
+    nothing of those that came after them.
     """
     accepted = [t for t in history if t.accepted]
     if len(accepted) < 2:
@@ -149,5 +153,5 @@ def _error_between(before: Tried, after: Tried, history: Sequence[Tried]) -> tup
         parts = sum(square**2 / (count - 1) for square, count in each)
         return math.sqrt(total), total**2 / parts if parts else 1.0
     own = [t for t in (before, after) if math.isfinite(t.standard_error)]
-    noise, freedom = utility_noise(own or history[1:])
+    noise, freedom = utility_noise(own or [t for t in history if t.candidate.base])
     return noise * math.sqrt(sum(1 / count for _, count in each)), float(freedom)

@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 
 from grounded.figures.figure import Band, Curve, Dot, Figure, Key, Panel, Rule, legend
+from grounded.result import figure
 from grounded.search.candidate import Candidate, Tried
-from grounded.search.certainty import utility_noise
 from grounded.search.standing import Standing
 
 STEEP = 8.0  # worst over best utility from which on the axis is logarithmic
@@ -30,8 +30,7 @@ def search_figure(now: Standing, optimum: float | None = None) -> Figure | None:
     if not tried:
         return None
     number = {t.candidate.id: k + 1 for k, t in enumerate(now.history)}
-    noise = utility_noise(now.history)[0]
-    whole = _utility(now, tried, number, optimum, noise)
+    whole = _utility(now, tried, number, optimum)
     near = (_near(whole),) if whole.loss and len(tried) > NEAR else ()
     panels = (whole, *near, _steps(shown, number))
     key = [
@@ -44,7 +43,7 @@ def search_figure(now: Standing, optimum: float | None = None) -> Figure | None:
         key.append(Key("model", "crashed", "cross"))
     if optimum is not None:
         key.append(Key("accepted", "optimum of the real system"))
-    if math.isfinite(noise):
+    if whole.bands:
         key.append(Key("other", "±2 standard errors of the best", "band"))
     caption = (
         "Each candidate is run on the real system; it becomes the best so far when its utility, a "
@@ -73,7 +72,7 @@ def few(history: Sequence[Tried], most: int) -> tuple[list[Tried], int]:
 
 
 def _utility(
-    now: Standing, tried: list[Tried], number: dict[str, int], optimum: float | None, noise: float
+    now: Standing, tried: list[Tried], number: dict[str, int], optimum: float | None
 ) -> Panel:
     dots = [d for t in tried for d in _dots(t, number[t.candidate.id], now.verdict(t))]
     rules, bands = [], []
@@ -82,9 +81,9 @@ def _utility(
         rules.append(Rule(optimum, "accepted", "optimum"))
         values.append(optimum)
     best = now.incumbent
-    if best is not None and math.isfinite(noise):
-        error = 2 * noise / math.sqrt(len(best.utilities))
-        note = f"{_said(best.utility)} ± {_said(error, 2)}: two standard errors of the best"
+    if best is not None and math.isfinite(best.standard_error):  # it was run twice or more
+        error = 2 * best.standard_error
+        note = f"{figure(best.utility)} ± {figure(error, 2)}: two standard errors of the best"
         bands.append(Band(best.utility - error, best.utility + error, "other", note))
     loss = bool(values) and max(values) < 0 and min(values) < STEEP * max(values)
     return Panel(
@@ -114,14 +113,14 @@ def _near(whole: Panel) -> Panel:
 
 def _dots(tried: Tried, at: int, became: str) -> list[Dot]:
     candidate = tried.candidate
-    real = _said(tried.utility)
+    real = figure(tried.utility)
     note = (
         f"{candidate.id}, iteration {candidate.iteration}, α = {candidate.alpha:g}\n"
-        f"utility {real}, predicted {_said(candidate.predicted_utility)}\n{became}"
+        f"utility {real}, predicted {figure(candidate.predicted_utility)}\n{became}"
     )
     error = tried.standard_error
     if math.isfinite(error):
-        note += f", ± {_said(error, 2)} over {len(tried.trials)} trials"
+        note += f", ± {figure(error, 2)} over {len(tried.trials)} trials"
     if not math.isfinite(tried.utility):
         return [Dot(at, math.nan, "model", f"{note}: the run failed", "cross")]
     shape, role = ("disc", "best") if tried.accepted else ("ring", "other")
@@ -129,10 +128,6 @@ def _dots(tried: Tried, at: int, became: str) -> list[Dot]:
     if math.isfinite(candidate.predicted_utility):
         dots.insert(0, Dot(at, candidate.predicted_utility, "predicted", note, "dash"))
     return dots
-
-
-def _said(value: float, digits: int = 4) -> str:
-    return "failed" if value == -math.inf else f"{value:.{digits}g}"
 
 
 def _record(tried: Sequence[Tried], number: dict[str, int]) -> tuple[Curve, ...]:
@@ -154,7 +149,7 @@ def _steps(shown: list[Tried], number: dict[str, int]) -> Panel:
     for t in shown:
         c = t.candidate
         shape, role = ("disc", "best") if t.accepted else ("ring", "other")
-        note = f"{c.id}: α = {c.alpha:g}, damping {c.damping:.2g}"
+        note = f"{c.id}: α = {c.alpha:g}, damping {figure(c.damping, 2)}"
         dots.append(Dot(number[c.id], math.log2(max(c.alpha, 2.0**-30)), role, note, shape))
     low = min(d.y for d in dots)
     return Panel(
@@ -177,5 +172,5 @@ def candidate_figure(candidate: Candidate) -> Figure:
         times = np.arange(len(values), dtype=np.float64) * policy.dt
         curve = Curve(times, values, "predicted", "predicted")
         panels.append(Panel(name, "time [s]", "", (curve,), kind="time"))
-    title = f"{candidate.id}: predicted utility {_said(candidate.predicted_utility)}"
+    title = f"{candidate.id}: predicted utility {figure(candidate.predicted_utility)}"
     return Figure("candidate", title, "", tuple(panels), legend(panels[:1]))

@@ -30,6 +30,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from grounded.result import figure
+
 KEPT, BROKEN = 0.9, 0.25
 EASED, RAISED = 30.0, 10.0
 LEAST, MOST = 1e-6, 1e3
@@ -43,7 +45,9 @@ class Step:
     alpha: float = 1.0
 
     def __str__(self) -> str:
-        return f"alpha = {self.alpha:g}" + f", damping {self.damping:.2g}" * (self.damping > 0)
+        return f"alpha = {self.alpha:g}" + f", damping {figure(self.damping, 2)}" * (
+            self.damping > 0
+        )
 
 
 def after_success(step: Step, predicted: float, real: float) -> Step:

@@ -105,3 +105,12 @@ def test_of_long_data_the_runs_are_kept_in_which_most_happens(monkeypatch):
     assert data.skipped == 14
     beginnings, busiest = {0, 5, 15}, {3, 11, 19}  # the busiest of each group of neighbours
     assert set(number.tolist()) == beginnings | busiest
+
+
+def test_a_long_log_that_ran_no_candidate_is_no_run_of_the_task(known):
+    """A 40 s drive by hand of a 3.5 s task had a utility, which the model "missed by 368"."""
+    predictor, fit, trials = known
+    task = task_of(predictor.data.model, STEPS // 3)
+    assert not len(utility_prediction(predictor, fit, fit.track, task, trials).real)
+    own = [replace(trial, candidate="c0001") for trial in trials]  # recorded for longer
+    assert len(utility_prediction(predictor, fit, fit.track, task, own).real) == 3

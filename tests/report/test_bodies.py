@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from grounded.figures.body import motion
+from grounded.model import Param
 from grounded.models import arm, buggy, cart_pole, lift, pendulum
 from grounded_trials.report.bodies import body_of, is_mechanism, reach
 from grounded_trials.report.scene import scene_of
@@ -87,6 +89,25 @@ def test_a_motion_is_the_body_seen_from_the_side(model):
 
 def test_what_has_no_length_has_no_unit():
     assert [_body(one.model).unit for one in (pendulum, cart_pole, lift, arm)] == ["m"] * 3 + [""]
+
+
+@pytest.mark.parametrize(
+    ("params", "lengths"),
+    [
+        ({"L": Param(0.6, "m"), "k": Param(15.0, "N/V")}, (0.6,)),
+        ({"rope": Param(0.7, "m"), "m": Param(1.0, "kg")}, (0.7,)),
+        ({"length": Param(0.5, "m"), "radius": Param(0.1, "m")}, (0.5,)),
+        ({"l1": Param(0.4, "m"), "radius": Param(0.1, "m")}, (0.4,)),
+        ({"rope": Param(0.7, "m"), "radius": Param(0.1, "m")}, ()),
+        ({"L": Param(0.6, "H")}, ()),
+    ],
+)
+def test_a_link_is_as_long_as_the_model_says(params, lengths):
+    """A rope of L = 0.6 m was drawn 1 m long, and distances of its tip were given in m."""
+    model = replace(pendulum.model, params=params)
+    body = _body(model)
+    assert body.unit == ("m" if lengths else "")
+    assert body.lengths == (lengths or (1.0,))
 
 
 MJCF = """

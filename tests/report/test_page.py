@@ -14,7 +14,7 @@ import pytest
 
 from grounded.diagnosis.report import Diagnosis
 from grounded.errors import NextCommand
-from grounded_trials.report.findings import improvements_in
+from grounded_trials.report.findings import improvements_in, tracking_error, utility_terms
 from grounded_trials.report.gathering import gather
 from grounded_trials.report.page.page import page
 from grounded_trials.report.page.tables import UNKNOWN
@@ -100,7 +100,7 @@ def test_page_shows_what_the_issue_lists(cart):
         "grounded adopt viscous_friction:v",
         "N s/m",
         "1.400 (1.36 to 1.44)",
-        "x > 0.2",
+        "x\xa0>\xa00.2",
         "90.5 %",  # of the squared error is explained
         "whole run (2 s)",
         "By state, 1 s ahead",
@@ -137,6 +137,27 @@ def test_what_improved_is_said_in_the_units_of_the_states(car):
     assert {"rad", "m/s"} <= {one.unit for one in found}
 
 
+def test_a_gain_at_the_end_is_said_first_and_the_terms_add_up(cart):
+    """A crane's utility went from -4.232 to -2.549 at the end alone: "6.9 cm -> 7.0 cm"."""
+    findings = gather(Folder(cart))
+    reward = replace(findings.task.reward, terminal=np.array([1e4, 0.0]))
+    task = replace(findings.task, reward=reward)
+    runs = tuple(replace(r, utility=task.utility(r.trial)) for r in findings.runs)
+    findings = replace(findings, task=task, runs=runs)
+    first, best = findings.first, findings.best
+    assert first is not None and best is not None
+    found = improvements_in(findings)[0]
+    assert found.what.startswith("at the end: x")
+    off = tracking_error(task, first.trial)[-1, 0], tracking_error(task, best.trial)[-1, 0]
+    np.testing.assert_allclose((found.before, found.after), np.abs(off))
+    for run in (first, best):
+        assert sum(task.terms(run.trial).values()) == pytest.approx(run.utility)
+    rows, header = utility_terms(findings)
+    assert header[1:] == (first.candidate.id, best.candidate.id)
+    assert [row[0] for row in rows][1] == "states, at the end" and rows[-1][0] == "utility"
+    assert 'id="terms"' in page(findings)
+
+
 def test_page_of_an_older_diagnosis_leaves_out_what_it_lacks(cart):
     findings = gather(Folder(cart))
     new = ("split", "whiteness")
@@ -150,6 +171,16 @@ def test_page_of_an_older_diagnosis_leaves_out_what_it_lacks(cart):
         "predicted<",
     ):
         assert words not in text
+
+
+@pytest.mark.parametrize("whole", ["|motor| > 0.477", "1e-05 kg", "-4.2 -> -2.5"])
+def test_a_browser_breaks_no_quantity(cart, whole):
+    """A line ended behind "|motor|", another began with "> 0.477"."""
+    findings = gather(Folder(cart))
+    document = DIAGNOSIS | {"verdict": DIAGNOSIS["verdict"] | {"sentence": f"It is {whole}."}}
+    text = "".join(_parsed(page(replace(findings, diagnosis=Diagnosis.from_json(document)))).text)
+    kept = whole.replace("->", "→").replace(" ", "\xa0")
+    assert re.sub(r"-(?=\d)|\|", "\\g<0>\u2060", kept) in text
 
 
 def test_page_without_a_diagnosis_names_the_command(car):

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from facts import holding
 from grounded.diagnosis.error_report import Credit, RulerRow
-from grounded.diagnosis.pictures import accuracy_figure, credit_figure
+from grounded.diagnosis.pictures import accuracy_figure, credit_figure, worth_figure
 from grounded.diagnosis.report import Diagnosis, Verdict
 from grounded.errors import GroundedError
 from grounded.experiments.pendulum import pendulum_task
@@ -42,7 +42,7 @@ from grounded.rollout import simulate
 from grounded.search.first_policy import first_policy
 from grounded.search.planner import Planner
 from grounded.trial import Trial
-from grounded_trials.report.figures.gap import residual_figures
+from grounded_trials.report.figures.gap import forecast_figures, residual_figures
 from grounded_trials.report.figures.paths import path_figure
 from grounded_trials.report.figures.png import _bars, png
 from grounded_trials.report.figures.runs import all_figures, error_figure
@@ -52,7 +52,7 @@ from grounded_trials.report.layouts import foxglove_layout
 from grounded_trials.report.scene import scene_of
 from grounded_trials.workspace.folder import Folder
 from page_browser import unpacked
-from reported import car, cart, many_flights
+from reported import DIAGNOSIS, car, cart, many_flights
 
 __all__ = ["car", "cart"]
 
@@ -331,6 +331,37 @@ def test_the_worth_of_each_effect_is_drawn_in_the_unit_of_the_state():
     assert worth.bars[1].label == "without delay:u" and worth.bars[1].text == "0.40 m/s"
     (x, v) = accuracy_figure(found).panels
     assert [bar.value for bar in x.bars] == [0.2, 0.1, 0.1, 0.05] and "v" in v.title
+
+
+def test_a_cause_is_drawn_where_it_shows():
+    """Both bars shown were shorter without a claimed cause, and no word said why it is claimed."""
+    credit = (
+        Credit("delay:u", 0.6, {"x": 0.2, "v": 0.3}),
+        Credit("gain:u", 0.2, {"x": 0.09, "v": 0.4}),
+    )
+    hidden = Credit("drag:v", 0.1, {"x": 0.1, "v": 0.3})
+    now = {"x": 0.1, "v": 0.3}
+    row = RulerRow(
+        1.0, unit_by_channel={"x": "m", "v": "m/s"}, crude={"x": 0.3, "v": 0.5}, with_effects=now
+    )
+    found = Diagnosis(Verdict("several"), prediction_error=(row,), credit=(*credit, hidden))
+    figure = worth_figure(found, [(["x"], "x")])
+    assert figure is not None
+    assert [panel.title.partition(":")[0] for panel in figure.panels] == ["x", "v"]
+    assert "drag:v" in figure.caption and "gain:u" not in figure.caption
+
+
+def test_a_mean_of_two_trials_is_no_trial(cart):
+    """Of a candidate that was run twice the page said that the diagnosis never saw it."""
+    findings = gather(Folder(cart))
+    best = findings.runs_of(findings.best.candidate.id)[-1]
+    again = replace(best, trial=replace(best.trial, id="t0099", states=best.trial.states + 1e-3))
+    seen = {"trials": [*(r.trial.id for r in findings.runs), "t0099"], "adopted": []}
+    diagnosis = Diagnosis.from_json(DIAGNOSIS | {"diagnosed": seen})
+    twice = replace(findings, runs=(*findings.runs, again), diagnosis=diagnosis)
+    figure = forecast_figures(twice)[0]
+    assert "t0099" in figure.title and "saw this trial too" in figure.caption
+    np.testing.assert_array_equal(figure.panels[0].curves[0].y, again.trial.states[:, 0])
 
 
 def test_the_residual_is_drawn_over_what_tells_most_of_it(cart):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,13 @@ from cli import grounded, plain
 from facts import holds
 from grounded.diagnosis.report import Diagnosis
 from grounded_trials.report.diagnosis_words import calibrated_sentence
-from grounded_trials.report.findings import prediction_error, rms, tracking_error
+from grounded_trials.report.findings import (
+    improvements_in,
+    off_target,
+    prediction_error,
+    rms,
+    tracking_error,
+)
 from grounded_trials.report.gathering import gather
 from grounded_trials.report.reporting import save_optimum
 from grounded_trials.store.documents import write_document
@@ -309,3 +316,19 @@ def test_at_most_three_parameters_are_named_the_most_changed_first():
         "calibrated beside them: p5 1.00 -> 1.50 m, p4 1.00 -> 1.40 m, p3 1.00 -> 1.30 m "
         "(and 2 more)"
     )
+
+
+def test_two_trials_of_a_candidate_miss_by_more_than_their_mean(cart):
+    """One ended 31 cm too far, one 31 cm short: their mean was said to be there."""
+    findings = gather(Folder(cart))
+    best = findings.runs_of(findings.best.candidate.id)[-1]
+    target = np.nan_to_num(findings.task.target)
+    two = [
+        replace(best, trial=replace(best.trial, id=f"t009{k}", states=target + sign * 0.31))
+        for k, sign in enumerate((1, -1))
+    ]
+    runs = (*(r for r in findings.runs if r.candidate.id != best.candidate.id), *two)
+    found = replace(findings, runs=runs)
+    assert rms(off_target(found, found.best))[0] == pytest.approx(0.31)
+    told = next(one for one in improvements_in(found) if "x" in one.what)
+    assert told.after == pytest.approx(0.31)

@@ -8,6 +8,7 @@ from grounded_trials.wording import (
     labelled,
     per_second,
     percent,
+    ranges,
     shown,
     with_unit,
 )
@@ -30,6 +31,14 @@ def test_the_unit_one_is_not_printed():
 )
 def test_no_line_is_broken_inside_a_quantity(whole):
     assert " " not in glued(whole)
+
+
+def test_trials_are_named_without_hiding_those_between():
+    names = ["t0001", *(f"t{k:04d}" for k in range(7, 17))]
+    assert ranges(names) == "t0001, t0007 to t0016"
+    assert ranges(["t0001"]) == "t0001" and ranges(["a", "b"]) == "a, b"
+    odd = [f"t{k:04d}" for k in range(1, 22, 2)]
+    assert ranges(odd) == "t0001 to t0021 without 10"
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,9 @@ from grounded.search.candidate import Tried
 from grounded.search.certainty import last_improvement, student, utility_noise
 
 
-def tried(*utilities, accepted=True):
-    return Tried(candidate=None, trials=(), utilities=utilities, accepted=accepted)
+def tried(*utilities, accepted=True, base="c0001"):
+    candidate = SimpleNamespace(base=base)
+    return Tried(candidate=candidate, trials=(), utilities=utilities, accepted=accepted)
 
 
 def test_nothing_to_say_before_the_first_improvement():
@@ -50,11 +51,13 @@ def test_noise_of_a_repeated_candidate_stands_in_for_the_others():
 
 def test_the_wild_first_policy_says_nothing_of_the_noise_of_later_ones():
     """FACTS 7: 0.1 pooled it, so that a gain of many standard errors had probability 0.5."""
-    wild = tried(-9000.0, -200.0, -4000.0)
+    wild = tried(-9000.0, -200.0, -4000.0, base="")
     found = last_improvement([wild, tried(-5.0, -5.02, -4.98), tried(-4.0, -4.01, -3.99)])
     assert holds(found, "probability 1.00")
     once = last_improvement([wild, tried(-5.0), tried(-4.0)])
     assert "probability" not in once
+    gentler = tried(-900.0, -200.0, accepted=False, base="")  # a first policy too
+    assert "probability" not in last_improvement([wild, gentler, tried(-5.0), tried(-4.0)])
 
 
 def test_failed_runs_are_left_out_and_trials_that_agree_say_so():

@@ -15,6 +15,7 @@ from grounded.diagnosis.report import Diagnosis, Made
 from grounded_cli.main import COMMANDS, cli
 from grounded_cli.options import ELSEWHERE
 from grounded_trials import Workspace
+from grounded_trials.report.gathering import gather
 from grounded_trials.store.documents import write_document
 from grounded_trials.wording import folded
 from grounded_trials.workspace.config import set_in_model
@@ -115,6 +116,23 @@ def test_what_logs_have_shown_is_adopted_before_the_first_candidate(cart, tmp_pa
     assert last(grounded("-C", folder, "status")) == "grounded adopt viscous_friction:v"
     assert grounded("-C", folder, "adopt", "viscous_friction:v").code == 0
     assert last(grounded("-C", folder, "status")) == "grounded propose"
+
+
+def test_what_a_fresh_diagnosis_claims_is_adopted_while_a_candidate_waits(tmp_path):
+    """`diagnose` said adopt; status, page and report said run, and never spoke of adopting."""
+    folder = make(tmp_path / "w").folder
+    assert grounded("-C", folder, "learn", "--trials", 2).code == 0
+    assert grounded("-C", folder, "propose").code == 0
+    assert last(grounded("-C", folder, "status")) == "grounded run"
+    (folder / "reports").mkdir(exist_ok=True)
+    diagnosed(folder, diagnosed={"trials": ["t0001", "t0002"], "adopted": [], "params": {}})
+    for command in ("status", "report"):
+        assert last(grounded("-C", folder, command)) == "grounded adopt viscous_friction:v"
+    found = gather(Folder(folder))
+    assert found.standing.phase == "await-trial"
+    assert found.next_command == "grounded adopt viscous_friction:v"
+    assert grounded("-C", folder, "learn", "--trials", 1).code == 0  # a later trial outdates it
+    assert "adopt" not in last(grounded("-C", folder, "status"))
 
 
 def test_a_long_command_is_broken_where_a_shell_allows_it():

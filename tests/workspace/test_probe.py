@@ -1,8 +1,11 @@
 """The candidate that a diagnosis offers next is one that `run` and `export` hand over."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from grounded.diagnosis.excitation import probes
 from grounded.effects import Library
 from grounded.errors import NextCommand
 from grounded_trials import Workspace
@@ -46,6 +49,24 @@ def test_every_probe_that_is_offered_is_handed_over(diagnosed):
     bounded(w, reached.min() - 0.01, reached.max() + 0.5)
     identity, sentence = offered(w, found)
     assert identity == "" and "[safety]" in sentence
+
+
+def test_the_sentence_of_a_probe_names_its_size_and_the_command_that_makes_it(diagnosed):
+    """The page said "a staircase of 0.7 on motor": of what unit, and how is it run?"""
+    w, found = diagnosed
+    trials = [w.planner.lift(trial) for trial in w.task_trials()]
+    identity, sentence = _probe(
+        w, replace(found, indistinguishable=()), trials, Library(), write=False
+    )
+    assert identity == "" and sentence.count("`grounded diagnose --probe`") == 1
+    policy = w.candidate("c0001")[0].policy
+    model = w.task.model
+    words = [said for said, _ in probes(policy, model, [0])][1:]
+    assert all(" N added to force" in said for said in words)
+    plain = replace(model, inputs={"force": "1"})
+    low, high = policy.low[0], policy.high[0]
+    told = [said for said, _ in probes(policy, plain, [0])][1:]
+    assert all(f"(limits {low:g} to {high:g}) added to force" in said for said in told)
 
 
 def test_people_export_a_probe(diagnosed, tmp_path):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 import shlex
 import shutil
@@ -12,6 +11,7 @@ from textwrap import TextWrapper
 from typing import TYPE_CHECKING
 
 from grounded.diagnosis.error_report import percent as percent
+from grounded.result import figure as figure
 
 if TYPE_CHECKING:
     from grounded.errors import NextCommand
@@ -20,6 +20,7 @@ ITERATION = (
     "iter.: improvements that a candidate builds on; it falls where the search goes back to "
     "an earlier one"
 )
+PIECES = 4  # of a list of trials that are named
 NARROW, WIDE = 60, 80  # columns: what every line can do with, and what a reader likes at most
 MARKS = "\ufdd0\ufdd1\ufdd2\ufdd3\ufdd4"  # of colours in a text: they take no column
 _WORD = re.compile(r"""(?:'[^']*'|"[^"]*"|\S)+""")  # of a command; what is quoted stays whole
@@ -36,23 +37,25 @@ def columns() -> int:
     return min(max(shutil.get_terminal_size((WIDE, 24)).columns, NARROW), WIDE)
 
 
-def figure(value: float | None, digits: int = 4) -> str:
-    """`digits` significant digits; "failed" for minus infinity, "-" where there is none."""
-    if value is None or math.isnan(value):
-        return "-"
-    if value == 0:
-        return "0"
-    if value == -math.inf:
-        return "failed"
-    if value != 0 and not 1e-3 <= abs(value) < 1e6:
-        return f"{value:.{digits - 1}e}"
-    decimals = max(digits - 1 - math.floor(math.log10(abs(value))), 0)
-    return f"{value:,.{decimals}f}"
-
-
 def count(number: int, word: str, many: str = "") -> str:
     """`1 trial`, `2 trials`; `many` where the plural is another one."""
     return f"{number} {word if number == 1 else many or word + 's'}"
+
+
+def ranges(names: Sequence[str]) -> str:
+    """`t0001, t0007 to t0016`: names in order, those that follow each other as a range.
+
+    Of many pieces the ends, and how many are not among them.
+    """
+    digits = [name[1:] for name in names]
+    if not all(map(str.isdecimal, digits)):
+        return ", ".join(names)
+    numbers = [int(number) for number in digits]
+    cuts = [k for k, (a, b) in enumerate(pairwise(numbers), 1) if b != a + 1]
+    pieces = [names[a:b] for a, b in pairwise([0, *cuts, len(names)])]
+    if len(pieces) > PIECES:
+        return f"{names[0]} to {names[-1]} without {numbers[-1] - numbers[0] + 1 - len(names)}"
+    return ", ".join(" to ".join(dict.fromkeys([piece[0], piece[-1]])) for piece in pieces)
 
 
 def shown(unit: str) -> str:

@@ -99,6 +99,8 @@ def utility_prediction(
 ) -> Utilities:
     """Real and predicted utilities of the trials that ran to the horizon.
 
+    A log that goes on after it and names no candidate is no run of the task.
+
     Args:
         predictor: the data that were made from `trials`.
         fit: the best hypothesis.
@@ -113,8 +115,9 @@ def utility_prediction(
     rows, chosen = [], any(trial.candidate for trial in trials)
     for i, trial in enumerate(trials):
         real = task.utility(trial)
-        if not np.isfinite(real) or i not in groups or (chosen and not trial.candidate):
-            continue  # driven by hand: no policy's utility
+        by_hand = not trial.candidate and (chosen or trial.steps > task.horizon)
+        if not np.isfinite(real) or i not in groups or by_hand:  # that is no policy's utility
+            continue
         first = int(np.flatnonzero(data.trial_of == i)[0])
         if data.time[0, first] > 0:  # the run that it began with was left out
             continue

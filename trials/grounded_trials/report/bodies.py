@@ -8,7 +8,8 @@
     a MuJoCo model              the geometry of its file
     nothing of these            a dot in the plane of the first two states
 
-Links are as long as the parameters l, l1, l2 ... say, or all alike.
+Links are as long as the parameters l1, l2 ..., or l, L or length, say in m; the only link as the
+only parameter in m, whatever its name. Else their lengths aren't known: they are drawn alike.
 """
 
 from __future__ import annotations
@@ -84,9 +85,11 @@ def _columns(model: Model, role: str) -> tuple[int, ...]:
 
 def _lengths(model: Model, count: int) -> tuple[float, ...]:
     """Of the links [m], zero where the model has none."""
-    params = model.params
-    named = [params.get(f"l{i}", params.get("l")) for i in range(1, count + 1)]
-    return tuple(0.0 if one is None or one.unit != "m" else one.value for one in named)
+    metres = {name.lower(): p.value for name, p in model.params.items() if p.unit == "m"}
+    shared = metres.get("l", metres.get("length", 0.0))
+    if len(metres) == count == 1:
+        shared = next(iter(metres.values()))
+    return tuple(metres.get(f"l{i}", shared) for i in range(1, count + 1))
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping
 from grounded.diagnosis.error_report import Gap
 from grounded.diagnosis.report import Correction, Diagnosis, Estimate
 from grounded.instruments.finding import Finding
-from grounded_trials.wording import changed, count, figure, percent, shown, with_unit
+from grounded_trials.wording import changed, count, figure, percent, ranges, shown, with_unit
 
 MOST = 3  # parameters that are named
 
@@ -47,8 +47,7 @@ def made_from(diagnosis: Diagnosis) -> str:
     """`made from 6 trials, t0001 to t0006`."""
     names = diagnosis.made.trials if diagnosis.made is not None else ()
     number = count(len(names) or diagnosis.trials, "trial")
-    ends = " to ".join(dict.fromkeys([*names[:1], *names[-1:]]))
-    return f"made from {number}{f', {ends}' * bool(ends)}"
+    return f"made from {number}{f', {ranges(names)}' * bool(names)}"
 
 
 Cells = tuple[str, ...]

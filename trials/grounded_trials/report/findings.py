@@ -32,6 +32,14 @@ if TYPE_CHECKING:
     from grounded_trials.report.settled import Settled
 
 One = TypeVar("One")
+SHOWN = 4  # numbers of what improved
+MOVED = 0.02  # of what the utility gained: a number that moved it less is left out
+TERMS = {  # tables of [reward]
+    "state": "states, along the way",
+    "terminal": "states, at the end",
+    "input": "inputs",
+    "input_change": "changes of inputs",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,6 +139,12 @@ class Findings:
         return self.runs[-1] if self.runs else None
 
     @cached_property
+    def lately(self) -> Run | None:
+        """A single trial, the best candidate's latest: a model replays no mean of several."""
+        best = self.best and self.runs_of(self.best.candidate.id)[-1]
+        return best or self.latest
+
+    @cached_property
     def improvements(self) -> tuple[Run, ...]:
         """The accepted candidates, by iteration: the model's policy, then each better one."""
         found = [self._mean(t.candidate.id) for t in self.history if t.accepted]
@@ -197,28 +211,48 @@ def weighed_groups(task: Task) -> list[tuple[list[str], str]]:
 
 
 def improvements_in(findings: Findings) -> list[Improved]:
-    """What the reward weighs, rms over the run: of the model's own policy, and of the best trial.
+    """How far the model's own policy missed the target, and the best trial does, rms over the run.
 
-    The position comes first, as one distance; then the other weighted states that have a target.
+    Where the reward weighs the last state, that one too. What moved the utility most comes first.
     """
     task, runs, found = findings.task, compared(findings), []
+    if not runs:
+        return []
+    each = [one for _, r in runs for one in findings.runs_of(r.candidate.id)]
+    short = [one.label for one in each if one.trial.finite_steps < task.horizon]
+    note = f"; {', '.join(short)} ended early" if short else ""
     for names, what in weighed_groups(task):
         states = [task.model.state_names.index(name) for name in names]
-        missed = [
-            float(np.linalg.norm(rms(tracking_error(task, r.trial)[:, states]))) for _, r in runs
-        ]
-        if missed:
-            short = [r.label for _, r in runs if r.trial.finite_steps < task.horizon]
-            note = f"; {', '.join(short)} ended early" if short else ""
+        errors = [[e[:, states] for e in off_target(findings, r)] for _, r in runs]
+        unit = shown(task.model.states[names[0]])
+        far = "distance from the desired position" if len(names) > 1 else f"{what}, off its target"
+        running, terminal = task.reward.state[states], task.reward.terminal[states]
+        views = [(errors, running, f"{far}, rms")] * bool(running.any() or not terminal.any())
+        if terminal.any() and not short:
+            last = [[e[[task.horizon]] for e in own] for own in errors]
+            views.append((last, terminal, f"at the end: {far}"))
+        for parts, weights, words in views:
+            missed = [float(np.linalg.norm(rms(part))) for part in parts]
+            costs = [float(np.nansum(np.vstack(p) ** 2 @ weights)) / len(p) for p in parts]
             before = missed[0] if len(missed) > 1 else float("nan")
-            unit = shown(task.model.states[names[0]])
-            off = (
-                "distance from the desired position"
-                if len(names) > 1
-                else f"{what}, off its target"
-            )
-            found.append(Improved(f"{off}, rms{note}", unit, before, missed[-1]))
-    return found
+            moved = abs(costs[0] - costs[-1]) if len(costs) > 1 else costs[0]
+            found.append((moved, Improved(words + note, unit, before, missed[-1])))
+    found.sort(key=lambda each: -each[0])
+    least = MOVED * sum(moved for moved, _ in found)
+    return [one for k, (moved, one) in enumerate(found[:SHOWN]) if not k or moved >= least]
+
+
+def utility_terms(findings: Findings) -> tuple[list[tuple[str, ...]], tuple[str, ...]]:
+    """(rows, header): the utility of what is compared, by the terms of the reward."""
+    task, runs = findings.task, [run for _, run in compared(findings)]
+    each = [[task.terms(one.trial) for one in findings.runs_of(run.candidate.id)] for run in runs]
+    rows = [
+        (words, *(figure(float(np.mean([terms[name] for terms in own]))) for own in each))
+        for name, words in TERMS.items()
+        if each and name in each[0][0]
+    ]
+    rows.append(("utility", *(figure(run.utility) for run in runs)))
+    return rows, ("term of the reward ", *(run.candidate.id for run in runs))
 
 
 def by_state(
@@ -229,11 +263,6 @@ def by_state(
         (name, unit(each), *(figure(float(column[i]), 3) for column in columns))
         for i, (name, each) in enumerate(model.states.items())
     ]
-
-
-def standard_error(tried: Tried) -> float:
-    """Of a candidate's mean utility; NaN for fewer than two trials, or when one of them failed."""
-    return tried.standard_error if np.isfinite(tried.utility) else float("nan")
 
 
 def tracked(task: Task) -> list[int]:
@@ -252,8 +281,21 @@ def prediction_error(task: Task, run: Run) -> Array:
     return task.model.difference(run.trial.states, run.candidate.predicted_states[: T + 1])
 
 
-def rms(values: Array) -> Array:
-    """Root mean square of each column over its finite rows; NaN where there is none."""
+def off_target(findings: Findings, run: Run) -> list[Array]:
+    """The tracking errors of each trial of a run's candidate: those of their mean are smaller."""
+    runs = findings.runs_of(run.candidate.id)
+    return [tracking_error(findings.task, one.trial) for one in runs]
+
+
+def off_prediction(findings: Findings, run: Run) -> list[Array]:
+    """What each trial of a run's candidate misses its prediction by."""
+    runs = findings.runs_of(run.candidate.id)
+    return [prediction_error(findings.task, one) for one in runs]
+
+
+def rms(values: Array | list[Array]) -> Array:
+    """Root mean square of each column over all finite rows; NaN where there is none."""
+    values = np.vstack(values) if isinstance(values, list) else values
     finite = np.isfinite(values)
     count = finite.sum(axis=0)
     total = np.where(finite, values, 0.0) ** 2

@@ -19,11 +19,10 @@ from grounded_trials.report.findings import (
     Findings,
     by_state,
     compared,
-    prediction_error,
+    off_prediction,
+    off_target,
     rms,
     selection,
-    standard_error,
-    tracking_error,
 )
 from grounded_trials.report.forecast import SECONDS, forecast_error
 from grounded_trials.report.settled import so_far
@@ -118,14 +117,13 @@ def _utilities(findings: Findings, table: Table, bars: Callable[[Sequence[float]
 
 
 def _candidate(tried: Tried, verdict: str) -> tuple[str, ...]:
-    error = standard_error(tried)
     return (
         tried.candidate.id,
         str(tried.candidate.iteration),
         f"{tried.candidate.alpha:g}",
         figure(tried.candidate.predicted_utility),
         figure(tried.utility),
-        figure(error, 2),
+        figure(tried.standard_error, 2),
         str(len(tried.trials)),
         verdict,
     )
@@ -134,8 +132,8 @@ def _candidate(tried: Tried, verdict: str) -> tuple[str, ...]:
 def _trajectories(findings: Findings, table: Table) -> str:
     """Distance to the target, and what the model had promised, rms over the run."""
     task, runs = findings.task, [run for _, run in compared(findings)]
-    columns = [rms(tracking_error(task, run.trial)) for run in runs]
-    columns += [rms(prediction_error(task, run)) for run in runs]
+    columns = [rms(off_target(findings, run)) for run in runs]
+    columns += [rms(off_prediction(findings, run)) for run in runs]
     rows = by_state(task.model, columns)
     ids = [run.candidate.id for run in runs]
     header = ("state", "unit", *(f"{i} off" for i in ids), *(f"{i} gap" for i in ids))

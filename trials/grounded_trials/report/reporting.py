@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from grounded.errors import GroundedError, needs
 from grounded.result import Result
-from grounded.task import Task
-from grounded_trials.report.findings import Findings, Run, prediction_error, rms, tracking_error
+from grounded_trials.report.findings import Findings, Run, off_prediction, off_target, rms
 from grounded_trials.report.gathering import gather
 from grounded_trials.store.documents import write_document
 from grounded_trials.store.store import write_atomically
@@ -58,8 +57,8 @@ class Report(Result):
             "optimum": findings.optimum,
             "lost": [vars(one) for one in findings.lost],
             "next": rendered(findings.then, findings.folder),
-            "model_policy": _measures(findings.task, findings.first),
-            "best": _measures(findings.task, findings.best),
+            "model_policy": _measures(findings, findings.first),
+            "best": _measures(findings, findings.best),
         }
         pictures = [str(path) for path in self.paths if path.suffix == ".png"]
         if pictures:
@@ -83,13 +82,14 @@ def _kind(path: Path) -> str:
     return name if layout else path.suffix[1:]
 
 
-def _measures(task: Task, run: Run | None) -> dict[str, Any] | None:
+def _measures(findings: Findings, run: Run | None) -> dict[str, Any] | None:
     """How far a run was from its target, from its prediction and from the model's, by state."""
     if run is None:
         return None
+    task = findings.task
     measures = {
-        "tracking_error": rms(tracking_error(task, run.trial)),
-        "prediction_error": rms(prediction_error(task, run)),
+        "tracking_error": rms(off_target(findings, run)),
+        "prediction_error": rms(off_prediction(findings, run)),
         "bias_rate": rms(run.residual) / task.dt,
     }
     return {"candidate": run.candidate.id, "utility": run.utility} | {

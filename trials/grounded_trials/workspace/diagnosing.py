@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
 FILE = "diagnosis.json"
 LEAST_STEPS = 2
+PROBE = NextCommand("diagnose", ("--probe",))
 
 
 def diagnose_in(
@@ -212,7 +213,9 @@ def _probe(
         made = None if inside is None else probe(inside, base, found, trials, library)
         if made is None:
             break
-        if not offer or (ties and made.expected < NOTHING):
+        if not offer:
+            return "", f"{made.sentence} (`{rendered(PROBE)}` makes the candidate)"
+        if ties and made.expected < NOTHING:
             return "", made.sentence
         candidate = _candidate_of(workspace, planner.narrowed(made.policy), best.candidate.id)
         reasons = (*outside_limits(task, candidate.policy), *objections(task, candidate, strays))

@@ -33,22 +33,20 @@ def next_command(
         diagnosis: the last one.
         usable: the trials that a diagnosis can use now, in order of arrival.
     """
+    since = since_diagnosis(workspace, diagnosis, usable) if diagnosis else Since()
+    follow = to_adopt(workspace, diagnosis) if diagnosis and not since.changed else None
+    if follow and not since.newer:  # wherever the search stands: a better model plans better
+        return follow
     if now.phase == "await-trial":
         return another_trial(workspace, now)
     if diagnosis is None:
         logs = usable and not now.history  # what they show comes before the first candidate
         return now.then or (PROPOSE if now.phase == "propose" and not logs else DIAGNOSE)
-    since = since_diagnosis(workspace, diagnosis, usable)
-    follow = to_adopt(workspace, diagnosis)
-    if now.phase == "propose":  # what logs have shown is adopted before the first candidate
-        if now.history or since.changed or follow is None:
-            return PROPOSE
-        return DIAGNOSE if since.newer else follow
+    if now.phase == "propose":
+        return DIAGNOSE if follow and not now.history else PROPOSE
     if since.changed or since.newer:
         return DIAGNOSE
-    if diagnosis.no_cause:
-        return another_trial(workspace, now)
-    return follow or EXPORT
+    return another_trial(workspace, now) if diagnosis.no_cause else EXPORT
 
 
 def another_trial(workspace: Folder, now: Standing) -> NextCommand:

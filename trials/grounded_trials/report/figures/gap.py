@@ -31,7 +31,7 @@ LEAST_STEPS = 30  # of a trial whose residual is drawn
 def forecast_figures(findings: Findings) -> list[Figure]:
     """One for a run that the diagnosis didn't see, or else the best; one for the longest logs."""
     found = []
-    run = _unseen(findings) or findings.best or findings.latest
+    run = _unseen(findings) or findings.lately
     if run is not None:
         title = f"The model, set right every {SECONDS:g} s, {run.label}"
         found.append(_figure(findings, "forecast", title, run.trial))
@@ -116,7 +116,7 @@ def _part(trial: Trial, first: int, last: int) -> Trial:
 
 def residual_figures(findings: Findings) -> list[Figure]:
     """What the model lacks over what explains it best, and whether the rest is white noise."""
-    run = findings.best or findings.latest
+    run = findings.lately
     data: list[tuple[Trial, Array, Array | None]] = [
         (r.trial, r.residual, r.explained) for r in ([run] if run is not None else [])
     ]

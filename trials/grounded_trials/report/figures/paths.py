@@ -81,7 +81,10 @@ def path_figure(findings: Findings) -> Figure | None:
     if body is None and not scene.spatial:
         caption.append(f"No plane among the roles: {' and '.join(scene.names)}.")
     if body is not None and not body.unit:
-        caption.append("The model has no l1, l2 ... [m]: its links are drawn alike.")
+        caption.append(
+            "How long its links are is not known (a parameter l, or l1, l2 ... in m says it): "
+            "they are drawn alike."
+        )
     if any(crash(run) for run in findings.runs):
         caption.append("A cross marks where a run ended early.")
     return Figure("paths", "Paths", " ".join(caption), tuple(panels), legend(panels[:1]))
@@ -190,7 +193,7 @@ def _shaded(findings: Findings, view: View) -> list[Panel]:
     (_, run), body = compared(findings)[-1], body_in(findings)
     states, target = run.trial.states, findings.task.target
     desired = body.path(target)
-    if not np.isfinite(desired).all():
+    if not np.isfinite(desired).all() or not body.unit:  # no distance without a length
         return []
     far = np.linalg.norm(body.path(states) - desired[: len(states)], axis=1)
     times: Array = np.arange(len(states), dtype=np.float64) * findings.task.dt

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 from grounded.diagnosis.error_report import ChannelParts, Parts, Split
 from grounded.diagnosis.pictures import accuracy_figure, credit_figure, where_figure
@@ -26,7 +25,7 @@ from grounded_trials.report.page.tables import (
     table,
 )
 from grounded_trials.report.settled import so_far
-from grounded_trials.wording import figure, glued, percent, rendered, with_unit
+from grounded_trials.wording import figure, percent, rendered, with_unit
 from grounded_trials.workspace.next_step import DIAGNOSE, Since
 
 MOST = 6  # states whose error without each effect is drawn
@@ -45,18 +44,13 @@ def gap_section(findings: Findings) -> list[Block]:
         return [Block("text", words), command, *ahead, *forecast_table(findings), *lacking]
     causes, others = verdict_lines(diagnosis)
     shown = so_far(diagnosis, findings.since, findings.settled)
-    verdict = Block("verdict", lines=typeset_lines([*shown, *causes, *others]))
+    verdict = Block("verdict", lines=[*shown, *causes, *others])
     if diagnosis.no_cause:  # with too little data, what was fitted is no finding
         return [verdict, *ahead, *forecast_table(findings), *lacking]
     proof = drawn(accuracy_figure(diagnosis), title=True)
     proof += drawn(credit_figure(diagnosis, MOST), title=True)
     proof += [*ahead, *forecast_table(findings)]
     return [verdict, *proof, *lacking, *_details(diagnosis, findings.since)]
-
-
-def typeset_lines(lines: Sequence[str]) -> list[str]:
-    """Lines in which no number is broken."""
-    return [re.sub(r"-(?=\d)", "-\u2060", glued(line)) for line in lines]  # no break in 1e-05
 
 
 def _details(diagnosis: Diagnosis, since: Since) -> list[Block]:

@@ -294,7 +294,7 @@
       const text = from.rows
         ? [...from.rows].map((row) => [...row.cells].map((cell) => cell.textContent).join("\t")).join("\n")
         : from.textContent;
-      await copied(text);
+      await copied(text.replaceAll("\u00a0", " ").replaceAll("\u2060", ""));
       const old = button.textContent;
       button.textContent = "copied";
       setTimeout(() => { button.textContent = old; }, 1200);

@@ -11,16 +11,17 @@ import base64
 import hashlib
 import json
 import math
+import re
 from functools import cache
 from importlib.resources import files
 from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis.pictures import credit_figure, worth_of
+from grounded.diagnosis.pictures import credit_figure, worth_figure
 from grounded.errors import needs
 from grounded.figures.body import Motion
-from grounded.figures.figure import Bars, Figure, Panel, typeset
+from grounded.figures.figure import Bars, Panel, typeset
 from grounded.figures.interactive import packed, palette, plotted
 from grounded.search.pictures import search_figure
 from grounded_trials.report.diagnosis_words import error_lines, instrument_lines
@@ -31,8 +32,8 @@ from grounded_trials.report.figures.runs import (
     input_figure,
     state_figure,
 )
-from grounded_trials.report.findings import Findings, improvements_in
-from grounded_trials.report.page.diagnosed import gap_section, typeset_lines
+from grounded_trials.report.findings import Findings, improvements_in, utility_terms
+from grounded_trials.report.page.diagnosed import gap_section
 from grounded_trials.report.page.tables import (
     Block,
     candidate_table,
@@ -40,6 +41,7 @@ from grounded_trials.report.page.tables import (
     drawn,
     error_table,
     parameter_table,
+    table,
 )
 from grounded_trials.report.settled import told
 from grounded_trials.report.three_lines import gained_most
@@ -62,7 +64,7 @@ def page(findings: Findings, watched: int = 0) -> str:
     from jinja2 import Environment
 
     jinja = Environment(autoescape=True, finalize=typeset, trim_blocks=True, lstrip_blocks=True)
-    jinja.filters["glued"] = glued
+    jinja.filters["glued"] = _unbroken
     scripts = [_own("plotly-basic.min.js"), _own("page.js")]
     panels: list[dict[str, Any]] = []
 
@@ -89,6 +91,11 @@ def page(findings: Findings, watched: int = 0) -> str:
         data=data,
         watched=watched,
     )
+
+
+def _unbroken(text: str) -> str:
+    """Text in which a browser breaks no quantity: neither 0.05 kg nor 1e-05 nor |motor|."""
+    return re.sub(r"-(?=\d)|\|", "\\g<0>\u2060", glued(text))
 
 
 @cache
@@ -180,7 +187,7 @@ def _improved(findings: Findings) -> list[tuple[str, str]]:
     if first is not None and best is not None and best is not first:
         gain = ""
         if -math.inf < first.utility < 0 and best.utility <= 0:
-            gain = f": {100 * (1 - best.utility / first.utility):.1f} % of the first loss is gone"
+            gain = f": {100 * (1 - best.utility / first.utility):.1f} % of the first cost is gone"
         moved = f"{figure(first.utility)} → {figure(best.utility)}"
         rows.append((moved, f"utility, the model’s own policy to {best.candidate.id}{gain}"))
     elif best is not None:
@@ -214,15 +221,12 @@ def _why(findings: Findings) -> dict[str, Any]:
         return {}
     before = {} if findings.since.changed else findings.values
     groups = gained_most(diagnosis, findings.task)
-    worth = [p for g in groups for p in worth_of(*g, diagnosis)]
-    credit = Figure("credit", "", "", tuple(worth)) if worth else credit_figure(diagnosis)
+    credit = worth_figure(diagnosis, groups) or credit_figure(diagnosis)
     known = [] if credit else error_lines(diagnosis, before)
     lines = [(title, text) for title, text in known if title == "parameters"]
     return {
         "kind": diagnosis.kind,
-        "verdict": typeset_lines(
-            told(diagnosis, findings.task, findings.since, findings.settled, None)
-        ),
+        "verdict": told(diagnosis, findings.task, findings.since, findings.settled, None),
         "preflight": instrument_lines(diagnosis.preflight),
         "lines": lines,
         "credit": credit,
@@ -238,9 +242,11 @@ def _utility(findings: Findings) -> list[Block]:
     sure = last_improvement(findings.history)
     begun = sure[:1].upper() + sure[1:]
     few = len(findings.history) <= OPEN
+    rows, header = utility_terms(findings)
     return [
         *drawn(search_figure(findings.standing, findings.optimum)),
         *([Block("text", f"{begun}.")] if sure else []),
+        *([table("terms", header, rows)] if len(rows) > 2 else []),
         Block("folded", "All candidates", blocks=candidate_table(findings), wide=few),
     ]
 

@@ -17,10 +17,9 @@ from grounded_trials.report.findings import (
     Findings,
     by_state,
     compared,
-    prediction_error,
+    off_prediction,
+    off_target,
     rms,
-    standard_error,
-    tracking_error,
 )
 from grounded_trials.report.forecast import SECONDS, forecast_error
 from grounded_trials.wording import figure, legend, percent, rendered, shown, with_unit
@@ -81,10 +80,10 @@ def candidate_table(findings: Findings) -> list[Block]:
             "from": c.base or "-",
             "iter.": str(c.iteration),
             "alpha": f"{c.alpha:g}",
-            "damping": f"{c.damping:.2g}" if c.base else "-",
+            "damping": figure(c.damping, 2) if c.base else "-",
             "predicted utility": figure(c.predicted_utility),
             "real utility": figure(tried.utility),
-            "std. error": figure(standard_error(tried), 2),
+            "std. error": figure(tried.standard_error, 2),
             "verdict ": findings.standing.verdict(tried),
             "trials ": " ".join(t.id for t in tried.trials) or "none",
         }
@@ -102,8 +101,8 @@ def error_table(findings: Findings) -> list[Block]:
     task, runs = findings.task, [run for _, run in compared(findings)]
     if findings.best is None:
         return []
-    columns = {f"off target, {r.candidate.id}": rms(tracking_error(task, r.trial)) for r in runs}
-    columns |= {f"off prediction, {r.candidate.id}": rms(prediction_error(task, r)) for r in runs}
+    columns = {f"off target, {r.candidate.id}": rms(off_target(findings, r)) for r in runs}
+    columns |= {f"off prediction, {r.candidate.id}": rms(off_prediction(findings, r)) for r in runs}
     columns |= {f"bias per s, {r.candidate.id}": rms(r.residual) / task.dt for r in runs}
     rows = by_state(task.model, [*columns.values()])
     return [table("errors", ("state", "unit", *columns), rows)]
@@ -111,8 +110,8 @@ def error_table(findings: Findings) -> list[Block]:
 
 def forecast_table(findings: Findings) -> list[Block]:
     """Rms error at the end of each second of the best run and every log: not the ruler's."""
-    best = findings.best or findings.latest
-    trials = ([best.trial] if best is not None else []) + [log.trial for log in findings.logs]
+    run = findings.lately
+    trials = ([run.trial] if run is not None else []) + [log.trial for log in findings.logs]
     if not trials:
         return []
     planners = [("without adopted effects" if findings.effects else "crude", findings.crude)]
