@@ -51,7 +51,7 @@ def test_a_constant_that_the_data_set_pays_as_a_number():
     search, best = attribute(data, Library().candidates(model, data.scales))
     (effect,) = best.hypothesis.effects
     values = dict(best.hypothesis.values[0])
-    plain = next(e for e in search.candidates if e.name == effect.name)
+    plain = next(e for e in Library().candidates(model, data.scales) if e.name == effect.name)
     assert plain.fixed["width"] < 0.2 * effect.fixed["width"] == 0.2 * values["width"]
     more = price(search.predictor, effect, values) - price(search.predictor, plain, values)
     assert more == pytest.approx(0.5 * np.log(data.steps))
