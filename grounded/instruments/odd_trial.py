@@ -43,6 +43,7 @@ def in_degrees(
         The index of the trial, and its states that are.
     """
     units = list(model.states.values())
+    shown = [i for i in shown if all(np.isfinite(t.states[:, i]).any() for t in trials)]
     angular = [i for i in shown if units[i] == "rad" or units[i].startswith("rad/")]
     if len(trials) < 2 or not angular:
         return
