@@ -1,5 +1,6 @@
 """START HERE: the instruments, from their own signals alone, before any physics is judged.
 
+odd_trial     a whole trial in other units than the rest
 single        each state by itself
 kinematics    velocities against the rates of their positions, courses against headings
 inputs        copies of one another, at their limits, constant within each trial
@@ -29,6 +30,7 @@ from grounded.instruments.kinematics import (
     turned,
 )
 from grounded.instruments.lag import Lag, alike, at_samples, lag_between, reach_of
+from grounded.instruments.odd_trial import in_degrees, judge_stamps, radians
 from grounded.instruments.single import Signal, judge_signal
 from grounded.model import Model
 from grounded.task import Task
@@ -88,7 +90,14 @@ def preflight(
         return Preflight((), tuple(trials))
     bench = _Bench(model, [t.until(t.known_steps) for t in used], set(hidden))
     with np.errstate(all="ignore"):
-        found = [*bench.singles(), *bench.pairs(), *bench.plane(), *_inputs(subject, bench.trials)]
+        judge_stamps(model, bench.trials)
+        found = [
+            *bench.odd(),
+            *bench.singles(),
+            *bench.pairs(),
+            *bench.plane(),
+            *_inputs(subject, bench.trials),
+        ]
     return Preflight(tuple(found), tuple(bench.trials), frozenset(bench.in_step))
 
 
@@ -113,6 +122,15 @@ class _Bench:
             states = np.array(trial.states)
             states[:, i] = x
             self.trials[k] = replace(trial, states=states)
+
+    def odd(self) -> Iterator[Finding]:
+        """Of trials that are in degrees as a whole."""
+        for k, some in list(in_degrees(self.model, self.trials, self.shown)):
+            trial = self.trials[k]
+            self.trials[k] = radians(trial, some)
+            text = f"is in degrees in trial {trial.id or f'number {k + 1}'}, in radians in others"
+            for i in some:  # of that log alone: no line for the table of all logs
+                yield _mended(self.model.state_names[i], text, "degrees", "", scale=DEGREES)
 
     def singles(self) -> Iterator[Finding]:
         """Of each sensor by itself."""

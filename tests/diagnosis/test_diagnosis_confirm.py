@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from grounded import Model, Param, Trial
+from grounded import Model, Param, Search, Trial
 from grounded.diagnosis.diagnose import diagnose
 from grounded.diagnosis.hypotheses.attribution import attribute
 from grounded.diagnosis.likelihood.data import prepare
@@ -16,6 +16,10 @@ from grounded.diagnosis.validation.limits import limits
 from grounded.diagnosis.validation.ruler import Ruler, folds
 from grounded.diagnosis.verdict import verdict
 from grounded.effects import Library
+from grounded.experiments.pendulum import model as real_pendulum
+from grounded.experiments.pendulum import pendulum_task
+from grounded.models.pendulum import model as crude_pendulum
+from grounded.plant import Plant
 
 DT = 0.02
 FRICTION, BIAS, WAVE = 0.4, -0.08, 0.05
@@ -234,3 +238,18 @@ def test_trials_that_each_gain_outweigh_one_that_rules_the_sums():
     assert gain([0.3, 0.2, 0.4, 0.3, 0.2]).pays(2.0, 0.01)
     assert not gain([1.5, 0.0, -0.1, 0.1, 0.0]).pays(2.0, 0.01)
     assert gain([0.3]).chance == gain([0.0, 0.0, 0.0]).chance == 1.0
+
+
+@pytest.mark.slow
+def test_what_is_left_without_the_only_effect_is_the_calibrated_model():
+    task, trials = pendulum_task(crude_pendulum), []
+    search, plant = Search(task), Plant(real_pendulum, {})
+    for _ in range(3):
+        trials.append(plant.run(search.ask().policy, {}, np.random.default_rng(0)))
+        search.tell(trials[-1])
+    found = diagnose(task, trials)
+    assert found.effects == ("coulomb_friction:omega",)
+    without = {one.of: one.without_it for one in found.credit}
+    assert set(without) == {"coulomb_friction:omega", "calibration"}
+    row = [r for r in found.prediction_error if not r.whole_trial][-1]
+    assert dict(without["coulomb_friction:omega"]) == pytest.approx(dict(row.calibrated))

@@ -65,6 +65,15 @@ def test_repeats_of_different_length_are_compared_where_they_begin_together(know
     np.testing.assert_allclose(Ruler(some).scatter(fit, [[0, 1]]), 0.0, atol=1e-9)
 
 
+def test_a_repeat_in_another_unit_is_no_noise(known):
+    predictor, _, trials = known
+    odd = replace(trials[2], states=57.3 * trials[2].states)
+    some = Predictor(prepare(predictor.data.model, [trials[0], odd, trials[2]]))
+    fit = SimpleNamespace(hypothesis=Hypothesis(shift=np.array([0.5, 0.0])), track=some.data.y)
+    np.testing.assert_allclose(Ruler(some).scatter(fit, [[0, 1, 2]]), 0.0, atol=1e-9)
+    assert Ruler(some).scatter(fit, [[0, 1]]) is None
+
+
 def test_repeats_are_found_by_candidate_or_by_their_commands(known):
     predictor, _, trials = known
     assert repeated(trials, predictor.data) == [[0, 2], [1, 3]]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from test_diagnosis import cart
 
-from grounded import Trial
+from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import diagnose
 from grounded.diagnosis.hypotheses.attribution import attribute
 from grounded.diagnosis.hypotheses.explored import price
@@ -45,13 +45,59 @@ def test_the_width_of_a_large_friction_is_found():
     assert row.params["c"].value == pytest.approx(FRICTION, rel=0.05)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("width", "off"), [(0.02, 0.05), (0.1, 0.25)])
+def test_a_friction_that_builds_up_slowly_does_not_lose_to_a_dead_zone(width, off):
+    crude, trials = carts(width)
+    found = diagnose(crude, trials)
+    row = found.ranking[0]
+    assert row.effect in ("joint_friction:force<-v", "coulomb_friction:v")
+    assert "dead_zone:force" not in found.effects
+    assert row.params["c"].value == pytest.approx(1.0, rel=off)
+    assert row.fixed["width"] == pytest.approx(width, rel=0.5)
+
+
+def carts(width, trials=3, steps=150):
+    """A cart with a hanging pole that a dry friction of 1 N opposes, and its crude model."""
+
+    def rates(s, a, p, friction):
+        force = a.force - 0.1 * s.v - friction * np.tanh(s.v / width)
+        sn, c = np.sin(s.th), np.cos(s.th)
+        push = (force + 0.2 * sn * (0.4 * s.w**2 + 9.81 * c)) / (p.M + 0.2 * sn**2)
+        return {"x": s.v, "th": s.w, "v": push, "w": (-push * c - 9.81 * sn) / 0.4}
+
+    crude, true = (
+        Model(
+            name="cart-pole",
+            states={"x": "m", "th": "rad", "v": "m/s", "w": "rad/s"},
+            inputs={"force": "N"},
+            params={"M": Param(1.0, "kg", 0.3, 3.0)},
+            roles={"position": ("x",), "hanging": ("th",)},
+            derivative=lambda s, a, p, friction=friction: rates(s, a, p, friction),
+        )
+        for friction in (0.0, 1.0)
+    )
+    t, found = 0.02 * np.arange(steps), []
+    for k in range(trials):
+        u = 1.6 * np.sin((2.0 + 0.7 * k) * t) + 0.8 * np.sin((5.0 - k) * t + k)
+        states = [np.zeros((1, 4))]
+        for value in u:
+            x = states[-1]
+            for _ in range(10):
+                x = true.system.step(x, np.array([[value]]), true.values, 0.002)
+            states.append(x)
+        names = crude.state_names, crude.input_names
+        found.append(Trial(np.concatenate(states), u[:, None], 0.02, *names))
+    return crude, found
+
+
 def test_a_constant_that_the_data_set_pays_as_a_number():
     model, trials = pushed(FRICTION)
     data = prepare(model, trials, np.zeros(1))
     search, best = attribute(data, Library().candidates(model, data.scales))
     (effect,) = best.hypothesis.effects
     values = dict(best.hypothesis.values[0])
-    plain = next(e for e in search.candidates if e.name == effect.name)
+    plain = next(e for e in Library().candidates(model, data.scales) if e.name == effect.name)
     assert plain.fixed["width"] < 0.2 * effect.fixed["width"] == 0.2 * values["width"]
     more = price(search.predictor, effect, values) - price(search.predictor, plain, values)
     assert more == pytest.approx(0.5 * np.log(data.steps))

@@ -7,6 +7,7 @@ import pytest
 
 from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import diagnose
+from grounded.errors import GroundedError, NextCommand
 from grounded.instruments.kinematics import integrals, turned
 from grounded.instruments.lag import at_samples, lag_between
 from grounded.instruments.preflight import preflight
@@ -243,3 +244,43 @@ def test_the_late_velocity_registers_of_real_joints():
 def test_sound_sensors_of_real_systems():
     for system in (EMPS, SERVO, DART_STEERING):
         assert preflight(system.model, system.read()).findings == ()
+
+
+def test_a_whole_trial_in_degrees_is_named_and_corrected():
+    trials = arm()
+    odd = replace(trials[2], states=np.rad2deg(trials[2].states), id="t0003")
+    found = preflight(ARM, [*trials[:2], odd, trials[3]])
+    assert [(f.signal, f.kind, f.corrected) for f in found.findings] == [
+        ("q", "degrees", True),
+        ("w", "degrees", True),
+    ]
+    assert all("t0003" in f.finding for f in found.findings)
+    np.testing.assert_allclose(found.trials[2].states, trials[2].states)
+    np.testing.assert_array_equal(found.trials[1].states, trials[1].states)
+
+
+def test_one_state_of_one_trial_in_degrees_is_named():
+    trials = arm()
+    states = np.array(trials[1].states)
+    states[:, 1] = np.rad2deg(states[:, 1])
+    found = preflight(ARM, [trials[0], replace(trials[1], states=states), *trials[2:]])
+    assert [(f.signal, f.kind) for f in found.findings] == [("w", "degrees")]
+    np.testing.assert_allclose(found.trials[1].states, trials[1].states)
+
+
+def test_a_trial_that_moves_more_is_not_in_degrees():
+    quiet, wild = arm(trials=2)
+    small = replace(quiet, states=quiet.states / 40, inputs=quiet.inputs / 40)
+    assert not preflight(ARM, [small, wild]).findings
+
+
+def test_a_trial_with_stamps_in_milliseconds_stops_the_diagnosis():
+    trials = arm(steps=100)
+    at = np.arange(0, 100, 1e-2)
+    slow = np.stack([np.interp(at, np.arange(101), x) for x in trials[1].states.T], axis=1)
+    inputs = np.repeat(trials[1].inputs, 100, axis=0)[: len(slow) - 1]
+    slow[:, 0] = trials[1].states[0, 0] + np.cumsum(slow[:, 1]) * DT / 1000
+    odd = Trial(slow, inputs, DT, ("q", "w"), ("u",), id="t0002")
+    with pytest.raises(GroundedError, match="t0002") as error:
+        preflight(ARM, [trials[0], odd])
+    assert error.value.then == NextCommand("discard", ("t0002",))

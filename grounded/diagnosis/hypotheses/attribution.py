@@ -19,6 +19,7 @@ from grounded.diagnosis.hypotheses.search import (
     SHORTLIST,
     TO_THE_TOP,
     HypothesisSearch,
+    sweep,
     tune,
 )
 from grounded.diagnosis.likelihood.data import Data
@@ -103,6 +104,7 @@ def _explore(search: HypothesisSearch) -> Fitted:
     # a large effect has a long way from its first look
     search.finished(singles[:SHORTLIST], 8, rivals=True)
     search.again(search.of_size(1)[: RESTARTED if search.data.model.n <= LARGE else 2])
+    sweep(search)
     search.beside_parameters()
     best = search.of_size(1)[0]
     for _ in range(3):  # with the noise that the best one leaves, others may look better

@@ -32,6 +32,7 @@ SLOW = (1.0, 2.0, 6.0)  # the same in steps, where a step is longer than all of 
 BESIDE = 4  # effects that are fitted with the parameters freed
 FIRST, COARSE, LAST = 3.0, 1.4, 1.05  # factors by which a constant is moved
 ROUNDS = 12
+WIDEST, TRIED = 100.0, 7  # a constant from end to end: its range, and values tried in it
 LARGE_GAIN = 50.0  # nats from which a hypothesis is also started by itself
 TO_THE_TOP = 25  # iterations of fits that decide: most need fewer, and stop by themselves
 LARGE = 8  # states; above, or of a simulator, one correlation time and half the shortlist do
@@ -297,6 +298,33 @@ def tune(search: HypothesisSearch, fits: list[Fitted]) -> None:
             for q in effect.quantities:
                 if q.tunable:
                     fit = _walked(search, fit, index, q.name)
+
+
+def sweep(search: HypothesisSearch) -> None:
+    """Tries constants from end to end for every effect, before effects are compared.
+
+    Else a dry friction that builds up slowly loses to a dead zone for its constant alone. What is
+    large then is kept, and further effects are scanned with its constants.
+    """
+    null = search.score(search.best_null())
+    starts = [
+        (fit.hypothesis.tuned(0, q.name, float(value)), fit.noise, fit.track)
+        for fit in search.of_size(1)
+        if search.score(fit) > null
+        for q in fit.hypothesis.effects[0].quantities
+        if q.tunable
+        for value in np.geomspace(max(q.low, q.high / WIDEST), q.high, TRIED)
+    ]
+    swept = []
+    for structure in dict.fromkeys(noise.structure for _, noise, _ in starts):
+        of_one = [start for start in starts if start[1].structure == structure]
+        swept += refine(search.predictor, of_one, iterations=TO_THE_TOP, worth=search.score)
+    large = [fit for fit in swept if search.score(fit) > null + LARGE_GAIN]
+    search.keep(large)
+    names = {fit.hypothesis.names for fit in large}
+    best = [f.hypothesis for f in search.of_size(1) if f.hypothesis.names in names]
+    known = {h.names[0]: h.effects[0] for h in best}
+    search.candidates = tuple(known.get(e.name, e) for e in search.candidates)
 
 
 def _walked(search: HypothesisSearch, fit: Fitted, index: int, name: str) -> Fitted:

@@ -152,7 +152,7 @@ def _pruned(
     """Without the causes that predictions don't need, the least needed first; the likely ones."""
     doubtful: list[Doubtful] = []
     while True:
-        without = {name: fit_without(search, fit, name) for name in causes(fit)}
+        without = {name: fit_without(search, fit, name, ruler) for name in causes(fit)}
         if not ruler.held_out:
             return fit, without, doubtful
         gains = {name: ruler.gain(less, fit) for name, less in without.items()}
@@ -173,16 +173,31 @@ def _effects(fit: Fitted) -> list[str]:
     return [e.name for e in fit.hypothesis.effects if not isinstance(e.family, ParamFamily)]
 
 
-def fit_without(search: HypothesisSearch, fit: Fitted, name: str) -> Fitted:
-    """The same without one cause, all the rest fitted again under noise of the same structure."""
-    h = fit.hypothesis
+def fit_without(search: HypothesisSearch, fit: Fitted, name: str, ruler: Ruler) -> Fitted:
+    """The same without one cause, all the rest fitted again, under the noise that it then has.
+
+    Of the likeliest of all and the likeliest under noise of the fit's own structure, the one that
+    predicts better: what another noise lets the rest do is not the cause's credit.
+    """
+    h, own, dt = fit.hypothesis, fit.noise.structure, search.data.dt
     less = replace(h, shift=None, spread=0.0) if name == CALIBRATION else h.minus(name)
-    key = (fit.noise.structure, less.spread, tuple(sorted(less.names)))
-    starts: list[Fitted | tuple] = [(less, fit.noise, fit.track)]  # type: ignore[type-arg]
-    if key in search.fits:
-        starts.append(search.fits[key])
-    found = search.refined(starts, REFIT)
-    return max(found, key=search.score) if found else search.exact_null()
+    names = tuple(sorted(less.names))
+    for structure in dict.fromkeys((own, search.best_null().noise.structure)):
+        known = search.fits.get((structure, less.spread, names))
+        noise = fit.noise if structure == own else fit.noise.allowing(structure, dt)
+        starts: list[Fitted | tuple] = [(less, noise, fit.track)]  # type: ignore[type-arg]
+        if structure == own or known is None:
+            search.refined([*starts, known] if known else starts, REFIT)
+    fits = [
+        (f, s == own and w == less.spread)
+        for (s, w, n), f in search.fits.items()
+        if n == names and (w > 0) == (less.spread > 0)
+    ]
+    if not fits:
+        return search.exact_null()
+    crude, near = search.exact_null(), [f for f, same in fits if same]
+    likely = [max(some, key=search.score) for some in ([f for f, _ in fits], near) if some]
+    return max(likely, key=lambda f: ruler.gain(crude, f).mean)
 
 
 def plain(search: HypothesisSearch, fit: Fitted) -> Fitted:

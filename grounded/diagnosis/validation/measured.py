@@ -45,12 +45,16 @@ class Measured:
         return np.asarray(self.ruler.errors(fit).rms[:, self.ruler.shown])
 
     def calibrated(self) -> Fitted | None:
-        """The model with its parameters fitted; as it is where that predicts no better."""
+        """The model with its parameters fitted; as it is where that predicts no better.
+
+        The likeliest, or what is left of the decision without its effect, if that predicts better.
+        """
         fits = [f for (_, spread, names), f in self.search.fits.items() if spread and not names]
         if not fits:
             return None
-        best, crude = max(fits, key=self.search.score), self.decision.crude
-        return best if self.ruler.gain(crude, best).mean > 0 else crude
+        rest = [f for f in self.decision.without.values() if f in fits]
+        found, crude = [max(fits, key=self.search.score), *rest], self.decision.crude
+        return max([crude, *found], key=lambda f: self.ruler.gain(crude, f).mean)
 
     def noise_floor(self) -> tuple[Array, str]:
         """Rms error that no model undercuts, by horizon and shown state, and where it is from.

@@ -42,6 +42,7 @@ LEAST_WHOLE = 3
 FINE = 2e-3  # of a channel's spread: errors below it do not matter
 SLIGHT = 1e-2  # nor below this part of the crude model's, or of the spread where that is less
 FAR = 1e6  # a state beyond it has diverged
+ODD = 10.0  # times the error of the best repeat: a trial that misses more is none
 MOMENTS = 20  # at which repeats are compared
 ALIKE = 0.02  # of a command's spread: how much commands of repeats may differ, rms
 
@@ -304,6 +305,7 @@ class Ruler:
         count = np.zeros_like(total)
         for group in repeats:
             runs = np.array([of_trial[i] for i in group if i in of_trial])
+            runs = self._alike(h, fit.track, runs)
             if len(runs) < 2:
                 continue
             length = int(data.lengths[data.trial_of[runs]].min())
@@ -323,6 +325,20 @@ class Ruler:
         if not (count[:-1][:, self.shown] > 0).all():
             return None
         return np.where(count > 0, np.sqrt(total / np.maximum(count, 1)), np.nan)
+
+    def _alike(self, h: Hypothesis, track: Array, runs: Any) -> Any:
+        """The runs that noise alone may tell apart; the rest repeat nothing.
+
+        Their errors hold that scatter, so the best of them can't be predicted much better than it.
+        """
+        own = []
+        for run in runs:
+            at, steps = np.arange(1, int(self.data.valid[run].sum())), self.steps[0]
+            at = at[:: max(1, len(at) // MOMENTS)]
+            error = self._along(h, track, at, np.full(len(at), run), steps)[-1]
+            own.append(np.sqrt(np.nanmean(error[:, self.shown] ** 2, axis=0)))
+        least = np.nanmin(own, axis=0) + self.fine[self.shown] if len(own) else 0.0
+        return runs[[bool((one <= ODD * least).all()) for one in own]] if len(own) else runs
 
 
 def _jackknife(each: Array) -> Array:
