@@ -77,7 +77,10 @@ def oracle(
         for e, effect in zip(label["effects"], effects, strict=True)
     ]
     known = [effect.name for effect in effects]
-    others = sorted((r for r in ranking if r["effect"] not in known), key=lambda r: -r["evidence"])
+    others = sorted(
+        (r for r in ranking if r["effect"] not in known and r["evidence"] is not None),
+        key=lambda r: -r["evidence"],
+    )
     others = [] if len(known) > 1 else others[:RIVALS]
     for row in others:
         effects.append(Library().effect(row["effect"], model, data.scales))
