@@ -89,7 +89,7 @@ def _missed(model: Model, trial: Trial, some: Sequence[int], shown: Sequence[int
     steps = max(1, round(AHEAD / trial.dt))
     logged = np.array(trial.states)
     logged[:, [i for i in range(model.n) if i not in shown]] = 0.0  # nobody knows
-    good = np.array(np.isfinite(logged).all(axis=1))
+    good = np.asarray(np.isfinite(logged).all(axis=1))
     at = np.flatnonzero(good[:-steps] & good[steps:])
     if len(at) < 5:
         return float("nan")
