@@ -118,6 +118,15 @@ def test_a_command_that_is_no_number_for_long_is_a_gap() -> None:
     assert len(grid(x, u, span=Span(end=0.9)).inputs) == 8  # outside the span it does not matter
 
 
+def test_stamps_in_milliseconds_are_refused_with_what_to_do() -> None:
+    def slow(s: Series) -> Series:
+        t = EPOCH + 1000 * (s.t - EPOCH)
+        return replace(s, t=t, log_times=t)
+
+    with pytest.raises(GroundedError, match=r"every 10.3 s.*t_ms"):
+        grid(slow(pose(np.sin)), slow(command()))
+
+
 def test_one_shot_topics() -> None:
     u = series(np.array([0.0]), np.array([0.3]), SignalSpec("/u", "log"))
     found = grid(pose(np.sin), u)

@@ -112,7 +112,7 @@ def to_grid(
     how = {n: samples[n].spec.resample or ("linear" if n in states else "hold") for n in names}
     for name in names:
         if how[name] == "linear":
-            samples[name].check_linear()
+            samples[name].check_linear(dt)
     known, until = _extent(samples, states, inputs, dt)
     origin = min(int(s.t[0]) for s in samples.values())
     start, late = _start(span, series, samples, inputs, known, origin)

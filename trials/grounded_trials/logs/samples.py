@@ -23,6 +23,7 @@ JUMP_S = 1.0  # a clock that goes back by more was set, or a simulation was star
 NEAR_0_S = 10.0  # a clock whose stamps come nearer to 0 may show 0 itself: it was not unset
 MIXED_S = 1.0  # signals on different clocks whose clocks differ by more don't fit each other
 SKEW_S = 0.1  # and by more than this, they may be shifted
+SPARSE = 50.0  # steps between two samples: the log's time is in another unit
 BRIDGED = 1.9  # a value between samples this many intervals apart was bridged
 
 
@@ -51,11 +52,18 @@ class Samples:
             return self.spec.max_age_s
         return max(GAP_INTERVALS * self.interval, GAP_STEPS * dt, GAP_S)
 
-    def check_linear(self) -> None:
-        """Refuses a single sample, between which and the next nothing can be interpolated."""
+    def check_linear(self, dt: float) -> None:
+        """Refuses what can't be interpolated: a single sample, or far more steps than samples."""
         if len(self.t) < 2:
             raise _unusable(
                 self.name, self.spec, 'one sample can\'t be interpolated; set resample = "hold"'
+            )
+        if self.interval > SPARSE * dt and self.spec.max_age_s is None:
+            raise _unusable(
+                self.name,
+                self.spec,
+                f"it comes every {self.interval:.3g} s, a control step is {dt:.3g} s. If its times "
+                "are milliseconds, call a table's column t_ms; if it is that slow, set max_age_s",
             )
 
     def linear(self, at: Ints, dt: float, origin: int) -> Floats:
