@@ -7,6 +7,7 @@ a stranger, so no text in it is trusted.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -87,8 +88,9 @@ def diagnose_in(
     try:
         identity, words = _probe(workspace, found, lifted + second, library, write=probe)
     except Exception as error:  # it must not cost the diagnosis, which is told whatever it is
-        why = f"{type(error).__name__} {error}" if str(error) else type(error).__name__
-        why = str(error) if isinstance(error, GroundedError) else f"{why}: please report it"
+        if not isinstance(error, GroundedError):  # a mistake of ours: its traceback is told as well
+            logging.getLogger(__name__).error("the probe failed, please report it", exc_info=error)
+        why = str(error) or type(error).__name__
         identity, words = "", f"{found.next_trial.rstrip('.')}; no probe could be computed ({why})"
     if words:
         run = f" ({identity}: {rendered(to_run(workspace, identity, identity))})" * bool(identity)
