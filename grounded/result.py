@@ -37,6 +37,16 @@ def figure(value: float | None, digits: int = 4) -> str:
     return f"{value:,.{decimals}f}"
 
 
+def percent(share: float) -> str:
+    """A share as a percentage; a tenth of a percent where it is small or nearly all."""
+    if math.isnan(share):
+        return "-"
+    value = 100 * share
+    if 0 < value < 0.05 or 99.95 <= value < 100:
+        return "< 0.1 %" if value < 50 else "> 99.9 %"
+    return f"{value:.0f} %" if 10 <= value <= 90 else f"{value:.1f} %"
+
+
 class Result:
     """Base of frozen results, dataclasses with `repr=False`: what a notebook shows of them."""
 

@@ -16,6 +16,14 @@ from grounded.challenge.mechanism import simulator
 from grounded.challenge.score import Oracle, judge, oracle, summary, task_of
 
 __all__ = [
-    "KINDS", "Case", "Oracle", "judge", "make", "oracle", "sealed", "simulator", "summary",
+    "KINDS",
+    "Case",
+    "Oracle",
+    "judge",
+    "make",
+    "oracle",
+    "sealed",
+    "simulator",
+    "summary",
     "task_of",
-]  # fmt: skip
+]

@@ -32,9 +32,17 @@ from grounded.compile.trace.graph import TooLong
 from grounded.compile.trace.tracing import Signature, trace
 
 __all__ = [
-    "Backward", "Descent", "DescentOptions", "Named", "Problem", "Status", "Swarm", "System",
-    "history_depths", "system_of",
-]  # fmt: skip
+    "Backward",
+    "Descent",
+    "DescentOptions",
+    "Named",
+    "Problem",
+    "Status",
+    "Swarm",
+    "System",
+    "history_depths",
+    "system_of",
+]
 MAX_COMPILED = 10_000  # operations of a model and its derivatives, about 4 s of compiling
 MAX_STEPS = 4_000  # of a model alone, where its derivatives are too many
 

@@ -214,16 +214,6 @@ def number(value: float) -> str:
     return "-" if math.isnan(value) else f"{value:.3g}"
 
 
-def percent(share: float) -> str:
-    """A share as a percentage; a tenth of a percent where it is small or nearly all."""
-    if math.isnan(share):
-        return "-"
-    value = 100 * share
-    if 0 < value < 0.05 or 99.95 <= value < 100:
-        return "< 0.1 %" if value < 50 else "> 99.9 %"
-    return f"{value:.0f} %" if 10 <= value <= 90 else f"{value:.1f} %"
-
-
 def measured(value: float, unit: str) -> str:
     """An error in two digits: in cm, mm, mrad ... where it is small in its own unit."""
     if unit == "m" and SMALL <= value < 1.0:

@@ -7,9 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from grounded.diagnosis.error_report import Credit, RulerRow, measured, number, percent
+from grounded.diagnosis.error_report import Credit, RulerRow, measured, number
 from grounded.diagnosis.report import Diagnosis
 from grounded.figures.figure import Bar, Bars, Curve, Figure, Panel, legend
+from grounded.result import percent
 
 MOST = 12
 SHOWS = 1.02  # times the error without a cause, from which on bars show its worth

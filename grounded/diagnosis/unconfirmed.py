@@ -24,7 +24,7 @@ from grounded.trial import Trial
 
 MENTIONED = 2
 MOST = 0.8  # of all that it does, which few trials hold
-FAR_OFF = 2.0
+FAR_OFF = 2.0  # times the room of the target and the best run: a run beyond it is lost
 FEW = 4  # one of so many trials
 ALIKE = 0.5  # of what it does in their steps: where others hold as much, no place shows it
 MEMORY = 1e-2  # of a memory's spread: what counts as noise there, where there is none

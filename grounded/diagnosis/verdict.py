@@ -15,9 +15,9 @@ from grounded.diagnosis.error_report import (
     RulerRow,
     measured,
     number,
-    percent,
 )
 from grounded.diagnosis.report import Estimate, Kind, Ranked, Unconfirmed, Verdict, quantity
+from grounded.result import percent
 
 if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
     from grounded.diagnosis.validation.claims import Claims

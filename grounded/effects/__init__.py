@@ -31,8 +31,25 @@ from grounded.effects.registry import Library
 from grounded.effects.wrap import memory_of, memory_start, param_name, wrap
 
 __all__ = [
-    "Effect", "Family", "InputFamily", "Library", "LossFamily", "MemoryFamily", "ParamFamily",
-    "Quantity", "RateFamily", "Scales", "SensorDelayFamily", "SensorFamily", "SensorLagFamily",
-    "Site", "acting_order", "memory_of", "memory_start", "param_name", "scales_of", "wrap",
+    "Effect",
+    "Family",
+    "InputFamily",
+    "Library",
+    "LossFamily",
+    "MemoryFamily",
+    "ParamFamily",
+    "Quantity",
+    "RateFamily",
+    "Scales",
+    "SensorDelayFamily",
+    "SensorFamily",
+    "SensorLagFamily",
+    "Site",
+    "acting_order",
+    "memory_of",
+    "memory_start",
+    "param_name",
+    "scales_of",
+    "wrap",
     "wrapping_order",
-]  # fmt: skip
+]

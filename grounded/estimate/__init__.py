@@ -25,6 +25,16 @@ from grounded.estimate.trials import (
 )
 
 __all__ = [
-    "Estimated", "Measurement", "NoiseEstimate", "NoiseStd", "Record", "Tracker", "cut",
-    "noise_of", "of_function", "of_states", "record_of", "smooth_trials",
-]  # fmt: skip
+    "Estimated",
+    "Measurement",
+    "NoiseEstimate",
+    "NoiseStd",
+    "Record",
+    "Tracker",
+    "cut",
+    "noise_of",
+    "of_function",
+    "of_states",
+    "record_of",
+    "smooth_trials",
+]

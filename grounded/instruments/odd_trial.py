@@ -28,15 +28,18 @@ NEAR = 0.1  # relative, of these factors
 TOGETHER = 0.9  # correlation of a rate and its velocity
 FAR = 1e9
 
+Ratios = Sequence[tuple[Integral, float]]  # of a trial's positions, see `ratios_of`
+
 
 def in_degrees(
-    model: Model, trials: Sequence[Trial], shown: Sequence[int]
+    model: Model, trials: Sequence[Trial], ratios: Sequence[Ratios], shown: Sequence[int]
 ) -> Iterator[tuple[int, list[int]]]:
     """Trials with states in degrees that are in radians in another trial.
 
     Args:
         model: however crude.
         trials: several.
+        ratios: of each.
         shown: states that a sensor has.
 
     Yields:
@@ -47,7 +50,7 @@ def in_degrees(
     angular = [i for i in shown if units[i] == "rad" or units[i].startswith("rad/")]
     if len(trials) < 2 or not angular:
         return
-    single = [_one_state(model, trial) for trial in trials]
+    single = [_one_state(one) for one in ratios]
     size = [np.sqrt(np.nanmean(t.states[:, angular] ** 2, axis=0)) for t in trials]
     pushed = [_size(t.inputs) for t in trials]
     missed = [_missed(model, trial, angular, shown) for trial in trials]
@@ -67,10 +70,10 @@ def in_degrees(
             yield k, angular
 
 
-def _one_state(model: Model, trial: Trial) -> list[int]:
+def _one_state(ratios: Ratios) -> list[int]:
     """The states that are in degrees beside a rate or a position that isn't."""
     found = []
-    for relation, factor in _ratios(model, trial):
+    for relation, factor in ratios:
         for i, one in ((relation.i, factor), (relation.j, 1 / factor)):
             if abs(one / DEGREES - 1) < NEAR:
                 found.append(i)
@@ -101,14 +104,18 @@ def _missed(model: Model, trial: Trial, some: Sequence[int], shown: Sequence[int
     return _size(model.difference(x, logged[at + steps])[:, some])
 
 
-def judge_stamps(model: Model, trials: Sequence[Trial]) -> None:
+def judge_stamps(model: Model, trials: Sequence[Trial], ratios: Sequence[Ratios]) -> None:
     """Stops at a trial whose stamps are in milliseconds, or were taken for such.
+
+    Args:
+        model: however crude.
+        trials: any.
+        ratios: of each.
 
     Raises:
         GroundedError: with the trial, a state and the factor.
     """
-    for k, trial in enumerate(trials):
-        found = _ratios(model, trial)
+    for k, (trial, found) in enumerate(zip(trials, ratios, strict=True)):
         for factor in (STAMPS, 1 / STAMPS):
             if found and all(abs(one / factor - 1) < NEAR for _, one in found):
                 q, w = (model.state_names[i] for i in (found[0][0].i, found[0][0].j))
@@ -121,10 +128,15 @@ def judge_stamps(model: Model, trials: Sequence[Trial]) -> None:
                 )
 
 
-def _ratios(model: Model, trial: Trial) -> list[tuple[Integral, float]]:
-    """The rate of each position of a trial over what its velocity says; 1 where they differ."""
+def ratios_of(model: Model, trials: Sequence[Trial]) -> list[Ratios]:
+    """Of each trial, the rate of each position over what its velocity says; 1 where they differ."""
+    relations = [one for one in integrals(model) if one.exact]
+    return [_ratios(relations, trial) for trial in trials]
+
+
+def _ratios(relations: Sequence[Integral], trial: Trial) -> Ratios:
     found = []
-    for relation in (one for one in integrals(model) if one.exact):
+    for relation in relations:
         some = [
             (np.diff(x[:, 0])[1:-1], over_steps(relation.c * x[:, 1]) * trial.dt)
             for x in pieces([trial], (relation.i, relation.j))

@@ -30,7 +30,7 @@ from grounded.instruments.kinematics import (
     turned,
 )
 from grounded.instruments.lag import Lag, alike, at_samples, lag_between, reach_of
-from grounded.instruments.odd_trial import in_degrees, judge_stamps, radians
+from grounded.instruments.odd_trial import Ratios, in_degrees, judge_stamps, radians, ratios_of
 from grounded.instruments.single import Signal, judge_signal
 from grounded.model import Model
 from grounded.task import Task
@@ -90,9 +90,10 @@ def preflight(
         return Preflight((), tuple(trials))
     bench = _Bench(model, [t.until(t.known_steps) for t in used], set(hidden))
     with np.errstate(all="ignore"):
-        judge_stamps(model, bench.trials)
+        ratios = ratios_of(model, bench.trials)
+        judge_stamps(model, bench.trials, ratios)
         found = [
-            *bench.odd(),
+            *bench.odd(ratios),
             *bench.singles(),
             *bench.pairs(),
             *bench.plane(),
@@ -123,9 +124,9 @@ class _Bench:
             states[:, i] = x
             self.trials[k] = replace(trial, states=states)
 
-    def odd(self) -> Iterator[Finding]:
+    def odd(self, ratios: Sequence[Ratios]) -> Iterator[Finding]:
         """Of trials that are in degrees as a whole."""
-        for k, some in list(in_degrees(self.model, self.trials, self.shown)):
+        for k, some in list(in_degrees(self.model, self.trials, ratios, self.shown)):
             trial = self.trials[k]
             self.trials[k] = radians(trial, some)
             text = f"is in degrees in trial {trial.id or f'number {k + 1}'}, in radians in others"

@@ -139,6 +139,17 @@ def test_a_log_that_was_stored_before_is_no_run_of_the_candidate_that_waits_now(
         assert w.ingest(copy).trial == first.trial
 
 
+def test_a_damaged_trial_is_replaced_by_its_log_beside_others(w, tmp_path):
+    policy = w.candidate("c0002")[0].policy
+    logs = [record(w, tmp_path / f"{k}.csv", policy, 0.0, seed=k) for k in range(2)]
+    first, _ = (w.ingest(log, data=True) for log in logs)
+    (path,) = (w.folder / "trials").glob(f"{first.trial}-*")
+    path.chmod(0o644)
+    path.write_bytes(path.read_bytes()[:-200])
+    again = Workspace(w.folder).ingest(logs[0], data=True)
+    assert again.trial == first.trial and len(Workspace(w.folder).trials()) == 3
+
+
 def test_the_log_of_a_probe_is_not_credited_and_its_export_says_how_it_is_taken_in(w, tmp_path):
     made, _ = w.candidate("c0002")
     turned = replace(made.policy, feedforward=np.array(made.policy.feedforward[::-1]))

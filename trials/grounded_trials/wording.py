@@ -10,8 +10,8 @@ from itertools import pairwise
 from textwrap import TextWrapper
 from typing import TYPE_CHECKING
 
-from grounded.diagnosis.error_report import percent as percent
 from grounded.result import figure as figure
+from grounded.result import percent as percent
 
 if TYPE_CHECKING:
     from grounded.errors import NextCommand

@@ -16,16 +16,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from hashlib import blake2b
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from grounded.compile.run.differenced import DifferencedSystem
 from grounded.frozen import Array
 from grounded.model import Model
-
-if TYPE_CHECKING:
-    pass
 
 NEAR = 0.01  # of the spread of a state, the peak of an input, the size of a parameter
 KEPT = 8  # sets of slopes

@@ -203,12 +203,11 @@ class Ruler:
         path = [track[np.maximum(at - j, 0), run] for j in range(oldest, -1, -1)]
         last, advance = data.lengths[trial], predictor.stepper(h)
         t = np.minimum(step + np.arange(steps)[:, None], last - 1)
-        u_all, z = received[trial, t], None
-        if added is None:
-            z = predictor.marched(h, path[-1], u_all)
+        sent = received[trial, t]
+        z = predictor.marched(h, path[-1], sent) if added is None else None
         if z is not None and (np.abs(z) < FAR).all():
-            path, u_all = [*path, *z[1:]], u_all[:0]
-        for j, (u, now) in enumerate(zip(u_all, t * data.dt, strict=False)):
+            path, sent = [*path, *z[1:]], sent[:0]  # every step is made
+        for j, (u, now) in enumerate(zip(sent, t[: len(sent)] * data.dt, strict=True)):
             x = advance(path[-1], u, now)
             if added is not None:
                 inside = (at + j < len(added))[:, None]

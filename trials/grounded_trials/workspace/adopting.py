@@ -33,9 +33,7 @@ class Adopted(Result):
     params: Mapping[str, float]  # of the model, written with them
     claimed: bool  # the diagnosis claims the new ones; else one was taken by itself
     then: NextCommand = PROPOSE
-    beside: tuple[
-        str, ...
-    ] = ()  # adopted since the diagnosis, which claims them no more than these
+    beside: tuple[str, ...] = ()  # adopted before from the same diagnosis, fitted in their place
 
     def summary(self) -> str:
         """The effects that the model has now."""

@@ -167,6 +167,13 @@ class Folder:
         """
         return self._trials
 
+    def whole_trials(self) -> tuple[StoredTrial, ...]:
+        """Those of the stored trials that are not damaged."""
+        try:
+            return self._trials
+        except GroundedError:
+            return self._read_trials([])
+
     def discarded(self) -> dict[str, str]:
         """Trials that are set aside, t0004 -> why."""
         aside = self.noted.aside

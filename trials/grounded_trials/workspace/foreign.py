@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,7 @@ from grounded_trials.store.store import hash_file
 from grounded_trials.toml_table import Table
 from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.identity import sha256
+from grounded_trials.workspace.identity import StoredTrial, sha256
 from grounded_trials.workspace.run_start import Recording, recording
 
 
@@ -85,6 +86,13 @@ class ForeignLog:
             start_inputs=found.start_inputs,
         )
         return trial, found
+
+    @cached_property
+    def stored(self) -> tuple[StoredTrial, ...]:
+        """The trials that were made from a file of the same bytes, whatever its name was."""
+        key = "source_sha256"
+        trials = self.workspace.whole_trials()
+        return tuple(one for one in trials if one.meta.get(key) == self.source[key])
 
     @property
     def recording(self) -> Recording | None:

@@ -155,10 +155,7 @@ class Check:
     @cached_property
     def trials(self) -> tuple[StoredTrial, ...]:
         """Those that are whole."""
-        try:
-            return self.workspace.trials()
-        except GroundedError:
-            return self.workspace.read(strict=False).trials
+        return self.workspace.whole_trials()
 
     @cached_property
     def standing(self) -> Standing:

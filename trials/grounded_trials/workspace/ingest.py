@@ -31,15 +31,15 @@ from grounded_trials.store.trial_file import read_trial, trial_bytes
 from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.foreign import ForeignLog, mapping_of, read_foreign
-from grounded_trials.workspace.identity import StoredTrial, sha256
+from grounded_trials.workspace.identity import sha256
 from grounded_trials.workspace.next_step import PROPOSE, after_log
 from grounded_trials.workspace.proposing import candidate_named, standing_in
 from grounded_trials.workspace.run_start import Recording, Start
 from grounded_trials.workspace.trial_check import (
     OTHERS,
     SAME,
-    in_degrees,
     suspicion,
+    taken_for_radians,
     warnings_about,
 )
 
@@ -180,7 +180,7 @@ def _recognised(workspace: Folder, path: Path, read: _Read, candidate: str | Non
         return read
     if candidate is not None and (log is None or (found and found.opens_alike)):
         return replace(read, warnings=(*read.warnings, why))
-    if turned := in_degrees(workspace.task, interpolate_gaps(read.trial).trial, own):
+    if turned := taken_for_radians(workspace.task, interpolate_gaps(read.trial).trial, own):
         raise GroundedError(
             f"{path} ran {ran}, with {' and '.join(turned)} in degrees where the model has "
             f"radians: give {'it' if len(turned) == 1 else 'them'} scale = {np.pi / 180:.6g} in "
@@ -314,22 +314,16 @@ def _check_candidate(
 def _foreign(workspace: Folder, path: Path, candidate: str | None, data: bool) -> _Read:
     """Somebody else's log, through [log]."""
     log = read_foreign(workspace, path, mapping_of(workspace, path))
-    before = [one.trial.candidate for one in _same_log(workspace, log)]
-    chosen = "" if data else candidate or (before or [""])[-1] or _outstanding(workspace, path)
+    ran = candidate or (log.stored[-1].trial.candidate if log.stored else "")
+    chosen = "" if data else ran or _outstanding(workspace, path)
     if chosen:
         _check_candidate(workspace, path, chosen)
     return _cut(log, chosen)
 
 
-def _same_log(workspace: Folder, log: ForeignLog) -> list[StoredTrial]:
-    """The trials that were made from a file of the same bytes, whatever its name was."""
-    own = log.source["source_sha256"]
-    return [one for one in workspace.trials() if one.meta.get("source_sha256") == own]
-
-
 def _renamed(workspace: Folder, read: _Read) -> _Read:
     """The log as it was stored where only its name is another."""
-    for one in _same_log(workspace, read.log) if read.log else ():
+    for one in read.log.stored if read.log else ():
         same = one.trial.candidate == read.trial.candidate
         pairs = ((one.measured.states, read.trial.states), (one.measured.inputs, read.trial.inputs))
         if same and all(np.array_equal(a, b, equal_nan=True) for a, b in pairs):

@@ -8,7 +8,7 @@ noisy, or resampled; a person's driving, or another candidate, is something else
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -255,16 +255,16 @@ def suspicion(
     ), name
 
 
-def in_degrees(task: Task, trial: Trial, own: Candidate) -> tuple[str, ...]:
+def taken_for_radians(task: Task, trial: Trial, own: Candidate) -> tuple[str, ...]:
     """The states with which a log is a run of its candidate once they are taken for degrees."""
+    from grounded.instruments.odd_trial import radians
+
     trial, latest = trial.until(task.horizon), _latest(task)
-    names = np.array(task.model.state_names)
-    units = np.array(list(task.model.states.values()))
-    for wrong in (np.isin(units, ("rad", "rad/s")), units == "rad", units == "rad/s"):
-        turned = replace(trial, states=np.where(wrong, np.deg2rad(trial.states), trial.states))
-        found = follows(own.policy, turned, latest) if wrong.any() else None
+    for units in (("rad", "rad/s"), ("rad",), ("rad/s",)):
+        some = [i for i, unit in enumerate(task.model.states.values()) if unit in units]
+        found = follows(own.policy, radians(trial, some), latest) if some else None
         if found is not None and found.alike:
-            return tuple(names[wrong])
+            return tuple(task.model.state_names[i] for i in some)
     return ()
 
 
