@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import click
 
 from grounded_cli import completion as complete
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
 from grounded_cli.terminal import field, number, remark, sentence, show, show_json
 from grounded_trials.wording import with_unit
+
+if TYPE_CHECKING:
+    from grounded_trials import Workspace
 
 UNCLAIMED = (
     "was not claimed by the last diagnosis: its values were fitted by themselves, in place of what "
@@ -20,24 +25,27 @@ BESIDE = (
 
 
 @click.command("adopt")
-@click.argument(
-    "effects", nargs=-1, required=True, metavar="EFFECT...", shell_complete=complete.effects
-)
+@click.argument("effects", nargs=-1, metavar="EFFECT...", shell_complete=complete.effects)
 @click.option("--effect-only", is_flag=True, help="Leave the model's own parameters alone.")
+@click.option("--undo", is_flag=True, help="Take the last adoption back.")
 @in_workspace
 @as_json
-def command(effects: tuple[str, ...], effect_only: bool, json_: bool) -> None:
+def command(effects: tuple[str, ...], effect_only: bool, undo: bool, json_: bool) -> None:
     """Add effects of the last diagnosis (`family:target`) to [model] in grounded.toml.
 
     Effects that were claimed together were estimated together: adopt them together. Parameters of
     the model that were calibrated beside them come along, in [model] params. An effect that was
     not claimed can be adopted by itself: its values come without parameters.
 
-    The search goes on from the best policy, planned with the better model. To undo it, take the
-    effects out of [model] effects and the parameters that were printed out of [model] params in
-    grounded.toml, or give them their old values.
+    The search goes on from the best policy, planned with the better model. --undo gives [model]
+    the effects and parameters that it had before the last adoption; again, before the one before.
     """
+    if undo == bool(effects) or (undo and effect_only):
+        raise click.UsageError("name what to adopt, EFFECT..., or else --undo alone")
     workspace = open_workspace()
+    if undo:
+        _undo(workspace, json_)
+        return
     before = workspace.base_model.params
     done = workspace.adopt(*effects, parameters=not effect_only)
     if json_:
@@ -54,4 +62,22 @@ def command(effects: tuple[str, ...], effect_only: bool, json_: bool) -> None:
     for name, value in done.params.items():
         text = with_unit(f"{number(before[name].value)} -> {number(value)}", before[name].unit)
         show(field(name, text, "  "))
+    show(f"\n{next_line(done.then)}")
+
+
+def _undo(workspace: Workspace, json_: bool) -> None:
+    """Takes the last adoption back, and prints what the model has again."""
+    before = workspace.base_model.params
+    done = workspace.undo_adoption()
+    if json_:
+        show_json(done.to_json())
+        return
+    sentence(f"undone: {', '.join(done.undone)} ({workspace.config.file})")
+    now = workspace.base_model.params
+    for name, was in before.items():
+        if was.value != now[name].value:
+            text = with_unit(f"{number(was.value)} -> {number(now[name].value)}", was.unit)
+            show(field(name, text, "  "))
+    rest = ", ".join(str(effect["name"]) for effect in done.effects)
+    sentence(f"still part of the model: {rest}" if rest else "no effect is adopted now")
     show(f"\n{next_line(done.then)}")

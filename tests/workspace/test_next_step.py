@@ -18,6 +18,7 @@ from grounded_trials import Workspace
 from grounded_trials.report.gathering import gather
 from grounded_trials.store.documents import write_document
 from grounded_trials.wording import folded
+from grounded_trials.workspace.adopting import diagnosed_again
 from grounded_trials.workspace.config import set_in_model
 from grounded_trials.workspace.diagnosing import _in_vain
 from grounded_trials.workspace.folder import Folder
@@ -417,7 +418,48 @@ def test_an_adoption_in_vain_is_told_how_to_be_undone(tmp_path, monkeypatch):
         return _in_vain(w, found)
 
     told = said("unknown", False, None, False)
-    assert "last 2" in told and "viscous_friction:v" in told and "[model] effects" in told
+    assert "last 2" in told and "viscous_friction:v" in told and "adopt --undo" in told
     assert said("none", False, False) == said("unknown", False) == ""
     assert said("unknown", False, False, True) == ""
     assert said("unknown", False, False, model="of yesterday") == ""
+
+
+def test_an_adoption_is_undone_and_not_proposed_again_until_a_new_diagnosis(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    names = ["viscous_friction:v", "delay:force"]
+    late = DIAGNOSIS["ranking"][1] | {"params": {"d": {"value": 0.02, "std": 0.01, "unit": "s"}}}
+    verdict = {"kind": "several", "effects": names, "sentence": "Two."}
+    diagnosed(folder, verdict=verdict, ranking=[DIAGNOSIS["ranking"][0], late])
+    before = (folder / "grounded.toml").read_text()
+    w = Workspace(folder)
+    w.adopt(*names[:1], parameters=False)
+    one = (folder / "grounded.toml").read_text()
+    w.adopt(names[1])
+    done = grounded("-C", folder, "adopt", "--undo", "--json").json
+    assert done["undone"] == [names[1]]
+    assert [effect["name"] for effect in done["effects"]] == [names[0]]
+    assert (folder / "grounded.toml").read_text() == one
+    back = grounded("-C", folder, "adopt", "--undo")
+    assert last(back) == "grounded propose"
+    assert (folder / "grounded.toml").read_text() == before
+    assert "adopt" not in last(grounded("-C", folder, "status"))
+    assert Workspace(folder).report().to_json()["next"] != "adopt"
+    nothing = grounded("-C", folder, "adopt", "--undo")
+    assert nothing.code == 1 and "no adoption" in nothing.err
+    diagnosed_again(Folder(folder))
+    assert last(grounded("-C", folder, "status")).startswith("grounded adopt ")
+
+
+def test_an_adoption_under_later_changes_is_not_undone(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    set_in_model(folder / "grounded.toml", effects=[{"name": "offset:v", "b": 0.5}])
+    assert grounded("-C", folder, "adopt", "viscous_friction:v").code == 0
+    set_in_model(folder / "grounded.toml", params={"mass": 3.25})
+    changed = (folder / "grounded.toml").read_text()
+    done = grounded("-C", folder, "adopt", "--undo")
+    assert done.code == 1 and holds(
+        done.err, "changed", "viscous_friction:v", 'effects = [{name = "offset:v", b = 0.5}]'
+    )
+    assert (folder / "grounded.toml").read_text() == changed
+    assert grounded("-C", folder, "adopt").code == 2
+    assert grounded("-C", folder, "adopt", "--undo", "viscous_friction:v").code == 2

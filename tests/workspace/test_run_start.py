@@ -198,3 +198,15 @@ def test_a_run_logged_in_degrees_says_so_and_a_name_that_is_none_is_answered(tmp
     assert holds(str(refused.value), "theta", "omega", "degrees", "0.0174533")
     with pytest.raises(GroundedError, match="no candidate 'c0009'"):
         w.ingest(path, candidate="c0009")
+
+
+@pytest.mark.parametrize("pace", [2.0, 0.5])
+def test_stamps_of_a_recording_played_at_another_rate_are_told(w, tmp_path, pace):
+    path = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.2)
+    rows = np.loadtxt(path, delimiter=",", skiprows=1)
+    rows[:, 0] = rows[0, 0] + (rows[:, 0] - rows[0, 0]) / pace
+    np.savetxt(path, rows, "%.5f", ",", header="t,x,v,force", comments="")
+    with pytest.raises(GroundedError) as refused:
+        w.ingest(path)
+    assert holds(str(refused.value), "c0002", "stamps", f"times {pace:g}")
+    assert len(w.trials()) == 1

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from grounded.instruments.finding import Finding
     from grounded.search.candidate import Candidate
     from grounded_trials.report.reporting import Report
-    from grounded_trials.workspace.adopting import Adopted
+    from grounded_trials.workspace.adopting import Adopted, Undone
     from grounded_trials.workspace.exporting import Exported
     from grounded_trials.workspace.fitting import Fitted
     from grounded_trials.workspace.identity import SetAside
@@ -284,6 +284,18 @@ class Workspace(Folder):
         from grounded_trials.workspace.adopting import adopt_effects
 
         done = adopt_effects(self._afresh(), effects, parameters=parameters)
+        self.forget()
+        return done
+
+    def undo_adoption(self) -> Undone:
+        """Gives the model of grounded.toml what it had before the last `adopt`: effects, params.
+
+        Raises:
+            GroundedError: if nothing is left to undo, or [model] was changed since.
+        """
+        from grounded_trials.workspace.adopting import undo_adoption
+
+        done = undo_adoption(self._afresh())
         self.forget()
         return done
 

@@ -3,7 +3,7 @@
 A diagnosis estimates the model's parameters beside the effects, so both belong to what it claims
 and are adopted together. `better_model` is that model before anybody adopts it, for reports to draw
 beside the crude one; once effects are adopted and nothing newer was diagnosed, it is the model that
-plans.
+plans. reports/adoptions.json keeps what [model] was before each, so that the last can be undone.
 """
 
 from __future__ import annotations
@@ -17,12 +17,14 @@ from grounded.diagnosis.report import Diagnosis, Estimate
 from grounded.errors import GroundedError, NextCommand, nearest
 from grounded.result import Result
 from grounded.search.planner import Planner
-from grounded_trials.workspace.config import set_in_model
+from grounded_trials.store.documents import read_document, write_document
+from grounded_trials.workspace.config import ModelTable, as_toml, set_in_model
 from grounded_trials.workspace.diagnosing import read_diagnosis
 from grounded_trials.workspace.folder import Folder
 
 Effect = dict[str, Any]  # {"name": "dead_zone:throttle", "c": 0.146}
 AGAIN, PROPOSE = NextCommand("diagnose"), NextCommand("propose")
+KEPT = "adoptions.json"  # in reports/
 
 
 @dataclass(frozen=True, repr=False)
@@ -50,6 +52,25 @@ class Adopted(Result):
         }
 
 
+@dataclass(frozen=True, repr=False)
+class Undone(Result):
+    """What the model has again."""
+
+    undone: tuple[str, ...]  # the effects that the last adoption had brought
+    effects: tuple[Mapping[str, Any], ...]  # all that are adopted now
+    params: Mapping[str, float]  # of [model] now
+    then: NextCommand = PROPOSE
+
+    def summary(self) -> str:
+        """The effects that the model lost again."""
+        return ", ".join(self.undone)
+
+    def to_json(self) -> dict[str, Any]:
+        """The document of `adopt --undo --json`."""
+        effects = [dict(effect) for effect in self.effects]
+        return {"undone": list(self.undone), "effects": effects, "params": dict(self.params)}
+
+
 def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool = True) -> Adopted:
     """Adds diagnosed effects to [model] effects, see `Workspace.adopt`; or else writes nothing.
 
@@ -74,9 +95,73 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
     own, adopted = joined(found, names, workspace.config.model.effects, nominal, calibrated)
     whole = dict(workspace.config.model.params) | own
     set_in_model(workspace.config.file, params=whole if own else None, effects=adopted or None)
+    earlier, model = _kept(workspace)[0], workspace.config.model
+    after = {"effects": adopted or model.effects, "params": whole if own else model.params}
+    step = {"names": names, "before": _written(model), "after": after}
+    write_document(workspace.reports / KEPT, {"adoptions": [*earlier, step], "undone": []})
     fitted = {*names, *before, *(found.effects if claimed else ())}
     beside = (str(effect["name"]) for effect in adopted)
     return Adopted(tuple(adopted), own, claimed, beside=tuple(n for n in beside if n not in fitted))
+
+
+def undo_adoption(workspace: Folder) -> Undone:
+    """Gives [model] back what it had before an adoption, see `Workspace.undo_adoption`.
+
+    Raises:
+        GroundedError: if nothing is left to undo, or [model] was changed since.
+    """
+    kept, undone = _kept(workspace)
+    file, model = workspace.config.file, workspace.config.model
+    if not kept:
+        has = ", ".join(str(effect["name"]) for effect in model.effects) or "none"
+        raise GroundedError(
+            f"no adoption is left to undo; [model] effects in {file}: {has}. One that was written "
+            "there by hand is taken out by hand"
+        )
+    *earlier, last = kept
+    names, before = [str(name) for name in last["names"]], last["before"]
+    if _written(model) != last["after"]:
+        was = as_toml(before["params"], before["effects"])
+        had = " and ".join(f"{name} = {value.as_string()}" for name, value in was.items())
+        raise GroundedError(
+            f"[model] in {file} was changed after {', '.join(names)} was adopted, by `fit --apply` "
+            f"or by hand, which would be lost. Before, it had {had}: write there what "
+            "should stay"
+        )
+    set_in_model(file, params=before["params"], effects=before["effects"])
+    write_document(workspace.reports / KEPT, {"adoptions": earlier, "undone": [*undone, *names]})
+    return Undone(tuple(names), tuple(before["effects"]), before["params"])
+
+
+def declined(workspace: Folder) -> tuple[str, ...]:
+    """What the last diagnosis claims, and was adopted and undone since."""
+    return tuple(str(name) for name in _kept(workspace)[1])
+
+
+def _kept(workspace: Folder) -> tuple[list[dict[str, Any]], list[str]]:
+    """The adoptions that can be undone, oldest first, and what was undone since a diagnosis."""
+    path = workspace.reports / KEPT
+    try:
+        document = read_document(path)
+        return list(document["adoptions"]), list(document["undone"])
+    except FileNotFoundError:
+        return [], []
+    except (ValueError, KeyError, TypeError, RecursionError, GroundedError) as error:
+        raise GroundedError(
+            f"{path} can't be read ({error}): without it, adoptions can't be undone; delete it"
+        ) from None
+
+
+def diagnosed_again(workspace: Folder) -> None:
+    """Forgets what was undone: a newer diagnosis may claim it again."""
+    kept, undone = _kept(workspace)
+    if undone:
+        write_document(workspace.reports / KEPT, {"adoptions": kept, "undone": []})
+
+
+def _written(model: ModelTable) -> dict[str, Any]:
+    """What an adoption may change, as JSON has it."""
+    return {"effects": [dict(e) for e in model.effects], "params": dict(model.params)}
 
 
 def joined(

@@ -187,17 +187,24 @@ def set_in_model(
     Raises:
         GroundedError: if the file can't be written.
     """
+    _change(file, "model", as_toml(params, effects))
+
+
+def as_toml(
+    params: Mapping[str, float] | None, effects: Sequence[Mapping[str, Any]] | None
+) -> dict[str, Any]:
+    """`params` and `effects` as the values that [model] has in grounded.toml, without None."""
     import tomlkit
 
-    changes: dict[str, Any] = {}
+    found: dict[str, Any] = {}
     if params is not None:
-        changes["params"] = _inline(params)
+        found["params"] = _inline(params)
     if effects is not None:
         array = tomlkit.array()
         for effect in effects:
             array.append(_inline(effect))
-        changes["effects"] = array.multiline(len(effects) > 1)
-    _change(file, "model", changes)
+        found["effects"] = array.multiline(len(effects) > 1)
+    return found
 
 
 def set_latency(file: Path, latency: Mapping[str, float]) -> None:
@@ -232,7 +239,9 @@ def _change(file: Path, where: str, changes: Mapping[str, Any]) -> None:
 
     document = tomlkit.parse(file.read_text(encoding="utf-8"))
     table: Any = document.setdefault(where, tomlkit.table())
-    table.update(changes)
+    table.update({name: value for name, value in changes.items() if value})
+    for name in [name for name, value in changes.items() if not value]:
+        table.pop(name, None)  # empty is what it is without
     write_atomically(file, tomlkit.dumps(document).encode())
 
 

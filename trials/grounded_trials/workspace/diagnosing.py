@@ -56,6 +56,7 @@ def diagnose_in(
     """
     from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
     from grounded.effects import Library
+    from grounded_trials.workspace.adopting import diagnosed_again
     from grounded_trials.workspace.next_step import after_diagnosis
     from grounded_trials.workspace.proposing import to_run
 
@@ -85,6 +86,7 @@ def diagnose_in(
     )
     found = replace(found, made=made)
     _keep(workspace, found)
+    diagnosed_again(workspace)
     try:
         identity, words = _probe(workspace, found, lifted + second, library, write=probe)
     except Exception as error:  # it must not cost the diagnosis, which is told whatever it is
@@ -118,9 +120,8 @@ def _in_vain(workspace: Folder, found: Diagnosis) -> str:
     if lost < LOST:
         return ""
     return (
-        f"The last {lost} candidates planned with the adopted {', '.join(names)} lost: to undo it, "
-        "take effects out of [model] effects in grounded.toml, and what came with them out of "
-        "[model] params, and diagnose again."
+        f"The last {lost} candidates planned with the adopted {', '.join(names)} lost: "
+        "`grounded adopt --undo` takes the last adoption back; then diagnose again."
     )
 
 

@@ -34,7 +34,7 @@ from grounded_trials.workspace.foreign import ForeignLog, mapping_of, read_forei
 from grounded_trials.workspace.identity import sha256
 from grounded_trials.workspace.next_step import PROPOSE, after_log
 from grounded_trials.workspace.proposing import candidate_named, standing_in
-from grounded_trials.workspace.run_start import Recording, Start
+from grounded_trials.workspace.run_start import Recording, Start, pace_of
 from grounded_trials.workspace.trial_check import (
     OTHERS,
     SAME,
@@ -185,6 +185,11 @@ def _recognised(workspace: Folder, path: Path, read: _Read, candidate: str | Non
             f"{path} ran {ran}, with {' and '.join(turned)} in degrees where the model has "
             f"radians: give {'it' if len(turned) == 1 else 'them'} scale = {np.pi / 180:.6g} in "
             f"{FILE}'s [log]"
+        )
+    if log and (pace := pace_of(log, workspace.task, own.policy)):
+        raise GroundedError(
+            f"{path} ran {ran}, but a second of its stamps is {pace:g} s of the run (a recording "
+            f"played at another rate?): correct the stamps, times {pace:g}, and ingest it again"
         )
     what = f"; with --candidate {other} for what it seems to have run" * bool(other)
     begins = "; [log.span] says where the run begins" * bool(read.log and not log)

@@ -95,6 +95,10 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
     new = diagnosis.open(workspace.config.model.effects, workspace.config.model.params)
     if diagnosis.kind not in ("effect", "several") or not new:
         return None
+    from grounded_trials.workspace.adopting import declined
+
+    if set(new) <= set(declined(workspace)):
+        return None  # adopted, and undone: whoever did that is not asked to do it again
     own = {f"parameter:{name}" for name in workspace.base_model.params}
     if own.issuperset(new):
         return NextCommand("fit")  # the model's form is right: all of its numbers at once

@@ -11,7 +11,7 @@ as it goes, where it was quiet before.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -29,6 +29,7 @@ FINEST = 8  # parts of a step, between which the start is sought
 FEW = 5  # changes, which are too few to say when the steps begin
 QUIET_S = 1.0  # without a change of commands, before a run that the log does not have whole
 SHORT = 4  # at least 1 / SHORT of a run tells that it was one
+PACES = (2.0, 0.5)  # of a recording that was played twice as fast, or half
 BATCH = 256  # instants compared at once
 
 
@@ -177,3 +178,29 @@ def recording(series: Mapping[str, Series], task: Task) -> Recording | None:
     at = np.concatenate([s.t[1:][np.diff(s.values) != 0] for s in sent])
     changes = (at - whole.origin_ns) * 1e-9
     return Recording(series, names, model.angles, dt, task.horizon, parts, whole, changes, interval)
+
+
+def pace_of(log: Recording, task: Task, policy: Policy) -> float | None:
+    """How many seconds of a policy's run a second of the log's stamps is, where not one.
+
+    Args:
+        log: in which no run of the policy begins.
+        task: whose steps it is cut into.
+        policy: what is sought.
+    """
+    for pace in PACES:
+        series = {name: _paced(one, pace) for name, one in log.series.items()}
+        again = recording(series, task)
+        found = again.start_of(policy) if again else None
+        if found and found.alike:
+            return pace
+    return None
+
+
+def _paced(series: Series, pace: float) -> Series:
+    """The same samples, `pace` times as far apart."""
+    t, log = (
+        at[:1] + np.round((at - at[:1]) * pace).astype(at.dtype)
+        for at in (series.t, series.log_times)
+    )
+    return replace(series, t=t, log_times=log)
