@@ -177,8 +177,8 @@ def _came_true(candidate: Candidate, same: Sequence[Tried], standing: Standing) 
     else:
         told = [number(off) if math.isfinite(off) else "a crash" for off in missed]
         text = f"the last {len(told)} predictions missed by {', '.join(told[:-1])} and {told[-1]}"
-    best, own = standing.incumbent, any(one.candidate.id == candidate.id for one in same)
-    if best is None or own or not math.isfinite(missed[-1]):
+    best, tried = standing.incumbent, {one.candidate.id for one in standing.history}
+    if best is None or candidate.id in tried or not math.isfinite(missed[-1]):
         return text
     gain = candidate.predicted_utility - best.utility
     within = gain < max(missed[-1], candidate.likely_off)

@@ -151,12 +151,23 @@ def test_tables_with_holes_and_texts(tmp_path):
     assert found.values[[0, 2]].tolist() == [1.5, 2.5] and np.isnan(found.values[1])
 
 
+def test_a_table_cut_in_its_last_row_ends_before_it_and_its_unit_counts(tmp_path):
+    """A logger that was stopped; `Time [ms]` was read as seconds."""
+    path = tmp_path / "log.csv"
+    path.write_text("Time [ms],x\n0,1.5\n20,2.5\n4")
+    found = read_signals(path, {"x": SignalSpec("/csv.x")})["x"]
+    assert found.values.tolist() == [1.5, 2.5] and found.t.tolist() == [0, 20_000_000]
+    path.write_text("elapsed_us,x\n0,1.5\n20,2.5\n")
+    assert read_signals(path, {"x": SignalSpec("/csv.x")})["x"].t.tolist() == [0, 20_000]
+
+
 @pytest.mark.parametrize(
     "text, holds",
     [
         ("1,2\n3,4\n", ("1,2", "'t'")),
         ("a,b\n3,4\n", ("a, b", "'t'")),
         ("t,b\n0,4\n1\n", ("line 3", "1", "2")),
+        ("t,b\n0,4\n1\n2,4", ("line 3", "1", "2")),
         ("t,b\n1e30,4\n", ("'t'",)),
         ("", ("log.csv",)),
     ],

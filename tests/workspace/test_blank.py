@@ -69,6 +69,19 @@ def test_a_blank_workspace_goes_from_a_model_to_an_accepted_trial(blank, tmp_pat
     assert blank.status().standing.incumbent.candidate.id == "c0001"
 
 
+def test_the_first_plan_says_what_the_task_leaves_open(blank):
+    """A target for one state was refused by what the template weighs; no limit was no word."""
+    blank.target({"x": np.linspace(0, 1, 41)})
+    folder = blank.folder
+    text = (folder / "grounded.toml").read_text().replace("horizon = 40", "horizon = 30")
+    (folder / "grounded.toml").write_text(text)
+    notes = blank.propose().proposal.notes
+    assert [("force" in one, "41 rows" in one) for one in notes[-2:]] == [(1, 0), (0, 1)]
+    limits = text.replace("[limits]", "[limits]\nforce = [-2, 2]").replace("= 30", "= 40")
+    (folder / "grounded.toml").write_text(limits)
+    assert not [one for one in blank.propose().proposal.notes if "[limits] has none" in one]
+
+
 def test_what_is_missing_in_the_robots_program_is_named(blank):
     with pytest.raises(NotImplementedError, match="measure"):
         driver(blank.folder).measure()

@@ -179,7 +179,16 @@ def test_a_strange_log_has_no_start_forced_or_not(w, tmp_path, forced):
     assert len(w.trials()) == 1
 
 
-def test_a_run_logged_in_degrees_says_so_and_a_name_that_is_none_is_answered(tmp_path):
+@pytest.mark.parametrize(
+    "wrong, said",
+    [
+        ((57.29578, 57.29578, 1), ("theta and omega", "large", "degrees", "0.0174533")),
+        ((1 / 57.29578, 1, 1), ("theta 57.3", "small", "57.2958")),
+        ((1, 1, 1e-3), ("torque 1000", "small", "by 1000")),
+    ],
+)
+def test_a_run_in_other_units_says_so_and_a_name_that_is_none_is_answered(tmp_path, wrong, said):
+    """The last two were somebody who took over, to be taken in as data."""
     folder = make(tmp_path / "w", "pendulum").folder
     with (folder / "grounded.toml").open("a") as file:
         for kind, name in (("state", "theta"), ("state", "omega"), ("input", "torque")):
@@ -190,12 +199,12 @@ def test_a_run_logged_in_degrees_says_so_and_a_name_that_is_none_is_answered(tmp
     log = next((folder / "runs").iterdir())
     trial = read_trial(log.read_bytes(), str(log))[0]
     t = trial.dt * np.arange(trial.steps)
-    table = np.column_stack([t, np.rad2deg(trial.states[:-1]), trial.inputs])
+    table = np.column_stack([t, np.column_stack([trial.states[:-1], trial.inputs]) * wrong])
     path = tmp_path / "run.csv"
     np.savetxt(path, table, "%.9f", ",", header="t,theta,omega,torque", comments="")
     with pytest.raises(GroundedError) as refused:
         w.ingest(path)
-    assert holds(str(refused.value), "theta", "omega", "degrees", "0.0174533")
+    assert holds(str(refused.value), *said)
     with pytest.raises(GroundedError, match="no candidate 'c0009'"):
         w.ingest(path, candidate="c0009")
 
@@ -210,3 +219,25 @@ def test_stamps_of_a_recording_played_at_another_rate_are_told(w, tmp_path, pace
         w.ingest(path)
     assert holds(str(refused.value), "c0002", "stamps", f"times {pace:g}")
     assert len(w.trials()) == 1
+
+
+def test_one_log_is_one_trial(w, tmp_path):
+    """A stranger's log was stored three times: as runs of two candidates, and as data."""
+    path = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 0.0)
+    first = w.ingest(path)
+    for other in ({"candidate": "c0001"}, {"data": True}):
+        with pytest.raises(GroundedError, match=f"stored already, as {first.trial}") as refused:
+            w.ingest(path, **other)
+        assert refused.value.then == NextCommand("discard", (first.trial,))
+    assert w.ingest(path, candidate="c0002").known and len(w.trials()) == 2
+    w.discard(first.trial)
+    assert w.ingest(path, data=True).candidate == ""
+
+
+def test_the_log_of_another_run_of_the_best_names_it(w):
+    file = w.folder / "grounded.toml"
+    file.write_text(
+        file.read_text().split("[system]")[0] + file.read_text()[file.read_text().index("[log") :]
+    )
+    again = w.status().again
+    assert again.arguments == ("LOG", "--candidate", "c0001")

@@ -27,7 +27,8 @@ from grounded_trials.formats.messages import Floats
 ULOG, ZIP = b"ULog\x01\x12\x35", b"PK\x03\x04"  # how the files begin
 VALUES = 200_000_000  # numbers in one file
 ROWS = 50_000  # of a batch
-TIMES = ("t", "time", "timestamp", "stamp", "times", "timestamps", "seconds", "secs", "clock")
+STAMPS = ("t", "time", "timestamp", "stamp", "times", "timestamps")
+TIMES = (*STAMPS, "seconds", "secs", "clock", "clk", "elapsed")
 UNITS = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
 LATEST = 4e18  # [ns], the year 2096
 
@@ -77,12 +78,15 @@ def column_units(path: Path) -> dict[str, str]:
 
 
 def _with_holes(stream: Any, mark: str, width: int, path: Path) -> Floats:
-    """Rows with texts or empty cells, which are no number."""
+    """Rows with texts or empty cells, which are no number; without a last one that was cut off."""
     rows: list[list[float]] = []
-    for number, row in enumerate(csv.reader(stream, delimiter=mark), start=2):
+    lines = list(stream)
+    for number, row in enumerate(csv.reader(lines, delimiter=mark), start=2):
         if not any(cell.strip() for cell in row):
             continue
         if len(row) != width:
+            if number > len(lines) and len(row) < width and not lines[-1].endswith("\n"):
+                break  # whoever wrote it was stopped there
             raise GroundedError(
                 f"{path}, line {number}: it has {len(row)} cells, its first line names {width}"
             )
@@ -263,7 +267,7 @@ def _time_of(names: list[str], path: Path) -> str:
             return name
     raise GroundedError(
         f"{path} has no column of times among {', '.join(names[:8])}: name one 't' (seconds), or "
-        "'t_us' or 't_ns' in their units"
+        "'t_ms', 't_us' or 't_ns' in their units ('time', 'stamp', 'clock', 'elapsed' will do too)"
     )
 
 
@@ -275,4 +279,6 @@ def _is_time(name: str) -> bool:
 def _name(cell: str) -> str:
     """A column's name as a message path can say it."""
     bare = re.sub(r"[\[(].*?[\])]", "", cell.strip()) if not re.search(r"\[\d+\]", cell) else cell
-    return re.sub(r"[^\w\[\]]+", "_", bare.strip()).strip("_")
+    name = re.sub(r"[^\w\[\]]+", "_", bare.strip()).strip("_")
+    unit = re.search(r"[\[(]\s*(ms|us|ns)\s*[\])]$", cell.strip())
+    return f"{name}_{unit[1]}" if unit and _is_time(name) else name

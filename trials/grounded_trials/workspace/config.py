@@ -221,15 +221,17 @@ def set_target(
 ) -> None:
     """Replaces [task] target and horizon, and the state weights of [reward] that nobody chose.
 
-    Those are none, or `before`, which belonged to the last target.
+    Those are none, `before`, which belonged to the last target, or 1 each, of `init --blank`.
     """
     import tomlkit
 
     _change(file, "task", {"target": name, "horizon": steps})
     reward = tomlkit.parse(file.read_text(encoding="utf-8")).get("reward", {})
     own = dict(reward.get("state", {}))
-    same = own.keys() == before.keys()
-    same = same and all(abs(own[k] - w) <= 1e-3 * abs(w) for k, w in before.items())
+    same = own.keys() == before.keys() and any(
+        all(abs(own[k] - w) <= 1e-3 * abs(w) for k, w in unchosen.items())
+        for unchosen in (before, dict.fromkeys(before, 1.0))
+    )
     if same or (not own and not reward.get("terminal")):
         _change(file, "reward", {"state": _inline(weights)})
 

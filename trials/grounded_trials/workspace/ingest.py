@@ -38,12 +38,13 @@ from grounded_trials.workspace.run_start import Recording, Start, pace_of
 from grounded_trials.workspace.trial_check import (
     OTHERS,
     SAME,
+    other_units,
     suspicion,
-    taken_for_radians,
     warnings_about,
 )
 
 ALIGNED = 0.75  # of the time between samples: a start nearer than that is as good
+THOUSAND = (1e-3, 1e3)
 CLEAR = 0.7  # of the commands' difference at the first command: the start is elsewhere
 
 
@@ -180,11 +181,16 @@ def _recognised(workspace: Folder, path: Path, read: _Read, candidate: str | Non
         return read
     if candidate is not None and (log is None or (found and found.opens_alike)):
         return replace(read, warnings=(*read.warnings, why))
-    if turned := taken_for_radians(workspace.task, interpolate_gaps(read.trial).trial, own):
+    units, by = other_units(workspace.task, interpolate_gaps(read.trial).trial, own)
+    if units and not other:
+        which = " and ".join(units)
+        degrees = f" (in {'degrees' if by < 1 else 'radians taken for degrees'})" * (
+            by not in THOUSAND
+        )
         raise GroundedError(
-            f"{path} ran {ran}, with {' and '.join(turned)} in degrees where the model has "
-            f"radians: give {'it' if len(turned) == 1 else 'them'} scale = {np.pi / 180:.6g} in "
-            f"{FILE}'s [log]"
+            f"{path} ran {ran}, with {which} {max(by, 1 / by):.4g} times too "
+            f"{'large' if by < 1 else 'small'}{degrees}: multiply the scale of {which} by {by:.6g} "
+            f"in {FILE}'s [log] (1 where none is given)"
         )
     if log and (pace := pace_of(log, workspace.task, own.policy)):
         raise GroundedError(
@@ -320,10 +326,22 @@ def _foreign(workspace: Folder, path: Path, candidate: str | None, data: bool) -
     """Somebody else's log, through [log]."""
     log = read_foreign(workspace, path, mapping_of(workspace, path))
     ran = candidate or (log.stored[-1].trial.candidate if log.stored else "")
+    wanted = "" if data else candidate
+    if log.stored and wanted not in (None, *(one.trial.candidate for one in log.stored)):
+        identity, as_run = log.stored[-1].stored.id, log.stored[-1].trial.candidate
+        raise GroundedError(
+            f"{path} is stored already, as {identity}, {_what(as_run)}: one log is one trial. To "
+            f"have it as {_what(wanted)} instead, discard {identity} first",
+            NextCommand("discard", (identity,)),
+        )
     chosen = "" if data else ran or _outstanding(workspace, path)
     if chosen:
         _check_candidate(workspace, path, chosen)
     return _cut(log, chosen)
+
+
+def _what(candidate: str | None) -> str:
+    return f"a run of {candidate}" if candidate else "data"
 
 
 def _renamed(workspace: Folder, read: _Read) -> _Read:
@@ -347,11 +365,11 @@ def _outstanding(workspace: Folder, path: Path) -> str:
     now = standing_in(workspace)
     waiting = now.outstanding
     if waiting is None:
-        then = NextCommand("ingest", (str(path), "--candidate", "best"))
+        best = now.incumbent.candidate.id if now.incumbent else ""
         raise GroundedError(
             f"{path} doesn't say which candidate it ran, and none is waiting for a trial: name it "
             "with --candidate ID, or use --data for a log that ran none",
-            then if now.incumbent is not None else None,
+            NextCommand("ingest", (str(path), "--candidate", best)) if best else None,
         )
     return waiting.id
 

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result
 from grounded_trials.workspace.folder import Contents, Folder
@@ -93,6 +95,8 @@ def propose_in(workspace: Folder) -> Proposed:
     if candidate is not None and proposal.is_new:
         notes = notes or _void(workspace, before)
         notes = [f"{note}; run {candidate.id} in its place" for note in notes]
+    if not proposal.standing.history:
+        notes += _unfinished(workspace)
     proposal = replace(proposal, notes=(*proposal.notes, *notes))
     if candidate is None:
         return Proposed(proposal, None, status_of(workspace, proposal.standing).then)
@@ -108,6 +112,30 @@ def to_run(workspace: Folder, candidate: str, *named: str) -> NextCommand:
     if any(any(folder.glob(f"{candidate}.*")) for folder in folders):
         return NextCommand("next", ("LOG",))
     return NextCommand("export", (candidate, "--runner"))
+
+
+def _unfinished(workspace: Folder) -> list[str]:
+    """What a task leaves open, or out, that whoever runs its first plan should know."""
+    from grounded_trials.workspace.task_file import read_target
+
+    task, found = workspace.task, []
+    free = [
+        name
+        for name, *both in zip(task.model.input_names, task.low, task.high, strict=True)
+        if not np.isfinite(both).all()
+    ]
+    if free:
+        found.append(
+            f"[limits] has none for {', '.join(free)}: what a plan asks for is sent, however much"
+        )
+    name = str(workspace.config.task.target)
+    rows = len(read_target(workspace.folder / name)[1])
+    if rows > task.horizon + 1:
+        found.append(
+            f"{name} has {rows} rows, of which [task] horizon = {task.horizon} uses the first "
+            f"{task.horizon + 1}: the plan ends after {task.horizon * task.dt:g} s"
+        )
+    return found
 
 
 def _handed_over(workspace: Folder) -> tuple[Proposal, dict[str, str]]:
@@ -224,18 +252,19 @@ def status_of(workspace: Folder, standing: Standing, notes: tuple[str, ...] = ()
     return Status(
         standing,
         next_command(workspace, standing, found, usable),
-        again_best(workspace),
+        again_best(workspace, standing),
         since.told(workspace.address) if since else "",
         (*notes, *_namesakes(workspace)),
         workspace.discarded(),
     )
 
 
-def again_best(workspace: Folder) -> NextCommand:
+def again_best(workspace: Folder, now: Standing) -> NextCommand:
     """One more trial of the best candidate: its run, or where people run the robot, its log."""
     if workspace.config.system.reachable:
         return NextCommand("run", ("best",))
-    return NextCommand("ingest", ("LOG", "--candidate", "best"))
+    best = now.incumbent.candidate.id if now.incumbent else "best"  # another one may be, by then
+    return NextCommand("ingest", ("LOG", "--candidate", best))
 
 
 def _namesakes(workspace: Folder) -> list[str]:

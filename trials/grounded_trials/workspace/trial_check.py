@@ -8,7 +8,7 @@ noisy, or resampled; a person's driving, or another candidate, is something else
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,6 +30,8 @@ ROUGH = 4.0  # steps over which noise keeps its sign: what strays for longer, so
 FINE = 1e-4  # of an input's size: how finely commands are logged at best
 BACK = (0.0, 0.5, 1.0, 1.5, 2.0, -0.5, -1.0)  # steps: states of the log older than those acted on
 AGES = 1.0  # steps by which that varies in a run: packets are lost, clocks drift and jitter
+ANGULAR = (("rad", "rad/s"), ("rad",), ("rad/s",))
+NEARLY = 0.1  # of an input's size: what other units must leave of the difference
 OTHERS = 20  # candidates to compare with, the latest
 
 
@@ -255,17 +257,26 @@ def suspicion(
     ), name
 
 
-def taken_for_radians(task: Task, trial: Trial, own: Candidate) -> tuple[str, ...]:
-    """The states with which a log is a run of its candidate once they are taken for degrees."""
-    from grounded.instruments.odd_trial import radians
+def other_units(task: Task, trial: Trial, own: Candidate) -> tuple[tuple[str, ...], float]:
+    """The signals with which a log is a run of its candidate once they are multiplied, and by what.
 
+    Degrees for radians or the other way round, thousandths or thousands; (), 1 where nothing helps.
+    """
+    model = task.model
     trial, latest = trial.until(task.horizon), _latest(task)
-    for units in (("rad", "rad/s"), ("rad",), ("rad/s",)):
-        some = [i for i, unit in enumerate(task.model.states.values()) if unit in units]
-        found = follows(own.policy, radians(trial, some), latest) if some else None
-        if found is not None and found.alike:
-            return tuple(task.model.state_names[i] for i in some)
-    return ()
+    angular = [[n for n, u in model.states.items() if u in units] for units in ANGULAR]
+    single = [[name] for name in (*model.state_names, *model.input_names)]
+    tried = [(names, factor) for factor in (np.pi / 180, 180 / np.pi) for names in angular if names]
+    for names, factor in tried + [(names, f) for f in (1e-3, 1e3) for names in single]:
+        by = [
+            np.array([factor if name in names else 1.0 for name in every])
+            for every in (trial.state_names, trial.input_names)
+        ]
+        turned = replace(trial, states=trial.states * by[0], inputs=trial.inputs * by[1])
+        found = follows(own.policy, turned, latest)
+        if found is not None and found.alike and found.error < NEARLY:
+            return tuple(names), float(factor)
+    return (), 1.0
 
 
 def _latest(task: Task) -> int:
