@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from grounded.errors import GroundedError
+
 Array = NDArray[np.float64]
 
 
@@ -17,6 +19,18 @@ def readonly(values: ArrayLike, dtype: Any = np.float64) -> Any:
         array = np.array(array, dtype=dtype, order="C")
         array.flags.writeable = False
     return array
+
+
+def numbers(values: Any, what: str) -> Any:
+    """The same of what a user gave.
+
+    Raises:
+        GroundedError: if it isn't an array of numbers; the sentence begins with `what`.
+    """
+    try:
+        return readonly(values)
+    except (TypeError, ValueError):
+        raise GroundedError(f"{what}: expected an array of numbers, got {values!r:.80}") from None
 
 
 def wrapped(d: Array, angles: ArrayLike) -> Array:

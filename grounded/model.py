@@ -118,7 +118,13 @@ class Model:
 
     def __post_init__(self) -> None:
         for attribute in ("states", "inputs", "params", "roles"):
-            value = dict(getattr(self, attribute))
+            given = getattr(self, attribute)
+            if not isinstance(given, Mapping):
+                raise GroundedError(
+                    f"a model's {attribute} are a dict by name, as in states={{'x': 'm', 'v': "
+                    f"'m/s'}}, got {given!r:.60}"
+                )
+            value = dict(given)
             if attribute == "roles" and isinstance(value.get("position"), str):
                 value["position"] = (value["position"],)
             object.__setattr__(self, attribute, MappingProxyType(value))

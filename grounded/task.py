@@ -15,7 +15,7 @@ import numpy as np
 
 from grounded.compile import Problem
 from grounded.errors import GroundedError
-from grounded.frozen import Array, readonly
+from grounded.frozen import Array, numbers
 from grounded.model import Model
 from grounded.policy import Policy
 from grounded.trial import Trial
@@ -79,10 +79,17 @@ class Task:
         shapes |= {"latency": (m,), "input_target": (H, m), "safety_low": (n,), "safety_high": (n,)}
         for name, shape in shapes.items():
             given = getattr(self, name)
-            value = readonly(defaults[name] if given is None else given)
+            value = numbers(defaults[name] if given is None else given, f"task: {name}")
             if value.shape != shape:
                 raise GroundedError(f"task: {name} must have shape {shape}, got {value.shape}")
             object.__setattr__(self, name, value)
+        for name, size in {"state": n, "terminal": n, "input": m, "input_change": m}.items():
+            if (found := getattr(self.reward, name).shape) != (size,):
+                each = "state" if size == n and name in ("state", "terminal") else "input"
+                raise GroundedError(
+                    f"[reward] {name}: expected {size} weights, one for each {each} of the model, "
+                    f"got an array of shape {found}"
+                )
         self._check_values()
 
     def _check_values(self) -> None:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from grounded.errors import GroundedError
-from grounded.frozen import Array, readonly
+from grounded.frozen import Array, numbers
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +32,7 @@ class Reward:
 
     def __post_init__(self) -> None:
         for name in ("state", "terminal", "input", "input_change"):
-            weights = readonly(getattr(self, name))
+            weights = numbers(getattr(self, name), f"[reward] {name}")
             if not np.isfinite(weights).all() or (weights < 0).any():
                 raise GroundedError(
                     f"[reward] {name}: weights must be finite and not negative, got "

@@ -17,7 +17,7 @@ import numpy as np
 
 from grounded.errors import GroundedError, nearest
 
-_NOT_THE_USER = (str(Path(__file__).parent), str(Path(np.__file__).parent), "<frozen")
+_NOT_THE_USER = (str(Path(__file__).parents[1]), str(Path(np.__file__).parent), "<frozen")
 
 
 class Named(Mapping[str, Any]):

@@ -109,6 +109,11 @@ def diagnose(
         Interrupted: on Ctrl-C, with the best hypothesis so far and what it predicts.
         GroundedError: for trials that don't fit the model, or with nothing in them.
     """
+    if not isinstance(subject, Task | Model) or isinstance(trials, Trial):
+        raise GroundedError(
+            "diagnose(task, trials) takes a Task or a Model and a list of trials, got "
+            f"{type(subject).__name__} and {type(trials).__name__}"
+        )
     options, tick = options or DiagnosisOptions(), Stages(progress, USUAL)
     model = subject.model if isinstance(subject, Task) else subject
     if model.n + model.m > MOST_NAMES:

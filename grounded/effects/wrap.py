@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from grounded.compile.names import Named
+from grounded.compile.names import Named, check_names
 from grounded.effects.family import (
     Effect,
     InputFamily,
@@ -54,18 +54,24 @@ Step = Callable[[Any, Any, Any, Any], dict[str, Any]]
 def plain_step(model: Model) -> Step:
     """The model's step(s, a, p, dt) in the user's own words, integrating a derivative."""
     stepped, derivative, names = model.step, model.derivative, model.state_names
+
+    def checked(function: Callable[..., Any], *at: Any) -> dict[str, Any]:
+        values = function(*at)
+        check_names(values, names, function)
+        return dict(values)
+
     if stepped is not None:
-        return lambda s, a, p, dt: dict(stepped(s, a, p, dt))
+        return lambda s, a, p, dt: checked(stepped, s, a, p, dt)
     assert derivative is not None
 
     def moved(s: Any, rates: Mapping[str, Any], by: Any) -> Named:
         return Named("state", names, [s[n] + by * rates[n] for n in names])
 
     def euler(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
-        return dict(moved(s, derivative(s, a, p), dt))
+        return dict(moved(s, checked(derivative, s, a, p), dt))
 
     def rk4(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
-        k1 = derivative(s, a, p)
+        k1 = checked(derivative, s, a, p)
         k2 = derivative(moved(s, k1, 0.5 * dt), a, p)
         k3 = derivative(moved(s, k2, 0.5 * dt), a, p)
         k4 = derivative(moved(s, k3, dt), a, p)

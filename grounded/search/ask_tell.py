@@ -21,7 +21,7 @@ from grounded.search.improve import propose
 from grounded.search.making import Proposal
 from grounded.search.standing import SearchOptions, Standing
 from grounded.task import Task
-from grounded.trial import Trial
+from grounded.trial import Trial, interpolate_gaps
 
 
 class Search:
@@ -63,7 +63,8 @@ class Search:
     def proposal(self) -> Proposal:
         """What `ask` would return, or why there is nothing more to run."""
         if self._planned is None:
-            self._planned = propose(self.task, self._candidates, self._trials, self.options)
+            whole = [interpolate_gaps(trial).trial for trial in self._trials]
+            self._planned = propose(self.task, self._candidates, whole, self.options)
         return self._planned
 
     @property
@@ -94,12 +95,15 @@ class Search:
 
         Args:
             trial: its `candidate` says what was run; without one, it was the outstanding candidate.
+                Short gaps (NaN) are bridged for the search, and stay gaps in `trials`.
 
         Raises:
             GroundedError: for a trial of no candidate of this search, of other states or inputs, or
                 on another time grid.
         """
         task, ids = self.task, [c.id for c in self._candidates]
+        if not isinstance(trial, Trial):
+            raise GroundedError(f"a robot returns a Trial of what it ran, got {trial!r:.60}")
         found = (trial.state_names, trial.input_names, trial.dt)
         expected = (task.model.state_names, task.model.input_names, task.dt)
         if found != expected:
@@ -145,4 +149,5 @@ def learn(
             return search
         candidate = search.ask()
         assert candidate is not None
-        search.tell(replace(run(candidate), candidate=candidate.id))
+        trial = run(candidate)
+        search.tell(replace(trial, candidate=candidate.id) if isinstance(trial, Trial) else trial)

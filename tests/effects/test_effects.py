@@ -284,3 +284,17 @@ def test_lags_of_long_steps_are_as_long_in_steps():
 def test_lags_are_sought_within_their_bound(dt, steps):
     tau = lag_of(dt, steps * dt)
     assert 0 < tau.grid[0] < tau.grid[-1] <= tau.high
+
+
+@pytest.mark.parametrize("name", ["dead_zone:force", "viscous_friction:v"])
+def test_a_model_that_lacks_a_state_says_so_with_an_adopted_effect_too(name):
+    """It was a KeyError in grounded's own file once an effect was adopted."""
+    model = Model(
+        states={"x": "m", "v": "m/s"},
+        inputs={"force": "N"},
+        derivative=lambda s, a, p: {"v": a.force},
+    )
+    effect = Library().effect(name, model)
+    whole = wrap(effect, dict.fromkeys((q.name for q in effect.quantities), 0.1), 0.02)
+    with pytest.raises(GroundedError, match=r"test_effects.py.*missing: x"):
+        whole.system.step(np.zeros((1, whole.n)), np.zeros((1, 1)), whole.values, 0.02)

@@ -120,3 +120,30 @@ def test_the_front_door_opens_at_once():
     code = "import sys, grounded; print(' '.join(m for m in sys.modules if '.' not in m))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert not {"numpy", "scipy", "llvmlite"} & set(done.stdout.split())
+
+
+def test_a_short_gap_is_bridged_as_in_a_workspace():
+    """One NaN of 151 was a crash."""
+    search = gr.Search(TASK, OPTIONS)
+    trial = run(search.ask())
+    states = np.array(trial.states)
+    states[5, 0] = np.nan
+    search.tell(replace(trial, states=states))
+    assert np.isfinite(search.standing.history[0].utility)
+    assert np.isnan(search.trials[0].states[5, 0])
+
+
+def test_what_a_user_gets_wrong_in_python_is_said():
+    model, n = TASK.model, TASK.model.n
+    reward = TASK.reward
+    for mistake, told in (
+        (lambda: replace(reward, state={"x": 3.0}), r"\[reward\] state: expected an array"),
+        (lambda: replace(TASK, reward=replace(reward, state=np.ones(n + 1))), f"expected {n} weig"),
+        (lambda: replace(TASK, start="here"), "task: start: expected an array"),
+        (lambda: gr.Model(states=["x"], inputs={"u": "N"}, derivative=len), "dict by name"),
+        (lambda: gr.diagnose([], TASK), "list of trials, got list and Task"),
+        (lambda: gr.diagnose(model, run(gr.Search(TASK).ask())), "list of trials"),
+        (lambda: gr.learn(TASK, lambda candidate: None), "returns a Trial"),
+    ):
+        with pytest.raises(gr.GroundedError, match=told):
+            mistake()

@@ -318,3 +318,19 @@ def test_a_span_that_was_given_is_kept_to_and_a_strange_run_has_no_start(tmp_pat
     with pytest.raises(GroundedError, match="c0001"):
         w.ingest(tmp_path / "strange.csv")
     assert not w.trials()
+
+
+def test_a_copy_is_discarded_without_its_original(waiting):
+    """Both have one hash; a stranger lost the run that he had, with the copy of it."""
+    w, _, _ = waiting
+    w.ingest(w.run().trial_file)
+    original = w.trials()[0].stored
+    w.store.add(original.path.read_bytes(), again=True)
+    w.forget()
+    copy = w.trials()[-1].stored
+    assert copy.digest == original.digest
+    assert list(w.discard(copy.id).discarded) == [copy.id]
+    assert [one.stored.id for one in w.trials()].count(original.id) == 1
+    assert list(w.discard(original.id).discarded) == [original.id, copy.id]
+    assert list(w.restore(original.id).discarded) == [copy.id]
+    assert w.restore(copy.id).discarded == {}

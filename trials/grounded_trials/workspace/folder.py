@@ -176,9 +176,9 @@ class Folder:
 
     def discarded(self) -> dict[str, str]:
         """Trials that are set aside, t0004 -> why."""
-        aside = self.noted.aside
-        entries = self.store.list() if aside else ()
-        return {one.id: aside[one.digest] for one in entries if one.digest in aside}
+        entries = self.store.list() if self.noted.aside else ()
+        found = {one.id: self.noted.why_aside(one) for one in entries}
+        return {name: why for name, why in found.items() if why is not None}
 
     def fits(self, trial: Trial) -> bool:
         """Whether a trial's states and inputs are this model's, and its dt is this task's."""
@@ -279,7 +279,7 @@ class Folder:
         """The stored trials; those that are damaged or gone are put into `lost` if it is there."""
         broken: list[Damaged] = []
         known, found = self.noted if lost is None else self._read_notes(broken), []
-        entries = [e for e in self.store.list() if e.digest not in known.aside]
+        entries = [e for e in self.store.list() if known.why_aside(e) is None]
         read = self._indexed if self._many else self._whole
         for stored in entries:
             try:

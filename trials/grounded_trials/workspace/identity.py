@@ -96,12 +96,16 @@ class StoredCandidate:
 
 @dataclass(frozen=True, eq=False)
 class Noted:
-    """What the notes of a folder say; trials are named by their hashes."""
+    """What the notes of a folder say; trials are named by their hashes, copies by their files."""
 
     aside: dict[str, str] = field(default_factory=dict)  # discarded and not restored -> why
     handed: dict[str, set[str]] = field(default_factory=dict)  # candidate -> SHA-256 of its files
     ran: dict[str, str] = field(default_factory=dict)  # trials without a policy -> its SHA-256
     last: set[str] = field(default_factory=set)  # the last file of a trial at each hand-out, or ""
+
+    def why_aside(self, stored: Stored) -> str | None:
+        """Why a trial is set aside; None where it isn't."""
+        return self.aside.get(stored.path.stem, self.aside.get(stored.digest))
 
     def gone(self, store: Store) -> Iterator[Damaged]:
         """Trials that were stored, and are not there any more."""
@@ -152,9 +156,12 @@ class SetAside(Result):
 def set_aside(workspace: Folder, note: str, trials: Sequence[str], why: str) -> SetAside:
     """Notes that trials were discarded, or restored: see `Workspace.discard`."""
     found = [workspace.store.find(name.lower()) for name in trials]
+    digests = [stored.digest for stored in workspace.store.list()]
     for one in found:
-        if (one.digest in workspace.noted.aside) == (note == "restore"):
-            workspace.notes.add({"note": note, "trial": one.digest, "why": why})
+        if (workspace.noted.why_aside(one) is None) == (note == "discard"):
+            copied = digests.count(one.digest) > 1 and one.digest not in workspace.noted.aside
+            trial = one.path.stem if copied else one.digest
+            workspace.notes.add({"note": note, "trial": trial, "why": why})
     workspace.forget_trials()
     return SetAside(tuple(one.id for one in found), workspace.discarded())
 

@@ -133,7 +133,7 @@ def ingest_log(
     if before:
         repeat = f"it repeats {before} to the last bit: the system is taken as deterministic"
         warnings = (*warnings, f"{repeat}, and no candidate is run a second time from now on")
-    if added.known and added.sha256[:DIGITS] in workspace.noted.aside:
+    if added.known and added.id in workspace.discarded():
         warnings = (*warnings, f"{added.id} is set aside: `restore` takes that back")
     now = standing_in(workspace) if trial.candidate else None
     history = now.history if now else ()
