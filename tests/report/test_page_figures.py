@@ -451,3 +451,18 @@ def test_a_crash_is_marked_where_it_happened(car):
     (cross,) = figure.panels[0].dots
     x = findings.task.model.state_names.index("x")
     assert cross.shape == "cross" and cross.x == states[19, x] and "0.95 s" in cross.note
+
+
+def test_both_compared_paths_are_drawn_where_both_were_run_twice(car, tmp_path):
+    """Means of runs have no id of their own: the best one took the other's place."""
+    findings = gather(Folder(car))
+    own = {findings.first.candidate.id, findings.best.candidate.id}
+    again = [run for run in findings.runs if run.candidate.id in own]
+    runs = [
+        *findings.runs,
+        *(replace(r, trial=replace(r.trial, id=f"{r.trial.id}b")) for r in again),
+    ]
+    figure = path_figure(replace(findings, runs=tuple(runs)))
+    roles = [curve.role for curve in figure.panels[0].curves if curve.style == "line"]
+    assert len(own) == 2 and roles.count("model") == roles.count("best") == 1
+    assert roles.count("other") == len(runs)

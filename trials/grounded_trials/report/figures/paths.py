@@ -134,10 +134,11 @@ def crash(run: Run | Log) -> int | None:
 def _seen_in(findings: Findings, view: View) -> Panel:
     """Every run's path by name, the compared ones before the others, and what was predicted."""
     dt = findings.task.dt
-    shown = {run.trial.id: (role, run) for role, run in compared(findings)}
-    others = [r for r in findings.runs if r.trial.id not in shown][-OTHERS:]
+    shown = compared(findings)  # means of several runs have no id
+    ids = {run.trial.id for _, run in shown}
+    others = [r for r in findings.runs if r.trial.id not in ids][-OTHERS:]
     runs = [("other", r.label, r) for r in others]
-    runs += [(role, name_of(role, r), r) for role, r in shown.values()]
+    runs += [(role, name_of(role, r), r) for role, r in shown]
     drawn = [(r.trial.states, role, name, r.trial.id, "line") for role, name, r in runs]
     drawn += [
         (c.predicted_states, "predicted", f"predicted for {c.id}", r.trial.id, "ghost")
