@@ -58,7 +58,7 @@ class Footnote9Result:
 
     def tables(self) -> list[StudyTable]:
         """Shares of the optimum by b."""
-        head = ("b", "model-based", "solved (trials)", "policy gradient (trials)")
+        head = ("b", "model-based", "one iteration (trials)", "policy gradient (trials)")
         rows = tuple(
             (
                 f"{row.b:g}",

@@ -93,9 +93,20 @@ def page(findings: Findings, watched: int = 0) -> str:
     )
 
 
-def _unbroken(text: str) -> str:
-    """Text in which a browser breaks no quantity: neither 0.05 kg nor 1e-05 nor |motor|."""
-    return re.sub(r"-(?=\d)|\|", "\\g<0>\u2060", glued(text))
+def _unbroken(text: str) -> Any:
+    """Markup in which a browser breaks no quantity: neither 0.05 kg nor 1e-05; `x` is code."""
+    from markupsafe import Markup, escape
+
+    parts = str(text).split("`")
+    if len(parts) % 2 == 0:  # one that is not closed
+        parts = [str(text)]
+    for k, part in enumerate(parts):
+        if k % 2:
+            parts[k] = f"<code>{escape(part)}</code>"
+        else:
+            plain = re.sub(r"-(?=\d)|\|", "\\g<0>\u2060", glued(part))
+            parts[k] = str(escape(typeset(plain)))
+    return Markup("".join(parts))
 
 
 @cache
