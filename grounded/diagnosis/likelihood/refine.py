@@ -26,6 +26,7 @@ from grounded.diagnosis.likelihood.delays import Delays, delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated, moved, shift_precision
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.linearise import (
+    columns_of,
     filter_system,
     gains_of,
     linearise,
@@ -67,6 +68,7 @@ class Work:
     step: ProposedStep | None = None
     part: float = 1.0  # of the step that is taken
     still: bool = False  # it no longer rises
+    given_up: bool = False  # too far behind its rivals
     moving: bool = True  # the track too: where the model has kinks that may not help
     along: Predictor | None = None  # of its own track, while it climbs
 
@@ -113,7 +115,10 @@ def refine(
         worth: of rivals, by which the worse half is given up on the way; None: all go on.
     """
     works = [
-        Work(s.hypothesis, s.noise, s.track) if isinstance(s, Fitted) else Work(*s) for s in starts
+        Work(s.hypothesis, s.noise, s.track, s if s.settled else None, still=s.settled)
+        if isinstance(s, Fitted)
+        else Work(*s)
+        for s in starts
     ]
     if not works:
         return []
@@ -125,7 +130,8 @@ def refine(
         _halve(works, worth)
         iterations -= HALVED
     works = _after(predictor, works, iterations, size, fixed_noise, tick)
-    return [work.best for work in works if work.best is not None]
+    fits = [(work.best, work.still and not fixed_noise) for work in works if work.best is not None]
+    return [replace(fit, settled=True) if top and not fit.settled else fit for fit, top in fits]
 
 
 def _after(
@@ -165,14 +171,14 @@ def _halve(works: list[Work], worth: Callable[[Fitted], float]) -> None:
     for work in works:
         mine = value.get(id(work), -np.inf)
         if mine < ranked[len(ranked) // 2] and mine < ranked[0] - CLOSE:
-            work.still = True
+            work.given_up = True
 
 
 def _of_one_shape(works: list[Work]) -> list[list[int]]:
     """Indices of works that go on, by the size of their filters' states: so many late sensors."""
     groups: dict[int, list[int]] = {}
     for i, work in enumerate(works):
-        if work.still:
+        if work.still or work.given_up:
             continue
         late = {e.site.target for e in work.h.effects if isinstance(e.family, LATE)}
         groups.setdefault(len(late), []).append(i)
@@ -183,12 +189,18 @@ def _iterate(predictor: Predictor, works: list[Work], fixed_noise: bool) -> None
     data = predictor.data
     B = data.time.shape[1]
     late = [delays_of(work.h, data) for work in works]
-    parts = [linearise(work.along or predictor, work.h, work.track) for work in works]
-    width = kalman.whole(max(part[1].shape[-1] for part in parts), data.model.n)
-    d, r = (_side_by_side([part[k] for part in parts], width) for k in (1, 2))
+    counts = [columns_of(work.h, data) for work in works]
+    width = kalman.whole(max(counts), data.model.n)
+    (L, _), n, runs = data.time.shape, data.model.n, B * len(works)
+    d, r = np.zeros((L, runs, n, width)), np.zeros((L + 1, runs, n, width))
+    own = [slice(i * B, (i + 1) * B) for i in range(len(works))]
+    F = [
+        linearise(work.along or predictor, work.h, work.track, (d[:, i], r[:, i]))[0]
+        for work, i in zip(works, own, strict=True)
+    ]
     systems = [
-        filter_system(predictor, work.h, work.noise, work.track, part[0])
-        for work, part in zip(works, parts, strict=True)
+        filter_system(predictor, work.h, work.noise, work.track, jacobian)
+        for work, jacobian in zip(works, F, strict=True)
     ]
     system, delayed = joined(systems)
     try:
@@ -202,27 +214,35 @@ def _iterate(predictor: Predictor, works: list[Work], fixed_noise: bool) -> None
         return
     white, filtered = kalman.innovations(g, d, r, track=True)
     assert filtered is not None
-    started = smoothed(data, g, np.concatenate([part[0] for part in parts], axis=1), white[..., 0])
+    started = smoothed(data, g, np.concatenate(F, axis=1), white[..., 0])
     if started is not None:
         filtered[0, ..., 0] += started
-    steps = [(work.noise, 0.0) for work in works]
+    rose = []
+    for i, (work, there) in enumerate(zip(works, own, strict=True)):
+        before = 0.0
+        if (delays := late[i]) is not None:
+            entry, residual = systems[i][0].G, white[:, there, :, 0]
+            before = delays.before(work.noise, entry, work.track, residual, g.weight[:, there])
+        columns, error = white[:, there, :, : counts[i]], filtered[:, there, :, 0]
+        fit = _scored(predictor, work, columns, g.logdet[:, there], error, before)
+        if _rises(work, fit):
+            rose.append(i)
+        else:
+            work.shorten(data)
+    if not rose:
+        return
+    up = [works[i] for i in rose]
+    steps = [(work.noise, 0.0) for work in up]
     if not fixed_noise:
-        steps = _climbed(data, works, late, systems, g, white[..., 0])
-    for i, work in enumerate(works):
-        own = slice(i * B, (i + 1) * B)
-        columns, before, delays = parts[i][1].shape[-1], 0.0, late[i]
-        if delays is not None:
-            entry, residual = systems[i][0].G, white[:, own, :, 0]
-            before = delays.before(work.noise, entry, work.track, residual, g.weight[:, own])
-        _update(
-            predictor,
-            work,
-            white[:, own, :, :columns],
-            g.logdet[:, own],
-            filtered[:, own, :, :columns],
-            steps[i],
-            before,
-        )
+        residual = white[..., 0]
+        if len(up) < len(works):
+            which = np.concatenate([np.arange(runs)[own[i]] for i in rose])
+            g, residual = g.of_runs(which), residual[:, which]
+        steps = _climbed(data, up, [late[i] for i in rose], [systems[i] for i in rose], g, residual)
+    for i, work, step in zip(rose, up, steps, strict=True):
+        assert work.best is not None
+        work.step = proposed(data, work.best, filtered[:, own[i], :, : counts[i]], *step)
+        work.go(data)
 
 
 def _climbed(
@@ -236,13 +256,14 @@ def _climbed(
     """Each work's noise after one step up the likelihood, and what it promises [nats]."""
     B, width = data.time.shape[1], data.model.n
     adjoints = kalman.smoother(g, white).parts(B)
-    columns_each = []
-    for work, delays, (own, _), adjoint in zip(works, delays_each, systems, adjoints, strict=True):
+    K = width * (2 if works[0].noise.structure.tau is None else 3)
+    L, runs, _ = white.shape
+    d, r = (np.zeros((T, runs, width, kalman.whole(K, width))) for T in (L, L + 1))
+    each_own = zip(works, delays_each, systems, adjoints, strict=True)
+    for i, (work, delays, (own, _), adjoint) in enumerate(each_own):
         noise = work.noise if delays is None else delays.noise(work.noise)
-        columns_each.append(working(noise, adjoint, own.G, data.dt))
-    K = columns_each[0][0].shape[-1]
-    wide = kalman.whole(K, width)
-    d, r = (_side_by_side([part[k] for part in columns_each], wide) for k in (0, 1))
+        there = slice(i * B, (i + 1) * B)
+        working(noise, adjoint, own.G, data.dt, (d[:, there], r[:, there]))
     columns = kalman.innovations(g, d, r)[0]
     found = []
     for i, (work, delays, adjoint) in enumerate(zip(works, delays_each, adjoints, strict=True)):
@@ -280,50 +301,29 @@ def clean(predictor: Predictor, fit: Fitted, rounds: int = 8) -> Fitted:
     return found[0] if found else fit
 
 
-def _side_by_side(parts: Sequence[Array], width: int) -> Array:
-    """Columns (steps, B, n, any) of several works along the runs, zeros up to `width`."""
-    steps, B, n, _ = parts[0].shape
-    found = np.zeros((steps, B * len(parts), n, width))
-    for i, part in enumerate(parts):
-        found[:, i * B : (i + 1) * B, :, : part.shape[-1]] = part
-    return found
-
-
-def _update(
-    predictor: Predictor,
-    work: Work,
-    white: Array,
-    logdet: Array,
-    filtered: Array,
-    climbed: tuple[NoiseModel, float],
-    before: float,
-) -> None:
-    """Scores the point where the work stands, keeps it if it is the best, and moves on."""
-    data = predictor.data
-    residual, columns = white[..., 0], white[..., 1:]
-    fit = _scored(predictor, work, residual, columns, logdet, filtered[..., 0], before)
+def _rises(work: Work, fit: Fitted) -> bool:
+    """Whether the point where the work stands is its best so far; then it is kept."""
     rise = np.inf if work.best is None else fit.evidence - work.best.evidence
     if not (rise > 0 and np.isfinite(fit.evidence)):
-        work.shorten(data)
-        return
+        return False
     work.still = not rise > 0.03
     work.moving = work.moving or rise > 1.0
     work.part = min(1.0, 2 * work.part)
     work.best = fit
-    work.step = proposed(data, fit, filtered, *climbed)
-    work.go(data)
+    return True
 
 
 def _scored(
     predictor: Predictor,
     work: Work,
-    residual: Array,
-    columns: Array,
+    white: Array,
     logdet: Array,
     error: Array,
     before: float,
 ) -> Fitted:
+    """The point where a work stands; the residual is the first of its columns."""
     data, h = predictor.data, work.h
+    residual, columns = white[..., 0], white[..., 1:]
     L, B, n, C = columns.shape
     by_run = np.ascontiguousarray(columns.swapaxes(0, 1)).reshape(B, L * n, C)
     flat = np.ascontiguousarray(residual.swapaxes(0, 1)).reshape(B, L * n)
