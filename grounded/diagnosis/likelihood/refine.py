@@ -51,10 +51,13 @@ from grounded.frozen import Array
 
 MOST_NUMBERS = 1e5  # of one (L, B, N, N) array: what fits in the cache goes fastest
 SHORTEST = 0.05  # part of a step that is still tried
-HALVED = 4  # iterations after which only the better half of rivals goes on
+# iterations of rivals after which only the better half goes on, and how much of what the next step
+# promises counts for the others: of what no step would make one of the better, early
+HALVED = ((2, 3.0), (4, 0.0))
 CLOSE = 10.0  # nats behind the best within which all go on
 LATE = SensorDelayFamily | SensorLagFamily
-LITTLE = 0.05  # nats that a step must promise to be tried in part where it fails
+LITTLE = 0.1  # nats that part of a step must promise to be tried where the step fails
+NOTHING = 0.01  # nats: what promises less, after it hardly rose, is not tried at all
 
 
 @dataclass(eq=False)
@@ -78,10 +81,15 @@ class Work:
             self.moving = False
         else:
             self.part *= 0.4
-        if self.step is None or self.part < SHORTEST or self.step.promise < LITTLE:
+        if self.step is None or self.part < SHORTEST or self.hope < LITTLE:
             self.still = True
         else:
             self.go(data)
+
+    @property
+    def hope(self) -> float:
+        """Nats that the part of the step that is taken next promises."""
+        return 0.0 if self.step is None else self.step.promise * self.part * (2 - self.part)
 
     def go(self, data: Data) -> None:
         """From the best point by a part of the step."""
@@ -125,10 +133,12 @@ def refine(
     (L, B), n = predictor.data.time.shape, predictor.data.model.n
     wide = n if works[0].noise.structure.tau is None else 2 * n
     size = max(1, int(MOST_NUMBERS / (L * B * wide * wide)))
-    if worth is not None and iterations > HALVED:
-        works = _after(predictor, works, HALVED, size, fixed_noise, tick)
-        _halve(works, worth)
-        iterations -= HALVED
+    done = 0
+    for at, promised in HALVED if worth is not None and iterations > HALVED[-1][0] else ():
+        works = _after(predictor, works, at - done, size, fixed_noise, tick)
+        _halve(works, worth, promised)
+        done = at
+    iterations -= done
     works = _after(predictor, works, iterations, size, fixed_noise, tick)
     fits = [(work.best, work.still and not fixed_noise) for work in works if work.best is not None]
     return [replace(fit, settled=True) if top and not fit.settled else fit for fit, top in fits]
@@ -164,12 +174,12 @@ def _climb(predictor: Predictor, works: list[Work], how: tuple[int, bool]) -> li
     return [replace(work, along=None) for work in works]
 
 
-def _halve(works: list[Work], worth: Callable[[Fitted], float]) -> None:
+def _halve(works: list[Work], worth: Callable[[Fitted], float], promised: float) -> None:
     """The worse half stays where it is: who is that far behind by now does not overtake."""
     value = {id(work): worth(work.best) for work in works if work.best is not None}
     ranked = sorted(value.values(), reverse=True)
     for work in works:
-        mine = value.get(id(work), -np.inf)
+        mine = value.get(id(work), -np.inf) + promised * work.hope
         if mine < ranked[len(ranked) // 2] and mine < ranked[0] - CLOSE:
             work.given_up = True
 
@@ -217,7 +227,7 @@ def _iterate(predictor: Predictor, works: list[Work], fixed_noise: bool) -> None
     started = smoothed(data, g, np.concatenate(F, axis=1), white[..., 0])
     if started is not None:
         filtered[0, ..., 0] += started
-    rose = []
+    rises: dict[int, float] = {}
     for i, (work, there) in enumerate(zip(works, own, strict=True)):
         before = 0.0
         if (delays := late[i]) is not None:
@@ -225,23 +235,25 @@ def _iterate(predictor: Predictor, works: list[Work], fixed_noise: bool) -> None
             before = delays.before(work.noise, entry, work.track, residual, g.weight[:, there])
         columns, error = white[:, there, :, : counts[i]], filtered[:, there, :, 0]
         fit = _scored(predictor, work, columns, g.logdet[:, there], error, before)
-        if _rises(work, fit):
-            rose.append(i)
+        if (rise := _rises(work, fit)) > 0:
+            rises[i] = rise
         else:
             work.shorten(data)
-    if not rose:
+    if not rises:
         return
-    up = [works[i] for i in rose]
+    up = [works[i] for i in rises]
     steps = [(work.noise, 0.0) for work in up]
     if not fixed_noise:
         residual = white[..., 0]
         if len(up) < len(works):
-            which = np.concatenate([np.arange(runs)[own[i]] for i in rose])
+            which = np.concatenate([np.arange(runs)[own[i]] for i in rises])
             g, residual = g.of_runs(which), residual[:, which]
-        steps = _climbed(data, up, [late[i] for i in rose], [systems[i] for i in rose], g, residual)
-    for i, work, step in zip(rose, up, steps, strict=True):
+        of_up = [late[i] for i in rises], [systems[i] for i in rises]
+        steps = _climbed(data, up, *of_up, g, residual)
+    for i, work, step in zip(rises, up, steps, strict=True):
         assert work.best is not None
         work.step = proposed(data, work.best, filtered[:, own[i], :, : counts[i]], *step)
+        work.still = work.still or (rises[i] < 1.0 and work.step.promise < NOTHING)
         work.go(data)
 
 
@@ -301,16 +313,16 @@ def clean(predictor: Predictor, fit: Fitted, rounds: int = 8) -> Fitted:
     return found[0] if found else fit
 
 
-def _rises(work: Work, fit: Fitted) -> bool:
-    """Whether the point where the work stands is its best so far; then it is kept."""
+def _rises(work: Work, fit: Fitted) -> float:
+    """How far the point where the work stands is above its best so far; then it is kept."""
     rise = np.inf if work.best is None else fit.evidence - work.best.evidence
     if not (rise > 0 and np.isfinite(fit.evidence)):
-        return False
+        return 0.0
     work.still = not rise > 0.03
     work.moving = work.moving or rise > 1.0
     work.part = min(1.0, 2 * work.part)
     work.best = fit
-    return True
+    return float(rise)
 
 
 def _scored(
