@@ -204,10 +204,11 @@ def _advance_rate(u: Any, z: tuple[Any, ...], c: Any, dt: Any) -> tuple[Any, tup
 def _along_rate(u: Any, z: Any, c: Any, dt: float) -> Any:
     most, path = max(c["r"] * dt, 1e-12), np.empty(u.shape)
     for row, commands, now in zip(path, u.tolist(), z.tolist(), strict=True):
-        at = []  # numbers: of few signals NumPy's calls take ten times as long
+        at = []  # plain numbers: of few signals NumPy's calls take longer
         for command in commands:
             at.append(now)
-            now += min(max(command - now, -most), most)
+            missing = command - now
+            now += most if missing > most else -most if missing < -most else missing
         row[:] = at
     return path
 
