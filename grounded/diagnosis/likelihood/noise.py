@@ -221,7 +221,11 @@ def _moment(variance: Array, score: Array, cover: Array) -> Array:
 
 
 def working(
-    noise: NoiseModel, adjoint: kalman.Adjoint, G: Array | None, dt: float, into: tuple[Array, Array]
+    noise: NoiseModel,
+    adjoint: kalman.Adjoint,
+    G: Array | None,
+    dt: float,
+    into: tuple[Array, Array],
 ) -> None:
     """What each noise, as the smoother sees it, adds to d (L, B, n, K) and r (L + 1, B, n, K).
 

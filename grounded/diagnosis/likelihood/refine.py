@@ -134,7 +134,9 @@ def refine(
     wide = n if works[0].noise.structure.tau is None else 2 * n
     size = max(1, int(MOST_NUMBERS / (L * B * wide * wide)))
     done = 0
-    for at, promised in HALVED if worth is not None and iterations > HALVED[-1][0] else ():
+    for at, promised in HALVED if iterations > HALVED[-1][0] else ():
+        if worth is None:
+            break
         works = _after(predictor, works, at - done, size, fixed_noise, tick)
         _halve(works, worth, promised)
         done = at
