@@ -202,11 +202,15 @@ def _advance_rate(u: Any, z: tuple[Any, ...], c: Any, dt: Any) -> tuple[Any, tup
 
 
 def _along_rate(u: Any, z: Any, c: Any, dt: float) -> Any:
-    most, path = max(c["r"] * dt, 1e-12), np.empty(u.shape[::-1])
-    for now, command in zip(path, u.T, strict=True):
-        now[:] = z
-        z = now + np.minimum(np.maximum(command - now, -most), most)
-    return path.T
+    most, path = max(c["r"] * dt, 1e-12), np.empty(u.shape)
+    for row, commands, now in zip(path, u.tolist(), z.tolist(), strict=True):
+        at = []  # plain numbers: of few signals NumPy's calls take longer
+        for command in commands:
+            at.append(now)
+            missing = command - now
+            now += most if missing > most else -most if missing < -most else missing
+        row[:] = at
+    return path
 
 
 def _advance_backlash(u: Any, z: tuple[Any, ...], c: Any, dt: Any) -> tuple[Any, tuple[Any, ...]]:

@@ -78,6 +78,17 @@ class Gains:
         assert self.P is not None
         return np.asarray(self.P - self.k.swapaxes(-1, -2) @ self.k)
 
+    def of_runs(self, which: Any) -> Gains:
+        """The same of some runs, by their indices."""
+        late, rows = self.delayed, self.system._asdict()
+        start = rows.pop("start")[which]
+        rows = {name: None if a is None else a[:, which] for name, a in rows.items()}
+        system = LinearSystem(**rows, start=start)
+        if late is not None:
+            late = replace(late, channel=late.channel[which], weights=late.weights[which])
+        P = None if self.P is None else self.P[:, which]
+        return Gains(system, self.k[:, which], self.weight[:, which], P, late)
+
     @cached_property
     def measured(self) -> Array:
         """H, zero rows where a channel was not seen, (L, B, n, N)."""

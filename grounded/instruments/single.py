@@ -149,13 +149,14 @@ def _stuck(s: Signal) -> Found | None:
         return None
     far, gone, longest = 2 * float(np.median(usual)), [], 0
     for x in s.columns:
-        flat = np.zeros(len(x), bool)
-        for start, length in zip(*runs(x), strict=True):
+        flat, (starts, lengths) = np.zeros(len(x), bool), runs(x)
+        long = lengths >= STUCK
+        for start, length in zip(starts[long], lengths[long], strict=True):
             end = start + length
             onward = abs(x[end + 1] - x[end]) if end + 1 < len(x) else np.inf
             jumps = end < len(x) and abs(x[end] - x[start]) > max(far, JUMP * onward)
             moving = start > 0 and x[start - 1] != x[start]
-            if length >= STUCK and jumps and moving:
+            if jumps and moving:
                 flat[start + 1 : end] = True
                 longest = max(longest, int(length))
         gone.append(flat)

@@ -7,6 +7,7 @@ from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import diagnose
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.step import _bounded
 from grounded.effects import Library
 from grounded.experiments.pendulum import FRICTION, HEAVIER, pendulum_task
@@ -54,6 +55,28 @@ def test_a_parameter_is_believed_within_three_of_its_standard_deviations():
     search.nulls()
     shifts = [f.hypothesis.shift[0] for (_, w, _), f in search.fits.items() if w > 0]
     assert max(shifts) == pytest.approx(0.06)
+
+
+def test_a_fit_at_its_top_is_not_climbed_again_and_one_on_its_way_is():
+    rng, u = np.random.default_rng(2), np.repeat(np.sin(np.arange(15)), 10)[:, None]
+    x = np.zeros((151, 2))
+    for t in range(150):
+        x[t + 1] = x[t] + 0.05 * np.array([x[t, 1], 1.3 * u[t, 0] - x[t, 1]])
+        x[t + 1] += 0.01 * rng.standard_normal(2)
+    y = x + 0.02 * rng.standard_normal(x.shape)
+    crude = Model(
+        states={"x": "m", "v": "m/s"},
+        inputs={"u": "N"},
+        params={"k": Param(1.0)},
+        derivative=lambda s, a, p: {"x": s.v, "v": p.k * a.u - s.v},
+    )
+    search = HypothesisSearch(prepare(crude, [Trial(y, u, 0.05, ("x", "v"), ("u",))]), ())
+    (early,) = search.refined([search.fresh(Hypothesis())], 1)
+    (top,) = search.refined([early], 40)
+    assert not early.settled and top.settled and top.evidence > early.evidence
+    assert search.refined([top, early], 5)[0] is top
+    again = search.refined([(top.hypothesis, top.noise, top.track)], 40)[0]
+    assert abs(again.evidence - top.evidence) < 0.1  # what another climb from there would find
 
 
 def test_an_unknown_whose_slope_is_no_number_stays_where_it_is():

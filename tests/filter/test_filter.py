@@ -112,8 +112,10 @@ def noise_of(problem, phi, dt=0.05):
 
 def information(problem, noise, dt=0.05):
     g, _, _, back = problem.passes(noise.process(dt), np.exp(noise.log_r))
-    columns = working(noise, back, problem.G, dt)
-    return average(innovations(g, *columns)[0]), back
+    columns = problem.n * (3 if noise.structure.tau else 2)
+    d, r = (np.zeros((T, B, problem.n, columns)) for T in (L, L + 1))
+    working(noise, back, problem.G, dt, (d, r))
+    return average(innovations(g, d, r)[0]), back
 
 
 def dense(problem):

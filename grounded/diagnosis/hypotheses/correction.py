@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis.hypotheses.leftover import CLAIM, Leftover, held_out_columns
+from grounded.diagnosis.hypotheses.leftover import CLAIM, Leftover, filter_of, held_out_columns
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
@@ -58,11 +58,13 @@ def correction(
     if not left or predictor.data.count < 2:
         return None
     i = predictor.data.model.state_names.index(left[0].channel)
-    chosen: list[_Curve] = []
+    chosen, gains = list[_Curve](), filter_of(predictor, fit)
     best, weights = CLAIM, np.zeros((predictor.data.count + 1, 0))
     while len(chosen) < MOST:
         rivals = [c for c in _curves(predictor, fit) if c.over not in [o.over for o in chosen]]
-        tried = [(held_out_columns(predictor, fit, _joined([*chosen, c]), i), c) for c in rivals]
+        tried = [
+            (held_out_columns(predictor, fit, gains, _joined([*chosen, c]), i), c) for c in rivals
+        ]
         if not tried:
             break
         (gain, _, each), curve = max(tried, key=lambda pair: pair[0][0])

@@ -51,12 +51,12 @@ def leftovers(predictor: Predictor, fit: Fitted) -> list[Leftover]:
     data = predictor.data
     if len(np.unique(folds(data))) < 2:
         return []
-    features = flexible(predictor, fit)
+    features, gains = flexible(predictor, fit), filter_of(predictor, fit)
     found = []
     for i, name in enumerate(data.model.state_names):
         if i in data.hidden:
             continue
-        gain, step_gain, correction = _channel(predictor, fit, features, i)
+        gain, step_gain, correction = _channel(predictor, fit, gains, features, i)
         if gain > CLAIM:
             size = float(np.sqrt((correction**2 * data.valid.T).sum() / data.valid.sum()))
             unit = data.model.states[name]
@@ -115,10 +115,10 @@ def _bins(value: Array, count: int) -> list[Array]:
 
 
 def _channel(
-    predictor: Predictor, fit: Fitted, features: Array, i: int
+    predictor: Predictor, fit: Fitted, gains: kalman.Gains, features: Array, i: int
 ) -> tuple[float, Array, Array]:
     """Held-out gain of correcting one channel's rate: total, by step (L, B); the correction."""
-    gain, by_step, weights = held_out_columns(predictor, fit, features, i)
+    gain, by_step, weights = held_out_columns(predictor, fit, gains, features, i)
     left_out, rate = folds(predictor.data), np.zeros_like(by_step)
     for k, trial in enumerate(np.unique(left_out)):
         own = left_out == trial
@@ -127,16 +127,17 @@ def _channel(
 
 
 def held_out_columns(
-    predictor: Predictor, fit: Fitted, features: Array, i: int
+    predictor: Predictor, fit: Fitted, gains: kalman.Gains, features: Array, i: int
 ) -> tuple[float, Array, Array]:
     """What features (L, B, K) of state i's rate gain on each trial, fitted to the others.
+
+    `gains` are those of the fit (`filter_of`).
 
     Returns:
         The gain [nats]; the same by step (L, B); weights (S + 1, K) without each of the S folds,
         and of all.
     """
     data = predictor.data
-    gains = filter_of(predictor, fit)
     L, B, K = features.shape
     n = data.model.n
     d = np.zeros((L, B, n, K))

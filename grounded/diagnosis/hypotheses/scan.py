@@ -112,7 +112,7 @@ class _Context(SentOnce):
         self.u = predictor.inputs(h)
         self.after = predictor.advance(h, self.x, self.u, data.time)
         self.ahead = np.concatenate([fit.track[:1], self.after])
-        self.F, self.f_p = sensitivities_of(predictor, h, self.x, self.u)
+        self.F, self.f_p = sensitivities_of(predictor, h, self.x, self.u, self.after)
         system, delayed = filter_system(predictor, h, fit.noise, fit.track, self.F)
         self.G, self.gains = system.G, kalman.gains(system, delayed)
         self.delays = delays_of(h, data)

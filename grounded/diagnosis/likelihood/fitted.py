@@ -32,6 +32,7 @@ class Fitted:
     logdet: Array
     white: Array
     residual: Array  # (L, B, n) x_{t+1|t+1} - prediction: what the filter had to correct
+    settled: bool = False  # nothing rises from here: a fit that starts here ends here
 
     @property
     def covariance(self) -> Array:

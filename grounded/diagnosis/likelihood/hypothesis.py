@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -30,12 +31,12 @@ class Hypothesis:
         """The effects' names."""
         return tuple(effect.name for effect in self.effects)
 
-    @property
+    @cached_property
     def pairs(self) -> list[tuple[Effect, Mapping[str, float]]]:
         """Each effect with its values."""
         return list(zip(self.effects, self.values, strict=True))
 
-    @property
+    @cached_property
     def theta(self) -> Array:
         """Free values of all effects in order, (k_effects,)."""
         return np.array([v[q.name] for e, v in self.pairs for q in e.free], float)

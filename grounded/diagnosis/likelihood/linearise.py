@@ -37,7 +37,7 @@ from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.noise import NoiseModel
-from grounded.diagnosis.likelihood.predictor import Predictor, limits_of, rates_of
+from grounded.diagnosis.likelihood.predictor import Predictor, limits_of, losses_of, rates_of
 from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.diagnosis.likelihood.tangent import tangent
 from grounded.effects import ParamFamily
@@ -48,26 +48,36 @@ from grounded.frozen import Array
 from grounded.model import Model
 
 
-def linearise(predictor: Predictor, h: Hypothesis, track: Array) -> tuple[Array, Array, Array]:
-    """F (L, B, n, n); columns of d and r: the residual first, then each value, then each shift."""
-    data = predictor.data
+def columns_of(h: Hypothesis, data: Data) -> int:
+    """How many columns a hypothesis has: the residual, its values, its shifts."""
+    return 1 + len(h.theta) + (len(calibrated(data)) if h.spread else 0)
+
+
+def linearise(
+    predictor: Predictor, h: Hypothesis, track: Array, into: tuple[Array, Array] | None = None
+) -> tuple[Array, Array, Array]:
+    """F (L, B, n, n); columns of d and r: the residual first, then each value, then each shift.
+
+    `into`: d and r, zeros of at least so many columns; else they are made.
+    """
+    data, count = predictor.data, columns_of(h, predictor.data)
     model = data.model
     x = track[:-1]
     u = predictor.inputs(h)
     after = predictor.advance(h, x, u, data.time)
+    d, r = into or (np.zeros((*a.shape, count)) for a in (after, track))
     ahead = np.concatenate([track[:1], after])  # predicted: a measurement must not explain itself
     delays = delays_of(h, data)
     y, here, shown = data.y, track, ahead
     if delays is not None:
         y, here, shown = delays.samples()[0], delays.shown(track, track), delays.shown(ahead, track)
     offset = predictor.standing(h, shown)
-    columns_d = [model.difference(after, track[1:])]
-    columns_r = [model.difference(y - here, np.asarray(offset))]
-    F, of_shifts = _sensitivities(predictor, h, x, u)
+    d[..., 0] = model.difference(after, track[1:])
+    r[..., 0] = model.difference(y - here, np.asarray(offset))
+    F, of_shifts = _sensitivities(predictor, h, x, u, after)
     theta, near = h.theta, tangent(predictor, h, x, u) if h.effects else predictor
     base = after if near is predictor else near.advance(h, x, u, data.time)
     for j, sizes in enumerate(_tried(h)):
-        by_d, by_r = np.zeros_like(after), np.zeros_like(track)
         for size in sizes:
             other, moved = _nudged(h, theta, j, size)
             if moved == 0:
@@ -77,28 +87,31 @@ def linearise(predictor: Predictor, h: Hypothesis, track: Array) -> tuple[Array,
             other_shown = shown if delays is None else delays.moved(other).shown(ahead, track)
             shifted = predictor.standing(other, other_shown)
             by_r = (shown - other_shown + offset - shifted) / moved
+            d[..., 1 + j], r[..., 1 + j] = by_d, by_r
             if by_d.any() or by_r.any():
                 break
-        columns_d.append(by_d)
-        columns_r.append(by_r)
-    more = np.zeros((*track.shape, of_shifts.shape[-1]))
-    d = np.concatenate([np.stack(columns_d, axis=-1), of_shifts], axis=-1)
-    return F, d, np.concatenate([np.stack(columns_r, axis=-1), more], axis=-1)
+    d[..., 1 + len(theta) : count] = of_shifts
+    return F, d, r
 
 
-def _sensitivities(predictor: Predictor, h: Hypothesis, x: Array, u: Array) -> tuple[Array, Array]:
+def _sensitivities(
+    predictor: Predictor, h: Hypothesis, x: Array, u: Array, after: Array
+) -> tuple[Array, Array]:
     """F (L, B, n, n) and what each shift adds to a step, (L, B, n, k); k = 0 without shifts."""
     if h.spread == 0:
-        return step_jacobian(predictor, h, x), np.zeros((*x.shape, 0))
+        return step_jacobian(predictor, h, x, after), np.zeros((*x.shape, 0))
     which = calibrated(predictor.data)
-    F, f_p = sensitivities_of(predictor, h, x, u)
+    F, f_p = sensitivities_of(predictor, h, x, u, after)
     return F, f_p[..., which] * param_scale(predictor.data.model)[which]
 
 
 def sensitivities_of(
-    predictor: Predictor, h: Hypothesis, x: Array, u: Array
+    predictor: Predictor, h: Hypothesis, x: Array, u: Array, after: Array | None = None
 ) -> tuple[Array, Array]:
-    """Of a hypothesis' steps from x (L, B, n): F (L, B, n, n), slope in all parameters (..., k)."""
+    """Of a hypothesis' steps from x (L, B, n): F (L, B, n, n), slope in all parameters (..., k).
+
+    after: where they lead, if known.
+    """
     data = predictor.data
     flat, p = predictor.flat(x, predictor.left(h, x, u)), predictor.params(h)
 
@@ -107,18 +120,23 @@ def sensitivities_of(
 
     slopes = predictor.taken.at(take, *flat, p, True) if simulated(data.model) else take(*flat)
     f_x, f_u, f_p = (f.reshape(*x.shape, f.shape[-1]) for f in slopes)
-    by_x, by_p = predictor.loss_slopes(h, x, u, f_x, f_p)
-    F = with_effects(predictor, h, x, u, f_x - f_u @ by_x)
-    return F, passed(predictor, h, x, u, f_p - f_u @ by_p)
+    if losses_of(h):
+        by_x, by_p = predictor.loss_slopes(h, x, u, f_x, f_p)
+        f_x, f_p = f_x - f_u @ by_x, f_p - f_u @ by_p
+    F = with_effects(predictor, h, x, u, f_x, after)
+    return F, passed(predictor, h, x, u, f_p)
 
 
-def step_jacobian(predictor: Predictor, h: Hypothesis, track: Array) -> Array:
+def step_jacobian(
+    predictor: Predictor, h: Hypothesis, track: Array, after: Array | None = None
+) -> Array:
     """F of every step along a track (L or more, B, n), (L, B, n, n)."""
     data, u = predictor.data, predictor.inputs(h)
     x = track[: len(data.time)]
     f_x, f_u = predictor.slopes(x, predictor.left(h, x, u), predictor.params(h))
-    by_x, _ = predictor.loss_slopes(h, x, u, f_x)
-    return with_effects(predictor, h, x, u, f_x - f_u @ by_x)
+    if losses_of(h):
+        f_x = f_x - f_u @ predictor.loss_slopes(h, x, u, f_x)[0]
+    return with_effects(predictor, h, x, u, f_x, after)
 
 
 def noise_entry(predictor: Predictor, h: Hypothesis, track: Array) -> Array | None:
@@ -211,13 +229,16 @@ SMALL = 1e-4  # of a state's spread: the difference that a slope is taken over
 STEEPEST = 1.0  # of a rate's own state, per half step
 
 
-def with_effects(predictor: Predictor, h: Hypothesis, x: Array, u: Array, F: Array) -> Array:
+def with_effects(
+    predictor: Predictor, h: Hypothesis, x: Array, u: Array, F: Array, after: Array | None = None
+) -> Array:
     """The Jacobian of a hypothesis' step from x (L, B, n); F (L, B, n, n) of the model alone."""
     one, data = np.eye(x.shape[-1]), predictor.data
     F = passed(predictor, h, x, u, F, one)
     if not rates_of(h):
         return F
-    after, half, mean = predictor.advance(h, x, u, data.time), 0.5 * data.dt, (F - one) / data.dt
+    after = predictor.advance(h, x, u, data.time) if after is None else after
+    half, mean = 0.5 * data.dt, (F - one) / data.dt
     first = rate_slopes(predictor, h, x, u, data.time, mean)
     direct = rate_slopes(predictor, h, after, u, data.time + data.dt, None)
     later = F + half * direct @ F
@@ -298,9 +319,10 @@ def heading_slope(
     """Slope of the heading's rate of this very moment, effects and all, (L, B, n) [1/s]."""
     data, short = predictor.data, 1e-3 * predictor.data.dt
     f_x, _ = predictor.slopes(x, u, predictor.params(h), short)
-    own = (f_x - np.eye(x.shape[-1])) / short
-    slope, name = own[..., heading, :].copy(), data.model.state_names[heading]
+    one, name = np.eye(x.shape[-1]), data.model.state_names[heading]
+    slope = (f_x[..., heading, :] - one[heading]) / short
     if any(name in e.site.targets or f"{name}<-" in e.name for e, _ in rates_of(h)):
+        own = (f_x - one) / short
         slope += rate_slopes(predictor, h, x, u, t, own)[..., heading, :]
     slope[..., [heading, rate]] = 0.0
     return np.asarray(slope)

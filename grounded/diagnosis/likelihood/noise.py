@@ -221,8 +221,12 @@ def _moment(variance: Array, score: Array, cover: Array) -> Array:
 
 
 def working(
-    noise: NoiseModel, adjoint: kalman.Adjoint, G: Array | None, dt: float
-) -> tuple[Array, Array]:
+    noise: NoiseModel,
+    adjoint: kalman.Adjoint,
+    G: Array | None,
+    dt: float,
+    into: tuple[Array, Array],
+) -> None:
     """What each noise, as the smoother sees it, adds to d (L, B, n, K) and r (L + 1, B, n, K).
 
     Args:
@@ -230,21 +234,25 @@ def working(
         adjoint: of the runs under this noise.
         G: how noise enters (L, B, n, n), None for the identity.
         dt: [s].
+        into: d and r, zeros.
     """
     L, B, n = adjoint.u.shape
-    phi = noise.structure.phi(dt)
-    K, i = 2 * n if phi is None else 3 * n, np.arange(n)
-    d, r = np.zeros((L, B, n, K)), np.zeros((L + 1, B, n, K))
-    enters = np.eye(n) if G is None else G
-    d[..., :n] = enters * _scaled(noise.log_q, noise.weight_w, adjoint.r[..., :n])[..., None, :]
-    r[1:, :, i, n + i] = -_scaled(noise.log_r, noise.weight_v, adjoint.u)  # d is foreseen, r is not
+    phi, i, (d, r) = noise.structure.phi(dt), np.arange(n), into
+
+    def enter(at: int, sizes: Array) -> None:
+        if G is None:
+            d[..., i, at + i] = sizes
+        else:
+            np.multiply(G, sizes[..., None, :], out=d[..., at : at + n])
+
+    enter(0, _scaled(noise.log_q, noise.weight_w, adjoint.r[..., :n]))
+    r[1:, ..., i, n + i] = -_scaled(noise.log_r, noise.weight_v, adjoint.u)  # d is foreseen, not r
     if phi is not None:
         kicks = np.exp(noise.log_c) * (1 - phi**2) * adjoint.r[..., n:]
         c = np.zeros((L, B, n))
         for t in range(1, L):
             c[t] = phi * c[t - 1] + kicks[t - 1]
-        d[..., 2 * n :] = enters * c[..., None, :]
-    return d, r
+        enter(2 * n, c)
 
 
 def _scaled(log_variance: Array, weight: Array | float, adjoint: Array) -> Array:

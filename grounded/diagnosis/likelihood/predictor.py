@@ -258,7 +258,8 @@ class Predictor(SentOnce):
 
     def named(self, x: Array) -> Named:
         """States, or their rates (..., n), by name."""
-        return Named("state", self.data.model.state_names, list(np.moveaxis(x, -1, 0)))
+        names = self.data.model.state_names
+        return Named("state", names, [x[..., i] for i in range(len(names))])
 
     def instant(self, h: Hypothesis, x: Array, u: Array) -> Array:
         """The model's own rates at x (..., n), by a very short step."""
@@ -280,7 +281,8 @@ class Predictor(SentOnce):
         `own` are the model's own rates by name, for families that need them.
         """
         names, s = self.data.model.state_names, self.named(x)
-        a = Named("input", self.data.model.input_names, list(np.moveaxis(u, -1, 0)))
+        inputs = self.data.model.input_names
+        a = Named("input", inputs, [u[..., j] for j in range(len(inputs))])
         total = np.zeros_like(x)
         for effect, values in rates:
             added = effect.family.rate(s, a, own, t, values, effect.site)

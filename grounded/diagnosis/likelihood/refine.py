@@ -26,6 +26,7 @@ from grounded.diagnosis.likelihood.delays import Delays, delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated, moved, shift_precision
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.linearise import (
+    columns_of,
     filter_system,
     gains_of,
     linearise,
@@ -50,10 +51,13 @@ from grounded.frozen import Array
 
 MOST_NUMBERS = 1e5  # of one (L, B, N, N) array: what fits in the cache goes fastest
 SHORTEST = 0.05  # part of a step that is still tried
-HALVED = 4  # iterations after which only the better half of rivals goes on
+# iterations of rivals after which only the better half goes on, and how much of what the next step
+# promises counts for the others: of what no step would make one of the better, early
+HALVED = ((2, 3.0), (4, 0.0))
 CLOSE = 10.0  # nats behind the best within which all go on
 LATE = SensorDelayFamily | SensorLagFamily
-LITTLE = 0.05  # nats that a step must promise to be tried in part where it fails
+LITTLE = 0.1  # nats that part of a step must promise to be tried where the step fails
+NOTHING = 0.01  # nats: what promises less, after it hardly rose, is not tried at all
 
 
 @dataclass(eq=False)
@@ -67,6 +71,7 @@ class Work:
     step: ProposedStep | None = None
     part: float = 1.0  # of the step that is taken
     still: bool = False  # it no longer rises
+    given_up: bool = False  # too far behind its rivals
     moving: bool = True  # the track too: where the model has kinks that may not help
     along: Predictor | None = None  # of its own track, while it climbs
 
@@ -76,10 +81,15 @@ class Work:
             self.moving = False
         else:
             self.part *= 0.4
-        if self.step is None or self.part < SHORTEST or self.step.promise < LITTLE:
+        if self.step is None or self.part < SHORTEST or self.hope < LITTLE:
             self.still = True
         else:
             self.go(data)
+
+    @property
+    def hope(self) -> float:
+        """Nats that the part of the step that is taken next promises."""
+        return 0.0 if self.step is None else self.step.promise * self.part * (2 - self.part)
 
     def go(self, data: Data) -> None:
         """From the best point by a part of the step."""
@@ -113,19 +123,27 @@ def refine(
         worth: of rivals, by which the worse half is given up on the way; None: all go on.
     """
     works = [
-        Work(s.hypothesis, s.noise, s.track) if isinstance(s, Fitted) else Work(*s) for s in starts
+        Work(s.hypothesis, s.noise, s.track, s if s.settled else None, still=s.settled)
+        if isinstance(s, Fitted)
+        else Work(*s)
+        for s in starts
     ]
     if not works:
         return []
     (L, B), n = predictor.data.time.shape, predictor.data.model.n
     wide = n if works[0].noise.structure.tau is None else 2 * n
     size = max(1, int(MOST_NUMBERS / (L * B * wide * wide)))
-    if worth is not None and iterations > HALVED:
-        works = _after(predictor, works, HALVED, size, fixed_noise, tick)
-        _halve(works, worth)
-        iterations -= HALVED
+    done = 0
+    for at, promised in HALVED if iterations > HALVED[-1][0] else ():
+        if worth is None:
+            break
+        works = _after(predictor, works, at - done, size, fixed_noise, tick)
+        _halve(works, worth, promised)
+        done = at
+    iterations -= done
     works = _after(predictor, works, iterations, size, fixed_noise, tick)
-    return [work.best for work in works if work.best is not None]
+    fits = [(work.best, work.still and not fixed_noise) for work in works if work.best is not None]
+    return [replace(fit, settled=True) if top and not fit.settled else fit for fit, top in fits]
 
 
 def _after(
@@ -158,21 +176,21 @@ def _climb(predictor: Predictor, works: list[Work], how: tuple[int, bool]) -> li
     return [replace(work, along=None) for work in works]
 
 
-def _halve(works: list[Work], worth: Callable[[Fitted], float]) -> None:
+def _halve(works: list[Work], worth: Callable[[Fitted], float], promised: float) -> None:
     """The worse half stays where it is: who is that far behind by now does not overtake."""
     value = {id(work): worth(work.best) for work in works if work.best is not None}
     ranked = sorted(value.values(), reverse=True)
     for work in works:
-        mine = value.get(id(work), -np.inf)
+        mine = value.get(id(work), -np.inf) + promised * work.hope
         if mine < ranked[len(ranked) // 2] and mine < ranked[0] - CLOSE:
-            work.still = True
+            work.given_up = True
 
 
 def _of_one_shape(works: list[Work]) -> list[list[int]]:
     """Indices of works that go on, by the size of their filters' states: so many late sensors."""
     groups: dict[int, list[int]] = {}
     for i, work in enumerate(works):
-        if work.still:
+        if work.still or work.given_up:
             continue
         late = {e.site.target for e in work.h.effects if isinstance(e.family, LATE)}
         groups.setdefault(len(late), []).append(i)
@@ -183,12 +201,18 @@ def _iterate(predictor: Predictor, works: list[Work], fixed_noise: bool) -> None
     data = predictor.data
     B = data.time.shape[1]
     late = [delays_of(work.h, data) for work in works]
-    parts = [linearise(work.along or predictor, work.h, work.track) for work in works]
-    width = kalman.whole(max(part[1].shape[-1] for part in parts), data.model.n)
-    d, r = (_side_by_side([part[k] for part in parts], width) for k in (1, 2))
+    counts = [columns_of(work.h, data) for work in works]
+    width = kalman.whole(max(counts), data.model.n)
+    (L, _), n, runs = data.time.shape, data.model.n, B * len(works)
+    d, r = np.zeros((L, runs, n, width)), np.zeros((L + 1, runs, n, width))
+    own = [slice(i * B, (i + 1) * B) for i in range(len(works))]
+    F = [
+        linearise(work.along or predictor, work.h, work.track, (d[:, i], r[:, i]))[0]
+        for work, i in zip(works, own, strict=True)
+    ]
     systems = [
-        filter_system(predictor, work.h, work.noise, work.track, part[0])
-        for work, part in zip(works, parts, strict=True)
+        filter_system(predictor, work.h, work.noise, work.track, jacobian)
+        for work, jacobian in zip(works, F, strict=True)
     ]
     system, delayed = joined(systems)
     try:
@@ -202,27 +226,37 @@ def _iterate(predictor: Predictor, works: list[Work], fixed_noise: bool) -> None
         return
     white, filtered = kalman.innovations(g, d, r, track=True)
     assert filtered is not None
-    started = smoothed(data, g, np.concatenate([part[0] for part in parts], axis=1), white[..., 0])
+    started = smoothed(data, g, np.concatenate(F, axis=1), white[..., 0])
     if started is not None:
         filtered[0, ..., 0] += started
-    steps = [(work.noise, 0.0) for work in works]
+    rises: dict[int, float] = {}
+    for i, (work, there) in enumerate(zip(works, own, strict=True)):
+        before = 0.0
+        if (delays := late[i]) is not None:
+            entry, residual = systems[i][0].G, white[:, there, :, 0]
+            before = delays.before(work.noise, entry, work.track, residual, g.weight[:, there])
+        columns, error = white[:, there, :, : counts[i]], filtered[:, there, :, 0]
+        fit = _scored(predictor, work, columns, g.logdet[:, there], error, before)
+        if (rise := _rises(work, fit)) > 0:
+            rises[i] = rise
+        else:
+            work.shorten(data)
+    if not rises:
+        return
+    up = [works[i] for i in rises]
+    steps = [(work.noise, 0.0) for work in up]
     if not fixed_noise:
-        steps = _climbed(data, works, late, systems, g, white[..., 0])
-    for i, work in enumerate(works):
-        own = slice(i * B, (i + 1) * B)
-        columns, before, delays = parts[i][1].shape[-1], 0.0, late[i]
-        if delays is not None:
-            entry, residual = systems[i][0].G, white[:, own, :, 0]
-            before = delays.before(work.noise, entry, work.track, residual, g.weight[:, own])
-        _update(
-            predictor,
-            work,
-            white[:, own, :, :columns],
-            g.logdet[:, own],
-            filtered[:, own, :, :columns],
-            steps[i],
-            before,
-        )
+        residual = white[..., 0]
+        if len(up) < len(works):
+            which = np.concatenate([np.arange(runs)[own[i]] for i in rises])
+            g, residual = g.of_runs(which), residual[:, which]
+        of_up = [late[i] for i in rises], [systems[i] for i in rises]
+        steps = _climbed(data, up, *of_up, g, residual)
+    for i, work, step in zip(rises, up, steps, strict=True):
+        assert work.best is not None
+        work.step = proposed(data, work.best, filtered[:, own[i], :, : counts[i]], *step)
+        work.still = work.still or (rises[i] < 1.0 and work.step.promise < NOTHING)
+        work.go(data)
 
 
 def _climbed(
@@ -236,13 +270,14 @@ def _climbed(
     """Each work's noise after one step up the likelihood, and what it promises [nats]."""
     B, width = data.time.shape[1], data.model.n
     adjoints = kalman.smoother(g, white).parts(B)
-    columns_each = []
-    for work, delays, (own, _), adjoint in zip(works, delays_each, systems, adjoints, strict=True):
+    K = width * (2 if works[0].noise.structure.tau is None else 3)
+    L, runs, _ = white.shape
+    d, r = (np.zeros((T, runs, width, kalman.whole(K, width))) for T in (L, L + 1))
+    each_own = zip(works, delays_each, systems, adjoints, strict=True)
+    for i, (work, delays, (own, _), adjoint) in enumerate(each_own):
         noise = work.noise if delays is None else delays.noise(work.noise)
-        columns_each.append(working(noise, adjoint, own.G, data.dt))
-    K = columns_each[0][0].shape[-1]
-    wide = kalman.whole(K, width)
-    d, r = (_side_by_side([part[k] for part in columns_each], wide) for k in (0, 1))
+        there = slice(i * B, (i + 1) * B)
+        working(noise, adjoint, own.G, data.dt, (d[:, there], r[:, there]))
     columns = kalman.innovations(g, d, r)[0]
     found = []
     for i, (work, delays, adjoint) in enumerate(zip(works, delays_each, adjoints, strict=True)):
@@ -280,50 +315,29 @@ def clean(predictor: Predictor, fit: Fitted, rounds: int = 8) -> Fitted:
     return found[0] if found else fit
 
 
-def _side_by_side(parts: Sequence[Array], width: int) -> Array:
-    """Columns (steps, B, n, any) of several works along the runs, zeros up to `width`."""
-    steps, B, n, _ = parts[0].shape
-    found = np.zeros((steps, B * len(parts), n, width))
-    for i, part in enumerate(parts):
-        found[:, i * B : (i + 1) * B, :, : part.shape[-1]] = part
-    return found
-
-
-def _update(
-    predictor: Predictor,
-    work: Work,
-    white: Array,
-    logdet: Array,
-    filtered: Array,
-    climbed: tuple[NoiseModel, float],
-    before: float,
-) -> None:
-    """Scores the point where the work stands, keeps it if it is the best, and moves on."""
-    data = predictor.data
-    residual, columns = white[..., 0], white[..., 1:]
-    fit = _scored(predictor, work, residual, columns, logdet, filtered[..., 0], before)
+def _rises(work: Work, fit: Fitted) -> float:
+    """How far the point where the work stands is above its best so far; then it is kept."""
     rise = np.inf if work.best is None else fit.evidence - work.best.evidence
     if not (rise > 0 and np.isfinite(fit.evidence)):
-        work.shorten(data)
-        return
+        return 0.0
     work.still = not rise > 0.03
     work.moving = work.moving or rise > 1.0
     work.part = min(1.0, 2 * work.part)
     work.best = fit
-    work.step = proposed(data, fit, filtered, *climbed)
-    work.go(data)
+    return float(rise)
 
 
 def _scored(
     predictor: Predictor,
     work: Work,
-    residual: Array,
-    columns: Array,
+    white: Array,
     logdet: Array,
     error: Array,
     before: float,
 ) -> Fitted:
+    """The point where a work stands; the residual is the first of its columns."""
     data, h = predictor.data, work.h
+    residual, columns = white[..., 0], white[..., 1:]
     L, B, n, C = columns.shape
     by_run = np.ascontiguousarray(columns.swapaxes(0, 1)).reshape(B, L * n, C)
     flat = np.ascontiguousarray(residual.swapaxes(0, 1)).reshape(B, L * n)

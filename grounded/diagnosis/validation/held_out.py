@@ -133,10 +133,12 @@ def _again(predictor: Predictor, h: Hypothesis, trial: Trial, start: Array, i: i
     """The trial as a hypothesis predicts it, from its start, with its commands."""
     data = predictor.data
     received = predictor.received(h)[i]
-    advance, path = predictor.stepper(h), [start[None]]
-    for t in range(trial.steps):
-        x = advance(path[-1], received[t][None], np.array([t * data.dt]))
-        path.append(np.minimum(np.maximum(x, -FAR), FAR))
-    states = np.stack(path)
+    states = predictor.marched(h, start[None], received[: trial.steps, None])
+    if states is None or not (np.abs(states) < FAR).all():
+        advance, path = predictor.stepper(h), [start[None]]
+        for t in range(trial.steps):
+            x = advance(path[-1], received[t][None], np.array([t * data.dt]))
+            path.append(np.minimum(np.maximum(x, -FAR), FAR))
+        states = np.stack(path)
     logged = states + predictor.offset(h, states)
     return replace(trial, states=logged[:, 0])
