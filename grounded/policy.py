@@ -134,7 +134,7 @@ class Policy:
         gain = (1 - alpha) * own_gain + alpha * other.gain
         return replace(other, feedforward=mixed, gain=gain)
 
-    def commands(self, states: Array, past: Array) -> Array:
+    def commands(self, states: Array, past: Array, sent: Array | None = None) -> Array:
         """What it sends on given states, (B, T, m); T is at most H.
 
         It remembers what it sent itself: a gain on the last inputs would make any smooth log look
@@ -143,6 +143,7 @@ class Policy:
         Args:
             states: (B, T, n), B runs.
             past: (m,) the inputs held before the first step.
+            sent: (B, T, m) what it remembers instead, many times quicker.
         """
         T, n = states.shape[1:]
         asked: Array = np.repeat(self.feedforward[None, :T], len(states), 0)
@@ -152,9 +153,17 @@ class Policy:
         asked += np.einsum("tij,btj->bti", self.gain[:T, :, :n], off)
         memory, newest = self.gain[:T, :, n:], np.cumsum([0, *self.depths[:-1]])
         asked -= np.einsum("tij,tj->ti", memory, self.reference[:T, n:])
+        if sent is not None:
+            oldest = max(self.depths)
+            held = np.concatenate([np.repeat(past[None, None], oldest, 1), sent], axis=1)
+            places = [(j, oldest - i) for j, d in enumerate(self.depths) for i in range(1, d + 1)]
+            for k, (j, start) in enumerate(places):
+                asked += memory[:, :, k] * held[:, start : start + T, j, None]
+            return np.clip(asked, self.low, self.high)
         z = np.repeat(np.repeat(past, self.depths)[None], len(states), 0)
         for t in range(T):
-            asked[:, t] = np.clip(asked[:, t] + z @ memory[t].T, self.low, self.high)
+            sent = np.maximum(asked[:, t] + z @ memory[t].T, self.low)  # clip takes twice as long
+            asked[:, t] = np.minimum(sent, self.high)
             z[:, 1:] = z[:, :-1].copy()
             z[:, newest] = asked[:, t]
         return asked

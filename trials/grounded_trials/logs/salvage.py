@@ -25,6 +25,7 @@ from grounded_trials.formats.mcap_records import (
     MESSAGE_HEADER,
     MESSAGE_INDEX,
     METADATA,
+    MAGIC,
     PARSERS,
     BadRecord,
     Channel,
@@ -37,7 +38,6 @@ from grounded_trials.formats.mcap_records import (
     decompress_part,
 )
 from grounded_trials.formats.mcap_walk import (
-    MAGIC,
     RECORD_LIMIT,
     again,
     chunk_records,
