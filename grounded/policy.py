@@ -14,14 +14,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from grounded import onboard
 from grounded.errors import GroundedError
 from grounded.frozen import Array, readonly, wrapped
-from grounded.onboard import FORMAT, NUMBERS, Runner
+
+if TYPE_CHECKING:
+    from grounded.onboard import Runner
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,6 +177,8 @@ def z_difference(a: Array, b: Array, angles: tuple[bool, ...]) -> Array:
 
 def to_arrays(policy: Policy, **about: str) -> dict[str, Any]:
     """A policy as arrays and strings for `numpy.savez`; `about` adds what a reader may check."""
+    from grounded.onboard import FORMAT, NUMBERS
+
     arrays: dict[str, Any] = {name: getattr(policy, name) for name in NUMBERS}
     arrays |= {
         "format": FORMAT,
@@ -210,10 +213,12 @@ def load(
     Raises:
         GroundedError: if the file is no exported candidate, or one for another robot or task.
     """
+    from grounded import onboard
+
     if Path(path).suffix == ".mcap":
-        return Runner(_proposed(Path(path), states, inputs, task))
+        return onboard.Runner(_proposed(Path(path), states, inputs, task))
     try:
-        return Runner(Policy(**onboard.read(path, states, inputs, task)))
+        return onboard.Runner(Policy(**onboard.read(path, states, inputs, task)))
     except ValueError as error:
         raise GroundedError(str(error)) from None
 
@@ -223,6 +228,8 @@ def _proposed(
 ) -> Policy:
     """A policy from a file whose format is registered by its suffix, checked as an .npz is."""
     from importlib.metadata import entry_points
+
+    from grounded import onboard
 
     readers = [p for p in entry_points(group="grounded.policies") if p.name == path.suffix[1:]]
     if not readers:
