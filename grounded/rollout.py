@@ -7,8 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from grounded.compile import Problem
-from grounded.frozen import Array, readonly
+from grounded.frozen import Array, readonly, wrapped
 from grounded.policy import Policy
+
+Run = tuple[Array, Array]  # states (H + 1, n) and inputs (H, m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,3 +57,15 @@ def augmented(problem: Problem, states: Array, inputs: Array, past: Array) -> Ar
             np.stack([sent[depth - 1 - i : depth + T - i] for i in range(depth)], axis=1)
         )
     return np.hstack(columns)
+
+
+def apart(problem: Problem, a: Run, b: Run) -> float:
+    """The cost of the difference of two runs, in the states that both have."""
+    n = min(a[0].shape[1], b[0].shape[1])
+    with np.errstate(all="ignore"):
+        x = wrapped(a[0][:, :n] - b[0][:, :n], problem.angles[:n]) ** 2
+        u = a[1] - b[1]
+        change = np.diff(u, axis=0, prepend=0.0) ** 2
+        cost = np.vdot(problem.state_weight[:, :n], x) + np.sum(u**2 @ problem.input_weight)
+        cost += np.sum(change @ problem.change_weight)
+    return float(cost) if np.isfinite(cost) else np.inf

@@ -11,7 +11,8 @@ from grounded.compile import DescentOptions, Problem
 from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.result import Result, document
-from grounded.search.candidate import Candidate, Tried, Way
+from grounded.rollout import Rollout, apart
+from grounded.search.candidate import Candidate, Slopes, Tried, Way
 from grounded.search.planner import Planner, predicted
 from grounded.search.safety import objections, spread
 from grounded.search.standing import SearchOptions, Standing, losers_of, wild
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
 PLANNING = DescentOptions(max_iterations=30, tolerance=1e-6)  # a direction needs no more digits
 GENTLER = 1e3  # factor on the price of inputs from which gentler gains are designed
+NEAR = 0.2  # of the way that one that lost would go: a step that ends so near is the same one
 SWINGS = 6  # of an input about its plan, each as large as the plan's own range: a limit cycle
 
 
@@ -63,6 +65,11 @@ class About:
         self.already = already if np.isfinite(already) else incumbent.utility
         self.least = options.tolerance * abs(self.already)
 
+    @property
+    def slopes(self) -> Slopes:
+        """Whose they are."""
+        return "corrected" if self.corrected else ""
+
     def _kept(self) -> bool:
         """Whether the model's own slopes have foretold what the step to the incumbent brought."""
         made, history = self.incumbent.candidate, self.make.now.history
@@ -76,7 +83,7 @@ class About:
     def candidate(self, policy: Policy, step: Step, way: Way) -> Candidate:
         """A candidate with what this model promises of it, and how far that is likely to be off."""
         made = self.make.candidate(policy, self.real, step, self.already, way)
-        made = replace(made, slopes="corrected" if self.corrected else "")
+        made = replace(made, slopes=self.slopes)
         return self._steadied(made) if made.predicted_gain > self.least else made
 
     def _steadied(self, made: Candidate) -> Candidate:
@@ -88,8 +95,6 @@ class About:
                 made = self.make.foretold(made, old, self.real, self.already)
         if not self.missed:
             return made
-        from grounded.search.mispredictions import apart
-
         moved = apart(self.real, (made.predicted_states, made.predicted_inputs), self.run)
         return replace(made, likely_off=self.missed * moved)
 
@@ -97,23 +102,30 @@ class About:
         """The first step worth a trial; one that is not allowed, or None; adds to the promises.
 
         One that is likely to lose, for what the model misses, is left for when there is no other.
+        One whose run is nearly that of a candidate that lost is none: where the price on leaving
+        the trial's inputs is small beside the others, ten times the damping is the same step.
+
+        Args:
+            first: the step that is due, whatever the slopes of those that lost.
+            promised: gains that were too small.
         """
         make, options, plan = self.make, self.options, self.make.planner.plan
-        own = self.incumbent.candidate.id
-        lost = losers_of(make.now.history, own, make.fingerprint, self.way)
-        losers = {(candidate.damping, candidate.alpha) for candidate in lost}
+        history, model = make.now.history, make.fingerprint
+        first = options.due(history, self.incumbent, model, self.way, self.slopes) or first
+        lost = losers_of(history, self.incumbent.candidate.id, model)
+        foretold = [predicted(self.real, candidate.policy) for candidate in lost]
         unsafe: Proposal | None = None
         doubted: Proposal | None = None
         directions: dict[float, Policy] = {}
         for step in options.steps_from(first):
-            if (step.damping, step.alpha) in losers:
-                continue
             if step.damping not in directions:
                 directions[step.damping] = direction(
                     plan, self.theta, self.grounding, options, step.damping, self.corrected
                 )
             policy = self.theta.toward(directions[step.damping], step.alpha)
             made = self.candidate(policy, step, self.way)
+            if any(self._near(made, run) for run in foretold):
+                continue
             if made.predicted_gain > self.least:
                 proposal = make.checked(made)
                 if proposal.candidate is None:
@@ -129,6 +141,11 @@ class About:
         if doubted is not None and doubted.candidate is not None:
             return replace(doubted, candidate=self._told(doubted.candidate))
         return unsafe
+
+    def _near(self, made: Candidate, lost: Rollout) -> bool:
+        """Whether a candidate is to do nearly what one that lost would do in this model."""
+        run, other = (made.predicted_states, made.predicted_inputs), (lost.states, lost.inputs)
+        return apart(self.real, run, other) <= NEAR**2 * apart(self.real, self.run, other)
 
     def _told(self, made: Candidate) -> Candidate:
         """The same; what it is likely to be off by is no less than what the alternatives say."""

@@ -38,7 +38,7 @@ import numpy as np
 from grounded.compile import Problem
 from grounded.frozen import Array, wrapped
 from grounded.policy import Policy
-from grounded.rollout import augmented
+from grounded.rollout import Run, apart, augmented
 from grounded.search.candidate import Tried
 from grounded.search.corrected import Corrected
 from grounded.search.feedback import Alternative
@@ -53,9 +53,6 @@ NEAREST = 12  # trials that count
 ASKED = 3  # the nearest trials, which are left out in turn
 LATEST = 100  # of which they are chosen
 DEAD = 1e-4  # of the mean square effect of the inputs: less explains nothing
-
-
-Run = tuple[Array, Array]  # states (H + 1, n) and inputs (H, m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,20 +132,8 @@ def _with(law: Array | None, own: Seen, grounded: Problem) -> Believed:
 def unforetold(problem: Problem, own: Seen, other: Seen) -> float:
     """The share of what a trial did otherwise than the incumbent's that a model is off by."""
     found = predicted(problem, other.policy)
-    run = (found.states[:, : own.x.shape[1]], found.inputs)
+    run = (found.states, found.inputs)
     return min(1.0, apart(problem, run, other.run) / apart(problem, own.run, other.run))
-
-
-def apart(problem: Problem, a: Run, b: Run) -> float:
-    """The cost of the difference of two runs."""
-    n = a[0].shape[1]
-    with np.errstate(all="ignore"):
-        x = wrapped(a[0] - b[0], problem.angles[:n]) ** 2
-        u = a[1] - b[1]
-        change = np.diff(u, axis=0, prepend=0.0) ** 2
-        cost = np.vdot(problem.state_weight[:, :n], x) + np.sum(u**2 @ problem.input_weight)
-        cost += np.sum(change @ problem.change_weight)
-    return float(cost) if np.isfinite(cost) else np.inf
 
 
 def seen(planner: Planner, tried: Tried, grounded: Problem) -> Seen | None:

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result, document
-from grounded.search.candidate import Candidate, Tried, Way
+from grounded.search.candidate import Candidate, Slopes, Tried, Way
 from grounded.search.certainty import judged, last_improvement
 from grounded.search.step_size import Step, after_failure, after_success
 from grounded.task import Task
@@ -99,13 +99,23 @@ class SearchOptions:
         recorded = incumbent.way == "recorded inputs"
         return ("recorded inputs", "") if recorded else ("", "recorded inputs")
 
-    def due(self, history: Sequence[Tried], incumbent: Tried, model: str, way: Way) -> Step | None:
+    def due(
+        self,
+        history: Sequence[Tried],
+        incumbent: Tried,
+        model: str,
+        way: Way,
+        slopes: Slopes | None = None,
+    ) -> Step | None:
         """The step that is due from the incumbent in one way; None where it is exhausted.
 
-        A direction belongs to one model: what was learnt with another counts for nothing.
+        A direction belongs to one model, and to one kind of its slopes where that is known: what
+        was learnt with another counts for nothing.
         """
         made = incumbent.candidate
         losers = losers_of(history, made.id, model, way)
+        if slopes is not None:
+            losers = [candidate for candidate in losers if candidate.slopes == slopes]
         if way != self.ways(made)[0] and (incumbent.standard_error > 0 or len(losers) >= OTHER_WAY):
             return None  # where trials scatter, one way is enough to be told from luck
         if losers:

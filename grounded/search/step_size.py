@@ -22,6 +22,10 @@ Damping goes on rising where the paper halves alpha: a damped step is the best o
 the grounded model, a halved one a mixture of two policies that neither was planned for. With
 `[search] step = "full"` alpha is halved from the start, as the paper has it.
 
+That holds among steps by the same slopes: the crude model's losses say nothing of steps by slopes
+that trials have corrected (`mispredictions`). And where mu is small beside the other prices, ten
+times the damping is the same step: one that the model runs nearly as one that lost is passed over.
+
 Real trials are the evaluations of this line search, so it is no loop but a question put to the
 trials so far. A step may also be passed over because its predicted run leaves the safe region.
 """

@@ -10,11 +10,11 @@ import pytest
 
 from grounded.model import Model, Param
 from grounded.plant import Noise, Plant
-from grounded.search.candidate import Candidate
+from grounded.search.candidate import Candidate, Tried
 from grounded.search.first_policy import first_policy
 from grounded.search.improve import propose
 from grounded.search.making import About, Maker, expected
-from grounded.search.planner import Planner, model_fingerprint, planner_for
+from grounded.search.planner import Planner, model_fingerprint, planner_for, predicted
 from grounded.search.standing import SearchOptions, standing
 from grounded.search.step_size import Step
 from grounded.utility import Reward
@@ -75,6 +75,21 @@ def test_gains_that_hold_are_kept(noisy):
     about, best = noisy.about, noisy.now.incumbent
     made = about.candidate(about.theta, Step(), "")
     np.testing.assert_allclose(made.policy.gain, best.candidate.policy.gain)
+
+
+def test_a_step_that_lost_is_not_tried_again_under_another_name(noisy):
+    """Crude steps of an arm with armature at damping 0.03, 0.3 and 3.3 were the same one, lost."""
+    about, now = noisy.about, noisy.now
+    about.least = 1e-9
+    found = about.step_from(Step(), []).candidate
+    lost = replace(found, id="c0098", damping=0.5, way="recorded inputs")
+    history = (*now.history, Tried(lost, now.history[0].trials, (-100.0,), False))
+    about.make = replace(about.make, now=replace(now, history=history))
+    run = predicted(about.real, found.policy)
+    assert about._near(found, run)
+    again = about.step_from(Step(), [])
+    assert again.candidate.damping > found.damping
+    assert not about._near(again.candidate, run)
 
 
 def test_what_a_model_is_likely_to_miss_grows_with_the_step(noisy):

@@ -108,8 +108,11 @@ def test_trials_that_do_not_improve_raise_the_damping_until_nothing_is_promised(
     story = Story(tolerance=1e-9).add()
     while story.propose().candidate is not None:
         story.add(bad)
-    made = [c.damping for c in story.candidates[1:] if c.way == ""]
-    assert made == sorted(set(made)) and made[0] == 1.0 and len(made) >= 1
+    made = [(c.slopes, c.damping) for c in story.candidates[1:] if c.way == ""]
+    assert made[0] == ("", 1.0) and len(set(made)) == len(made)
+    for slopes in ("", "corrected"):
+        own = [damping for kind, damping in made if kind == slopes]
+        assert own == sorted(own)
     others = [c.way for c in story.candidates[1 + len(made) :]]
     assert set(others) <= {"recorded inputs"} and len(others) <= OTHER_WAY
     ended = story.propose().standing
@@ -370,11 +373,11 @@ def test_a_search_with_nothing_to_gain_ends_before_a_trial_is_spent():
 
 
 def test_another_model_starts_again_with_the_first_step_from_the_best_policy():
-    story = Story(max_halvings=2).add().add(bad).add(bad)
+    story = Story(max_halvings=2).add().add(bad).add(bad).add(bad)
     assert story.candidates[-1].damping == 10.0
     story.task = story.task.with_model(other(TASK.model, 1.3))  # fitted, say
     made = story.propose().candidate
-    assert (made.damping, made.base, made.id) == (1.0, "c0001", "c0004")
+    assert (made.damping, made.base, made.id) == (1.0, "c0001", "c0005")
     assert story.now.outstanding is made
 
 
@@ -582,3 +585,18 @@ def test_gains_are_cut_only_where_the_loop_swung_to_and_fro(times, made):
         assert np.abs(second.policy.gain).mean() < 0.5 * np.abs(first).mean()
         story.add(lambda trial: bad(trial, 60.0)).propose()  # it lost: not again
         assert [c.way for c in story.candidates].count("gentler gains") == 1
+
+
+def test_losses_of_other_slopes_raise_no_damping():
+    story = Story(tolerance=1e-9).add()
+    while story.propose().candidate is not None and len(story.candidates) < 3:
+        story.add(bad)
+    now, model = story.now, story.candidates[0].model
+    first = story.candidates[1]
+    assert (first.slopes, first.damping) == ("", 1.0)
+    history = now.history[:2]
+    steps = [
+        story.options.due(history, now.incumbent, model, "", slopes)
+        for slopes in (None, "", "corrected")
+    ]
+    assert [step.damping for step in steps] == [10.0, 10.0, 1.0]

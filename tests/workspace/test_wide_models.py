@@ -12,8 +12,8 @@ from grounded.instruments.preflight import preflight
 from grounded.model import Model, Param
 from grounded.trial import Trial
 from grounded_trials import Workspace
-from grounded_trials.formats.mcap_writer import encode_doubles
-from grounded_trials.formats.protobuf import uniform_doubles
+from grounded_trials.formats.mcap_writer import encode_doubles, encode_lists
+from grounded_trials.formats.protobuf import double_tag, doubles_tag, uniform_doubles
 
 RING = """
 import numpy as np
@@ -114,10 +114,24 @@ def test_messages_of_many_numbers_are_read_in_one_piece():
     messages = encode_doubles(values)
     buffer, lengths = b"".join(messages), [len(message) for message in messages]
     end = np.cumsum(lengths)
-    numbers = list(range(1, 301))
-    assert np.array_equal(uniform_doubles(buffer, end - lengths, end, numbers), values)
-    assert uniform_doubles(buffer, end - lengths, end, [*numbers[1:], 1]) is None
-    assert uniform_doubles(buffer, end - lengths, end, numbers[:-1]) is None
+    fields = [(double_tag(number), 1) for number in range(1, 301)]
+    found = uniform_doubles(buffer, end - lengths, end, fields)
+    assert np.array_equal(np.column_stack(found), values)
+    assert uniform_doubles(buffer, end - lengths, end, [*fields[1:], fields[0]]) is None
+    assert uniform_doubles(buffer, end - lengths, end, fields[:-1]) is None
+
+
+def test_lists_of_numbers_are_read_in_one_piece():
+    rng = np.random.default_rng(0)
+    lists = [rng.standard_normal((5, count)) for count in (2, 40)]
+    messages = encode_lists(lists)
+    buffer, lengths = b"".join(messages), [len(message) for message in messages]
+    end = np.cumsum(lengths)
+    fields = [(doubles_tag(1, 2), 2), (doubles_tag(2, 40), 40)]
+    found = uniform_doubles(buffer, end - lengths, end, fields)
+    assert all(np.array_equal(a, b) for a, b in zip(found, lists, strict=True))
+    assert uniform_doubles(buffer, end - lengths, end, fields[::-1]) is None
+    assert uniform_doubles(buffer, end - lengths, end, [(doubles_tag(1, 42), 42)]) is None
 
 
 def test_of_many_commands_a_late_noisy_copy_is_found():

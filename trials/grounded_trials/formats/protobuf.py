@@ -8,6 +8,7 @@ message that is absent has no row.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -118,24 +119,41 @@ def protobuf_messages(buffer: bytes, type: Struct, start: Ints, end: Ints) -> No
     return _ProtobufNode(type, np.arange(len(start)), start, end, wire, buffer)
 
 
-def uniform_doubles(buffer: bytes, start: Ints, end: Ints, numbers: list[int]) -> Floats | None:
-    """Messages that all hold exactly the doubles `numbers` in this order, (N, k); else None.
+def double_tag(number: int) -> bytes:
+    """What stands before a double."""
+    return varint(number << 3 | FIXED64)
+
+
+def doubles_tag(number: int, count: int) -> bytes:
+    """What stands before a packed list of so many doubles."""
+    return varint(number << 3 | BYTES) + varint(8 * count)
+
+
+def uniform_doubles(
+    buffer: bytes, start: Ints, end: Ints, fields: Sequence[tuple[bytes, int]]
+) -> list[Floats] | None:
+    """Messages that all hold exactly these fields in this order; None for others.
 
     It is how `mcap_writer` writes; reading it this way is ten times as fast as field by field.
+
+    Args:
+        buffer: the bytes.
+        start: where each message starts, (N,).
+        end: where it ends, (N,).
+        fields: the tag of each, and how many doubles follow it.
+
+    Returns:
+        The numbers of each field, (N, count).
     """
-    if not len(start):
+    sizes = [size for tag, count in fields for size in (len(tag), 8 * count)]
+    if not len(start) or (end - start != sum(sizes)).any():
         return None
-    tags = [varint(number << 3 | FIXED64) for number in numbers]
-    first = np.cumsum([0, *(len(tag) + 8 for tag in tags)])  # of each tag; then the size
-    if (end - start != first[-1]).any():
-        return None
-    block = windows(buffer, f"V{first[-1]}")[start].view(np.uint8).reshape(len(start), -1)
-    within = np.arange(first[-1]) - np.repeat(first[:-1], np.diff(first))
-    is_tag = within < np.repeat(np.diff(first) - 8, np.diff(first))
-    if (block[:, is_tag] != np.frombuffer(b"".join(tags), dtype=np.uint8)).any():
-        return None
-    values = np.ascontiguousarray(block[:, ~is_tag])
-    return values.view("<f8").astype(np.float64)
+    block = windows(buffer, f"V{sum(sizes)}")[start].view(np.uint8).reshape(len(start), -1)
+    parts = np.split(block, np.cumsum(sizes)[:-1], axis=1)
+    for (tag, _), found in zip(fields, parts[::2], strict=True):
+        if (found != np.frombuffer(tag, dtype=np.uint8)).any():
+            return None
+    return [np.ascontiguousarray(part).view("<f8").astype(np.float64) for part in parts[1::2]]
 
 
 def _occurrences(node: _ProtobufNode, number: int) -> tuple[Ints, Ints, Ints, Ints]:

@@ -34,7 +34,13 @@ from grounded_trials.formats.mcap_records import (
 from grounded_trials.formats.mcap_walk import DamagedFile, read_records
 from grounded_trials.formats.messages import Array as ArrayType
 from grounded_trials.formats.messages import BadMessage, BadSchema, Number, Struct
-from grounded_trials.formats.protobuf import ProtobufItems, protobuf_messages, uniform_doubles
+from grounded_trials.formats.protobuf import (
+    ProtobufItems,
+    double_tag,
+    doubles_tag,
+    protobuf_messages,
+    uniform_doubles,
+)
 from grounded_trials.formats.schemas import struct_of
 from grounded_trials.plain_file import read_file
 
@@ -126,18 +132,25 @@ class OwnFile:
     def doubles(self, topic: str, names: list[str]) -> Array:
         """The numbers of a topic's messages, (N, len(names))."""
         type, batches = self._topic(topic, names, listed=False)
-        numbers = [type.by_name[name].number for name in names]
+        fields = [(double_tag(type.by_name[name].number), 1) for name in names]
         blocks = []
         for batch in batches:
-            block = uniform_doubles(batch.buffer, batch.starts, batch.ends, numbers)
-            if block is None:
-                block = np.column_stack([self._values(type, batch, name)[0] for name in names])
-            blocks.append(block)
+            values = uniform_doubles(batch.buffer, batch.starts, batch.ends, fields)
+            if values is None:
+                values = [self._values(type, batch, name)[0] for name in names]
+            blocks.append(np.column_stack(values))
         return np.concatenate(blocks or [np.zeros((0, len(names)))])
 
     def lists(self, topic: str, sizes: Mapping[str, int]) -> list[Array]:
         """Lists of a topic's messages, (N, size) each; (0, size) where no message has any."""
         type, batches = self._topic(topic, sizes, listed=True)
+        all_there = [
+            (doubles_tag(type.by_name[name].number, size), size) for name, size in sizes.items()
+        ]
+        read = (uniform_doubles(b.buffer, b.starts, b.ends, all_there) for b in batches)
+        uniform = [values for values in read if values is not None]
+        if uniform and len(uniform) == len(batches):
+            return [np.concatenate(blocks) for blocks in zip(*uniform, strict=True)]
         found = []
         for name, size in sizes.items():
             parts = [self._values(type, batch, name) for batch in batches]

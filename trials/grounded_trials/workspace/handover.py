@@ -127,7 +127,7 @@ def intact(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]:
     candidate, meta = candidate_of(data, identity)
     predicted, policy = candidate.predicted_inputs, candidate.policy
     with np.errstate(all="ignore"):
-        sent = policy.commands(candidate.predicted_states[None, :-1], policy.past)
+        sent = policy.commands(candidate.predicted_states[None, :-1], policy.past, predicted[None])
         off = np.abs(sent[0] - predicted)
         wrong = off > AGREES * (1 + np.abs(predicted).max(axis=0))
     if wrong.any():

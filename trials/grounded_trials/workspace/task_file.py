@@ -6,6 +6,7 @@ target.csv says what the states are to do, a row a control step; a state without
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Mapping
 from contextlib import suppress
 from io import TextIOWrapper
@@ -152,7 +153,7 @@ def _numbers(path: Path, line: int, names: list[str], row: list[str]) -> list[fl
             raise GroundedError(
                 f"{path.name} line {line}: '{cell}' in column '{name}' is not a number"
             ) from None
-        if not np.isfinite(value):
+        if not math.isfinite(value):
             raise GroundedError(
                 f"{path.name} line {line}: {cell.strip()} in column '{name}'; every tracked value "
                 "must be finite, leave out the column of a state that is free"
