@@ -10,22 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from mcap.writer import CompressionType, Writer
 from mcap_protobuf.decoder import DecoderFactory
 
 from facts import holding
 from grounded.errors import GroundedError, NextCommand
 from grounded.policy import Policy
 from grounded.trial import Trial
-from grounded_trials.formats.mcap_records import (
-    Attachment,
-    Channel,
-    Header,
-    Messages,
-    Metadata,
-    Schema,
-)
-from grounded_trials.formats.mcap_writer import CopyWriter, LogWriter, file_descriptor_set
+from grounded_trials.formats.mcap_records import Schema
+from grounded_trials.formats.mcap_writer import file_descriptor_set
 from grounded_trials.formats.schemas import parse_protobuf, struct_of
 from grounded_trials.store.candidate_file import candidate_bytes, read_candidate
 from grounded_trials.store.trial_file import TrialWriter, read_trial, trial_bytes, write_trial
@@ -214,56 +206,6 @@ def test_refusals() -> None:
         read_trial("/nowhere/t.mcap")
     with pytest.raises(GroundedError, match=holding("/nowhere/t.mcap")):
         write_trial("/nowhere/t.mcap", a_trial(), {})
-
-
-@pytest.mark.parametrize("compressed", [False, True])
-def test_a_file_is_what_the_mcap_package_writes(compressed: bool) -> None:
-    """Byte for byte: several chunks, one of them ended by a large message, stamps out of order."""
-    rng = np.random.default_rng(2)
-    ours, theirs = io.BytesIO(), io.BytesIO()
-    copy = CopyWriter(ours, Header("ros2", "a logger"), compressed=compressed)
-    kind = CompressionType.ZSTD if compressed else CompressionType.NONE
-    writer = Writer(theirs, compression=kind, enable_data_crcs=True)
-    writer.start("ros2", "a logger")
-    copy.metadata(Metadata("first", {"robot": "Löwe", "": "x"}))
-    writer.add_metadata("first", {"robot": "Löwe", "": "x"})
-    schema = Schema(0, "pkg/Type", "ros2msg", b"float64 x")
-    for topic, told in (("/a", schema), ("/b", None), ("/c", schema), ("/silent", schema)):
-        copy.channel(Channel(7, topic, "cdr", 7, {"qos": topic}), told)
-    assert writer.register_schema(schema.name, schema.encoding, schema.data) == 1
-    for topic, told in (("/a", 1), ("/b", 0), ("/c", 1), ("/silent", 1)):
-        writer.register_channel(topic, "cdr", told, {"qos": topic})
-    for turn in range(600):
-        size = 2**20 if turn == 300 else int(rng.integers(0, 8000))
-        data, stamp, sent = rng.bytes(size), int(rng.integers(0, 2**62)), int(rng.integers(-9, 9))
-        channel, number = 1 + turn % 3, int(rng.integers(2**32))
-        one = [np.array([value]) for value in (0, size, channel, number, stamp, sent)]
-        copy.messages(Messages(data, *one), channel)
-        writer.add_message(channel, stamp, data, sent % 2**64, number)
-    copy.attachment(Attachment("notes", "text/plain", b"\0 9", 5, 6))
-    writer.add_attachment(6, 5, "notes", "text/plain", b"\0 9")
-    copy.finish()
-    writer.finish()
-    assert ours.getvalue() == theirs.getvalue()
-
-
-@pytest.mark.parametrize("flushed", [False, True])
-def test_a_file_without_messages_is_what_the_mcap_package_writes(flushed: bool) -> None:
-    ours, theirs = io.BytesIO(), io.BytesIO()
-    log = LogWriter(ours)
-    log.channel("/state", "State", ["x"])
-    writer = Writer(theirs, compression=CompressionType.NONE, enable_data_crcs=True)
-    writer.start("", "grounded")
-    schema = file_descriptor_set("State", ["x"])
-    writer.register_channel(
-        "/state", "protobuf", writer.register_schema("grounded.State", "protobuf", schema)
-    )
-    if flushed:
-        log.flush()
-        writer.flush()
-    log.finish()
-    writer.finish()
-    assert ours.getvalue() == theirs.getvalue()
 
 
 def test_reading_needs_no_mcap_and_no_protobuf() -> None:

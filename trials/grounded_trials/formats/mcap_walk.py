@@ -26,7 +26,6 @@ from grounded_trials.formats.mcap_records import (
     CHUNK,
     DATA_END,
     FOOTER,
-    MAGIC,
     MESSAGE,
     MESSAGE_HEADER,
     PARSERS,
@@ -42,6 +41,7 @@ from grounded_trials.formats.mcap_records import (
     chunk_content,
 )
 
+MAGIC = b"\x89MCAP0\r\n"
 RECORD_LIMIT = 512 * 2**20  # [bytes] of one record, and of one chunk when decompressed
 BLOCK = 4 * 2**20  # [bytes] read at a time
 SMALL = 2**16  # [bytes]: chunks below this are handed on together, up to

@@ -17,8 +17,8 @@ from typing import BinaryIO
 
 from grounded.errors import GroundedError, nearest
 from grounded_trials.formats.budget import budget
-from grounded_trials.formats.mcap_records import MAGIC, Messages, Metadata, Record
-from grounded_trials.formats.mcap_walk import read_records
+from grounded_trials.formats.mcap_records import Messages, Metadata, Record
+from grounded_trials.formats.mcap_walk import MAGIC, read_records
 from grounded_trials.plain_file import open_file, read_file
 
 BAGS = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")  # files of a bag's folder

@@ -21,7 +21,6 @@ from grounded_trials.formats.mcap_records import (
     CHUNK,
     DATA_END,
     FOOTER,
-    MAGIC,
     MESSAGE,
     MESSAGE_HEADER,
     MESSAGE_INDEX,
@@ -38,6 +37,7 @@ from grounded_trials.formats.mcap_records import (
     decompress_part,
 )
 from grounded_trials.formats.mcap_walk import (
+    MAGIC,
     RECORD_LIMIT,
     again,
     chunk_records,

@@ -18,7 +18,6 @@ import numpy as np
 from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import Array
 from grounded.policy import Policy
-from grounded_trials.formats.mcap_records import Attachment, Metadata
 from grounded_trials.store.own_files import (
     CANDIDATE,
     Meta,
@@ -75,8 +74,8 @@ def candidate_bytes(
     table["sha256"] = _hash(table, [*_controls(policy), states, inputs])
     stream = io.BytesIO()
     log = LogWriter(stream)
-    log.metadata(Metadata("grounded", table))
-    log.attachment(Attachment("about", "text/plain", _ABOUT))
+    log.metadata("grounded", table)
+    log.attachment("about", "text/plain", _ABOUT)
     topic = log.channel("/policy", "Policy", ["feedforward", "gain", "reference"], repeated=True)
     state = log.channel("/predicted_state", "State", policy.state_names)
     input = log.channel("/predicted_input", "Input", policy.input_names)

@@ -18,7 +18,6 @@ import numpy as np
 from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.trial import Trial
-from grounded_trials.formats.mcap_records import Attachment, Metadata
 from grounded_trials.store.own_files import TRIAL, Meta, Units, read_own, stated, with_units
 from grounded_trials.store.store import write_atomically
 
@@ -76,11 +75,11 @@ class TrialWriter:
         self._closed = False
         self._encode_state, self._encode_input = DoublesEncoder(self._n), DoublesEncoder(self._m)
         self._log = LogWriter(self._stream)
-        self._log.metadata(Metadata("grounded", table))
-        about = Attachment("about", "text/plain", b"A trial; no policy was run.")
-        if policy is not None:
-            about = Attachment("policy", "application/octet-stream", policy)
-        self._log.attachment(about)
+        self._log.metadata("grounded", table)
+        if policy is None:
+            self._log.attachment("about", "text/plain", b"A trial; no policy was run.")
+        else:
+            self._log.attachment("policy", "application/octet-stream", policy)
         self._state = self._log.channel("/state", "State", list(states))
         self._input = self._log.channel("/input", "Input", list(inputs))
         self._flushed = max(start_ns, 0)
