@@ -28,6 +28,7 @@ from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.noise import Structure
 from grounded.diagnosis.validation.ruler import Ruler
+from grounded.diagnosis.validation.visits import acting, few_trials
 from grounded.effects import ParamFamily
 
 CALIBRATION = "calibration"
@@ -114,14 +115,21 @@ def _pays(
     """Whether predictions bear out what `after` has beyond `before`.
 
     A second ahead noise that has added up hides what single steps show. So where nothing but white
-    noise is left, a further effect that is likely beyond doubt need only gain anything. Where more
-    is left, thousands of nats are no certainty.
+    noise is left, a further effect that is likely beyond doubt, and not for one trial alone, need
+    only gain anything. Where more is left, thousands of nats are no certainty.
     """
     gain, effects = ruler.gain(before, after), len(after.hypothesis.effects)
     sure = search.score(after) - search.score(before) > SURE
-    if sure and white and effects > max(1, len(before.hypothesis.effects)):
+    further = effects > max(1, len(before.hypothesis.effects))
+    if sure and white and further and _in_several(search, before, after):
         return gain.mean > 0 and gain.largest > LEAST
     return gain.pays(*(ALONE if sure and effects < 2 else PAYS))
+
+
+def _in_several(search: HypothesisSearch, before: Fitted, after: Fitted) -> bool:
+    """Whether more than few trials show each effect that `after` has beyond `before`."""
+    new = set(after.hypothesis.names) - set(before.hypothesis.names)
+    return not any(few_trials(search.data, acting(search.predictor, after, n)) for n in new)
 
 
 def _overrules(
