@@ -8,8 +8,8 @@ those of a wrong model, and thousands of nats are no certainty. So the likeliest
 likeliest of every other structure of noise, are held against the `ruler`:
 
     a rival takes the place of the likeliest only where it predicts clearly better
-    a cause without which predictions are as good, within their scatter, is dropped, unless it is
-    likely beyond doubt, white noise is all that is left, and predictions are better at all
+    a cause without which predictions are as good, within their scatter, is dropped; a further
+    effect that is beyond doubt, where white noise is all that is left, only if they gain nothing
     what is left then must be likelier than none by itself
     what predicts no better than the crude model is not claimed at all
     a likely effect that was dropped is doubtful: seen in too few trials, maybe
@@ -40,7 +40,7 @@ SURE = 8.0  # nats, odds of 3,000 to 1, from which an effect is likely beyond do
 WHITE = 0.9  # of a nat is believed where what is left is white noise
 BETTER = (2.0, 0.05)  # the same for a rival to take the place of a likelier hypothesis
 OVERRULES = (3.0, 0.1)  # and for a claim that is likely under another noise only
-SLIGHT = 0.02  # of what all causes gain, adopted ones too: one that makes less is not named
+SLIGHT = 0.02  # of what all causes gain, adopted ones too: what makes less in each channel is not named
 AMOUNTS = 0.1  # of what the likeliest gains: what a rival has to gain beyond it
 LIKELY = 10.0  # nats from which a dropped effect is mentioned
 REFIT = 12  # iterations after a cause was taken out
