@@ -325,12 +325,3 @@ def test_a_bias_and_a_trend_are_no_slow_wave():
     _, best = attribute(data, Library().candidates(SLED, data.scales), max_effects=2)
     families = {name.partition(":")[0] for name in best.hypothesis.names}
     assert len(families) == 2 and "trend" in families and families & {"input_bias", "offset"}
-
-
-@pytest.mark.slow
-def test_a_dead_zone_and_a_gain_are_no_other_two_parameters():
-    """Where inputs keep their sign and seldom rest, a gain and a constant do nearly as well."""
-    trials = slid(2, lambda v, u, t: 0.7 * max(u - 0.15, 0.0) + 0.2 - 0.5 * v, low=0.1)
-    data = prepare(SLED, trials, np.zeros(1))
-    _, best = attribute(data, Library().candidates(SLED, data.scales), max_effects=2)
-    assert "dead_zone:u" in best.hypothesis.names and best.hypothesis.spread == 0

@@ -178,9 +178,8 @@ def _foretold(search: HypothesisSearch, size: int, best: Fitted) -> Fitted:
 def _halves(search: HypothesisSearch, starts: Sequence[Fitted]) -> list[Fitted]:
     """The likeliest effects with exact parameters under white noise that nothing grows from yet.
 
-    What two make together passes for coloured noise, for parameters that are off or for a third
-    effect with more numbers: a dead zone and a wrong gain for two wrong gains, a bias and a trend
-    for a slow wave.
+    What two make together passes for a third with more numbers: a bias and a trend for a slow wave.
+    (Not where calibration alone is likelier: two effects can do what two wrong parameters do.)
     """
     null, score = search.fits.get((Structure(), 0.0, ())), search.score
     plain = [
@@ -197,12 +196,9 @@ def _halves(search: HypothesisSearch, starts: Sequence[Fitted]) -> list[Fitted]:
 def _grow(search: HypothesisSearch, best: Fitted, most: int) -> None:
     """Second and further effects: add, then swap each for what goes better with the others."""
     size = len(best.hypothesis.effects)
-    while size < most:
-        starts = _starts(search, size, best) if size else []
-        halves = _halves(search, starts) if size < 2 else []
-        if not starts and not halves:
-            return
-        size = max(size, 1)
+    while 1 <= size < most:
+        starts = _starts(search, size, best)
+        halves = _halves(search, starts) if size == 1 else []
         grown = [search.extended(start, 8) for start in starts]
         grown += [search.extended(half, 4) for half in halves]
         firsts = [max(fits, key=search.score) for fits in grown if fits]  # each has its own noise
