@@ -17,17 +17,14 @@ from grounded.diagnosis.report import Unconfirmed
 from grounded.diagnosis.validation.claims import Claims
 from grounded.diagnosis.validation.decide import Doubtful
 from grounded.diagnosis.validation.prediction_error import by_region
+from grounded.diagnosis.validation.visits import acting, few_trials
 from grounded.diagnosis.verdict import LOG, LOST, meaning
 from grounded.frozen import Array
 from grounded.task import Task
 from grounded.trial import Trial
 
 MENTIONED = 2
-MOST = 0.8  # of all that it does, which few trials hold
 FAR_OFF = 2.0  # times the room of the target and the best run: a run beyond it is lost
-FEW = 4  # one of so many trials
-ALIKE = 0.5  # of what it does in their steps: where others hold as much, no place shows it
-MEMORY = 1e-2  # of a memory's spread: what counts as noise there, where there is none
 SURE = 2.0  # standard deviations that one of its numbers is from zero
 
 
@@ -43,18 +40,11 @@ def unconfirmed(
 
 
 def _seen(claims: Claims, one: Doubtful) -> Unconfirmed | None:
-    data, acts = claims.data, _acting(claims, one)
-    by = np.bincount(data.trial_of, acts.sum(axis=0), data.count)
-    steps = np.bincount(data.trial_of, data.valid.sum(axis=1), data.count)
-    order = np.argsort(-by)
-    held = np.cumsum(by[order])
-    few = 1 + int(np.searchsorted(held, MOST * held[-1]))
-    if not held[-1] > 0 or few > max(data.count // FEW, 1) or few == data.count:
+    data, acts = claims.data, acting(claims.predictor, one.fit, one.name)
+    few = few_trials(data, acts)
+    if not few:
         return None
-    there, rest = order[:few], order[few:]
-    if by[rest].sum() * steps[there].sum() > ALIKE * by[there].sum() * steps[rest].sum():
-        return None  # the few are long, not special
-    trial = int(by.argmax())
+    trial = int(np.bincount(data.trial_of, acts.sum(axis=0), data.count).argmax())
     own = np.flatnonzero(data.trial_of == trial)
     run = int(own[acts[:, own].sum(axis=0).argmax()])
     start, end = (t * data.dt for t in _stretch(acts[:, run] - acts.mean()))
@@ -104,20 +94,6 @@ def _far(task: Task, trial: Trial, best: Trial | None) -> bool:
     steps = min(len(trial.states), len(task.target))  # an older task may have been longer
     off = task.model.difference(trial.states[:steps], task.target[:steps])
     return bool((np.abs(off) > room).any())
-
-
-def _acting(claims: Claims, one: Doubtful) -> Array:
-    """How much it does in each step, squared, in units of the noise, (L, B)."""
-    predictor, data, fit = claims.predictor, claims.data, one.fit
-    h, x = fit.hypothesis, fit.track
-    less = h.minus(one.name)
-    moved = data.model.difference(predictor.next(less, x[:-1]), predictor.next(h, x[:-1]))
-    shown = np.zeros_like(x) + predictor.offset(h, x) - predictor.offset(less, x)
-    log_q, log_r = fit.noise.log_q.copy(), fit.noise.log_r.copy()
-    for i in data.hidden:  # no noise disturbs it, and by none nothing can be divided
-        log_q[i] = log_r[i] = 2 * np.log(MEMORY * data.scales.spread(data.model.state_names[i]))
-    square = moved**2 / np.exp(log_q) + shown[1:] ** 2 / np.exp(log_r)
-    return np.asarray(square.sum(axis=-1) * data.valid.T)
 
 
 def _stretch(more: Array) -> Any:

@@ -30,7 +30,10 @@ def _coupling(site: Site) -> tuple[Quantity, ...]:
 
 
 def _periodic(site: Site) -> tuple[Quantity, ...]:
-    """Frequencies from one period a trial to a fifth of the sampling rate, half a bin apart."""
+    """Frequencies from one period a trial to a fifth of the sampling rate, half a bin apart.
+
+    What turns less than half a period in the longest trial is an offset and a trend, no wave.
+    """
     duration, dt = site.scales.duration, site.scales.dt
     lowest, highest = 1.0 / duration, min(0.2 / dt, 5.0)
     bins = max((highest - lowest) * duration, 1.0)
@@ -40,7 +43,7 @@ def _periodic(site: Site) -> tuple[Quantity, ...]:
     return (
         Quantity("A", unit),
         Quantity("B", unit),
-        Quantity("omega", "rad/s", grid, 0.0, 2 * np.pi * 0.45 / dt, places=bins),
+        Quantity("omega", "rad/s", grid, np.pi * lowest, 2 * np.pi * 0.45 / dt, places=bins),
     )
 
 

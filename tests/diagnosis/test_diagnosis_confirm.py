@@ -9,6 +9,7 @@ from grounded.diagnosis.hypotheses.attribution import attribute
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.report import Unconfirmed
 from grounded.diagnosis.unconfirmed import unconfirmed
+from grounded.diagnosis.validation import decide as decide_module
 from grounded.diagnosis.validation.claims import Claims
 from grounded.diagnosis.validation.decide import causes, decide, shares
 from grounded.diagnosis.validation.gain import Gain
@@ -18,6 +19,7 @@ from grounded.diagnosis.verdict import verdict
 from grounded.effects import Library
 from grounded.experiments.pendulum import model as real_pendulum
 from grounded.experiments.pendulum import pendulum_task
+from grounded.filter.tempering import Tempering
 from grounded.models.pendulum import model as crude_pendulum
 from grounded.plant import Plant
 
@@ -253,3 +255,73 @@ def test_what_is_left_without_the_only_effect_is_the_calibrated_model():
     assert set(without) == {"coulomb_friction:omega", "calibration"}
     row = [r for r in found.prediction_error if not r.whole_trial][-1]
     assert dict(without["coulomb_friction:omega"]) == pytest.approx(dict(row.calibrated))
+
+
+@pytest.mark.slow
+def test_a_further_effect_beyond_doubt_need_only_gain_where_noise_is_white(rare, monkeypatch):
+    """Half a scatter is enough: all trials show the friction, and white noise is what is left."""
+    search, best = rare
+    both = {"viscous_friction:v", "saturation:u"}
+
+    def gains(more, scatters, first=0.5):
+        rest = np.exp(-0.02 * scatters)
+        return Said(lambda c: (first if both - {more} <= set(c) else 1.0) * rest ** (more in c))
+
+    assert set(decide(search, best, gains("viscous_friction:v", 0.8), 3).causes) == both
+    assert set(decide(search, best, gains("viscous_friction:v", -0.8), 3).causes) == both - {
+        "viscous_friction:v"
+    }
+    once = decide(search, best, gains("saturation:u", 0.8), 3)  # of one trial
+    assert once.causes == ("viscous_friction:v",)
+    monkeypatch.setattr(search, "tempering", Tempering(0.5))
+    less = decide(search, best, gains("viscous_friction:v", 0.8), 3)
+    assert less.causes == ("saturation:u",)
+
+
+@pytest.mark.slow
+def test_a_sole_effect_of_few_nats_has_to_gain_twice_its_scatter(rare, monkeypatch):
+    search, _ = rare
+    alone = next(f for f in search.of_size(1) if f.hypothesis.names == ("viscous_friction:v",))
+    some = Said(lambda c: np.exp(-0.03) if "viscous_friction:v" in c else 1.0)
+    assert decide(search, alone, some, 1).causes == ("viscous_friction:v",)
+    monkeypatch.setattr(decide_module, "SURE", np.inf)
+    assert not decide(search, alone, some, 1).causes
+
+
+def slid(trials, rate, low=-1.0, steps=240):
+    """Runs of a sled, v' = `rate`(v, u, t), under steps of its drive; little noise."""
+    rng, found = np.random.default_rng(3), []
+    for _ in range(trials):
+        u = np.repeat(rng.uniform(low, 1, steps // 12), 12)
+        x, states = np.zeros(2), [np.zeros(2)]
+        for k, value in enumerate(u):
+            for part in range(10):
+                t = 0.05 * k + 0.005 * part
+                x = x + 0.005 * np.array([x[1], rate(x[1], value, t)])
+            states.append(x)
+        y = np.array(states) + 2e-3 * rng.standard_normal((steps + 1, 2))
+        found.append(Trial(y, u[:, None], 0.05, ("x", "v"), ("u",), start_inputs=u[:1]))
+    return found
+
+
+SLED = Model(
+    states={"x": "m", "v": "m/s"},
+    inputs={"u": "m/s^2"},
+    params={
+        "k": Param(1.0, "1", std=0.3),
+        "c": Param(0.2, "m/s^2", std=0.2),
+        "b": Param(0.5, "1/s", std=0.2),
+    },
+    derivative=lambda s, a, p: {"x": s.v, "v": p.k * a.u + p.c - p.b * s.v},
+    roles={"position": ("x",), "speed": "v"},
+    name="sled",
+)
+
+
+@pytest.mark.slow
+def test_a_bias_and_a_trend_are_no_slow_wave():
+    trials = slid(4, lambda v, u, t: u + 0.5 - 0.06 * t - 0.5 * v)
+    data = prepare(SLED, trials, np.zeros(1))
+    _, best = attribute(data, Library().candidates(SLED, data.scales), max_effects=2)
+    families = {name.partition(":")[0] for name in best.hypothesis.names}
+    assert len(families) == 2 and "trend" in families and families & {"input_bias", "offset"}

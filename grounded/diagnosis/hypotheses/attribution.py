@@ -33,6 +33,7 @@ from grounded.progress import interruptible
 HOPEFUL = 4  # larger sets that are fitted to the end
 TUNED = 2  # sets whose constants are set by the data
 FORETOLD = (2.0, 0.05)  # scatters, and least gain, from which what predicts better is grown too
+HALVES = 2  # single effects that are also grown where another hypothesis is likelier
 RESTARTED = 3  # large effects that are also fitted from a start of their own
 
 
@@ -174,11 +175,32 @@ def _foretold(search: HypothesisSearch, size: int, best: Fitted) -> Fitted:
     return found
 
 
+def _halves(search: HypothesisSearch, starts: Sequence[Fitted]) -> list[Fitted]:
+    """The likeliest effects with exact parameters under white noise that nothing grows from yet.
+
+    What two make together passes for a third with more numbers: a bias and a trend for a slow wave.
+    (Not where calibration alone is likelier: two effects can do what two wrong parameters do.)
+    """
+    null, score = search.fits.get((Structure(), 0.0, ())), search.score
+    plain = [
+        fit
+        for (structure, spread, names), fit in search.fits.items()
+        if len(names) == 1 and structure == Structure() and not spread
+    ]
+    likely = sorted(plain, key=lambda fit: -score(fit))[:HALVES]
+    if null is None:
+        return []
+    return [f for f in likely if f not in starts and score(f) > score(null) + LARGE_GAIN]
+
+
 def _grow(search: HypothesisSearch, best: Fitted, most: int) -> None:
     """Second and further effects: add, then swap each for what goes better with the others."""
     size = len(best.hypothesis.effects)
     while 1 <= size < most:
-        grown = [search.extended(start, 8) for start in _starts(search, size, best)]
+        starts = _starts(search, size, best)
+        halves = _halves(search, starts) if size == 1 else []
+        grown = [search.extended(start, 8) for start in starts]
+        grown += [search.extended(half, 4) for half in halves]
         firsts = [max(fits, key=search.score) for fits in grown if fits]  # each has its own noise
         search.finished(list(dict.fromkeys([*search.of_size(size + 1)[:HOPEFUL], *firsts])), 10)
         search.again(search.of_size(size + 1)[:2])

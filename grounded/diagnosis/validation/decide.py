@@ -8,7 +8,8 @@ those of a wrong model, and thousands of nats are no certainty. So the likeliest
 likeliest of every other structure of noise, are held against the `ruler`:
 
     a rival takes the place of the likeliest only where it predicts clearly better
-    a cause without which predictions are as good, within their scatter, is dropped
+    a cause without which predictions are as good, within their scatter, is dropped; a further
+    effect that is beyond doubt, where white noise is all that is left, only if they gain nothing
     what is left then must be likelier than none by itself
     what predicts no better than the crude model is not claimed at all
     a likely effect that was dropped is doubtful: seen in too few trials, maybe
@@ -27,15 +28,19 @@ from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.noise import Structure
 from grounded.diagnosis.validation.ruler import Ruler
+from grounded.diagnosis.validation.visits import acting, few_trials
 from grounded.effects import ParamFamily
 
 CALIBRATION = "calibration"
 RIVALS = 8  # likeliest hypotheses that are measured
-PAYS = (1.0, 0.01)  # scatters that a cause must gain, and the least gain in one channel
-FURTHER = (2.0, 0.01)  # the same where there are several effects
+LEAST = 0.01  # gain that a cause must have in one channel
+PAYS = (2.0, LEAST)  # scatters that it must gain, and that
+ALONE = (1.0, LEAST)  # the same of the only effect, or of calibration, that is beyond doubt
+SURE = 8.0  # nats, odds of 3,000 to 1, from which an effect is likely beyond doubt
+WHITE = 0.9  # of a nat is believed where what is left is white noise
 BETTER = (2.0, 0.05)  # the same for a rival to take the place of a likelier hypothesis
 OVERRULES = (3.0, 0.1)  # and for a claim that is likely under another noise only
-SLIGHT = 0.02  # of what all causes gain, adopted ones too: one that makes less is not named
+SLIGHT = 0.02  # of what all causes gain, adopted ones too: less in each channel is not named
 AMOUNTS = 0.1  # of what the likeliest gains: what a rival has to gain beyond it
 LIKELY = 10.0  # nats from which a dropped effect is mentioned
 REFIT = 12  # iterations after a cause was taken out
@@ -80,13 +85,13 @@ def decide(search: HypothesisSearch, best: Fitted, ruler: Ruler, most: int) -> D
         ruler: of the same data.
         most: so many effects at most.
     """
-    crude = search.exact_null()
+    crude, white = search.exact_null(), search.tempering.factor > WHITE
     ruler.beside(crude)
     search, fit = _proposed(search, best, crude, ruler, most)
-    fit, without, doubtful = _pruned(search, fit, ruler)
+    fit, without, doubtful = _pruned(search, fit, ruler, white)
     if not _likely(search, fit):
-        fit, without, _ = _pruned(search, search.best_null(), ruler)
-    if causes(fit) and not _pays(ruler, crude, fit, PAYS):
+        fit, without, _ = _pruned(search, search.best_null(), ruler, white)
+    if causes(fit) and not _pays(search, ruler, crude, fit, white):
         fit, without = crude, {}
     fit = fit if causes(fit) else _quiet(search, fit, crude)
     open_ = sorted((d for d in doubtful if d.name not in causes(fit)), key=lambda d: -d.nats)
@@ -104,8 +109,27 @@ def _quiet(search: HypothesisSearch, fit: Fitted, crude: Fitted) -> Fitted:
     return crude if fit.hypothesis.spread > 0 else fit
 
 
-def _pays(ruler: Ruler, before: Fitted, after: Fitted, bar: tuple[float, float]) -> bool:
-    return ruler.gain(before, after).pays(*bar)
+def _pays(
+    search: HypothesisSearch, ruler: Ruler, before: Fitted, after: Fitted, white: bool
+) -> bool:
+    """Whether predictions bear out what `after` has beyond `before`.
+
+    A second ahead noise that has added up hides what single steps show. So where nothing but white
+    noise is left, a further effect that is likely beyond doubt, and not for one trial alone, need
+    only gain anything. Where more is left, thousands of nats are no certainty.
+    """
+    gain, effects = ruler.gain(before, after), len(after.hypothesis.effects)
+    sure = search.score(after) - search.score(before) > SURE
+    further = effects > max(1, len(before.hypothesis.effects))
+    if sure and white and further and _in_several(search, before, after):
+        return gain.mean > 0 and gain.largest > LEAST
+    return gain.pays(*(ALONE if sure and effects < 2 else PAYS))
+
+
+def _in_several(search: HypothesisSearch, before: Fitted, after: Fitted) -> bool:
+    """Whether more than few trials show each effect that `after` has beyond `before`."""
+    new = set(after.hypothesis.names) - set(before.hypothesis.names)
+    return not any(few_trials(search.data, acting(search.predictor, after, n)) for n in new)
 
 
 def _overrules(
@@ -147,7 +171,7 @@ def _proposed(
 
 
 def _pruned(
-    search: HypothesisSearch, fit: Fitted, ruler: Ruler
+    search: HypothesisSearch, fit: Fitted, ruler: Ruler, white: bool
 ) -> tuple[Fitted, dict[str, Fitted], list[Doubtful]]:
     """Without the causes that predictions don't need, the least needed first; the likely ones."""
     doubtful: list[Doubtful] = []
@@ -157,8 +181,11 @@ def _pruned(
             return fit, without, doubtful
         gains = {name: ruler.gain(less, fit) for name, less in without.items()}
         least = SLIGHT * ruler.since_outset(fit)
-        bar = PAYS if len(fit.hypothesis.effects) < 2 else FURTHER
-        idle = [n for n, gain in gains.items() if not gain.pays(*bar) or gain.mean < least]
+        idle = [
+            name
+            for name, less in without.items()
+            if gains[name].channels.max() < least or not _pays(search, ruler, less, fit, white)
+        ]
         if not idle:
             return fit, without, doubtful
         name = min(idle, key=lambda name: gains[name].mean)
