@@ -120,6 +120,11 @@ def _pays(
     """
     gain, effects = ruler.gain(before, after), len(after.hypothesis.effects)
     sure = search.score(after) - search.score(before) > SURE
+    new = set(after.hypothesis.names) - set(before.hypothesis.names)
+    rest = set(after.hypothesis.names) - new
+    if new:  # `before` may be what predicts better, and not the likeliest without it
+        less = [search.score(f) for f in search.fits.values() if set(f.hypothesis.names) <= rest]
+        sure = sure and search.score(after) - max(less) > CLAIM
     further = effects > max(1, len(before.hypothesis.effects))
     if sure and white and further and _in_several(search, before, after):
         return gain.mean > 0 and gain.largest > LEAST
