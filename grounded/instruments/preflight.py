@@ -30,7 +30,14 @@ from grounded.instruments.kinematics import (
     turned,
 )
 from grounded.instruments.lag import Lag, alike, at_samples, lag_between, reach_of
-from grounded.instruments.odd_trial import Ratios, in_degrees, judge_stamps, radians, ratios_of
+from grounded.instruments.odd_trial import (
+    Odd,
+    Ratios,
+    judge_stamps,
+    odd_commands,
+    odd_states,
+    ratios_of,
+)
 from grounded.instruments.single import Signal, judge_signal
 from grounded.model import Model
 from grounded.task import Task
@@ -125,13 +132,26 @@ class _Bench:
             self.trials[k] = replace(trial, states=states)
 
     def odd(self, ratios: Sequence[Ratios]) -> Iterator[Finding]:
-        """Of trials that are in degrees as a whole."""
-        for k, some in list(in_degrees(self.model, self.trials, ratios, self.shown)):
-            trial = self.trials[k]
-            self.trials[k] = radians(trial, some)
-            text = f"is in degrees in trial {trial.id or f'number {k + 1}'}, in radians in others"
-            for i in some:  # of that log alone: no line for the table of all logs
-                yield _mended(self.model.state_names[i], text, "degrees", "", scale=DEGREES)
+        """Of trials that are in other units than the rest, as a whole or in one signal."""
+        for odd in list(odd_states(self.model, self.trials, ratios, self.shown)):
+            yield from self.in_unit(odd)
+        for odd in list(odd_commands(self.model, self.trials, self.shown)):
+            yield from self.in_unit(odd)
+
+    def in_unit(self, odd: Odd) -> Iterator[Finding]:
+        """With one trial in the unit of the others; no line for the table of all logs."""
+        trial = self.trials[odd.trial]
+        self.trials[odd.trial] = odd.mended(trial)
+        where = f"in trial {trial.id or f'number {odd.trial + 1}'}"
+        text = f"is in degrees {where}, in radians in others"
+        if abs(odd.factor / DEGREES - 1) > UNIT or odd.inputs:
+            size = f"{max(odd.factor, 1 / odd.factor):.4g} times too"
+            text = f"is {size} {'large' if odd.factor > 1 else 'small'} {where}"
+        degrees = abs(abs(np.log(odd.factor)) - np.log(DEGREES)) < UNIT
+        names = [self.model.state_names[i] for i in odd.states]
+        for name in names + [self.model.input_names[j] for j in odd.inputs]:
+            kind = "degrees" if degrees else "scale"
+            yield _mended(name, text, kind, "", scale=odd.factor)
 
     def singles(self) -> Iterator[Finding]:
         """Of each sensor by itself."""

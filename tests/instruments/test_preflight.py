@@ -268,6 +268,58 @@ def test_one_state_of_one_trial_in_degrees_is_named():
     np.testing.assert_allclose(found.trials[1].states, trials[1].states)
 
 
+@pytest.mark.parametrize(
+    ("state", "factor"), [(0, 180 / np.pi), (0, np.pi / 180), (1, 180 / np.pi), (1, np.pi / 180)]
+)
+def test_the_sensor_that_is_off_is_told_by_the_sizes_in_other_trials(state, factor):
+    """A theta that was 57.3 times too small passed for an omega in degrees."""
+    trials = arm()
+    states = np.array(trials[1].states)
+    states[:, state] *= factor
+    found = preflight(ARM, [trials[0], replace(trials[1], states=states), *trials[2:]])
+    assert [(f.signal, f.kind) for f in found.findings] == [("qw"[state], "degrees")]
+    assert found.findings[0].scale == pytest.approx(factor)
+    np.testing.assert_allclose(found.trials[1].states, trials[1].states)
+
+
+@pytest.mark.parametrize("wrapped", [False, True])
+def test_a_noisy_angle_in_degrees_is_found_over_longer_windows(wrapped):
+    """A boat's compass, 0.23 degrees of noise at 20 Hz: its steps are mostly noise."""
+    trials, rng = arm(), np.random.default_rng(3)
+    for k, trial in enumerate(trials):
+        x = np.array(trial.states)
+        x[:, 0] += 0.04 * rng.standard_normal(len(x)) + 3 * (k == 1)
+        if k == 1:
+            x[:, 0] = np.rad2deg(x[:, 0])
+            x[:, 0] = (x[:, 0] + 180) % 360 - 180 if wrapped else x[:, 0]
+        trials[k] = replace(trial, states=x)
+    found = preflight(ARM, trials)
+    assert (found.findings[0].signal, found.findings[0].kind) == ("q", "degrees")
+    assert 0.5 < np.ptp(found.trials[1].states[:, 0]) / np.ptp(arm()[1].states[:, 0]) < 2
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
+def test_commands_in_another_unit_in_one_trial_are_told(factor):
+    trials = arm(friction=0.4)
+    odd = replace(trials[2], inputs=factor * trials[2].inputs, start_inputs=np.array([factor]))
+    found = preflight(ARM, [*trials[:2], odd, trials[3]])
+    assert [(f.signal, f.kind, f.corrected) for f in found.findings] == [("u", "scale", True)]
+    assert found.findings[0].scale == pytest.approx(factor)
+    np.testing.assert_allclose(found.trials[2].inputs, trials[2].inputs)
+    np.testing.assert_allclose(found.trials[2].start_inputs, [1.0])
+
+
+def test_a_body_that_swings_freely_has_no_commands_in_another_unit():
+    pushed, free = arm(trials=2)
+    states = [np.array([1.0, 0.0])]
+    for u in (inputs := 1e-3 * pushed.inputs):
+        states.append(ARM.system.step(states[-1][None], u[None], ARM.values, DT)[0])
+    swing = replace(free, states=np.array(states), inputs=inputs)
+    assert not preflight(ARM, [pushed, swing]).findings
+    still = replace(free, states=1e-3 * free.states, inputs=inputs)
+    assert not [f for f in preflight(ARM, [pushed, still]).findings if f.signal == "u"]
+
+
 def test_a_trial_that_moves_more_is_not_in_degrees():
     quiet, wild = arm(trials=2)
     small = replace(quiet, states=quiet.states / 40, inputs=quiet.inputs / 40)
