@@ -31,6 +31,7 @@ NEAR = 0.1  # relative, of these factors
 TOGETHER = 0.95  # cosine of what a position moves and its velocity says, over the best window
 TURNS = (2 * np.pi, 360.0)  # by which a wrapped angle jumps
 LIKE = 10.0  # times as large, or as small, as in others: what corrected commands may be
+MANY = 8  # trials that tell enough
 LEAST = 8  # windows that a trial must hold
 FAR = 1e9
 
@@ -67,13 +68,12 @@ def odd_states(
         model: however crude.
         trials: several.
         ratios: of each.
-        shown: states that a sensor has.
+        shown: states that a sensor has, in every trial.
 
     Yields:
         A trial and its states, all of one factor.
     """
     units = list(model.states.values())
-    shown = [i for i in shown if all(np.isfinite(t.states[:, i]).any() for t in trials)]
     angular = [i for i in shown if units[i] == "rad" or units[i].startswith("rad/")]
     if len(trials) < 2 or not angular:
         return
@@ -127,18 +127,41 @@ def _spread(trial: Trial, some: Sequence[int]) -> Array:
     return np.asarray(np.nanstd(trial.states[:, some], axis=0) + 1e-300)
 
 
+def all_in_degrees(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> tuple[int, ...]:
+    """Angles that are in degrees in all trials, by what the model makes of them.
+
+    Args:
+        model: whose errors halve where they are divided by 57.3, and nowhere near.
+        trials: any.
+        shown: states that a sensor has, in every trial.
+    """
+    angular = [i for i in shown if list(model.states.values())[i] == "rad"]
+    trials = trials[:: max(1, len(trials) // MANY)]
+    choices = dict.fromkeys((tuple(angular), *((i,) for i in angular)))
+
+    def missed(some: tuple[int, ...], factor: float) -> float:
+        turned = [Odd(0, factor, some).mended(trial) for trial in trials]
+        unit = np.median([_spread(t, shown) for t in turned], axis=0)
+        return float(np.median([_missed(model, t, shown, shown, unit) for t in turned]))
+
+    for some in choices if angular else ():
+        wrong = (1.0, DEGREES / SIMILAR, DEGREES * SIMILAR)
+        if missed(some, DEGREES) < 0.5 * min(missed(some, factor) for factor in wrong):
+            return some
+    return ()
+
+
 def odd_commands(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> Iterator[Odd]:
     """Trials with an input in thousandths, or in degrees, of its unit in other trials.
 
     Args:
         model: however crude.
         trials: several, their states in the model's units.
-        shown: states that a sensor has.
+        shown: states that a sensor has, in every trial.
 
     Yields:
         A trial and an input.
     """
-    shown = [i for i in shown if all(np.isfinite(t.states[:, i]).any() for t in trials)]
     if len(trials) < 2 or not shown:
         return
     unit = np.mean([_spread(t, shown) for t in trials], axis=0)

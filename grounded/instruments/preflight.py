@@ -33,6 +33,7 @@ from grounded.instruments.lag import Lag, alike, at_samples, lag_between, reach_
 from grounded.instruments.odd_trial import (
     Odd,
     Ratios,
+    all_in_degrees,
     judge_stamps,
     odd_commands,
     odd_states,
@@ -133,9 +134,12 @@ class _Bench:
 
     def odd(self, ratios: Sequence[Ratios]) -> Iterator[Finding]:
         """Of trials that are in other units than the rest, as a whole or in one signal."""
-        for odd in list(odd_states(self.model, self.trials, ratios, self.shown)):
+        shown = [i for i in self.shown if all(np.isfinite(x).any() for x in self.column(i))]
+        for odd in list(odd_states(self.model, self.trials, ratios, shown)):
             yield from self.in_unit(odd)
-        for odd in list(odd_commands(self.model, self.trials, self.shown)):
+        for i in all_in_degrees(self.model, self.trials, shown):
+            yield self.from_degrees(i)
+        for odd in list(odd_commands(self.model, self.trials, shown)):
             yield from self.in_unit(odd)
 
     def in_unit(self, odd: Odd) -> Iterator[Finding]:

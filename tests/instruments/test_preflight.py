@@ -309,6 +309,34 @@ def test_commands_in_another_unit_in_one_trial_are_told(factor):
     np.testing.assert_allclose(found.trials[2].start_inputs, [1.0])
 
 
+BEAM = Model(
+    states={"r": "m", "v": "m/s", "theta": "rad"},
+    inputs={"cmd": "rad"},
+    params={"k": Param(5.0, "m/s^2", 2.0, 12.0), "tau": Param(0.1, "s", 0.02, 0.5)},
+    derivative=lambda s, a, p: {
+        "r": s.v,
+        "v": p.k * np.sin(s.theta),
+        "theta": (a.cmd - s.theta) / p.tau,
+    },
+)
+
+
+@pytest.mark.parametrize("k", [5.0, 2.5, 10.0])
+@pytest.mark.parametrize("unit", [1.0, 180 / np.pi])
+def test_an_angle_in_degrees_in_all_logs_is_told_by_the_model(unit, k):
+    """Ball on a beam: no rate of theta is logged, only its command and what it does to the ball."""
+    rng, trials = np.random.default_rng(1), []
+    for phase in (0.0, 2.0):
+        u, states = 0.12 * np.sin(1.8 * DT * np.arange(400) + phase)[:, None], [np.zeros(3)]
+        for one in u:
+            real = np.array([0.7 * k, 0.13])
+            states.append(BEAM.system.step(states[-1][None], one[None], real, DT)[0])
+        x = np.array(states) + rng.normal(size=(401, 3)) * [1e-3, 4e-3, 1e-3]
+        trials.append(Trial(x * [1, 1, unit], u, DT, BEAM.state_names, ("cmd",)))
+    found = [(f.signal, f.kind) for f in preflight(BEAM, trials).findings]
+    assert found == [("theta", "degrees")] * (unit > 1)
+
+
 def test_a_body_that_swings_freely_has_no_commands_in_another_unit():
     pushed, free = arm(trials=2)
     states = [np.array([1.0, 0.0])]
