@@ -217,7 +217,8 @@ def judge_stamps(model: Model, trials: Sequence[Trial], ratios: Sequence[Ratios]
     Raises:
         GroundedError: with the trial, a state and the factor.
     """
-    for k, (trial, found) in enumerate(zip(trials, ratios, strict=True)):
+    for k, (trial, every) in enumerate(zip(trials, ratios, strict=True)):
+        found = [one for one in every if one[0].exact]
         for factor in (STAMPS, 1 / STAMPS):
             if found and all(abs(one / factor - 1) < NEAR for _, one in found):
                 q, w = (model.state_names[i] for i in (found[0][0].i, found[0][0].j))
@@ -230,9 +231,9 @@ def judge_stamps(model: Model, trials: Sequence[Trial], ratios: Sequence[Ratios]
                 )
 
 
-def ratios_of(model: Model, trials: Sequence[Trial]) -> list[Ratios]:
+def ratios_of(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> list[Ratios]:
     """Of each trial, the rate of each position over what its velocity says; 1 where they differ."""
-    relations = [one for one in integrals(model) if one.exact]
+    relations = [one for one in integrals(model) if {one.i, one.j} <= set(shown)]
     return [_ratios(relations, trial) for trial in trials]
 
 

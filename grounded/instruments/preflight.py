@@ -98,7 +98,7 @@ def preflight(
         return Preflight((), tuple(trials))
     bench = _Bench(model, [t.until(t.known_steps) for t in used], set(hidden))
     with np.errstate(all="ignore"):
-        ratios = ratios_of(model, bench.trials)
+        ratios = ratios_of(model, bench.trials, bench.shown)
         judge_stamps(model, bench.trials, ratios)
         found = [
             *bench.odd(ratios),

@@ -282,6 +282,24 @@ def test_the_sensor_that_is_off_is_told_by_the_sizes_in_other_trials(state, fact
     np.testing.assert_allclose(found.trials[1].states, trials[1].states)
 
 
+def test_a_heading_in_degrees_in_one_trial_leaves_the_others_alone():
+    """The car carries its heading's rate along: pooled, one trial made all be in degrees."""
+    rng, trials = np.random.default_rng(4), []
+    for _ in range(3):
+        u = 0.4 + 0.2 * np.sin(DT * np.arange(150)[:, None] * rng.uniform(1, 4, 2))
+        states = [np.zeros(car.n)]
+        for one in u:
+            states.append(car.system.step(states[-1][None], one[None], car.values, DT)[0])
+        x = np.array(states) + 1e-4 * rng.standard_normal((151, car.n))
+        trials.append(Trial(x, u, DT, car.state_names, car.input_names))
+    x = np.array(trials[1].states)
+    x[:, car.state_names.index("psi")] *= 180 / np.pi
+    found = preflight(car, [trials[0], replace(trials[1], states=x), *trials[2:]])
+    assert [(f.signal, f.kind) for f in found.findings] == [("psi", "degrees")]
+    for mended, trial in zip(found.trials, trials, strict=True):
+        np.testing.assert_allclose(mended.states, trial.states)
+
+
 @pytest.mark.parametrize("wrapped", [False, True])
 def test_a_noisy_angle_in_degrees_is_found_over_longer_windows(wrapped):
     """A boat's compass, 0.23 degrees of noise at 20 Hz: its steps are mostly noise."""
