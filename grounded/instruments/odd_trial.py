@@ -30,7 +30,7 @@ STAMPS, DEGREES = 1000.0, 180 / np.pi
 NEAR = 0.1  # relative, of these factors
 TOGETHER = 0.95  # cosine of what a position moves and its velocity says, over the best window
 TURNS = (2 * np.pi, 360.0)  # by which a wrapped angle jumps
-LIKE = 10.0  # times as large, or as small, as in others: what corrected commands may be
+LIKE = 10.0  # times as large, or as small: beside what corrected signals may be
 MANY = 8  # trials that tell enough
 LEAST = 8  # windows that a trial must hold
 FAR = 1e9
@@ -127,28 +127,34 @@ def _spread(trial: Trial, some: Sequence[int]) -> Array:
     return np.asarray(np.nanstd(trial.states[:, some], axis=0) + 1e-300)
 
 
-def all_in_degrees(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> tuple[int, ...]:
-    """Angles that are in degrees in all trials, by what the model makes of them.
+def all_in_degrees(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> list[Odd]:
+    """Of each trial the signals that are in degrees in all of them, by what the model makes of it.
 
     Args:
-        model: whose errors halve where they are divided by 57.3, and nowhere near.
+        model: whose errors are a third where they are divided by 57.3, and larger beside that.
         trials: any.
         shown: states that a sensor has, in every trial.
     """
-    angular = [i for i in shown if list(model.states.values())[i] == "rad"]
-    trials = trials[:: max(1, len(trials) // MANY)]
-    choices = dict.fromkeys((tuple(angular), *((i,) for i in angular)))
+    units, inputs = list(model.states.values()), list(model.inputs.values())
+    angles = tuple(i for i in shown if units[i] == "rad")
+    sent = tuple(j for j, unit in enumerate(inputs) if unit == "rad")
+    moving = tuple(i for i in shown if units[i] in ("rad", "rad/s"))
+    some = trials[:: max(1, len(trials) // MANY)]
 
-    def missed(some: tuple[int, ...], factor: float) -> float:
-        turned = [Odd(0, factor, some).mended(trial) for trial in trials]
+    def missed(odd: Odd) -> float:
+        turned = [odd.mended(trial) for trial in some]
         unit = np.median([_spread(t, shown) for t in turned], axis=0)
         return float(np.median([_missed(model, t, shown, shown, unit) for t in turned]))
 
-    for some in choices if angular else ():
-        wrong = (1.0, DEGREES / SIMILAR, DEGREES * SIMILAR)
-        if missed(some, DEGREES) < 0.5 * min(missed(some, factor) for factor in wrong):
-            return some
-    return ()
+    groups = dict.fromkeys([*((i,) for i in angles), angles, moving, ()])
+    choices = [Odd(0, DEGREES, g, u) for g in groups for u in ((), sent) if g or u]
+    errors = [missed(odd) for odd in choices]
+    if not np.isfinite(errors).any():
+        return []
+    best = choices[int(np.nanargmin(errors))]
+    near = [missed(replace(best, factor=f * DEGREES)) for f in (1 / LIKE, LIKE)]
+    told = np.nanmin(errors) < min(missed(replace(best, factor=1.0)) / SIMILAR, *near) / (1 + NEAR)
+    return [replace(best, trial=k) for k in range(len(trials))] if told else []
 
 
 def odd_commands(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> Iterator[Odd]:

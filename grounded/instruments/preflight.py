@@ -137,8 +137,10 @@ class _Bench:
         shown = [i for i in self.shown if all(np.isfinite(x).any() for x in self.column(i))]
         for odd in list(odd_states(self.model, self.trials, ratios, shown)):
             yield from self.in_unit(odd)
-        for i in all_in_degrees(self.model, self.trials, shown):
-            yield self.from_degrees(i)
+        for odd in all_in_degrees(self.model, self.trials, shown):
+            self.trials[odd.trial] = odd.mended(self.trials[odd.trial])
+            if odd.trial == 0:
+                yield from (_in_degrees(n, unit) for n, unit in self.named(odd))
         for odd in list(odd_commands(self.model, self.trials, shown)):
             yield from self.in_unit(odd)
 
@@ -152,10 +154,14 @@ class _Bench:
             size = f"{max(odd.factor, 1 / odd.factor):.4g} times too"
             text = f"is {size} {'large' if odd.factor > 1 else 'small'} {where}"
         degrees = abs(abs(np.log(odd.factor)) - np.log(DEGREES)) < UNIT
-        names = [self.model.state_names[i] for i in odd.states]
-        for name in names + [self.model.input_names[j] for j in odd.inputs]:
+        for name, _ in self.named(odd):
             kind = "degrees" if degrees else "scale"
             yield _mended(name, text, kind, "", scale=odd.factor)
+
+    def named(self, odd: Odd) -> list[tuple[str, str]]:
+        """Names and units of its signals."""
+        states, inputs = list(self.model.states.items()), list(self.model.inputs.items())
+        return [states[i] for i in odd.states] + [inputs[j] for j in odd.inputs]
 
     def singles(self) -> Iterator[Finding]:
         """Of each sensor by itself."""
@@ -200,8 +206,7 @@ class _Bench:
         """With state i in radians."""
         self.put(i, [x / DEGREES for x in self.column(i)])
         name = self.model.state_names[i]
-        text, log = f"is in degrees, not in {self.model.states[name]}", f"scale = {1 / DEGREES:.8g}"
-        return _mended(name, text, "degrees", log, scale=DEGREES)
+        return _in_degrees(name, self.model.states[name])
 
     def late(self, relation: Integral, lag: Lag) -> Iterator[Finding]:
         """A delay: no sensor is early, so it is the later one's."""
@@ -263,6 +268,11 @@ class _Bench:
 def _mended(name: str, text: str, kind: str, log: str, **values: float) -> Finding:
     """A finding that the trials were corrected for."""
     return Finding(name, text, kind, corrected=True, log=log, **values)
+
+
+def _in_degrees(name: str, unit: str) -> Finding:
+    text, log = f"is in degrees, not in {unit}", f"scale = {1 / DEGREES:.8g}"
+    return _mended(name, text, "degrees", log, scale=DEGREES)
 
 
 def _earlier(x: Array, steps: float) -> Array:

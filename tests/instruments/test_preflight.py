@@ -339,20 +339,21 @@ BEAM = Model(
 )
 
 
-@pytest.mark.parametrize("k", [5.0, 2.5, 10.0])
+@pytest.mark.parametrize("k", [2.8, 5.0, 10.0])
 @pytest.mark.parametrize("unit", [1.0, 180 / np.pi])
-def test_an_angle_in_degrees_in_all_logs_is_told_by_the_model(unit, k):
+@pytest.mark.parametrize("sent", [1.0, 180 / np.pi])
+def test_an_angle_in_degrees_in_all_logs_is_told_by_the_model(unit, sent, k):
     """Ball on a beam: no rate of theta is logged, only its command and what it does to the ball."""
     rng, trials = np.random.default_rng(1), []
     for phase in (0.0, 2.0):
         u, states = 0.12 * np.sin(1.8 * DT * np.arange(400) + phase)[:, None], [np.zeros(3)]
         for one in u:
-            real = np.array([0.7 * k, 0.13])
+            real = np.array([k, 0.13])
             states.append(BEAM.system.step(states[-1][None], one[None], real, DT)[0])
         x = np.array(states) + rng.normal(size=(401, 3)) * [1e-3, 4e-3, 1e-3]
-        trials.append(Trial(x * [1, 1, unit], u, DT, BEAM.state_names, ("cmd",)))
+        trials.append(Trial(x * [1, 1, unit], sent * u, DT, BEAM.state_names, ("cmd",)))
     found = [(f.signal, f.kind) for f in preflight(BEAM, trials).findings]
-    assert found == [("theta", "degrees")] * (unit > 1)
+    assert found == [("theta", "degrees")] * (unit > 1) + [("cmd", "degrees")] * (sent > 1)
 
 
 def test_a_body_that_swings_freely_has_no_commands_in_another_unit():
