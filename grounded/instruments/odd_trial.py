@@ -26,6 +26,7 @@ AHEAD = 0.25  # [s]
 STARTS = 200
 LARGE = 20.0  # times what the others do
 SIMILAR = 3.0
+BETTER = 0.9  # of the error with commands as they are, or a third, or three times as large
 STAMPS, DEGREES = 1000.0, 180 / np.pi
 NEAR = 0.1  # relative, of these factors
 TOGETHER = 0.95  # cosine of what a position moves and its velocity says, over the best window
@@ -131,7 +132,7 @@ def all_in_degrees(model: Model, trials: Sequence[Trial], shown: Sequence[int]) 
     """Of each trial the signals that are in degrees in all of them, by what the model makes of it.
 
     Args:
-        model: whose errors are a third where they are divided by 57.3, and larger beside that.
+        model: whose errors are less than half where they are divided by 57.3, and larger far from that.
         trials: any.
         shown: states that a sensor has, in every trial.
     """
@@ -153,7 +154,7 @@ def all_in_degrees(model: Model, trials: Sequence[Trial], shown: Sequence[int]) 
         return []
     best = choices[int(np.nanargmin(errors))]
     near = [missed(replace(best, factor=f * DEGREES)) for f in (1 / LIKE, LIKE)]
-    told = np.nanmin(errors) < min(missed(replace(best, factor=1.0)) / SIMILAR, *near) / (1 + NEAR)
+    told = np.nanmin(errors) < min(missed(replace(best, factor=1.0)) / 2, *near)
     return [replace(best, trial=k) for k in range(len(trials))] if told else []
 
 
@@ -189,7 +190,7 @@ def odd_commands(model: Model, trials: Sequence[Trial], shown: Sequence[int]) ->
             wrong = [replace(odd, factor=f) for f in (factor / SIMILAR, factor * SIMILAR)]
             others = [missed(one.mended(trials[k])) for one in wrong]
             sound = mended < SIMILAR * float(np.median([missed(t) for t in rest]))
-            if sound and mended < min(0.5 * missed(trials[k]), *others):
+            if sound and mended < BETTER * min(missed(trials[k]), *others):
                 yield odd
 
 
