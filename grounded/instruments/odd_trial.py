@@ -132,7 +132,7 @@ def all_in_degrees(model: Model, trials: Sequence[Trial], shown: Sequence[int]) 
     """Of each trial the signals that are in degrees in all of them, by what the model makes of it.
 
     Args:
-        model: whose errors are less than half where they are divided by 57.3, and larger far from that.
+        model: whose errors fall below half where they are divided by 57.3, not far from that.
         trials: any.
         shown: states that a sensor has, in every trial.
     """
