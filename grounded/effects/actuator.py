@@ -85,7 +85,7 @@ input_gain = InputFamily(
     equation="u_eff = (1 + g) u",
     sentence="{target} act{s} {g%stronger|weaker} than modelled",
     targets=_one_or_alike,
-    quantities=lambda site: (Quantity("g", "1", low=-1.5, high=5.0),),
+    quantities=lambda site: (Quantity("g", "1", low=-1.5, high=5.0, absurd=4.0),),
     lookalikes=("viscous_friction", "rate_gain", "parameter", "input_fade"),
     effect=lambda u, t, c: (1 + c["g"]) * u,
 )
@@ -132,12 +132,19 @@ input_curve = InputFamily(
     effect=lambda u, t, c: (1 + c["b"] * (np.abs(u) / c["U"] - 0.5)) * u + c["a"] * np.abs(u),
 )
 
+
+def _fade(site: Site) -> tuple[Quantity, ...]:
+    """Nothing is left at the end at most, and a gain more than doubles in no trial."""
+    most = 1.0 / max(site.scales.duration, 1e-3)
+    return (Quantity("k", "1/s", high=most, absurd=most),)
+
+
 input_fade = InputFamily(
     name="input_fade",
     equation="u_eff = (1 - k t) u",
     sentence="{target} gets {k%weaker every second (a battery that sags)|stronger every second}",
     targets=places.inputs,
-    quantities=lambda site: (Quantity("k", "1/s", high=1.0 / max(site.scales.duration, 1e-3)),),
+    quantities=_fade,
     lookalikes=("input_gain", "trend", "input_bias"),
     effect=lambda u, t, c: (1 - c["k"] * t) * u,
     timed=True,

@@ -57,6 +57,7 @@ class Quantity:
         places: how many independent values the grid looks at, for the price of looking.
         tunable: a constant that data may set (above zero) where they show the effect well.
         tuned: it was.
+        absurd: a size beyond which it is no finding but a sign of other units, or of other logs.
     """
 
     name: str
@@ -69,6 +70,7 @@ class Quantity:
     places: float = 1.0
     tunable: bool = False
     tuned: bool = False
+    absurd: float = np.inf
 
 
 @dataclass(frozen=True)

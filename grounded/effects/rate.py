@@ -78,7 +78,7 @@ rate_gain = RateFamily(
     equation="s' = (1 + g) model",
     sentence="{target} changes {g%faster|slower} than modelled",
     targets=places.but_position,
-    quantities=lambda site: (Quantity("g", "1", low=-1.5, high=5.0),),
+    quantities=lambda site: (Quantity("g", "1", low=-1.5, high=5.0, absurd=4.0),),
     lookalikes=("input_gain", "understeer", "parameter", "sensor_scale"),
     rate=lambda s, a, own, t, c, site: {site.target: c["g"] * own[site.target]},
     needs_own=True,

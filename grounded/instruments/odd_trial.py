@@ -1,15 +1,18 @@
 """A whole trial in other units than the rest: degrees for radians, milliseconds for seconds.
 
 Where one state of a trial is in degrees, or its stamps are in milliseconds, the rate of a position
-is a constant times what the velocity says. Where all angles and their rates are in degrees they
-agree with each other: then commands as large as in other trials seem to move the body tens of times
-as far, the model misses that by tens of times as much, and divided by 57.3 by as much as the rest.
+is a constant times what the velocity says; which of the two is off, the sizes in sound trials say.
+Where all angles and their rates are in degrees they agree with each other: then commands as large
+as in other trials seem to move the body tens of times as far, the model misses that by tens of
+times as much, and divided by 57.3 by as much as the rest. Commands in thousandths are tens of times
+smaller than in other trials, and the model predicts what the body does with thousand times as much,
+neither with a third of that nor with three times.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,40 +26,65 @@ AHEAD = 0.25  # [s]
 STARTS = 200
 LARGE = 20.0  # times what the others do
 SIMILAR = 3.0
+BETTER = 0.9  # of the error with commands as they are, or a third, or three times as large
 STAMPS, DEGREES = 1000.0, 180 / np.pi
 NEAR = 0.1  # relative, of these factors
-TOGETHER = 0.9  # correlation of a rate and its velocity
+TOGETHER = 0.95  # cosine of what a position moves and its velocity says, over the best window
+TURNS = (2 * np.pi, 360.0)  # by which a wrapped angle jumps
+LIKE = 10.0  # times as large, or as small: beside what corrected signals may be
+MANY = 8  # trials that tell enough
+LEAST = 8  # windows that a trial must hold
 FAR = 1e9
 
 Ratios = Sequence[tuple[Integral, float]]  # of a trial's positions, see `ratios_of`
 
 
-def in_degrees(
+@dataclass(frozen=True)
+class Odd:
+    """Signals of trial number `trial` that are `factor` times what they are in the others."""
+
+    trial: int
+    factor: float
+    states: tuple[int, ...] = ()
+    inputs: tuple[int, ...] = ()
+
+    def mended(self, trial: Trial) -> Trial:
+        """The trial in the unit of the others."""
+        x, u = np.array(trial.states), np.array(trial.inputs)
+        x[:, self.states] /= self.factor
+        u[:, self.inputs] /= self.factor
+        held = trial.start_inputs
+        if held is not None:
+            held = np.array(held)
+            held[list(self.inputs)] /= self.factor
+        return replace(trial, states=x, inputs=u, start_inputs=held)
+
+
+def odd_states(
     model: Model, trials: Sequence[Trial], ratios: Sequence[Ratios], shown: Sequence[int]
-) -> Iterator[tuple[int, list[int]]]:
-    """Trials with states in degrees that are in radians in another trial.
+) -> Iterator[Odd]:
+    """Trials with states in degrees that are in radians in another trial, or divided like degrees.
 
     Args:
         model: however crude.
         trials: several.
         ratios: of each.
-        shown: states that a sensor has.
+        shown: states that a sensor has, in every trial.
 
     Yields:
-        The index of the trial, and its states that are.
+        A trial and its states, all of one factor.
     """
     units = list(model.states.values())
-    shown = [i for i in shown if all(np.isfinite(t.states[:, i]).any() for t in trials)]
     angular = [i for i in shown if units[i] == "rad" or units[i].startswith("rad/")]
     if len(trials) < 2 or not angular:
         return
-    single = [_one_state(one) for one in ratios]
+    single = [_one_state(trials, ratios, k) for k in range(len(trials))]
     size = [np.sqrt(np.nanmean(t.states[:, angular] ** 2, axis=0)) for t in trials]
     pushed = [_size(t.inputs) for t in trials]
     missed = [_missed(model, trial, angular, shown) for trial in trials]
     for k, trial in enumerate(trials):
         if single[k] and not all(single):
-            yield k, single[k]
+            yield from single[k]
             continue
         rest = [j for j in range(len(trials)) if not (size[j] * LARGE > size[k]).any()]
         rest = [
@@ -64,30 +92,111 @@ def in_degrees(
         ]
         if not rest:
             continue
+        odd = Odd(k, DEGREES, tuple(angular))
         usual = max(missed[j] for j in rest)
-        mended = _missed(model, radians(trial, angular), angular, shown)
+        mended = _missed(model, odd.mended(trial), angular, shown)
         if missed[k] > LARGE * max(usual, mended) and mended < SIMILAR * usual:
-            yield k, angular
+            yield odd
 
 
-def _one_state(ratios: Ratios) -> list[int]:
-    """The states that are in degrees beside a rate or a position that isn't."""
+def _one_state(trials: Sequence[Trial], ratios: Sequence[Ratios], k: int) -> list[Odd]:
+    """The states of a trial that are in degrees, or divided so, beside a rate or a position."""
     found = []
-    for relation, factor in ratios:
-        for i, one in ((relation.i, factor), (relation.j, 1 / factor)):
-            if abs(one / DEGREES - 1) < NEAR:
-                found.append(i)
+    for at, (relation, ratio) in enumerate(ratios[k]):
+        factor = next((f for f in (DEGREES, 1 / DEGREES) if abs(ratio / f - 1) < NEAR), None)
+        if factor is None:
+            continue
+        sound = [
+            t
+            for t, one in zip(trials, ratios, strict=True)
+            if len(one) == len(ratios[k]) and 1 / SIMILAR < one[at][1] < SIMILAR
+        ]
+        choice = [Odd(k, factor, (relation.i,)), Odd(k, 1 / factor, (relation.j,))]
+        choice.sort(key=lambda odd: -odd.factor)  # degrees, where no other trial tells
+        if sound:
+            pair = [relation.i, relation.j]
+            usual = np.median([_spread(t, pair) for t in sound], axis=0)
+            strange = [
+                np.abs(np.log(_spread(odd.mended(trials[k]), pair) / usual)).sum() for odd in choice
+            ]
+            choice = [choice[int(np.argmin(strange))]]
+        found.append(choice[0])
     return found
 
 
-def radians(trial: Trial, some: Sequence[int]) -> Trial:
-    """The trial with some of its states divided by 57.3."""
-    states = np.array(trial.states)
-    states[:, some] = np.deg2rad(states[:, some])
-    return replace(trial, states=states)
+def _spread(trial: Trial, some: Sequence[int]) -> Array:
+    return np.asarray(np.nanstd(trial.states[:, some], axis=0) + 1e-300)
 
 
-def _missed(model: Model, trial: Trial, some: Sequence[int], shown: Sequence[int]) -> float:
+def all_in_degrees(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> list[Odd]:
+    """Of each trial the signals that are in degrees in all of them, by what the model makes of it.
+
+    Args:
+        model: whose errors fall below half where they are divided by 57.3, not far from that.
+        trials: any.
+        shown: states that a sensor has, in every trial.
+    """
+    units, inputs = list(model.states.values()), list(model.inputs.values())
+    angles = tuple(i for i in shown if units[i] == "rad")
+    sent = tuple(j for j, unit in enumerate(inputs) if unit == "rad")
+    moving = tuple(i for i in shown if units[i] in ("rad", "rad/s"))
+    some = trials[:: max(1, len(trials) // MANY)]
+
+    def missed(odd: Odd) -> float:
+        turned = [odd.mended(trial) for trial in some]
+        unit = np.median([_spread(t, shown) for t in turned], axis=0)
+        return float(np.median([_missed(model, t, shown, shown, unit) for t in turned]))
+
+    groups = dict.fromkeys([*((i,) for i in angles), angles, moving, ()])
+    choices = [Odd(0, DEGREES, g, u) for g in groups for u in ((), sent) if g or u]
+    errors = [missed(odd) for odd in choices]
+    if not np.isfinite(errors).any():
+        return []
+    best = choices[int(np.nanargmin(errors))]
+    near = [missed(replace(best, factor=f * DEGREES)) for f in (1 / LIKE, LIKE)]
+    told = np.nanmin(errors) < min(missed(replace(best, factor=1.0)) / 2, *near)
+    return [replace(best, trial=k) for k in range(len(trials))] if told else []
+
+
+def odd_commands(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> Iterator[Odd]:
+    """Trials with an input in thousandths, or in degrees, of its unit in other trials.
+
+    Args:
+        model: however crude.
+        trials: several, their states in the model's units.
+        shown: states that a sensor has, in every trial.
+
+    Yields:
+        A trial and an input.
+    """
+    if len(trials) < 2 or not shown:
+        return
+    unit = np.mean([_spread(t, shown) for t in trials], axis=0)
+    size = np.array([np.sqrt(np.nanmean(t.inputs**2, axis=0)) for t in trials])
+
+    def missed(trial: Trial) -> float:
+        return _missed(model, trial, shown, shown, unit)
+
+    for j, measure in enumerate(model.inputs.values()):
+        factors = (STAMPS, 1 / STAMPS, *((DEGREES, 1 / DEGREES) if measure == "rad" else ()))
+        for k, factor in ((k, f) for k in range(len(trials)) for f in factors):
+            apart = size[k, j] / size[:, j] if factor > 1 else size[:, j] / size[k, j]
+            rest = [t for t, one in zip(trials, apart > LARGE, strict=True) if one]
+            like = size[k, j] / factor / np.median(size[apart > LARGE, j]) if rest else 0.0
+            if not 1 / LIKE < like < LIKE:
+                continue
+            odd = Odd(k, factor, inputs=(j,))
+            mended = missed(odd.mended(trials[k]))
+            wrong = [replace(odd, factor=f) for f in (factor / SIMILAR, factor * SIMILAR)]
+            others = [missed(one.mended(trials[k])) for one in wrong]
+            sound = mended < SIMILAR * float(np.median([missed(t) for t in rest]))
+            if sound and mended < BETTER * min(missed(trials[k]), *others):
+                yield odd
+
+
+def _missed(
+    model: Model, trial: Trial, some: Sequence[int], shown: Sequence[int], unit: Array | float = 1.0
+) -> float:
     """Rms error of predictions a quarter of a second ahead, of the states `some` together."""
     steps = max(1, round(AHEAD / trial.dt))
     logged = np.array(trial.states)
@@ -101,7 +210,7 @@ def _missed(model: Model, trial: Trial, some: Sequence[int], shown: Sequence[int
     for j in range(steps):
         x = model.system.step(x, trial.inputs[at + j], model.values, trial.dt)
         x = np.fmax(np.fmin(x, FAR), -FAR)
-    return _size(model.difference(x, logged[at + steps])[:, some])
+    return _size(model.difference(x, logged[at + steps])[:, some] / unit)
 
 
 def judge_stamps(model: Model, trials: Sequence[Trial], ratios: Sequence[Ratios]) -> None:
@@ -115,7 +224,8 @@ def judge_stamps(model: Model, trials: Sequence[Trial], ratios: Sequence[Ratios]
     Raises:
         GroundedError: with the trial, a state and the factor.
     """
-    for k, (trial, found) in enumerate(zip(trials, ratios, strict=True)):
+    for k, (trial, every) in enumerate(zip(trials, ratios, strict=True)):
+        found = [one for one in every if one[0].exact]
         for factor in (STAMPS, 1 / STAMPS):
             if found and all(abs(one / factor - 1) < NEAR for _, one in found):
                 q, w = (model.state_names[i] for i in (found[0][0].i, found[0][0].j))
@@ -128,26 +238,41 @@ def judge_stamps(model: Model, trials: Sequence[Trial], ratios: Sequence[Ratios]
                 )
 
 
-def ratios_of(model: Model, trials: Sequence[Trial]) -> list[Ratios]:
+def ratios_of(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> list[Ratios]:
     """Of each trial, the rate of each position over what its velocity says; 1 where they differ."""
-    relations = [one for one in integrals(model) if one.exact]
+    relations = [one for one in integrals(model) if {one.i, one.j} <= set(shown)]
     return [_ratios(relations, trial) for trial in trials]
 
 
 def _ratios(relations: Sequence[Integral], trial: Trial) -> Ratios:
+    """Over the window in which they agree best: a position's noise is small beside a long way."""
     found = []
     for relation in relations:
         some = [
-            (np.diff(x[:, 0])[1:-1], over_steps(relation.c * x[:, 1]) * trial.dt)
+            (_unturned(x[:, 0])[1:-1], np.cumsum([0.0, *over_steps(relation.c * x[:, 1])]))
             for x in pieces([trial], (relation.i, relation.j))
         ]
-        if not some:
-            continue
-        moved, said = (np.concatenate(parts) for parts in zip(*some, strict=True))
-        if np.std(moved) > 0 and np.std(said) > 0:
-            same = abs(float(np.corrcoef(moved, said)[0, 1])) > TOGETHER
-            found.append((relation, _size(moved) / _size(said) if same else 1.0))
+        best, ratio, steps = TOGETHER, 1.0, 1
+        while usable := [pair for pair in some if len(pair[0]) > LEAST * steps]:
+            parts = [[z[steps:] - z[:-steps] for z in pair] for pair in usable]
+            moved, said = (np.concatenate(z) for z in zip(*parts, strict=True))
+            same = abs(moved @ said) / max(_size(moved) * _size(said) * len(said), 1e-300)
+            if same > best:
+                best, ratio = same, _size(moved) / (_size(said) * trial.dt)
+            steps *= 2
+        if some:
+            found.append((relation, ratio))
     return found
+
+
+def _unturned(q: Array) -> Array:
+    """Without the jumps of a wrapped angle."""
+    steps = np.diff(q)
+    for turn in TURNS:
+        jumps = np.abs(np.abs(steps) - turn) < 0.1 * turn
+        if np.median(np.abs(steps)) < 0.05 * turn:
+            steps -= np.where(jumps, np.sign(steps) * turn, 0.0)
+    return np.concatenate([[q[0]], q[0] + np.cumsum(steps)])
 
 
 def _size(x: Array) -> float:

@@ -30,7 +30,15 @@ from grounded.instruments.kinematics import (
     turned,
 )
 from grounded.instruments.lag import Lag, alike, at_samples, lag_between, reach_of
-from grounded.instruments.odd_trial import Ratios, in_degrees, judge_stamps, radians, ratios_of
+from grounded.instruments.odd_trial import (
+    Odd,
+    Ratios,
+    all_in_degrees,
+    judge_stamps,
+    odd_commands,
+    odd_states,
+    ratios_of,
+)
 from grounded.instruments.single import Signal, judge_signal
 from grounded.model import Model
 from grounded.task import Task
@@ -90,7 +98,7 @@ def preflight(
         return Preflight((), tuple(trials))
     bench = _Bench(model, [t.until(t.known_steps) for t in used], set(hidden))
     with np.errstate(all="ignore"):
-        ratios = ratios_of(model, bench.trials)
+        ratios = ratios_of(model, bench.trials, bench.shown)
         judge_stamps(model, bench.trials, ratios)
         found = [
             *bench.odd(ratios),
@@ -125,13 +133,35 @@ class _Bench:
             self.trials[k] = replace(trial, states=states)
 
     def odd(self, ratios: Sequence[Ratios]) -> Iterator[Finding]:
-        """Of trials that are in degrees as a whole."""
-        for k, some in list(in_degrees(self.model, self.trials, ratios, self.shown)):
-            trial = self.trials[k]
-            self.trials[k] = radians(trial, some)
-            text = f"is in degrees in trial {trial.id or f'number {k + 1}'}, in radians in others"
-            for i in some:  # of that log alone: no line for the table of all logs
-                yield _mended(self.model.state_names[i], text, "degrees", "", scale=DEGREES)
+        """Of trials that are in other units than the rest, as a whole or in one signal."""
+        shown = [i for i in self.shown if all(np.isfinite(x).any() for x in self.column(i))]
+        for odd in list(odd_states(self.model, self.trials, ratios, shown)):
+            yield from self.in_unit(odd)
+        for odd in all_in_degrees(self.model, self.trials, shown):
+            self.trials[odd.trial] = odd.mended(self.trials[odd.trial])
+            if odd.trial == 0:
+                yield from (_in_degrees(n, unit) for n, unit in self.named(odd))
+        for odd in list(odd_commands(self.model, self.trials, shown)):
+            yield from self.in_unit(odd)
+
+    def in_unit(self, odd: Odd) -> Iterator[Finding]:
+        """With one trial in the unit of the others; no line for the table of all logs."""
+        trial = self.trials[odd.trial]
+        self.trials[odd.trial] = odd.mended(trial)
+        where = f"in trial {trial.id or f'number {odd.trial + 1}'}"
+        text = f"is in degrees {where}, in radians in others"
+        if abs(odd.factor / DEGREES - 1) > UNIT or odd.inputs:
+            size = f"{max(odd.factor, 1 / odd.factor):.4g} times too"
+            text = f"is {size} {'large' if odd.factor > 1 else 'small'} {where}"
+        degrees = abs(abs(np.log(odd.factor)) - np.log(DEGREES)) < UNIT
+        for name, _ in self.named(odd):
+            kind = "degrees" if degrees else "scale"
+            yield _mended(name, text, kind, "", scale=odd.factor)
+
+    def named(self, odd: Odd) -> list[tuple[str, str]]:
+        """Names and units of its signals."""
+        states, inputs = list(self.model.states.items()), list(self.model.inputs.items())
+        return [states[i] for i in odd.states] + [inputs[j] for j in odd.inputs]
 
     def singles(self) -> Iterator[Finding]:
         """Of each sensor by itself."""
@@ -176,8 +206,7 @@ class _Bench:
         """With state i in radians."""
         self.put(i, [x / DEGREES for x in self.column(i)])
         name = self.model.state_names[i]
-        text, log = f"is in degrees, not in {self.model.states[name]}", f"scale = {1 / DEGREES:.8g}"
-        return _mended(name, text, "degrees", log, scale=DEGREES)
+        return _in_degrees(name, self.model.states[name])
 
     def late(self, relation: Integral, lag: Lag) -> Iterator[Finding]:
         """A delay: no sensor is early, so it is the later one's."""
@@ -239,6 +268,11 @@ class _Bench:
 def _mended(name: str, text: str, kind: str, log: str, **values: float) -> Finding:
     """A finding that the trials were corrected for."""
     return Finding(name, text, kind, corrected=True, log=log, **values)
+
+
+def _in_degrees(name: str, unit: str) -> Finding:
+    text, log = f"is in degrees, not in {unit}", f"scale = {1 / DEGREES:.8g}"
+    return _mended(name, text, "degrees", log, scale=DEGREES)
 
 
 def _earlier(x: Array, steps: float) -> Array:

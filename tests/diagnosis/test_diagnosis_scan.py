@@ -43,6 +43,25 @@ def test_a_delay_of_a_hundredth_of_a_step_is_a_matter_of_time_stamps():
     assert search.price(effect, {"d": 0.02}) < 20
 
 
+@pytest.mark.parametrize(
+    ("name", "sound", "absurd"),
+    [
+        ("input_fade:torque", {"k": -0.1}, {"k": -4.94}),
+        ("sensor_scale:theta", {"k": 0.5}, {"k": 1.81}),
+        ("input_gain:torque", {"g": 1.0}, {"g": 5.0}),
+    ],
+)
+def test_absurd_sizes_are_not_claimed(name, sound, absurd):
+    """Logs in degrees: the command got 494 % stronger every second, a log was 181 % too large."""
+    t = np.arange(60) * 0.05
+    trial = Trial(np.zeros((61, 2)), np.sin(t)[:, None], 0.05, ("theta", "omega"), ("torque",))
+    data = prepare(pendulum, [trial, trial])
+    search = HypothesisSearch(data, Library().candidates(pendulum, data.scales))
+    effect = Library().effect(name, pendulum, data.scales)
+    assert search.price(effect, sound) < 20
+    assert search.price(effect, absurd) == math.inf
+
+
 def test_a_state_that_is_set_outright_has_no_rate_to_be_scaled():
     model = Model(
         states={"w": "rad/s"},

@@ -268,6 +268,105 @@ def test_one_state_of_one_trial_in_degrees_is_named():
     np.testing.assert_allclose(found.trials[1].states, trials[1].states)
 
 
+@pytest.mark.parametrize(
+    ("state", "factor"), [(0, 180 / np.pi), (0, np.pi / 180), (1, 180 / np.pi), (1, np.pi / 180)]
+)
+def test_the_sensor_that_is_off_is_told_by_the_sizes_in_other_trials(state, factor):
+    """A theta that was 57.3 times too small passed for an omega in degrees."""
+    trials = arm()
+    states = np.array(trials[1].states)
+    states[:, state] *= factor
+    found = preflight(ARM, [trials[0], replace(trials[1], states=states), *trials[2:]])
+    assert [(f.signal, f.kind) for f in found.findings] == [("qw"[state], "degrees")]
+    assert found.findings[0].scale == pytest.approx(factor)
+    np.testing.assert_allclose(found.trials[1].states, trials[1].states)
+
+
+def test_a_heading_in_degrees_in_one_trial_leaves_the_others_alone():
+    """The car carries its heading's rate along: pooled, one trial made all be in degrees."""
+    rng, trials = np.random.default_rng(4), []
+    for _ in range(3):
+        u = 0.4 + 0.2 * np.sin(DT * np.arange(150)[:, None] * rng.uniform(1, 4, 2))
+        states = [np.zeros(car.n)]
+        for one in u:
+            states.append(car.system.step(states[-1][None], one[None], car.values, DT)[0])
+        x = np.array(states) + 1e-4 * rng.standard_normal((151, car.n))
+        trials.append(Trial(x, u, DT, car.state_names, car.input_names))
+    x = np.array(trials[1].states)
+    x[:, car.state_names.index("psi")] *= 180 / np.pi
+    found = preflight(car, [trials[0], replace(trials[1], states=x), *trials[2:]])
+    assert [(f.signal, f.kind) for f in found.findings] == [("psi", "degrees")]
+    for mended, trial in zip(found.trials, trials, strict=True):
+        np.testing.assert_allclose(mended.states, trial.states)
+
+
+@pytest.mark.parametrize("wrapped", [False, True])
+def test_a_noisy_angle_in_degrees_is_found_over_longer_windows(wrapped):
+    """A boat's compass, 0.23 degrees of noise at 20 Hz: its steps are mostly noise."""
+    trials, rng = arm(), np.random.default_rng(3)
+    for k, trial in enumerate(trials):
+        x = np.array(trial.states)
+        x[:, 0] += 0.04 * rng.standard_normal(len(x)) + 3 * (k == 1)
+        if k == 1:
+            x[:, 0] = np.rad2deg(x[:, 0])
+            x[:, 0] = (x[:, 0] + 180) % 360 - 180 if wrapped else x[:, 0]
+        trials[k] = replace(trial, states=x)
+    found = preflight(ARM, trials)
+    assert (found.findings[0].signal, found.findings[0].kind) == ("q", "degrees")
+    assert 0.5 < np.ptp(found.trials[1].states[:, 0]) / np.ptp(arm()[1].states[:, 0]) < 2
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
+def test_commands_in_another_unit_in_one_trial_are_told(factor):
+    trials = arm(friction=0.4)
+    odd = replace(trials[2], inputs=factor * trials[2].inputs, start_inputs=np.array([factor]))
+    found = preflight(ARM, [*trials[:2], odd, trials[3]])
+    assert [(f.signal, f.kind, f.corrected) for f in found.findings] == [("u", "scale", True)]
+    assert found.findings[0].scale == pytest.approx(factor)
+    np.testing.assert_allclose(found.trials[2].inputs, trials[2].inputs)
+    np.testing.assert_allclose(found.trials[2].start_inputs, [1.0])
+
+
+BEAM = Model(
+    states={"r": "m", "v": "m/s", "theta": "rad"},
+    inputs={"cmd": "rad"},
+    params={"k": Param(5.0, "m/s^2", 2.0, 12.0), "tau": Param(0.1, "s", 0.02, 0.5)},
+    derivative=lambda s, a, p: {
+        "r": s.v,
+        "v": p.k * np.sin(s.theta),
+        "theta": (a.cmd - s.theta) / p.tau,
+    },
+)
+
+
+@pytest.mark.parametrize("k", [2.8, 5.0, 10.0])
+@pytest.mark.parametrize("unit", [1.0, 180 / np.pi])
+@pytest.mark.parametrize("sent", [1.0, 180 / np.pi])
+def test_an_angle_in_degrees_in_all_logs_is_told_by_the_model(unit, sent, k):
+    """Ball on a beam: no rate of theta is logged, only its command and what it does to the ball."""
+    rng, trials = np.random.default_rng(1), []
+    for phase in (0.0, 2.0):
+        u, states = 0.12 * np.sin(1.8 * DT * np.arange(400) + phase)[:, None], [np.zeros(3)]
+        for one in u:
+            real = np.array([k, 0.13])
+            states.append(BEAM.system.step(states[-1][None], one[None], real, DT)[0])
+        x = np.array(states) + rng.normal(size=(401, 3)) * [1e-3, 4e-3, 1e-3]
+        trials.append(Trial(x * [1, 1, unit], sent * u, DT, BEAM.state_names, ("cmd",)))
+    found = [(f.signal, f.kind) for f in preflight(BEAM, trials).findings]
+    assert found == [("theta", "degrees")] * (unit > 1) + [("cmd", "degrees")] * (sent > 1)
+
+
+def test_a_body_that_swings_freely_has_no_commands_in_another_unit():
+    pushed, free = arm(trials=2)
+    states = [np.array([1.0, 0.0])]
+    for u in (inputs := 1e-3 * pushed.inputs):
+        states.append(ARM.system.step(states[-1][None], u[None], ARM.values, DT)[0])
+    swing = replace(free, states=np.array(states), inputs=inputs)
+    assert not preflight(ARM, [pushed, swing]).findings
+    still = replace(free, states=1e-3 * free.states, inputs=inputs)
+    assert not [f for f in preflight(ARM, [pushed, still]).findings if f.signal == "u"]
+
+
 def test_a_trial_that_moves_more_is_not_in_degrees():
     quiet, wild = arm(trials=2)
     small = replace(quiet, states=quiet.states / 40, inputs=quiet.inputs / 40)

@@ -82,6 +82,26 @@ def test_a_trial_that_does_not_say_what_it_ran_is_the_outstanding_ones(w, tmp_pa
     assert again.known and again.trial == found.trial
 
 
+@pytest.mark.parametrize("data", [False, True])
+def test_units_that_a_trial_states_must_be_the_models(w, tmp_path, data):
+    """A trial in cm was stored as if it were in m."""
+    write_trial(tmp_path / "t.mcap", plain(), {}, state_units={"x": "cm", "v": "m / s"})
+    with pytest.raises(GroundedError, match="x is in cm, the model has m") as refused:
+        ingest_log(w, tmp_path / "t.mcap", data=data)
+    assert " v is" not in str(refused.value) and not w.store.list()
+    write_trial(tmp_path / "u.mcap", plain(), {}, state_units={"x": "m", "v": "m / s"})
+    assert ingest_log(w, tmp_path / "u.mcap", data=True).trial
+
+
+@pytest.mark.parametrize("factor", [1e3, 1e-3])
+def test_stamps_in_another_unit_are_told_from_lost_samples(w, tmp_path, factor):
+    with TrialWriter(tmp_path / "t.mcap", 0.05, {"x": "m", "v": "m/s"}, {"force": "N"}, {}) as log:
+        for k in range(11):
+            log.append(0.05 * k * factor, np.zeros(2), np.zeros(1) if k < 10 else None)
+    with pytest.raises(GroundedError, match=f"another unit.* {1 / factor:g} times"):
+        ingest_log(w, tmp_path / "t.mcap", data=True)
+
+
 def test_without_an_outstanding_candidate_it_must_be_named(w, tmp_path):
     write_trial(tmp_path / "t.mcap", plain(), {"kind": "trial"})
     with pytest.raises(GroundedError, match=holding("--candidate", "--data")):

@@ -13,7 +13,7 @@ from cli import grounded
 from facts import holds
 from grounded.errors import GroundedError, NextCommand
 from grounded_trials import Workspace
-from grounded_trials.store.trial_file import read_trial
+from grounded_trials.store.trial_file import read_trial, write_trial
 from grounded_trials.workspace import foreign, ingest
 from workspaces import CONFIG, make
 
@@ -207,6 +207,63 @@ def test_a_run_in_other_units_says_so_and_a_name_that_is_none_is_answered(tmp_pa
     assert holds(str(refused.value), *said)
     with pytest.raises(GroundedError, match="no candidate 'c0009'"):
         w.ingest(path, candidate="c0009")
+
+
+BOAT = """import numpy as np
+
+from grounded import Model, Param
+
+model = Model(
+    states={"x": "m", "y": "m", "psi": "rad", "u": "m/s", "r": "rad/s"},
+    inputs={"thrust": "N", "rudder": "rad"},
+    params={"drag": Param(4.0, "N s/m", 1.0, 12.0)},
+    angles=("psi",),
+    derivative=lambda s, a, p: {
+        "x": s.u * np.cos(s.psi),
+        "y": s.u * np.sin(s.psi),
+        "psi": s.r,
+        "u": (a.thrust - p.drag * s.u) / 6,
+        "r": (1.5 * s.u * a.rudder - s.r) / 0.4,
+    },
+)
+"""
+BOAT_CONFIG = """[model]
+file = "model.py"
+[task]
+dt = 0.05
+horizon = 240
+target = "target.csv"
+start = { u = 1.0 }
+[reward]
+state = { x = 4.0, y = 4.0, psi = 0.5, u = 0.5 }
+input = { thrust = 0.001, rudder = 0.05 }
+input_change = { thrust = 0.01, rudder = 0.01 }
+[limits]
+thrust = [-10.0, 15.0]
+rudder = [-0.7, 0.7]
+[system]
+model = "model.py"
+noise.measurement = { x = 0.01, y = 0.01, psi = 0.004, u = 0.01, r = 0.01 }
+"""
+
+
+def test_a_log_so_noisy_that_any_commands_follow_from_it_is_one_in_degrees(tmp_path):
+    """A boat's compass: 0.23 of noise, taken for radians, made any rudder the candidate's."""
+    t = np.arange(241) * 0.05
+    path = np.column_stack([t, 3 * np.sin(t / 3), 3 - 3 * np.cos(t / 3), t / 3, 1 + 0 * t])
+    rows = "\n".join(",".join(f"{v:.6f}" for v in row) for row in path)
+    target = f"t,x,y,psi,u\n{rows}\n"
+    w = Workspace(make(tmp_path / "w", config=BOAT_CONFIG, model=BOAT, target=target).folder)
+    w.propose()
+    w.run()
+    trial, meta, _ = read_trial(next((w.folder / "runs").iterdir()))
+    odd = replace(trial, states=trial.states * [1, 1, 180 / np.pi, 1, 1])
+    write_trial(tmp_path / "odd.mcap", odd, {k: meta[k] for k in ("kind", "task")})
+    with pytest.raises(GroundedError) as refused:
+        w.ingest(tmp_path / "odd.mcap")
+    assert holds(str(refused.value), "psi 57.3", "large", "degrees", "0.0174533")
+    named = w.ingest(tmp_path / "odd.mcap", candidate=trial.candidate)
+    assert any("psi" in warning and "0.0174533" in warning for warning in named.warnings)
 
 
 @pytest.mark.parametrize("pace", [2.0, 0.5])

@@ -10,7 +10,8 @@ What naming an effect costs, the price of its numbers, of looking for it, of whe
 
 k free values, N time steps. Thresholds, frequencies and places that were scanned pay for the
 looking, and families that could have been blamed at many targets for the choice. A parameter of the
-model pays by its prior (a fifth of its size) instead. Two added rates that cancel are no finding.
+model pays by its prior (a fifth of its size) instead. Two added rates that cancel are no finding,
+nor is a gain that more than doubles in a trial or a log twice too large (`Quantity.absurd`).
 """
 
 from __future__ import annotations
@@ -155,6 +156,8 @@ def price(
     if isinstance(effect.family, ParamFamily):
         return math.log(targets) + _of_parameter(effect, values, data.steps)
     if values.get(TIMES.get(effect.family.name, ""), math.inf) < BRIEF * data.dt:
+        return math.inf
+    if any(abs(values.get(q.name, 0.0)) > q.absurd for q in effect.free):
         return math.inf
     numbers = len(effect.free) + sum(q.tuned for q in effect.quantities)
     cost = 0.5 * numbers * math.log(max(data.steps, 2)) + effect.family.vague

@@ -171,13 +171,22 @@ class OwnFile:
         stamps = np.concatenate([b.publish_times for b in batches] or [np.zeros(0, np.int64)])
         times = (stamps - start_ns) * 1e-9
         off = np.abs(times - dt * np.arange(len(times))) > 0.5 * dt
-        if off.any():
-            k = int(np.argmax(off))
-            raise GroundedError(
-                f"{self.name}: {topic} sample {k} is stamped {times[k]:.4f} s, its place on the "
-                f"grid of {dt} s is {k * dt:.4f} s: samples are missing, or came late. A trial "
-                "needs one at every step: run it again"
-            )
+        if not off.any():
+            return
+        apart = float(np.median(np.diff(times, prepend=times[0] - dt)))
+        for factor in (1e3, 1e-3):
+            if abs(apart / (dt * factor) - 1) < 0.1:
+                raise GroundedError(
+                    f"{self.name}: {topic} has a sample every {apart:.4g} s by its stamps, its dt "
+                    f"is {dt} s: they are in another unit (milliseconds, not seconds). Append each "
+                    f"at {1 / factor:g} times its stamp"
+                )
+        k = int(np.argmax(off))
+        raise GroundedError(
+            f"{self.name}: {topic} sample {k} is stamped {times[k]:.4f} s, its place on the "
+            f"grid of {dt} s is {k * dt:.4f} s: samples are missing, or came late. A trial "
+            "needs one at every step: run it again"
+        )
 
     def _topic(
         self, topic: str, names: Iterable[str], *, listed: bool

@@ -8,7 +8,8 @@ finds the first.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -45,6 +46,7 @@ from grounded_trials.workspace.trial_check import (
 
 ALIGNED = 0.75  # of the time between samples: a start nearer than that is as good
 THOUSAND = (1e-3, 1e3)
+SPELT = str.maketrans({" ": "", "·": "", "*": "", "²": "^2"})  # a unit, whoever writes it
 CLEAR = 0.7  # of the commands' difference at the first command: the start is elsewhere
 
 
@@ -177,20 +179,28 @@ def _recognised(workspace: Folder, path: Path, read: _Read, candidate: str | Non
         if (rival := _rival(log, found, ran, candidates)) is not None:
             other_why, name = judged(rival)  # as it lies where that one fits best
             why, other = (other_why, name) if name else (why or other_why, other)
-    if not why:
-        return read
-    if candidate is not None and (log is None or (found and found.opens_alike)):
-        return replace(read, warnings=(*read.warnings, why))
     units, by = other_units(workspace.task, interpolate_gaps(read.trial).trial, own)
-    if units and not other:
-        which = " and ".join(units)
+    units = () if other else units
+    if not why and not units:
+        return read
+    which = " and ".join(units)
+    if candidate is not None and (log is None or (found and found.opens_alike)):
+        why = (
+            why or f"{which} seem to be in another unit: times {by:.6g} they fit {ran} much better"
+        )
+        return replace(read, warnings=(*read.warnings, why))
+    if units:
         degrees = f" (in {'degrees' if by < 1 else 'radians taken for degrees'})" * (
             by not in THOUSAND
         )
+        mend = (
+            f"multiply the scale of {which} by {by:.6g} in {FILE}'s [log] (1 where none is given)"
+            if read.log
+            else f"append {which} times {by:.6g} and run it again, or take it in with --data"
+        )
         raise GroundedError(
             f"{path} ran {ran}, with {which} {max(by, 1 / by):.4g} times too "
-            f"{'large' if by < 1 else 'small'}{degrees}: multiply the scale of {which} by {by:.6g} "
-            f"in {FILE}'s [log] (1 where none is given)"
+            f"{'large' if by < 1 else 'small'}{degrees}: {mend}"
         )
     if log and (pace := pace_of(log, workspace.task, own.policy)):
         raise GroundedError(
@@ -274,6 +284,11 @@ def _own(workspace: Folder, path: Path, candidate: str | None, data: bool) -> _R
                 f"{path} has the {what} {', '.join(found)}; this workspace's model has "
                 f"{', '.join(own)}: it is a trial of another robot"
             )
+    if other := list(_other_units(workspace, meta)):
+        raise GroundedError(
+            f"{path}: {'; '.join(other)}. A trial is stored as it is: write its signals in the "
+            "model's units and name those, or ingest them as a CSV with a scale in [log]"
+        )
     if abs(trial.dt - dt) > 1e-9:
         raise GroundedError(
             f"{path} was recorded every {trial.dt:g} s, this workspace's [task] dt is {dt:g} s: "
@@ -296,6 +311,16 @@ def _own(workspace: Folder, path: Path, candidate: str | None, data: bool) -> _R
     trial = replace(trial, candidate=candidate or _outstanding(workspace, path))
     _check_candidate(workspace, path, trial.candidate)
     return _Read(trial, _encode(workspace, trial, _about(workspace, trial.candidate)))
+
+
+def _other_units(workspace: Folder, meta: dict[str, str]) -> Iterator[str]:
+    """The signals of a trial whose units are stated, and not the model's: `N m` is `N·m`, too."""
+    model = workspace.base_model
+    for kind, own in (("states", model.states), ("inputs", model.inputs)):
+        for name, unit in json.loads(meta[kind]).items():
+            said, wanted = (u.translate(SPELT) for u in (unit, own[name]))
+            if "1" not in (said, wanted) and said != wanted and said:
+                yield f"{name} is in {unit}, the model has {own[name]}"
 
 
 def _check_candidate(

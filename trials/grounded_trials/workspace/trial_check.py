@@ -30,7 +30,7 @@ ROUGH = 4.0  # steps over which noise keeps its sign: what strays for longer, so
 FINE = 1e-4  # of an input's size: how finely commands are logged at best
 BACK = (0.0, 0.5, 1.0, 1.5, 2.0, -0.5, -1.0)  # steps: states of the log older than those acted on
 AGES = 1.0  # steps by which that varies in a run: packets are lost, clocks drift and jitter
-ANGULAR = (("rad", "rad/s"), ("rad",), ("rad/s",))
+ANGULAR = (("rad", "rad/s"), ("rad",), ("rad/s",))  # groups of units that may be in degrees
 NEARLY = 0.1  # of an input's size: what other units must leave of the difference
 OTHERS = 20  # candidates to compare with, the latest
 
@@ -260,11 +260,16 @@ def suspicion(
 def other_units(task: Task, trial: Trial, own: Candidate) -> tuple[tuple[str, ...], float]:
     """The signals with which a log is a run of its candidate once they are multiplied, and by what.
 
-    Degrees for radians or the other way round, thousandths or thousands; (), 1 where nothing helps.
+    Degrees for radians or the other way round, thousandths or thousands; (), 1 where nothing helps,
+    or nothing needs to: a log so noisy that any commands could follow from it is nobody's.
     """
     model = task.model
     trial, latest = trial.until(task.horizon), _latest(task)
+    plain = follows(own.policy, trial, latest)
+    if plain is None or (plain.alike and plain.error < NEARLY):
+        return (), 1.0
     angular = [[n for n, u in model.states.items() if u in units] for units in ANGULAR]
+    angular += [[n] for n, u in (*model.states.items(), *model.inputs.items()) if u in ANGULAR[0]]
     single = [[name] for name in (*model.state_names, *model.input_names)]
     tried = [(names, factor) for factor in (np.pi / 180, 180 / np.pi) for names in angular if names]
     for names, factor in tried + [(names, f) for f in (1e-3, 1e3) for names in single]:
@@ -274,7 +279,8 @@ def other_units(task: Task, trial: Trial, own: Candidate) -> tuple[tuple[str, ..
         ]
         turned = replace(trial, states=trial.states * by[0], inputs=trial.inputs * by[1])
         found = follows(own.policy, turned, latest)
-        if found is not None and found.alike and found.error < NEARLY:
+        fits = found is not None and found.alike and found.error < NEARLY
+        if found and fits and (not plain.alike or evidence(plain, found) > DECISIVE):
             return tuple(names), float(factor)
     return (), 1.0
 
