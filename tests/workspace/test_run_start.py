@@ -289,12 +289,3 @@ def test_one_log_is_one_trial(w, tmp_path):
     assert w.ingest(path, candidate="c0002").known and len(w.trials()) == 2
     w.discard(first.trial)
     assert w.ingest(path, data=True).candidate == ""
-
-
-def test_the_log_of_another_run_of_the_best_names_it(w):
-    file = w.folder / "grounded.toml"
-    file.write_text(
-        file.read_text().split("[system]")[0] + file.read_text()[file.read_text().index("[log") :]
-    )
-    again = w.status().again
-    assert again.arguments == ("LOG", "--candidate", "c0001")

@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
-from grounded.policy import Policy
 from grounded.result import Result
 from grounded.search.candidate import Candidate, Tried
 from grounded.trial import Trial, interpolate_gaps
@@ -35,19 +34,16 @@ from grounded_trials.workspace.foreign import ForeignLog, mapping_of, read_forei
 from grounded_trials.workspace.identity import sha256
 from grounded_trials.workspace.next_step import PROPOSE, after_log
 from grounded_trials.workspace.proposing import candidate_named, standing_in
-from grounded_trials.workspace.run_start import Recording, Start, pace_of
+from grounded_trials.workspace.run_start import elsewhere, pace_of, rival_in
 from grounded_trials.workspace.trial_check import (
     OTHERS,
-    SAME,
     other_units,
     suspicion,
     warnings_about,
 )
 
-ALIGNED = 0.75  # of the time between samples: a start nearer than that is as good
 THOUSAND = (1e-3, 1e3)
 SPELT = str.maketrans({" ": "", "·": "", "*": "", "²": "^2"})  # a unit, whoever writes it
-CLEAR = 0.7  # of the commands' difference at the first command: the start is elsewhere
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -172,36 +168,22 @@ def _recognised(workspace: Folder, path: Path, read: _Read, candidate: str | Non
     log, found = read.log.recording if read.log else None, None
     if read.log and log:
         found = log.start_of(own.policy)
-        if found and _elsewhere(log, found, own.policy, why):
+        if found and elsewhere(log, found, own.policy, why):
             note = f"the log begins {found.seconds:.3f} s before {ran} does: it is taken from there"
             read = replace(_cut(read.log, ran, found.seconds), notes=(note,))
             why, other = judged(interpolate_gaps(read.trial).trial)
-        if (rival := _rival(log, found, ran, candidates)) is not None:
+        if (rival := rival_in(log, found, ran, candidates)) is not None:
             other_why, name = judged(rival)  # as it lies where that one fits best
             why, other = (other_why, name) if name else (why or other_why, other)
     units, by = other_units(workspace.task, interpolate_gaps(read.trial).trial, own)
     units = () if other else units
     if not why and not units:
         return read
-    which = " and ".join(units)
     if candidate is not None and (log is None or (found and found.opens_alike)):
-        why = (
-            why or f"{which} seem to be in another unit: times {by:.6g} they fit {ran} much better"
-        )
-        return replace(read, warnings=(*read.warnings, why))
+        seem = f"{' and '.join(units)} seem to be in another unit: times {by:.6g} they fit better"
+        return replace(read, warnings=(*read.warnings, why or seem))
     if units:
-        degrees = f" (in {'degrees' if by < 1 else 'radians taken for degrees'})" * (
-            by not in THOUSAND
-        )
-        mend = (
-            f"multiply the scale of {which} by {by:.6g} in {FILE}'s [log] (1 where none is given)"
-            if read.log
-            else f"append {which} times {by:.6g} and run it again, or take it in with --data"
-        )
-        raise GroundedError(
-            f"{path} ran {ran}, with {which} {max(by, 1 / by):.4g} times too "
-            f"{'large' if by < 1 else 'small'}{degrees}: {mend}"
-        )
+        raise GroundedError(f"{path} ran {ran}, {_units_told(units, by, read.log is not None)}")
     if log and (pace := pace_of(log, workspace.task, own.policy)):
         raise GroundedError(
             f"{path} ran {ran}, but a second of its stamps is {pace:g} s of the run (a recording "
@@ -217,11 +199,15 @@ def _recognised(workspace: Folder, path: Path, read: _Read, candidate: str | Non
     )
 
 
-def _elsewhere(log: Recording, found: Start, policy: Policy, why: str) -> bool:
-    """Whether a run begins where it was found, not with the log's first command."""
-    if not found.opens_alike or abs(found.seconds - log.first) <= ALIGNED * log.interval:
-        return False
-    return bool(why) or found.apart < CLEAR * log.apart_at(policy, log.first)
+def _units_told(names: Sequence[str], by: float, mapped: bool) -> str:
+    """What is wrong with the units of a log, and what mends it; `mapped`: by a [log] table."""
+    which = " and ".join(names)
+    size = f"{max(by, 1 / by):.4g} times too {'large' if by < 1 else 'small'}"
+    degrees = "" if by in THOUSAND else " (in degrees)" if by < 1 else " (radians for degrees)"
+    mend = f"multiply the scale of {which} by {by:.6g} in {FILE}'s [log] (1 where none is given)"
+    if not mapped:
+        mend = f"append {which} times {by:.6g} and run it again, or take it in with --data"
+    return f"with {which} {size}{degrees}: {mend}"
 
 
 def _latest(workspace: Folder) -> list[Candidate]:
@@ -232,18 +218,6 @@ def _latest(workspace: Folder) -> list[Candidate]:
             candidate, meta = workspace.candidate(identity)
             found += [candidate] * (meta.get("task") == workspace.task.hash)
     return found
-
-
-def _rival(
-    log: Recording, found: Start | None, own: str, candidates: Sequence[Candidate]
-) -> Trial | None:
-    """The log from where another candidate fits it much better than the own one anywhere."""
-    best, bound = None, SAME * found.apart if found and found.alike else np.inf
-    for one in candidates:
-        start = log.start_of(one.policy) if one.id != own else None
-        if start is not None and start.alike and start.apart < bound:
-            best, bound = log.trial_from(start.seconds), start.apart
-    return best
 
 
 def _repeated(workspace: Folder, path: Path, read: _Read) -> str:

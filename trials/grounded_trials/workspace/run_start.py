@@ -10,7 +10,7 @@ as it goes, where it was quiet before.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,17 +18,20 @@ import numpy as np
 from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.policy import Policy
+from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import LAST, Trial, interpolate_gaps
 from grounded_trials.logs.resample import Gridded, Span, to_grid
 from grounded_trials.logs.signals import Series
-from grounded_trials.workspace.trial_check import FINE, LEAST, UNLIKE, follows
+from grounded_trials.workspace.trial_check import FINE, LEAST, SAME, UNLIKE, follows
 
 TRIED = 5  # instants at which the commands fit best
 FINEST = 8  # parts of a step, between which the start is sought
 FEW = 5  # changes, which are too few to say when the steps begin
 QUIET_S = 1.0  # without a change of commands, before a run that the log does not have whole
 SHORT = 4  # at least 1 / SHORT of a run tells that it was one
+ALIGNED = 0.75  # of the time between samples: a start nearer than that is as good
+CLEARLY = 0.7  # of the commands' difference at the first command: the start is elsewhere
 PACES = (2.0, 0.5)  # of a recording that was played twice as fast, or half
 BATCH = 256  # instants compared at once
 
@@ -204,3 +207,22 @@ def _paced(series: Series, pace: float) -> Series:
         for at in (series.t, series.log_times)
     )
     return replace(series, t=t, log_times=log)
+
+
+def elsewhere(log: Recording, found: Start, policy: Policy, why: str) -> bool:
+    """Whether a run begins where it was found, not with the log's first command."""
+    if not found.opens_alike or abs(found.seconds - log.first) <= ALIGNED * log.interval:
+        return False
+    return bool(why) or found.apart < CLEARLY * log.apart_at(policy, log.first)
+
+
+def rival_in(
+    log: Recording, found: Start | None, own: str, candidates: Sequence[Candidate]
+) -> Trial | None:
+    """The log from where another candidate fits it much better than the own one anywhere."""
+    best, bound = None, SAME * found.apart if found and found.alike else np.inf
+    for one in candidates:
+        start = log.start_of(one.policy) if one.id != own else None
+        if start is not None and start.alike and start.apart < bound:
+            best, bound = log.trial_from(start.seconds), start.apart
+    return best
