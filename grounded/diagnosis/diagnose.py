@@ -35,10 +35,8 @@ from grounded.diagnosis.error_report import (
 )
 from grounded.diagnosis.hypotheses.attribution import attribute, so_far
 from grounded.diagnosis.hypotheses.correction import correction
-from grounded.diagnosis.hypotheses.leftover import whiteness
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
-from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.predictor import Predictor
@@ -52,7 +50,7 @@ from grounded.diagnosis.validation.limits import Limits, held, identifiable, kno
 from grounded.diagnosis.validation.measured import Measured, root_mean_square
 from grounded.diagnosis.validation.prediction_error import by_region, by_time, explained, horizon
 from grounded.diagnosis.validation.ruler import Ruler
-from grounded.diagnosis.verdict import next_trial, verdict
+from grounded.diagnosis.verdict import next_trial, open_noise, verdict
 from grounded.effects import Library
 from grounded.engine import Engine, running, steady
 from grounded.errors import GroundedError
@@ -211,7 +209,7 @@ class _Writer:
         measured = self.measured
         remainder = measured.remainders()
         rows, credit = measured.prediction_error(), measured.credits()
-        off = remainder[0].channel if remainder else ""
+        off = remainder[0].channel if remainder else open_noise(rows)
         named = [row.effect for row in ranking if row.claimed]
         seen = unconfirmed(self.claims, self.decision.doubtful, groups)
         values, agreement = by_trial(self.best, data, named) if named else ((), ())
@@ -222,7 +220,7 @@ class _Writer:
                 times=tuple(by_time(gain.sum(axis=-1), data)),
                 regions=tuple(by_region(gain.sum(axis=-1), predictor, self.best)),
                 split=measured.split(),
-                whiteness=self.whiteness(),
+                whiteness=measured.whiteness,
                 tempering=self.search.tempering.factor,
             ),
             ranking=ranking,
@@ -297,13 +295,6 @@ class _Writer:
             correlation_s=np.nan if tau is None else tau,
             outliers=not isinstance(noise.weight_v, float),
         )
-
-    def whiteness(self) -> dict[str, float]:
-        """The chance that white noise leaves innovations as correlated as these, by channel."""
-        delays = delays_of(self.best.hypothesis, self.data)
-        seen = self.data.seen if delays is None else delays.samples()[1]
-        found = whiteness(self.best, seen)
-        return {name: found[str(i)] for i, name in self.shown}
 
     def utility_prediction(self, bare: Any) -> UtilityPrediction | None:
         """Rms errors of predicted utilities, held out; None for a bare model."""
