@@ -46,7 +46,14 @@ from grounded.diagnosis.validation.agreement import by_trial, changed
 from grounded.diagnosis.validation.claims import Claims
 from grounded.diagnosis.validation.decide import Decision, decide
 from grounded.diagnosis.validation.held_out import shrinkage, utility_prediction
-from grounded.diagnosis.validation.limits import Limits, held, identifiable, knowable, limits
+from grounded.diagnosis.validation.limits import (
+    Limits,
+    counted_once,
+    held,
+    identifiable,
+    knowable,
+    limits,
+)
 from grounded.diagnosis.validation.measured import Measured, root_mean_square
 from grounded.diagnosis.validation.prediction_error import by_region, by_time, explained, horizon
 from grounded.diagnosis.validation.ruler import Ruler
@@ -58,7 +65,7 @@ from grounded.instruments.preflight import preflight
 from grounded.model import Model
 from grounded.progress import Stages, interruptible
 from grounded.task import Task
-from grounded.trial import Trial
+from grounded.trial import Trial, scattered
 
 
 @dataclass(frozen=True)
@@ -118,6 +125,10 @@ def diagnose(
     latency = subject.latency if isinstance(subject, Task) else None
     past = subject.past if isinstance(subject, Task) else None
     tick("instruments")
+    trials, copies = counted_once(trials)
+    compare, more = counted_once(compare)
+    copies += more
+    exact = bool(copies) and not scattered([*trials, *compare])
     first = sum(trial.known_steps >= 2 for trial in trials)
     looked = preflight(subject, [*trials, *compare], options.hidden)
     trials = looked.trials
@@ -125,6 +136,7 @@ def diagnose(
     filters = {model.state_names.index(name): tau for name, tau in looked.filters.items()}
     data = replace(data, filters=filters)
     known = limits(data)
+    known = replace(known, sentences=(*known.sentences, *copies))
     tick("candidates")
     uncertain = Predictor(data)
     with np.errstate(all="ignore"):
@@ -145,7 +157,7 @@ def diagnose(
         )
         tick("leftover")
         task = subject if isinstance(subject, Task) else None
-        found = _Writer(decision, ruler, known, options, tick, task, used).diagnosis()
+        found = _Writer(decision, ruler, known, options, tick, task, used, exact).diagnosis()
         groups = [k < first for k in range(data.count)]
         return replace(
             found,
@@ -181,13 +193,14 @@ class _Writer:
         tick: Callable[[str], None],
         task: Task | None,
         trials: Sequence[Trial],
+        exact: bool,
     ) -> None:
         self.decision, self.ruler, self.known, self.options = decision, ruler, known, options
         self.tick, self.task, self.trials = tick, task, trials
         self.search, self.best = decision.search, decision.fit
         self.predictor, self.data = self.search.predictor, self.search.data
         self.shown = list(zip(ruler.shown, ruler.names, strict=True))
-        self.measured = Measured(decision, ruler, trials)
+        self.measured = Measured(decision, ruler, trials, exact)
         self.claims = Claims(decision, self.measured.credit, known, ruler)
         self.left = self.measured.left
 

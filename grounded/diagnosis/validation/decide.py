@@ -106,7 +106,9 @@ def _likelier(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> Fitted | N
     if h.spread > 0 or not near:
         return None
     starts = [(replace(f.hypothesis, shift=None, spread=0.0), fit.noise, f.track) for f in near]
-    others = [f for f in search.refined(starts[:RIVALS], REFIT) if search.score(f) > search.score(fit)]
+    others = [
+        f for f in search.refined(starts[:RIVALS], REFIT) if search.score(f) > search.score(fit)
+    ]
     others = [f for f in others if not ruler.gain(f, fit).beyond(*BETTER)]
     return max(others, key=search.score, default=None)
 

@@ -32,8 +32,11 @@ COUNTS = (2.0, 0.03)  # scatters, and least gain, of a flexible correction that 
 class Measured:
     """A decision, measured; every method is one part of the `Diagnosis`."""
 
-    def __init__(self, decision: Decision, ruler: Ruler, trials: Sequence[Trial]) -> None:
+    def __init__(
+        self, decision: Decision, ruler: Ruler, trials: Sequence[Trial], exact: bool = False
+    ) -> None:
         self.decision, self.ruler, self.trials = decision, ruler, trials
+        self.exact = exact  # every repeat was the same to the last bit: a simulator
         self.search, self.best = decision.search, decision.fit
         self.predictor, self.data = self.search.predictor, self.search.data
         self.units = {n: self.data.model.states[n] for n in ruler.names}
@@ -67,6 +70,8 @@ class Measured:
         What one step leaves holds the model's error too: carried on, it is a bound (`at_most`).
         Noise that seems coloured counts as such in channels where no flexible model finds anything.
         """
+        if self.exact:
+            return np.zeros((len(self.ruler.steps) + 1, len(self.units))), "repeats"
         repeats = repeated(self.trials, self.data)
         found, source = self.ruler.scatter(self.best, repeats), "repeats"
         if not all(len({self.trials[i].candidate or i for i in group}) == 1 for group in repeats):

@@ -21,7 +21,7 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.policy import Policy
 from grounded.result import Result
 from grounded.search.candidate import Candidate, Tried
-from grounded.trial import Trial, interpolate_gaps
+from grounded.trial import Trial, interpolate_gaps, scattered
 from grounded_trials.logs.log_files import kind_of, log_files
 from grounded_trials.logs.samples import SignalReport
 from grounded_trials.plain_file import read_file
@@ -131,8 +131,7 @@ def ingest_log(
     trial = replace(read.trial, id=added.id)
     warnings = (*read.warnings, *warnings_about(workspace, trial))
     if before:
-        repeat = f"it repeats {before} to the last bit: the system is taken as deterministic"
-        warnings = (*warnings, f"{repeat}, and no candidate is run a second time from now on")
+        warnings = (*warnings, f"it repeats {before} to the last bit: {_what_repeats(workspace)}")
     if added.known and added.sha256[:DIGITS] in workspace.noted.aside:
         warnings = (*warnings, f"{added.id} is set aside: `restore` takes that back")
     now = standing_in(workspace) if trial.candidate else None
@@ -251,6 +250,18 @@ def _repeated(workspace: Folder, path: Path, read: _Read) -> str:
     written = max(file.stat().st_mtime_ns for file in files)
     fresh = written > known[-1].path.stat().st_mtime_ns
     return known[-1].id if fresh and waiting and waiting.id == read.trial.candidate else ""
+
+
+def _what_repeats(workspace: Folder) -> str:
+    """What an exact repeat says: no noise, or a copy where other trials of a candidate differ."""
+    ran = [trial for trial in workspace.task_trials() if trial.candidate]
+    if scattered([trial.whole(workspace.task.horizon) for trial in ran]):
+        return (
+            "other trials of one candidate differ, so it looks like a copy, or a program with a "
+            "fixed seed: `discard` it and run again"
+        )
+    taken = "the system is taken as deterministic"
+    return f"{taken}, and no candidate is run a second time from now on"
 
 
 def _verdict(trial: Trial, tried: Tried | None, repeats: int) -> str:
