@@ -275,15 +275,12 @@ class Claims:
     def rivals(self, name: str) -> list[tuple[str, Fitted]]:
         """What may stand in the place of a claimed effect, beside all the others: name and fit."""
         rest, score = set(self.names) - {name}, self.search.score
-        close = [
-            f
-            for f in self.as_free(len(self.names))
-            if rest <= set(f.hypothesis.names) and name not in f.hypothesis.names
-            if score(self.best) - score(f) < TIE
-        ]
-        named = [(next(n for n in f.hypothesis.names if n not in rest), f) for f in close]
-        likeliest = {other: f for other, f in reversed(named)}
-        return [(n, likeliest[n]) for n in dict.fromkeys(other for other, _ in named)][:2]
+        found: dict[str, Fitted] = {}  # likeliest first
+        for f in self.as_free(len(self.names)):
+            others = set(f.hypothesis.names) - rest
+            if len(others) == 1 and name not in others and score(self.best) - score(f) < TIE:
+                found.setdefault(others.pop(), f)
+        return list(found.items())[:2]
 
     def tied(self, parts: Mapping[str, float]) -> dict[str, tuple[Fitted, float]]:
         """Each rival's fit in the place of a claimed effect, and its evidence there."""

@@ -80,14 +80,14 @@ def counted_once(trials: Sequence[Trial]) -> tuple[list[Trial], list[str]]:
 
     A copy holds no further noise: counted twice it would confirm what one run shows.
     """
-    known: dict[tuple[bytes, bytes], Trial] = {}
+    known: dict[tuple[bytes, bytes], tuple[int, Trial]] = {}
     found, said = [], []
     for k, trial in enumerate(trials):
-        one = known.setdefault((trial.states.tobytes(), trial.inputs.tobytes()), trial)
-        if one is trial:
+        key = trial.states.tobytes(), trial.inputs.tobytes()
+        if (one := known.setdefault(key, (k, trial)))[0] == k:
             found.append(trial)
             continue
-        name, other = trial.id or f"trial {k + 1}", one.id or "an earlier one"
+        name, other = (t.id or f"trial {i + 1}" for i, t in ((k, trial), one))
         said.append(
             f"{name} is {other} to the last bit: a copy, or no noise at all; it counts once"
         )

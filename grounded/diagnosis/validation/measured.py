@@ -43,10 +43,11 @@ class Measured:
         self.credit = shares(ruler, decision)
         self.left = leftovers(self.predictor, self.best)
         self.flexible = self.corrections()
-        self.floor, self.source = self.noise_floor()
         self.whiteness = self.white()
-        clean = min(self.whiteness.values(), default=0.0) * len(self.whiteness) > WHITE
-        self.at_most = self.source == "short horizon" and not (clean and not self.left)
+        least = min(self.whiteness.values(), default=0.0)
+        self.is_white = not self.left and least * len(self.whiteness) > WHITE
+        self.floor, self.source = self.noise_floor()
+        self.at_most = self.source == "short horizon" and not self.is_white
 
     def rms(self, fit: Fitted) -> Array:
         """By horizon and shown state, (K, n')."""
@@ -70,7 +71,7 @@ class Measured:
         What one step leaves holds the model's error too: carried on, it is a bound (`at_most`).
         Noise that seems coloured counts as such in channels where no flexible model finds anything.
         """
-        if self.exact:
+        if self.exact and not self.is_white:  # what is white is noise, and one trial a copy
             return np.zeros((len(self.ruler.steps) + 1, len(self.units))), "repeats"
         repeats = repeated(self.trials, self.data)
         found, source = self.ruler.scatter(self.best, repeats), "repeats"
