@@ -166,7 +166,7 @@ def test_without_a_calibration_effects_are_weighed_against_effects_without_one(w
 
 
 def test_once_a_calibration_is_dropped_the_likelier_effect_is_named(wavy):
-    search, best = wavy
+    search, _ = wavy
     alone = Said(lambda c: 1.0)
     singles = [f for f in search.of_size(1) if f.hypothesis.spread == 0][:4]
     likelier = _likelier(search, singles[-1], alone)
