@@ -98,7 +98,7 @@ class Trial:
 
     def repeats(self, other: Trial) -> bool:
         """Whether the other has the very same states."""
-        return np.array_equal(self.states, other.states)
+        return np.array_equal(self.states, other.states, equal_nan=True)
 
     def whole(self, steps: int) -> Trial:
         """The trial up to so many steps; one that ends a step or two before goes on to there.
@@ -124,6 +124,18 @@ class Trial:
         if steps >= self.steps:
             return self
         return replace(self, states=self.states[: steps + 1], inputs=self.inputs[:steps])
+
+
+def scattered(trials: Sequence[Trial]) -> bool:
+    """Whether a candidate, or the same commands, came out differently when run again.
+
+    Then the system has noise, and two trials that agree to the last bit are one and its copy.
+    """
+    first: dict[str | bytes, Trial] = {}
+    return any(
+        not first.setdefault(trial.candidate or trial.inputs.tobytes(), trial).repeats(trial)
+        for trial in trials
+    )
 
 
 def mean_trial(trials: Sequence[Trial], angles: NDArray[np.bool_] | None = None) -> Trial:

@@ -155,6 +155,11 @@ def _held_out(found: Diagnosis) -> str:
         "alike": "the scatter of trials whose commands agree to 2 %",
         "short horizon": "one step's noise, carried on",
     }
+    if row.floor_at_most:
+        noise["short horizon"] = (
+            "at most what one step leaves, carried on (it isn't white: part of it is the model's "
+            "error; repeat a trial)"
+        )
     return f"{by.get(row.held_out, 'not held out')}; noise: {noise.get(row.floor_from, 'unknown')}"
 
 

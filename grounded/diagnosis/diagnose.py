@@ -35,10 +35,8 @@ from grounded.diagnosis.error_report import (
 )
 from grounded.diagnosis.hypotheses.attribution import attribute, so_far
 from grounded.diagnosis.hypotheses.correction import correction
-from grounded.diagnosis.hypotheses.leftover import whiteness
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
-from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.predictor import Predictor
@@ -48,11 +46,18 @@ from grounded.diagnosis.validation.agreement import by_trial, changed
 from grounded.diagnosis.validation.claims import Claims
 from grounded.diagnosis.validation.decide import Decision, decide
 from grounded.diagnosis.validation.held_out import shrinkage, utility_prediction
-from grounded.diagnosis.validation.limits import Limits, held, identifiable, knowable, limits
+from grounded.diagnosis.validation.limits import (
+    Limits,
+    counted_once,
+    held,
+    identifiable,
+    knowable,
+    limits,
+)
 from grounded.diagnosis.validation.measured import Measured, root_mean_square
 from grounded.diagnosis.validation.prediction_error import by_region, by_time, explained, horizon
 from grounded.diagnosis.validation.ruler import Ruler
-from grounded.diagnosis.verdict import next_trial, verdict
+from grounded.diagnosis.verdict import next_trial, open_noise, verdict
 from grounded.effects import Library
 from grounded.engine import Engine, running, steady
 from grounded.errors import GroundedError
@@ -60,7 +65,7 @@ from grounded.instruments.preflight import preflight
 from grounded.model import Model
 from grounded.progress import Stages, interruptible
 from grounded.task import Task
-from grounded.trial import Trial
+from grounded.trial import Trial, scattered
 
 
 @dataclass(frozen=True)
@@ -125,6 +130,10 @@ def diagnose(
     latency = subject.latency if isinstance(subject, Task) else None
     past = subject.past if isinstance(subject, Task) else None
     tick("instruments")
+    trials, copies = counted_once(trials)
+    compare, more = counted_once(compare)
+    copies += more
+    exact = bool(copies) and not scattered([*trials, *compare])
     first = sum(trial.known_steps >= 2 for trial in trials)
     looked = preflight(subject, [*trials, *compare], options.hidden)
     trials = looked.trials
@@ -132,6 +141,7 @@ def diagnose(
     filters = {model.state_names.index(name): tau for name, tau in looked.filters.items()}
     data = replace(data, filters=filters)
     known = limits(data)
+    known = replace(known, sentences=(*known.sentences, *copies))
     tick("candidates")
     uncertain = Predictor(data)
     with np.errstate(all="ignore"):
@@ -152,7 +162,7 @@ def diagnose(
         )
         tick("leftover")
         task = subject if isinstance(subject, Task) else None
-        found = _Writer(decision, ruler, known, options, tick, task, used).diagnosis()
+        found = _Writer(decision, ruler, known, options, tick, task, used, exact).diagnosis()
         groups = [k < first for k in range(data.count)]
         return replace(
             found,
@@ -188,13 +198,14 @@ class _Writer:
         tick: Callable[[str], None],
         task: Task | None,
         trials: Sequence[Trial],
+        exact: bool,
     ) -> None:
         self.decision, self.ruler, self.known, self.options = decision, ruler, known, options
         self.tick, self.task, self.trials = tick, task, trials
         self.search, self.best = decision.search, decision.fit
         self.predictor, self.data = self.search.predictor, self.search.data
         self.shown = list(zip(ruler.shown, ruler.names, strict=True))
-        self.measured = Measured(decision, ruler, trials)
+        self.measured = Measured(decision, ruler, trials, exact)
         self.claims = Claims(decision, self.measured.credit, known, ruler)
         self.left = self.measured.left
 
@@ -216,7 +227,7 @@ class _Writer:
         measured = self.measured
         remainder = measured.remainders()
         rows, credit = measured.prediction_error(), measured.credits()
-        off = remainder[0].channel if remainder else ""
+        off = remainder[0].channel if remainder else open_noise(rows)
         named = [row.effect for row in ranking if row.claimed]
         seen = unconfirmed(self.claims, self.decision.doubtful, groups)
         values, agreement = by_trial(self.best, data, named) if named else ((), ())
@@ -227,7 +238,7 @@ class _Writer:
                 times=tuple(by_time(gain.sum(axis=-1), data)),
                 regions=tuple(by_region(gain.sum(axis=-1), predictor, self.best)),
                 split=measured.split(),
-                whiteness=self.whiteness(),
+                whiteness=measured.whiteness,
                 tempering=self.search.tempering.factor,
             ),
             ranking=ranking,
@@ -302,13 +313,6 @@ class _Writer:
             correlation_s=np.nan if tau is None else tau,
             outliers=not isinstance(noise.weight_v, float),
         )
-
-    def whiteness(self) -> dict[str, float]:
-        """The chance that white noise leaves innovations as correlated as these, by channel."""
-        delays = delays_of(self.best.hypothesis, self.data)
-        seen = self.data.seen if delays is None else delays.samples()[1]
-        found = whiteness(self.best, seen)
-        return {name: found[str(i)] for i, name in self.shown}
 
     def utility_prediction(self, bare: Any) -> UtilityPrediction | None:
         """Rms errors of predicted utilities, held out; None for a bare model."""

@@ -69,7 +69,8 @@ class ChannelParts(Document):
 class Split(Document):
     """What the error a while ahead is made of: of all states in units of their noise, and of each.
 
-    The irreducible part comes from "repeats" of a candidate, trials "alike", or the "noise".
+    The irreducible part comes from "repeats" of a candidate, trials "alike", or the "noise"; of
+    a noise of which only a bound is known it is "at most" so large.
     """
 
     horizon_s: float
@@ -153,6 +154,8 @@ class RulerRow(Document):
     calibrated: with the model's own parameters fitted; empty where none may move.
     floor_from: "repeats" of a candidate, trials whose commands are "alike", or the "short horizon",
         whose noise is carried on.
+    floor_at_most: the noise is no more than `noise_floor` and may be far less: nothing was
+        repeated, and what one step leaves isn't white, so part of it is the model's error.
     """
 
     horizon_s: float
@@ -164,6 +167,7 @@ class RulerRow(Document):
     with_effects: Mapping[str, float] = field(default_factory=dict)
     noise_floor: Mapping[str, float] = field(default_factory=dict)
     floor_from: str = ""
+    floor_at_most: bool = False
     outset: Mapping[str, float] = field(metadata=BRIEF, default_factory=dict)
 
 
@@ -185,7 +189,8 @@ class Remainder(Document):
     """A leftover that no known effect explains.
 
     size: rms of the rate that a state lacks, where a flexible model finds one [unit of the state
-    per second]; error: rms of predictions `horizon_s` ahead, which noise alone leaves at `floor`.
+    per second]; error: rms of predictions `horizon_s` ahead, which noise alone leaves at `floor`,
+    or at less (`floor_at_most`).
     """
 
     channel: str
@@ -197,16 +202,25 @@ class Remainder(Document):
     floor: float = math.nan
     horizon_s: float = math.nan
     error_unit: str = ""
+    floor_at_most: bool = False
 
     def sentence(self) -> str:
         """One clause."""
         where = "" if self.region is None else f", mostly where {self.region.when}"
         if not math.isfinite(self.error):
             return f"{self.channel} is off by {number(self.size)} {self.unit} rms{where}"
-        off, floor = (measured(value, self.error_unit) for value in (self.error, self.floor))
-        noise = f" (noise: {floor})" if 0 < self.floor < math.inf else ""
-        ahead = f"{number(self.horizon_s)} s ahead"
+        off, ahead = measured(self.error, self.error_unit), f"{number(self.horizon_s)} s ahead"
+        noise = noise_of(self.error, self.floor, self.error_unit, at_most=self.floor_at_most)
         return f"{self.channel} is still off by {off} {ahead}{noise}{where}"
+
+
+def noise_of(error: float, floor: float, unit: str, *, at_most: bool) -> str:
+    """`" (noise: 0.1 rad)"` beside an error; a mere bound is told as one."""
+    if not 0 < floor < math.inf:
+        return ""
+    if at_most and error <= ABOVE * floor:
+        return " (noise: at most that, only repeated trials tell)"
+    return f" (noise: {'at most ' * at_most}{measured(floor, unit)})"
 
 
 def number(value: float) -> str:

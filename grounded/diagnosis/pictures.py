@@ -24,6 +24,12 @@ MODELS = {  # keys of a prediction error: role, name
 }
 
 
+def models(error: RulerRow) -> dict[str, tuple[str, str]]:
+    """`MODELS`, with the noise called a bound where it is one."""
+    bound = {"noise_floor": ("other", "noise, at most")}
+    return MODELS | bound if error.floor_at_most else MODELS
+
+
 def gap_figures(diagnosis: Diagnosis) -> list[Figure]:
     """The diagnosis in figures, what matters first; nothing where no cause is known."""
     if diagnosis.no_cause:
@@ -44,7 +50,8 @@ def accuracy_figure(diagnosis: Diagnosis) -> Figure | None:
     if not panels:
         return None
     where = "on data that was held out" if held else "on the data that it was made from"
-    caption = f"Rms error of predictions, {where}. No model gets below the noise."
+    least = "" if any(e.floor_at_most for e in errors) else " No model gets below the noise."
+    caption = f"Rms error of predictions, {where}.{least}"
     key = tuple(sorted(legend(panels), key=lambda one: one.role == "other"))
     return Figure("accuracy", "Predictions before and after", caption, tuple(panels), key)
 
@@ -56,7 +63,7 @@ def _over_horizons(errors: Sequence[RulerRow]) -> list[Panel | Bars]:
     ahead = np.array([error.horizon_s for error in errors])
     for channel, unit in units.items():
         curves = []
-        for key, (role, name) in MODELS.items():
+        for key, (role, name) in models(errors[0]).items():
             values = [getattr(e, key).get(channel, math.nan) for e in errors]
             if np.isfinite(values).any():
                 curves.append(Curve(ahead, np.array(values, float), role, name, 2.0))
@@ -72,7 +79,7 @@ def _by_channel(error: RulerRow) -> list[Panel | Bars]:
     panels: list[Panel | Bars] = []
     for channel, unit in error.unit_by_channel.items():
         bars = []
-        for key, (role, name) in MODELS.items():
+        for key, (role, name) in models(error).items():
             value = getattr(error, key).get(channel, math.nan)
             if math.isfinite(value):
                 bars.append(Bar(name, value, measured(value, unit), role))
@@ -166,7 +173,7 @@ def worth_of(names: Sequence[str], what: str, diagnosis: Diagnosis) -> list[Bars
     rows = [(MODELS["crude"], error.crude)]
     rows += [(("limit", f"without {c.of}"), c.without_it) for c in diagnosis.credit[:MOST]]
     rows += [(MODELS["with_effects"], error.with_effects)]
-    rows += [(MODELS["noise_floor"], error.noise_floor)]
+    rows += [(models(error)["noise_floor"], error.noise_floor)]
     found = [(look, math.hypot(*(v[n] for n in names))) for look, v in rows if set(names) <= set(v)]
     bars = tuple(Bar(n, v, measured(v, unit), role) for (role, n), v in found)
     title = what.removeprefix("the ").capitalize() if len(names) > 1 else what

@@ -14,6 +14,7 @@ from grounded.diagnosis.error_report import (
     Remainder,
     RulerRow,
     measured,
+    noise_of,
     number,
 )
 from grounded.diagnosis.report import Estimate, Kind, Ranked, Unconfirmed, Verdict, quantity
@@ -64,6 +65,9 @@ def verdict(
             return _said("unknown", f"A gap remains that no known effect explains: {left}.", *once)
         if above := rest(rows):
             text = f"The model explains what these trials can show: {above}."
+        elif row is not None and row.floor_at_most:
+            what = "No known effect explains what is left, and it is no white noise"
+            return _said("unknown", f"{what}{floor(row)}.", *once)
         else:
             text = f"The model explains the data down to the noise{floor(row)}."
         return _said("none", text, *once)
@@ -130,7 +134,7 @@ def improvement(rows: Sequence[RulerRow]) -> str:
         best = sorted((n for n in gains if gains[n] > SHOWS), key=lambda n: -gains[n])
         parts = [
             f"{name} by {_measured(row, name, row.with_effects[name])} instead of "
-            f"{_measured(row, name, row.crude[name])}{_noise(row, name)}"
+            f"{_measured(row, name, row.crude[name])}{_noise(row, name, row.with_effects[name])}"
             for name in best[: NAMED - 1]
         ]
         if parts:
@@ -164,12 +168,23 @@ def floor(row: RulerRow | None) -> str:
     """What predictions miss by, and noise alone, of the channel that misses most."""
     if row is None:
         return ""
-    known = {n: e for n, e in row.with_effects.items() if e == e}
-    if not known:
+    if not (name := most_off(row)):
         return ""
-    name = max(known, key=lambda n: known[n] / max(row.noise_floor.get(n, math.nan), 1e-300))
-    ahead = f"{number(row.horizon_s)} s ahead"
-    return f": {ahead} it misses {name} by {_measured(row, name, known[name])}{_noise(row, name)}"
+    ahead, error = f"{number(row.horizon_s)} s ahead", row.with_effects[name]
+    return f": {ahead} it misses {name} by {_measured(row, name, error)}{_noise(row, name, error)}"
+
+
+def most_off(row: RulerRow) -> str:
+    """The state that is off by most, beside its noise; "" where none was measured."""
+    known = {n: e for n, e in row.with_effects.items() if e == e}
+    off = {n: e / max(row.noise_floor.get(n, math.nan), 1e-300) for n, e in known.items()}
+    return max(off, key=lambda n: off[n], default="")
+
+
+def open_noise(rows: Sequence[RulerRow]) -> str:
+    """The state whose error may be noise or not, for want of repeats; "" where that is known."""
+    row = next((r for r in reversed(rows) if not r.whole_trial and r.floor_at_most), None)
+    return "" if row is None or rest(rows) else most_off(row)
 
 
 def rest(rows: Sequence[RulerRow]) -> str:
@@ -187,7 +202,8 @@ def rest(rows: Sequence[RulerRow]) -> str:
     times, share, where = max(found, default=(0.0, 0.0, ""))
     if not times > ABOVE:
         return ""
-    text = f"what is left in {where} is {times:.2g} times the noise"
+    least = "at least " * rows[0].floor_at_most
+    text = f"what is left in {where} is {least}{times:.2g} times the noise"
     if share < MATTERS:
         return f"{text} but {100 * share:.1g} % of what the crude model missed"
     return f"{text}, yet little beside how far the state moves, or no more than trials differ by"
@@ -201,9 +217,9 @@ def _measured(row: RulerRow, name: str, value: float) -> str:
     return measured(value, row.unit_by_channel[name])
 
 
-def _noise(row: RulerRow, name: str) -> str:
-    value = row.noise_floor.get(name, math.nan)
-    return f" (noise: {_measured(row, name, value)})" if 0 < value < math.inf else ""
+def _noise(row: RulerRow, name: str, error: float) -> str:
+    value, unit = row.noise_floor.get(name, math.nan), row.unit_by_channel[name]
+    return noise_of(error, value, unit, at_most=row.floor_at_most)
 
 
 def next_trial(

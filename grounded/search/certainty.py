@@ -12,7 +12,7 @@ import numpy as np
 
 from grounded.search.candidate import Candidate, Tried
 from grounded.task import Task
-from grounded.trial import Trial
+from grounded.trial import Trial, scattered
 
 if TYPE_CHECKING:
     from grounded.search.standing import SearchOptions
@@ -37,11 +37,12 @@ def judged(
     by_name: dict[str, list[Trial]] = {}
     for trial in trials:
         by_name.setdefault(trial.candidate, []).append(trial.whole(task.horizon))
+    agree = not scattered([trial for one in ids for trial in by_name.get(one, ())])
     for candidate in candidates:
         own = tuple(by_name.get(candidate.id, ()))
         utilities = tuple(task.utility(t) for t in own)
         failed = any(u == -np.inf for u in utilities)
-        exact = exact or repeated_exactly(own)
+        exact = exact or (agree and repeated_exactly(own))
         enough = min(options.repeats, len(own)) if exact and own else options.repeats
         if len(own) < enough and not failed:
             history.append(Tried(candidate, own, utilities, None))

@@ -8,8 +8,8 @@ in which they were proposed, and the trials that came back, say all there is to 
     tried            the steps from the incumbent that did not improve (step 6)
     in doubt         a loss that may be luck: the incumbent is run once more before it is believed
 
-Two trials of one candidate that agree to the last bit say that the system is deterministic: nothing
-is run a second time from then on.
+Two trials of one candidate that agree to the last bit say that the system is deterministic, unless
+others of one candidate differ: nothing is run a second time from then on.
 
 Same candidates and trials, same state: nothing depends on the clock or on the process that asks.
 """

@@ -1,5 +1,8 @@
 """What held-out trials confirm: which noise, which hypothesis."""
 
+from copy import copy
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -11,7 +14,7 @@ from grounded.diagnosis.report import Unconfirmed
 from grounded.diagnosis.unconfirmed import unconfirmed
 from grounded.diagnosis.validation import decide as decide_module
 from grounded.diagnosis.validation.claims import Claims
-from grounded.diagnosis.validation.decide import causes, decide, shares
+from grounded.diagnosis.validation.decide import Decision, _likelier, causes, decide, shares
 from grounded.diagnosis.validation.gain import Gain
 from grounded.diagnosis.validation.limits import limits
 from grounded.diagnosis.validation.ruler import Ruler, folds
@@ -131,6 +134,48 @@ def test_what_predicts_no_better_is_not_claimed(wavy):
     assert needed.causes == (one,)
     whole = decide(search, best, Said(lambda c: 0.5 ** len(names & set(c))), 3)
     assert set(whole.causes) == names
+
+
+def test_without_a_claim_the_diagnosed_model_is_the_crude_one(wavy, monkeypatch):
+    search, best = wavy
+    fit = search.exact_null()
+    other = next(f for k, f in search.fits.items() if k[1:] == (0.0, ()) and f is not fit)
+    under = search.under(other.noise.structure, 0.0)
+    monkeypatch.setattr("grounded.diagnosis.validation.decide._proposed", lambda *_: (under, other))
+    found = decide(search, best, Said(lambda c: 1.0), 3)
+    assert not found.causes and found.fit is found.crude is fit
+    assert found.search is search  # all that was fitted is ranked
+
+
+def test_without_a_calibration_effects_are_weighed_against_effects_without_one(wavy, ruler):
+    search, best = copy(wavy[0]), wavy[1]
+    search.fits = dict(search.fits)
+    claimed = next(
+        f for f in search.of_size(2) if set(f.hypothesis.names) <= {*best.hypothesis.names}
+    )
+    h = replace(claimed.hypothesis, shift=None, spread=0.0)
+    plain = search.refined([(h, claimed.noise, claimed.track)], 12)[0]
+    for size in (1, 2):  # likelier by far, by the help of parameters that the claim leaves alone
+        for f in search.of_size(size):
+            free = replace(f, evidence=f.evidence + 300.0)
+            free = replace(free, hypothesis=replace(f.hypothesis, spread=0.1, shift=np.zeros(1)))
+            search.fits[f.noise.structure, 0.1, tuple(sorted(f.hypothesis.names))] = free
+    known = limits(search.data)
+    decision = Decision(search, search, plain, search.exact_null(), {})
+    claims = Claims(decision, dict.fromkeys(h.names, 0.5), known, ruler)
+    assert min(claims.parts().values()) > 0
+    assert all(f.hypothesis.spread == 0 for n in h.names for _, f in claims.rivals(n))
+
+
+def test_once_a_calibration_is_dropped_the_likelier_effect_is_named(wavy):
+    search, _ = wavy
+    alone = Said(lambda c: 1.0)
+    singles = [f for f in search.of_size(1) if f.hypothesis.spread == 0][:4]
+    likelier = _likelier(search, singles[-1], alone)
+    assert likelier is not None and likelier.hypothesis.spread == 0
+    assert search.score(likelier) > search.score(singles[-1])
+    assert likelier.hypothesis.names != singles[-1].hypothesis.names
+    assert _likelier(search, likelier, alone) is None
 
 
 def test_noise_can_not_hide_what_predicts_far_better(wavy):

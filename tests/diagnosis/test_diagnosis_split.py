@@ -33,6 +33,21 @@ def parts(row):
     return [row[key] for key in ("explained", "unexplained", "irreducible")]
 
 
+def repeats_of(trial, count):
+    """The same commands again, other noise."""
+    noise, same = np.random.default_rng(3), []
+    for _ in range(count):
+        x, states = np.zeros(2), [np.zeros(2)]
+        for value in trial.inputs[:, 0]:
+            for _ in range(10):
+                x = x + DT / 10 * np.array([x[1], 2.0 * value - x[1]])
+            x = x + np.array([0.0003, 0.003]) * noise.standard_normal(2)
+            states.append(x)
+        y = np.array(states) + np.array([0.002, 0.01]) * noise.standard_normal((121, 2))
+        same.append(replace(trial, states=y, candidate="c0001"))
+    return same
+
+
 def test_an_effect_that_is_found_explains_the_error():
     model, trials = cart(friction=0.4)
     document = diagnose(task_of(model), trials).to_json()
@@ -73,16 +88,7 @@ def test_what_no_effect_explains_stays_unexplained_and_is_not_white():
 
 def test_repeats_of_a_candidate_tell_the_noise():
     model, trials = cart(trials=1)
-    noise, same = np.random.default_rng(3), []
-    for _ in range(4):  # the same commands again, other noise
-        x, states = np.zeros(2), [np.zeros(2)]
-        for value in trials[0].inputs[:, 0]:
-            for _ in range(10):
-                x = x + DT / 10 * np.array([x[1], 2.0 * value - x[1]])
-            x = x + np.array([0.0003, 0.003]) * noise.standard_normal(2)
-            states.append(x)
-        y = np.array(states) + np.array([0.002, 0.01]) * noise.standard_normal((121, 2))
-        same.append(replace(trials[0], states=y, candidate="c0001"))
+    same = repeats_of(trials[0], 4)
     row = diagnose(model, same).where.split["horizon"]
     assert row.irreducible_from == "repeats"
     assert row.whole.irreducible > 0.7
@@ -108,3 +114,31 @@ def test_noise_with_its_outliers_comes_to_its_variance():
     noise = NoiseModel(Structure(), logs, logs, logs, logs - 20, weight, weight)
     assert noise.plain.measurement(1)[0, 0, 0] == pytest.approx((v**2).mean(), rel=0.05)
     assert r < 0.6 * (v**2).mean() and noise.plain.weight_v == 1.0
+
+
+def test_a_copy_counts_once():
+    model, trials = cart(trials=1)
+    same = [replace(t, id=f"t{k}") for k, t in enumerate(repeats_of(trials[0], 3))]
+    alone, beside = diagnose(model, same), diagnose(model, [*same, replace(same[0], id="t9")])
+    assert (beside.trials, beside.kind) == (3, alone.kind) and not beside.leftover
+    assert beside.prediction_error[-1].noise_floor == alone.prediction_error[-1].noise_floor
+    assert any("t9" in text and "t0" in text for text in beside.unknowable)
+    assert not alone.unknowable
+
+
+def test_a_trial_beside_itself_confirms_nothing():
+    model, trials = cart(friction=0.4, trials=1)
+    found = diagnose(model, [trials[0], trials[0]])
+    assert found.no_cause and not found.effects and found.trials == 1
+
+
+def test_without_repeats_noise_is_a_bound_unless_what_is_left_is_white():
+    model, trials = cart(asymmetric=0.8, trials=4)
+    poor = DiagnosisOptions(library=Library((Library().family("trend"),)))
+    found = diagnose(model, trials, poor)
+    assert all(row.floor_at_most for row in found.prediction_error)
+    assert found.leftover[0].floor_at_most and "at most" in found.sentence
+    assert found.where.split["horizon"].irreducible_from == "at most"
+    white = diagnose(*cart())
+    assert not any(row.floor_at_most for row in white.prediction_error)
+    assert white.kind == "none" and "at most" not in white.sentence

@@ -7,10 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 
 from grounded import Trial
-from grounded.diagnosis.error_report import Credit, Region, RulerRow
+from grounded.diagnosis.error_report import Credit, Region, Remainder, RulerRow
 from grounded.diagnosis.report import Estimate, Ranked, Unconfirmed
 from grounded.diagnosis.unconfirmed import unrepeatable
-from grounded.diagnosis.verdict import LOG, LOST, next_trial, verdict, worsened
+from grounded.diagnosis.verdict import LOG, LOST, next_trial, open_noise, verdict, worsened
 from grounded.effects import Library
 from grounded.models import car, pendulum
 from small_tasks import cart_task
@@ -110,3 +110,18 @@ def test_what_ended_early_left_safety_or_ran_far_is_lost():
     assert unrepeatable(task, [replace(trials[2], candidate="")]) == {"early": LOG}
     longer = np.vstack([good, 50.0 + good])  # ran for the target of before
     assert list(unrepeatable(task, [*trials, ran("longer", longer)])) == ["early", "far"]
+
+
+def test_a_noise_of_which_only_a_bound_is_known_is_told_as_one():
+    def said(after, floor, bound=True):
+        rows = (row({"x": 1.0}, {"x": after}, {"x": floor}, floor_at_most=bound),)
+        return verdict(_claims(), (), (), (), rows, ()), open_noise(rows)
+
+    unknown, state = said(0.9, 0.89)
+    assert unknown.kind == "unknown" and "at most" in unknown.sentence and state == "x"
+    assert "89 cm" not in unknown.sentence and "explains the data" not in unknown.sentence
+    known, state = said(0.9, 0.89, bound=False)
+    assert known.kind == "none" and "89 cm" in known.sentence and not state
+    assert "at least 9 times" in said(0.9, 0.1)[0].sentence
+    left = Remainder("x", error=0.9, floor=0.1, horizon_s=1.0, error_unit="m", floor_at_most=True)
+    assert "at most 10 cm" in left.sentence()

@@ -173,6 +173,17 @@ def test_page_of_an_older_diagnosis_leaves_out_what_it_lacks(cart):
         assert words not in text
 
 
+def test_a_leftover_of_which_no_rate_is_known_makes_no_table(cart):
+    (known, *_), heading = DIAGNOSIS["leftover"], "What no known effect explains"
+    bare = {k: v for k, v in known.items() if k not in ("size", "unit", "evidence", "region")}
+    findings = gather(Folder(cart))
+    texts = [
+        page(replace(findings, diagnosis=Diagnosis.from_json(DIAGNOSIS | {"leftover": [one]})))
+        for one in (known, bare | {"error": 0.2, "floor": 0.1, "horizon_s": 1.0})
+    ]
+    assert [heading in text for text in texts] == [True, False]
+
+
 @pytest.mark.parametrize("whole", ["|motor| > 0.477", "1e-05 kg", "-4.2 -> -2.5"])
 def test_a_browser_breaks_no_quantity(cart, whole):
     """A line ended behind "|motor|", another began with "> 0.477"."""

@@ -135,6 +135,14 @@ def test_two_exact_repeats_are_as_good_as_many():
     assert story.now.history[0].accepted is True and story.now.phase == "propose"
 
 
+def test_a_copy_beside_repeats_that_differ_is_no_sign_of_a_deterministic_system():
+    noisy = Plant(PLANT.model, noise=Noise(process={"v": 0.02}))
+    story = Story(plant=noisy, repeats=3).add().add().add().add()
+    story.trials.append(story.trials[-1])
+    assert story.trials[-1].candidate == story.candidates[1].id
+    assert (story.now.phase, story.now.missing) == ("await-trial", 1)
+
+
 def test_an_equal_utility_is_no_improvement():
     story = Story().add()
     same = story.trials[0]

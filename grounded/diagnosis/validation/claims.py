@@ -114,6 +114,7 @@ class Claims:
         self, decision: Decision, credit: dict[str, float], known: Limits, ruler: Ruler
     ) -> None:
         self.search, self.best, self.known = decision.search, decision.fit, known
+        self.whole = decision.whole
         search, best, self.credit = decision.search, decision.fit, credit
         self.predictor, self.data = search.predictor, search.data
         self.names = best.hypothesis.names
@@ -130,7 +131,7 @@ class Claims:
 
     def ranking(self, where: Any, before: float) -> tuple[Ranked, ...]:
         """The claimed effects first (those that make most of the error), then what lost."""
-        search, rows = self.search, []
+        rows: list[Ranked] = []
         parts = self.parts()
         after = normalised(
             held_out_errors(self.predictor, self.best, self.best.track, where), where
@@ -145,12 +146,13 @@ class Claims:
                 gap = gaps_of(self.predictor, [fit], where)[0]
                 rows.append(self._row(fit, name, evidence, gap, before, claimed=False))
                 listed.append(name)
-        singles = [f for f in search.of_size(1) if f.hypothesis.names[0] not in listed]
+        singles = [f for f in self.whole.of_size(1) if f.hypothesis.names[0] not in listed]
         singles = singles[: max(RANKED - len(rows), 3)]
         gaps = gaps_of(self.predictor, singles, where)
+        base = self.base if self.whole is self.search else self.whole.score(self.whole.best_null())
         for fit, gap in zip(singles, gaps, strict=True):
             name = fit.hypothesis.names[0]
-            evidence = search.score(fit) - self.base
+            evidence = self.whole.score(fit) - base
             rows.append(self._row(fit, name, evidence, gap, before, claimed=False))
         return tuple(rows)
 
@@ -177,7 +179,7 @@ class Claims:
         return rows
 
     def parts(self) -> dict[str, float]:
-        """What the evidence loses without each claimed effect.
+        """What the evidence loses without each claimed effect, parameters free or not as with it.
 
         An effect of the others that vanished (a delay too short to be one) is left out with it.
         """
@@ -187,10 +189,20 @@ class Claims:
             rest = {n for n in self.names if n != name}
             scores: list[float] = []
             for size in range(len(rest), 0, -1):
-                fits = [f for f in search.of_size(size) if set(f.hypothesis.names) <= rest]
+                fits = [f for f in self.as_free(size) if set(f.hypothesis.names) <= rest]
                 scores = scores or [s for f in fits if math.isfinite(s := search.score(f))]
             found[name] = whole - max(scores or [self.base])
         return found
+
+    def as_free(self, size: int) -> list[Fitted]:
+        """Fits of so many effects, calibrated if the claim is: what a parameter does is its own."""
+        free = self.best.hypothesis.spread > 0
+        fits = self.search.fits.values()
+        return [
+            f
+            for f in sorted(fits, key=lambda f: -self.search.score(f))
+            if len(f.hypothesis.names) == size and (f.hypothesis.spread > 0) == free
+        ]
 
     def _row(
         self, fit: Fitted, name: str, evidence: float, gap: float, before: float, *, claimed: bool
@@ -263,13 +275,12 @@ class Claims:
     def rivals(self, name: str) -> list[tuple[str, Fitted]]:
         """What may stand in the place of a claimed effect, beside all the others: name and fit."""
         rest, score = set(self.names) - {name}, self.search.score
-        close = [
-            f
-            for f in self.search.of_size(len(self.names))
-            if rest <= set(f.hypothesis.names) and name not in f.hypothesis.names
-            if score(self.best) - score(f) < TIE
-        ]
-        return [(next(n for n in f.hypothesis.names if n not in rest), f) for f in close[:2]]
+        found: dict[str, Fitted] = {}  # likeliest first
+        for f in self.as_free(len(self.names)):
+            others = set(f.hypothesis.names) - rest
+            if len(others) == 1 and name not in others and score(self.best) - score(f) < TIE:
+                found.setdefault(others.pop(), f)
+        return list(found.items())[:2]
 
     def tied(self, parts: Mapping[str, float]) -> dict[str, tuple[Fitted, float]]:
         """Each rival's fit in the place of a claimed effect, and its evidence there."""

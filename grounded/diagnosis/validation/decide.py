@@ -59,7 +59,8 @@ class Doubtful:
 class Decision:
     """What is claimed: its fit, the crude model's, and the fit without each of its causes."""
 
-    search: HypothesisSearch
+    search: HypothesisSearch  # under the claim's own noise, where another one overruled
+    whole: HypothesisSearch
     fit: Fitted
     crude: Fitted
     without: dict[str, Fitted]  # by effect, or "calibration"
@@ -85,28 +86,43 @@ def decide(search: HypothesisSearch, best: Fitted, ruler: Ruler, most: int) -> D
         ruler: of the same data.
         most: so many effects at most.
     """
-    crude, white = search.exact_null(), search.tempering.factor > WHITE
+    whole, crude = search, search.exact_null()
+    white = search.tempering.factor > WHITE
     ruler.beside(crude)
-    search, fit = _proposed(search, best, crude, ruler, most)
-    fit, without, doubtful = _pruned(search, fit, ruler, white)
+    search, proposed = _proposed(search, best, crude, ruler, most)
+    fit, without, doubtful = _pruned(search, proposed, ruler, white)
+    if proposed.hypothesis.spread > 0 and (other := _likelier(search, fit, ruler)):
+        fit, without, more = _pruned(search, other, ruler, white)
+        doubtful += more
     if not _likely(search, fit):
         fit, without, _ = _pruned(search, search.best_null(), ruler, white)
-    if causes(fit) and not _pays(search, ruler, crude, fit, white):
-        fit, without = crude, {}
-    fit = fit if causes(fit) else _quiet(search, fit, crude)
+    if not causes(fit) or not _pays(search, ruler, crude, fit, white):
+        search, fit, without = whole, crude, {}
     open_ = sorted((d for d in doubtful if d.name not in causes(fit)), key=lambda d: -d.nats)
-    return Decision(search, fit, crude, without, tuple(open_))
+    return Decision(search, whole, fit, crude, without, tuple(open_))
+
+
+def _likelier(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> Fitted | None:
+    """Where a calibration was dropped: what is likelier than one of the effects without it, too.
+
+    Which effect goes best with the others was asked beside parameters that were free to help.
+    """
+    h, names = fit.hypothesis, set(fit.hypothesis.names)
+    near = [f for f in search.of_size(len(names)) if len(names - {*f.hypothesis.names}) == 1]
+    if h.spread > 0 or not near:
+        return None
+    starts = [(replace(f.hypothesis, shift=None, spread=0.0), fit.noise, f.track) for f in near]
+    others = [
+        f for f in search.refined(starts[:RIVALS], REFIT) if search.score(f) > search.score(fit)
+    ]
+    others = [f for f in others if not ruler.gain(f, fit).beyond(*BETTER)]
+    return max(others, key=search.score, default=None)
 
 
 def _likely(search: HypothesisSearch, fit: Fitted) -> bool:
     """Whether evidence still asks for the effects that are left: others may have carried them."""
     null = search.exact_null() if parametric(fit) else search.best_null()
     return not fit.hypothesis.effects or search.score(fit) > search.score(null) + CLAIM
-
-
-def _quiet(search: HypothesisSearch, fit: Fitted, crude: Fitted) -> Fitted:
-    """Without causes: the likeliest noise of the model as it is."""
-    return crude if fit.hypothesis.spread > 0 else fit
 
 
 def _pays(
@@ -123,7 +139,9 @@ def _pays(
     new = set(after.hypothesis.names) - set(before.hypothesis.names)
     rest = set(after.hypothesis.names) - new
     if new:  # `before` may be what predicts better, and not the likeliest without it
-        less = [search.score(f) for f in search.fits.values() if set(f.hypothesis.names) <= rest]
+        free = after.hypothesis.spread > 0
+        fits = [f for f in search.fits.values() if free or f.hypothesis.spread == 0]
+        less = (search.score(f) for f in fits if set(f.hypothesis.names) <= rest)
         sure = sure and search.score(after) - max(less) > CLAIM
     further = effects > max(1, len(before.hypothesis.effects))
     if sure and white and further and _in_several(search, before, after):

@@ -30,6 +30,7 @@ from grounded.effects import (
 from grounded.filter import kalman
 from grounded.frozen import Array
 from grounded.model import Model, Param
+from grounded.trial import Trial
 
 FEW_STEPS = 30
 WEAK, UNKNOWN = 0.2, 0.6  # of its prior standard deviation: what the trials leave of it
@@ -72,6 +73,25 @@ def limits(data: Data) -> Limits:
     if len(unmoved) + len(empty) + len(data.hidden) == data.model.n:
         no_cause = True
     return Limits(tuple(found), no_cause)
+
+
+def counted_once(trials: Sequence[Trial]) -> tuple[list[Trial], list[str]]:
+    """The trials without those that are another one to the last bit, and a sentence for each.
+
+    A copy holds no further noise: counted twice it would confirm what one run shows.
+    """
+    known: dict[tuple[bytes, bytes], tuple[int, Trial]] = {}
+    found, said = [], []
+    for k, trial in enumerate(trials):
+        key = trial.states.tobytes(), trial.inputs.tobytes()
+        if (one := known.setdefault(key, (k, trial)))[0] == k:
+            found.append(trial)
+            continue
+        name, other = (t.id or f"trial {i + 1}" for i, t in ((k, trial), one))
+        said.append(
+            f"{name} is {other} to the last bit: a copy, or no noise at all; it counts once"
+        )
+    return found, said
 
 
 def constant_inputs(data: Data) -> list[str]:

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis.error_report import ABOVE, Credit, Remainder, RulerRow, RunChange, Split
-from grounded.diagnosis.hypotheses.leftover import Leftover, leftovers
+from grounded.diagnosis.hypotheses.leftover import Leftover, leftovers, whiteness
+from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.validation.decide import Decision, ordered, plain, shares
 from grounded.diagnosis.validation.gain import Errors
@@ -24,21 +25,29 @@ from grounded.frozen import Array
 from grounded.trial import Trial
 
 FAR = 3.0  # times the noise floor: what is left is stated whatever the doubt
+WHITE = 0.01  # chance below which what is left is not white noise
 COUNTS = (2.0, 0.03)  # scatters, and least gain, of a flexible correction that is stated
 
 
 class Measured:
     """A decision, measured; every method is one part of the `Diagnosis`."""
 
-    def __init__(self, decision: Decision, ruler: Ruler, trials: Sequence[Trial]) -> None:
+    def __init__(
+        self, decision: Decision, ruler: Ruler, trials: Sequence[Trial], exact: bool = False
+    ) -> None:
         self.decision, self.ruler, self.trials = decision, ruler, trials
+        self.exact = exact  # every repeat was the same to the last bit: a simulator
         self.search, self.best = decision.search, decision.fit
         self.predictor, self.data = self.search.predictor, self.search.data
         self.units = {n: self.data.model.states[n] for n in ruler.names}
         self.credit = shares(ruler, decision)
         self.left = leftovers(self.predictor, self.best)
         self.flexible = self.corrections()
+        self.whiteness = self.white()
+        least = min(self.whiteness.values(), default=0.0)
+        self.is_white = not self.left and least * len(self.whiteness) > WHITE
         self.floor, self.source = self.noise_floor()
+        self.at_most = self.source == "short horizon" and not self.is_white
 
     def rms(self, fit: Fitted) -> Array:
         """By horizon and shown state, (K, n')."""
@@ -57,10 +66,13 @@ class Measured:
         return max([crude, *found], key=lambda f: self.ruler.gain(crude, f).mean)
 
     def noise_floor(self) -> tuple[Array, str]:
-        """Rms error that no model undercuts, by horizon and shown state, and where it is from.
+        """Rms error of noise alone, by horizon and shown state, and where it is from.
 
+        What one step leaves holds the model's error too: carried on, it is a bound (`at_most`).
         Noise that seems coloured counts as such in channels where no flexible model finds anything.
         """
+        if self.exact and not self.is_white:  # what is white is noise, and one trial a copy
+            return np.zeros((len(self.ruler.steps) + 1, len(self.units))), "repeats"
         repeats = repeated(self.trials, self.data)
         found, source = self.ruler.scatter(self.best, repeats), "repeats"
         if not all(len({self.trials[i].candidate or i for i in group}) == 1 for group in repeats):
@@ -73,6 +85,13 @@ class Measured:
         reached = [e.rms for _, e in self.ruler.measured]
         reached += [errors.rms for _, errors in self.flexible.values()]
         return np.fmin(found, np.fmin.reduce(reached))[:, self.ruler.shown], source
+
+    def white(self) -> dict[str, float]:
+        """The chance that white noise leaves innovations as correlated as these, by channel."""
+        delays = delays_of(self.best.hypothesis, self.data)
+        seen = self.data.seen if delays is None else delays.samples()[1]
+        found = whiteness(self.best, seen)
+        return {n: found[str(i)] for i, n in zip(self.ruler.shown, self.units, strict=True)}
 
     def carried(self, fit: Fitted) -> Array:
         """What one step's noise comes to, carried on by the model, (K, n); NaN for whole trials."""
@@ -119,6 +138,7 @@ class Measured:
                     self.units,
                     by if self.ruler.held_out else "no",
                     floor_from=self.source,
+                    floor_at_most=self.at_most,
                     **found,
                 )
             )
@@ -173,6 +193,7 @@ class Measured:
                 floor=floor,
                 horizon_s=ruler.steps[at] * data.dt,
                 error_unit=self.units[name],
+                floor_at_most=self.at_most,
             )
             found.append((left is None, -error / max(floor, float(fine[i])), i, left, row))
         return tuple(self.with_region(row, left) for *_, left, row in sorted(found, key=_first))
@@ -192,8 +213,10 @@ class Measured:
         rows = {"one_step": 0, "horizon": len(steps) - 1, "whole_run": len(steps)}
         seconds = [*(k * dt for k in steps), float(np.median(self.data.lengths)) * dt]
         before, after = self.rms(self.decision.crude), self.rms(self.best)
+        carried = "at most" if self.at_most else "noise"
+        source = carried if self.source == "short horizon" else self.source
         return {
-            key: split(seconds[k], self.units, before[k], after[k], self.floor[k], self.source)
+            key: split(seconds[k], self.units, before[k], after[k], self.floor[k], source)
             for key, k in rows.items()
         }
 

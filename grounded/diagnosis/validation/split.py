@@ -54,5 +54,4 @@ def split(
         ChannelParts(name, unit, float(np.nan_to_num(before[i])), *map(float, each[:, i]))
         for i, (name, unit) in enumerate(units.items())
     )
-    origin = "noise" if source == "short horizon" else source
-    return Split(horizon_s, Parts(*map(float, whole)), channels, origin)
+    return Split(horizon_s, Parts(*map(float, whole)), channels, source)

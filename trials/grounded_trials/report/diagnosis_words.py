@@ -66,6 +66,8 @@ def error_table(diagnosis: Diagnosis) -> tuple[list[Cells], Cells]:
     }
     if any(row.outset for row in ahead):
         columns["crude"] = "now"
+    if any(row.floor_at_most for row in ahead):
+        columns["noise_floor"] = "noise, at most"
     for key in ("outset", "calibrated"):
         if not any(getattr(row, key) for row in ahead):
             del columns[key]

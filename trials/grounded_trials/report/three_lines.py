@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 from grounded.diagnosis.error_report import RulerRow, measured
 from grounded.diagnosis.report import Diagnosis
-from grounded.diagnosis.verdict import rest, told_apart, worsened
+from grounded.diagnosis.verdict import open_noise, rest, told_apart, worsened
 from grounded.task import Task
 from grounded_trials.report.findings import weighed_groups
 from grounded_trials.wording import count, shown
@@ -104,5 +104,8 @@ def still_open(diagnosis: Diagnosis) -> str:
         others = len(diagnosis.leftover) - 1
         more = f"; {count(others, 'more state')}" * bool(others)
         found.append(f"still unexplained: {diagnosis.leftover[0].sentence()}{more}")
-    text = "; ".join(found) or rest(diagnosis.prediction_error) or "nothing is left above the noise"
+    rows = diagnosis.prediction_error
+    if not found and (name := open_noise(rows)):
+        found.append(f"only repeated trials tell how much of what is left in {name} is noise")
+    text = "; ".join(found) or rest(rows) or "nothing is left above the noise"
     return f"{text[:1].upper()}{text[1:]}."

@@ -9,7 +9,7 @@ finds the first.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -21,14 +21,13 @@ import numpy as np
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result
 from grounded.search.candidate import Candidate, Tried
-from grounded.trial import Trial, interpolate_gaps
+from grounded.trial import Trial, interpolate_gaps, scattered
 from grounded_trials.logs.log_files import kind_of, log_files
 from grounded_trials.logs.samples import SignalReport
 from grounded_trials.plain_file import read_file
 from grounded_trials.store.own_files import CANDIDATE, FILE_LIMIT, TRIAL
 from grounded_trials.store.store import DIGITS
 from grounded_trials.store.trial_file import read_trial, trial_bytes
-from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.foreign import ForeignLog, mapping_of, read_foreign
 from grounded_trials.workspace.identity import sha256
@@ -39,10 +38,10 @@ from grounded_trials.workspace.trial_check import (
     OTHERS,
     other_units,
     suspicion,
+    units_told,
     warnings_about,
 )
 
-THOUSAND = (1e-3, 1e3)
 SPELT = str.maketrans({" ": "", "·": "", "*": "", "²": "^2"})  # a unit, whoever writes it
 
 
@@ -129,8 +128,7 @@ def ingest_log(
     trial = replace(read.trial, id=added.id)
     warnings = (*read.warnings, *warnings_about(workspace, trial))
     if before:
-        repeat = f"it repeats {before} to the last bit: the system is taken as deterministic"
-        warnings = (*warnings, f"{repeat}, and no candidate is run a second time from now on")
+        warnings = (*warnings, f"it repeats {before} to the last bit: {_what_repeats(workspace)}")
     if added.known and added.id in workspace.discarded():
         warnings = (*warnings, f"{added.id} is set aside: `restore` takes that back")
     now = standing_in(workspace) if trial.candidate else None
@@ -183,7 +181,7 @@ def _recognised(workspace: Folder, path: Path, read: _Read, candidate: str | Non
         seem = f"{' and '.join(units)} seem to be in another unit: times {by:.6g} they fit better"
         return replace(read, warnings=(*read.warnings, why or seem))
     if units:
-        raise GroundedError(f"{path} ran {ran}, {_units_told(units, by, read.log is not None)}")
+        raise GroundedError(f"{path} ran {ran}, {units_told(units, by, read.log is not None)}")
     if log and (pace := pace_of(log, workspace.task, own.policy)):
         raise GroundedError(
             f"{path} ran {ran}, but a second of its stamps is {pace:g} s of the run (a recording "
@@ -197,17 +195,6 @@ def _recognised(workspace: Folder, path: Path, read: _Read, candidate: str | Non
         f"{begins}",
         NextCommand("ingest", (str(path), *(("--candidate", other) if other else ("--data",)))),
     )
-
-
-def _units_told(names: Sequence[str], by: float, mapped: bool) -> str:
-    """What is wrong with the units of a log, and what mends it; `mapped`: by a [log] table."""
-    which = " and ".join(names)
-    size = f"{max(by, 1 / by):.4g} times too {'large' if by < 1 else 'small'}"
-    degrees = "" if by in THOUSAND else " (in degrees)" if by < 1 else " (radians for degrees)"
-    mend = f"multiply the scale of {which} by {by:.6g} in {FILE}'s [log] (1 where none is given)"
-    if not mapped:
-        mend = f"append {which} times {by:.6g} and run it again, or take it in with --data"
-    return f"with {which} {size}{degrees}: {mend}"
 
 
 def _latest(workspace: Folder) -> list[Candidate]:
@@ -235,6 +222,18 @@ def _repeated(workspace: Folder, path: Path, read: _Read) -> str:
     written = max(file.stat().st_mtime_ns for file in files)
     fresh = written > known[-1].path.stat().st_mtime_ns
     return known[-1].id if fresh and waiting and waiting.id == read.trial.candidate else ""
+
+
+def _what_repeats(workspace: Folder) -> str:
+    """What an exact repeat says: no noise, or a copy where other trials of a candidate differ."""
+    ran = [trial for trial in workspace.task_trials() if trial.candidate]
+    if scattered([trial.whole(workspace.task.horizon) for trial in ran]):
+        return (
+            "other trials of one candidate differ, so it looks like a copy, or a program with a "
+            "fixed seed: `discard` it and run again"
+        )
+    taken = "the system is taken as deterministic"
+    return f"{taken}, and no candidate is run a second time from now on"
 
 
 def _verdict(trial: Trial, tried: Tried | None, repeats: int) -> str:

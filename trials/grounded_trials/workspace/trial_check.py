@@ -18,6 +18,7 @@ from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import HUGE, Trial, interpolate_gaps
 from grounded_trials.wording import with_unit
+from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.folder import Folder
 
 FAR = 0.1  # of a state's range in the trial: a start this far from s_0 is worth a warning
@@ -30,6 +31,7 @@ ROUGH = 4.0  # steps over which noise keeps its sign: what strays for longer, so
 FINE = 1e-4  # of an input's size: how finely commands are logged at best
 BACK = (0.0, 0.5, 1.0, 1.5, 2.0, -0.5, -1.0)  # steps: states of the log older than those acted on
 AGES = 1.0  # steps by which that varies in a run: packets are lost, clocks drift and jitter
+THOUSAND = (1e-3, 1e3)
 ANGULAR = (("rad", "rad/s"), ("rad",), ("rad/s",))  # groups of units that may be in degrees
 NEARLY = 0.1  # of an input's size: what other units must leave of the difference
 OTHERS = 20  # candidates to compare with, the latest
@@ -283,6 +285,17 @@ def other_units(task: Task, trial: Trial, own: Candidate) -> tuple[tuple[str, ..
         if found and fits and (not plain.alike or evidence(plain, found) > DECISIVE):
             return tuple(names), float(factor)
     return (), 1.0
+
+
+def units_told(names: Sequence[str], by: float, mapped: bool) -> str:
+    """What is wrong with the units of a log, and what mends it; `mapped`: by a [log] table."""
+    which = " and ".join(names)
+    size = f"{max(by, 1 / by):.4g} times too {'large' if by < 1 else 'small'}"
+    degrees = "" if by in THOUSAND else " (in degrees)" if by < 1 else " (radians for degrees)"
+    mend = f"multiply the scale of {which} by {by:.6g} in {FILE}'s [log] (1 where none is given)"
+    if not mapped:
+        mend = f"append {which} times {by:.6g} and run it again, or take it in with --data"
+    return f"with {which} {size}{degrees}: {mend}"
 
 
 def _latest(task: Task) -> int:

@@ -58,8 +58,7 @@ def _details(diagnosis: Diagnosis, since: Since) -> list[Block]:
     if diagnosis.ranking:
         found += [Block("heading", "Effects that were weighed"), effect_table(diagnosis, since)]
     found += _alike(diagnosis) + _by_trial(diagnosis)
-    if diagnosis.leftover:
-        found += [Block("heading", "What no known effect explains"), leftover_table(diagnosis)]
+    found += leftover_table(diagnosis)
     found += _made_of(diagnosis.where.split) + _rest(diagnosis)
     if text := utility_sentence(diagnosis):
         found += [Block("heading", "Utility, predicted"), Block("text", f"{_begun(text)}.")]
@@ -118,7 +117,8 @@ def _made_of(splits: Mapping[str, Split]) -> list[Block]:
     """The squared error in three parts: at each horizon in all, and by state."""
     if not splits:
         return []
-    header = ("ahead", "explained", "unexplained", "noise")
+    bound = any(one.irreducible_from == "at most" for one in splits.values())
+    header = ("ahead", "explained", "unexplained", "noise" + ", at most" * bound)
     named = {
         key: words.format(f"{one.horizon_s:.3g} s")
         for key, words in HORIZONS.items()
@@ -128,6 +128,7 @@ def _made_of(splits: Mapping[str, Split]) -> list[Block]:
     main = "horizon" if "horizon" in named else next(iter(named))
     by_state = [(parts.name, *_shares(parts)) for parts in splits[main].channels]
     known = {"repeats": "repeated trials", "alike": "trials whose commands agree to 2 %"}
+    known["at most"] = "what one step leaves, and is at most that: no trial was repeated"
     source = known.get(splits[main].irreducible_from, "the estimated noise")
     words = (
         "Explained is the share of the squared error that the effects take away on trials that "

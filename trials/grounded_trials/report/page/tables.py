@@ -158,8 +158,8 @@ def _interval(v: Estimate) -> str:
     return f"{figure(v.value)} ({figure(low, 3)} to {figure(high, 3)})" if known else UNKNOWN
 
 
-def leftover_table(diagnosis: Diagnosis) -> Block:
-    """What no known effect explains."""
+def leftover_table(diagnosis: Diagnosis) -> list[Block]:
+    """What a flexible model finds that no known effect explains; nothing where it finds none."""
     rows = [
         (
             left.channel,
@@ -169,9 +169,13 @@ def leftover_table(diagnosis: Diagnosis) -> Block:
             figure(left.evidence, 3),
         )
         for left in diagnosis.leftover
+        if math.isfinite(left.size)
     ]
+    if not rows:
+        return []
     header = ("channel", "missing rate, rms", "mostly where ", "share there", "evidence [nats]")
-    return table("leftover", header, rows)
+    named = Block("heading", "What no known effect explains")
+    return [named, table("leftover", header, rows)]
 
 
 def parameter_table(findings: Findings) -> list[Block]:
