@@ -181,6 +181,8 @@ def _came_true(candidate: Candidate, same: Sequence[Tried], standing: Standing) 
     if best is None or candidate.id in tried or not math.isfinite(missed[-1]):
         return text
     gain = candidate.predicted_utility - best.utility
+    if not gain > 0:  # the best one's runs were luckier than what is predicted of it
+        return text
     within = gain < max(missed[-1], candidate.likely_off)
     doubt = ", which is no more than such a miss" * within
     return f"{text}; this one promises a gain of {number(gain)}{doubt}"

@@ -8,7 +8,7 @@ import click
 
 from grounded.errors import NextCommand
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
-from grounded_cli.terminal import field, number, show, show_json
+from grounded_cli.terminal import field, number, sentence, show, show_json
 from grounded_trials.wording import with_unit
 
 if TYPE_CHECKING:
@@ -42,7 +42,8 @@ def command(
 
     FILE is a log, read through [log], or a CSV with columns `t` and states. Paths start from rest
     and keep to the speeds and accelerations given. The target there was is kept as target.csv.bak,
-    and [task] horizon follows. Earlier trials stay, for fit and diagnose; the search begins anew.
+    and [task] horizon follows; so do the weights in [reward] state, unless you chose them.
+    Earlier trials stay, for fit and diagnose; the search begins anew.
     """
     from grounded_trials.starting.shapes import PATHS, Drive, path_target, step_target, swing_up
 
@@ -56,7 +57,9 @@ def command(
         columns = swing_up(model, dt, seconds)
     else:
         columns = _recorded(workspace, shape)
+    before = _weights(workspace)
     path = workspace.target(columns)
+    weights = _weights(workspace)
     rows = len(next(iter(columns.values())))
     ranges = {name: (float(v.min()), float(v.max())) for name, v in columns.items()}
     if json_:
@@ -66,7 +69,17 @@ def command(
     for name, (low, high) in ranges.items():
         text = with_unit(f"{number(low)} to {number(high)}", model.states[name])
         show(field(name, text, "  "))
+    if weights != before:
+        told = ", ".join(f"{name} = {number(weight)}" for name, weight in weights.items())
+        sentence(f"[reward] state is new, 1 for an error as large as a range here: {told}")
     show(f"\n{next_line(NextCommand('propose'))}")
+
+
+def _weights(workspace: Workspace) -> dict[str, float]:
+    import tomllib
+
+    written = tomllib.loads(workspace.config.file.read_text(encoding="utf-8"))
+    return dict(written.get("reward", {}).get("state", {}))
 
 
 def _values(pairs: tuple[str, ...]) -> dict[str, float]:

@@ -44,6 +44,8 @@ class Search:
     ) -> None:
         self.task, self.options = task, options or SearchOptions()
         self._candidates, self._trials = list(candidates), list(trials)
+        for trial in self._trials:
+            self._fits(trial)
         self._planned: Proposal | None = None  # what follows from them, once that is asked for
 
     def __repr__(self) -> str:
@@ -90,6 +92,17 @@ class Search:
             self._planned = None
         return proposal.candidate
 
+    def _fits(self, trial: Trial) -> None:
+        if not isinstance(trial, Trial):
+            raise GroundedError(f"a robot returns a Trial of what it ran, got {trial!r:.60}")
+        model = self.task.model
+        found = (trial.state_names, trial.input_names, trial.dt)
+        expected = (model.state_names, model.input_names, self.task.dt)
+        if found != expected:
+            raise GroundedError(
+                f"a trial of this task has states, inputs and dt {expected}, found {found}"
+            )
+
     def tell(self, trial: Trial) -> None:
         """Adds a real trial.
 
@@ -101,15 +114,8 @@ class Search:
             GroundedError: for a trial of no candidate of this search, of other states or inputs, or
                 on another time grid.
         """
-        task, ids = self.task, [c.id for c in self._candidates]
-        if not isinstance(trial, Trial):
-            raise GroundedError(f"a robot returns a Trial of what it ran, got {trial!r:.60}")
-        found = (trial.state_names, trial.input_names, trial.dt)
-        expected = (task.model.state_names, task.model.input_names, task.dt)
-        if found != expected:
-            raise GroundedError(
-                f"a trial of this task has states, inputs and dt {expected}, found {found}"
-            )
+        ids = [c.id for c in self._candidates]
+        self._fits(trial)
         if not trial.candidate:
             waiting = self.standing.outstanding
             if waiting is None:

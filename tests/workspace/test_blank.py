@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from facts import holding
+from cli import grounded
+from facts import holding, holds
 from grounded.errors import GroundedError
 from grounded.policy import load
 from grounded_trials import Workspace
@@ -133,3 +134,16 @@ def test_a_model_that_needs_its_neighbours_leaves_nothing_behind(tmp_path):
     (tmp_path / "w" / "model.py").write_text((tmp_path / "sled.py").read_text())
     made = Workspace.create(tmp_path / "w", model=tmp_path / "w" / "model.py")
     assert (made.folder / "drive.py").is_file()
+
+
+def test_a_plan_whose_inputs_cost_nearly_all_says_so_and_a_target_tells_its_weights(blank):
+    """A stranger's figure-8 stayed 3 cm off: 93 % of its cost was the drive's effort."""
+    done = grounded("-C", blank.folder, "target", "step", "--to", "x=1")
+    assert holds(done.out, "[reward] state", "x = 1")
+    file = blank.folder / "grounded.toml"
+    text = file.read_text()
+    assert "input = { }" in text
+    assert not [n for n in blank.propose().proposal.notes if "of what the plan costs" in n]
+    blank.target({"x": np.linspace(0, 20, 201)})
+    file.write_text(file.read_text().replace("input = { }", "input = { force = 0.01 }"))
+    assert [n for n in blank.propose().proposal.notes if "of what the plan costs" in n]

@@ -27,11 +27,13 @@ from grounded.errors import GroundedError
 from grounded.instruments.kinematics import integrals
 from grounded.model import Model
 from grounded_trials.formats.messages import Floats
+from grounded_trials.formats.tables import column_units
 from grounded_trials.logs.inspect_guess import SIMULATED_S, Guess
 from grounded_trials.logs.inspect_log import LogReport
 from grounded_trials.logs.joint_names import JOINT_UNITS, in_order, joint_names, of_joint
 from grounded_trials.logs.samples import Samples, tidy
 from grounded_trials.logs.signals import Series, SignalSpec, read_signals
+from grounded_trials.logs.stated_units import factor_between
 
 UNITS = (  # what the end of a path measures, in ROS's conventions (REP 103)
     (r"(position|translation)\.[xyz]$", "m"),
@@ -79,6 +81,8 @@ def weigh(
     guesses |= _steps(model, guesses, signals)
     guesses |= _taken_by_inputs(guesses, model)
     guesses = {name: _as_logged(guess, log) for name, guess in guesses.items()}
+    stated = column_units(Path(log.files[0])) if log.files else {}
+    guesses = {n: _stated(g, stated.get(g.path, ""), units[n]) for n, g in guesses.items()}
     return tuple(guesses[g.name] for g in states), tuple(guesses[g.name] for g in inputs)
 
 
@@ -89,6 +93,17 @@ def unit_of(path: str, joint: bool = True) -> str:
             return unit
     found = re.search(r"\.(position|velocity|effort)\[\d+\]$", path)
     return JOINT_UNITS[found[1]] if found and joint else ""
+
+
+def _stated(guess: Guess, said: str, wanted: str) -> Guess:
+    """The guess with the factor between the unit that the log states and the model's."""
+    factor = factor_between(said, wanted) if said else None
+    if factor is None or abs(factor - 1) < 1e-9:
+        return guess
+    why = f"the log says {said}, the model {wanted}"
+    return replace(
+        guess, scale=float(np.copysign(factor, guess.scale)), reasons=(*guess.reasons, why)
+    )
 
 
 def _taken_by_inputs(guesses: Mapping[str, Guess], model: Model) -> dict[str, Guess]:

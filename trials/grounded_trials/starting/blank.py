@@ -125,7 +125,7 @@ def _task(model: Model, dt: float) -> Task:
         model=model,
         dt=dt,
         target=np.zeros((HORIZON + 1, n)),
-        reward=Reward(np.ones(n), np.zeros(n), np.full(m, 0.01), np.full(m, 0.01)),
+        reward=Reward(np.ones(n), np.zeros(n), np.zeros(m), np.full(m, 0.01)),
         start=np.zeros(n),
         past=np.zeros(m),
         low=-free,

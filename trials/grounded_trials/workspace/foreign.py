@@ -87,6 +87,27 @@ class ForeignLog:
         )
         return trial, found
 
+    @property
+    def unlike_units(self) -> tuple[str, ...]:
+        """Where a table states a multiple of the model's unit that no scale makes up for."""
+        from grounded_trials.formats.tables import column_units
+        from grounded_trials.logs.stated_units import factor_between
+
+        model, found = self.workspace.base_model, []
+        files = [
+            file for file in log_files(self.path) if file.suffix.lower() in (".csv", ".tsv", ".txt")
+        ]
+        said = column_units(files[0]) if files else {}
+        for name, one in self.series.items():
+            wanted = {**model.states, **model.inputs}[name]
+            factor = factor_between(said.get(one.spec.path, ""), wanted)
+            if factor and one.spec.scale == 1 and abs(factor - 1) > 1e-9:
+                found.append(
+                    f"{name} is read as it is from a column in {said[one.spec.path]}, the model "
+                    f"has {wanted}: [log] scale = {factor:.6g} would make it that"
+                )
+        return tuple(found)
+
     @cached_property
     def stored(self) -> tuple[StoredTrial, ...]:
         """The trials that were made from a file of the same bytes, whatever its name was."""

@@ -356,7 +356,8 @@ def _cut(log: ForeignLog, candidate: str, start: float | None = None) -> _Read:
     trial, found = log.cut(candidate, start)
     about = _about(log.workspace, candidate) | log.source
     encoded = _encode(log.workspace, trial, about, found.start_ns)
-    return _Read(trial, encoded, found.warnings, found.reports, log=log)
+    warnings = (*log.unlike_units, *found.warnings)
+    return _Read(trial, encoded, warnings, found.reports, log=log)
 
 
 def _outstanding(workspace: Folder, path: Path) -> str:

@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
-from grounded.result import Result
+from grounded.result import Result, percent
 from grounded_trials.workspace.folder import Contents, Folder
 from grounded_trials.workspace.handover import Void, checked_candidate, outside_limits
+
+MOSTLY = 0.9  # of a plan's cost
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
@@ -96,7 +98,7 @@ def propose_in(workspace: Folder) -> Proposed:
         notes = notes or _void(workspace, before)
         notes = [f"{note}; run {candidate.id} in its place" for note in notes]
     if not proposal.standing.history:
-        notes += _unfinished(workspace)
+        notes += _unfinished(workspace, candidate)
     proposal = replace(proposal, notes=(*proposal.notes, *notes))
     if candidate is None:
         return Proposed(proposal, None, status_of(workspace, proposal.standing).then)
@@ -114,8 +116,9 @@ def to_run(workspace: Folder, candidate: str, *named: str) -> NextCommand:
     return NextCommand("export", (candidate, "--runner"))
 
 
-def _unfinished(workspace: Folder) -> list[str]:
+def _unfinished(workspace: Folder, first: Candidate | None) -> list[str]:
     """What a task leaves open, or out, that whoever runs its first plan should know."""
+    from grounded.utility import step_rewards
     from grounded_trials.workspace.task_file import read_target
 
     task, found = workspace.task, []
@@ -128,6 +131,17 @@ def _unfinished(workspace: Folder) -> list[str]:
         found.append(
             f"[limits] has none for {', '.join(free)}: what a plan asks for is sent, however much"
         )
+    if first is not None and first.predicted_utility < 0:
+        none = np.zeros(task.model.n)
+        reward, sent = replace(task.reward, state=none, terminal=none), first.predicted_inputs
+        error, aim = np.zeros((len(sent) + 1, len(none))), task.input_target
+        assert aim is not None
+        share = step_rewards(reward, error, sent, aim, task.past).sum() / first.predicted_utility
+        if share > MOSTLY:
+            found.append(
+                f"{percent(share)} of what the plan costs is [reward] input and input_change: with "
+                "less weight there, errors would count for more"
+            )
     name = str(workspace.config.task.target)
     rows = len(read_target(workspace.folder / name)[1])
     if rows > task.horizon + 1:
