@@ -144,6 +144,8 @@ def test_a_plan_whose_inputs_cost_nearly_all_says_so_and_a_target_tells_its_weig
     text = file.read_text()
     assert "input = { }" in text
     assert not [n for n in blank.propose().proposal.notes if "of what the plan costs" in n]
-    blank.target({"x": np.linspace(0, 20, 201)})
-    file.write_text(file.read_text().replace("input = { }", "input = { force = 0.01 }"))
+    s = np.linspace(0, 1, 201)
+    blank.target({"x": 10 * s**3 * (10 - 15 * s + 6 * s**2)})
+    text = file.read_text().replace("state = {x = 0.01}", "state = {x = 1000.0}")
+    file.write_text(text.replace("input = { }", "input = { force = 0.1 }"))
     assert [n for n in blank.propose().proposal.notes if "of what the plan costs" in n]

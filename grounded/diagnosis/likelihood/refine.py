@@ -51,9 +51,7 @@ from grounded.frozen import Array
 
 MOST_NUMBERS = 1e5  # of one (L, B, N, N) array: what fits in the cache goes fastest
 SHORTEST = 0.05  # part of a step that is still tried
-# iterations of rivals after which only the better half goes on, and how much of what the next step
-# promises counts for the others: of what no step would make one of the better, early
-HALVED = ((2, 3.0), (4, 0.0))
+HALVED = 4  # iterations after which only the better half of rivals goes on
 CLOSE = 10.0  # nats behind the best within which all go on
 LATE = SensorDelayFamily | SensorLagFamily
 LITTLE = 0.1  # nats that part of a step must promise to be tried where the step fails
@@ -133,14 +131,10 @@ def refine(
     (L, B), n = predictor.data.time.shape, predictor.data.model.n
     wide = n if works[0].noise.structure.tau is None else 2 * n
     size = max(1, int(MOST_NUMBERS / (L * B * wide * wide)))
-    done = 0
-    for at, promised in HALVED if iterations > HALVED[-1][0] else ():
-        if worth is None:
-            break
-        works = _after(predictor, works, at - done, size, fixed_noise, tick)
-        _halve(works, worth, promised)
-        done = at
-    iterations -= done
+    if worth is not None and iterations > HALVED:
+        works = _after(predictor, works, HALVED, size, fixed_noise, tick)
+        _halve(works, worth)
+        iterations -= HALVED
     works = _after(predictor, works, iterations, size, fixed_noise, tick)
     fits = [(work.best, work.still and not fixed_noise) for work in works if work.best is not None]
     return [replace(fit, settled=True) if top and not fit.settled else fit for fit, top in fits]
@@ -176,12 +170,12 @@ def _climb(predictor: Predictor, works: list[Work], how: tuple[int, bool]) -> li
     return [replace(work, along=None) for work in works]
 
 
-def _halve(works: list[Work], worth: Callable[[Fitted], float], promised: float) -> None:
+def _halve(works: list[Work], worth: Callable[[Fitted], float]) -> None:
     """The worse half stays where it is: who is that far behind by now does not overtake."""
     value = {id(work): worth(work.best) for work in works if work.best is not None}
     ranked = sorted(value.values(), reverse=True)
     for work in works:
-        mine = value.get(id(work), -np.inf) + promised * work.hope
+        mine = value.get(id(work), -np.inf)
         if mine < ranked[len(ranked) // 2] and mine < ranked[0] - CLOSE:
             work.given_up = True
 
