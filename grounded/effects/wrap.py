@@ -56,8 +56,7 @@ def plain_step(model: Model) -> Step:
     stepped, derivative, names = model.step, model.derivative, model.state_names
 
     def checked(function: Callable[..., Any], *at: Any) -> dict[str, Any]:
-        values = function(*at)
-        check_names(values, names, function)
+        check_names(values := function(*at), names, function)
         return dict(values)
 
     if stepped is not None:
@@ -113,13 +112,11 @@ def wrap(effect: Effect, values: Mapping[str, float], dt: float) -> Model:
         SensorDelayFamily: _sensor_delay_step,
         SensorLagFamily: _sensor_lag_step,
     }
-    for kind, build in make.items():
-        if isinstance(family, kind):
-            step, memory = build(effect, whole, dt)
-            vars(step)["timestep"] = getattr(model.step, "timestep", 0.0)
-            break
-    else:
+    build = next((build for kind, build in make.items() if isinstance(family, kind)), None)
+    if build is None:
         raise GroundedError(f"effect '{effect.name}': its family can't be adopted")
+    step, memory = build(effect, whole, dt)
+    vars(step)["timestep"] = getattr(model.step, "timestep", 0.0)
     return Model(
         states={**model.states, **memory},
         inputs=model.inputs,
@@ -153,8 +150,10 @@ def _quantities(effect: Effect, p: Any) -> dict[str, Any]:
     return {q.name: p[param_name(effect.name, q.name)] for q in effect.quantities}
 
 
-def _own_state(model: Model, s: Any) -> Named:
-    return Named("state", model.state_names, [s[n] for n in model.state_names])
+def _own_state(model: Model, s: Any, true: Mapping[str, str] | None = None) -> Named:
+    """The model's states; `true`: the memory that stands for one that is only logged."""
+    values = [s[(true or {}).get(n, n)] for n in model.state_names]
+    return Named("state", model.state_names, values)
 
 
 def _replaced(model: Model, a: Any, target: Mapping[str, Any]) -> Named:
@@ -346,8 +345,7 @@ def _sensor_delay_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, 
 
     def step(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
         behind = _quantities(effect, p)["d"] / dt
-        true = [s[memory[0]] if n == target else s[n] for n in model.state_names]
-        after = base(Named("state", model.state_names, true), a, p, dt)
+        after = base(_own_state(model, s, {target: memory[0]}), a, p, dt)
         line = [after[target], *[s[z] for z in memory]]
         logged: Any = 0.0
         for i, value in enumerate(line):
@@ -363,8 +361,7 @@ def _sensor_lag_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, di
     base, memory = plain_step(model), f"{target}_true"
 
     def step(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
-        true = [s[memory] if n == target else s[n] for n in model.state_names]
-        after = base(Named("state", model.state_names, true), a, p, dt)
+        after = base(_own_state(model, s, {target: memory}), a, p, dt)
         behind, moved = s[target] - s[memory], after[target] - s[memory]
         off = lagging(behind, moved, _quantities(effect, p)["tau"], dt)
         return {**after, target: after[target] + off, memory: after[target]}
@@ -378,21 +375,18 @@ def memory_of(wrapped: Model, base: Model, trial: Trial) -> Array:
     They start at what held before t = 0 (the held input, the first logged value, a clock at zero)
     and follow the commands and the logged states.
     """
-    extra = wrapped.state_names[base.n :]
-    now = memory_start(wrapped, base, trial)
-    found = [now]
+    found = [now := memory_start(wrapped, base, trial)]
     for t in range(trial.steps):
         x = np.concatenate([trial.states[t], now])[None]
         after = wrapped.system.step(x, trial.inputs[t][None], wrapped.values, trial.dt)
         now = after[0, base.n :]
         found.append(now)
-    return np.array(found).reshape(trial.steps + 1, len(extra))
+    return np.array(found).reshape(trial.steps + 1, wrapped.n - base.n)
 
 
 def memory_start(wrapped: Model, base: Model, trial: Trial) -> Array:
     """The memory states at t = 0, (wrapped.n - base.n,)."""
-    held = np.zeros(base.m) if trial.start_inputs is None else trial.start_inputs
-    start = []
+    held, start = np.zeros(base.m) if trial.start_inputs is None else trial.start_inputs, []
     for name in wrapped.state_names[base.n :]:
         inputs = [i for i, n in enumerate(base.input_names) if name.startswith(f"{n}_")]
         states = [i for i, n in enumerate(base.state_names) if name.startswith(f"{n}_true")]

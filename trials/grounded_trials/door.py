@@ -252,12 +252,11 @@ class Workspace(Folder):
         from grounded_trials.workspace.adopted import installed_effects
         from grounded_trials.workspace.diagnosing import diagnose_in
 
-        library = library or installed_effects()
         return diagnose_in(
             self._afresh(),
             trials=trials,
             max_effects=max_effects,
-            library=library.without(without),
+            library=(library or installed_effects()).without(without),
             compare=compare,
             probe=probe,
             engine=engine,
@@ -265,11 +264,7 @@ class Workspace(Folder):
         )
 
     def preflight(self, trials: Sequence[str] = ()) -> tuple[Finding, ...]:
-        """Judges the instruments alone, from their own signals: late, scaled, stuck; quick.
-
-        Args:
-            trials: short names, t0007; none: all that can be used.
-        """
+        """Judges the instruments of some trials, or all, from their own signals: late, scaled."""
         from grounded_trials.workspace.diagnosing import instruments_in
 
         return instruments_in(self._afresh(), trials)
@@ -288,11 +283,7 @@ class Workspace(Folder):
         return done
 
     def undo_adoption(self) -> Undone:
-        """Gives the model of grounded.toml what it had before the last `adopt`: effects, params.
-
-        Raises:
-            GroundedError: if nothing is left to undo, or [model] was changed since.
-        """
+        """Gives the model of grounded.toml what it had before the last `adopt`: effects, params."""
         from grounded_trials.workspace.adopting import undo_adoption
 
         done = undo_adoption(self._afresh())
