@@ -98,8 +98,9 @@ class ForeignLog:
             file for file in log_files(self.path) if file.suffix.lower() in (".csv", ".tsv", ".txt")
         ]
         said = column_units(files[0]) if files else {}
-        for name, one in self.series.items():
-            wanted = {**model.states, **model.inputs}[name]
+        units = {**model.states, **model.inputs}
+        for name, one in self.series.items():  # of [log.span], too
+            wanted = units.get(name, "")
             factor = factor_between(said.get(one.spec.path, ""), wanted)
             if factor and one.spec.scale == 1 and abs(factor - 1) > 1e-9:
                 found.append(
