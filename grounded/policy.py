@@ -163,8 +163,8 @@ class Policy:
             return np.clip(asked, self.low, self.high)
         z = np.repeat(np.repeat(past, self.depths)[None], len(states), 0)
         for t in range(T):
-            sent = np.maximum(asked[:, t] + z @ memory[t].T, self.low)  # clip takes twice as long
-            asked[:, t] = np.minimum(sent, self.high)
+            low = np.maximum(asked[:, t] + z @ memory[t].T, self.low)  # clip takes twice as long
+            asked[:, t] = np.minimum(low, self.high)
             z[:, 1:] = z[:, :-1].copy()
             z[:, newest] = asked[:, t]
         return asked

@@ -85,7 +85,7 @@ class Task:
             object.__setattr__(self, name, value)
         for name, size in {"state": n, "terminal": n, "input": m, "input_change": m}.items():
             if (found := getattr(self.reward, name).shape) != (size,):
-                each = "state" if size == n and name in ("state", "terminal") else "input"
+                each = "state" if name in ("state", "terminal") else "input"
                 raise GroundedError(
                     f"[reward] {name}: expected {size} weights, one for each {each} of the model, "
                     f"got an array of shape {found}"

@@ -63,7 +63,7 @@ def noisy(made, share, seed, *, other):
 
 def refused(w, trial, made, candidates):
     """Why the run is not this candidate's, "" where it is taken for it."""
-    return suspicion(w.task, replace(trial, candidate=made.id), made, [*candidates.values()])[0]
+    return suspicion(w.task, replace(trial, candidate=made.id), made, [*candidates.values()]).why
 
 
 @pytest.mark.parametrize("other", [False, True])

@@ -43,6 +43,15 @@ def diagnosed(folder: Path, **changes):
     write_document(folder / "reports" / "diagnosis.json", document)
 
 
+def two_claimed(folder: Path) -> list[str]:
+    """A diagnosis that claims two effects; their names."""
+    names = ["viscous_friction:v", "delay:force"]
+    late = DIAGNOSIS["ranking"][1] | {"params": {"d": {"value": 0.02, "std": 0.01, "unit": "s"}}}
+    verdict = {"kind": "several", "effects": names, "sentence": "Two."}
+    diagnosed(folder, verdict=verdict, ranking=[DIAGNOSIS["ranking"][0], late])
+    return names
+
+
 @pytest.mark.parametrize("command", ["status", "report", "learn", "propose"])
 def test_every_command_says_the_same_once_the_search_has_ended(cart, command):
     assert last(grounded("-C", cart, command)) == "grounded adopt viscous_friction:v"
@@ -50,10 +59,7 @@ def test_every_command_says_the_same_once_the_search_has_ended(cart, command):
 
 def test_all_claimed_effects_are_adopted_at_once(cart, tmp_path):
     folder = copied(cart, tmp_path / "w")
-    names = ["viscous_friction:v", "delay:force"]
-    late = DIAGNOSIS["ranking"][1] | {"params": {"d": {"value": 0.02, "std": 0.01, "unit": "s"}}}
-    verdict = {"kind": "several", "effects": names, "sentence": "Two."}
-    diagnosed(folder, verdict=verdict, ranking=[DIAGNOSIS["ranking"][0], late])
+    names = two_claimed(folder)
     command = last(grounded("-C", folder, "status"))
     assert command == "grounded adopt viscous_friction:v delay:force"
     done = grounded("-C", folder, *shlex.split(command)[1:], "--json").json
@@ -427,10 +433,7 @@ def test_an_adoption_in_vain_is_told_how_to_be_undone(tmp_path, monkeypatch):
 
 def test_an_adoption_is_undone_and_not_proposed_again_until_a_new_diagnosis(cart, tmp_path):
     folder = copied(cart, tmp_path / "w")
-    names = ["viscous_friction:v", "delay:force"]
-    late = DIAGNOSIS["ranking"][1] | {"params": {"d": {"value": 0.02, "std": 0.01, "unit": "s"}}}
-    verdict = {"kind": "several", "effects": names, "sentence": "Two."}
-    diagnosed(folder, verdict=verdict, ranking=[DIAGNOSIS["ranking"][0], late])
+    names = two_claimed(folder)
     before = (folder / "grounded.toml").read_text()
     w = Workspace(folder)
     w.adopt(*names[:1], parameters=False)
@@ -464,3 +467,13 @@ def test_an_adoption_under_later_changes_is_not_undone(cart, tmp_path):
     assert (folder / "grounded.toml").read_text() == changed
     assert grounded("-C", folder, "adopt").code == 2
     assert grounded("-C", folder, "adopt", "--undo", "viscous_friction:v").code == 2
+
+
+def test_a_damaged_list_of_adoptions_is_found_before_anything_is_written(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    (folder / "reports" / "adoptions.json").write_text("[")
+    before = (folder / "grounded.toml").read_text()
+    done = grounded("-C", folder, "adopt", "viscous_friction:v")
+    assert done.code == 1 and "adoptions.json" in done.err
+    assert (folder / "grounded.toml").read_text() == before
+    assert [Path(one.file).name for one in Workspace(folder).verify().damaged] == ["adoptions.json"]

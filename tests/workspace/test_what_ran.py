@@ -65,7 +65,7 @@ def test_a_run_is_recognised_though_the_log_is_not_perfect(learnt, kind):
     for own, trial, candidates in runs(learnt):
         states, inputs = HONEST[kind](np.array(trial.states), np.array(trial.inputs))
         logged = replace(trial, states=states, inputs=inputs)
-        assert suspicion(learnt.task, logged, own, candidates)[0] == ""
+        assert suspicion(learnt.task, logged, own, candidates).why == ""
 
 
 @pytest.mark.parametrize("share", [0.01, 0.03])
@@ -83,20 +83,20 @@ def test_a_run_on_states_of_varying_age_with_noise_of_its_own_is_recognised(lear
                 states=clean + noise * rng.normal(size=clean.shape),
                 inputs=own.policy.commands(acted[None], own.policy.past)[0],
             )
-            assert suspicion(learnt.task, logged, own, [own])[0] == ""
+            assert suspicion(learnt.task, logged, own, [own]).why == ""
 
 
 @pytest.mark.parametrize("kind", OTHERS)
 def test_other_commands_are_not_the_candidate_s(learnt, kind):
     for own, trial, candidates in runs(learnt):
         logged = replace(trial, inputs=OTHERS[kind](np.array(trial.inputs)))
-        assert "force" in suspicion(learnt.task, logged, own, candidates)[0]
+        assert "force" in suspicion(learnt.task, logged, own, candidates).why
 
 
 def test_every_pair_of_candidates_is_told_apart(learnt):
     for own, trial, candidates in runs(learnt):
         for other in candidates:
-            why = suspicion(learnt.task, replace(trial, candidate=other.id), other, candidates)[0]
+            why = suspicion(learnt.task, replace(trial, candidate=other.id), other, candidates).why
             assert why.endswith(f"those of {own.id}") if other.id != own.id else why == ""
 
 
@@ -104,7 +104,7 @@ def test_a_takeover_is_dated(learnt):
     own, trial, candidates = runs(learnt)[0]
     inputs = np.array(trial.inputs)
     inputs[25:] = -inputs[25:] + 2
-    why = suspicion(learnt.task, replace(trial, inputs=inputs), own, candidates)[0]
+    why = suspicion(learnt.task, replace(trial, inputs=inputs), own, candidates).why
     assert re.search(r"up to 1\.[0-3] s", why)
 
 
@@ -258,9 +258,11 @@ def test_it_is_said_whose_commands_they_are_only_where_they_match(learnt):
     """A third policy's run, nearer to one candidate than to the other, is neither's."""
     (own, _, candidates), _, (_, theirs, _) = runs(learnt)
     inputs = theirs.inputs + 0.2 * np.sin(np.arange(theirs.steps) / 8)[:, None]
-    why, name = suspicion(learnt.task, replace(theirs, inputs=inputs), own, candidates)
+    seen = suspicion(learnt.task, replace(theirs, inputs=inputs), own, candidates)
+    why, name = seen.why, seen.other
     assert "nearer" in why and name == ""
-    why, name = suspicion(learnt.task, theirs, own, candidates)
+    seen = suspicion(learnt.task, theirs, own, candidates)
+    why, name = seen.why, seen.other
     assert why and name == theirs.candidate != own.id
 
 

@@ -144,15 +144,14 @@ def _pays(
         less = (search.score(f) for f in fits if set(f.hypothesis.names) <= rest)
         sure = sure and search.score(after) - max(less) > CLAIM
     further = effects > max(1, len(before.hypothesis.effects))
-    if sure and white and further and _in_several(search, before, after):
+    if sure and white and further and _in_several(search, after, new):
         return gain.mean > 0 and gain.largest > LEAST
     return gain.pays(*(ALONE if sure and effects < 2 else PAYS))
 
 
-def _in_several(search: HypothesisSearch, before: Fitted, after: Fitted) -> bool:
-    """Whether more than few trials show each effect that `after` has beyond `before`."""
-    new = set(after.hypothesis.names) - set(before.hypothesis.names)
-    return not any(few_trials(search.data, acting(search.predictor, after, n)) for n in new)
+def _in_several(search: HypothesisSearch, fit: Fitted, names: set[str]) -> bool:
+    """Whether more than few trials show each of these effects of a fit."""
+    return not any(few_trials(search.data, acting(search.predictor, fit, n)) for n in names)
 
 
 def _overrules(

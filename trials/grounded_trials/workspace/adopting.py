@@ -94,8 +94,9 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
     }
     own, adopted = joined(found, names, workspace.config.model.effects, nominal, calibrated)
     whole = dict(workspace.config.model.params) | own
+    earlier, _ = _kept(workspace)  # or nothing is written
     set_in_model(workspace.config.file, params=whole if own else None, effects=adopted or None)
-    earlier, model = _kept(workspace)[0], workspace.config.model
+    model = workspace.config.model
     after = {"effects": adopted or model.effects, "params": whole if own else model.params}
     step = {"names": names, "before": _written(model), "after": after}
     write_document(workspace.reports / KEPT, {"adoptions": [*earlier, step], "undone": []})

@@ -94,10 +94,7 @@ class ForeignLog:
         from grounded_trials.logs.stated_units import factor_between
 
         model, found = self.workspace.base_model, []
-        files = [
-            file for file in log_files(self.path) if file.suffix.lower() in (".csv", ".tsv", ".txt")
-        ]
-        said = column_units(files[0]) if files else {}
+        said = column_units(log_files(self.path)[0])
         units = {**model.states, **model.inputs}
         for name, one in self.series.items():  # of [log.span], too
             wanted = units.get(name, "")

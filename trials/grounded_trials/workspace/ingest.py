@@ -162,18 +162,22 @@ def _recognised(workspace: Folder, path: Path, read: _Read, candidate: str | Non
         return read
     (own, _), candidates = workspace.candidate(ran), _latest(workspace)
     judged = partial(suspicion, workspace.task, own=own, others=candidates)
-    why, other = judged(interpolate_gaps(read.trial).trial)
+    whole = interpolate_gaps(read.trial).trial
+    seen = judged(whole)
     log, found = read.log.recording if read.log else None, None
     if read.log and log:
         found = log.start_of(own.policy)
-        if found and elsewhere(log, found, own.policy, why):
+        if found and elsewhere(log, found, own.policy, seen.why):
             note = f"the log begins {found.seconds:.3f} s before {ran} does: it is taken from there"
             read = replace(_cut(read.log, ran, found.seconds), notes=(note,))
-            why, other = judged(interpolate_gaps(read.trial).trial)
+            whole = interpolate_gaps(read.trial).trial
+            seen = judged(whole)
         if (rival := rival_in(log, found, ran, candidates)) is not None:
-            other_why, name = judged(rival)  # as it lies where that one fits best
-            why, other = (other_why, name) if name else (why or other_why, other)
-    units, by = other_units(workspace.task, interpolate_gaps(read.trial).trial, own)
+            there = judged(rival)  # as it lies where that one fits best
+            told = there if there.other else seen if seen.why else replace(seen, why=there.why)
+            seen = replace(told, ran=seen.ran)
+    why, other = seen.why, seen.other
+    units, by = other_units(workspace.task, whole, own, seen.ran)
     units = () if other else units
     if not why and not units:
         return read

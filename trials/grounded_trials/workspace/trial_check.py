@@ -223,10 +223,17 @@ def _steps_alike(noise: Array) -> float:
     return float(2 * power[:end].sum() / power[0] - 1)
 
 
-def suspicion(
-    task: Task, trial: Trial, own: Candidate, others: Sequence[Candidate]
-) -> tuple[str, str]:
-    """Why a trial is not a run of its candidate, "" where nothing says so; and whose it is.
+@dataclass(frozen=True, eq=False)
+class Suspicion:
+    """What a trial's commands say of who drove."""
+
+    ran: Following | None  # beside what its candidate asks for
+    why: str = ""  # why it is not its candidate's run; "" where nothing says so
+    other: str = ""  # whose run it is
+
+
+def suspicion(task: Task, trial: Trial, own: Candidate, others: Sequence[Candidate]) -> Suspicion:
+    """Why a trial is not a run of its candidate, and whose it is.
 
     Args:
         task: whose latency and units hold.
@@ -237,7 +244,7 @@ def suspicion(
     trial, latest = trial.until(task.horizon), _latest(task)
     found = follows(own.policy, trial, latest)
     if found is None or (found.alike and found.error < 1e-5):
-        return "", ""
+        return Suspicion(found)
     rivals = [(follows(c.policy, trial, latest), c.id) for c in others[-OTHERS:] if c.id != own.id]
     alike = [(evidence(found, f), n, f.error) for f, n in rivals if f is not None and f.alike]
     nats, name, left = max(alike, default=(-np.inf, "", 0.0))
@@ -246,30 +253,32 @@ def suspicion(
         looks = f"they are {'' if same else 'nearer to '}those of {name}"
         name = name if same else ""
     elif found.alike:
-        return "", ""
+        return Suspicion(found)
     elif found.until_s >= LEAST * trial.dt:
         looks = f"up to {found.until_s:.1f} s they are alike: somebody, or something, took over"
     else:
         looks = "somebody, or another controller, drove"
     name = name if nats > DECISIVE else ""
     differs = with_unit(f"{found.rms:.3g}", task.model.inputs[found.input])
-    return (
+    why = (
         f"its commands are not what {own.id} sends on the logged states: {found.input} differs by "
         f"{differs} (rms); {looks}"
-    ), name
+    )
+    return Suspicion(found, why, name)
 
 
-def other_units(task: Task, trial: Trial, own: Candidate) -> tuple[tuple[str, ...], float]:
+def other_units(
+    task: Task, trial: Trial, own: Candidate, plain: Following | None
+) -> tuple[tuple[str, ...], float]:
     """The signals with which a log is a run of its candidate once they are multiplied, and by what.
 
     Degrees for radians or the other way round, thousandths or thousands; (), 1 where nothing helps,
     or nothing needs to: a log so noisy that any commands could follow from it is nobody's.
+    `plain`: how its commands follow as they are.
     """
-    model = task.model
-    trial, latest = trial.until(task.horizon), _latest(task)
-    plain = follows(own.policy, trial, latest)
     if plain is None or (plain.alike and plain.error < NEARLY):
         return (), 1.0
+    model, trial, latest = task.model, trial.until(task.horizon), _latest(task)
     angular = [[n for n, u in model.states.items() if u in units] for units in ANGULAR]
     angular += [[n] for n, u in (*model.states.items(), *model.inputs.items()) if u in ANGULAR[0]]
     single = [[name] for name in (*model.state_names, *model.input_names)]

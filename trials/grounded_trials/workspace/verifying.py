@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -81,5 +82,6 @@ def _documents(workspace: Folder) -> Iterator[tuple[Path, Callable[[], Any]]]:
     """The documents of reports/ that there are, and how they are checked."""
     if (path := workspace.reports / "diagnosis.json").exists():
         yield path, lambda: read_diagnosis(workspace.reports)
-    if (place := workspace.reports / "optimum.json").exists():
-        yield place, lambda: read_document(place)
+    for name in ("optimum.json", "adoptions.json"):
+        if (place := workspace.reports / name).exists():
+            yield place, partial(read_document, place)
