@@ -244,4 +244,6 @@ def _values(row: Ranked) -> str:
 
 
 def _spread(std: float) -> str:
-    return f" +- {number(std, 2)}" if std and math.isfinite(std) else ""
+    if not math.isfinite(std):
+        return " (any value fits)"
+    return f" +- {number(std, 2)}" if std else ""

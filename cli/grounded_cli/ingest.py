@@ -23,7 +23,7 @@ VERDICTS = {
     "waiting": ": more trials of it are needed ([search] repeats)",
     "in doubt": ": it may be bad luck, the best so far is run once more",
     "probe": ", for the diagnosis: the search leaves it out",
-    "run again": ": its utility is the mean of its trials",
+    "run again": ": the candidate counts with the mean of its runs",
 }
 
 

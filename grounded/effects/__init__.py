@@ -27,6 +27,7 @@ from grounded.effects.family import (
     scales_of,
     wrapping_order,
 )
+from grounded.effects.joint import one_friction
 from grounded.effects.registry import Library
 from grounded.effects.wrap import memory_of, memory_start, param_name, wrap
 
@@ -48,6 +49,7 @@ __all__ = [
     "acting_order",
     "memory_of",
     "memory_start",
+    "one_friction",
     "param_name",
     "scales_of",
     "wrap",

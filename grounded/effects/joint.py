@@ -230,6 +230,13 @@ def renamed(model: Model) -> dict[str, str]:
     return found
 
 
+def one_friction(one: Effect, other: Effect) -> bool:
+    """Whether both describe the dry friction of one motion, which no model has twice."""
+    dry = {"coulomb_friction", joint_friction.name, load_friction.name}
+    (a, of), (b, at) = ((e.family.name, e.site.target.rpartition("<-")[2]) for e in (one, other))
+    return {a, b} <= dry and of == at
+
+
 joint_friction = LossFamily(
     name="joint_friction",
     equation="u_eff = u - c sign(w) - b w   (u<-w)",

@@ -1,6 +1,7 @@
 """START HERE: the instruments, from their own signals alone, before any physics is judged.
 
 odd_trial     a whole trial in other units than the rest
+swapped       two columns of a trial in each other's place
 single        each state by itself
 kinematics    velocities against the rates of their positions, courses against headings
 inputs        copies of one another, at their limits, constant within each trial
@@ -40,6 +41,7 @@ from grounded.instruments.odd_trial import (
     ratios_of,
 )
 from grounded.instruments.single import Signal, judge_signal
+from grounded.instruments.swapped import judge_columns
 from grounded.model import Model
 from grounded.task import Task
 from grounded.trial import Trial
@@ -100,6 +102,7 @@ def preflight(
     with np.errstate(all="ignore"):
         ratios = ratios_of(model, bench.trials, bench.shown)
         judge_stamps(model, bench.trials, ratios)
+        judge_columns(model, bench.trials, bench.shown)
         found = [
             *bench.odd(ratios),
             *bench.singles(),

@@ -42,6 +42,7 @@ MORE_WORK = 2e8  # the same for MANY
 WIDER = (64.0, 32.0, 16.0, 8.0, 4.0, 2.0, 1.0)  # times the speed a dry friction builds up over
 FOLLOWED = 200  # iterations of DDP for each of them
 FEWEST = 10  # iterations: a rival that gets no more is not started
+CHECKED = 4  # steps of the plan in which the model is asked once more, as it was written
 HOPELESS, HOPELESS_SLOW = 1e6, 1e3  # times the best cost: a start above it is not pursued
 
 Tick = Callable[[str], None]
@@ -61,6 +62,9 @@ def first_policy(
     Returns:
         The policy, and the result of DDP that it is made of: its `status` says whether the plan
         has converged.
+
+    Raises:
+        GroundedError: if the model computes other numbers than when it was read (random ones).
     """
     if caution:
         reward = replace(
@@ -87,6 +91,9 @@ def first_policy(
     if best.status == "max iterations" and len(best.trace) < ITERATIONS:
         more = finished(problem, best.u, best.K, best.z[:-1], tick=tick)
         best = replace(more, trace=(*best.trace, *more.trace))
+    model, some = task.model, np.linspace(0, len(best.u) - 1, CHECKED).astype(int)
+    if np.isfinite(best.z).all():
+        model.system.check(best.z[some, : model.n], best.u[some], model.values, task.dt)
     return task.policy(best.u, best.K, best.z[:-1]), best
 
 

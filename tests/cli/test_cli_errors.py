@@ -275,6 +275,10 @@ MODELS = {
     ),
     "wrong declaration": (MODEL.replace('"v": "m/s"}', '"v": "m/s", "mass": "kg"}'), ["twice"]),
     "wrong args": (MODEL.replace("def dynamics(s, a, p)", "def dynamics(s, a)"), ["model.py"]),
+    "random": (
+        MODEL.replace('"x": s.v', '"x": s.v + np.random.normal()'),
+        ["model.py", "random numbers"],
+    ),
     "empty": ("", ["does not define"]),
     "bytes": ("\x00\x01", ["model.py"]),
 }

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from grounded.compile import system_of
@@ -98,6 +98,7 @@ def differenced(step, x, u, p):
 
 
 @settings(max_examples=60, deadline=None)
+@example("s.x", ("and", "s.x", ("add", ("and", "1.3", "1.3"), "s.x")), 0)  # an array without axes
 @given(trees, trees, st.integers(0, 10_000))
 def test_derivatives_of_made_up_expressions(left, right, seed):
     """Indicator terms with a width of 0.5, so that they have derivatives everywhere."""

@@ -9,6 +9,7 @@ from grounded import Model, Param
 from grounded.diagnosis.hypotheses.scan import elsewhere, faint
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.effects import Library
 from grounded.models.car import model as car
 from grounded.models.pendulum import model as pendulum
@@ -72,3 +73,19 @@ def test_a_state_that_is_set_outright_has_no_rate_to_be_scaled():
     names = [effect.name for effect in Library().candidates(model)]
     assert "rate_gain:w" not in names and "offset:w" in names
     assert "rate_gain:omega" in [effect.name for effect in Library().candidates(pendulum)]
+
+
+def test_the_dry_friction_of_one_motion_is_claimed_once():
+    """Beside a friction that grows with the load, the constant one passed for a second cause."""
+    t = np.arange(200) * 0.05
+    u = np.sin(t)[:, None]
+    states = pendulum.system.march(np.zeros((1, 2)), u[:, None], pendulum.values, 0.05)[:, 0]
+    trial = Trial(states, u, 0.05, ("theta", "omega"), ("torque",))
+    data = prepare(pendulum, [trial, trial])
+    search = HypothesisSearch(data, Library().candidates(pendulum, data.scales))
+    loaded = Library().effect("load_friction:torque<-omega", pendulum, data.scales)
+    h = Hypothesis().plus(loaded, {"c": 0.1, "b": 0.0, "k": 0.1})
+    fit = search.refined([search.fresh(h)], 1)[0]
+    names = {look.effect.name for look in search.shortlist(fit, 100)}
+    assert "viscous_friction:omega" in names
+    assert not names & {"coulomb_friction:omega", "joint_friction:torque<-omega"}

@@ -6,11 +6,21 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from facts import holds
 from grounded import Trial
 from grounded.diagnosis.error_report import Credit, Region, Remainder, RulerRow
 from grounded.diagnosis.report import Estimate, Ranked, Unconfirmed
 from grounded.diagnosis.unconfirmed import unrepeatable
-from grounded.diagnosis.verdict import LOG, LOST, next_trial, open_noise, verdict, worsened
+from grounded.diagnosis.verdict import (
+    LOG,
+    LOST,
+    improvement,
+    next_trial,
+    open_noise,
+    telling,
+    verdict,
+    worsened,
+)
 from grounded.effects import Library
 from grounded.models import car, pendulum
 from small_tasks import cart_task
@@ -35,6 +45,17 @@ def test_what_got_worse_is_said_of_the_channel_that_lost_most():
     said = worsened((short, whole))
     assert "x" in said.split() and "3.8 m" in said and "2.1 m" in said
     assert "0.60 m/s" in worsened((short,))
+
+
+def test_a_slow_plant_is_spoken_of_by_whole_trials():
+    """A second ahead, what heats up over an hour is predicted by any model."""
+    second = row({"x": 0.02}, {"x": 0.017})
+    whole = row({"x": 5.0}, {"x": 0.3}, whole_trial=True, horizon_s=3600.0)
+    assert telling((second, whole)) is whole
+    assert holds(improvement((second, whole)), "30 cm", "5.0 m")
+    quick = row({"x": 0.2}, {"x": 0.08})
+    assert telling((quick, whole)) is quick and "8.0 cm" in improvement((quick, whole))
+    assert telling((whole,)) is None and telling(()) is None
 
 
 def test_nothing_is_said_where_nothing_lost_or_only_within_the_noise():

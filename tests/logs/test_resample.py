@@ -205,6 +205,30 @@ def test_the_span() -> None:
     assert late.late_s == pytest.approx(0.495, abs=0.001) and "late" in late.warnings[0]
 
 
+def held(change: float, phase: float) -> Series:
+    """A command that changes every so often, first at `phase`, logged at 200 Hz from 0 on."""
+    t = np.arange(0.0, 2.0, 0.005)
+    return series(t, np.floor((t - phase) / change + 1e-9), SignalSpec("/u.data", "log"))
+
+
+@pytest.mark.parametrize("phase", [0.02, 0.035])
+def test_data_begin_where_a_step_of_the_commands_does(phase: float) -> None:
+    u = held(0.05, phase)
+    found = grid(pose(np.sin), u, in_step=True)
+    assert found.moved_s == pytest.approx(phase, abs=1e-6) and found.warnings == ()
+    t = phase + 0.05 * np.arange(len(found.states))
+    np.testing.assert_allclose(found.states[:, 0], np.sin(t), atol=2e-5)
+    assert found.inputs[:39, 0].tolist() == list(range(39))
+    assert grid(pose(np.sin), u).moved_s == 0  # a candidate's run begins with its first command
+
+
+def test_data_whose_commands_do_not_change_in_steps_stay_where_they_are() -> None:
+    often = grid(pose(np.sin), held(0.005, 0.0), in_step=True)
+    assert often.moved_s == 0 and often.warnings == ()  # a step has their mean
+    odd = grid(pose(np.sin), held(0.035, 0.0), in_step=True)
+    assert odd.moved_s == 0 and holds(odd.warnings[0], "0.035 s", "0.05 s", "0.025 s")
+
+
 @given(st.integers(0, 2**32 - 1))
 def test_any_jitter_any_loss_any_order_stays_near_the_truth(seed: int) -> None:
     rng = np.random.default_rng(seed)

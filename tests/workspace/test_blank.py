@@ -83,6 +83,18 @@ def test_the_first_plan_says_what_the_task_leaves_open(blank):
     assert not [one for one in blank.propose().proposal.notes if "[limits] has none" in one]
 
 
+def test_a_target_that_nobody_has_drawn_is_told(blank):
+    blank.target({"x": np.zeros(41), "v": np.zeros(41)})
+    assert any("`target`" in one for one in blank.propose().proposal.notes)
+    blank.target({"x": np.linspace(0, 1, 41)})
+    assert not any("`target`" in one for one in blank.propose().proposal.notes)
+
+
+def test_a_workspace_in_a_folder_of_this_one_is_named(blank):
+    done = grounded("-C", blank.folder.parent, "status")
+    assert done.code == 1 and f"-C {blank.folder}" in done.err
+
+
 def test_what_is_missing_in_the_robots_program_is_named(blank):
     with pytest.raises(NotImplementedError, match="measure"):
         driver(blank.folder).measure()

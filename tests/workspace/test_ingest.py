@@ -13,6 +13,7 @@ from facts import holding
 from grounded.errors import GroundedError
 from grounded.trial import Trial
 from grounded_trials.store.trial_file import TrialWriter, read_trial, trial_bytes, write_trial
+from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.ingest import ingest_log
 from grounded_trials.workspace.proposing import propose_in, standing_in
 from grounded_trials.workspace.running import run_candidate
@@ -203,3 +204,31 @@ def test_a_trial_of_a_deleted_candidate_still_counts(w):
     assert standing_in(fresh).incumbent.candidate.id == "c0001"
     again = run_candidate(fresh, "c0001").trial_file
     assert ingest_log(fresh, again).candidate == "c0001"
+
+
+def test_data_are_taken_from_where_a_step_of_their_commands_begins(w, tmp_path):
+    """Half a step early or late, a delay was found so much too short or long."""
+    t = np.arange(0, 4, 0.005)
+    force = np.sin(np.floor((t - 0.03) / 0.05 + 1e-6))
+    rows = np.column_stack([t, np.sin(t), np.cos(t), force])
+    np.savetxt(tmp_path / "log.csv", rows, "%.6f", ",", header="t,x,v,force", comments="")
+    text = (w.folder / "grounded.toml").read_text() + LOG_OF_A_TABLE
+    (w.folder / "grounded.toml").write_text(text)
+    done = grounded("-C", w.folder, "ingest", "--data", tmp_path / "log.csv")
+    assert done.code == 0 and "0.030 s" in done.err, done.err
+    assert w.store.list()
+    (kept,) = Folder(w.folder).whole_trials()
+    np.testing.assert_allclose(kept.trial.inputs[:70, 0], np.sin(np.arange(70)), atol=1e-5)
+    np.testing.assert_allclose(
+        kept.trial.states[:70, 0], np.sin(0.03 + 0.05 * np.arange(70)), atol=1e-4
+    )
+
+
+LOG_OF_A_TABLE = """
+[log.state]
+x = { path = "/csv.x" }
+v = { path = "/csv.v" }
+
+[log.input]
+force = { path = "/csv.force" }
+"""

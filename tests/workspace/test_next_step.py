@@ -477,3 +477,17 @@ def test_a_damaged_list_of_adoptions_is_found_before_anything_is_written(cart, t
     assert done.code == 1 and "adoptions.json" in done.err
     assert (folder / "grounded.toml").read_text() == before
     assert [Path(one.file).name for one in Workspace(folder).verify().damaged] == ["adoptions.json"]
+
+
+def test_what_trials_differ_in_and_predictions_lose_with_is_not_adopted(cart, tmp_path):
+    """A log with two columns exchanged bent a claim; `next:` was to adopt it."""
+    folder, rows = copied(cart, tmp_path / "w"), list[dict[str, object]]()
+    differs = {"effect": "viscous_friction:v", "quantity": "k", "agrees": False, "chance": 0.0}
+    for after in (0.2, 0.5):
+        row = {"horizon_s": 1.0, "unit_by_channel": {"v": "m/s"}, "crude": {"v": 0.3}}
+        rows = [row | {"with_effects": {"v": after}}]
+        diagnosed(folder, prediction_error=rows, agreement=[differs])
+        adopts = last(grounded("-C", folder, "status")).startswith("grounded adopt")
+        assert adopts == (after < 0.3)
+    diagnosed(folder, prediction_error=rows)
+    assert last(grounded("-C", folder, "status")).startswith("grounded adopt")

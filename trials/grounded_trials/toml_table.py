@@ -136,6 +136,12 @@ def read_toml(path: Path) -> Table:
         with open_file(path) as stream:
             text = stream.read(SIZE_LIMIT + 1).decode("utf-8")
     except FileNotFoundError:
+        near = sorted(str(one.parent) for one in path.parent.glob(f"*/{path.name}"))
+        if near:
+            raise GroundedError(
+                f"{path} does not exist: this is not a workspace; name one with -C, such as "
+                f"-C {near[0]}"
+            ) from None
         raise GroundedError(
             f"{path} does not exist: this is not a workspace; name one with -C DIR, or make one",
             NextCommand("init", ("DIR", "--example", "car-turn")),

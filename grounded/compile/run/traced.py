@@ -72,11 +72,11 @@ class TracedSystem(Interpreted):
         differ &= ~(np.abs(mine - theirs) <= AGREE * scale)
         if differ.any():
             t, i = np.argwhere(differ)[0]
+            ours, own = float(mine[t, i]), float(theirs[t, i])
             raise GroundedError(
-                f"{self.source}: the traced model differs from the function: "
-                f"at sample {t}, state '{self.signature.states[i]}', the trace gives "
-                f"{mine[t, i]!r} and the function {theirs[t, i]!r}. Does it use random numbers, "
-                "keep a memory, or look at the type of its arguments?"
+                f"{self.source}: the traced model differs from the function: at sample {t}, state "
+                f"'{self.signature.states[i]}', the trace gives {ours!r} and the function {own!r}. "
+                "Does it use random numbers, keep a memory, or look at the type of its arguments?"
             )
 
     def jacobian(

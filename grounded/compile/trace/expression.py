@@ -125,7 +125,11 @@ def decide(condition: Expression) -> bool:
 
 
 def elementwise(function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-    """A function of expressions and numbers, broadcast over arrays of them."""
+    """A function of expressions and numbers, broadcast over arrays of them.
+
+    An array without axes, as np.where of two constants gives, is a number.
+    """
+    args = tuple(a[()] if isinstance(a, np.ndarray) and a.ndim == 0 else a for a in args)
     arrays = [np.asarray(a, object) for a in args if isinstance(a, np.ndarray | list | tuple)]
     if not arrays:
         return function(*args, **kwargs)

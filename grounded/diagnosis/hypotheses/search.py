@@ -20,7 +20,7 @@ from grounded.diagnosis.likelihood.noise import NoiseModel, Structure, noise_gue
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.refine import refine
 from grounded.diagnosis.likelihood.simulated import simulated
-from grounded.effects import Effect, ParamFamily, SensorLagFamily
+from grounded.effects import Effect, ParamFamily, SensorLagFamily, one_friction
 from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import Array
 
@@ -213,6 +213,7 @@ class HypothesisSearch(FittedHypotheses):
             e
             for e in self.candidates
             if e.name not in taken
+            and not any(one_friction(e, known) for known in fit.hypothesis.effects)
             and not (isinstance(e.family, ParamFamily) and fit.hypothesis.spread > 0)
         ]
         self.tick("scan")

@@ -103,6 +103,7 @@ def unmoved(data: Data, fit: Fitted, column: int, shift: float) -> Fitted:
     return replace(fit, hypothesis=moved(data, fit.hypothesis, delta), gram=gram, score=score)
 
 
+UNTOLD = 1e6  # times a value: a standard deviation that says nothing was learnt of it
 RANKED = 12  # explanations that are listed
 SAME = 0.95  # share of a parameter's signal from which an effect is the same thing
 
@@ -227,7 +228,9 @@ class Claims:
             some = {}
             for q in effect.free:
                 v, s, w = float(values[q.name]), float(stds[at]), float(halves[at])
-                some[q.name] = Estimate(v, s, (v - w, v + w), q.unit)
+                told = s < UNTOLD * max(abs(v), 1.0)
+                interval = (v - w, v + w) if told else None
+                some[q.name] = Estimate(v, s if told else math.inf, interval, q.unit)
                 at += 1
             found.append(some)
         return found

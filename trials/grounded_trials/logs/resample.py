@@ -4,8 +4,11 @@
     input k = value held at t_k + dt / 2        the command in force in the middle of the step
 
 Half a step, because a command's stamp scatters about its t_k: held at t_k itself, every late one
-would be missed and appear a whole step later. Gaps, clocks that jump and clocks that differ are
-refused, since they hide what happened; everything else is counted and reported.
+would be missed and appear a whole step later. Where commands change within the steps, all of them
+would lie up to half a step early or late: data are taken from the next change on.
+
+Gaps, clocks that jump and clocks that differ are refused, since they hide what happened; everything
+else is counted and reported.
 """
 
 from __future__ import annotations
@@ -31,6 +34,9 @@ from grounded_trials.logs.signals import Clock, Series, SignalSpec
 START, END = "[log.span] start", "[log.span] end"  # names of the series that a span watches
 ABSOLUTE_S = 1e8  # a time beyond this is a stamp, not one that counts from the log's beginning
 STEP_LIMIT = 2_000_000
+FEW = 5  # changes, which are too few to say when the steps begin
+IN_STEP = 0.8  # mean of the changes' phases, as unit vectors: the commands come in steps
+MOVED = 0.05  # of a step; a start that is nearer to a change is left where it is
 REGULAR = 10  # inputs sent more often than this are sent all the time; their end is the trial's
 
 
@@ -76,6 +82,7 @@ class Gridded:
     start_ns: int  # t = 0 on the signals' clock [ns]
     origin_ns: int  # the first sample of any signal, likewise
     late_s: float  # the start was moved by this much, because a state was not known yet
+    moved_s: float  # and by this much more, to where the commands change
     reports: tuple[SignalReport, ...]  # of the states, then of the inputs
     warnings: tuple[str, ...]
 
@@ -89,6 +96,7 @@ def to_grid(
     *,
     angles: Sequence[str] = (),
     steps: int | None = None,
+    in_step: bool = False,
 ) -> Gridded:
     """Samples signals every dt.
 
@@ -100,6 +108,7 @@ def to_grid(
         span: which part of the log.
         angles: names that are unwrapped whether their spec says so or not.
         steps: at most this many steps.
+        in_step: to begin up to a step later, where the commands change with every step.
 
     Raises:
         GroundedError: for a gap beyond max_age_s, a clock that jumps, signals on clocks that do
@@ -116,6 +125,8 @@ def to_grid(
     known, until = _extent(samples, states, inputs, dt)
     origin = min(int(s.t[0]) for s in samples.values())
     start, late = _start(span, series, samples, inputs, known, origin)
+    moved, uneven = _to_change([samples[n] for n in inputs], start, dt) if in_step else (0, "")
+    start += moved
     stop = min(until, _end(span, series, start, origin, until))
     count = _steps(start, stop, dt, steps, origin)
     grid = start + np.round(dt * 1e9 * np.arange(count + 1)).astype(np.int64)
@@ -134,8 +145,9 @@ def to_grid(
         start_ns=start,
         origin_ns=origin,
         late_s=late,
+        moved_s=moved * 1e-9,
         reports=tuple(reports),
-        warnings=warnings_of(tuple(reports), late),
+        warnings=(*warnings_of(tuple(reports), late), *([uneven] if uneven else [])),
     )
 
 
@@ -175,6 +187,37 @@ def _start(
     else:
         start = _time(span.start, origin)
     return max(start, known), max(0.0, (known - start) * 1e-9)
+
+
+def phase_of(changes: Floats, dt: float) -> float | None:
+    """When within a step of dt commands change [s], -dt / 2 to dt / 2; None: not in steps.
+
+    Args:
+        changes: (K,) when one changed, counted from the beginning of a step [s].
+        dt: the step [s].
+    """
+    turns = np.exp(2j * np.pi * changes / dt)
+    if len(turns) <= FEW or abs(turns.mean()) < IN_STEP:
+        return None
+    return float(np.angle(turns.mean())) / (2 * np.pi) * dt
+
+
+def _to_change(inputs: Sequence[Samples], start: int, dt: float) -> tuple[int, str]:
+    """From a start to the beginning of a step by the changes of the commands [ns]; a warning."""
+    found = np.concatenate([s.t[1:][np.diff(s.y) != 0] for s in inputs])
+    found = np.unique(found[found >= start - round(dt * 0.5e9)])
+    phase = phase_of((found - start) * 1e-9, dt)
+    if phase is None:
+        apart = float(np.median(np.diff(found))) * 1e-9 if len(found) > FEW else 0.0
+        if apart <= dt / 2:  # so often that a step has the mean
+            return 0, ""
+        return 0, (
+            f"commands change every {apart:.3g} s, not in steps of {dt:g} s: each is up to "
+            f"{dt / 2:.3g} s early or late, and so is a delay that is found"
+        )
+    if abs(phase) < MOVED * dt:
+        return 0, ""
+    return round((phase if phase > 0 else phase + dt) * 1e9), ""
 
 
 def _end(span: Span, series: Mapping[str, Series], start: int, origin: int, until: int) -> int:

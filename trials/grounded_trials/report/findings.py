@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 One = TypeVar("One")
 SHOWN = 4  # numbers of what improved
 MOVED = 0.02  # of what the utility gained: a number that moved it less is left out
+WORSE = 1.05  # times the first trial's error, from which it is said that it rose
 TERMS = {  # tables of [reward]
     "state": "states, along the way",
     "terminal": "states, at the end",
@@ -221,6 +222,7 @@ def improvements_in(findings: Findings) -> list[Improved]:
     each = [one for _, r in runs for one in findings.runs_of(r.candidate.id)]
     short = [one.label for one in each if one.trial.finite_steps < task.horizon]
     note = f"; {', '.join(short)} ended early" if short else ""
+    worse = "; worse than the first trial, which the rest makes up for"
     for names, what in weighed_groups(task):
         states = [task.model.state_names.index(name) for name in names]
         errors = [[e[:, states] for e in off_target(findings, r)] for _, r in runs]
@@ -236,7 +238,8 @@ def improvements_in(findings: Findings) -> list[Improved]:
             costs = [float(np.nansum(np.vstack(p) ** 2 @ weights)) / len(p) for p in parts]
             before = missed[0] if len(missed) > 1 else float("nan")
             moved = abs(costs[0] - costs[-1]) if len(costs) > 1 else costs[0]
-            found.append((moved, Improved(words + note, unit, before, missed[-1])))
+            paid = worse * (missed[-1] > WORSE * missed[0])
+            found.append((moved, Improved(words + note + paid, unit, before, missed[-1])))
     found.sort(key=lambda each: -each[0])
     least = MOVED * sum(moved for moved, _ in found)
     return [one for k, (moved, one) in enumerate(found[:SHOWN]) if not k or moved >= least]

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from grounded.diagnosis.error_report import RulerRow, measured
+from grounded.diagnosis.error_report import measured
 from grounded.diagnosis.report import Diagnosis
-from grounded.diagnosis.verdict import open_noise, rest, told_apart, worsened
+from grounded.diagnosis.verdict import open_noise, rest, telling, told_apart, worsened
 from grounded.task import Task
 from grounded_trials.report.findings import weighed_groups
 from grounded_trials.wording import count, shown
@@ -60,7 +60,7 @@ def gained(
         before: the column of those before; that of today says nothing of before.
         who: misses so much.
     """
-    row, parts = _ahead(diagnosis), []
+    row, parts = telling(diagnosis.prediction_error), []
     if row is None:
         return ""
     after, first = getattr(row, now), getattr(row, before)
@@ -70,13 +70,13 @@ def gained(
         ends = (measured(_together(errors, names), unit) for errors in told)
         parts.append(f"{what} by {' instead of '.join(ends)}")
     held = "" if row.held_out != "no" else ", not held out"
-    ahead = f"{row.horizon_s:.3g} s ahead{held}"
+    ahead = f"{'Over whole trials' if row.whole_trial else f'{row.horizon_s:.3g} s ahead'}{held}"
     return f"{ahead} {who} misses {' and '.join(parts)}." if parts else ""
 
 
 def gained_most(diagnosis: Diagnosis, task: Task) -> list[tuple[list[str], str]]:
     """The weighed states that a verdict speaks of: the position, then what improved most."""
-    row = _ahead(diagnosis)
+    row = telling(diagnosis.prediction_error)
     return [] if row is None else _improved(row.with_effects, row.crude, task)
 
 
@@ -86,10 +86,6 @@ def _improved(
     groups = [g for g in weighed_groups(task) if all(before.get(n, 0.0) > 0 for n in g[0])]
     ratio = {what: _together(now, names) / _together(before, names) for names, what in groups}
     return sorted(groups, key=lambda g: (len(g[0]) < 2, ratio[g[1]]))[:FEW]
-
-
-def _ahead(diagnosis: Diagnosis) -> RulerRow | None:
-    return next((r for r in reversed(diagnosis.prediction_error) if not r.whole_trial), None)
 
 
 def _together(errors: Mapping[str, float], names: list[str]) -> float:

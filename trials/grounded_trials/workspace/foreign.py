@@ -67,6 +67,7 @@ class ForeignLog:
             self.mapping.span if start is None else Span(start=start),
             angles=model.angles,
             steps=task.horizon if candidate else None,
+            in_step=not candidate,
         )
         if self.estimate:
             found = smoothed(self.workspace, found, self.estimate)

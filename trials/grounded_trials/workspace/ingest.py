@@ -360,8 +360,18 @@ def _cut(log: ForeignLog, candidate: str, start: float | None = None) -> _Read:
     trial, found = log.cut(candidate, start)
     about = _about(log.workspace, candidate) | log.source
     encoded = _encode(log.workspace, trial, about, found.start_ns)
-    warnings = (*log.unlike_units, *found.warnings)
-    return _Read(trial, encoded, warnings, found.reports, log=log)
+    notes = (
+        f"it is taken from {(found.start_ns - found.origin_ns) * 1e-9:.3f} s on, where a step of "
+        "the commands begins"
+    )
+    return _Read(
+        trial,
+        encoded,
+        (*log.unlike_units, *found.warnings),
+        found.reports,
+        notes=(notes,) * (found.moved_s > 0),
+        log=log,
+    )
 
 
 def _outstanding(workspace: Folder, path: Path) -> str:

@@ -127,6 +127,10 @@ def _unfinished(workspace: Folder, first: Candidate | None) -> list[str]:
         for name, *both in zip(task.model.input_names, task.low, task.high, strict=True)
         if not np.isfinite(both).all()
     ]
+    if np.allclose(task.target, task.start):
+        found.append(
+            "the target is to stay where the run starts, in every state: `target` draws another"
+        )
     if free:
         found.append(
             f"[limits] has none for {', '.join(free)}: what a plan asks for is sent, however much"

@@ -21,13 +21,12 @@ from grounded.policy import Policy
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import LAST, Trial, interpolate_gaps
-from grounded_trials.logs.resample import Gridded, Span, to_grid
+from grounded_trials.logs.resample import Gridded, Span, phase_of, to_grid
 from grounded_trials.logs.signals import Series
 from grounded_trials.workspace.trial_check import FINE, LEAST, SAME, UNLIKE, follows
 
 TRIED = 5  # instants at which the commands fit best
 FINEST = 8  # parts of a step, between which the start is sought
-FEW = 5  # changes, which are too few to say when the steps begin
 QUIET_S = 1.0  # without a change of commands, before a run that the log does not have whole
 SHORT = 4  # at least 1 / SHORT of a run tells that it was one
 ALIGNED = 0.75  # of the time between samples: a start nearer than that is as good
@@ -109,10 +108,8 @@ class Recording:
         """A start moved to where the commands change, by less than a step."""
         dt, length = self.dt, self.dt * policy.horizon
         inside = self.changes[(self.changes > start - dt / 2) & (self.changes < start + length)]
-        turns = np.exp(2j * np.pi * (inside - start) / dt)
-        if len(inside) <= FEW or abs(turns.mean()) < 0.8:  # they do not come in steps
+        if (phase := phase_of(inside - start, dt)) is None:
             return start
-        phase = float(np.angle(turns.mean())) / (2 * np.pi) * dt
         if abs(phase) < self.dt / self.parts:
             return start + phase
         tried = [start + phase + move * dt for move in (-1, 0, 1)]

@@ -38,7 +38,9 @@ OTHERS = 20  # candidates to compare with, the latest
 
 
 def warnings_about(workspace: Folder, trial: Trial) -> tuple[str, ...]:
-    """Gaps, an early end, a start far from s_0, inputs outside the limits or logged late."""
+    """Gaps, exchanged columns, an early end or a start far from s_0, inputs that can't be."""
+    from grounded.instruments.swapped import exchanged, swapped_columns
+
     task = workspace.task
     filled = interpolate_gaps(trial)
     found = []
@@ -54,6 +56,8 @@ def warnings_about(workspace: Folder, trial: Trial) -> tuple[str, ...]:
             f"'{name}' is not a finite number at {step * trial.dt:.2f} s: the trial counts as "
             "ended there"
         )
+    if pair := swapped_columns(workspace.base_model, whole.until(whole.known_steps)):
+        found.append(exchanged(pair))
     if not trial.candidate:
         return tuple(found)
     if whole.steps < task.horizon:

@@ -1,0 +1,129 @@
+"""Two columns of a log in each other's place: found by a position and its velocity.
+
+As they are logged the one does not move as the other says; with two columns exchanged it does, by
+the right amount and in the right direction. No unmodelled effect does that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+
+from grounded.errors import GroundedError, NextCommand
+from grounded.frozen import Array
+from grounded.instruments.kinematics import Integral, integrals, over_steps, pieces
+from grounded.model import Model
+from grounded.trial import Trial
+
+BROKEN, WHOLE = 0.8, 0.97  # cosine of what a position moves and its velocity says
+SIZED = 1.25  # times by which the two may differ in size, where they are whole
+CLEARLY, ROUNDING = 4.0, 1e-9  # times what the best exchange leaves of 1 - cosine: as good
+LEAST = 8  # windows that a trial must hold
+
+
+def swapped_columns(
+    model: Model,
+    trial: Trial,
+    shown: Sequence[int] | None = None,
+    relations: Sequence[Integral] | None = None,
+) -> str:
+    """The signals of a trial that stand in each other's column, `x and v`; "" where none do.
+
+    Args:
+        model: however crude: only which state is another's rate is read off it.
+        trial: with this model's states and inputs.
+        shown: states that a sensor has; None: all that are known in the trial.
+        relations: of the model, where they are known.
+    """
+    relations = integrals(model) if relations is None else relations
+    known = range(model.n) if shown is None else shown
+    some = [i for i in known if np.isfinite(trial.states[:, i]).any()]
+    exact = [r for r in relations if r.exact and {r.i, r.j} <= set(some)]
+    broken = [r for r in exact if _broken(trial, r)]
+    names = [*trial.state_names, *trial.input_names]
+    columns = [*some, *range(model.n, model.n + model.m)]
+    touched = {i for r in broken for i in (r.i, r.j)}
+    found = {
+        f"{names[pair[0]]} and {names[pair[1]]}": _left(_exchanged(trial, pair), exact)
+        for pair in combinations(columns, 2)
+        if touched & set(pair)
+    }
+    least = CLEARLY * max(min(found.values(), default=1.0), ROUNDING)
+    found = {pair: left for pair, left in found.items() if left < min(least, 1 - WHOLE)}
+    return " (or ".join(found) + ")" * (len(found) - 1)
+
+
+def judge_columns(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> None:
+    """Stops at trials with two columns in each other's place.
+
+    Raises:
+        GroundedError: naming the trials and the columns.
+    """
+    relations = integrals(model)
+    found = [(trial, swapped_columns(model, trial, shown, relations)) for trial in trials]
+    odd = [(trial.id or f"number {k + 1}", pair) for k, (trial, pair) in enumerate(found) if pair]
+    if not odd:
+        return
+    pair = odd[0][1]
+    same = [trial for trial, other in odd if other == pair]
+    one = len(same) == 1
+    raise GroundedError(
+        f"trial{'s' * (not one)} {', '.join(same)}: {exchanged(pair)}. Correct the log, or the "
+        f"paths in [log], and take it in again, without {'this one' if one else 'these'}",
+        then=NextCommand("discard", tuple(same)) if trials[0].id else None,
+    )
+
+
+def exchanged(pair: str) -> str:
+    """What is said of two such columns."""
+    return (
+        f"the columns of {pair} look exchanged: only the other way round do positions move as "
+        "their velocities say"
+    )
+
+
+def _together(trial: Trial, relation: Integral) -> tuple[float, float]:
+    """Cosine and ratio of what moved and what was said, over the window that agrees best."""
+    some = [
+        (x[1:-2, 0], np.cumsum([0.0, *over_steps(relation.c * x[:, 1])])[:-1] * trial.dt)
+        for x in pieces([trial], (relation.i, relation.j))
+        if len(x) > LEAST
+    ]
+    best, steps = (-1.0, 1.0), 1
+    while usable := [pair for pair in some if len(pair[0]) > LEAST * steps]:
+        parts = [[z[steps:] - z[:-steps] for z in pair] for pair in usable]
+        moved, said = (np.concatenate(z) for z in zip(*parts, strict=True))
+        sizes = _size(moved), _size(said)
+        if min(sizes) > 0:
+            cosine = float(moved @ said) / (sizes[0] * sizes[1])
+            best = max(best, (cosine, sizes[0] / sizes[1]))
+        steps *= 2
+    return best if some else (1.0, 1.0)
+
+
+def _broken(trial: Trial, relation: Integral) -> bool:
+    """Neither alike nor mirrored, over any window."""
+    mirrored = replace(relation, c=-relation.c)
+    return _together(trial, relation)[0] < BROKEN and _left(trial, [mirrored]) > 1 - WHOLE
+
+
+def _left(trial: Trial, relations: Sequence[Integral]) -> float:
+    """1 - cosine of the worst relation; 1 where sizes differ."""
+    found = [_together(trial, relation) for relation in relations]
+    sized = all(1 / SIZED < ratio < SIZED for _, ratio in found)
+    return 1 - min(cosine for cosine, _ in found) if sized else 1.0
+
+
+def _exchanged(trial: Trial, pair: tuple[int, int]) -> Trial:
+    n = len(trial.state_names)
+    last = trial.inputs[-1:] if trial.steps else np.full((1, len(trial.input_names)), np.nan)
+    both = np.hstack([trial.states, np.vstack([trial.inputs, last])])
+    both[:, pair] = both[:, pair[::-1]]
+    return replace(trial, states=both[:, :n], inputs=both[:-1, n:])
+
+
+def _size(x: Array) -> float:
+    return float(np.sqrt(x @ x))

@@ -1,0 +1,90 @@
+"""Columns of a log in each other's place, by positions and their velocities."""
+
+import numpy as np
+import pytest
+
+from facts import holding
+from grounded import Model, Param
+from grounded.errors import GroundedError
+from grounded.instruments.preflight import preflight
+from grounded.instruments.swapped import swapped_columns
+from grounded.trial import Trial
+
+PLANE = Model(
+    name="plane",
+    states={"x": "m", "y": "m", "vx": "m/s", "vy": "m/s"},
+    inputs={"F": "N", "G": "N"},
+    params={"m": Param(1.0, "kg")},
+    derivative=lambda s, a, p: {"x": s.vx, "y": s.vy, "vx": a.F / p.m, "vy": a.G / p.m},
+)
+SLED = Model(
+    name="sled",
+    states={"x": "m", "v": "m/s"},
+    inputs={"F": "N"},
+    params={"m": Param(1.0, "kg")},
+    derivative=lambda s, a, p: {"x": s.v, "v": (a.F - 0.3 * s.v) / p.m},
+)
+
+
+def driven(model: Model, seed: int = 0, noise: float = 1e-3) -> Trial:
+    """20 s under commands that change every 0.4 s and hold the position."""
+    rng, x, states, inputs = np.random.default_rng(seed), np.zeros(model.n), [], []
+    for k in range(400):
+        if k % 8 == 0:
+            push = rng.uniform(-2, 2, model.m)
+        u = push - 0.4 * x[: model.m]
+        states.append(x)
+        inputs.append(u)
+        x = model.system.step(x[None], u[None], model.values, 0.05)[0]
+    logged = np.array([*states, x])
+    logged += noise * rng.normal(size=logged.shape) * np.std(logged, axis=0)
+    names = (model.state_names, model.input_names)
+    return Trial(logged, np.array(inputs), 0.05, *names, id=f"t{seed:04}")
+
+
+def with_columns(trial: Trial, a: int, b: int) -> Trial:
+    both = np.hstack([trial.states, np.vstack([trial.inputs, trial.inputs[-1:]])])
+    both[:, [a, b]] = both[:, [b, a]]
+    n = trial.states.shape[1]
+    return Trial(
+        both[:, :n], both[:-1, n:], trial.dt, trial.state_names, trial.input_names, id=trial.id
+    )
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "said"), [(0, 1, "x and v"), (1, 2, "v and F"), (0, 2, "x and F")]
+)
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+def test_exchanged_columns_are_named(a, b, said, noise):
+    trial = driven(SLED, 3, noise)
+    assert swapped_columns(SLED, trial) == ""
+    assert swapped_columns(SLED, with_columns(trial, a, b)) == said
+
+
+def test_two_pairs_that_would_mend_it_are_both_named():
+    """Nothing but the place tells x and y exchanged from their velocities exchanged."""
+    found = swapped_columns(PLANE, with_columns(driven(PLANE), 2, 3))
+    assert found == "x and y (or vx and vy)"
+
+
+def test_a_sign_a_scale_a_delay_or_a_drifting_position_are_no_exchange():
+    trial = driven(SLED, 1)
+    x, v = np.array(trial.states).T
+    others = [
+        (x, -v),
+        (x, 57.3 * v),
+        (x, np.concatenate([np.zeros(4), v[:-4]])),
+        (x + 0 * v, 0 * v),
+    ]
+    others += [(np.random.default_rng(0).normal(size=len(x)), v)]
+    for states in others:
+        changed = Trial(np.array(states).T, trial.inputs, 0.05, ("x", "v"), ("F",))
+        assert swapped_columns(SLED, changed) == ""
+
+
+def test_a_diagnosis_stops_at_such_a_trial():
+    trials = [driven(SLED, k) for k in range(3)]
+    trials[1] = with_columns(trials[1], 0, 1)
+    with pytest.raises(GroundedError, match=holding("t0001", "x and v")) as stopped:
+        preflight(SLED, trials)
+    assert stopped.value.then is not None and stopped.value.then.arguments == ("t0001",)
