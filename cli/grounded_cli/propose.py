@@ -88,7 +88,8 @@ def _what(candidate: Candidate, standing: Standing, task: Task) -> str:
         )
     if candidate.base:
         step = Step(candidate.damping, candidate.alpha)
-        return f"iteration {candidate.iteration}: {step} from {candidate.base}, {seconds}"
+        by = ", by slopes that the trials corrected" * bool(candidate.slopes)
+        return f"iteration {candidate.iteration}: {step} from {candidate.base}{by}, {seconds}"
     crashes = candidate.caution
     gently = f", designed more gently after {count(crashes, 'crash', 'crashes')}" * bool(crashes)
     return f"the model's own policy{gently}, {seconds}"

@@ -214,7 +214,7 @@ def held(change: float, phase: float) -> Series:
 @pytest.mark.parametrize("phase", [0.02, 0.035])
 def test_data_begin_where_a_step_of_the_commands_does(phase: float) -> None:
     u = held(0.05, phase)
-    found = grid(pose(np.sin), u, in_step=True)
+    found = grid(pose(np.sin), u, rest=np.zeros(1))
     assert found.moved_s == pytest.approx(phase, abs=1e-6) and found.warnings == ()
     t = phase + 0.05 * np.arange(len(found.states))
     np.testing.assert_allclose(found.states[:, 0], np.sin(t), atol=2e-5)
@@ -223,9 +223,9 @@ def test_data_begin_where_a_step_of_the_commands_does(phase: float) -> None:
 
 
 def test_data_whose_commands_do_not_change_in_steps_stay_where_they_are() -> None:
-    often = grid(pose(np.sin), held(0.005, 0.0), in_step=True)
+    often = grid(pose(np.sin), held(0.005, 0.0), rest=np.zeros(1))
     assert often.moved_s == 0 and often.warnings == ()  # a step has their mean
-    odd = grid(pose(np.sin), held(0.035, 0.0), in_step=True)
+    odd = grid(pose(np.sin), held(0.035, 0.0), rest=np.zeros(1))
     assert odd.moved_s == 0 and holds(odd.warnings[0], "0.035 s", "0.05 s", "0.025 s")
 
 

@@ -4,8 +4,7 @@
     input k = value held at t_k + dt / 2        the command in force in the middle of the step
 
 Half a step, because a command's stamp scatters about its t_k: held at t_k itself, every late one
-would be missed and appear a whole step later. Where commands change within the steps, all of them
-would lie up to half a step early or late: data are taken from the next change on.
+would be missed and appear a whole step later.
 
 Gaps, clocks that jump and clocks that differ are refused, since they hide what happened; everything
 else is counted and reported.
@@ -21,6 +20,7 @@ import numpy as np
 
 from grounded.errors import GroundedError
 from grounded_trials.formats.messages import Floats
+from grounded_trials.logs.command_steps import first_step, held_rows, in_motion
 from grounded_trials.logs.samples import (
     Samples,
     SignalReport,
@@ -34,9 +34,6 @@ from grounded_trials.logs.signals import Clock, Series, SignalSpec
 START, END = "[log.span] start", "[log.span] end"  # names of the series that a span watches
 ABSOLUTE_S = 1e8  # a time beyond this is a stamp, not one that counts from the log's beginning
 STEP_LIMIT = 2_000_000
-FEW = 5  # changes, which are too few to say when the steps begin
-IN_STEP = 0.8  # mean of the changes' phases, as unit vectors: the commands come in steps
-MOVED = 0.05  # of a step; a start that is nearer to a change is left where it is
 REGULAR = 10  # inputs sent more often than this are sent all the time; their end is the trial's
 
 
@@ -83,6 +80,7 @@ class Gridded:
     origin_ns: int  # the first sample of any signal, likewise
     late_s: float  # the start was moved by this much, because a state was not known yet
     moved_s: float  # and by this much more, to where the commands change
+    row_s: float  # by how much commands may be logged late: a table repeats them row by row
     reports: tuple[SignalReport, ...]  # of the states, then of the inputs
     warnings: tuple[str, ...]
 
@@ -96,7 +94,7 @@ def to_grid(
     *,
     angles: Sequence[str] = (),
     steps: int | None = None,
-    in_step: bool = False,
+    rest: Floats | None = None,
 ) -> Gridded:
     """Samples signals every dt.
 
@@ -108,7 +106,7 @@ def to_grid(
         span: which part of the log.
         angles: names that are unwrapped whether their spec says so or not.
         steps: at most this many steps.
-        in_step: to begin up to a step later, where the commands change with every step.
+        rest: (m,) what inputs hold before a run: to begin where `command_steps` says; None: not.
 
     Raises:
         GroundedError: for a gap beyond max_age_s, a clock that jumps, signals on clocks that do
@@ -125,7 +123,8 @@ def to_grid(
     known, until = _extent(samples, states, inputs, dt)
     origin = min(int(s.t[0]) for s in samples.values())
     start, late = _start(span, series, samples, inputs, known, origin)
-    moved, uneven = _to_change([samples[n] for n in inputs], start, dt) if in_step else (0, "")
+    sent = [samples[name] for name in inputs]
+    moved, uneven = (0, "") if rest is None else first_step(sent, start, dt, rest)
     start += moved
     stop = min(until, _end(span, series, start, origin, until))
     count = _steps(start, stop, dt, steps, origin)
@@ -137,7 +136,9 @@ def to_grid(
         value = samples[name].linear if how[name] == "linear" else samples[name].hold
         columns.append(value(at, dt, start))
         reports.append(report_of(samples[name], series[name], columns[-1], at, start))
-    held = np.array([samples[n].before(start - round(dt * 0.5e9)) for n in inputs])
+    held = np.array([s.before(start - round(dt * 0.5e9)) for s in sent])
+    if rest is not None and in_motion(sent, start, rest):
+        held = np.where(np.isfinite(held), held, [s.y[0] for s in sent])
     return Gridded(
         states=np.column_stack(columns[: len(states)]),
         inputs=np.column_stack(columns[len(states) :]),
@@ -146,6 +147,7 @@ def to_grid(
         origin_ns=origin,
         late_s=late,
         moved_s=moved * 1e-9,
+        row_s=max((held_rows(s.t, s.y) for s in sent), default=0.0),
         reports=tuple(reports),
         warnings=(*warnings_of(tuple(reports), late), *([uneven] if uneven else [])),
     )
@@ -187,37 +189,6 @@ def _start(
     else:
         start = _time(span.start, origin)
     return max(start, known), max(0.0, (known - start) * 1e-9)
-
-
-def phase_of(changes: Floats, dt: float) -> float | None:
-    """When within a step of dt commands change [s], -dt / 2 to dt / 2; None: not in steps.
-
-    Args:
-        changes: (K,) when one changed, counted from the beginning of a step [s].
-        dt: the step [s].
-    """
-    turns = np.exp(2j * np.pi * changes / dt)
-    if len(turns) <= FEW or abs(turns.mean()) < IN_STEP:
-        return None
-    return float(np.angle(turns.mean())) / (2 * np.pi) * dt
-
-
-def _to_change(inputs: Sequence[Samples], start: int, dt: float) -> tuple[int, str]:
-    """From a start to the beginning of a step by the changes of the commands [ns]; a warning."""
-    found = np.concatenate([s.t[1:][np.diff(s.y) != 0] for s in inputs])
-    found = np.unique(found[found >= start - round(dt * 0.5e9)])
-    phase = phase_of((found - start) * 1e-9, dt)
-    if phase is None:
-        apart = float(np.median(np.diff(found))) * 1e-9 if len(found) > FEW else 0.0
-        if apart <= dt / 2:  # so often that a step has the mean
-            return 0, ""
-        return 0, (
-            f"commands change every {apart:.3g} s, not in steps of {dt:g} s: each is up to "
-            f"{dt / 2:.3g} s early or late, and so is a delay that is found"
-        )
-    if abs(phase) < MOVED * dt:
-        return 0, ""
-    return round((phase if phase > 0 else phase + dt) * 1e9), ""
 
 
 def _end(span: Span, series: Mapping[str, Series], start: int, origin: int, until: int) -> int:

@@ -16,10 +16,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.diagnosis.report import Diagnosis, Made
+from grounded.diagnosis.report import Diagnosis, Estimate, Made, Ranked
 from grounded.errors import GroundedError, NextCommand, nearest
 from grounded_trials.store.documents import read_document, write_document
 from grounded_trials.wording import rendered
+from grounded_trials.workspace.identity import ROWS
 
 if TYPE_CHECKING:
     from grounded.effects import Library
@@ -84,7 +85,7 @@ def diagnose_in(
     found = diagnose(
         planner.plan, lifted, options, compare=second, engine=engine, progress=progress
     )
-    found = replace(found, made=made)
+    found = replace(found, made=made, ranking=_as_known(workspace, found.ranking, made))
     _keep(workspace, found)
     diagnosed_again(workspace)
     try:
@@ -102,6 +103,25 @@ def diagnose_in(
         found = replace(found, next_trial=f"{undo} {found.next_trial}")
         _keep(workspace, found)
     return replace(found, then=after_diagnosis(workspace, found))
+
+
+def _as_known(workspace: Folder, ranking: Sequence[Ranked], made: Made) -> tuple[Ranked, ...]:
+    """The ranking with delays no surer than tables say when a command was sent, see `Gridded`."""
+    logs = [one for one in workspace.whole_trials() if one.stored.id in made.trials]
+    row = max((float(one.meta.get(ROWS, 0.0)) for one in logs), default=0.0)
+
+    def wider(name: str, one: Estimate) -> Estimate:
+        if name != "d" or one.interval is None:
+            return one
+        low, high = one.interval
+        return replace(one, std=math.hypot(one.std, row / 2), interval=(low - row, high + row))
+
+    return tuple(
+        replace(one, params={name: wider(name, e) for name, e in one.params.items()})
+        if row and one.effect.startswith("delay:")
+        else one
+        for one in ranking
+    )
 
 
 def _in_vain(workspace: Folder, found: Diagnosis) -> str:

@@ -14,7 +14,7 @@ were measured.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -59,6 +59,7 @@ class ForeignLog:
             GroundedError: if no whole trial is in it.
         """
         model, task = self.workspace.base_model, self.workspace.config.task
+        rest = np.array([task.start.get(name, 0.0) for name in model.input_names])
         found = to_grid(
             self.series,
             task.dt,
@@ -67,7 +68,7 @@ class ForeignLog:
             self.mapping.span if start is None else Span(start=start),
             angles=model.angles,
             steps=task.horizon if candidate else None,
-            in_step=not candidate,
+            rest=None if candidate else rest,
         )
         if self.estimate:
             found = smoothed(self.workspace, found, self.estimate)
@@ -170,6 +171,20 @@ def _hashed(files: Sequence[Path]) -> str:
     """SHA-256 over a log's files, or over their hashes when there are several."""
     hashes = [hash_file(file) for file in files]
     return hashes[0] if len(hashes) == 1 else sha256("".join(hashes).encode())
+
+
+def begun(found: Gridded, dt: float) -> Iterator[str]:
+    """Where data were begun, and how well the time of their commands is known."""
+    at = f"it is taken from {(found.start_ns - found.origin_ns) * 1e-9:.3f} s on"
+    if found.moved_s > dt:
+        yield f"{at}: before that it begins in motion, and does not say what was sent earlier"
+    elif found.moved_s > 0:
+        yield f"{at}, where a step of the commands begins"
+    if found.row_s > dt / 20:
+        yield (
+            f"its rows come every {found.row_s:.3g} s, so a command was sent up to that much "
+            "before it is seen, and a delay is known no better"
+        )
 
 
 @dataclass(frozen=True)

@@ -29,8 +29,8 @@ from grounded_trials.store.own_files import CANDIDATE, FILE_LIMIT, TRIAL
 from grounded_trials.store.store import DIGITS
 from grounded_trials.store.trial_file import read_trial, trial_bytes
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.foreign import ForeignLog, mapping_of, read_foreign
-from grounded_trials.workspace.identity import sha256
+from grounded_trials.workspace.foreign import ForeignLog, begun, mapping_of, read_foreign
+from grounded_trials.workspace.identity import ROWS, sha256
 from grounded_trials.workspace.next_step import PROPOSE, after_log
 from grounded_trials.workspace.proposing import candidate_named, standing_in
 from grounded_trials.workspace.run_start import elsewhere, pace_of, rival_in
@@ -359,17 +359,14 @@ def _renamed(workspace: Folder, read: _Read) -> _Read:
 def _cut(log: ForeignLog, candidate: str, start: float | None = None) -> _Read:
     trial, found = log.cut(candidate, start)
     about = _about(log.workspace, candidate) | log.source
+    about |= {ROWS: f"{found.row_s:.6g}"} if found.row_s and not candidate else {}
     encoded = _encode(log.workspace, trial, about, found.start_ns)
-    notes = (
-        f"it is taken from {(found.start_ns - found.origin_ns) * 1e-9:.3f} s on, where a step of "
-        "the commands begins"
-    )
     return _Read(
         trial,
         encoded,
         (*log.unlike_units, *found.warnings),
         found.reports,
-        notes=(notes,) * (found.moved_s > 0),
+        notes=() if candidate else tuple(begun(found, trial.dt)),
         log=log,
     )
 

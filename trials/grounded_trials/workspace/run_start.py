@@ -6,6 +6,10 @@ run. So at every instant of the log, as finely as it was sampled, the logged com
 with what the policy would send on the states logged from there on, feedback and all. The instants
 at which commands change say the rest. A log that ends before the run would have is compared as far
 as it goes, where it was quiet before.
+
+A table of rows shows a command that is held with the first row after its change, up to a row late:
+at 2 m/s and 100 Hz that is 2 cm. Feedback tells when within that row the run began, since what was
+sent answers to where the robot was then.
 """
 
 from __future__ import annotations
@@ -21,7 +25,8 @@ from grounded.policy import Policy
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import LAST, Trial, interpolate_gaps
-from grounded_trials.logs.resample import Gridded, Span, phase_of, to_grid
+from grounded_trials.logs.command_steps import held_rows, phase_of
+from grounded_trials.logs.resample import Gridded, Span, to_grid
 from grounded_trials.logs.signals import Series
 from grounded_trials.workspace.trial_check import FINE, LEAST, SAME, UNLIKE, follows
 
@@ -31,6 +36,7 @@ QUIET_S = 1.0  # without a change of commands, before a run that the log does no
 SHORT = 4  # at least 1 / SHORT of a run tells that it was one
 ALIGNED = 0.75  # of the time between samples: a start nearer than that is as good
 CLEARLY = 0.7  # of the commands' difference at the first command: the start is elsewhere
+KNOWN = 0.25  # of a row: the standard deviation from which feedback tells when in it a run began
 PACES = (2.0, 0.5)  # of a recording that was played twice as fast, or half
 BATCH = 256  # instants compared at once
 
@@ -43,6 +49,7 @@ class Start:
     apart: float  # mean difference of the commands there, in units of each input's size
     alike: bool  # the commands are the policy's from there on
     opens_alike: bool  # they are at the beginning at least; somebody may have taken over
+    between_rows: bool = False  # found below the time between rows, by the feedback
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +65,7 @@ class Recording:
     whole: Gridded
     changes: Array  # when a command changed, seconds after the log's first sample
     interval: float  # between samples [s]
+    row: float  # by how much a held command may be logged late [s]; 0 where each has its own stamp
 
     @property
     def first(self) -> float:
@@ -89,13 +97,14 @@ class Recording:
         while len(found) < TRIED and np.isfinite(left).any():
             k = int(np.argmin(left))
             left[max(0, k - self.parts) : k + self.parts + 1] = np.inf
-            seconds = self._on_step(policy, self.first + k * self.dt / self.parts)
+            on_step = self._on_step(policy, self.first + k * self.dt / self.parts)
+            seconds = self._between_rows(policy, on_step)
             trial = self.trial_from(seconds)
             fit = None if trial is None else follows(policy, trial.until(policy.horizon), 0)
             if trial is not None and fit is not None:
                 alike = fit.alike and not fit.late and _close(policy, trial)
                 opens = alike or fit.until_s >= LEAST * self.dt
-                found.append(Start(seconds, float(apart[k]), alike, opens))
+                found.append(Start(seconds, float(apart[k]), alike, opens, seconds < on_step))
         return min(found, key=lambda one: (not one.alike, one.apart), default=None)
 
     def apart_at(self, policy: Policy, start: float) -> float:
@@ -114,6 +123,31 @@ class Recording:
             return start + phase
         tried = [start + phase + move * dt for move in (-1, 0, 1)]
         return min(tried, key=lambda one: self.apart_at(policy, one))
+
+    def _between_rows(self, policy: Policy, start: float) -> float:
+        """A start moved back by less than a row, to where the feedback says that it was."""
+        if policy.gain is None or not self.row:
+            return start
+        late, early = self.trial_from(start), self.trial_from(start - self.row)
+        if late is None or early is None:
+            return start
+        T = min(late.finite_steps, early.finite_steps, policy.horizon)
+        if T < LEAST:
+            return start
+        states = np.stack([late.states[:T], early.states[:T]])
+        asked, before = policy.commands(states, policy.past)
+        sent = np.clip(late.inputs[:T], policy.low, policy.high)
+        unit = np.abs(policy.feedforward).max(axis=0) + 1e-12
+        free = (asked > policy.low) & (asked < policy.high)
+        slope, off = (((v - asked) / unit)[free] for v in (before, sent))
+        power = float(slope @ slope)
+        if not power:
+            return start
+        share = float(slope @ off) / power
+        left = float(((off - share * slope) ** 2).mean())
+        if left > KNOWN**2 * power or not -KNOWN < share < 1 + KNOWN:
+            return start
+        return start - float(np.clip(share, 0.0, 1.0)) * self.row
 
     def _apart(self, policy: Policy, instants: range | None = None) -> Array:
         """The mean difference of the commands at every instant, infinite where none can be."""
@@ -177,7 +211,10 @@ def recording(series: Mapping[str, Series], task: Task) -> Recording | None:
     sent = [series[name] for name in model.input_names]
     at = np.concatenate([s.t[1:][np.diff(s.values) != 0] for s in sent])
     changes = (at - whole.origin_ns) * 1e-9
-    return Recording(series, names, model.angles, dt, task.horizon, parts, whole, changes, interval)
+    row = max((held_rows(s.t, s.values) for s in sent), default=0.0)
+    return Recording(
+        series, names, model.angles, dt, task.horizon, parts, whole, changes, interval, row
+    )
 
 
 def pace_of(log: Recording, task: Task, policy: Policy) -> float | None:
@@ -208,6 +245,8 @@ def _paced(series: Series, pace: float) -> Series:
 
 def elsewhere(log: Recording, found: Start, policy: Policy, why: str) -> bool:
     """Whether a run begins where it was found, not with the log's first command."""
+    if found.between_rows and found.alike:
+        return True
     if not found.opens_alike or abs(found.seconds - log.first) <= ALIGNED * log.interval:
         return False
     return bool(why) or found.apart < CLEARLY * log.apart_at(policy, log.first)

@@ -1,0 +1,94 @@
+"""When commands change, in a log that nobody cut: where its steps begin, and what was held before.
+
+Where commands change within the steps of the grid, all of them would lie up to half a step early or
+late: data begin with the next change. A recording that begins in motion does not say what was
+commanded before it; with a delay in the model its first steps would be judged by commands that
+nobody knows. There data begin where the commands have been steady for a while.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from grounded_trials.formats.messages import Floats, Ints
+from grounded_trials.logs.samples import Samples
+
+FEW = 5  # changes, which are too few to say when the steps begin
+IN_STEP = 0.8  # mean of the changes' phases, as unit vectors: the commands come in steps
+MOVED = 0.05  # of a step; a start that is nearer to a change is left where it is
+HELD = 0.5  # of a table's rows repeat the one before: it was not made where commands change
+STEADY_S, STEADY_STEPS = 0.25, 4  # without a change, both: what was commanded before is known
+LOOK_S, LOOK = 3.0, 0.2  # how far into a log, and into what share of it, such a moment is sought
+
+
+def phase_of(changes: Floats, dt: float) -> float | None:
+    """When within a step of dt commands change [s], -dt / 2 to dt / 2; None: not in steps.
+
+    Args:
+        changes: (K,) when one changed, counted from the beginning of a step [s].
+        dt: the step [s].
+    """
+    turns = np.exp(2j * np.pi * changes / dt)
+    if len(turns) <= FEW or abs(turns.mean()) < IN_STEP:
+        return None
+    return float(np.angle(turns.mean())) / (2 * np.pi) * dt
+
+
+def held_rows(t: Ints, values: Floats) -> float:
+    """By how much a held value is seen late [s]: the time between rows that repeat it; 0: by none.
+
+    Args:
+        t: (N,) stamps [ns].
+        values: (N,) one that changes, each with its own stamp, or one that every row repeats.
+    """
+    order = np.argsort(t, kind="stable")
+    if len(t) <= 2 * FEW or np.mean(np.diff(values[order]) == 0) < HELD:
+        return 0.0
+    return float(np.median(np.diff(t[order]))) * 1e-9
+
+
+def first_step(inputs: Sequence[Samples], start: int, dt: float, rest: Floats) -> tuple[int, str]:
+    """From a start to where data begin [ns], and a warning, "" for none.
+
+    Args:
+        inputs: the commands.
+        start: where every signal is known [ns].
+        dt: the step [s].
+        rest: (m,) what the inputs hold before a run.
+    """
+    found = np.unique(np.concatenate([s.t[1:][np.diff(s.y) != 0] for s in inputs]))
+    later = found[found >= start - round(dt * 0.5e9)]
+    phase, moved, warning = phase_of((later - start) * 1e-9, dt), 0, ""
+    if phase is not None and abs(phase) >= MOVED * dt:
+        moved = round((phase if phase > 0 else phase + dt) * 1e9)
+    elif phase is None and len(later) > FEW:
+        apart = float(np.median(np.diff(later))) * 1e-9
+        if apart > dt / 2:  # oftener, and a step has the mean
+            warning = (
+                f"commands change every {apart:.3g} s, not in steps of {dt:g} s: each is up to "
+                f"{dt / 2:.3g} s early or late, and so is a delay that is found"
+            )
+    if in_motion(inputs, start, rest):
+        moved = _steady(inputs, found, start, moved, dt)
+    return moved, warning
+
+
+def in_motion(inputs: Sequence[Samples], start: int, rest: Floats) -> bool:
+    """Whether a table's rows begin with commands that are not those of rest."""
+    rows = any(held_rows(s.t, s.y) > 0 for s in inputs)
+    return rows and any(s.before(start) != u for s, u in zip(inputs, rest, strict=True))
+
+
+def _steady(inputs: Sequence[Samples], changes: Ints, start: int, moved: int, dt: float) -> int:
+    """From a start to the first step before which no command changed for a while."""
+    first = max(int(s.t[0]) for s in inputs)
+    length = min(LOOK_S, LOOK * 1e-9 * (max(int(s.t[-1]) for s in inputs) - start))
+    quiet = max(STEADY_S, STEADY_STEPS * dt) * 1e9
+    for k in range(int(length / dt)):
+        at = start + moved + round(k * dt * 1e9)
+        before = changes[changes < at - round(dt * 0.5e9)]
+        if at - max(first, int(before[-1]) if len(before) else first) >= quiet:
+            return at - start
+    return moved
