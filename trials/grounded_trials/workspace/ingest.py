@@ -181,22 +181,29 @@ def _recognised(workspace: Folder, path: Path, read: _Read, candidate: str | Non
     units = () if other else units
     if not why and not units:
         return read
-    if candidate is not None and (log is None or (found and found.opens_alike)):
+    slow = pace_of(log, workspace.task, own.policy) if log and not units else None
+    pace = slow and (
+        f"a second of its stamps is {slow:g} s of the run (a recording played at another rate?): "
+        f"correct the stamps, times {slow:g}, and ingest it again"
+    )
+    if candidate is not None:
         seem = f"{' and '.join(units)} seem to be in another unit: times {by:.6g} they fit better"
-        return replace(read, warnings=(*read.warnings, why or seem))
+        doubts = [pace or why or seem]
+        if log and not (found and found.opens_alike):
+            doubts.append(
+                f"no start of {ran} was found in it: it is taken from {log.first:.3f} s on, its "
+                "first command; [log.span] start = SECONDS names another"
+            )
+        return replace(read, warnings=(*read.warnings, *doubts))
     if units:
         raise GroundedError(f"{path} ran {ran}, {units_told(units, by, read.log is not None)}")
-    if log and (pace := pace_of(log, workspace.task, own.policy)):
-        raise GroundedError(
-            f"{path} ran {ran}, but a second of its stamps is {pace:g} s of the run (a recording "
-            f"played at another rate?): correct the stamps, times {pace:g}, and ingest it again"
-        )
+    if pace:
+        raise GroundedError(f"{path} ran {ran}, but {pace}")
     what = f"; with --candidate {other} for what it seems to have run" * bool(other)
-    begins = "; [log.span] says where the run begins" * bool(read.log and not log)
+    begins = "; [log.span] start = SECONDS says where the run begins" * (read.log is not None)
     raise GroundedError(
         f"{path} did not run {ran}: {why}. Take it in with --data for fitting and diagnosis{what}, "
-        f"or with {'[log.span] start = SECONDS and ' * bool(log)}--candidate {ran} all the same"
-        f"{begins}",
+        f"or with --candidate {ran} all the same{begins}",
         NextCommand("ingest", (str(path), *(("--candidate", other) if other else ("--data",)))),
     )
 
