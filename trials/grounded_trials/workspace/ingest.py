@@ -14,12 +14,10 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
-from grounded.result import Result
 from grounded.search.candidate import Candidate, Tried
 from grounded.trial import Trial, interpolate_gaps, scattered
 from grounded_trials.logs.log_files import kind_of, log_files
@@ -31,7 +29,9 @@ from grounded_trials.store.trial_file import read_trial, trial_bytes
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.foreign import ForeignLog, mapping_of, read_foreign
 from grounded_trials.workspace.identity import sha256
-from grounded_trials.workspace.next_step import PROPOSE, after_log
+from grounded_trials.workspace.ingested import Ingested
+from grounded_trials.workspace.next_step import after_log
+from grounded_trials.workspace.off_target import off_target_of
 from grounded_trials.workspace.proposing import candidate_named, standing_in
 from grounded_trials.workspace.run_start import elsewhere, pace_of, rival_in
 from grounded_trials.workspace.trial_check import (
@@ -43,43 +43,6 @@ from grounded_trials.workspace.trial_check import (
 )
 
 SPELT = str.maketrans({" ": "", "·": "", "*": "", "²": "^2"})  # a unit, whoever writes it
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Ingested(Result):
-    """One log that was taken in."""
-
-    trial: str  # its short name, t0007
-    sha256: str
-    known: bool  # it had been stored before
-    candidate: str  # "" for data
-    utility: float | None  # None for data; -inf for a run that failed
-    accepted: bool | None  # None: data, or not decided yet
-    warnings: tuple[str, ...]
-    signals: tuple[SignalReport, ...]  # for a foreign log
-    verdict: str = ""  # a word of `wording.verdict`, run again, probe; "" for data
-    notes: tuple[str, ...] = ()  # where in a longer log the run was found
-    then: NextCommand = PROPOSE
-
-    def summary(self) -> str:
-        """The trial, what it ran and what became of that."""
-        return f"{self.trial}: {f'{self.candidate}, {self.verdict}' if self.candidate else 'data'}"
-
-    def to_json(self) -> dict[str, Any]:
-        """Its entry in `ingest --json`; a failed run's utility is null and `failed` true."""
-        return {
-            "trial": self.trial,
-            "sha256": self.sha256,
-            "known": self.known,
-            "candidate": self.candidate or None,
-            "utility": self.utility,
-            "failed": self.utility == float("-inf"),
-            "accepted": self.accepted,
-            "verdict": self.verdict or None,
-            "warnings": list(self.warnings),
-            "notes": list(self.notes),
-            "signals": [vars(signal) for signal in self.signals],
-        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,17 +100,19 @@ def ingest_log(
     verdict = _verdict(trial, tried, workspace.config.search.repeats)
     if ahead and verdict == "run again":
         now = standing_in(workspace, ahead=True)
+    judged = [interpolate_gaps(trial).trial] if trial.candidate else []
     return Ingested(
         trial=added.id,
         sha256=added.sha256,
         known=added.known,
         candidate=trial.candidate,
-        utility=workspace.task.utility(interpolate_gaps(trial).trial) if trial.candidate else None,
+        utility=workspace.task.utility(judged[0]) if judged else None,
         accepted=tried.accepted if tried else None,
         warnings=warnings,
         signals=read.signals,
         verdict=verdict,
         notes=read.notes,
+        off_target=off_target_of(workspace.task, judged),
         then=after_log(workspace, verdict, now),
     )
 

@@ -12,6 +12,7 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result, percent
 from grounded_trials.workspace.folder import Contents, Folder
 from grounded_trials.workspace.handover import Void, checked_candidate, outside_limits
+from grounded_trials.workspace.off_target import OffTarget, off_target_of
 
 MOSTLY = 0.9  # of a plan's cost
 
@@ -61,6 +62,7 @@ class Status(Result):
     outdated: str = ""  # why the last diagnosis is not the last word
     notes: tuple[str, ...] = ()  # of the search, where it has ended; trials of namesakes
     discarded: dict[str, str] = field(default_factory=dict)  # t0004 -> why it is set aside
+    off_target: tuple[OffTarget, ...] = ()  # how far the runs of the best are off it, in units
 
     def summary(self) -> str:
         """The phase and the best candidate."""
@@ -72,7 +74,10 @@ class Status(Result):
 
     def to_json(self) -> dict[str, Any]:
         """The document of `status --json`, the whole history in it."""
-        return self.standing.to_json() | {"discarded": self.discarded}
+        found = self.standing.to_json() | {"discarded": self.discarded}
+        if found["best"] is not None:
+            found["best"] |= {"off_target": [one.to_json() for one in self.off_target]}
+        return found
 
 
 def propose_in(workspace: Folder) -> Proposed:
@@ -274,6 +279,7 @@ def status_of(workspace: Folder, standing: Standing, notes: tuple[str, ...] = ()
         since.told(workspace.address) if since else "",
         (*notes, *_namesakes(workspace)),
         workspace.discarded(),
+        off_target_of(workspace.task, standing.incumbent.trials if standing.incumbent else ()),
     )
 
 
