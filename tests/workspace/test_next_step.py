@@ -12,6 +12,7 @@ import pytest
 from cli import grounded, plain, process
 from facts import holds
 from grounded.diagnosis.report import Diagnosis, Made
+from grounded.errors import GroundedError, NextCommand
 from grounded_cli.main import COMMANDS, cli
 from grounded_cli.options import ELSEWHERE
 from grounded_trials import Workspace
@@ -84,6 +85,21 @@ def test_nothing_is_adopted_where_one_name_is_wrong(cart, tmp_path):
     done = grounded("-C", folder, "adopt", "viscous_friction:v", "delay:forse")
     assert done.code == 1 and "'delay:force'" in done.err
     assert (folder / "grounded.toml").read_text() == before
+
+
+def test_what_is_listed_as_alike_was_not_fitted_and_another_diagnosis_fits_it(cart, tmp_path):
+    """It was "not among the effects of the last diagnosis", which names it."""
+    folder = copied(cart, tmp_path / "w")
+    like = {"effect": "viscous_friction:v", "like": "input_gain:force", "share": 0.954}
+    diagnosed(folder, lookalikes=[like])
+    with pytest.raises(GroundedError) as refused:
+        Workspace(folder).adopt("input_gain:force")
+    assert holds(str(refused.value), "95.4 %", "viscous_friction:v", "not fitted")
+    assert refused.value.then == NextCommand("diagnose", ("--without", "viscous_friction"))
+    diagnosed(folder, lookalikes=[like | {"like": "viscous_friction:x"}])
+    with pytest.raises(GroundedError) as refused:
+        Workspace(folder).adopt("viscous_friction:x")
+    assert refused.value.then == NextCommand("adopt", ("viscous_friction:v",))
 
 
 def test_numbers_that_are_wrong_are_fitted(cart, tmp_path):
