@@ -12,7 +12,7 @@ from grounded_cli.options import as_json, in_workspace, next_line, open_workspac
 from grounded_cli.terminal import field, number, progress, remark, sentence, show, show_json, table
 
 if TYPE_CHECKING:
-    from grounded_trials.workspace.ingest import Ingested
+    from grounded_trials.workspace.ingested import Ingested
 
 # what a verdict means for the search
 VERDICTS = {
@@ -99,6 +99,8 @@ def _tell(name: str, one: Ingested) -> None:
         meaning = VERDICTS.get(one.verdict, "")
         text = f"utility {number(one.utility)}, {one.verdict}{meaning}"
         show(field(one.candidate, text, "  "))
+    if one.off_target:
+        show(field("off target", "; ".join(each.summary() for each in one.off_target), "  "))
     if one.signals:
         rows = [
             (

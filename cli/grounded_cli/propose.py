@@ -184,9 +184,13 @@ def _came_true(candidate: Candidate, same: Sequence[Tried], standing: Standing) 
     gain = candidate.predicted_utility - best.utility
     if not gain > 0:  # the best one's runs were luckier than what is predicted of it
         return text
-    within = gain < max(missed[-1], candidate.likely_off)
-    doubt = ", which is no more than such a miss" * within
-    return f"{text}; this one promises a gain of {number(gain)}{doubt}"
+    promise = f"{text}; this one promises a gain of {number(gain)}"
+    if not gain < max(missed[-1], candidate.likely_off):
+        return promise
+    doubt = f"{promise}, which is no more than such a miss"
+    if candidate.doubtful:  # a note of the candidate's says so
+        return doubt
+    return f"{doubt}: you may stop here, with {best.candidate.id}, the best so far"
 
 
 def _measured(workspace: Workspace) -> str:

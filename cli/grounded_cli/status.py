@@ -79,6 +79,8 @@ def summary(status: Status) -> str:
         best = standing.incumbent
         text = f"{best.candidate.id}, utility {number(best.utility)}{_gained(standing)}"
         lines.append(field("best", text))
+    if status.off_target:
+        lines.append(field("off target", "; ".join(one.summary() for one in status.off_target)))
     again = f"run the best one again: `{typed(status.again)}`"
     if certainty := last_improvement(standing.history, again):
         lines.append(field("certainty", certainty))

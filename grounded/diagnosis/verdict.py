@@ -216,20 +216,22 @@ def rest(rows: Sequence[RulerRow]) -> str:
         (
             row.with_effects[name] / noise,
             row.with_effects[name] / max((row.outset or row.crude)[name], 1e-300),
-            f"{name} {_when(row)}",
+            (name, _when(row)),
         )
         for row in rows
         for name, noise in row.noise_floor.items()
         if noise > 0 and math.isfinite(row.with_effects[name])
     ]
-    times, share, where = max(found, default=(0.0, 0.0, ""))
+    times, share, (name, when) = max(found, default=(0.0, 0.0, ("", "")))
     if not times > ABOVE:
         return ""
     least = "at least " * rows[0].floor_at_most
-    text = f"what is left in {where} is {least}{times:.2g} times the noise"
+    text = f"the state {name} is still off by {least}{times:.2g} times the noise {when}"
     if share < MATTERS:
-        return f"{text} but {100 * share:.1g} % of what the crude model missed"
-    return f"{text}, yet little beside how far the state moves, or no more than trials differ by"
+        of = f"{100 * share:.1g} % of what the crude model missed"
+        return f"{text}, which is {of}: too little to look for a cause"
+    beside = f"beside how far {name} moves or how much trials differ"
+    return f"{text}: too little to look for a cause, {beside}"
 
 
 def _when(row: RulerRow) -> str:

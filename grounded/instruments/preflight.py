@@ -4,7 +4,7 @@ odd_trial     a whole trial in other units than the rest
 swapped       two columns of a trial in each other's place
 single        each state by itself
 kinematics    velocities against the rates of their positions, courses against headings
-inputs        copies of one another, at their limits, constant within each trial
+inputs        copies of one another, at their limits or beyond, constant within each trial
 
 What is certain from sensors alone is put right in the trials that the diagnosis then takes: a late
 signal is moved, a wrong sign or unit undone, samples that show nothing become missing ones; what a
@@ -31,6 +31,7 @@ from grounded.instruments.kinematics import (
     turned,
 )
 from grounded.instruments.lag import Lag, alike, at_samples, lag_between, reach_of
+from grounded.instruments.limits import judge_limits
 from grounded.instruments.odd_trial import (
     Odd,
     Ratios,
@@ -56,7 +57,6 @@ UNIT = 0.1  # relative, from which a scale is taken for one of degrees
 TURNED_AWAY = np.deg2rad(20)  # what no side slip makes
 COPY = 0.99  # coherence of two inputs that are one: two motors of one vehicle have 0.96
 SAME_WAY = 0.95  # of a speed and the way: below it something drifts or slips
-AT_LIMITS = 0.1  # of the time
 
 
 @dataclass(frozen=True, eq=False)
@@ -288,7 +288,7 @@ def _earlier(x: Array, steps: float) -> Array:
 
 
 def _inputs(subject: Task | Model, trials: Sequence[Trial]) -> Iterator[Finding]:
-    """Of commands: copies of one another, at their limits, conditions of a trial."""
+    """Of commands: copies of one another, at their limits or beyond, conditions of a trial."""
     names = trials[0].input_names
     columns = [[trial.inputs[:, j] for trial in trials] for j in range(len(names))]
     fixed = [all(np.ptp(x) == 0 for x in some) for some in columns]
@@ -297,13 +297,8 @@ def _inputs(subject: Task | Model, trials: Sequence[Trial]) -> Iterator[Finding]
         if fixed[j] and len(values) > 1:
             shown = ", ".join(f"{v:.4g}" for v in values[:6])
             yield Finding(name, f"constant within each trial ({shown})", "constant")
-        if isinstance(subject, Task):
-            x = np.concatenate(columns[j])
-            share = float(((x <= subject.low[j]) | (x >= subject.high[j])).mean())
-            if share > AT_LIMITS:
-                yield Finding(
-                    name, f"at its limits {100 * share:.0f} % of the time", "saturated", share=share
-                )
+    if isinstance(subject, Task):
+        yield from judge_limits(subject, np.concatenate([trial.inputs for trial in trials]))
     longest = max(trials, key=lambda trial: trial.steps).inputs
     for i, j in alike(longest, reach_of(len(longest), trials[0].dt)):
         if fixed[i] or fixed[j]:

@@ -14,11 +14,12 @@ import pytest
 
 from grounded.diagnosis.report import Diagnosis
 from grounded.errors import NextCommand
-from grounded_trials.report.findings import improvements_in, tracking_error, utility_terms
+from grounded_trials.report.findings import improvements_in, utility_terms
 from grounded_trials.report.gathering import gather
 from grounded_trials.report.page.page import page
 from grounded_trials.report.page.tables import UNKNOWN
 from grounded_trials.workspace.folder import Folder, Lost
+from grounded_trials.workspace.off_target import tracking_error
 from page_browser import unpacked
 from reported import DIAGNOSIS, car, cart, many_flights
 

@@ -20,12 +20,12 @@ from grounded_trials.report.findings import (
     off_target,
     prediction_error,
     rms,
-    tracking_error,
 )
 from grounded_trials.report.gathering import gather
 from grounded_trials.report.reporting import save_optimum
 from grounded_trials.store.documents import write_document
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.off_target import tracking_error
 from reported import DIAGNOSIS, car, cart, copied, damage
 from workspaces import make
 

@@ -12,6 +12,8 @@ import pytest
 from cli import grounded, plain, process
 from facts import holds
 from grounded.diagnosis.report import Diagnosis, Made
+from grounded.errors import GroundedError, NextCommand
+from grounded.search.candidate import Candidate
 from grounded_cli.main import COMMANDS, cli
 from grounded_cli.options import ELSEWHERE
 from grounded_trials import Workspace
@@ -84,6 +86,21 @@ def test_nothing_is_adopted_where_one_name_is_wrong(cart, tmp_path):
     done = grounded("-C", folder, "adopt", "viscous_friction:v", "delay:forse")
     assert done.code == 1 and "'delay:force'" in done.err
     assert (folder / "grounded.toml").read_text() == before
+
+
+def test_what_is_listed_as_alike_was_not_fitted_and_another_diagnosis_fits_it(cart, tmp_path):
+    """It was "not among the effects of the last diagnosis", which names it."""
+    folder = copied(cart, tmp_path / "w")
+    like = {"effect": "viscous_friction:v", "like": "input_gain:force", "share": 0.954}
+    diagnosed(folder, lookalikes=[like])
+    with pytest.raises(GroundedError) as refused:
+        Workspace(folder).adopt("input_gain:force")
+    assert holds(str(refused.value), "95.4 %", "viscous_friction:v", "not fitted")
+    assert refused.value.then == NextCommand("diagnose", ("--without", "viscous_friction"))
+    diagnosed(folder, lookalikes=[like | {"like": "viscous_friction:x"}])
+    with pytest.raises(GroundedError) as refused:
+        Workspace(folder).adopt("viscous_friction:x")
+    assert refused.value.then == NextCommand("adopt", ("viscous_friction:v",))
 
 
 def test_numbers_that_are_wrong_are_fitted(cart, tmp_path):
@@ -409,6 +426,16 @@ def test_trust_sets_the_promised_gain_against_the_last_misses(tmp_path):
     assert holds(said[1], f"{ran[0].utility:.4g}", "promises")
     assert holds(said[2], f"{missed[0]:.4g}", f"{missed[1]:.4g}", f"{gain:.4g}")
     assert ("no more than" in " ".join(said[2].split())) == (gain < missed[1])
+    assert holds(" ".join(said[2].split()), "stop here", "c0002") == (gain < missed[1])
+
+
+def test_who_is_told_that_a_candidate_may_lose_is_told_where_to_stop(tmp_path, monkeypatch):
+    folder = make(tmp_path / "w").folder
+    grounded("-C", folder, "learn", "--trials", "1")
+    monkeypatch.setattr(Candidate, "doubtful", property(lambda made: bool(made.base)))
+    done = grounded("-C", folder, "propose")
+    assert holds(" ".join(done.err.split()), "c0002 may well lose", "stop here, with c0001")
+    assert "stop here" not in done.out and last(done) == "grounded run"
 
 
 def test_an_adoption_in_vain_is_told_how_to_be_undone(tmp_path, monkeypatch):

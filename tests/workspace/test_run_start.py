@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from cli import grounded
-from facts import holds
+from facts import holding, holds
 from grounded.errors import GroundedError, NextCommand
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import read_trial, write_trial
@@ -168,15 +168,19 @@ def test_the_log_of_a_probe_is_not_credited_and_its_export_says_how_it_is_taken_
     assert waiting.out.split()[-1] == "LOG"
 
 
-@pytest.mark.parametrize("forced", [False, True])
-def test_a_strange_log_has_no_start_forced_or_not(w, tmp_path, forced):
+def test_a_strange_log_has_no_start_and_is_taken_with_a_warning_where_it_is_named(w, tmp_path):
+    """A named one was refused too, and told to name the candidate."""
     policy = w.candidate("c0002")[0].policy
     driven = 3 * np.sin(np.arange(policy.horizon) / 3)[:, None]
     strange = replace(policy, feedforward=driven, gain=0 * policy.gain)
     path = record(w, tmp_path / "a.csv", strange, 1.0)
-    with pytest.raises(GroundedError, match="c0002"):
-        w.ingest(path, candidate="c0002" if forced else None)
+    with pytest.raises(GroundedError, match=holding("c0002", "--candidate c0002 all the same")):
+        w.ingest(path)
     assert len(w.trials()) == 1
+    found = w.ingest(path, candidate="c0002")
+    assert found.candidate == "c0002" and len(w.trials()) == 2
+    why, begins = found.warnings[:2]
+    assert holds(why, "c0002", "force") and holds(begins, "[log.span] start = SECONDS", "0.000 s")
 
 
 @pytest.mark.parametrize(
@@ -276,6 +280,8 @@ def test_stamps_of_a_recording_played_at_another_rate_are_told(w, tmp_path, pace
         w.ingest(path)
     assert holds(str(refused.value), "c0002", "stamps", f"times {pace:g}")
     assert len(w.trials()) == 1
+    named = w.ingest(path, candidate="c0002")
+    assert holds(named.warnings[0], "stamps", f"times {pace:g}")
 
 
 def test_one_log_is_one_trial(w, tmp_path):

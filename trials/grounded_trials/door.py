@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from grounded_trials.workspace.exporting import Exported
     from grounded_trials.workspace.fitting import Fitted
     from grounded_trials.workspace.identity import SetAside
-    from grounded_trials.workspace.ingest import Ingested
+    from grounded_trials.workspace.ingested import Ingested
     from grounded_trials.workspace.inspecting import Inspected
     from grounded_trials.workspace.looping import NextRun
     from grounded_trials.workspace.proposing import Proposed, Status

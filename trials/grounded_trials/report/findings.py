@@ -22,11 +22,11 @@ from grounded.search.planner import Planner
 from grounded.search.standing import Standing
 from grounded.task import Task
 from grounded.trial import Trial, mean_trial
-from grounded_trials.report.scene import scene_of
 from grounded_trials.wording import figure, rendered, shown
 from grounded_trials.workspace.adopting import Better
 from grounded_trials.workspace.folder import Lost
 from grounded_trials.workspace.next_step import Since
+from grounded_trials.workspace.off_target import tracking_error, weighed_groups
 
 if TYPE_CHECKING:
     from grounded_trials.report.settled import Settled
@@ -196,21 +196,6 @@ class Improved:
         return [v for v in (self.before, self.after) if np.isfinite(v)]
 
 
-def weighed_groups(task: Task) -> list[tuple[list[str], str]]:
-    """The states that the reward weighs and that have a target, with what their error is called.
-
-    The position comes first, as one distance.
-    """
-    scene, names, known = scene_of(task.model), task.model.state_names, set(tracked(task))
-    reward = task.reward
-    weighed = [i for i in sorted(known) if reward.state[i] or reward.terminal[i]]
-    position = [i for i in scene.axes if i in known] if scene.spatial else []
-    if len(position) < 2:
-        position = []
-    found = [([names[i] for i in position], "the position")] if position else []
-    return found + [([names[i]], names[i]) for i in weighed if i not in position]
-
-
 def improvements_in(findings: Findings) -> list[Improved]:
     """How far the model's own policy missed the target, and the best trial does, rms over the run.
 
@@ -266,16 +251,6 @@ def by_state(
         (name, unit(each), *(figure(float(column[i]), 3) for column in columns))
         for i, (name, each) in enumerate(model.states.items())
     ]
-
-
-def tracked(task: Task) -> list[int]:
-    """States with a target."""
-    return [i for i in range(task.model.n) if np.isfinite(task.target[:, i]).all()]
-
-
-def tracking_error(task: Task, trial: Trial) -> Array:
-    """s_t - target_t, (T + 1, n), angles wrapped; NaN where there is no target."""
-    return task.model.difference(trial.states, task.target[: trial.steps + 1])
 
 
 def prediction_error(task: Task, run: Run) -> Array:

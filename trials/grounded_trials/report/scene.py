@@ -17,6 +17,7 @@ import numpy as np
 
 from grounded.frozen import Array
 from grounded.model import Model
+from grounded_trials.workspace.off_target import position_axes, roles_of
 
 NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # to east, north, up
 
@@ -63,20 +64,13 @@ class Scene:
 
 def scene_of(model: Model) -> Scene:
     """The scene of a model's roles."""
-    index = {name: i for i, name in enumerate(model.state_names)}
-    roles = {
-        role: [index[n] for n in ((names,) if isinstance(names, str) else names) if n in index]
-        for role, names in model.roles.items()
-    }
-    position = roles.get("position", [])
-    spatial = len(position) >= 2
+    roles, axes = roles_of(model), position_axes(model)
+    spatial, position = bool(axes), roles.get("position", [])
     first = [*position, *(roles.get("speed", []) if position else []), *range(model.n)]
-    axes = position[:3] if spatial else list(dict.fromkeys(first))[:2]
+    axes = axes or list(dict.fromkeys(first))[:2]
     is_map = spatial and [model.state_names[i] for i in axes[:2]] == ["north", "east"]
     if is_map:
         axes[:2] = axes[1::-1]
-    if spatial and len(axes) == 2:
-        axes += roles.get("altitude", [])[:1]
     heading, attitude = roles.get("heading", []), roles.get("attitude", [])
     names = [model.state_names[i] for i in axes]
     return Scene(

@@ -9,8 +9,8 @@ from grounded.diagnosis.error_report import measured
 from grounded.diagnosis.report import Diagnosis
 from grounded.diagnosis.verdict import open_noise, rest, telling, told_apart, worsened
 from grounded.task import Task
-from grounded_trials.report.findings import weighed_groups
 from grounded_trials.wording import count, shown
+from grounded_trials.workspace.off_target import weighed_groups
 
 CAUSES = 2  # that the first line names
 SMALL = 0.05  # of the gain: a cause below it is only counted

@@ -26,6 +26,7 @@ from grounded_trials.logs.joint_names import joint_names
 from grounded_trials.logs.log_files import kind_of, log_files
 from grounded_trials.logs.log_table import log_mapping, read_log
 from grounded_trials.starting.examples import fresh_folder
+from grounded_trials.starting.interval import interval_of
 from grounded_trials.starting.kinds import KINDS, Joints, called_input, kind_in, moving, skeleton
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.config import FILE
@@ -33,7 +34,6 @@ from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.model_file import load_module, model_in
 from grounded_trials.workspace.task_file import equal_weights, write_target
 
-STEPS = (0.001, 0.002, 0.0025, 0.004, 0.005, 0.008, 0.01, 0.02, 0.025, 0.04, 0.05, 0.1, 0.2, 0.5)
 WRITTEN = (FILE, "model.py", "target.csv")
 MOST_ASKED = 20  # numbers of the log to choose from where nothing fits
 HORIZON = 200  # steps of a target that is a recorded run, at most
@@ -119,7 +119,8 @@ def begin(
         log: of any format.
         model: the user's model.py, which is copied; None: a skeleton is written.
         kind: of the skeleton, see `KINDS`; None: as the log looks.
-        dt: control interval [s]; None: that of the commands in the log.
+        dt: control interval [s]; None: that in which the commands of the log change, see
+            `interval_of`.
         inputs: which numbers of the log are a generic skeleton's inputs; none: as they look.
         ask: given each unsure signal, returns the path to take; None: the best guess is taken.
 
@@ -173,7 +174,7 @@ def _begin(
         taken = {g.path for g in (*states, *inputs)}
         free = tuple(one.path for one in moving(report).values() if one.path not in taken)
         states, inputs = (tuple(_asked(g, ask, free) for g in some) for some in (states, inputs))
-    step, whose = (dt, "") if dt else _interval(report, inputs, states)
+    step, whose, note = (dt, "", "") if dt else interval_of(report, inputs, states)
     ranges = {g.name: _range(report, g) for g in (*states, *inputs)}
     if chosen != "drone":  # what is sent after a run must be allowed: rest
         ranges |= {
@@ -196,7 +197,7 @@ def _begin(
         states=states,
         inputs=inputs,
         target=target,
-        notes=(*notes, *more),
+        notes=(*notes, *[note] * bool(note), *more),
     )
 
 
@@ -279,25 +280,6 @@ def _asked(guess: Guess, ask: Ask, free: tuple[str, ...]) -> Guess:
     return replace(
         guess, path=path, sure=bool(path), reasons=("as you said",), field=None, scale=1.0
     )
-
-
-def _interval(
-    report: LogReport, inputs: Sequence[Guess], states: Sequence[Guess]
-) -> tuple[float, str]:
-    """The control interval: the slowest command or state, as a round number; and whose it is."""
-    for guesses, whose in ((inputs, "log's commands"), (states, "log's states")):
-        rates = [
-            t.rate_hz for g in guesses if (t := _topic(report, g)) is not None and t.rate_hz > 0
-        ]
-        if rates:
-            step = min(STEPS, key=lambda step: abs(np.log(step * min(rates))))
-            return step, f": that of the {whose}"
-    return 0.05, ": a guess, no input or state was found"
-
-
-def _topic(report: LogReport, guess: Guess) -> Any:
-    known = {t.topic: t for t in report.topics if guess.path.strip('"').startswith(t.topic)}
-    return known[max(known, key=len)] if known and guess.path else None
 
 
 def _range(report: LogReport, guess: Guess) -> tuple[float, float] | None:

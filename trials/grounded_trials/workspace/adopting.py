@@ -15,7 +15,7 @@ from typing import Any
 
 from grounded.diagnosis.report import Diagnosis, Estimate
 from grounded.errors import GroundedError, NextCommand, nearest
-from grounded.result import Result
+from grounded.result import Result, percent
 from grounded.search.planner import Planner
 from grounded_trials.store.documents import read_document, write_document
 from grounded_trials.workspace.config import ModelTable, as_toml, set_in_model
@@ -83,8 +83,7 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
         raise GroundedError("nothing was diagnosed yet: diagnose first", then=AGAIN)
     names = _corrections(found, list(dict.fromkeys(names)))
     before = {} if found.made is None else found.made.effects
-    known = [row.effect for row in found.ranking]
-    _check(names, known + _curves(found), workspace, before)
+    _check(names, found, workspace, before)
     claimed = _claimed(found, names)
     calibrated = found.known_parameters if parameters and claimed else {}
     nominal = {
@@ -252,12 +251,14 @@ def settled(
 
 
 def _check(
-    names: Sequence[str], known: Sequence[str], workspace: Folder, before: Mapping[str, Any]
+    names: Sequence[str], found: Diagnosis, workspace: Folder, before: Mapping[str, Any]
 ) -> None:
     """Each must have been weighed, and not be adopted since."""
+    known = [row.effect for row in found.ranking] + _curves(found)
     adopted = [e["name"] for e in workspace.config.model.effects if e["name"] not in before]
     for name in names:
         if name not in known:
+            _check_alike(name, found)
             raise GroundedError(
                 f"'{name}' is not among the effects of the last diagnosis: {nearest(name, known)}"
             )
@@ -265,6 +266,24 @@ def _check(
             raise GroundedError(
                 f"'{name}' is adopted already; see [model] effects in grounded.toml"
             )
+
+
+def _check_alike(name: str, found: Diagnosis) -> None:
+    """Refuses what the diagnosis lists as alike a claimed effect, and has no values for."""
+    alike = next((one for one in found.lookalikes if one.like == name), None)
+    if alike is None:
+        return
+    family = alike.effect.partition(":")[0]
+    then = NextCommand("diagnose", ("--without", family))
+    what = f"a diagnosis without {family} would fit it"
+    if family == name.partition(":")[0]:
+        then, what = NextCommand("adopt", found.effects), "adopt that one"
+    raise GroundedError(
+        f"'{name}' was not fitted in its own right, so that it has no values: the last diagnosis "
+        f"lists it because it makes {percent(alike.share)} of the signal of {alike.effect}, which "
+        f"was fitted; {what} instead",
+        then=then,
+    )
 
 
 def _claimed(found: Diagnosis, names: Sequence[str]) -> bool:

@@ -233,10 +233,12 @@ class Check:
         """What a person should know of it, though nothing speaks against it."""
         made, name = self.candidate, self.candidate.id
         if made.doubtful and not self._trials(name):
+            best = self.standing.incumbent
+            stop = f". You may stop here, with {best.candidate.id}, the best so far" if best else ""
             yield (
                 f"{name} may well lose: it promises {made.predicted_gain:.3g} over {made.base}, "
                 f"and its model is likely to be off by {made.likely_off:.3g} there, as it was for "
-                "earlier trials"
+                f"earlier trials{stop}"
             )
         if "sha256" not in self.meta:
             yield f"{name} was written by an older version: its file has no checksum of its own"

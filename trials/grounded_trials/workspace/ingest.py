@@ -14,12 +14,10 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
-from grounded.result import Result
 from grounded.search.candidate import Candidate, Tried
 from grounded.trial import Trial, interpolate_gaps, scattered
 from grounded_trials.logs.log_files import kind_of, log_files
@@ -31,7 +29,9 @@ from grounded_trials.store.trial_file import read_trial, trial_bytes
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.foreign import ForeignLog, begun, mapping_of, read_foreign
 from grounded_trials.workspace.identity import ROWS, sha256
-from grounded_trials.workspace.next_step import PROPOSE, after_log
+from grounded_trials.workspace.ingested import Ingested
+from grounded_trials.workspace.next_step import after_log
+from grounded_trials.workspace.off_target import off_target_of
 from grounded_trials.workspace.proposing import candidate_named, standing_in
 from grounded_trials.workspace.run_start import elsewhere, pace_of, rival_in
 from grounded_trials.workspace.trial_check import (
@@ -43,43 +43,6 @@ from grounded_trials.workspace.trial_check import (
 )
 
 SPELT = str.maketrans({" ": "", "·": "", "*": "", "²": "^2"})  # a unit, whoever writes it
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Ingested(Result):
-    """One log that was taken in."""
-
-    trial: str  # its short name, t0007
-    sha256: str
-    known: bool  # it had been stored before
-    candidate: str  # "" for data
-    utility: float | None  # None for data; -inf for a run that failed
-    accepted: bool | None  # None: data, or not decided yet
-    warnings: tuple[str, ...]
-    signals: tuple[SignalReport, ...]  # for a foreign log
-    verdict: str = ""  # a word of `wording.verdict`, run again, probe; "" for data
-    notes: tuple[str, ...] = ()  # where in a longer log the run was found
-    then: NextCommand = PROPOSE
-
-    def summary(self) -> str:
-        """The trial, what it ran and what became of that."""
-        return f"{self.trial}: {f'{self.candidate}, {self.verdict}' if self.candidate else 'data'}"
-
-    def to_json(self) -> dict[str, Any]:
-        """Its entry in `ingest --json`; a failed run's utility is null and `failed` true."""
-        return {
-            "trial": self.trial,
-            "sha256": self.sha256,
-            "known": self.known,
-            "candidate": self.candidate or None,
-            "utility": self.utility,
-            "failed": self.utility == float("-inf"),
-            "accepted": self.accepted,
-            "verdict": self.verdict or None,
-            "warnings": list(self.warnings),
-            "notes": list(self.notes),
-            "signals": [vars(signal) for signal in self.signals],
-        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,17 +100,19 @@ def ingest_log(
     verdict = _verdict(trial, tried, workspace.config.search.repeats)
     if ahead and verdict == "run again":
         now = standing_in(workspace, ahead=True)
+    judged = [interpolate_gaps(trial).trial] if trial.candidate else []
     return Ingested(
         trial=added.id,
         sha256=added.sha256,
         known=added.known,
         candidate=trial.candidate,
-        utility=workspace.task.utility(interpolate_gaps(trial).trial) if trial.candidate else None,
+        utility=workspace.task.utility(judged[0]) if judged else None,
         accepted=tried.accepted if tried else None,
         warnings=warnings,
         signals=read.signals,
         verdict=verdict,
         notes=read.notes,
+        off_target=off_target_of(workspace.task, judged),
         then=after_log(workspace, verdict, now),
     )
 
@@ -181,22 +146,29 @@ def _recognised(workspace: Folder, path: Path, read: _Read, candidate: str | Non
     units = () if other else units
     if not why and not units:
         return read
-    if candidate is not None and (log is None or (found and found.opens_alike)):
+    slow = pace_of(log, workspace.task, own.policy) if log and not units else None
+    pace = slow and (
+        f"a second of its stamps is {slow:g} s of the run (a recording played at another rate?): "
+        f"correct the stamps, times {slow:g}, and ingest it again"
+    )
+    if candidate is not None:
         seem = f"{' and '.join(units)} seem to be in another unit: times {by:.6g} they fit better"
-        return replace(read, warnings=(*read.warnings, why or seem))
+        doubts = [pace or why or seem]
+        if log and not (found and found.opens_alike):
+            doubts.append(
+                f"no start of {ran} was found in it: it is taken from {log.first:.3f} s on, its "
+                "first command; [log.span] start = SECONDS names another"
+            )
+        return replace(read, warnings=(*read.warnings, *doubts))
     if units:
         raise GroundedError(f"{path} ran {ran}, {units_told(units, by, read.log is not None)}")
-    if log and (pace := pace_of(log, workspace.task, own.policy)):
-        raise GroundedError(
-            f"{path} ran {ran}, but a second of its stamps is {pace:g} s of the run (a recording "
-            f"played at another rate?): correct the stamps, times {pace:g}, and ingest it again"
-        )
+    if pace:
+        raise GroundedError(f"{path} ran {ran}, but {pace}")
     what = f"; with --candidate {other} for what it seems to have run" * bool(other)
-    begins = "; [log.span] says where the run begins" * bool(read.log and not log)
+    begins = "; [log.span] start = SECONDS says where the run begins" * (read.log is not None)
     raise GroundedError(
         f"{path} did not run {ran}: {why}. Take it in with --data for fitting and diagnosis{what}, "
-        f"or with {'[log.span] start = SECONDS and ' * bool(log)}--candidate {ran} all the same"
-        f"{begins}",
+        f"or with --candidate {ran} all the same{begins}",
         NextCommand("ingest", (str(path), *(("--candidate", other) if other else ("--data",)))),
     )
 

@@ -12,7 +12,8 @@ from grounded.result import Result
 from grounded.search.candidate import Candidate
 from grounded_trials.workspace.exporting import Exported, export_candidate
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.ingest import Ingested, ingest_log
+from grounded_trials.workspace.ingest import ingest_log
+from grounded_trials.workspace.ingested import Ingested
 from grounded_trials.workspace.proposing import (
     Proposed,
     Status,

@@ -10,10 +10,21 @@ import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result, percent
+from grounded.task import Task
+from grounded.trial import Trial
+from grounded_trials.wording import with_unit
 from grounded_trials.workspace.folder import Contents, Folder
 from grounded_trials.workspace.handover import Void, checked_candidate, outside_limits
+from grounded_trials.workspace.off_target import (
+    OffTarget,
+    off_target_of,
+    tracking_error,
+    weighed_groups,
+)
 
 MOSTLY = 0.9  # of a plan's cost
+HELD = 0.8  # of a plan's steps: an input is at a limit nearly all the time
+MISSED = 0.1  # of the way that a target asks for: the plan falls short
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
@@ -61,6 +72,7 @@ class Status(Result):
     outdated: str = ""  # why the last diagnosis is not the last word
     notes: tuple[str, ...] = ()  # of the search, where it has ended; trials of namesakes
     discarded: dict[str, str] = field(default_factory=dict)  # t0004 -> why it is set aside
+    off_target: tuple[OffTarget, ...] = ()  # how far the runs of the best are off it, in units
 
     def summary(self) -> str:
         """The phase and the best candidate."""
@@ -72,7 +84,10 @@ class Status(Result):
 
     def to_json(self) -> dict[str, Any]:
         """The document of `status --json`, the whole history in it."""
-        return self.standing.to_json() | {"discarded": self.discarded}
+        found = self.standing.to_json() | {"discarded": self.discarded}
+        if found["best"] is not None:
+            found["best"] |= {"off_target": [one.to_json() for one in self.off_target]}
+        return found
 
 
 def propose_in(workspace: Folder) -> Proposed:
@@ -146,6 +161,8 @@ def _unfinished(workspace: Folder, first: Candidate | None) -> list[str]:
                 f"{percent(share)} of what the plan costs is [reward] input and input_change: with "
                 "less weight there, errors would count for more"
             )
+    if first is not None:
+        found += _held_back(task, first)
     name = str(workspace.config.task.target)
     rows = len(read_target(workspace.folder / name)[1])
     if rows > task.horizon + 1:
@@ -154,6 +171,44 @@ def _unfinished(workspace: Folder, first: Candidate | None) -> list[str]:
             f"{task.horizon + 1}: the plan ends after {task.horizon * task.dt:g} s"
         )
     return found
+
+
+def _held_back(task: Task, first: Candidate) -> list[str]:
+    """Where [limits] keep a plan from its target: an input is at one nearly all the time."""
+    names, sent, aim = task.model.input_names, first.predicted_inputs, task.input_target
+    assert aim is not None
+    held = []
+    for j, name in enumerate(names):
+        for end in (float(task.low[j]), float(task.high[j])):
+            share = float(np.isclose(sent[:, j], end, rtol=1e-3, atol=1e-9).mean())
+            if np.isfinite(end) and share > HELD and not np.allclose(aim[:, j], end):
+                limit = with_unit(f"{end:.4g}", task.model.inputs[name])
+                held.append(f"{name} is at its limit of {limit} for {percent(share)} of the plan")
+    plan = Trial(first.predicted_states, sent, task.dt, task.model.state_names, names)
+    if not held or not (missed := _most_missed(task, plan)):
+        return []
+    return [
+        f"{' and '.join(held)}, and still {missed}: the target seems to ask for more "
+        "than [limits] allow. Widen them if the robot may get more, or draw a slower target"
+    ]
+
+
+def _most_missed(task: Task, plan: Trial) -> str:
+    """What a plan misses by most, beside the way that its target asks for; "" for nothing much."""
+    from grounded.diagnosis.error_report import measured
+
+    error, way, found = tracking_error(task, plan), np.vstack([task.start, task.target]), []
+    for names, what in weighed_groups(task):
+        states = [task.model.state_names.index(name) for name in names]
+        far = np.linalg.norm(error[:, states], axis=1)
+        k, asked = int(np.argmax(far)), float(np.linalg.norm(np.ptp(way[:, states], axis=0)))
+        text = (
+            f"{what} misses its target by {measured(far[k], task.model.states[names[0]])} at "
+            f"{k * task.dt:.4g} s"
+        )
+        found.append((float(far[k]) / max(asked, 1e-300), text))
+    share, text = max(found, default=(0.0, ""))
+    return text if share > MISSED else ""
 
 
 def _handed_over(workspace: Folder) -> tuple[Proposal, dict[str, str]]:
@@ -274,6 +329,7 @@ def status_of(workspace: Folder, standing: Standing, notes: tuple[str, ...] = ()
         since.told(workspace.address) if since else "",
         (*notes, *_namesakes(workspace)),
         workspace.discarded(),
+        off_target_of(workspace.task, standing.incumbent.trials if standing.incumbent else ()),
     )
 
 

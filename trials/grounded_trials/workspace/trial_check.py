@@ -38,7 +38,7 @@ OTHERS = 20  # candidates to compare with, the latest
 
 
 def warnings_about(workspace: Folder, trial: Trial) -> tuple[str, ...]:
-    """Gaps, exchanged columns, an early end or a start far from s_0, inputs that can't be."""
+    """Gaps, exchanged columns, an early end, a start far from s_0, inputs beyond [limits]."""
     from grounded.instruments.swapped import exchanged, swapped_columns
 
     task = workspace.task
@@ -59,7 +59,7 @@ def warnings_about(workspace: Folder, trial: Trial) -> tuple[str, ...]:
     if pair := swapped_columns(workspace.base_model, whole.until(whole.known_steps)):
         found.append(exchanged(pair))
     if not trial.candidate:
-        return tuple(found)
+        return (*found, *_beyond(task, whole))
     if whole.steps < task.horizon:
         ends = f"after {whole.steps} of {task.horizon} steps ({whole.steps * trial.dt:.2f} s)"
         found.append(
@@ -123,6 +123,19 @@ def _inputs(task: Task, trial: Trial) -> list[str]:
         "clipping"
         for i, name in enumerate(trial.input_names)
         if excess[i] > 1e-6
+    ]
+
+
+def _beyond(task: Task, trial: Trial) -> list[str]:
+    """Where data show that the robot got more than a plan may ask for: [limits] of one log."""
+    from grounded.instruments.limits import beyond_limits, limits_of, span
+
+    past = beyond_limits(task, trial.inputs).any(axis=0)
+    return [
+        f"{name} goes from {span(trial.inputs[:, i])} in this log, beyond its [limits], "
+        f"{limits_of(task, i)}: no plan will ask for that; widen them if the robot may get it"
+        for i, name in enumerate(trial.input_names)
+        if past[i]
     ]
 
 

@@ -27,11 +27,10 @@ from grounded_trials.report.findings import (
     compared,
     prediction_error,
     selection,
-    tracked,
-    tracking_error,
 )
 from grounded_trials.report.scene import scene_of
 from grounded_trials.wording import figure, labelled, per_second, shown
+from grounded_trials.workspace.off_target import tracked, tracking_error
 
 ITERATIONS = 5
 

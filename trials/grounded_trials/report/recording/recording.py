@@ -31,12 +31,13 @@ from grounded.figures.figure import rgb
 from grounded.frozen import Array
 from grounded.trial import Trial
 from grounded_trials.report.bodies import body_in
-from grounded_trials.report.findings import Findings, Run, selection, tracked
+from grounded_trials.report.findings import Findings, Run, selection
 from grounded_trials.report.forecast import forecast
 from grounded_trials.report.recording.layout import Space, blueprint
 from grounded_trials.report.scene import scene_of
 from grounded_trials.report.settled import told
 from grounded_trials.wording import count, labelled, per_second, percent
+from grounded_trials.workspace.off_target import tracked
 
 COLOURS = {role: rgb(dark) for role, (_, dark) in PAGE.items()}
 COLOURS |= {"desired": (170, 170, 170), "other": (110, 110, 110), "model_policy": COLOURS["model"]}

@@ -1,0 +1,80 @@
+"""The control interval is that in which commands change, where rows are more frequent."""
+
+import numpy as np
+import pytest
+
+from grounded_trials.starting.begin import begin
+from grounded_trials.starting.interval import changes_every
+
+MODEL = """from grounded import Model, Param
+
+model = Model(
+    states={"x": "m", "v": "m/s"},
+    inputs={"force": "N"},
+    params={"drag": Param(0.5, "1/s", 0.0, 5.0)},
+    derivative=lambda s, a, p: {"x": s.v, "v": a.force - p.drag * s.v},
+)
+"""
+
+
+def gaps(every, rows, seed=0, jitter=0.0, drift=0.0, held=0.3, odd=0):
+    """Times between changes of a command that a loop sends, as rows of a log show them."""
+    rng = np.random.default_rng(seed)
+    t = every * (1 + drift) * np.arange(600) + rng.normal(0, jitter, 600) + 0.37 * rows
+    t = t[rng.random(600) > held]  # at times it stays as it was
+    t = np.concatenate([t, rng.uniform(0, t[-1], odd)])
+    return np.diff(np.unique(np.ceil(t / rows)) * rows)
+
+
+@pytest.mark.parametrize(
+    "every, rows, more",
+    [
+        (0.05, 0.01, {}),
+        (0.05, 0.01, {"jitter": 0.002}),
+        (0.05, 0.001, {"jitter": 0.001}),
+        (0.05, 0.01, {"drift": 1e-3}),  # clocks of two computers
+        (0.05, 0.01, {"odd": 4}),
+        (0.05, 0.01, {"held": 0.6}),
+        (0.02, 0.005, {}),
+        (0.1, 0.01, {}),
+        (0.1, 0.02, {"jitter": 0.003}),
+        (0.02, 0.01, {}),
+    ],
+)
+def test_the_interval_is_found_in_what_rows_show(every, rows, more):
+    assert changes_every(gaps(every, rows, **more), rows) == every
+
+
+@pytest.mark.parametrize(
+    "times",
+    [
+        np.full(2000, 0.01),  # every row
+        np.full(40, 1.0),  # a test signal's steps
+        np.full(15, 0.05),  # too few
+        np.round(np.random.default_rng(0).exponential(0.08, 500) + 0.01, 2),  # whenever
+        np.tile([0.05, 0.05, 0.06, 0.08], 30),
+    ],
+)
+def test_what_no_interval_explains_has_none(times):
+    assert changes_every(times, 0.01) is None
+
+
+def table(path, every):
+    """A run of 20 s, a row every 10 ms, whose command changes every so many rows."""
+    rng, t = np.random.default_rng(1), np.arange(2000) * 0.01
+    force = np.repeat(np.round(rng.normal(0, 1, 2000 // every), 3), every)
+    v = np.cumsum(force) * 0.01
+    columns = np.column_stack([t, np.cumsum(v) * 0.01, v, force])
+    np.savetxt(path, columns, "%.5f", ",", header="t,x,v,force", comments="")
+    return path
+
+
+@pytest.mark.parametrize("every, dt", [(5, 0.05), (1, 0.01)])
+def test_a_table_of_rows_more_frequent_than_commands_has_the_commands_interval(tmp_path, every, dt):
+    """`dt = 0.01  # that of the log's commands`, of which one came every 50 ms."""
+    (tmp_path / "m.py").write_text(MODEL)
+    found = begin(tmp_path / "w", table(tmp_path / "r.csv", every), model=tmp_path / "m.py")
+    assert found.dt == dt
+    assert any("0.05 s" in note for note in found.notes) == (every == 5)
+    given = begin(tmp_path / "g", tmp_path / "r.csv", model=tmp_path / "m.py", dt=0.02)
+    assert given.dt == 0.02 and not any("--dt" in note for note in given.notes)

@@ -1,0 +1,123 @@
+"""How far a run is off its target, in units: the numbers that a utility does not say."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cli import grounded
+from facts import holds
+from grounded import Model, Task, Trial
+from grounded.task import Reward
+from grounded_trials import Workspace
+from grounded_trials.report.findings import improvements_in
+from grounded_trials.report.gathering import gather
+from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.off_target import off_target_of
+from reported import cart, copied
+
+__all__ = ["cart"]
+
+ROVER = Model(
+    states={"x": "m", "y": "m", "psi": "rad", "v": "m/s"},
+    inputs={"turn": "rad/s", "push": "m/s^2"},
+    params={},
+    angles=("psi",),
+    roles={"position": ("x", "y")},
+    derivative=lambda s, a, p: {
+        "x": s.v * np.cos(s.psi),
+        "y": s.v * np.sin(s.psi),
+        "psi": a.turn,
+        "v": a.push,
+    },
+)
+H, DT = 20, 0.1
+
+
+def task(**weights):
+    target = np.zeros((H + 1, 4))
+    target[:, 3] = np.nan  # the speed is free
+    none = {"state": np.zeros(4), "input": np.ones(2), "input_change": np.ones(2)}
+    none["terminal"] = np.zeros(4)
+    return Task(
+        ROVER,
+        DT,
+        target,
+        Reward(**none | weights),
+        start=np.zeros(4),
+        past=np.zeros(2),
+        low=np.full(2, -1.0),
+        high=np.ones(2),
+    )
+
+
+def run(states):
+    names = (ROVER.state_names, ROVER.input_names)
+    return Trial(states, np.zeros((len(states) - 1, 2)), DT, *names)
+
+
+def off(x=0.0, y=0.0, psi=0.0, steps=H):
+    states = np.zeros((steps + 1, 4))
+    states[:, 0], states[:, 1], states[:, 2] = x, y, psi
+    return states
+
+
+ALONG = {"state": np.array([1.0, 1.0, 0.1, 0.0])}
+
+
+def test_the_position_is_one_distance_and_angles_are_wrapped():
+    states = off(0.003, 0.004, 2 * np.pi - 0.01)
+    states[15, :2] = (0.03, 0.04)
+    position, psi = off_target_of(task(**ALONG), [run(states)])
+    assert (position.what, position.unit) == ("position", "m")
+    assert position.most == pytest.approx(0.05) and position.at_s == pytest.approx(1.5)
+    assert position.rms == pytest.approx(math.sqrt((20 * 0.005**2 + 0.05**2) / 21))
+    assert math.isnan(position.end)
+    assert (psi.what, psi.most) == ("psi", pytest.approx(0.01))
+    assert holds(position.summary(), "position", "1.2 cm rms", "5.0 cm at most", "at 1.5 s")
+
+
+def test_repeats_count_together_and_the_worst_of_all_is_told():
+    runs = [run(off(0.01)), run(off(0.03))]
+    position, _ = off_target_of(task(**ALONG), runs)
+    assert position.rms == pytest.approx(math.sqrt((0.01**2 + 0.03**2) / 2))
+    assert position.most == pytest.approx(0.03)
+
+
+def test_what_only_the_end_weighs_is_told_there():
+    states = off(0.5)
+    states[-1, 0] = 0.002
+    (position,) = off_target_of(task(terminal=np.array([1.0, 1.0, 0.0, 0.0])), [run(states)])
+    assert math.isnan(position.rms) and position.end == pytest.approx(0.002)
+    assert holds(position.summary(), "0.20 cm at the end")
+    both = off_target_of(task(terminal=np.array([1.0, 1.0, 0.1, 0.0]), **ALONG), [run(states)])[0]
+    assert both.rms > 0.4 and both.end == pytest.approx(0.002)
+
+
+def test_a_run_that_ended_early_has_no_end_and_a_lost_one_no_line():
+    states = off(0.5, steps=10)
+    (position,) = off_target_of(task(terminal=np.array([1.0, 1.0, 0.0, 0.0])), [run(states)])
+    assert position.rms == pytest.approx(0.5) and math.isnan(position.end)
+    assert off_target_of(task(**ALONG), [run(np.full((11, 4), np.nan))]) == ()
+    free = replace(task(), target=np.full((H + 1, 4), np.nan))
+    assert off_target_of(free, [run(off(0.5))]) == () == off_target_of(task(**ALONG), [])
+
+
+def test_status_and_ingest_say_the_number_of_the_page(cart, tmp_path):
+    """Five commands gave `utility -0.155`, and no metre."""
+    folder = copied(cart, tmp_path / "cart")
+    w = Workspace(folder)
+    (told, *_) = w.status().off_target
+    shown = next(one for one in improvements_in(gather(Folder(folder))) if told.what in one.what)
+    assert told.rms == pytest.approx(shown.after)
+    out = grounded("-C", folder, "status").out
+    assert f"off target {told.summary()}" in " ".join(out.split())
+    document = w.status().to_json()["best"]["off_target"][0]
+    assert (document["what"], document["rms"]) == (told.what, pytest.approx(told.rms))
+    best = w.trials()[-1]
+    again = w.ingest(best.stored.path)
+    assert again.off_target == off_target_of(w.task, [best.trial])
+    assert again.to_json()["off_target"][0]["unit"] == told.unit
+    out = grounded("-C", folder, "ingest", best.stored.path).out
+    assert again.off_target[0].summary() in " ".join(out.split())

@@ -1,0 +1,100 @@
+"""The control interval of a log: how often its commands change, or else how often they are logged.
+
+A table has a row every 10 ms though the loop that is recorded in it sends a command every 50 ms.
+So the times between changes are asked first: nearly all must be multiples of one interval, and many
+be that interval itself; a test signal that steps once a second says nothing of the loop.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from grounded.errors import GroundedError
+from grounded.frozen import Array
+from grounded_trials.logs.inspect_guess import Guess
+from grounded_trials.logs.inspect_log import LogReport
+from grounded_trials.logs.signals import Series, SignalSpec, read_signals
+
+STEPS = (0.001, 0.002, 0.0025, 0.004, 0.005, 0.008, 0.01, 0.02, 0.025, 0.04, 0.05, 0.1, 0.2, 0.5)
+GUESSED = 0.05  # [s]
+LONGEST = 0.1  # [s]; what changes more rarely may be a test signal's steps
+ENOUGH = 20  # times between changes
+NEARLY_ALL = 0.95  # of them are multiples of the interval
+ONCE = 0.25  # of them are the interval itself
+APART = 1.5  # rows, from which an interval is another one than theirs
+EXACT, LOOSE = 0.1, 0.25  # of an interval: how far a multiple may be off it
+
+
+def interval_of(
+    report: LogReport, inputs: Sequence[Guess], states: Sequence[Guess]
+) -> tuple[float, str, str]:
+    """(the control interval [s], whose it is, a note where it is not that of the rows).
+
+    Args:
+        report: the log.
+        inputs: where its commands are.
+        states: where its states are.
+    """
+    for guesses, whose in ((inputs, "log's commands"), (states, "log's states")):
+        rates = [
+            t.rate_hz for g in guesses if (t := _topic(report, g)) is not None and t.rate_hz > 0
+        ]
+        if not rates:
+            continue
+        rows = 1 / min(rates)
+        held = _held(report, inputs, rows) if guesses is inputs else None
+        if held is not None:
+            note = (
+                f"the log has its commands every {rows:.3g} s, but they change every {held:g} s: "
+                "that is dt; --dt says otherwise"
+            )
+            return held, ": that in which the log's commands change", note
+        step = min(STEPS, key=lambda step: abs(np.log(step / rows)))
+        return step, f": that of the {whose}", ""
+    return GUESSED, ": a guess, no input or state was found", ""
+
+
+def _held(report: LogReport, inputs: Sequence[Guess], rows: float) -> float | None:
+    """The interval in which commands change that are logged more often; None: not to be told."""
+    specs = {g.name: SignalSpec(g.path, clock=g.clock) for g in inputs if g.path}  # type: ignore[arg-type]
+    try:
+        found = read_signals(report.files, specs)
+    except GroundedError:  # what is wrong with it is said where the run is sampled
+        return None
+    gaps = np.concatenate([_between_changes(one) for one in found.values()])
+    return changes_every(gaps, rows)
+
+
+def _between_changes(series: Series) -> Array:
+    """The times between changes of a command [s]."""
+    order = np.argsort(series.t, kind="stable")
+    t, values = series.t[order], series.values[order]
+    return np.asarray(np.diff(t[1:][np.diff(values) != 0]) * 1e-9)
+
+
+def changes_every(gaps: Array, rows: float) -> float | None:
+    """The interval of which nearly all times between changes are multiples; None for none.
+
+    Args:
+        gaps: those times [s].
+        rows: the time between samples [s], by which each may be off.
+    """
+    if len(gaps) < ENOUGH:
+        return None
+    for step in reversed(STEPS):
+        if not APART * rows < step <= LONGEST:
+            continue
+        near = step * min(max(EXACT, 1.05 * rows / step), LOOSE)
+        whole = np.maximum(np.rint(gaps / step), 1)
+        on = np.abs(gaps - whole * step) <= near
+        if on.mean() >= NEARLY_ALL and (on & (whole == 1)).mean() >= ONCE:
+            return step
+    return None
+
+
+def _topic(report: LogReport, guess: Guess) -> Any:
+    known = {t.topic: t for t in report.topics if guess.path.strip('"').startswith(t.topic)}
+    return known[max(known, key=len)] if known and guess.path else None

@@ -1,0 +1,51 @@
+"""What `ingest` answers of one log: its trial, what became of the candidate, what to know."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from grounded.errors import NextCommand
+from grounded.result import Result
+from grounded_trials.logs.samples import SignalReport
+from grounded_trials.workspace.next_step import PROPOSE
+from grounded_trials.workspace.off_target import OffTarget
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Ingested(Result):
+    """One log that was taken in."""
+
+    trial: str  # its short name, t0007
+    sha256: str
+    known: bool  # it had been stored before
+    candidate: str  # "" for data
+    utility: float | None  # None for data; -inf for a run that failed
+    accepted: bool | None  # None: data, or not decided yet
+    warnings: tuple[str, ...]
+    signals: tuple[SignalReport, ...]  # for a foreign log
+    verdict: str = ""  # a word of `wording.verdict`, run again, probe; "" for data
+    notes: tuple[str, ...] = ()  # where in a longer log the run was found
+    off_target: tuple[OffTarget, ...] = ()  # how far the run is off it, in units
+    then: NextCommand = PROPOSE
+
+    def summary(self) -> str:
+        """The trial, what it ran and what became of that."""
+        return f"{self.trial}: {f'{self.candidate}, {self.verdict}' if self.candidate else 'data'}"
+
+    def to_json(self) -> dict[str, Any]:
+        """Its entry in `ingest --json`; a failed run's utility is null and `failed` true."""
+        return {
+            "trial": self.trial,
+            "sha256": self.sha256,
+            "known": self.known,
+            "candidate": self.candidate or None,
+            "utility": self.utility,
+            "failed": self.utility == float("-inf"),
+            "accepted": self.accepted,
+            "verdict": self.verdict or None,
+            "off_target": [one.to_json() for one in self.off_target],
+            "warnings": list(self.warnings),
+            "notes": list(self.notes),
+            "signals": [vars(signal) for signal in self.signals],
+        }

@@ -1,0 +1,128 @@
+"""How far runs are off their target, in the unit of the state: what a utility does not say.
+
+The states of a position count as one distance. What [reward] weighs along the way is told as its
+rms and its largest error, what it weighs at the end as the error there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from grounded.frozen import Array
+from grounded.model import Model
+from grounded.result import Document
+from grounded.task import Task
+from grounded.trial import Trial
+
+FEW = 2  # groups of states that are told: those that cost most
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class OffTarget(Document):
+    """The error of one state, or of the position as one distance, over all runs of a candidate.
+
+    Args:
+        what: the state, or "position".
+        unit: of the errors.
+        rms: over the whole run; NaN where only its end is weighed.
+        most: the largest.
+        at_s: when that was, in seconds of the run.
+        end: rms at the last state; NaN where that has no weight of its own, or a run ended early.
+    """
+
+    what: str
+    unit: str
+    rms: float = float("nan")
+    most: float = float("nan")
+    at_s: float = float("nan")
+    end: float = float("nan")
+
+    def summary(self) -> str:
+        """`position 2.1 mm rms, 7.3 mm at most (at 7.95 s)`."""
+        from grounded.diagnosis.error_report import measured
+
+        told = []
+        if np.isfinite(self.rms):
+            most = f"{measured(self.most, self.unit)} at most (at {self.at_s:.4g} s)"
+            told += [f"{measured(self.rms, self.unit)} rms", most]
+        if np.isfinite(self.end):
+            told.append(f"{measured(self.end, self.unit)} at the end")
+        return f"{self.what} {', '.join(told)}"
+
+
+def off_target_of(task: Task, trials: Sequence[Trial]) -> tuple[OffTarget, ...]:
+    """How far the runs of one candidate are off the target, the position first; () without one.
+
+    Args:
+        task: whose target and weights hold.
+        trials: of its model; one may end early, or be lost before its first state.
+    """
+    whole = [trial.whole(task.horizon) for trial in trials]
+    errors = [tracking_error(task, trial.until(max(trial.finite_steps, 0))) for trial in whole]
+    ended = any(len(e) <= task.horizon for e in errors)
+    found = []
+    for names, what in weighed_groups(task):
+        states = [task.model.state_names.index(name) for name in names]
+        each = [e[:, states] for e in errors]
+        if not all(np.isfinite(e).all() for e in each) or not each:
+            continue
+        running, terminal = task.reward.state[states], task.reward.terminal[states]
+        cost = sum(float((e**2 @ running).sum() + e[-1] ** 2 @ terminal) for e in each)
+        values: dict[str, float] = {}
+        if running.any() or ended:
+            far = [np.linalg.norm(e, axis=1) for e in each]
+            worst = max(far, key=lambda d: float(d.max()))
+            values["rms"] = float(np.sqrt(np.mean(np.concatenate(far) ** 2)))
+            values |= {"most": float(worst.max()), "at_s": task.dt * int(np.argmax(worst))}
+        if terminal.any() and not ended:
+            values["end"] = float(np.sqrt(np.mean([e[-1] @ e[-1] for e in each])))
+        found.append(
+            (cost, OffTarget(what.removeprefix("the "), task.model.states[names[0]], **values))
+        )
+    least = sorted((cost for cost, _ in found), reverse=True)[:FEW][-1:]
+    return tuple(one for cost, one in found if cost >= least[0])[:FEW]
+
+
+def weighed_groups(task: Task) -> list[tuple[list[str], str]]:
+    """The states that the reward weighs and that have a target, with what their error is called.
+
+    The position comes first, as one distance.
+    """
+    names, known, reward = task.model.state_names, set(tracked(task)), task.reward
+    weighed = [i for i in sorted(known) if reward.state[i] or reward.terminal[i]]
+    position = [i for i in position_axes(task.model) if i in known]
+    if len(position) < 2:
+        position = []
+    found = [([names[i] for i in position], "the position")] if position else []
+    return found + [([names[i]], names[i]) for i in weighed if i not in position]
+
+
+def position_axes(model: Model) -> list[int]:
+    """The two or three states that are a position in space, by index; [] for a model without."""
+    roles = roles_of(model)
+    axes = roles.get("position", [])[:3]
+    if len(axes) < 2:
+        return []
+    return axes + roles.get("altitude", [])[: 3 - len(axes)]
+
+
+def roles_of(model: Model) -> dict[str, list[int]]:
+    """The states that play each role, by index."""
+    index = {name: i for i, name in enumerate(model.state_names)}
+    return {
+        role: [index[n] for n in ((names,) if isinstance(names, str) else names) if n in index]
+        for role, names in model.roles.items()
+    }
+
+
+def tracked(task: Task) -> list[int]:
+    """States with a target."""
+    return [i for i in range(task.model.n) if np.isfinite(task.target[:, i]).all()]
+
+
+def tracking_error(task: Task, trial: Trial) -> Array:
+    """s_t - target_t, (T + 1, n), angles wrapped; NaN where there is no target."""
+    return task.model.difference(trial.states, task.target[: trial.steps + 1])
