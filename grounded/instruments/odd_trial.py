@@ -125,6 +125,7 @@ def _one_state(trials: Sequence[Trial], ratios: Sequence[Ratios], k: int) -> lis
 
 
 def spread(trial: Trial, some: Sequence[int]) -> Array:
+    """Standard deviations of some states (len(some),), in their units."""
     return np.asarray(np.nanstd(trial.states[:, some], axis=0) + 1e-300)
 
 
@@ -306,4 +307,5 @@ def _unturned(q: Array) -> Array:
 
 
 def size_of(x: Array) -> float:
+    """Root mean square of what is known of x, of any shape; 0 where it is empty."""
     return float(np.sqrt(np.nanmean(x**2))) if x.size else 0.0

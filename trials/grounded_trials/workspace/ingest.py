@@ -118,6 +118,7 @@ def ingest_log(
     else:
         read = _foreign(workspace, path, candidate, data)
     read = _renamed(workspace, _recognised(workspace, path, read, candidate))
+    _refuse_another_reading(workspace, path, read)
     before = _repeated(workspace, path, read)
     added = workspace.store.add(read.data, again=before != "")
     if read.bare:  # what it ran is kept beside it
@@ -354,6 +355,20 @@ def _renamed(workspace: Folder, read: _Read) -> _Read:
         if same and all(np.array_equal(a, b, equal_nan=True) for a, b in pairs):
             return replace(read, data=workspace.store.read(one.stored))
     return read
+
+
+def _refuse_another_reading(workspace: Folder, path: Path, read: _Read) -> None:
+    """Raises where a log is stored with other numbers: as two trials it would pass for repeats."""
+    stored = read.log.stored if read.log else ()
+    if not stored or sha256(read.data)[:DIGITS] in workspace.store.digests():
+        return
+    names = tuple(one.stored.id for one in stored)
+    which = names[0] if len(names) == 1 else "them"
+    raise GroundedError(
+        f"{path}: the same recording is stored as {', '.join(names)}, read in another way (another "
+        f"[log], [estimate] or [task] dt): discard {which}, then ingest it again",
+        NextCommand("discard", names),
+    )
 
 
 def _cut(log: ForeignLog, candidate: str, start: float | None = None) -> _Read:
