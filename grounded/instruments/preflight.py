@@ -271,9 +271,18 @@ class _Bench:
             yield Finding(name, text, "scale", scale=size)
 
 
-def _mended(name: str, text: str, kind: str, log: str, **values: float) -> Finding:
+def _mended(
+    name: str,
+    text: str,
+    kind: str,
+    log: str,
+    *,
+    delay_s: float = 0.0,
+    std_s: float = np.nan,
+    scale: float = 1.0,
+) -> Finding:
     """A finding that the trials were corrected for."""
-    return Finding(name, text, kind, corrected=True, log=log, **values)
+    return Finding(name, text, kind, delay_s, std_s, scale, corrected=True, log=log)
 
 
 def _in_degrees(name: str, unit: str) -> Finding:
