@@ -41,7 +41,7 @@ from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.report import Diagnosis, Estimate, Identifiable, NoiseLevels
-from grounded.diagnosis.unconfirmed import unconfirmed, unrepeatable
+from grounded.diagnosis.unconfirmed import another_look, unconfirmed, unrepeatable
 from grounded.diagnosis.validation.agreement import by_trial, changed
 from grounded.diagnosis.validation.claims import Claims
 from grounded.diagnosis.validation.decide import Decision, decide
@@ -227,7 +227,11 @@ class _Writer:
         measured = self.measured
         remainder = measured.remainders()
         rows, credit = measured.prediction_error(), measured.credits()
-        off = remainder[0].channel if remainder else open_noise(rows)
+        off, region = open_noise(rows), None
+        if remainder:
+            off, region = remainder[0].channel, remainder[0].region
+        when = region.when if region else ""
+        look = another_look(self.task, self.trials, off, when) if off else ""
         named = [row.effect for row in ranking if row.claimed]
         seen = unconfirmed(self.claims, self.decision.doubtful, groups)
         values, agreement = by_trial(self.best, data, named) if named else ((), ())
@@ -259,7 +263,7 @@ class _Writer:
             leftover=remainder,
             unconfirmed=seen,
             correction=correction(predictor, self.best, self.left, where),
-            next_trial=next_trial(self.claims, off, groups, seen, same, self.unrepeatable()),
+            next_trial=next_trial(self.claims, look, groups, seen, same, self.unrepeatable()),
             unknowable=self.known.sentences,
             noise=self.noise(),
             parameters=self.claims.parameters(),

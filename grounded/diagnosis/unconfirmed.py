@@ -8,6 +8,7 @@ fault of the likelihood and is not told; nor is what ties with a cause, which is
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
@@ -84,6 +85,29 @@ def unrepeatable(task: Task, trials: Sequence[Trial]) -> dict[str, str]:
         if trial is not best and lost:
             found[trial.id] = LOST
     return found
+
+
+def another_look(task: Task | None, trials: Sequence[Trial], left: str, when: str = "") -> str:
+    """What to run for a leftover: a repeat where there is none yet, else something new.
+
+    A candidate with feedback sends other inputs each time: it is the candidate that is run again.
+
+    Args:
+        task: that candidates were run for; None for bare trials.
+        trials: that were diagnosed.
+        left: the channel that is off without a cause.
+        when: the region that holds most of that, "" where none does.
+    """
+    runs = Counter(trial.candidate or trial.inputs.tobytes() for trial in trials)
+    if max(runs.values(), default=0) > 1:
+        where = f"goes more often where {when}" if when else f"moves {left} in another way"
+        return f"Run a trial that {where}, for the leftover in {left}: repeats are there already."
+    why = f"to see whether the leftover in {left} repeats"
+    ran = [trial for trial in trials if trial.candidate] if task else []
+    best = max(ran, key=task.utility, default=None) if task else None
+    if task is None or best is None or math.isinf(task.utility(best)):
+        return f"Record one run three times, sending the same inputs each time, {why}."
+    return f"Run {best.candidate} twice more, {why}."
 
 
 def _far(task: Task, trial: Trial, best: Trial | None) -> bool:

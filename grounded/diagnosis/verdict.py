@@ -249,7 +249,7 @@ def _noise(row: RulerRow, name: str, error: float) -> str:
 
 def next_trial(
     claims: Claims,
-    left: str,
+    look: str,
     groups: tuple[tuple[str, ...], ...],
     seen: Sequence[Unconfirmed] = (),
     same: tuple[tuple[str, ...], ...] = (),
@@ -259,7 +259,7 @@ def next_trial(
 
     Args:
         claims: what is blamed.
-        left: the channel that is off without a cause, "" for none.
+        look: what to run for what is off without a cause, "" where nothing is.
         groups: what ties.
         seen: what only one trial shows.
         same: of the groups, what is one thing in the model.
@@ -283,11 +283,8 @@ def next_trial(
         there = "" if one.region is None else f" that goes where {one.region.when}"
         better = f"run a gentler one{there}" if why == LOST else f"record another one{there}"
         return f"Hardly a trial but {one.trial} shows {one.effect}, and that one {why}: {better}."
-    if not claims.names and left:
-        return (
-            f"Repeat the best trial twice with the same inputs to see whether the leftover in "
-            f"{left} repeats."
-        )
+    if not claims.names and look:
+        return look
     if not claims.names and not claims.blamed:
         return "Nothing is tied and nothing to adopt."
     return f"Nothing is tied: adopt {'them' if len(claims.names) > 1 else 'it'}."

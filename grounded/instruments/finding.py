@@ -22,6 +22,7 @@ class Finding(Document):
         share: of the samples that are concerned, 0 to 1.
         corrected: the physics was judged on corrected trials.
         log: key and value for the signal's [log] table that correct it in the logs too.
+        advice: what to change instead where no [log] reads the trials.
     """
 
     signal: str
@@ -33,3 +34,4 @@ class Finding(Document):
     share: float = field(default=float("nan"), metadata={"brief": True})
     corrected: bool = False
     log: str = field(default="", metadata={"brief": True})
+    advice: str = field(default="", metadata={"brief": True})

@@ -80,8 +80,8 @@ def odd_states(
         return
     single = [_one_state(trials, ratios, k) for k in range(len(trials))]
     size = [np.sqrt(np.nanmean(t.states[:, angular] ** 2, axis=0)) for t in trials]
-    pushed = [_size(t.inputs) for t in trials]
-    missed = [_missed(model, trial, angular, shown) for trial in trials]
+    pushed = [size_of(t.inputs) for t in trials]
+    error = [missed(model, trial, angular, shown) for trial in trials]
     for k, trial in enumerate(trials):
         if single[k] and not all(single):
             yield from single[k]
@@ -93,9 +93,9 @@ def odd_states(
         if not rest:
             continue
         odd = Odd(k, DEGREES, tuple(angular))
-        usual = max(missed[j] for j in rest)
-        mended = _missed(model, odd.mended(trial), angular, shown)
-        if missed[k] > LARGE * max(usual, mended) and mended < SIMILAR * usual:
+        usual = max(error[j] for j in rest)
+        mended = missed(model, odd.mended(trial), angular, shown)
+        if error[k] > LARGE * max(usual, mended) and mended < SIMILAR * usual:
             yield odd
 
 
@@ -115,16 +115,17 @@ def _one_state(trials: Sequence[Trial], ratios: Sequence[Ratios], k: int) -> lis
         choice.sort(key=lambda odd: -odd.factor)  # degrees, where no other trial tells
         if sound:
             pair = [relation.i, relation.j]
-            usual = np.median([_spread(t, pair) for t in sound], axis=0)
+            usual = np.median([spread(t, pair) for t in sound], axis=0)
             strange = [
-                np.abs(np.log(_spread(odd.mended(trials[k]), pair) / usual)).sum() for odd in choice
+                np.abs(np.log(spread(odd.mended(trials[k]), pair) / usual)).sum() for odd in choice
             ]
             choice = [choice[int(np.argmin(strange))]]
         found.append(choice[0])
     return found
 
 
-def _spread(trial: Trial, some: Sequence[int]) -> Array:
+def spread(trial: Trial, some: Sequence[int]) -> Array:
+    """Standard deviations of some states (len(some),), in their units."""
     return np.asarray(np.nanstd(trial.states[:, some], axis=0) + 1e-300)
 
 
@@ -142,19 +143,19 @@ def all_in_degrees(model: Model, trials: Sequence[Trial], shown: Sequence[int]) 
     moving = tuple(i for i in shown if units[i] in ("rad", "rad/s"))
     some = trials[:: max(1, len(trials) // MANY)]
 
-    def missed(odd: Odd) -> float:
+    def left(odd: Odd) -> float:
         turned = [odd.mended(trial) for trial in some]
-        unit = np.median([_spread(t, shown) for t in turned], axis=0)
-        return float(np.median([_missed(model, t, shown, shown, unit) for t in turned]))
+        unit = np.median([spread(t, shown) for t in turned], axis=0)
+        return float(np.median([missed(model, t, shown, shown, unit) for t in turned]))
 
     groups = dict.fromkeys([*((i,) for i in angles), angles, moving, ()])
     choices = [Odd(0, DEGREES, g, u) for g in groups for u in ((), sent) if g or u]
-    errors = [missed(odd) for odd in choices]
+    errors = [left(odd) for odd in choices]
     if not np.isfinite(errors).any():
         return []
     best = choices[int(np.nanargmin(errors))]
-    near = [missed(replace(best, factor=f * DEGREES)) for f in (1 / LIKE, LIKE)]
-    told = np.nanmin(errors) < min(missed(replace(best, factor=1.0)) / 2, *near)
+    near = [left(replace(best, factor=f * DEGREES)) for f in (1 / LIKE, LIKE)]
+    told = np.nanmin(errors) < min(left(replace(best, factor=1.0)) / 2, *near)
     return [replace(best, trial=k) for k in range(len(trials))] if told else []
 
 
@@ -171,11 +172,11 @@ def odd_commands(model: Model, trials: Sequence[Trial], shown: Sequence[int]) ->
     """
     if len(trials) < 2 or not shown:
         return
-    unit = np.mean([_spread(t, shown) for t in trials], axis=0)
+    unit = np.mean([spread(t, shown) for t in trials], axis=0)
     size = np.array([np.sqrt(np.nanmean(t.inputs**2, axis=0)) for t in trials])
 
-    def missed(trial: Trial) -> float:
-        return _missed(model, trial, shown, shown, unit)
+    def left(trial: Trial) -> float:
+        return missed(model, trial, shown, shown, unit)
 
     for j, measure in enumerate(model.inputs.values()):
         factors = (STAMPS, 1 / STAMPS, *((DEGREES, 1 / DEGREES) if measure == "rad" else ()))
@@ -186,15 +187,15 @@ def odd_commands(model: Model, trials: Sequence[Trial], shown: Sequence[int]) ->
             if not 1 / LIKE < like < LIKE:
                 continue
             odd = Odd(k, factor, inputs=(j,))
-            mended = missed(odd.mended(trials[k]))
+            mended = left(odd.mended(trials[k]))
             wrong = [replace(odd, factor=f) for f in (factor / SIMILAR, factor * SIMILAR)]
-            others = [missed(one.mended(trials[k])) for one in wrong]
-            sound = mended < SIMILAR * float(np.median([missed(t) for t in rest]))
-            if sound and mended < BETTER * min(missed(trials[k]), *others):
+            others = [left(one.mended(trials[k])) for one in wrong]
+            sound = mended < SIMILAR * float(np.median([left(t) for t in rest]))
+            if sound and mended < BETTER * min(left(trials[k]), *others):
                 yield odd
 
 
-def _missed(
+def missed(
     model: Model, trial: Trial, some: Sequence[int], shown: Sequence[int], unit: Array | float = 1.0
 ) -> float:
     """Rms error of predictions a quarter of a second ahead, of the states `some` together."""
@@ -210,11 +211,14 @@ def _missed(
     for j in range(steps):
         x = model.system.step(x, trial.inputs[at + j], model.values, trial.dt)
         x = np.fmax(np.fmin(x, FAR), -FAR)
-    return _size(model.difference(x, logged[at + steps])[:, some] / unit)
+    return size_of(model.difference(x, logged[at + steps])[:, some] / unit)
 
 
 def judge_stamps(model: Model, trials: Sequence[Trial], ratios: Sequence[Ratios]) -> None:
     """Stops at a trial whose stamps are in milliseconds, or were taken for such.
+
+    Where all positions are lengths they may be in mm as well: the stamps it is then only where they
+    and their velocities are as large as in sound trials.
 
     Args:
         model: however crude.
@@ -225,17 +229,44 @@ def judge_stamps(model: Model, trials: Sequence[Trial], ratios: Sequence[Ratios]
         GroundedError: with the trial, a state and the factor.
     """
     for k, (trial, every) in enumerate(zip(trials, ratios, strict=True)):
-        found = [one for one in every if one[0].exact]
-        for factor in (STAMPS, 1 / STAMPS):
-            if found and all(abs(one / factor - 1) < NEAR for _, one in found):
-                q, w = (model.state_names[i] for i in (found[0][0].i, found[0][0].j))
-                name = trial.id or f"number {k + 1}"
-                raise GroundedError(
-                    f"trial {name}: {q} moves {found[0][1]:.3g} times as fast as {w} says, so the "
-                    "stamps of its log are in another unit (milliseconds, not seconds): correct "
-                    "them and take it in again, without this one",
-                    then=NextCommand("discard", (trial.id,)) if trial.id else None,
-                )
+        if (found := slow_or_fast(model, every)) is None:
+            continue
+        relation, ratio = found
+        if model.states[model.state_names[relation.i]] == "m":
+            some = sorted({i for r, _ in every for i in (r.i, r.j)})
+            sound = [t for t, one in zip(trials, ratios, strict=True) if _sound(one)]
+            if not sound:
+                continue
+            apart = spread(trial, some) / np.median([spread(t, some) for t in sound], axis=0)
+            if max(apart.max(), 1 / apart.min()) > np.sqrt(STAMPS):
+                continue
+        q, w = (model.state_names[i] for i in (relation.i, relation.j))
+        name = trial.id or f"number {k + 1}"
+        raise GroundedError(
+            f"trial {name}: {q} moves {ratio:.3g} times as fast as {w} says, so the "
+            "stamps of its log are in another unit (milliseconds, not seconds): correct "
+            "them and take it in again, without this one",
+            then=NextCommand("discard", (trial.id,)) if trial.id else None,
+        )
+
+
+def slow_or_fast(model: Model, every: Ratios) -> tuple[Integral, float] | None:
+    """A position that moves a thousand times as fast as it should, or as slowly, as all do.
+
+    One whose unit is not m is taken if there is one.
+    """
+    found = [one for one in every if one[0].exact]
+    for factor in (STAMPS, 1 / STAMPS):
+        if found and all(abs(ratio / factor - 1) < NEAR for _, ratio in found):
+            units = list(model.states.values())
+            return min(found, key=lambda one: units[one[0].i] == "m")
+    return None
+
+
+def _sound(every: Ratios) -> bool:
+    """Whether positions move as their velocities say."""
+    found = [ratio for relation, ratio in every if relation.exact]
+    return bool(found) and all(1 / SIMILAR < ratio < SIMILAR for ratio in found)
 
 
 def ratios_of(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> list[Ratios]:
@@ -256,9 +287,9 @@ def _ratios(relations: Sequence[Integral], trial: Trial) -> Ratios:
         while usable := [pair for pair in some if len(pair[0]) > LEAST * steps]:
             parts = [[z[steps:] - z[:-steps] for z in pair] for pair in usable]
             moved, said = (np.concatenate(z) for z in zip(*parts, strict=True))
-            same = abs(moved @ said) / max(_size(moved) * _size(said) * len(said), 1e-300)
+            same = abs(moved @ said) / max(size_of(moved) * size_of(said) * len(said), 1e-300)
             if same > best:
-                best, ratio = same, _size(moved) / (_size(said) * trial.dt)
+                best, ratio = same, size_of(moved) / (size_of(said) * trial.dt)
             steps *= 2
         if some:
             found.append((relation, ratio))
@@ -275,5 +306,6 @@ def _unturned(q: Array) -> Array:
     return np.concatenate([[q[0]], q[0] + np.cumsum(steps)])
 
 
-def _size(x: Array) -> float:
+def size_of(x: Array) -> float:
+    """Root mean square of what is known of x, of any shape; 0 where it is empty."""
     return float(np.sqrt(np.nanmean(x**2))) if x.size else 0.0

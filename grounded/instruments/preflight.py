@@ -1,6 +1,7 @@
 """START HERE: the instruments, from their own signals alone, before any physics is judged.
 
 odd_trial     a whole trial in other units than the rest
+other_units   a position in mm beside a velocity in m/s
 swapped       two columns of a trial in each other's place
 single        each state by itself
 kinematics    velocities against the rates of their positions, courses against headings
@@ -41,6 +42,7 @@ from grounded.instruments.odd_trial import (
     odd_states,
     ratios_of,
 )
+from grounded.instruments.other_units import judge_units
 from grounded.instruments.single import Signal, judge_signal
 from grounded.instruments.swapped import judge_columns
 from grounded.model import Model
@@ -102,6 +104,7 @@ def preflight(
     with np.errstate(all="ignore"):
         ratios = ratios_of(model, bench.trials, bench.shown)
         judge_stamps(model, bench.trials, ratios)
+        judge_units(model, bench.trials, ratios, bench.shown)
         judge_columns(model, bench.trials, bench.shown)
         found = [
             *bench.odd(ratios),
@@ -268,9 +271,18 @@ class _Bench:
             yield Finding(name, text, "scale", scale=size)
 
 
-def _mended(name: str, text: str, kind: str, log: str, **values: float) -> Finding:
+def _mended(
+    name: str,
+    text: str,
+    kind: str,
+    log: str,
+    *,
+    delay_s: float = 0.0,
+    std_s: float = np.nan,
+    scale: float = 1.0,
+) -> Finding:
     """A finding that the trials were corrected for."""
-    return Finding(name, text, kind, corrected=True, log=log, **values)
+    return Finding(name, text, kind, delay_s, std_s, scale, corrected=True, log=log)
 
 
 def _in_degrees(name: str, unit: str) -> Finding:

@@ -10,7 +10,7 @@ from facts import holds
 from grounded import Trial
 from grounded.diagnosis.error_report import Credit, Region, Remainder, RulerRow
 from grounded.diagnosis.report import Estimate, Ranked, Unconfirmed
-from grounded.diagnosis.unconfirmed import unrepeatable
+from grounded.diagnosis.unconfirmed import another_look, unrepeatable
 from grounded.diagnosis.verdict import (
     LOG,
     LOST,
@@ -146,3 +146,25 @@ def test_a_noise_of_which_only_a_bound_is_known_is_told_as_one():
     assert "at least 9 times" in said(0.9, 0.1)[0].sentence
     left = Remainder("x", error=0.9, floor=0.1, horizon_s=1.0, error_unit="m", floor_at_most=True)
     assert "at most 10 cm" in left.sentence()
+
+
+def test_repeats_are_asked_for_where_there_are_none_as_they_can_be_made():
+    """The same inputs can't be sent by a candidate with feedback, and a best of two runs has a
+    repeat."""
+    task = cart_task()
+    names = task.model.state_names, task.model.input_names
+    H, n, m = task.horizon, task.model.n, task.model.m
+
+    def ran(k, candidate):
+        x, u = np.full((H + 1, n), 0.1 * k), np.full((H, m), 0.01 * k)
+        return Trial(x, u, task.dt, *names, id=f"t{k}", candidate=candidate)
+
+    single = [ran(1, "c0001"), ran(2, "c0002")]
+    best = max(single, key=task.utility).candidate
+    assert holds(another_look(task, single, "x"), f"Run {best} twice more", "leftover in x")
+    twice = another_look(task, [*single, ran(3, "c0002")], "x", "|v| > 1")
+    assert "twice" not in twice and holds(twice, "x", "|v| > 1")
+    by_hand = another_look(task, [ran(1, ""), ran(2, "")], "x")
+    assert "same inputs" in by_hand and "best" not in by_hand
+    assert "same inputs" not in another_look(task, [ran(1, ""), ran(1, "")], "x")
+    assert next_trial(_claims(), by_hand, ()) == by_hand

@@ -5,7 +5,7 @@ import pytest
 
 from cli import grounded
 from facts import holds
-from grounded_trials.logs.stated_units import factor_between
+from grounded_trials.logs.stated_units import factor_between, unit_in_name, without_unit
 
 MODEL = """from grounded import Model, Param
 model = Model(states={"x": "m", "v": "m/s", "theta": "rad"}, inputs={"volt": "V"},
@@ -60,3 +60,94 @@ def test_units_in_a_table_s_first_row_become_scales(tmp_path):
     assert high["v"] == pytest.approx(1.0, rel=0.01)
     assert high["theta"] == pytest.approx(0.3, rel=0.01)
     assert high["volt"] == pytest.approx(np.sqrt(2), rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("path", "unit", "bare"),
+    [
+        ("/csv.r_mm", "mm", "/csv.r"),
+        ("/csv.thd_deg_s", "deg/s", "/csv.thd"),
+        ("/csv.v_m_s", "m/s", "/csv.v"),
+        ("/imu.yaw_deg", "deg", "/imu.yaw"),
+        ("/arm.q_deg[2]", "deg", "/arm.q"),
+        ("/speed_mps.data", "m/s", "/speed"),
+        ("/csv.vel_N", "N", "/csv.vel_N"),
+        ("/csv._mm", "", "/csv._mm"),
+        ("/csv.summ", "", "/csv.summ"),
+        ("/imu.orientation.@rpy.yaw", "", "/imu.orientation.@rpy.yaw"),
+    ],
+)
+def test_the_end_of_a_name_says_a_unit(path, unit, bare):
+    assert unit_in_name(path) == unit
+    assert without_unit(path) == bare
+
+
+BEAM = """from grounded import Model, Param
+model = Model(states={"r": "m", "rd": "m/s", "th": "rad", "thd": "rad/s"}, inputs={"volt": "V"},
+    params={"k": Param(1.0, "1/s", 0.5, 2.0)},
+    derivative=lambda s, a, p: {"r": s.rd, "rd": -7 * s.th, "th": s.thd, "thd": a.volt - s.thd})
+"""
+MM, DEG = 1e-3, np.pi / 180
+
+
+def begun(tmp_path, head: str, factors: dict[str, float]) -> dict:
+    """The signals that `init` finds in a log of the beam, each divided by its factor."""
+    t = np.arange(0, 8, 0.02)
+    th, thd = 0.1 * np.sin(2 * t), 0.2 * np.cos(2 * t)
+    rd, r = 0.35 * (np.cos(2 * t) - 1), 0.35 * (np.sin(2 * t) / 2 - t)
+    signals = {"r": r, "rd": rd, "th": th, "thd": thd, "volt": thd - 0.4 * np.sin(2 * t)}
+    rows = np.column_stack([t, *(x / factors.get(name, 1) for name, x in signals.items())])
+    np.savetxt(tmp_path / "log.csv", rows, "%.6f", ",", header=head, comments="")
+    (tmp_path / "m.py").write_text(BEAM)
+    made = grounded(
+        "init",
+        tmp_path / "w",
+        "--from",
+        tmp_path / "log.csv",
+        "--model",
+        tmp_path / "m.py",
+        "--yes",
+        "--json",
+    )
+    assert made.code == 0, made.err
+    return {one["name"]: one for one in made.json["signals"]}
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        "t,r_mm,rd,th_deg,thd_deg,volt",
+        "t,r_mm,rd_m_s,th_deg,thd_deg_s,volt_V",
+        "t,r [mm],rd,th [deg],thd [deg/s],volt",
+        "t,r [mm],rd [m/s],th [deg],thd,volt",
+    ],
+)
+def test_names_and_heads_make_scales_and_a_rate_is_compared_after_them(tmp_path, head):
+    factors = {"r": MM, "th": DEG, "thd": DEG}
+    found = begun(tmp_path, head, factors)
+    assert {n: one["scale"] for n, one in found.items()} == {
+        n: pytest.approx(factors.get(n, 1.0)) for n in found
+    }
+    assert all(one["sure"] for one in found.values())
+    assert holds(" ".join(found["r"]["reasons"]), "says mm", "the model m")
+
+
+def test_a_rate_without_a_unit_that_is_as_large_as_its_position_says_is_asked_for(tmp_path):
+    """Two columns in mm, of which one says so, or a name that ends like a unit and is none."""
+    found = begun(tmp_path, "t,r_cm,rd,th,thd,volt", {"r": 0.01, "rd": 0.01})
+    assert found["r"]["scale"] == found["rd"]["scale"] == pytest.approx(0.01)
+    assert not found["rd"]["sure"]
+
+
+def test_a_name_in_degrees_that_the_position_contradicts_is_unsure(tmp_path):
+    found = begun(tmp_path, "t,r,rd,th,thd_deg,volt", {})
+    assert not found["thd"]["sure"] and found["thd"]["scale"] == 1
+    assert holds(" ".join(found["thd"]["reasons"]), "deg", "rad/s")
+
+
+def test_ingest_warns_of_a_name_whose_unit_no_scale_makes_up_for(tmp_path):
+    begun(tmp_path, "t,r_mm,rd,th,thd,volt", {"r": MM})
+    file = tmp_path / "w" / "grounded.toml"
+    file.write_text(file.read_text().replace("scale = 0.001\n", ""))
+    done = grounded("-C", tmp_path / "w", "ingest", "--data", tmp_path / "log.csv", "--json")
+    assert holds(done.json["trials"][0]["warnings"][0], "r", "mm", "scale = 0.001")

@@ -232,3 +232,47 @@ v = { path = "/csv.v" }
 [log.input]
 force = { path = "/csv.force" }
 """
+
+
+def table_in(w, tmp_path, length=4.0):
+    """A log of the cart as a table, in a workspace that maps it."""
+    t = np.arange(0, length, 0.05)
+    rows = np.column_stack([t, np.sin(t), np.cos(t), np.sin(3 * t)])
+    np.savetxt(tmp_path / "log.csv", rows, "%.6f", ",", header="t,x,v,force", comments="")
+    file = w.folder / "grounded.toml"
+    file.write_text(file.read_text() + LOG_OF_A_TABLE)
+    return tmp_path / "log.csv", file
+
+
+@pytest.mark.parametrize("mended", ["scale = 0.001", "delay_s = 0.0195"])
+def test_a_log_is_not_stored_again_through_another_table(w, tmp_path, mended):
+    """Two readings of one run passed for repeats, and their difference for a cause."""
+    log, file = table_in(w, tmp_path)
+    first = ingest_log(w, log, data=True).trial
+    whole = file.read_text()
+    file.write_text(whole.replace('/csv.v"', f'/csv.v", {mended}'))
+    other, copy = Folder(w.folder), tmp_path / "copy.csv"
+    copy.write_bytes(log.read_bytes())
+    for again in (log, copy):
+        with pytest.raises(GroundedError, match=holding(first, "discard", "again")) as refused:
+            ingest_log(other, again, data=True)
+    assert refused.value.then.arguments == (first,) and len(other.trials()) == 1
+    assert grounded("-C", w.folder, "discard", first).code == 0
+    second = ingest_log(Folder(w.folder), log, data=True)
+    assert second.trial != first and not second.known
+    assert ingest_log(Folder(w.folder), copy, data=True).known
+    file.write_text(whole)  # as the one that was set aside was read
+    with pytest.raises(GroundedError, match=second.trial):
+        ingest_log(Folder(w.folder), log, data=True)
+
+
+def test_another_part_of_a_recording_is_another_trial(w, tmp_path):
+    log, file = table_in(w, tmp_path, 12.0)
+    whole = file.read_text()
+    for start, end in ((0, 4), (5, 9)):
+        file.write_text(whole + f"[log.span]\nstart = {start}.0\nend = {end}.0\n")
+        ingest_log(Folder(w.folder), log, data=True)
+    assert len(Folder(w.folder).trials()) == 2
+    file.write_text(whole + "[log.span]\nstart = 6.0\nend = 12.0\n")
+    with pytest.raises(GroundedError, match=holding("t0002")):
+        ingest_log(Folder(w.folder), log, data=True)

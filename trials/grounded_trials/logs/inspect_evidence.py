@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import islice, product
 from pathlib import Path
 
@@ -27,13 +27,13 @@ from grounded.errors import GroundedError
 from grounded.instruments.kinematics import integrals
 from grounded.model import Model
 from grounded_trials.formats.messages import Floats
-from grounded_trials.formats.tables import column_units
+from grounded_trials.logs.following import DEGREE, SAME, follows, scale_of
 from grounded_trials.logs.inspect_guess import SIMULATED_S, Guess
 from grounded_trials.logs.inspect_log import LogReport
 from grounded_trials.logs.joint_names import JOINT_UNITS, in_order, joint_names, of_joint
 from grounded_trials.logs.samples import Samples, tidy
 from grounded_trials.logs.signals import Series, SignalSpec, read_signals
-from grounded_trials.logs.stated_units import factor_between
+from grounded_trials.logs.stated_units import Stated, factor_between
 
 UNITS = (  # what the end of a path measures, in ROS's conventions (REP 103)
     (r"(position|translation)\.[xyz]$", "m"),
@@ -42,10 +42,10 @@ UNITS = (  # what the end of a path measures, in ROS's conventions (REP 103)
     (r"linear_acceleration\.[xyz]$|accel\.linear\.[xyz]$", "m/s^2"),
     (r"linear\.[xyz]$|drive\.speed$", "m/s"),
 )
-SAME, DEGREE, SLOPE = 0.15, 180 / np.pi, 0.01
+SLOPE = 0.01
 FOLLOWS = 0.8  # correlation of a rate with the derivative of its position
 BETTER = 0.9  # of the rival's error: less decides
-COMBINATIONS, SPAN, LONGEST = 64, 5, 20_000  # tried at most; samples a slope is taken over; grid
+COMBINATIONS, LONGEST = 64, 20_000  # tried at most; samples of a grid
 FEW = 8  # numbers without a name that are tried as a position or a rate
 
 
@@ -73,7 +73,9 @@ def weigh(
     guesses = {name: _unit(guess, units[name]) for name, guess in guesses.items()}
     guesses |= _speed_asked(guesses, model, log)
     turning = [guesses[name] for name in model.state_names if units[name] in ("rad", "deg")]
-    signals = _Signals(log, guesses.values(), {p for g in turning for p in (g.path, *g.others)})
+    stated = Stated.by(log.files)
+    angles = {p for g in turning for p in (g.path, *g.others)}
+    signals = _Signals(log, guesses.values(), angles, stated)
     guesses |= _speed(guesses, model, signals)
     pairs = [(q, w) for q, w in velocities(model).items() if q in guesses and w in guesses]
     for pair in sorted(pairs, key=lambda qw: not any(guesses[name].path for name in qw)):
@@ -81,8 +83,7 @@ def weigh(
     guesses |= _steps(model, guesses, signals)
     guesses |= _taken_by_inputs(guesses, model)
     guesses = {name: _as_logged(guess, log) for name, guess in guesses.items()}
-    stated = column_units(Path(log.files[0])) if log.files else {}
-    guesses = {n: _stated(g, stated.get(g.path, ""), units[n]) for n, g in guesses.items()}
+    guesses = {name: as_stated(stated, units[name], guess) for name, guess in guesses.items()}
     return tuple(guesses[g.name] for g in states), tuple(guesses[g.name] for g in inputs)
 
 
@@ -95,15 +96,15 @@ def unit_of(path: str, joint: bool = True) -> str:
     return JOINT_UNITS[found[1]] if found and joint else ""
 
 
-def _stated(guess: Guess, said: str, wanted: str) -> Guess:
+def as_stated(stated: Stated, wanted: str, guess: Guess) -> Guess:
     """The guess with the factor between the unit that the log states and the model's."""
-    factor = factor_between(said, wanted) if said else None
-    if factor is None or abs(factor - 1) < 1e-9:
+    said, factor = stated.unit(guess.path), stated.factor(guess.path, wanted)
+    why = f"{stated.by_whom(guess.path)} says {said}, the model {wanted}"
+    if said and guess.scale == 1 and factor_between(f"{said}/s", wanted) is not None:
+        return replace(guess, sure=False, reasons=(*guess.reasons, why))  # deg, of a rate
+    if abs(factor - 1) < 1e-9:
         return guess
-    why = f"the log says {said}, the model {wanted}"
-    return replace(
-        guess, scale=float(np.copysign(factor, guess.scale)), reasons=(*guess.reasons, why)
-    )
+    return replace(guess, scale=guess.scale * factor, reasons=(*guess.reasons, why))
 
 
 def _taken_by_inputs(guesses: Mapping[str, Guess], model: Model) -> dict[str, Guess]:
@@ -152,7 +153,10 @@ def _unit(guess: Guess, unit: str) -> Guess:
 class _Signals:
     """The samples of everything that was guessed, read once, and put on one grid when asked."""
 
-    def __init__(self, log: LogReport, guesses: Iterable[Guess], angles: Collection[str]) -> None:
+    def __init__(
+        self, log: LogReport, guesses: Iterable[Guess], angles: Collection[str], stated: Stated
+    ) -> None:
+        self.stated = stated
         self._clocks = {t.topic: "header" if t.stamped else "log" for t in log.topics}
         if any(t.skew_s is not None and abs(t.skew_s) > SIMULATED_S for t in log.topics):
             self._clocks = dict.fromkeys(self._clocks, "log")
@@ -234,8 +238,13 @@ def _speed(guesses: Mapping[str, Guess], model: Model, signals: _Signals) -> dic
         gridded = signals.grid((*axes, path))
         if gridded is not None:
             step, (*places, speed) = gridded
-            steps = np.sqrt(sum(np.diff(p) ** 2 for p in places))
-            found = _follows(np.concatenate([[0.0], np.cumsum(steps)]), speed, step)
+            by = [
+                signals.stated.factor(p, model.states[n])
+                for n, p in zip(position, axes, strict=True)
+            ]
+            steps = np.sqrt(sum(np.diff(f * p) ** 2 for f, p in zip(by, places, strict=True)))
+            speed = speed * signals.stated.factor(path, model.states[name])
+            found = follows(np.concatenate([[0.0], np.cumsum(steps)]), speed, step)
             tried.append((found.correlation, found.slope, path))
     good = sorted((one for one in tried if one[0] > FOLLOWS), reverse=True)
     if not good:
@@ -254,24 +263,6 @@ def velocities(model: Model) -> dict[str, str]:
     return {names[r.i]: names[r.j] for r in own}
 
 
-@dataclass(frozen=True)
-class _Follows:
-    correlation: float
-    slope: float
-
-
-def _follows(q: Floats, w: Floats, step: float) -> _Follows:
-    """How w goes with the derivative of q, both averaged over a few samples."""
-    slope = (q[SPAN:] - q[:-SPAN]) / (SPAN * step)
-    mean = np.convolve(0.5 * (w[1:] + w[:-1]), np.ones(SPAN) / SPAN, "valid")
-    good = np.isfinite(slope) & np.isfinite(mean)
-    a, b = slope[good], mean[good]
-    if len(a) < 20 or a.std() < 1e-9 or b.std() < 1e-9:
-        return _Follows(0.0, 1.0)
-    a, b = a - a.mean(), b - b.mean()
-    return _Follows(float(a @ b / np.sqrt((a @ a) * (b @ b))), float(a @ b / (a @ a)))
-
-
 def _paired(
     guesses: Mapping[str, Guess],
     pair: tuple[str, str],
@@ -285,14 +276,14 @@ def _paired(
     own = {name: guesses[name] for name in pair}
     bare = [name for name, guess in own.items() if not guess.path and not guess.others]
     if not bare:
-        return _derivative(own[pair[0]], own[pair[1]], signals, units[pair[1]])
+        return _derivative(own[pair[0]], own[pair[1]], signals, units)
     if not 0 < len(free) <= FEW or not any(guess.path for guess in guesses.values()):
         return {}
     tried = {
         name: replace(own[name], others=tuple(free)) if name in bare else own[name] for name in pair
     }
     signals.read(free)
-    found = _derivative(tried[pair[0]], tried[pair[1]], signals, units[pair[1]])
+    found = _derivative(tried[pair[0]], tried[pair[1]], signals, units)
     if len(found) < 2:
         return {}
     known = len(bare) == 1 and all(own[name].sure for name in pair if name not in bare)
@@ -303,23 +294,31 @@ def _paired(
     return found
 
 
-def _derivative(q: Guess, w: Guess, signals: _Signals, unit: str) -> dict[str, Guess]:
-    """Both guesses, after trying which pair of candidates are a position and its rate."""
+def _derivative(
+    q: Guess, w: Guess, signals: _Signals, units: Mapping[str, str]
+) -> dict[str, Guess]:
+    """Both guesses, after trying which pair of candidates are a position and its rate.
+
+    Their scales are beside the units that the log states: those are multiplied in by `as_stated`.
+    """
+    stated = signals.stated
     tried = []
     pairs = product([p for p in (q.path, *q.others) if p], [p for p in (w.path, *w.others) if p])
     for rank, (a, b) in enumerate(islice(pairs, COMBINATIONS)):
         gridded = signals.grid((a, b)) if a != b else None
         if gridded is not None:
             step, (position, rate) = gridded
-            found = _follows(position, rate, step)
+            found = follows(position, rate, step)
             tried.append((abs(found.correlation) - 0.02 * rank, found, a, b))
     if not tried:
         return {}
     _, best, a, b = max(tried, key=lambda one: one[0])
+    by = stated.factor(a, units[q.name]), stated.factor(b, units[w.name])
+    logged, best = best, replace(best, slope=best.slope * by[1] / by[0])
     if abs(best.correlation) < FOLLOWS:
         why = f"it does not follow the derivative of {q.path} (correlation {best.correlation:.2f})"
         return {w.name: replace(w, sure=False, reasons=(*w.reasons, why))}
-    scale, what = _scale(best.slope)
+    scale, what = scale_of(best.slope)
     why = f"follows the derivative of {a}, correlation {best.correlation:.3f}{what}"
     fits = abs(best.slope * scale - 1) < SAME
     found_q, found_w = _moved(q, a), _moved(w, b)
@@ -328,21 +327,17 @@ def _derivative(q: Guess, w: Guess, signals: _Signals, unit: str) -> dict[str, G
             found_q = replace(found_q, scale=1 / DEGREE, sure=False)
             scale /= DEGREE
         found_w = replace(found_w, scale=scale, sure=found_w.sure or fits)
+    elif abs(abs(logged.slope) - 1) < SAME and bool(stated.unit(a)) != bool(stated.unit(b)):
+        why += ", as large as it is logged: both are taken to be in one unit"
+        if stated.unit(a):
+            found_w = replace(found_w, scale=scale * by[0], sure=False)
+        else:
+            found_q = replace(found_q, scale=by[1], sure=False)
+            found_w = replace(found_w, scale=scale, sure=False)
     else:
         why += f", but {best.slope:.3g} times as large"
         found_w = replace(found_w, sure=False)
     return {q.name: found_q, w.name: replace(found_w, reasons=(*found_w.reasons, why))}
-
-
-def _scale(slope: float) -> tuple[float, str]:
-    """What a rate must be multiplied by, and how to say it."""
-    sign, size = np.sign(slope), abs(slope)
-    opposite = " with the OPPOSITE SIGN" if sign < 0 else ""
-    if abs(size / DEGREE - 1) < SAME:
-        return float(sign / DEGREE), f"{opposite}, in DEGREES per second"
-    if abs(size * DEGREE - 1) < SAME:
-        return float(sign * DEGREE), f"{opposite}, whose values are in DEGREES"
-    return float(sign), opposite
 
 
 def _moved(guess: Guess, path: str) -> Guess:
@@ -359,13 +354,15 @@ def _steps(model: Model, guesses: Mapping[str, Guess], signals: _Signals) -> dic
     known = [*model.state_names, *model.input_names]
     if not unsure or not all(guesses[name].path for name in known):
         return {}
+    units = {**model.states, **model.inputs}
     choices = [(guesses[n].path, *guesses[n].others) for n in unsure]
     errors: dict[tuple[str, ...], float] = {}
     for chosen in islice(product(*choices), COMBINATIONS):
         paths = {n: guesses[n].path for n in known} | dict(zip(unsure, chosen, strict=True))
         gridded = signals.grid(list(paths.values()))
         if gridded is not None and len(set(paths.values())) == len(paths):
-            scales = [guesses[name].scale for name in known]
+            own = signals.stated
+            scales = [guesses[name].scale * own.factor(paths[name], units[name]) for name in known]
             errors[chosen] = _one_step(model, gridded[0], gridded[1], scales)
     ranked = sorted(errors, key=errors.__getitem__)
     if len(ranked) < 2 or not errors[ranked[0]] < BETTER * errors[ranked[1]]:

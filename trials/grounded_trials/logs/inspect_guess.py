@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from grounded_trials.logs.inspect_log import FieldReport, LogReport, TopicReport
+from grounded_trials.logs.stated_units import without_unit
 
 SURE = 1.5  # how much better than the next topic's best a guess must be
 LEAST = 2.0  # below this score nothing is proposed
@@ -124,7 +125,8 @@ def _candidates(log: LogReport, name: str, *, is_input: bool) -> list[_Candidate
 def _score(name: str, topic: TopicReport, field: FieldReport, *, is_input: bool) -> float:
     path = field.path.lower()
     inside = field.path[len(topic.topic) :].lower().strip('".')
-    best = _fit(name.lower(), inside, topic.topic.lower())
+    bare = without_unit(field.path)[len(topic.topic) :].lower().strip('".')
+    best = max(_fit(name.lower(), one, topic.topic.lower()) for one in {inside, bare})
     if best <= 0:
         return 0.0
     words = set(_WORD.findall(path))

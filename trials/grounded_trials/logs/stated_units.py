@@ -1,7 +1,8 @@
-"""Units that a log writes beside its numbers, `x [mm]`, against those of the model.
+"""Units that a log writes beside its numbers, `x [mm]` or `x_mm`, against those of the model.
 
-What a CSV's first row says is no guess: where it names a multiple of the model's unit, [log] gets
-the factor between the two. Units that are no multiples of each other say nothing.
+What a CSV's first row says in brackets is no guess, and the end of a name hardly one: where either
+names a multiple of the model's unit, [log] gets the factor between the two. Units that are no
+multiples of each other say nothing.
 """
 
 from __future__ import annotations
@@ -9,6 +10,11 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from grounded_trials.formats.tables import column_units
 
 _OF = {  # a multiple of another unit, itself a product
     "mm": ("m", 1e-3),
@@ -34,6 +40,65 @@ _OF = {  # a multiple of another unit, itself a product
     "Nm": ("N m", 1.0),
     "%": ("1", 0.01),
 }
+
+_ENDINGS = {  # of a name, and the unit that they write
+    **dict.fromkeys(("deg_s", "degs", "deg_per_s", "dps"), "deg/s"),
+    **dict.fromkeys(("rad_s", "rads", "rad_per_s"), "rad/s"),
+    **dict.fromkeys(("m_s", "mps", "m_per_s"), "m/s"),
+    **dict.fromkeys(("km_h", "kmh", "kph"), "km/h"),
+    **{"mm_s": "mm/s", "cm_s": "cm/s", "m_s2": "m/s^2", "deg_s2": "deg/s^2", "RPM": "rpm"},
+    **{unit: unit for unit in ("mm", "cm", "m", "km", "deg", "mrad", "rad", "rpm", "us", "ms")},
+    **{unit: unit for unit in ("mV", "mA", "Nm", "mNm", "mN", "kN")},
+    **{unit: unit for unit in ("s", "V", "A", "N")},
+}
+_SHORT = ("s", "V", "A", "N")  # may be part of a name as well: `vel_N`
+_NUMBER = re.compile(r"(?:\.(?:data|value))?(?:\[-?\d+\])*\"?$")  # what follows a number's name
+
+
+@dataclass(frozen=True)
+class Stated:
+    """The units that a log states by message path: in a table's first row, or by a name's end."""
+
+    heads: Mapping[str, str]
+
+    @classmethod
+    def by(cls, files: Sequence[str | Path]) -> Stated:
+        """What a log's files state; names do so in every log."""
+        return cls(column_units(Path(files[0])) if files else {})
+
+    def unit(self, path: str) -> str:
+        """The unit of a number, "" where none is stated."""
+        return self.heads.get(path) or unit_in_name(path)
+
+    def factor(self, path: str, wanted: str) -> float:
+        """What makes the model's unit of a number in the log's; 1 where nothing is stated."""
+        found = factor_between(said, wanted) if (said := self.unit(path)) else None
+        return 1.0 if found is None else found
+
+    def by_whom(self, path: str) -> str:
+        """What states it, for a sentence."""
+        return "the log" if path in self.heads else "its name"
+
+
+def unit_in_name(path: str) -> str:
+    """The unit that the last name of a message path ends with, `/csv.x_mm`; "" for none."""
+    return _ENDINGS.get(_parts(path)[1], "")
+
+
+def without_unit(path: str) -> str:
+    """A message path without the unit that its last name ends with, where that is surely one."""
+    bare, ending = _parts(path)
+    return bare if ending and ending not in _SHORT else path
+
+
+def _parts(path: str) -> tuple[str, str]:
+    """A path without the ending of its last name, and that ending."""
+    whole = _NUMBER.sub("", path)
+    name = re.split(r"[./]", whole)[-1]
+    for ending in sorted(_ENDINGS, key=len, reverse=True):
+        if name.endswith("_" + ending) and len(name) > len(ending) + 1:
+            return whole[: -len(ending) - 1], ending
+    return path, ""
 
 
 def factor_between(said: str, wanted: str) -> float | None:

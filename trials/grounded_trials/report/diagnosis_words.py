@@ -132,11 +132,12 @@ def _with_spread(estimate: Estimate) -> str:
 
 
 def instrument_lines(findings: Iterable[Finding]) -> list[str]:
-    """Each finding with its signal, whether it was corrected, and the key of [log] that does so."""
+    """Each finding with its signal, whether it was corrected, and what does so in the logs, too."""
     lines = []
     for one in findings:
         done = "; corrected here" * one.corrected
-        lines.append(f"{one.signal}: {one.finding}{done}{f', in [log]: {one.log}' * bool(one.log)}")
+        more = f", in [log]: {one.log}" if one.log else f"; {one.advice}" if one.advice else ""
+        lines.append(f"{one.signal}: {one.finding}{done}{more}")
     return lines
 
 

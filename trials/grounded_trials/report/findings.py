@@ -207,7 +207,7 @@ def improvements_in(findings: Findings) -> list[Improved]:
     each = [one for _, r in runs for one in findings.runs_of(r.candidate.id)]
     short = [one.label for one in each if one.trial.finite_steps < task.horizon]
     note = f"; {', '.join(short)} ended early" if short else ""
-    worse = "; worse than the first trial, which the rest makes up for"
+    worse = "; here the best trial is worse than the first, and better in other terms of the reward"
     for names, what in weighed_groups(task):
         states = [task.model.state_names.index(name) for name in names]
         errors = [[e[:, states] for e in off_target(findings, r)] for _, r in runs]

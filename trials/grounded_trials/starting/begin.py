@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +20,13 @@ from grounded.frozen import Array
 from grounded.model import Model
 from grounded.result import Result
 from grounded_trials.formats.tables import column_units
-from grounded_trials.logs.inspect_evidence import velocities, weigh
+from grounded_trials.logs.inspect_evidence import as_stated, velocities, weigh
 from grounded_trials.logs.inspect_guess import Guess, guess_mapping, is_simulated, mapping_toml
 from grounded_trials.logs.inspect_log import LogReport, inspect_log
 from grounded_trials.logs.joint_names import joint_names
 from grounded_trials.logs.log_files import kind_of, log_files
 from grounded_trials.logs.log_table import log_mapping, read_log
+from grounded_trials.logs.stated_units import Stated
 from grounded_trials.starting.examples import fresh_folder
 from grounded_trials.starting.interval import interval_of
 from grounded_trials.starting.kinds import KINDS, Joints, called_input, kind_in, moving, skeleton
@@ -173,7 +175,11 @@ def _begin(
     if ask is not None:
         taken = {g.path for g in (*states, *inputs)}
         free = tuple(one.path for one in moving(report).values() if one.path not in taken)
-        states, inputs = (tuple(_asked(g, ask, free) for g in some) for some in (states, inputs))
+        said, units = Stated.by(files), {**found.states, **found.inputs}
+        states, inputs = (
+            tuple(_asked(g, ask, free, partial(as_stated, said, units[g.name])) for g in some)
+            for some in (states, inputs)
+        )
     step, whose, note = (dt, "", "") if dt else interval_of(report, inputs, states)
     ranges = {g.name: _range(report, g) for g in (*states, *inputs)}
     if chosen != "drone":  # what is sent after a run must be allowed: rest
@@ -269,7 +275,7 @@ def _left_out(report: LogReport, model: Model) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _asked(guess: Guess, ask: Ask, free: tuple[str, ...]) -> Guess:
+def _asked(guess: Guess, ask: Ask, free: tuple[str, ...], stated: Callable[..., Guess]) -> Guess:
     if guess.sure:
         return guess
     if not guess.path and not guess.others:
@@ -277,9 +283,8 @@ def _asked(guess: Guess, ask: Ask, free: tuple[str, ...]) -> Guess:
     path = ask(guess)
     if path == guess.path:
         return replace(guess, sure=bool(path))
-    return replace(
-        guess, path=path, sure=bool(path), reasons=("as you said",), field=None, scale=1.0
-    )
+    why = ("as you said",)
+    return stated(replace(guess, path=path, sure=bool(path), reasons=why, field=None, scale=1.0))
 
 
 def _range(report: LogReport, guess: Guess) -> tuple[float, float] | None:

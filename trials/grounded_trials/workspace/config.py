@@ -91,7 +91,7 @@ def read_config(folder: Path) -> Config:
         safety=table.sub("safety"),
         search=_search(table.sub("search")),
         system=_system(table.sub("system")),
-        log=table.sub("log"),
+        log=_log(table.sub("log")),
         estimate=table.sub("estimate"),
     )
 
@@ -175,6 +175,20 @@ def _system(table: Table) -> SystemTable:
     if found.seed < 0:
         raise table.error("seed", f"must not be negative, found {found.seed}")
     return found
+
+
+def _log(table: Table) -> Table:
+    """[log] as it stands; an entry without a path reads nothing, so that its keys would be lost."""
+    for kind in ("state", "input"):
+        group = table.sub(kind)
+        for name in group.names():
+            if not (one := group.sub(name)).has("path"):
+                raise one.error(
+                    "path",
+                    f"is missing: [log] says where a foreign log has {name}, and what is done to "
+                    "it there; a trial that grounded's own TrialWriter wrote is taken as it is",
+                )
+    return table
 
 
 def set_in_model(

@@ -91,20 +91,21 @@ class ForeignLog:
 
     @property
     def unlike_units(self) -> tuple[str, ...]:
-        """Where a table states a multiple of the model's unit that no scale makes up for."""
-        from grounded_trials.formats.tables import column_units
-        from grounded_trials.logs.stated_units import factor_between
+        """Where a log states a multiple of the model's unit that no scale makes up for."""
+        from grounded_trials.logs.stated_units import Stated
 
         model, found = self.workspace.base_model, []
-        said = column_units(log_files(self.path)[0])
+        said = Stated.by(log_files(self.path))
         units = {**model.states, **model.inputs}
         for name, one in self.series.items():  # of [log.span], too
-            wanted = units.get(name, "")
-            factor = factor_between(said.get(one.spec.path, ""), wanted)
-            if factor and one.spec.scale == 1 and abs(factor - 1) > 1e-9:
+            path, wanted = one.spec.path, units.get(name, "")
+            factor = said.factor(path, wanted)
+            if one.spec.scale == 1 and abs(factor - 1) > 1e-9:
+                named = f"whose name says {said.unit(path)}"
+                column = f"in {said.unit(path)}" if path in said.heads else named
                 found.append(
-                    f"{name} is read as it is from a column in {said[one.spec.path]}, the model "
-                    f"has {wanted}: [log] scale = {factor:.6g} would make it that"
+                    f"{name} is read as it is from a column {column}, the model has {wanted}: "
+                    f"[log] scale = {factor:.6g} would make it that"
                 )
         return tuple(found)
 

@@ -15,12 +15,10 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-
 from grounded.errors import GroundedError, NextCommand
 from grounded.search.candidate import Candidate, Tried
-from grounded.trial import Trial, interpolate_gaps, scattered
-from grounded_trials.logs.log_files import kind_of, log_files
+from grounded.trial import Trial, interpolate_gaps
+from grounded_trials.logs.log_files import kind_of
 from grounded_trials.logs.samples import SignalReport
 from grounded_trials.plain_file import read_file
 from grounded_trials.store.own_files import CANDIDATE, FILE_LIMIT, TRIAL
@@ -34,6 +32,12 @@ from grounded_trials.workspace.next_step import after_log
 from grounded_trials.workspace.off_target import off_target_of
 from grounded_trials.workspace.proposing import candidate_named, standing_in
 from grounded_trials.workspace.run_start import elsewhere, pace_of, rival_in
+from grounded_trials.workspace.stored_before import (
+    as_stored,
+    refuse_as_another,
+    repeated,
+    what_repeats,
+)
 from grounded_trials.workspace.trial_check import (
     OTHERS,
     other_units,
@@ -80,8 +84,10 @@ def ingest_log(
         read = _own(workspace, path, candidate, data)
     else:
         read = _foreign(workspace, path, candidate, data)
-    read = _renamed(workspace, _recognised(workspace, path, read, candidate))
-    before = _repeated(workspace, path, read)
+    read = _recognised(workspace, path, read, candidate)
+    if read.log and read.log.stored:
+        read = replace(read, data=as_stored(workspace, read.log, read.trial, read.data))
+    before = repeated(workspace, path, read.trial, read.data)
     added = workspace.store.add(read.data, again=before != "")
     if read.bare:  # what it ran is kept beside it
         ran = sha256(workspace.candidate_bytes(read.trial.candidate))
@@ -91,7 +97,7 @@ def ingest_log(
     trial = replace(read.trial, id=added.id)
     warnings = (*read.warnings, *warnings_about(workspace, trial))
     if before:
-        warnings = (*warnings, f"it repeats {before} to the last bit: {_what_repeats(workspace)}")
+        warnings = (*warnings, f"it repeats {before} to the last bit: {what_repeats(workspace)}")
     if added.known and added.id in workspace.discarded():
         warnings = (*warnings, f"{added.id} is set aside: `restore` takes that back")
     now = standing_in(workspace) if trial.candidate else None
@@ -183,35 +189,6 @@ def _latest(workspace: Folder) -> list[Candidate]:
     return found
 
 
-def _repeated(workspace: Folder, path: Path, read: _Read) -> str:
-    """The stored trial that a new run repeats to the last bit, "" for none.
-
-    The same bytes are a new run, not the old one ingested twice, where a run of that candidate is
-    being waited for and the file was written after the stored one.
-    """
-    digest = sha256(read.data)
-    known = [one for one in workspace.store.list() if digest.startswith(one.digest)]
-    if not known or not read.trial.candidate:
-        return ""
-    waiting = standing_in(workspace).outstanding
-    files = log_files(path) if path.is_dir() else [path]
-    written = max(file.stat().st_mtime_ns for file in files)
-    fresh = written > known[-1].path.stat().st_mtime_ns
-    return known[-1].id if fresh and waiting and waiting.id == read.trial.candidate else ""
-
-
-def _what_repeats(workspace: Folder) -> str:
-    """What an exact repeat says: no noise, or a copy where other trials of a candidate differ."""
-    ran = [trial for trial in workspace.task_trials() if trial.candidate]
-    if scattered([trial.whole(workspace.task.horizon) for trial in ran]):
-        return (
-            "other trials of one candidate differ, so it looks like a copy, or a program with a "
-            "fixed seed: `discard` it and run again"
-        )
-    taken = "the system is taken as deterministic"
-    return f"{taken}, and no candidate is run a second time from now on"
-
-
 def _verdict(trial: Trial, tried: Tried | None, repeats: int) -> str:
     if tried is None:
         return "probe" if trial.candidate else ""
@@ -300,32 +277,11 @@ def _foreign(workspace: Folder, path: Path, candidate: str | None, data: bool) -
     """Somebody else's log, through [log]."""
     log = read_foreign(workspace, path, mapping_of(workspace, path))
     ran = candidate or (log.stored[-1].trial.candidate if log.stored else "")
-    wanted = "" if data else candidate
-    if log.stored and wanted not in (None, *(one.trial.candidate for one in log.stored)):
-        identity, as_run = log.stored[-1].stored.id, log.stored[-1].trial.candidate
-        raise GroundedError(
-            f"{path} is stored already, as {identity}, {_what(as_run)}: one log is one trial. To "
-            f"have it as {_what(wanted)} instead, discard {identity} first",
-            NextCommand("discard", (identity,)),
-        )
+    refuse_as_another(log, "" if data else candidate)
     chosen = "" if data else ran or _outstanding(workspace, path)
     if chosen:
         _check_candidate(workspace, path, chosen)
     return _cut(log, chosen)
-
-
-def _what(candidate: str | None) -> str:
-    return f"a run of {candidate}" if candidate else "data"
-
-
-def _renamed(workspace: Folder, read: _Read) -> _Read:
-    """The log as it was stored where only its name is another."""
-    for one in read.log.stored if read.log else ():
-        same = one.trial.candidate == read.trial.candidate
-        pairs = ((one.measured.states, read.trial.states), (one.measured.inputs, read.trial.inputs))
-        if same and all(np.array_equal(a, b, equal_nan=True) for a, b in pairs):
-            return replace(read, data=workspace.store.read(one.stored))
-    return read
 
 
 def _cut(log: ForeignLog, candidate: str, start: float | None = None) -> _Read:

@@ -1,0 +1,161 @@
+"""A position in mm beside a velocity in m/s: their ratio is a unit's, which no physics makes.
+
+Which of the two is off can't be read off them. Where trials in the model's units are among the
+others, sizes there tell it; else what the model makes of the velocity with either mended; else the
+larger is taken first, since logs have mm rather than km. What is found is never put right here: a
+sensor's factor of a thousand belongs into [log], where feedback and utilities see it too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from grounded.errors import GroundedError, NextCommand
+from grounded.frozen import Array
+from grounded.instruments.kinematics import Integral
+from grounded.instruments.odd_trial import (
+    AHEAD,
+    NEAR,
+    SIMILAR,
+    STAMPS,
+    Odd,
+    Ratios,
+    missed,
+    size_of,
+    slow_or_fast,
+    spread,
+)
+from grounded.model import Model
+from grounded.trial import Trial
+
+FACTORS = (STAMPS, 100.0, 0.01, 1 / STAMPS)  # a position's rate over its velocity
+TOLD = 0.5  # of how far a velocity changes, and of the other's error: a model that explains it
+PREFIXES = {1000.0: "m", 100.0: "c"}
+SINGLE = ("m", "rad", "V", "A", "N")  # units that are written with a prefix
+
+
+@dataclass(frozen=True)
+class _Off:
+    """The rate of a position is `factor` times its velocity in some trials."""
+
+    relation: Integral
+    factor: float
+    trials: tuple[int, ...]
+    sound: tuple[int, ...]  # trials in which they agree
+
+    @property
+    def choices(self) -> tuple[Odd, Odd]:
+        """What may be off, the larger first."""
+        k, i, j = self.trials[0], self.relation.i, self.relation.j
+        both = Odd(k, self.factor, (i,)), Odd(k, 1 / self.factor, (j,))
+        return both if self.factor > 1 else (both[1], both[0])
+
+
+def judge_units(
+    model: Model, trials: Sequence[Trial], ratios: Sequence[Ratios], shown: Sequence[int]
+) -> None:
+    """Stops at a position and a velocity of which one is a hundred or a thousand times too large.
+
+    Args:
+        model: however crude.
+        trials: any.
+        ratios: of each, see `odd_trial.ratios_of`.
+        shown: states that a sensor has.
+
+    Raises:
+        GroundedError: with the trials, the states, what may be off and the scale that mends it.
+    """
+    found = list(_found(ratios))
+    if not found:
+        return
+    clauses = [_clause(model, trials, ratios, one, found, shown) for one in found]
+    odd = sorted({k for one in found for k in one.trials})
+    names = [trials[k].id or f"number {k + 1}" for k in odd]
+    one, every = len(odd) == 1, len(odd) == len(trials) > 1
+    where = "in every trial" if every else f"in trial{'s' * (not one)} {', '.join(names)}"
+    raise GroundedError(
+        f"{where} {'; '.join(clauses)}. Multiply the scale in [log] (1 where none is given), or "
+        f"correct the log, and take it in again, without {'this one' if one else 'these'}",
+        then=NextCommand("discard", tuple(names)) if trials[0].id else None,
+    )
+
+
+def _found(ratios: Sequence[Ratios]) -> Iterator[_Off]:
+    """Each relation and factor, with the trials that have it."""
+    relations = {relation for every in ratios for relation, _ in every if relation.exact}
+    for relation in sorted(relations, key=lambda r: (r.i, r.j)):
+        known = {k: dict(every).get(relation, np.nan) for k, every in enumerate(ratios)}
+        sound = tuple(k for k, ratio in known.items() if 1 / SIMILAR < ratio < SIMILAR)
+        for factor in FACTORS:
+            odd = tuple(k for k, ratio in known.items() if abs(ratio / factor - 1) < NEAR)
+            if odd:
+                yield _Off(relation, factor, odd, sound)
+
+
+def _clause(
+    model: Model,
+    trials: Sequence[Trial],
+    ratios: Sequence[Ratios],
+    one: _Off,
+    found: Sequence[_Off],
+    shown: Sequence[int],
+) -> str:
+    """What is seen, what it looks like, and what else it may be."""
+    names = model.state_names
+    ratio = dict(ratios[one.trials[0]])[one.relation]
+    first, second = _ranked(model, trials, one, found, shown)
+    text = (
+        f"{names[one.relation.i]} moves {ratio:.4g} times as fast as {names[one.relation.j]} says: "
+        f"{_said(model, first)}"
+    )
+    if not one.sound:
+        text += f", or else {_said(model, second)}"
+        if slow_or_fast(model, ratios[one.trials[0]]) is not None:
+            text += ", or the stamps are in milliseconds" if one.factor < 1 else ""
+            text += ", or the stamps were taken for milliseconds" if one.factor > 1 else ""
+    return text
+
+
+def _ranked(
+    model: Model,
+    trials: Sequence[Trial],
+    one: _Off,
+    found: Sequence[_Off],
+    shown: Sequence[int],
+) -> tuple[Odd, Odd]:
+    """What may be off, the likelier first."""
+    a, b = one.choices
+    pair = [one.relation.i, one.relation.j]
+    odd = trials[one.trials[0]]
+    if one.sound:
+        usual = np.median([spread(trials[k], pair) for k in one.sound], axis=0)
+        strange = [np.abs(np.log(spread(c.mended(odd), pair) / usual)).sum() for c in (a, b)]
+        return (a, b) if strange[0] <= strange[1] else (b, a)
+    votes = [sum(c.states[0] in (r.relation.i, r.relation.j) for r in found) for c in (a, b)]
+    if votes[0] != votes[1]:  # a velocity that is the position of another
+        return (a, b) if votes[0] > votes[1] else (b, a)
+    error = [_unexplained(model, c.mended(odd), one.relation.j, shown) for c in (a, b)]
+    swap = error[1] < TOLD and error[1] < TOLD * error[0]
+    return (b, a) if swap else (a, b)
+
+
+def _unexplained(model: Model, trial: Trial, j: int, shown: Sequence[int]) -> float:
+    """What the model misses a velocity by, over how far that changes meanwhile."""
+    steps = max(1, round(AHEAD / trial.dt))
+    x: Array = trial.states[:, j]
+    change = size_of(x[steps:] - x[:-steps])
+    return missed(model, trial, [j], shown) / change if change > 0 else np.inf
+
+
+def _said(model: Model, odd: Odd) -> str:
+    """One state as it seems to be logged, and the scale for it."""
+    name = model.state_names[odd.states[0]]
+    large, factor = odd.factor > 1, max(odd.factor, 1 / odd.factor)
+    base, _, per = model.states[name].partition("/")
+    prefix = PREFIXES[factor] if large and base in SINGLE else ""
+    unit = f" (in {prefix}{base}{'/' * bool(per)}{per})" if prefix else ""
+    size = f"{factor:g} times too {'large' if large else 'small'}"
+    return f"{name} looks {size}{unit}, [log.state.{name}] scale = {1 / odd.factor:g}"

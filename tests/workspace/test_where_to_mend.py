@@ -1,0 +1,74 @@
+"""What a sensor does is mended in [log], or in the program that writes grounded's own trials."""
+
+import numpy as np
+import pytest
+
+from cli import grounded
+from facts import holding, holds
+from grounded.errors import GroundedError
+from grounded.trial import Trial
+from grounded_trials.report.diagnosis_words import instrument_lines
+from grounded_trials.store.trial_file import write_trial
+from grounded_trials.workspace.config import read_config
+from grounded_trials.workspace.diagnosing import instruments_in
+from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.ingest import ingest_log
+from workspaces import make
+
+LOG = """
+[log.state]
+x = { path = "/csv.x" }
+v = { path = "/csv.v" }
+
+[log.input]
+force = { path = "/csv.force" }
+"""
+
+
+def late(T: int = 400) -> Trial:
+    """A cart whose speed comes 0.1 s late."""
+    t = 0.05 * np.arange(T + 1)
+    force = np.cos(3 * t) + np.cos(1.3 * t + 1)
+    speed = lambda t: np.sin(3 * t) / 3 + np.sin(1.3 * t + 1) / 1.3  # noqa: E731
+    x = -np.cos(3 * t) / 9 - np.cos(1.3 * t + 1) / 1.69
+    states = np.column_stack([x, speed(t - 0.1)])
+    return Trial(states, force[:-1, None], 0.05, ("x", "v"), ("force",))
+
+
+def found_in(w: Folder):
+    (one,) = (f for f in instruments_in(Folder(w.folder)) if f.kind == "delay")
+    return one
+
+
+def test_a_late_sensor_of_our_own_trials_is_mended_in_the_program(tmp_path):
+    w = make(tmp_path / "w")
+    write_trial(tmp_path / "own.mcap", late(), {"kind": "data"})
+    ingest_log(w, tmp_path / "own.mcap", data=True)
+    one = found_in(w)
+    assert (one.signal, one.corrected, one.log) == ("v", True, "")
+    assert holds(one.advice, "program", "feedback")
+    (line,) = (line for line in instrument_lines([one]))
+    assert "[log]" not in line and holds(line, "corrected here", "program")
+    assert grounded("-C", w.folder, "diagnose", "--instruments", "--json").json["preflight"][0][
+        "advice"
+    ]
+
+
+def test_a_late_sensor_of_a_foreign_log_is_mended_in_its_table(tmp_path):
+    w, trial = make(tmp_path / "w"), late()
+    (w.folder / "grounded.toml").write_text((w.folder / "grounded.toml").read_text() + LOG)
+    t = 0.05 * np.arange(trial.steps)
+    rows = np.column_stack([t, trial.states[:-1], trial.inputs])
+    np.savetxt(tmp_path / "log.csv", rows, "%.6f", ",", header="t,x,v,force", comments="")
+    ingest_log(w, tmp_path / "log.csv", data=True)
+    one = found_in(w)
+    assert one.log.startswith("delay_s = 0.1") and not one.advice
+
+
+@pytest.mark.parametrize("entry", ["[log.state.v]\ndelay_s = 0.02", "[log.input.force]\nscale = 2"])
+def test_an_entry_of_log_without_a_path_is_an_error(tmp_path, entry):
+    """It raised none, and changed nothing."""
+    w = make(tmp_path / "w")
+    (w.folder / "grounded.toml").write_text((w.folder / "grounded.toml").read_text() + entry)
+    with pytest.raises(GroundedError, match=holding("path", "is missing", "TrialWriter")):
+        read_config(w.folder)
