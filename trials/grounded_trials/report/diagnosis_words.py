@@ -77,12 +77,15 @@ def error_table(diagnosis: Diagnosis) -> tuple[list[Cells], Cells]:
         for name, unit in row.unit_by_channel.items():
             if math.isnan(row.crude.get(name, math.nan)):
                 continue  # never measured
-            figures = (_cell(getattr(row, key).get(name, math.nan)) for key in columns)
+            figures = (_cell(row, key, name) for key in columns)
             rows.append((f"{name}, {when}", *figures, shown(unit)))
     return rows, ("error (rms)", *columns.values(), "unit")
 
 
-def _cell(value: float) -> str:
+def _cell(row: RulerRow, column: str, name: str) -> str:
+    value = getattr(row, column).get(name, math.nan)
+    if not row.tells(name, column):
+        return "runs away"
     return figure(value, 3) if math.isfinite(value) else "-"
 
 
