@@ -133,14 +133,11 @@ def has_viscous(model: Model, tau: str, w: str) -> bool:
     speed = x[:, model.state_names.index(w)]
     ours = (f_u[:, :, model.input_names.index(tau)] * speed[:, None]).reshape(-1)
     theirs = f_p.reshape(len(ours), -1)
-    known = np.sqrt(np.sum(theirs**2, axis=0)) > 0
-    length = float(np.sqrt(np.sum(ours**2)))
-    alone = [[i] for i in np.flatnonzero(known)]
-    for which in (*alone, [i for i in uncertain if known[i]]):
-        axes = np.linalg.qr(theirs[:, which])[0]
-        if float(np.sqrt(np.sum((axes.T @ ours) ** 2))) > ALIKE * length:
-            return True
-    return False
+    known = [i for i in range(theirs.shape[1]) if theirs[:, i].any()]
+    sets = [[i] for i in known] + [[i for i in uncertain if i in known]]
+    axes = [np.linalg.qr(theirs[:, some])[0] for some in sets]
+    alike = max(float(np.sum((each.T @ ours) ** 2)) for each in axes)
+    return bool(alike > ALIKE**2 * float(np.sum(ours**2)) > 0)
 
 
 def _strongest(site: Site) -> float:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 
-from grounded.diagnosis.error_report import Gap
+from grounded.diagnosis.error_report import Gap, RulerRow
 from grounded.diagnosis.report import Correction, Diagnosis, Estimate
 from grounded.instruments.finding import Finding
 from grounded_trials.wording import changed, count, figure, percent, ranges, shown, with_unit
