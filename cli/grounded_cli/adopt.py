@@ -23,6 +23,8 @@ BESIDE = (
     "of these, not beside them. Take it out of [model] effects in grounded.toml, or diagnose again"
 )
 
+REMEASURE = "nothing has measured the model as it is now yet: `grounded diagnose` does"
+
 
 @click.command("adopt")
 @click.argument("effects", nargs=-1, metavar="EFFECT...", shell_complete=complete.effects)
@@ -62,6 +64,12 @@ def command(effects: tuple[str, ...], effect_only: bool, undo: bool, json_: bool
     for name, value in done.params.items():
         text = with_unit(f"{number(before[name].value)} -> {number(value)}", before[name].unit)
         show(field(name, text, "  "))
+    for name, value in done.left.items():
+        kept, unit = before[name], before[name].unit
+        text = f"{name} stays at {with_unit(number(kept.value), unit)}: these trials do not tell it"
+        remark("note", f"{text}. The effects were fitted beside {with_unit(number(value), unit)}")
+    if done.left:
+        remark("note", REMEASURE)
     show(f"\n{next_line(done.then)}")
 
 

@@ -151,8 +151,11 @@ def diagnose(
     offered = options.library.candidates(data.model, data.scales)
     settled = {*options.but, *looked.settled}
     candidates = knowable(data, [e for e in offered if e.name not in settled])
+    joints = options.library.joints(data.model, data.scales)
+    joints = knowable(data, [e for e in joints if e.name not in settled])
     with running(engine):
-        search, best = attribute(data, candidates, max_effects=options.max_effects, tick=tick)
+        most = options.max_effects
+        search, best = attribute(data, candidates, max_effects=most, tick=tick, joints=joints)
     tick("predict")
     used = [trial for trial in trials if trial.known_steps >= 2]
     here = interruptible(lambda: so_far(search, options.max_effects))

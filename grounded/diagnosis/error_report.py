@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -156,6 +156,8 @@ class RulerRow(Document):
         whose noise is carried on.
     floor_at_most: the noise is no more than `noise_floor` and may be far less: nothing was
         repeated, and what one step leaves isn't white, so part of it is the model's error.
+    runs_away: by column ("crude" ...), the channels whose prediction leaves all that was measured
+        far behind, as open-loop ones of an unstable plant do: how far says nothing.
     """
 
     horizon_s: float
@@ -169,6 +171,20 @@ class RulerRow(Document):
     floor_from: str = ""
     floor_at_most: bool = False
     outset: Mapping[str, float] = field(metadata=BRIEF, default_factory=dict)
+    runs_away: Mapping[str, tuple[str, ...]] = field(metadata=BRIEF, default_factory=dict)
+
+    def tells(self, name: str, *columns: str) -> bool:
+        """Whether the errors of a channel in these columns mean something: none runs away."""
+        return not any(name in self.runs_away.get(column, ()) for column in columns)
+
+
+def runaway(rows: Sequence[RulerRow]) -> str:
+    """Of whole trials, whose predictions run away whatever is claimed; "" where none does."""
+    whole = next((row for row in rows if row.whole_trial), None)
+    names = () if whole is None else whole.runs_away.get("with_effects", ())
+    if not names:
+        return ""
+    return f"Predictions of whole trials run away, open loop, in {', '.join(names)}."
 
 
 @dataclass(frozen=True, eq=False)

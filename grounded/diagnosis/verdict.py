@@ -16,6 +16,7 @@ from grounded.diagnosis.error_report import (
     measured,
     noise_of,
     number,
+    runaway,
 )
 from grounded.diagnosis.report import Estimate, Kind, Ranked, Unconfirmed, Verdict, quantity
 from grounded.result import percent
@@ -76,6 +77,7 @@ def verdict(
     several = len(causes) > 1
     shares = [f" ({percent(one.share)} of the gain)" * several for one in credit]
     words = [sentence(map(str.__add__, causes, shares)), improvement(rows), worsened(rows)]
+    words.append(runaway(rows))
     words += [f"{told_apart(group, same)}." for group in groups[:1]]
     if remainder:
         words.append(f"Something is left that no known effect explains: {left}.")
@@ -157,8 +159,9 @@ def telling(rows: Sequence[RulerRow]) -> RulerRow | None:
 
 
 def _gains(row: RulerRow) -> dict[str, float]:
-    """The share of each channel's error that is gone."""
-    return {n: 1 - row.with_effects[n] / e for n, e in row.crude.items() if e > 0}
+    """The share of each channel's error that is gone, where predictions do not run away."""
+    told = {n: e for n, e in row.crude.items() if row.tells(n, "crude", "with_effects")}
+    return {n: 1 - row.with_effects[n] / e for n, e in told.items() if e > 0}
 
 
 def _most(row: RulerRow) -> float:
@@ -178,7 +181,7 @@ def worsened(rows: Sequence[RulerRow]) -> str:
         (row.with_effects[name] / max(error, row.noise_floor.get(name, 0.0)), row, name)
         for row in rows
         for name, error in row.crude.items()
-        if error > 0 and math.isfinite(row.with_effects[name])
+        if error > 0 and math.isfinite(row.with_effects[name]) and row.tells(name, "crude")
     ]
     ratio, row, name = max(losses, key=lambda loss: loss[0], default=(0.0, None, ""))
     if row is None or not ratio > 1 + SHOWS:
@@ -220,7 +223,7 @@ def rest(rows: Sequence[RulerRow]) -> str:
         )
         for row in rows
         for name, noise in row.noise_floor.items()
-        if noise > 0 and math.isfinite(row.with_effects[name])
+        if noise > 0 and math.isfinite(row.with_effects[name]) and row.tells(name, "with_effects")
     ]
     times, share, (name, when) = max(found, default=(0.0, 0.0, ("", "")))
     if not times > ABOVE:

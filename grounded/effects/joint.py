@@ -122,14 +122,22 @@ def _per_acceleration(site: Site) -> str:
 
 
 def has_viscous(model: Model, tau: str, w: str) -> bool:
-    """Whether a parameter of the model is the viscous part already: d f / d p = k w d f / d tau."""
-    dt, (x, u) = places.probe(model, 1e-4), places.samples(model, 8)
+    """Whether the model's parameters are the viscous part already: k w d f / d tau = d f / d p.
+
+    One of them, or what uncertain ones do together: a motor's gain K and time constant T in
+    w' = (K u - w) / T make any viscous friction, and data could not tell it from them.
+    """
+    uncertain = [i for i, p in enumerate(model.params.values()) if p.spread > 0]
+    dt, (x, u) = places.probe(model, 1e-4), places.samples(model, 8 * (1 + len(uncertain)))
     _, f_u, f_p = model.system.sensitivities(x, u, model.values, dt)
     speed = x[:, model.state_names.index(w)]
     ours = (f_u[:, :, model.input_names.index(tau)] * speed[:, None]).reshape(-1)
     theirs = f_p.reshape(len(ours), -1)
-    lengths = np.sqrt(np.sum(theirs**2, axis=0) * np.sum(ours**2))
-    return bool(((np.abs(theirs.T @ ours) > ALIKE * lengths) & (lengths > 0)).any())
+    known = [i for i in range(theirs.shape[1]) if theirs[:, i].any()]
+    sets = [[i] for i in known] + [[i for i in uncertain if i in known]]
+    axes = [np.linalg.qr(theirs[:, some])[0] for some in sets]
+    alike = max(float(np.sum((each.T @ ours) ** 2)) for each in axes)
+    return bool(alike > ALIKE**2 * float(np.sum(ours**2)) > 0)
 
 
 def _strongest(site: Site) -> float:

@@ -137,6 +137,14 @@ class Library:
                 found.append(_build(family, target, model, scales or Scales()))
         return tuple(found)
 
+    def joints(self, model: Model, scales: Scales | None = None) -> tuple[Effect, ...]:
+        """The plain dry friction of every joint, where it goes by another name too."""
+        family = joint.joint_friction
+        if family not in self.families:
+            return ()
+        targets = family.targets(model)
+        return tuple(_build(family, target, model, scales or Scales()) for target in targets)
+
 
 def _build(family: Family, target: str, model: Model, scales: Scales) -> Effect:
     site = Site(model, tuple(target.split("+")), scales)

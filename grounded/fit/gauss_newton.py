@@ -100,19 +100,30 @@ def _step(
 def marquardt_step(
     data: FitData, theta: Array, slopes: Linear, free: NDArray[np.bool_], damping: float
 ) -> tuple[Array, float]:
-    """The damped step (k,) and the gain in nats that the linear problem promises of it."""
+    """The damped step (k,) and the gain in nats that the linear problem promises of it.
+
+    An unknown that would leave its bounds stops there, and the others step as is best with it
+    there: clipped afterwards, they would rely on a move that is not made.
+    """
     unknowns = data.unknowns
     N, g = slopes.N, slopes.g
     stuck = ((theta <= unknowns.low) & (g < 0)) | ((theta >= unknowns.high) & (g > 0))
-    use = np.flatnonzero(free & ~stuck & (np.diag(N) > 0))
-    delta = np.zeros(unknowns.k)
-    if len(use) == 0:
-        return delta, 0.0
-    scale = 1 / np.sqrt(np.diag(N)[use])
-    scaled = N[np.ix_(use, use)] * np.outer(scale, scale)
-    values, vectors = np.linalg.eigh(scaled)
-    said = values > NOTHING * values[-1]
-    along = vectors[:, said].T @ (g[use] * scale)
-    delta[use] = scale * (vectors[:, said] @ (along / (values[said] + damping)))
-    delta = unknowns.clipped(theta + delta) - theta
+    free, delta = free & ~stuck & (np.diag(N) > 0), np.zeros(unknowns.k)
+    while (use := np.flatnonzero(free)).size:
+        left = g[use] - N[use][:, ~free] @ delta[~free]
+        to = theta[use] + _damped(N[np.ix_(use, use)], left, damping)
+        inside = np.clip(to, unknowns.low[use], unknowns.high[use])
+        delta[use] = inside - theta[use]
+        if (inside == to).all():
+            break
+        free[use[inside != to]] = False
     return delta, float(g @ delta - 0.5 * delta @ N @ delta)
+
+
+def _damped(N: Array, g: Array, damping: float) -> Array:
+    """(N + damping diag(N))^-1 g, zero in directions of which the data say nothing."""
+    scale = 1 / np.sqrt(np.diag(N))
+    values, vectors = np.linalg.eigh(N * np.outer(scale, scale))
+    said = values > NOTHING * values[-1]
+    along = vectors[:, said].T @ (g * scale)
+    return np.asarray(scale * (vectors[:, said] @ (along / (values[said] + damping))))

@@ -7,7 +7,8 @@ How sure a fit is of each unknown is judged twice:
 
 The sandwich does not believe that innovations are independent within a block; of the two the larger
 is reported, so that an interval is not narrower than either says. A direction in which I is zero is
-one that the data don't identify: its unknowns have an infinite standard deviation.
+one that the data don't identify: its unknowns have an infinite standard deviation. An unknown that
+ended at a bound has no direction left.
 Source: White, Estimation, Inference and Specification Analysis (1994); Newey & West (1987).
 """
 
@@ -184,7 +185,7 @@ def _estimates(unknowns: Unknowns, found: SearchEnd) -> tuple[dict[str, FittedVa
     else:
         scanned = quiet(found.data, found.climb.slopes) | found.thresholds
         smooth, scanned = ~scanned, scanned & np.isfinite(unknowns.scale)
-        wide = uncertainty(found.climb.slopes, smooth)
+        wide = beside_bounds(found.climb.slopes, smooth, unknowns, at.theta)
         worth = inflation(found.climb.slopes, smooth)
     params: dict[str, FittedValue] = {}
     for i, name in enumerate(unknowns.names):
@@ -195,7 +196,7 @@ def _estimates(unknowns: Unknowns, found: SearchEnd) -> tuple[dict[str, FittedVa
             std = (high - low) / (2 * 1.96)
         range_ = unknowns.high[i] - unknowns.low[i]
         std = np.inf if high - low >= range_ else std
-        known = bool(np.isfinite(std) and std < range_ / np.sqrt(12))
+        known = bool(np.isfinite(std) and std < range_ / FLAT)
         low, high = max(low, float(unknowns.low[i])), min(high, float(unknowns.high[i]))
         start = float(unknowns.start[i])
         params[name] = FittedValue(value, std, low, high, unknowns.units[i], known, start)
@@ -215,14 +216,19 @@ def _sentence(
         if len(group) > 1:
             names = ", ".join(unknowns.names[i] for i in group)
             parts.append(f"only a combination of {names} is identified")
-    theta = found.climb.at.theta
-    edge = np.isclose(theta, unknowns.low) | np.isclose(theta, unknowns.high)
+    edge = _edge(unknowns, found.climb.at.theta)
     held = [unknowns.names[i] for i in np.flatnonzero(edge) if params[unknowns.names[i]].identified]
     if held:
         parts.append("at a bound: " + ", ".join(held))
     return "; ".join(parts)
 
 
+def _edge(unknowns: Unknowns, theta: Array) -> NDArray[np.bool_]:
+    """Unknowns (k,) that ended at a bound."""
+    return np.asarray(np.isclose(theta, unknowns.low) | np.isclose(theta, unknowns.high))
+
+
+FLAT = np.sqrt(12)  # standard deviations in the range of what may be anything within bounds
 NULL = 1e-10  # of the largest eigenvalue of the scaled information
 LOADING = 0.05  # a share of a null direction above which an unknown takes part in it
 
@@ -234,6 +240,31 @@ class Uncertainty:
     std: Array
     covariance: Array  # (k, k) of the identified ones; zero rows elsewhere
     together: tuple[tuple[int, ...], ...]  # unknowns that only a combination of is identified
+
+
+def beside_bounds(
+    slopes: Linear, free: NDArray[np.bool_], unknowns: Unknowns, theta: Array
+) -> Uncertainty:
+    """The same where some ended at a bound: they stay there, the others are judged beside them.
+
+    What only ties with one that can't go further is known. How far that one may be from its bound
+    is asked with the others free, or, where these could make up for it, with them held.
+
+    Args:
+        slopes: at the end of a climb.
+        free: unknowns that slopes speak about, (k,).
+        unknowns: with their bounds.
+        theta: where the climb ended, (k,).
+    """
+    edge, most = _edge(unknowns, theta), (unknowns.high - unknowns.low) / FLAT
+    found = uncertainty(slopes, free & ~edge)
+    std, covariance = found.std.copy(), found.covariance.copy()
+    for i in np.flatnonzero(free & edge & (np.diag(slopes.N) > 0)):
+        alone = np.arange(len(free)) == i
+        both = uncertainty(slopes, free & (~edge | alone)).std[i]
+        std[i] = both if both < most[i] else uncertainty(slopes, alone).std[i]
+        covariance[i, i] = std[i] ** 2
+    return replace(found, std=std, covariance=covariance)
 
 
 def uncertainty(slopes: Linear, free: NDArray[np.bool_]) -> Uncertainty:

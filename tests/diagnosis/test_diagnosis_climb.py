@@ -8,7 +8,7 @@ from grounded.diagnosis.diagnose import diagnose
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
-from grounded.diagnosis.likelihood.step import _bounded
+from grounded.diagnosis.likelihood.step import bounded
 from grounded.effects import Library
 from grounded.experiments.pendulum import FRICTION, HEAVIER, pendulum_task
 from grounded.experiments.pendulum import model as real_pendulum
@@ -28,12 +28,12 @@ def test_a_bounded_step_is_the_best_one_inside(seed):
     G, slope = A.T @ A, 3 * rng.standard_normal(4)
     low, high = -rng.uniform(0, 0.2, 4), rng.uniform(0, 0.2, 4)
     low[3], high[3] = -np.inf, np.inf
-    step = _bounded(G, slope, low, high)
+    step = bounded(G, slope, low, high)
     assert (step >= low).all() and (step <= high).all()
     inside = (step > low) & (step < high)
     assert np.abs((G @ step + slope)[inside]).max(initial=0.0) < 1e-9
     np.testing.assert_allclose(
-        _bounded(G, slope, low - np.inf, high + np.inf), -np.linalg.solve(G, slope)
+        bounded(G, slope, low - np.inf, high + np.inf), -np.linalg.solve(G, slope)
     )
 
 
@@ -83,9 +83,9 @@ def test_an_unknown_whose_slope_is_no_number_stays_where_it_is():
     G = np.diag([2.0, np.nan, 1.0])
     G[1, 0] = G[0, 1] = np.nan
     wide = np.full(3, np.inf)
-    step = _bounded(G, np.array([2.0, np.nan, 3.0]), -wide, wide)
+    step = bounded(G, np.array([2.0, np.nan, 3.0]), -wide, wide)
     np.testing.assert_allclose(step, [-1.0, 0.0, -3.0])
-    assert not _bounded(np.full((2, 2), np.nan), np.full(2, np.nan), -wide[:2], wide[:2]).any()
+    assert not bounded(np.full((2, 2), np.nan), np.full(2, np.nan), -wide[:2], wide[:2]).any()
 
 
 @pytest.mark.slow

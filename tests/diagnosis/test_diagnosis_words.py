@@ -8,7 +8,7 @@ import numpy as np
 
 from facts import holds
 from grounded import Trial
-from grounded.diagnosis.error_report import Credit, Region, Remainder, RulerRow
+from grounded.diagnosis.error_report import Credit, Region, Remainder, RulerRow, runaway
 from grounded.diagnosis.report import Estimate, Ranked, Unconfirmed
 from grounded.diagnosis.unconfirmed import another_look, unrepeatable
 from grounded.diagnosis.verdict import (
@@ -17,12 +17,14 @@ from grounded.diagnosis.verdict import (
     improvement,
     next_trial,
     open_noise,
+    rest,
     telling,
     verdict,
     worsened,
 )
 from grounded.effects import Library
 from grounded.models import car, pendulum
+from grounded_trials.report.diagnosis_words import error_table
 from small_tasks import cart_task
 
 UNITS = {"x": "m", "v": "m/s"}
@@ -45,6 +47,21 @@ def test_what_got_worse_is_said_of_the_channel_that_lost_most():
     said = worsened((short, whole))
     assert "x" in said.split() and "3.8 m" in said and "2.1 m" in said
     assert "0.60 m/s" in worsened((short,))
+
+
+def test_predictions_that_run_away_are_compared_with_nothing():
+    """Whole trials of an unstable plant, open loop: 4e5 m says nothing, nor do half of them."""
+    second = row({"x": 0.2, "v": 0.5}, {"x": 0.1, "v": 0.4}, {"x": 0.1, "v": 0.4})
+    away = dict.fromkeys(("crude", "with_effects", "noise_floor"), ("x",))
+    far = {"x": 7e5, "v": 0.5}, {"x": 4e5, "v": 0.4}, {"x": 4e3, "v": 0.4}
+    whole = row(*far, whole_trial=True, horizon_s=40.0, runs_away=away)
+    assert not whole.tells("x", "crude") and whole.tells("v", "crude")
+    assert rest((second, whole)) == "" and telling((second, whole)) is second
+    assert worsened((second, replace(whole, with_effects={"x": 9e5, "v": 0.4}))) == ""
+    assert "x" in runaway((second, whole)) and not runaway((second,))
+    table, _ = error_table(SimpleNamespace(prediction_error=(second, whole)))
+    assert next(cells[1:-1] for cells in table if "whole" in cells[0]) == ("runs away",) * 3
+    assert rest((second, replace(whole, runs_away={}))).startswith("what is left in x over whole")
 
 
 def test_a_slow_plant_is_spoken_of_by_whole_trials():

@@ -13,8 +13,8 @@ from grounded.estimate import NoiseStd, of_states, record_of
 from grounded.estimate.extended import filter_batch
 from grounded.estimate.steps import ModelSteps
 from grounded.fit import PredictionError, fit, prediction_error
-from grounded.fit.gauss_newton import climb
-from grounded.fit.point import FitData, exact, linear, point, whitened
+from grounded.fit.gauss_newton import climb, marquardt_step
+from grounded.fit.point import FitData, Linear, exact, linear, point, whitened
 from grounded.fit.unknowns import unknowns_of
 from grounded.model import Model, Param
 from grounded.models.pendulum import model as pendulum
@@ -409,3 +409,45 @@ def test_a_fit_that_predicts_no_better_is_not_recommended():
     better = fitted((0.0111, 0.0382), (0.00694, 0.0281))
     assert better.fit.helps and better.then == NextCommand("fit", ("--apply",))
     assert not fitted((0.01, 0.02), (np.nan, 0.02)).fit.helps
+
+
+def test_a_gain_that_ties_with_what_is_at_its_bound_is_identified():
+    """b >= 0 does what K and tau do together; with b at 0 the trials tell both."""
+
+    def rates(s, a, p):
+        return {"w": (p.K * (a.u - p.b * s.w) - s.w) / p.tau}
+
+    true = Model(
+        name="motor",
+        states={"w": "rad/s"},
+        inputs={"u": "V"},
+        params={
+            "K": Param(0.8, "rad/s/V", 0.4, 2.0),
+            "b": Param(0.0, "V s/rad", 0.0, 1.0),
+            "tau": Param(0.2, "s", 0.05, 0.6),
+        },
+        derivative=rates,
+    )
+    noise = NoiseStd(np.array([1e-4]), np.array([0.005]), DT)
+    trials = simulated(true, np.random.default_rng(3), noise)
+    found = fit(true.with_values({"K": 0.7, "tau": 0.25}), trials)
+    assert all(value.identified for value in found.params.values()), found.sentence
+    assert found.params["b"].value == 0.0 and found.params["b"].low == 0.0
+    assert found.params["K"].value == pytest.approx(0.8, abs=0.02)
+    assert found.params["tau"].value == pytest.approx(0.2, rel=0.03)
+
+
+def test_a_step_that_meets_a_bound_is_the_best_one_with_it_there():
+    rng = np.random.default_rng(0)
+    data = FitData(
+        SPRING.system,
+        tuple(record_of(SPRING, t) for t in simulated(SPRING, rng, NOISE, B=1, T=60)),
+        of_states(SPRING),
+        unknowns_of(SPRING, None, np.zeros(1), "known"),
+    )
+    N, g = np.array([[1.0, 0.99], [0.99, 1.0]]), np.array([1.0, -1.0])
+    step, promise = marquardt_step(
+        data, np.array([4.0, 0.0001]), Linear(N, g, np.zeros((1, 2))), np.ones(2, bool), 0.0
+    )
+    assert step[1] == pytest.approx(-0.0001)
+    assert step[0] == pytest.approx(1.0, rel=1e-3) and promise > 0.4

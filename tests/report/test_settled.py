@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from cli import grounded, plain
+from facts import holds
 from grounded.diagnosis.report import Diagnosis
 from grounded_trials.report.gathering import gather
 from grounded_trials.report.page.tables import candidate_table, parameter_table
@@ -55,6 +56,19 @@ def test_what_was_adopted_is_told_everywhere_with_what_it_gained(adopted):
     for text in (words(adopted, "report"), words(adopted, "status"), re.sub(r"<[^>]+>", "", page)):
         assert "Found and adopted: " in text and "1.2 cm instead of 25 cm" in text
     assert "2 trials, t0001 to t0002" in page
+
+
+def test_a_parameter_that_stays_behind_is_told_and_no_gain_is_claimed(cart, tmp_path):
+    """The effect was fitted beside a mass of 1.4 kg, which the trials do not tell."""
+    lost = {"parameter": "mass", "verdict": "not identifiable"}
+    folder = written(copied(cart, tmp_path / "w"), identifiable=[lost])
+    done = grounded("-C", folder, "adopt", "viscous_friction:v")
+    assert done.code == 0 and holds(done.err, "mass stays at 1.0", "1.4", "diagnose")
+    assert grounded("-C", folder, "adopt", "--undo").code == 0
+    again = grounded("-C", folder, "adopt", "viscous_friction:v", "--json").json
+    assert again["left"] == {"mass": 1.4} and "mass" not in again["params"]
+    adopted = grounded("-C", folder, "report", "--json").json["adopted"]
+    assert not adopted["gained"] and "instead of 25 cm" not in words(folder, "status")
 
 
 def test_a_gain_that_nobody_measured_is_not_claimed(cart, tmp_path):

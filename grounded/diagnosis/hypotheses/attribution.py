@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from grounded.diagnosis.hypotheses.explored import CLAIM
+from grounded.diagnosis.hypotheses.plainest import fit_plainer
 from grounded.diagnosis.hypotheses.search import (
     LARGE,
     LARGE_GAIN,
@@ -43,6 +44,7 @@ def attribute(
     *,
     max_effects: int = 3,
     tick: Callable[[str], None] | None = None,
+    joints: Sequence[Effect] = (),
 ) -> tuple[HypothesisSearch, Fitted]:
     """Searches for the effects that make the gap; returns the search and its best fit.
 
@@ -51,8 +53,9 @@ def attribute(
         candidates: the effects that may be blamed.
         max_effects: at most so many at once.
         tick: called with what is being done, for a progress display.
+        joints: plain frictions that stand beside richer ones, whether they are candidates or not.
     """
-    search = HypothesisSearch(data, candidates, tick)
+    search = HypothesisSearch(data, candidates, tick, joints)
     with (
         np.errstate(all="ignore"),  # a hypothesis that diverges scores minus infinity
         interruptible(lambda: so_far(search, max_effects)),
@@ -118,6 +121,7 @@ def _explore(search: HypothesisSearch) -> Fitted:
         if same:
             break
     search.finished(search.of_size(1)[:HOPEFUL], TO_THE_TOP)
+    fit_plainer(search, search.of_size(1)[:HOPEFUL])
     tune(search, search.of_size(1)[:TUNED])
     best = search.of_size(1)[0]
     search.fair(best)
@@ -195,8 +199,9 @@ def _halves(search: HypothesisSearch, starts: Sequence[Fitted]) -> list[Fitted]:
 
 def _grow(search: HypothesisSearch, best: Fitted, most: int) -> None:
     """Second and further effects: add, then swap each for what goes better with the others."""
-    size = len(best.hypothesis.effects)
+    size, grown_from = len(best.hypothesis.effects), set[tuple[str, ...]]()
     while 1 <= size < most:
+        grown_from.add(best.hypothesis.names)
         starts = _starts(search, size, best)
         halves = _halves(search, starts) if size == 1 else []
         grown = [search.extended(start, 8) for start in starts]
@@ -206,6 +211,13 @@ def _grow(search: HypothesisSearch, best: Fitted, most: int) -> None:
         search.again(search.of_size(size + 1)[:2])
         search.finished(search.of_size(size + 1)[:TUNED], TO_THE_TOP)
         tune(search, search.of_size(size + 1)[:TUNED])
+        found = fit_plainer(search, search.of_size(size + 1)[:TUNED])
+        fewer = [f for f in found if f.hypothesis.names not in grown_from]
+        fewer = [f for f in fewer if len(f.hypothesis.names) == size]
+        plainest = max(fewer, key=search.score, default=best)
+        if search.score(plainest) > search.score(best):
+            best = plainest  # two frictions in one: there is room for another effect
+            continue
         larger = search.of_size(size + 1)
         if not larger or search.score(larger[0]) < search.score(best) + CLAIM:
             return

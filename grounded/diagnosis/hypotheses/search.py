@@ -39,15 +39,21 @@ LARGE = 8  # states; above, or of a simulator, one correlation time and half the
 
 
 class HypothesisSearch(FittedHypotheses):
-    """The fits of one attribution (`FittedHypotheses`), and the ways to more of them."""
+    """The fits of one attribution (`FittedHypotheses`), and the ways to more of them.
+
+    `joints`: by motion, the plain dry friction of its joint, a candidate or not (`plainest`).
+    """
 
     def __init__(
         self,
         data: Data,
         candidates: Sequence[Effect],
         tick: Callable[[str], None] | None = None,
+        joints: Sequence[Effect] = (),
     ) -> None:
         super().__init__(data, candidates)
+        self.joints = {effect.site.target.rpartition("<-")[2]: effect for effect in joints}
+        self.crowd |= dict.fromkeys((effect.name for effect in joints), len(joints))
         self.tick = tick or (lambda what: None)
         large = data.model.n > LARGE or simulated(data.model)
         taus = TAUS[1:2] if large else TAUS
@@ -184,9 +190,13 @@ class HypothesisSearch(FittedHypotheses):
         for fit in self.refined(likely, 12):
             self.calibrated(fit)
 
+    def _empty(self) -> HypothesisSearch:
+        """A new search of the same candidates."""
+        return HypothesisSearch(self.data, self.candidates, self.tick, tuple(self.joints.values()))
+
     def with_weights(self, clean_fit: Fitted) -> HypothesisSearch:
         """A new search on the same data with a clean fit's outlier weights in all noise."""
-        other = HypothesisSearch(self.data, self.candidates, self.tick)
+        other = self._empty()
         weights = clean_fit.noise
         starts = []
         for fit in [*self.of_size(0), *self.of_size(1)[:SHORTLIST], clean_fit]:
@@ -251,7 +261,7 @@ class HypothesisSearch(FittedHypotheses):
 
     def under(self, structure: Structure, spread: float) -> HypothesisSearch | None:
         """What was fitted under one noise and freedom of the parameters; None without a null."""
-        other = HypothesisSearch(self.data, self.candidates, self.tick)
+        other = self._empty()
         exact = (structure, 0.0, ())
         kept = {k: f for k, f in self.fits.items() if k[:2] == (structure, spread) or k == exact}
         other.fits, other._prices = kept, self._prices

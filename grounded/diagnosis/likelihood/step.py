@@ -1,7 +1,9 @@
 """The step that is proposed at a hypothesis' best point: its values, shifts, track and noise.
 
-Gauss-Newton within bounds: parameters keep their sign or their user's limits, scanned values move
-by a few grid gaps at once.
+Gauss-Newton within bounds: values stay inside theirs, parameters keep their sign or their user's
+limits, scanned values move by a few grid gaps at once. All of it bounds the step itself: what is
+clipped afterwards leaves the others relying on a move that is not made, and where two are tied (a
+viscous friction, a motor's gain) such a step leads down, and the fit ends where it began.
 """
 
 from __future__ import annotations
@@ -17,6 +19,8 @@ from grounded.diagnosis.likelihood.linearise import step_sizes
 from grounded.diagnosis.likelihood.noise import NoiseModel
 from grounded.frozen import Array
 
+LEAP = 0.3  # of a parameter's scale that its shift moves at once
+GAPS = 20  # differences, two gaps of its grid, that a scanned value moves at once
 BELIEVED = 3.0  # standard deviations, as the user gave them, that a parameter may be off
 
 
@@ -40,18 +44,18 @@ def proposed(
     h = fit.hypothesis
     G = fit.gram.sum(axis=0) + np.diag(fit.prior)
     slope = fit.score.sum(axis=0) + fit.prior_pull(data)
-    k, track, delta = len(h.theta), filtered[..., 0], np.zeros(len(slope))
+    track, delta = filtered[..., 0], np.zeros(len(slope))
     if len(slope):
-        delta = _bounded(G, slope, *_room(data, h, k, len(slope)))
-        delta[:k] = _limited(h, delta[:k])
-        delta[k:] = np.clip(delta[k:], -0.3, 0.3)
+        low, high = room(data, h, len(slope))
+        far = _far(h, len(slope))
+        delta = bounded(G, slope, np.maximum(low, -far), np.minimum(high, far))
         by = delta != 0
         track = track + filtered[..., 1:][..., by] @ delta[by]
     promise -= float(slope @ delta + 0.5 * delta @ G @ delta)
     return ProposedStep(delta, track, noise, promise)
 
 
-def _bounded(G: Array, slope: Array, low: Array, high: Array) -> Array:
+def bounded(G: Array, slope: Array, low: Array, high: Array) -> Array:
     """The Gauss-Newton step -G^-1 slope within low <= step <= high, (K,) each.
 
     An unknown that would leave its bounds stops there, and the others step as is best with it
@@ -73,9 +77,12 @@ def _bounded(G: Array, slope: Array, low: Array, high: Array) -> Array:
     return delta
 
 
-def _room(data: Data, h: Hypothesis, k: int, size: int) -> tuple[Array, Array]:
-    """How far each unknown may step down and up: values freely, shifts inside their bounds."""
-    low, high = np.full(size, -np.inf), np.full(size, np.inf)
+def room(data: Data, h: Hypothesis, size: int) -> tuple[Array, Array]:
+    """How far each unknown may step down and up inside its bounds, (size,): values, then shifts."""
+    low, high, k = np.full(size, -np.inf), np.full(size, np.inf), len(h.theta)
+    free = [q for e in h.effects for q in e.free]
+    low[:k] = np.minimum([q.low for q in free] - h.theta, 0.0)
+    high[:k] = np.maximum([q.high for q in free] - h.theta, 0.0)
     if size > k:
         which = calibrated(data)
         shift = np.zeros(data.model.system.k) if h.shift is None else h.shift
@@ -86,13 +93,12 @@ def _room(data: Data, h: Hypothesis, k: int, size: int) -> tuple[Array, Array]:
     return low, high
 
 
-def _limited(h: Hypothesis, delta: Array) -> Array:
-    """Scanned values move by at most two grid gaps at once: between grid points anything may be."""
-    limits = [
-        20 * s if q.grid else np.inf
-        for s, q in zip(step_sizes(h), [q for e in h.effects for q in e.free], strict=True)
-    ]
-    return np.clip(delta, -np.array(limits), np.array(limits))
+def _far(h: Hypothesis, size: int) -> Array:
+    """How far each unknown moves at once, (size,): between grid points anything may be."""
+    far, free = np.full(size, LEAP), [q for e in h.effects for q in e.free]
+    gaps = [GAPS * s if q.grid else np.inf for s, q in zip(step_sizes(h), free, strict=True)]
+    far[: len(gaps)] = gaps
+    return far
 
 
 def inside(data: Data, shift: Array) -> Array:

@@ -24,6 +24,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from grounded.diagnosis.hypotheses.explored import CLAIM, parametric
+from grounded.diagnosis.hypotheses.plainest import plainer
 from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.noise import Structure
@@ -90,6 +91,7 @@ def decide(search: HypothesisSearch, best: Fitted, ruler: Ruler, most: int) -> D
     white = search.tempering.factor > WHITE
     ruler.beside(crude)
     search, proposed = _proposed(search, best, crude, ruler, most)
+    proposed = _plainest(search, proposed, ruler, white)
     fit, without, doubtful = _pruned(search, proposed, ruler, white)
     if proposed.hypothesis.spread > 0 and (other := _likelier(search, fit, ruler)):
         fit, without, more = _pruned(search, other, ruler, white)
@@ -100,6 +102,14 @@ def decide(search: HypothesisSearch, best: Fitted, ruler: Ruler, most: int) -> D
         search, fit, without = whole, crude, {}
     open_ = sorted((d for d in doubtful if d.name not in causes(fit)), key=lambda d: -d.nats)
     return Decision(search, whole, fit, crude, without, tuple(open_))
+
+
+def _plainest(search: HypothesisSearch, fit: Fitted, ruler: Ruler, white: bool) -> Fitted:
+    """The fit with frictions at their plainest where what they have more predicts no better."""
+    for plain_form in plainer(search, fit) if ruler.held_out else ():
+        if not _pays(search, ruler, plain_form, fit, white):
+            return _plainest(search, plain_form, ruler, white)
+    return fit
 
 
 def _likelier(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> Fitted | None:

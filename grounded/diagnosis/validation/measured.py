@@ -26,6 +26,7 @@ from grounded.trial import Trial
 
 FAR = 3.0  # times the noise floor: what is left is stated whatever the doubt
 WHITE = 0.01  # chance below which what is left is not white noise
+AWAY = 30.0  # times all that was measured of a state: beyond it a prediction has run away
 COUNTS = (2.0, 0.03)  # scatters, and least gain, of a flexible correction that is stated
 
 
@@ -131,6 +132,10 @@ class Measured:
                 key: {} if rms is None else dict(zip(self.units, map(float, rms[k]), strict=True))
                 for key, rms in columns.items()
             }
+            away = {
+                key: tuple(n for n, e in found[key].items() if e > AWAY * self.reach[n] > 0)
+                for key in columns
+            }
             rows.append(
                 RulerRow(
                     seconds,
@@ -139,10 +144,17 @@ class Measured:
                     by if self.ruler.held_out else "no",
                     floor_from=self.source,
                     floor_at_most=self.at_most,
+                    runs_away={key: names for key, names in away.items() if names},
                     **found,
                 )
             )
         return tuple(rows)
+
+    @property
+    def reach(self) -> dict[str, float]:
+        """From the least to the largest value that was measured of each shown state."""
+        reach = np.ptp(self.data.filled, axis=0)
+        return {n: float(reach[i]) for i, n in zip(self.ruler.shown, self.units, strict=True)}
 
     def horizons(self) -> list[tuple[int, float]]:
         """(index, seconds) of the ruler's rows; a single step is no row unless it is 0.1 s."""

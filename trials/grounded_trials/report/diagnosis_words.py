@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 
-from grounded.diagnosis.error_report import Gap
+from grounded.diagnosis.error_report import Gap, RulerRow
 from grounded.diagnosis.report import Correction, Diagnosis, Estimate
 from grounded.instruments.finding import Finding
 from grounded_trials.wording import changed, count, figure, percent, ranges, shown, with_unit
@@ -77,12 +77,15 @@ def error_table(diagnosis: Diagnosis) -> tuple[list[Cells], Cells]:
         for name, unit in row.unit_by_channel.items():
             if math.isnan(row.crude.get(name, math.nan)):
                 continue  # never measured
-            figures = (_cell(getattr(row, key).get(name, math.nan)) for key in columns)
+            figures = (_cell(row, key, name) for key in columns)
             rows.append((f"{name}, {when}", *figures, shown(unit)))
     return rows, ("error (rms)", *columns.values(), "unit")
 
 
-def _cell(value: float) -> str:
+def _cell(row: RulerRow, column: str, name: str) -> str:
+    value = getattr(row, column).get(name, math.nan)
+    if not row.tells(name, column):
+        return "runs away"
     return figure(value, 3) if math.isfinite(value) else "-"
 
 

@@ -17,7 +17,7 @@ from grounded.task import Task
 from grounded_trials.report.diagnosis_words import made_from
 from grounded_trials.report.three_lines import gained, still_open, three_lines
 from grounded_trials.wording import changed
-from grounded_trials.workspace.adopting import joined
+from grounded_trials.workspace.adopting import joined, left_behind
 from grounded_trials.workspace.config import ModelTable
 from grounded_trials.workspace.diagnosing import read_diagnosis
 from grounded_trials.workspace.folder import Folder
@@ -127,7 +127,9 @@ def _still(diagnosis: Diagnosis) -> str:
 
 
 def _as_claimed(diagnosis: Diagnosis, table: ModelTable) -> bool:
-    """Whether the model is what `adopt` makes of all that the diagnosis claims."""
+    """Whether the model is what the diagnosis measured: `adopt` of all that it claims made it."""
+    if left_behind(diagnosis):
+        return False
     made, names = diagnosis.made or Made(), diagnosis.effects
     try:
         known = diagnosis.known_parameters

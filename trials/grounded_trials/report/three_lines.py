@@ -64,6 +64,7 @@ def gained(
     if row is None:
         return ""
     after, first = getattr(row, now), getattr(row, before)
+    first = {name: error for name, error in first.items() if row.tells(name, now, before)}
     for names, what in _improved(after, first, task):
         unit = shown(row.unit_by_channel[names[0]])
         told = (after,) if now == before else (after, first)
@@ -77,7 +78,10 @@ def gained(
 def gained_most(diagnosis: Diagnosis, task: Task) -> list[tuple[list[str], str]]:
     """The weighed states that a verdict speaks of: the position, then what improved most."""
     row = telling(diagnosis.prediction_error)
-    return [] if row is None else _improved(row.with_effects, row.crude, task)
+    if row is None:
+        return []
+    crude = {n: e for n, e in row.crude.items() if row.tells(n, "crude", "with_effects")}
+    return _improved(row.with_effects, crude, task)
 
 
 def _improved(

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from grounded.diagnosis.report import Diagnosis, Estimate
@@ -25,6 +25,7 @@ from grounded_trials.workspace.folder import Folder
 Effect = dict[str, Any]  # {"name": "dead_zone:throttle", "c": 0.146}
 AGAIN, PROPOSE = NextCommand("diagnose"), NextCommand("propose")
 KEPT = "adoptions.json"  # in reports/
+SLIGHT = 1e-3  # of a parameter: no move at all
 
 
 @dataclass(frozen=True, repr=False)
@@ -36,6 +37,7 @@ class Adopted(Result):
     claimed: bool  # the diagnosis claims the new ones; else one was taken by itself
     then: NextCommand = PROPOSE
     beside: tuple[str, ...] = ()  # adopted before from the same diagnosis, fitted in their place
+    left: Mapping[str, float] = field(default_factory=dict)  # beside what the effects were fitted
 
     def summary(self) -> str:
         """The effects that the model has now."""
@@ -49,6 +51,7 @@ class Adopted(Result):
             "params": dict(self.params),
             "claimed": self.claimed,
             "beside": list(self.beside),
+            "left": dict(self.left),
         }
 
 
@@ -101,7 +104,27 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
     write_document(workspace.reports / KEPT, {"adoptions": [*earlier, step], "undone": []})
     fitted = {*names, *before, *(found.effects if claimed else ())}
     beside = (str(effect["name"]) for effect in adopted)
-    return Adopted(tuple(adopted), own, claimed, beside=tuple(n for n in beside if n not in fitted))
+    return Adopted(
+        tuple(adopted),
+        own,
+        claimed,
+        beside=tuple(n for n in beside if n not in fitted),
+        left=left_behind(found) if calibrated else {},
+    )
+
+
+def left_behind(found: Diagnosis) -> dict[str, float]:
+    """The values of parameters that moved beside the effects and are not adopted with them.
+
+    The trials do not tell them apart from others; what the diagnosis measured had them all.
+    """
+    nominal = {} if found.made is None else found.made.nominal
+    return {
+        name: estimate.value
+        for name, estimate in found.parameters.items()
+        if name not in found.known_parameters and name in nominal
+        if abs(estimate.value - nominal[name]) > SLIGHT * max(abs(nominal[name]), estimate.std)
+    }
 
 
 def undo_adoption(workspace: Folder) -> Undone:

@@ -59,7 +59,9 @@ def _details(diagnosis: Diagnosis, since: Since) -> list[Block]:
         found += [Block("heading", "Effects that were weighed"), effect_table(diagnosis, since)]
     found += _alike(diagnosis) + _by_trial(diagnosis)
     found += leftover_table(diagnosis)
-    found += _made_of(diagnosis.where.split) + _rest(diagnosis)
+    away = any(row.runs_away for row in diagnosis.prediction_error if row.whole_trial)
+    split = {k: v for k, v in diagnosis.where.split.items() if k != "whole_run" or not away}
+    found += _made_of(split) + _rest(diagnosis)
     if text := utility_sentence(diagnosis):
         found += [Block("heading", "Utility, predicted"), Block("text", f"{_begun(text)}.")]
     if diagnosis.made is not None:

@@ -1,0 +1,84 @@
+"""The dry friction of one motion at its plainest, fitted beside whatever has more numbers.
+
+A friction that grows with its load, a constant one with a stiction beside, a joint's with a viscous
+part that is nothing: each holds the plain friction of the joint as a case, with less to be paid.
+Where the joint's inertia is constant that friction goes by the name of `coulomb_friction`, whose
+rate holds nothing at rest; what does would win against it for that alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch, tune
+from grounded.diagnosis.likelihood.fitted import Fitted
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.likelihood.noise import Structure
+from grounded.effects import Effect, places
+from grounded.effects.family import coupled
+from grounded.effects.joint import joint_friction, load_friction
+
+
+def fit_plainer(search: HypothesisSearch, fits: Sequence[Fitted]) -> list[Fitted]:
+    """Fits the plainer forms of some fits too; returns those that are likelier than theirs."""
+    better: list[Fitted] = []
+    for fit in fits:
+        likelier = [f for f in plainer(search, fit) if search.score(f) > search.score(fit)]
+        tune(search, likelier)
+        better += [search.fits[_key(f)] for f in likelier]
+    return better
+
+
+def plainer(search: HypothesisSearch, fit: Fitted) -> list[Fitted]:
+    """The plainer forms of a fit, under noise of its structure."""
+    found = []
+    for h in plain_forms(search, fit.hypothesis):
+        key = _key(replace(fit, hypothesis=h))
+        if key not in search.fits or h.names == fit.hypothesis.names:
+            search.refined([(h, fit.noise, fit.track)], TO_THE_TOP)
+        if key in search.fits:
+            found.append(search.fits[key])
+    return found
+
+
+def _key(fit: Fitted) -> tuple[Structure, float, tuple[str, ...]]:
+    h = fit.hypothesis
+    return fit.noise.structure, h.spread, tuple(sorted(h.names))
+
+
+def plain_forms(search: HypothesisSearch, h: Hypothesis) -> Iterator[Hypothesis]:
+    """The same hypothesis with each dry friction at its plainest, where it is not."""
+    by_family = {(e.family.name, _motion(e)): (e, v) for e, v in h.pairs}
+    for (family, motion), (effect, values) in by_family.items():
+        joint = search.joints.get(motion)
+        if family == load_friction.name and joint is not None:
+            yield h.minus(effect.name).plus(joint, _of_joint(joint, values))
+        stiction = by_family.get(("stiction", motion))
+        if family == "coulomb_friction" and stiction is not None and joint is not None:
+            rest = h.minus(effect.name).minus(stiction[0].name)
+            yield rest.plus(joint, {"c": values["c"] / _push(joint), "b": 0.0})
+        if family == joint_friction.name and values["b"] == 0 and "b" not in effect.fixed:
+            some = (replace(q, fixed=q.fixed or q.name == "b") for q in effect.quantities)
+            dry = replace(effect, quantities=tuple(some))
+            yield h.minus(effect.name).plus(dry, values)
+
+
+def _motion(effect: Effect) -> str:
+    return effect.site.target.rpartition("<-")[2]
+
+
+def _of_joint(joint: Effect, values: Mapping[str, float]) -> dict[str, float]:
+    """What a friction of the joint that grows with its load has without that."""
+    return {q.name: float(values[q.name]) for q in joint.quantities}
+
+
+def _push(joint: Effect) -> float:
+    """The acceleration that a unit of the input makes, in the middle of what it does."""
+    model, (tau, w) = joint.site.model, coupled(joint.site)
+    dt, (x, u) = places.probe(model, 1e-5), places.samples(model, 8)
+    _, f_u = model.system.linearise(x, u, model.values, dt)
+    by = f_u[:, model.state_names.index(w), model.input_names.index(tau)]
+    return float(np.median(by)) / dt

@@ -1,0 +1,144 @@
+"""The dry friction of a motor's joint: one cause, at its plainest, beside a gain and a lag."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from grounded import Model, Param, Trial
+from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
+from grounded.diagnosis.hypotheses.plainest import fit_plainer, plain_forms
+from grounded.diagnosis.hypotheses.search import HypothesisSearch
+from grounded.diagnosis.likelihood.data import prepare
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.effects import Library
+from grounded.effects.joint import has_viscous
+
+FRICTION, K, TAU, DT = 0.35, 0.88, 0.06, 0.02
+MOTOR = Model(
+    name="motor",
+    states={"q": "rad", "w": "rad/s"},
+    inputs={"volt": "V"},
+    params={
+        "K": Param(1.0, "rad/s/V", 0.5, 2.0),
+        "tau": Param(0.05, "s", 0.02, 0.15),
+    },
+    derivative=lambda s, a, p: {"q": s.w, "w": (p.K * a.volt - s.w) / p.tau},
+)
+JOINT, LOADED = "joint_friction:volt<-w", "load_friction:volt<-w"
+
+
+def driven(trials=4, steps=150):
+    """Logs of a motor whose gear holds at rest, driven to and fro with stops."""
+    rng, found = np.random.default_rng(1), []
+    for k in range(trials):
+        t = DT * np.arange(steps)
+        u = (1.0 + 0.3 * k) * np.sin((2.0 + 0.7 * k) * t) * (np.sin(1.3 * t + k) > -0.4)
+        x, rows = np.zeros(2), [np.zeros(2)]
+        for volt in u:
+            for _ in range(20):
+                w = x[1] + 1e-3 * (K * volt - x[1]) / TAU
+                w = np.sign(w) * max(abs(w) - 1e-3 * K * FRICTION / TAU, 0.0)
+                x = np.array([x[0] + 1e-3 * w, w])
+            rows.append(x)
+        noise = rng.standard_normal((steps + 1, 2)) * [5e-4, 0.01]
+        found.append(Trial(np.array(rows) + noise, u[:, None], DT, ("q", "w"), ("volt",)))
+    return found
+
+
+@pytest.fixture(scope="module")
+def search():
+    data = prepare(MOTOR, driven())
+    library = Library()
+    candidates = library.candidates(MOTOR, data.scales)
+    joints = library.joints(MOTOR, data.scales)
+    found = HypothesisSearch(data, candidates, joints=joints)
+    found.nulls()
+    return found
+
+
+def fitted(search, *effects, start=(-0.1, 0.01)):
+    """A hypothesis of effects with values, refined from a start of its own."""
+    h = Hypothesis(shift=np.array(start), spread=1.0)
+    for effect, values in effects:
+        h = h.plus(effect, {**effect.fixed, **values})
+    return search.refined([search.fresh(h)], 30)[0]
+
+
+def test_a_gain_and_a_lag_together_are_the_viscous_part():
+    assert has_viscous(MOTOR, "volt", "w")
+    lagged = replace(MOTOR, params={**MOTOR.params, "K": Param(1.0, "rad/s/V")})
+    assert not has_viscous(lagged, "volt", "w")
+    assert "b" in Library().effect(JOINT, MOTOR).fixed
+
+
+def test_a_value_at_its_bound_stops_no_fit_of_the_others(search):
+    """b >= 0 ties with K and tau: clipped after the step, it made the step lead down."""
+    joint = search.joints["w"]
+    free = tuple(replace(q, fixed=False) if q.name == "b" else q for q in joint.quantities)
+    told, tied = (
+        fitted(search, (effect, {"c": 0.35, "b": 0.0}), start=(-0.02, 0.02))
+        for effect in (joint, replace(joint, quantities=free))
+    )
+    shifts = [fit.hypothesis.shift for fit in (told, tied)]
+    assert np.abs(shifts[1] - [-0.02, 0.02]).max() > 1e-3
+    assert tied.evidence > told.evidence - 20
+    assert shifts[0] == pytest.approx([K - 1.0, TAU - 0.05], rel=0.1)
+
+
+def test_what_holds_the_plain_friction_as_a_case_is_compared_with_it(search):
+    effects = {e.name: e for e in search.candidates}
+    assert JOINT not in effects
+    loaded = fitted(search, (effects[LOADED], {"c": 0.31, "k": 0.2}), start=(0.09, 0.015))
+    (better,) = fit_plainer(search, [loaded])
+    assert better.hypothesis.names == (JOINT,)
+    assert better.hypothesis.values[0]["c"] == pytest.approx(FRICTION, rel=0.03)
+    assert better.hypothesis.shift[0] == pytest.approx(K - 1.0, rel=0.2)
+
+
+def test_two_names_of_one_friction_are_compared_with_one(search):
+    effects = {e.name: e for e in search.candidates}
+    h = Hypothesis().plus(effects["coulomb_friction:w"], {"c": 5.2})
+    assert not list(plain_forms(search, h))
+    h = h.plus(effects["stiction:w"], {"c": 5.0}).plus(effects["offset:w"], {"c": 0.1})
+    (plain,) = plain_forms(search, h)
+    assert set(plain.names) == {JOINT, "offset:w"}
+    assert plain.values[plain.names.index(JOINT)]["c"] == pytest.approx(5.2 * 0.05, rel=0.01)
+
+
+@pytest.mark.slow
+def test_a_dry_friction_that_holds_at_rest_is_one_cause_and_the_gain_is_right():
+    found = diagnose(MOTOR, driven())
+    assert found.effects == (JOINT,)
+    assert found.ranking[0].params["c"].value == pytest.approx(FRICTION, rel=0.03)
+    assert found.parameters["K"].value == pytest.approx(K, rel=0.03)
+    assert "0 V" not in found.sentence
+
+
+def test_open_loop_predictions_of_an_unstable_plant_run_away():
+    """Balanced by a feedback for four seconds: errors grow by exp(5 t), the log stays small."""
+    crude, true = (
+        Model(
+            name="balanced",
+            states={"x": "m", "v": "m/s"},
+            inputs={"u": "m/s^2"},
+            params={"k": Param(k)},
+            derivative=lambda s, a, p: {"x": s.v, "v": p.k * s.x + a.u},
+        )
+        for k in (25.0, 27.0)
+    )
+    rng, trials = np.random.default_rng(0), []
+    for _ in range(3):
+        x, rows, inputs = np.array([[0.05, 0.0]]), [np.array([0.05, 0.0])], []
+        for k in range(80):
+            u = -60 * x[0, 0] - 12 * x[0, 1] + np.sin(0.2 * k) + rng.normal(0, 0.3)
+            inputs.append([u])
+            x = true.system.step(x, np.array([[u]]), true.values, 0.05)
+            rows.append(x[0])
+        y = np.array(rows) + rng.normal(0, 1e-3, (81, 2))
+        trials.append(Trial(y, np.array(inputs), 0.05, ("x", "v"), ("u",)))
+    library = Library(tuple(f for f in Library().families if f.name == "input_bias"))
+    options = DiagnosisOptions(library=library, max_effects=1)
+    rows = diagnose(crude, trials, options).prediction_error
+    assert rows[-1].whole_trial and set(rows[-1].runs_away["crude"]) == {"x", "v"}
+    assert rows[-1].crude["x"] > 1e3 and not rows[0].runs_away
