@@ -378,7 +378,16 @@ def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
         old = model.params[effect.site.target].value
         new = quantity(params["d"].moved(old))
         return f"the parameter {effect.site.target} should be {new} instead of {number(old)}"
+
+    def signed(found: re.Match[str]) -> str:
+        name, positive, negative = found.groups()
+        less = name in params and params[name].value < 0
+        if less:
+            words[name] = words[name].removeprefix("-")
+        return negative if less else positive
+
     text = re.sub(r"\[([^]]*)\]", kept, effect.family.sentence)
+    text = re.sub(r"\{(\w+)>([^{}|]+)\|([^{}|]+)\}", signed, text)
     return re.sub(r"\{(\w+)(%)?(?:([^{}|]+)\|([^{}|]+))?\}", filled, text)
 
 

@@ -164,7 +164,8 @@ class Family:
         name: `dead_zone`.
         equation: one line of maths for docs and messages.
         sentence: what it means in the workshop. {target} and quantities are filled in; {s} is a
-            verb's ending, {g%} a percentage, {g%stronger|weaker} one with its direction; what
+            verb's ending, {g%} a percentage, {g%stronger|weaker} one with its direction,
+            {k>by|less, by} words by the sign of a quantity that then stands without it; what
             stands in [] is left out where a quantity {b} in it is a constant.
         targets: all targets of a model to which it can apply, joined by "+".
         quantities: the numbers to estimate at a site.

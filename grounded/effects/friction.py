@@ -76,7 +76,7 @@ def _stiction_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Valu
 viscous_friction = RateFamily(
     name="viscous_friction",
     equation="v' = model - k v",
-    sentence="{target} is damped by {k}",
+    sentence="{target} is damped {k>by|less than modelled, by} {k}",
     targets=places.velocities,
     quantities=_viscous,
     lookalikes=("quadratic_drag", "coulomb_friction", "input_gain", "parameter"),
@@ -87,7 +87,7 @@ viscous_friction = RateFamily(
 coulomb_friction = RateFamily(
     name="coulomb_friction",
     equation="v' = model - c sign(v)",
-    sentence="{target} is opposed by a dry friction of {c}",
+    sentence="{target} is opposed by {c>a dry friction of|less dry friction than modelled, by} {c}",
     targets=places.velocities,
     quantities=_coulomb,
     lookalikes=("dead_zone", "viscous_friction", "offset", "stiction"),
@@ -100,7 +100,8 @@ coulomb_friction = RateFamily(
 quadratic_drag = RateFamily(
     name="quadratic_drag",
     equation="v' = model - k v |v|",
-    sentence="{target} is opposed by a drag of {k} times its square",
+    sentence="{target} is opposed by {k>a drag of|less drag than modelled, by} {k} times "
+    "its square",
     targets=places.velocities,
     quantities=_quadratic,
     lookalikes=("viscous_friction", "coulomb_friction", "saturation"),

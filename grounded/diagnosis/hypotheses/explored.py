@@ -10,14 +10,16 @@ What naming an effect costs, the price of its numbers, of looking for it, of whe
 
 k free values, N time steps. Thresholds, frequencies and places that were scanned pay for the
 looking, and families that could have been blamed at many targets for the choice. A parameter of the
-model pays by its prior (a fifth of its size) instead. Two added rates that cancel are no finding,
-nor is a gain that more than doubles in a trial or a log twice too large (`Quantity.absurd`).
+model pays by its prior (a fifth of its size) instead; a friction below zero, which is less of the
+model's own, by the same prior beside. Effects that cancel are no finding, nor is a gain that more
+than doubles in a trial or a log twice too large (`Quantity.absurd`).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 
 import numpy as np
 
@@ -26,8 +28,9 @@ from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.noise import Structure
 from grounded.diagnosis.likelihood.predictor import Predictor, rates_of
-from grounded.effects import Effect, ParamFamily
+from grounded.effects import Effect, InputFamily, ParamFamily, RateFamily
 from grounded.filter.tempering import Tempering, tempering
+from grounded.frozen import Array
 
 CLAIM = 3.0  # nats from which an effect is claimed
 TIE = 3.0  # nats within which two explanations are not told apart
@@ -71,7 +74,7 @@ class FittedHypotheses:
         )
 
     def cancelling(self, h: Hypothesis) -> bool:
-        """Whether two added rates of a hypothesis all but cancel: neither is a finding."""
+        """Whether effects of a hypothesis all but cancel: none of them is a finding."""
         key = tuple(zip(h.names, (tuple(v.values()) for v in h.values), strict=True))
         if key not in self._cancelling:
             self._cancelling[key] = cancelling(self.predictor, h)
@@ -137,7 +140,7 @@ def parametric(fit: Fitted) -> bool:
 PARAM_PRIOR = 0.2  # prior relative error of one parameter that is blamed
 BRIEF = 0.1  # of a control step: shorter delays and lags are a matter of time stamps
 TIMES = {"delay": "d", "sensor_delay": "d", "first_order_lag": "tau", "sensor_lag": "tau"}
-LEFT = 0.25  # of the larger of two rates, from which one is more than the other's counterpart
+LEFT = 0.25  # of what effects do alone, from which together they are more than counterparts
 SAME = 0.05  # part of a dead zone's power that a mere offset may lack and still be the same
 
 
@@ -161,23 +164,30 @@ def price(
         return math.inf
     numbers = len(effect.free) + sum(q.tuned for q in effect.quantities)
     cost = 0.5 * numbers * math.log(max(data.steps, 2)) + effect.family.vague
+    cost += _of_less_friction(effect, values)
     if not _mere_offset(predictor, effect, values):
         cost += math.log(effect.places)
     return cost + math.log(targets)
 
 
 def cancelling(predictor: Predictor, h: Hypothesis) -> bool:
-    """Whether two rates that are added to the same states leave little of each other."""
+    """Whether effects leave little of one another: two added rates, or three effects and more."""
+    units = predictor.data.model.states  # states of one unit, a position's two, share a scale
+    scales = predictor.data.scales
+    size = np.array(
+        [max(scales.spread(n) for n in units if units[n] == unit) for unit in units.values()]
+    )
+    return _two_rates_cancel(predictor, h, size) or _several_cancel(predictor, h, size)
+
+
+def _two_rates_cancel(predictor: Predictor, h: Hypothesis, size: Array) -> bool:
+    """Whether the sum of two added rates is less than LEFT of the larger; `size` (n,) of states."""
     rates, data = rates_of(h), predictor.data
     if len(rates) < 2:
         return False
     x, u = data.y[:-1], predictor.inputs(h)
     needed = any(effect.family.needs_own for effect, _ in rates)
     own = predictor.named((predictor.moved(h, x, u) - x) / data.dt) if needed else {}
-    units = data.model.states  # states of one unit, a position's two, share a scale
-    size = np.array(
-        [max(data.scales.spread(n) for n in units if units[n] == unit) for unit in units.values()]
-    )
     by = [predictor.added_rate([one], x, u, data.time, own) / size for one in rates]
     lengths = [float(np.sqrt(np.sum(one**2))) for one in by]
     return any(
@@ -185,6 +195,47 @@ def cancelling(predictor: Predictor, h: Hypothesis) -> bool:
         for i in range(len(by))
         for j in range(i)
     )
+
+
+def _several_cancel(predictor: Predictor, h: Hypothesis, size: Array) -> bool:
+    """Whether three effects or more change a step by less than LEFT of what each does alone.
+
+    Rates and what an actuator makes of a command alike: a rate that is half as fast again, of a
+    weaker input, beside less friction is a time constant that is three percent shorter. (Two of
+    them that differ in kind, a dead zone and a gain, may well both be there.)
+    """
+    data, x = predictor.data, predictor.data.y[:-1]
+    known = [p for p in h.pairs if isinstance(p[0].family, RateFamily | InputFamily)]
+    names = [effect.name for effect, _ in known if not getattr(effect.family, "parts", 0)]
+
+    def step(of: Hypothesis) -> Array:
+        return predictor.next(of, x)
+
+    def without(of: Hypothesis, taken: Sequence[str]) -> Hypothesis:
+        for name in taken:
+            of = of.minus(name)
+        return of
+
+    for count in range(3, len(names) + 1):
+        for some in combinations(names, count):
+            bare = step(without(h, some))
+
+            def change(of: Hypothesis, bare: Array = bare) -> float:
+                moved = data.model.difference(step(of), bare) / size
+                return float(np.sqrt(np.sum(moved**2 * data.valid.T[..., None])))
+
+            alone = [change(without(h, [n for n in some if n != name])) for name in some]
+            if change(h) < LEFT * min(alone):
+                return True
+    return False
+
+
+def _of_less_friction(effect: Effect, values: Mapping[str, float]) -> float:
+    """What a friction below zero pays: the model's own, which is less, has a parameter's prior."""
+    if not getattr(effect.family, "brakes", False):
+        return 0.0
+    less = [values.get(q.name, 0.0) / q.low for q in effect.free if -math.inf < q.low < 0]
+    return sum(0.5 * (max(share, 0.0) / PARAM_PRIOR) ** 2 for share in less)
 
 
 def _of_parameter(effect: Effect, values: Mapping[str, float], steps: int) -> float:

@@ -162,12 +162,12 @@ class HypothesisSearch(FittedHypotheses):
             (replace(fit.hypothesis, spread=w, shift=shift), fit.noise, fit.track) for w in SPREADS
         ]
         found = self.refined(starts, iterations=14)
-        if found and self._far(found[-1]):
+        if found and self.far(found[-1]):
             crude = replace(found[-1].hypothesis, spread=CRUDE)
             found += self.refined([(crude, found[-1].noise, found[-1].track)], iterations=10)
         return found
 
-    def _far(self, fit: Fitted) -> bool:
+    def far(self, fit: Fitted) -> bool:
         """Whether a parameter has moved beyond what it was given."""
         h, unit = fit.hypothesis, param_scale(self.data.model)
         assert h.shift is not None

@@ -23,12 +23,13 @@ import numpy as np
 from grounded.diagnosis.hypotheses.explored import TIE, parametric
 from grounded.diagnosis.hypotheses.lookalike import lookalikes, of_parameters, one_thing
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
+from grounded.diagnosis.hypotheses.swapped import moving, swap, twins
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated, moved
 from grounded.diagnosis.likelihood.hypothesis import param_scale
 from grounded.diagnosis.likelihood.intervals import standard_deviations
 from grounded.diagnosis.report import Estimate, Likeness, Ranked
-from grounded.diagnosis.validation.decide import SLIGHT, Decision, ordered
+from grounded.diagnosis.validation.decide import BETTER, SLIGHT, Decision, ordered
 from grounded.diagnosis.validation.held_out import gaps_of, held_out_errors
 from grounded.diagnosis.validation.limits import Limits
 from grounded.diagnosis.validation.prediction_error import normalised
@@ -115,10 +116,11 @@ class Claims:
         self, decision: Decision, credit: dict[str, float], known: Limits, ruler: Ruler
     ) -> None:
         self.search, self.best, self.known = decision.search, decision.fit, known
+        self.ruler = ruler
         self.whole = decision.whole
         search, best, self.credit = decision.search, decision.fit, credit
         self.predictor, self.data = search.predictor, search.data
-        self.names = best.hypothesis.names
+        self.names, self._same = best.hypothesis.names, dict[tuple[str, str], bool]()
         calibrating = not self.names and best.hypothesis.spread > 0
         self.null = best if calibrating else search.best_null()
         self.base = search.score(decision.crude if parametric(best) else self.null)
@@ -126,6 +128,8 @@ class Claims:
         self.blamed = self.moved if calibrating else ()
         off = [blame.index for blame in self.blamed[:2]]
         candidates = search.candidates
+        self.alike = () if known.no_cause else lookalikes(self.predictor, best, candidates)
+        swap(search, best, self.alike)  # what ties is asked of fits that are at their top
         self.like_parameters = (
             of_parameters(self.predictor, self.null, off, candidates) if off else ()
         )
@@ -238,7 +242,8 @@ class Claims:
     def groups(self) -> tuple[tuple[str, ...], ...]:
         """For each claimed effect, what could stand in its place within a few nats.
 
-        For parameters that are off: the effects that are the same thing, or as likely alone.
+        For parameters that are off: the effects that are the same thing, or as likely alone. Where
+        parameters move beside effects: what is the same thing with other values of those, too.
         """
         found = []
         for name in dict.fromkeys(one.effect for one in self.like_parameters):
@@ -263,11 +268,13 @@ class Claims:
         return tuple(found)
 
     def equivalent(self, groups: tuple[tuple[str, ...], ...]) -> tuple[tuple[str, ...], ...]:
-        """Of the groups, those of a parameter that are one thing in the model: no trial helps."""
+        """Of the groups, those that are one thing in the model: no trial helps."""
         effects = {e.name: e for e in self.search.candidates}
         model, found = self.data.model, []
         for first, *others in groups:
             name = first.removeprefix("parameter:")
+            if first in self.names and all(self._one_thing(first, other) for other in others):
+                found.append((first, *others))
             if name == first or name not in model.param_names:
                 continue
             index = model.param_names.index(name)
@@ -277,13 +284,42 @@ class Claims:
 
     def rivals(self, name: str) -> list[tuple[str, Fitted]]:
         """What may stand in the place of a claimed effect, beside all the others: name and fit."""
-        rest, score = set(self.names) - {name}, self.search.score
+        rest = set(self.names) - {name}
         found: dict[str, Fitted] = {}  # likeliest first
         for f in self.as_free(len(self.names)):
-            others = set(f.hypothesis.names) - rest
-            if len(others) == 1 and name not in others and score(self.best) - score(f) < TIE:
-                found.setdefault(others.pop(), f)
+            other, *more = set(f.hypothesis.names) - rest
+            if not more and other not in (name, *found) and self._ties(name, other, f):
+                found[other] = f
         return list(found.items())[:2]
+
+    def _ties(self, name: str, other: str, fit: Fitted) -> bool:
+        """Whether a fit with another effect in the place of one is as likely, or is the same thing.
+
+        Two that are one thing differ by how a step is integrated, hundreds of which add up to nats.
+        They tie where predictions of trials left out don't tell them and what is known beforehand,
+        of the parameters above all, favours neither by more than a tie.
+        """
+        score, best = self.search.score, self.best
+        if score(best) - score(fit) < TIE:
+            return True
+        if not self.ruler.held_out or not self._one_thing(name, other):
+            return False
+        b = self.search.tempering.factor
+        known, other_known = (score(f) - b * f.loglik for f in (best, fit))
+        unlike = abs(known - other_known) > TIE
+        gains = (self.ruler.gain(fit, best), self.ruler.gain(best, fit))
+        return not unlike and not any(gain.beyond(*BETTER) for gain in gains)
+
+    def _one_thing(self, name: str, other: str) -> bool:
+        """Whether two effects are the same thing, with other values of the parameters that move."""
+        key = name, other
+        if key not in self._same:
+            effects = {e.name: e for e in self.search.candidates}
+            like = (name, other) in {(one.effect, one.like) for one in self.alike}
+            free = moving(self.data, self.best.hypothesis)
+            pair = effects[name], effects[other]
+            self._same[key] = bool(free) and like and twins(self.predictor, *pair, free)
+        return self._same[key]
 
     def tied(self, parts: Mapping[str, float]) -> dict[str, tuple[Fitted, float]]:
         """Each rival's fit in the place of a claimed effect, and its evidence there."""
@@ -298,8 +334,7 @@ class Claims:
         if self.known.no_cause:
             return ()
         tied = {(group[0], other) for group in groups for other in group[1:]}
-        found = lookalikes(self.predictor, self.best, self.search.candidates)
-        found += self.like_parameters
+        found = self.alike + self.like_parameters
         return tuple(one for one in found if (one.effect, one.like) not in tied)
 
     def parameters(self) -> dict[str, Estimate]:

@@ -1,0 +1,119 @@
+"""Effects that are one thing once a parameter may move: fitted to the end, named together."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from grounded import Model, Param, Trial
+from grounded.diagnosis.diagnose import diagnose
+from grounded.diagnosis.hypotheses.lookalike import lookalikes
+from grounded.diagnosis.hypotheses.search import HypothesisSearch
+from grounded.diagnosis.hypotheses.swapped import moving, swap, twins
+from grounded.diagnosis.likelihood.data import prepare
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.likelihood.predictor import Predictor
+from grounded.effects import Library
+
+DT = 0.05
+
+
+def turner(tau=0.10, gain=1.0, **known):
+    """A heading rate that follows its command; `known`: of its time constant."""
+    return Model(
+        name="turner",
+        states={"psi": "rad", "w": "rad/s"},
+        inputs={"c": "rad/s"},
+        params={"tau": Param(tau, "s", **known)},
+        angles=("psi",),
+        roles={"heading": "psi", "heading_rate": "w"},
+        derivative=lambda s, a, p: {"psi": s.w, "w": (gain * a.c - s.w) / p.tau},
+    )
+
+
+def trials(count=4, steps=150):
+    """Runs from rest of one that turns 12 % less, and takes 20 % longer."""
+    real, rng, found = turner(0.12, 0.88), np.random.default_rng(2), []
+    for _ in range(count):
+        c = np.repeat(rng.uniform(-1.2, 1.2, steps // 10), 10)
+        states = [np.zeros(2)]
+        for value in c:
+            states.append(
+                real.system.step(states[-1][None], np.array([[value]]), real.values, DT)[0]
+            )
+        y = np.array(states) + rng.normal(size=(len(states), 2)) * [1e-3, 4e-3]
+        found.append(
+            Trial(y, c[:, None], DT, real.state_names, real.input_names, start_inputs=np.zeros(1))
+        )
+    return found
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "known", "same"),
+    [
+        ("viscous_friction:w", "input_gain:c", {"low": 0.03, "high": 0.6}, True),
+        ("input_gain:c", "viscous_friction:w", {"low": 0.03, "high": 0.6}, True),
+        ("viscous_friction:w", "input_gain:c", {}, False),  # a constant does not move
+        ("coulomb_friction:w", "input_gain:c", {"low": 0.03, "high": 0.6}, False),
+        ("quadratic_drag:w", "viscous_friction:w", {"low": 0.03, "high": 0.6}, False),
+    ],
+)
+def test_two_effects_are_one_thing_beside_a_parameter_that_moves(one, other, known, same):
+    model = turner(**known)
+    data = prepare(model, trials(2, 60))
+    a, b = (Library().effect(name, model, data.scales) for name in (one, other))
+    free = moving(data, Hypothesis(spread=0.3))
+    assert twins(Predictor(data), a, b, free) is same
+    blamed = [Library().effect("parameter:tau", model)] if known else []
+    assert moving(data, Hypothesis(tuple(blamed), ({"d": 0.02},) * len(blamed))) == free
+    assert moving(data, Hypothesis((a,), ({},))) == []
+
+
+@pytest.fixture(scope="module")
+def search():
+    """The friction alone, beside the time constant."""
+    data = prepare(turner(low=0.03, high=0.6), trials(2))
+    names = ("viscous_friction:w", "input_gain:c", "coulomb_friction:w")
+    effects = [Library().effect(name, data.model, data.scales) for name in names]
+    found = HypothesisSearch(data, effects)
+    with np.errstate(all="ignore"):
+        null = found.nulls()
+        plain = found.exact_null() if null.hypothesis.spread else null
+        found.extended(plain)
+        found.beside_parameters()
+        friction = next(f for f in found.of_size(1) if f.hypothesis.names == names[:1])
+        found.calibrated(friction)
+    return found
+
+
+def test_a_look_alike_is_fitted_in_its_place_to_the_end(search):
+    best = next(
+        f
+        for f in search.fits.values()
+        if f.hypothesis.names == ("viscous_friction:w",) and f.hypothesis.spread > 0
+    )
+    (best,) = search.refined([best], 25)
+    search.fits = {k: f for k, f in search.fits.items() if "input_gain:c" not in k[2]}
+    alike = lookalikes(search.predictor, best, search.candidates)
+    assert "input_gain:c" in [one.like for one in alike]
+    swap(search, replace(best, hypothesis=replace(best.hypothesis, spread=0.0)), alike)
+    assert not any("input_gain:c" in k[2] for k in search.fits)  # nothing was calibrated
+    swap(search, best, alike)
+    found = [f for k, f in search.fits.items() if k[2] == ("input_gain:c",)]
+    top = max(found, key=search.score)
+    assert top.hypothesis.values[0]["g"] == pytest.approx(-0.12, abs=0.01)
+    assert top.settled and abs(search.score(top) - search.score(best)) < 12
+
+
+@pytest.mark.slow
+def test_what_is_one_thing_beside_a_parameter_is_named_together():
+    found = diagnose(turner(low=0.03, high=0.6), trials())
+    pair = {"viscous_friction:w", "input_gain:c"}
+    assert len(pair & set(found.effects)) == 1
+    assert "tau" in found.parameters or "parameter:tau" in found.effects
+    assert pair in [set(group) for group in found.indistinguishable]
+    assert pair in [set(group) for group in found.equivalent]
+    assert "no trial" in found.next_trial and all(name in found.sentence for name in pair)
+    rows = {row.effect: row for row in found.ranking}
+    assert pair <= set(rows) and sum(rows[name].claimed for name in pair) == 1
+    assert not any({one.effect, one.like} == pair for one in found.lookalikes)
