@@ -41,6 +41,7 @@ from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.report import Diagnosis, Estimate, Identifiable, NoiseLevels
+from grounded.diagnosis.ruler_words import open_noise
 from grounded.diagnosis.unconfirmed import another_look, unconfirmed, unrepeatable
 from grounded.diagnosis.validation.agreement import by_trial, changed
 from grounded.diagnosis.validation.claims import Claims
@@ -57,7 +58,7 @@ from grounded.diagnosis.validation.limits import (
 from grounded.diagnosis.validation.measured import Measured, root_mean_square
 from grounded.diagnosis.validation.prediction_error import by_region, by_time, explained, horizon
 from grounded.diagnosis.validation.ruler import Ruler
-from grounded.diagnosis.verdict import next_trial, open_noise, verdict
+from grounded.diagnosis.verdict import next_trial, verdict
 from grounded.effects import Library
 from grounded.engine import Engine, running, steady
 from grounded.errors import GroundedError

@@ -15,9 +15,10 @@ from grounded.diagnosis.excitation import probe
 from grounded.diagnosis.hypotheses.leftover import whiteness
 from grounded.diagnosis.likelihood.data import prepare, shifted
 from grounded.diagnosis.report import Estimate, Ranked
+from grounded.diagnosis.ruler_words import rest
 from grounded.diagnosis.validation.claims import Blame, loss
 from grounded.diagnosis.validation.prediction_error import _stump
-from grounded.diagnosis.verdict import meaning, rest, sentence, verdict
+from grounded.diagnosis.verdict import meaning, sentence, verdict
 from grounded.effects import Library
 from grounded.filter import kalman
 from grounded.models.pendulum import model as pendulum

@@ -10,18 +10,9 @@ from facts import holds
 from grounded import Trial
 from grounded.diagnosis.error_report import Credit, Region, Remainder, RulerRow, runaway
 from grounded.diagnosis.report import Estimate, Ranked, Unconfirmed
+from grounded.diagnosis.ruler_words import improvement, open_noise, rest, telling, worsened
 from grounded.diagnosis.unconfirmed import another_look, unrepeatable
-from grounded.diagnosis.verdict import (
-    LOG,
-    LOST,
-    improvement,
-    next_trial,
-    open_noise,
-    rest,
-    telling,
-    verdict,
-    worsened,
-)
+from grounded.diagnosis.verdict import LOG, LOST, next_trial, verdict
 from grounded.effects import Library
 from grounded.models import car, pendulum
 from grounded_trials.report.diagnosis_words import error_table

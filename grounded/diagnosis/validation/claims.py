@@ -23,7 +23,7 @@ import numpy as np
 from grounded.diagnosis.hypotheses.explored import TIE, parametric
 from grounded.diagnosis.hypotheses.lookalike import lookalikes, of_parameters, one_thing
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
-from grounded.diagnosis.hypotheses.swapped import moving, swap, twins
+from grounded.diagnosis.hypotheses.stand_in import moving, swap, twins
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated, moved
 from grounded.diagnosis.likelihood.hypothesis import param_scale

@@ -107,7 +107,7 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
 
 def _contested(diagnosis: Diagnosis) -> bool:
     """Whether trials differ in what is claimed, and predictions get worse somewhere with it."""
-    from grounded.diagnosis.verdict import worsened
+    from grounded.diagnosis.ruler_words import worsened
 
     differ = {one.effect for one in diagnosis.agreement if not one.agrees}
     return bool(differ & set(diagnosis.effects) and worsened(diagnosis.prediction_error))

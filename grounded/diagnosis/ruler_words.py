@@ -1,0 +1,137 @@
+"""What the ruler's rows say in words: what predictions gain and lose, what is left of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from grounded.diagnosis.error_report import ABOVE, RulerRow, measured, noise_of, number
+
+NAMED = 3  # channels that a sentence names at most
+MATTERS = 0.05  # of the crude model's error: a rest below it is told as its share
+HALF, MORE = 0.5, 0.2  # of the error that is gone: less a second ahead, so much more by the end
+SHOWS = 0.1  # of the error: a channel that improves by less is not named
+
+
+def improvement(rows: Sequence[RulerRow]) -> str:
+    """What predictions gain: `1 s ahead predictions miss v by 0.08 m/s instead of 0.31`.
+
+    Of whole trials, where they gain nothing a second ahead, or much more.
+    """
+    first = telling(rows)
+    shown = [row for row in rows if row is first or row.whole_trial]
+    for row in sorted(shown, key=lambda row: row is not first):
+        gains = _gains(row)
+        best = sorted((n for n in gains if gains[n] > SHOWS), key=lambda n: -gains[n])
+        parts = [
+            f"{name} by {_measured(row, name, row.with_effects[name])} instead of "
+            f"{_measured(row, name, row.crude[name])}{_noise(row, name, row.with_effects[name])}"
+            for name in best[: NAMED - 1]
+        ]
+        if parts:
+            return f"{_ahead(row)} miss {' and '.join(parts)}."
+    return f"{_ahead(first)} hardly change." if first else ""
+
+
+def telling(rows: Sequence[RulerRow]) -> RulerRow | None:
+    """The row that a sentence is about: the longest horizon, or whole trials of a slow plant.
+
+    A second ahead, what heats up over an hour misses little whatever the model lacks.
+    """
+    ahead = next((row for row in reversed(rows) if not row.whole_trial), None)
+    whole = next((row for row in rows if row.whole_trial), None)
+    if ahead and whole and _most(ahead) < HALF and _most(whole) > _most(ahead) + MORE:
+        return whole
+    return ahead
+
+
+def _gains(row: RulerRow) -> dict[str, float]:
+    """The share of each channel's error that is gone, where predictions do not run away."""
+    told = {n: e for n, e in row.crude.items() if row.tells(n, "crude", "with_effects")}
+    return {n: 1 - row.with_effects[n] / e for n, e in told.items() if e > 0}
+
+
+def _most(row: RulerRow) -> float:
+    return max((gain for gain in _gains(row).values() if gain == gain), default=0.0)
+
+
+def _ahead(row: RulerRow) -> str:
+    if row.whole_trial:
+        return "Whole trials"
+    held = "" if row.held_out != "no" else ", not held out"
+    return f"{number(row.horizon_s)} s ahead{held} predictions"
+
+
+def worsened(rows: Sequence[RulerRow]) -> str:
+    """What predictions lose in the channel that loses most, "" where none loses over SHOWS."""
+    losses = [
+        (row.with_effects[name] / max(error, row.noise_floor.get(name, 0.0)), row, name)
+        for row in rows
+        for name, error in row.crude.items()
+        if error > 0 and math.isfinite(row.with_effects[name]) and row.tells(name, "crude")
+    ]
+    ratio, row, name = max(losses, key=lambda loss: loss[0], default=(0.0, None, ""))
+    if row is None or not ratio > 1 + SHOWS:
+        return ""
+    now, then = (_measured(row, name, errors[name]) for errors in (row.with_effects, row.crude))
+    return f"{_ahead(row)} miss {name} by {now} instead of {then}: that is worse."
+
+
+def floor(row: RulerRow | None) -> str:
+    """What predictions miss by, and noise alone, of the channel that misses most."""
+    if row is None:
+        return ""
+    if not (name := most_off(row)):
+        return ""
+    ahead, error = f"{number(row.horizon_s)} s ahead", row.with_effects[name]
+    return f": {ahead} it misses {name} by {_measured(row, name, error)}{_noise(row, name, error)}"
+
+
+def most_off(row: RulerRow) -> str:
+    """The state that is off by most, beside its noise; "" where none was measured."""
+    known = {n: e for n, e in row.with_effects.items() if e == e}
+    off = {n: e / max(row.noise_floor.get(n, math.nan), 1e-300) for n, e in known.items()}
+    return max(off, key=lambda n: off[n], default="")
+
+
+def open_noise(rows: Sequence[RulerRow]) -> str:
+    """The state whose error may be noise or not, for want of repeats; "" where that is known."""
+    row = next((r for r in reversed(rows) if not r.whole_trial and r.floor_at_most), None)
+    return "" if row is None or rest(rows) else most_off(row)
+
+
+def rest(rows: Sequence[RulerRow]) -> str:
+    """What is left above the noise where no leftover is stated, and why none is; "": nothing."""
+    found = [
+        (
+            row.with_effects[name] / noise,
+            row.with_effects[name] / max((row.outset or row.crude)[name], 1e-300),
+            (name, _when(row)),
+        )
+        for row in rows
+        for name, noise in row.noise_floor.items()
+        if noise > 0 and math.isfinite(row.with_effects[name]) and row.tells(name, "with_effects")
+    ]
+    times, share, (name, when) = max(found, default=(0.0, 0.0, ("", "")))
+    if not times > ABOVE:
+        return ""
+    least = "at least " * rows[0].floor_at_most
+    text = f"the state {name} is still off by {least}{times:.2g} times the noise {when}"
+    if share < MATTERS:
+        of = f"{100 * share:.1g} % of what the crude model missed"
+        return f"{text}, which is {of}: too little to look for a cause"
+    beside = f"beside how far {name} moves or how much trials differ"
+    return f"{text}: too little to look for a cause, {beside}"
+
+
+def _when(row: RulerRow) -> str:
+    return "over whole trials" if row.whole_trial else f"{number(row.horizon_s)} s ahead"
+
+
+def _measured(row: RulerRow, name: str, value: float) -> str:
+    return measured(value, row.unit_by_channel[name])
+
+
+def _noise(row: RulerRow, name: str, error: float) -> str:
+    value, unit = row.noise_floor.get(name, math.nan), row.unit_by_channel[name]
+    return noise_of(error, value, unit, at_most=row.floor_at_most)
