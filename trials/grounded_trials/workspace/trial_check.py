@@ -130,7 +130,7 @@ def _beyond(task: Task, trial: Trial) -> list[str]:
     """Where data show that the robot got more than a plan may ask for: [limits] of one log."""
     from grounded.instruments.limits import beyond_limits, limits_of, span
 
-    past = beyond_limits(task, trial.inputs).any(axis=0)
+    past = np.any(beyond_limits(task, trial.inputs), axis=0)
     return [
         f"{name} goes from {span(trial.inputs[:, i])} in this log, beyond its [limits], "
         f"{limits_of(task, i)}: no plan will ask for that; widen them if the robot may get it"
