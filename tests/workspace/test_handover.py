@@ -101,8 +101,9 @@ def test_limits_that_were_narrowed_make_it_void(w, tmp_path):
     assert caught.value.then == NextCommand("propose")
     made = w.propose()
     assert made.candidate.id == "c0002" and made.proposal.is_new
-    (note,) = made.proposal.notes
+    note, held = made.proposal.notes
     assert note == f"c0001 was not run and is void: {why}; run c0002 in its place"
+    assert holds(held, "force", "[limits]")  # half a newton does not reach the target
     assert w.run().candidate == "c0002"
     assert w.propose().proposal.notes == ()  # said once
 
