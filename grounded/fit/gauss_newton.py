@@ -28,6 +28,7 @@ from grounded.fit.point import FitData, Linear, Point, exact, linear, point
 from grounded.frozen import Array
 
 ENOUGH = 0.002  # [nats] a step that promises less, a sixteenth of a std, is the last
+WHOLE = 1e-9  # of a step: rounding
 NOTHING = 1e-9  # of the largest eigenvalue (scaled): below it the data say nothing
 
 
@@ -111,12 +112,13 @@ def marquardt_step(
     free, delta = free & ~stuck & (np.diag(N) > 0), np.zeros(unknowns.k)
     while (use := np.flatnonzero(free)).size:
         left = g[use] - N[use][:, ~free] @ delta[~free]
-        to = theta[use] + _damped(N[np.ix_(use, use)], left, damping)
-        inside = np.clip(to, unknowns.low[use], unknowns.high[use])
-        delta[use] = inside - theta[use]
-        if (inside == to).all():
+        step = _damped(N[np.ix_(use, use)], left, damping)
+        inside = np.clip(theta[use] + step, unknowns.low[use], unknowns.high[use]) - theta[use]
+        delta[use] = inside
+        part = inside / np.where(step == 0, 1.0, step) + (step == 0)
+        if (part > 1 - WHOLE).all():
             break
-        free[use[inside != to]] = False
+        free[use[np.argmin(part)]] = False  # the first to meet its bound
     return delta, float(g @ delta - 0.5 * delta @ N @ delta)
 
 

@@ -82,7 +82,6 @@ def test_a_value_at_its_bound_stops_no_fit_of_the_others(search):
     )
     shifts = [fit.hypothesis.shift for fit in (told, tied)]
     assert np.abs(shifts[1] - [-0.02, 0.02]).max() > 1e-3
-    assert tied.evidence > told.evidence - 20
     assert shifts[0] == pytest.approx([K - 1.0, TAU - 0.05], rel=0.1)
 
 
@@ -100,9 +99,9 @@ def test_two_names_of_one_friction_are_compared_with_one(search):
     effects = {e.name: e for e in search.candidates}
     h = Hypothesis().plus(effects["coulomb_friction:w"], {"c": 5.2})
     assert not list(plain_forms(search, h))
-    h = h.plus(effects["stiction:w"], {"c": 5.0}).plus(effects["offset:w"], {"c": 0.1})
+    h = h.plus(effects["stiction:w"], {"c": 5.0}).plus(effects["quadratic_drag:w"], {"k": 0.1})
     (plain,) = plain_forms(search, h)
-    assert set(plain.names) == {JOINT, "offset:w"}
+    assert set(plain.names) == {JOINT, "quadratic_drag:w"}
     assert plain.values[plain.names.index(JOINT)]["c"] == pytest.approx(5.2 * 0.05, rel=0.01)
 
 

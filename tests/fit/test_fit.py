@@ -15,6 +15,7 @@ from grounded.estimate.steps import ModelSteps
 from grounded.fit import PredictionError, fit, prediction_error
 from grounded.fit.gauss_newton import climb, marquardt_step
 from grounded.fit.point import FitData, Linear, exact, linear, point, whitened
+from grounded.fit.result import beside_bounds, uncertainty
 from grounded.fit.unknowns import unknowns_of
 from grounded.model import Model, Param
 from grounded.models.pendulum import model as pendulum
@@ -412,29 +413,14 @@ def test_a_fit_that_predicts_no_better_is_not_recommended():
 
 
 def test_a_gain_that_ties_with_what_is_at_its_bound_is_identified():
-    """b >= 0 does what K and tau do together; with b at 0 the trials tell both."""
-
-    def rates(s, a, p):
-        return {"w": (p.K * (a.u - p.b * s.w) - s.w) / p.tau}
-
-    true = Model(
-        name="motor",
-        states={"w": "rad/s"},
-        inputs={"u": "V"},
-        params={
-            "K": Param(0.8, "rad/s/V", 0.4, 2.0),
-            "b": Param(0.0, "V s/rad", 0.0, 1.0),
-            "tau": Param(0.2, "s", 0.05, 0.6),
-        },
-        derivative=rates,
-    )
-    noise = NoiseStd(np.array([1e-4]), np.array([0.005]), DT)
-    trials = simulated(true, np.random.default_rng(3), noise)
-    found = fit(true.with_values({"K": 0.7, "tau": 0.25}), trials)
-    assert all(value.identified for value in found.params.values()), found.sentence
-    assert found.params["b"].value == 0.0 and found.params["b"].low == 0.0
-    assert found.params["K"].value == pytest.approx(0.8, abs=0.02)
-    assert found.params["tau"].value == pytest.approx(0.2, rel=0.03)
+    """k and d do the same here; where d has ended at its bound 0, the trials tell k."""
+    unknowns = unknowns_of(SPRING, None, np.zeros(1), "known")
+    both = Linear(np.full((2, 2), 1e4), np.zeros(2), np.zeros((3, 2)))
+    every, inside, at_bound = np.ones(2, bool), np.array([4.0, 0.5]), np.array([4.0, 0.0])
+    assert np.isinf(uncertainty(both, every).std).all()
+    assert np.isinf(beside_bounds(both, every, unknowns, inside).std).all()
+    found = beside_bounds(both, every, unknowns, at_bound)
+    assert found.std == pytest.approx([0.01, 0.01]) and not found.together
 
 
 def test_a_step_that_meets_a_bound_is_the_best_one_with_it_there():

@@ -109,7 +109,7 @@ def adopt_effects(workspace: Folder, names: Sequence[str], *, parameters: bool =
         own,
         claimed,
         beside=tuple(n for n in beside if n not in fitted),
-        left=left_behind(found) if calibrated else {},
+        left=left_behind(found) if parameters and claimed else {},
     )
 
 
