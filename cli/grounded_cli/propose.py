@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from grounded.search.candidate import LITTLE
 from grounded.search.step_size import Step
 from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
 from grounded_cli.terminal import field, number, progress, remark, show, show_json
@@ -188,7 +189,7 @@ def _came_true(candidate: Candidate, same: Sequence[Tried], standing: Standing) 
     if not gain < max(missed[-1], candidate.likely_off):
         return promise
     doubt = f"{promise}, which is no more than such a miss"
-    if candidate.doubtful:  # a note of the candidate's says so
+    if candidate.doubtful or not gain < LITTLE * abs(best.utility):  # a note may say so
         return doubt
     return f"{doubt}: you may stop here, with {best.candidate.id}, the best so far"
 

@@ -240,7 +240,17 @@ class _Writer:
         seen = unconfirmed(self.claims, self.decision.doubtful, groups)
         values, agreement = by_trial(self.best, data, named) if named else ((), ())
         return Diagnosis(
-            verdict=verdict(self.claims, ranking, groups, remainder, rows, credit, seen, same),
+            verdict=verdict(
+                self.claims,
+                ranking,
+                groups,
+                remainder,
+                rows,
+                credit,
+                seen,
+                same,
+                self.options.max_effects,
+            ),
             where=Where(
                 channels=self.channels(gain, rows),
                 times=tuple(by_time(gain.sum(axis=-1), data)),

@@ -36,6 +36,7 @@ def verdict(
     credit: tuple[Credit, ...],
     seen: Sequence[Unconfirmed] = (),
     same: tuple[tuple[str, ...], ...] = (),
+    most: int = 0,
 ) -> Verdict:
     """One effect, several, none or unknown, and why: what, by how much, what is left.
 
@@ -48,6 +49,7 @@ def verdict(
         credit: what each cause is worth, largest first.
         seen: what only one trial shows.
         same: of the groups, what is one thing in the model.
+        most: effects that were looked for at once; 0: any number.
     """
     once = [sentence([one.sentence()]) for one in seen]
     left = remainder[0].sentence() if remainder else ""
@@ -73,7 +75,9 @@ def verdict(
     words = [sentence(map(str.__add__, causes, shares)), improvement(rows), worsened(rows)]
     words.append(runaway(rows))
     words += [f"{told_apart(group, same)}." for group in groups[:1]]
-    if remainder:
+    if remainder and len(claims.names) == most:
+        words.append(f"More is left: {left}; beyond {most} effects nothing was looked for.")
+    elif remainder:
         words.append(f"Something is left that no known effect explains: {left}.")
     elif above := rest(rows):
         words.append(sentence([above]))

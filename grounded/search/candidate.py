@@ -26,6 +26,8 @@ Slopes = Literal[
     "corrected",  # by what earlier trials were mispredicted by, see `mispredictions`
 ]
 
+LITTLE = 0.1  # of the best one's cost: a doubtful promise below it is no reason to go on
+
 if TYPE_CHECKING:
     from grounded.figures.figure import Figure
 

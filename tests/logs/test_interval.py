@@ -39,6 +39,8 @@ def gaps(every, rows, seed=0, jitter=0.0, drift=0.0, held=0.3, odd=0):
         (0.1, 0.01, {}),
         (0.1, 0.02, {"jitter": 0.003}),
         (0.02, 0.01, {}),
+        (0.02, 0.01, {"held": 0.0}),  # not 0.025 s, of which it is within a row
+        (0.02, 0.005, {"held": 0.0}),
     ],
 )
 def test_the_interval_is_found_in_what_rows_show(every, rows, more):

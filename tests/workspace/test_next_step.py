@@ -426,13 +426,18 @@ def test_trust_sets_the_promised_gain_against_the_last_misses(tmp_path):
     assert holds(said[1], f"{ran[0].utility:.4g}", "promises")
     assert holds(said[2], f"{missed[0]:.4g}", f"{missed[1]:.4g}", f"{gain:.4g}")
     assert ("no more than" in " ".join(said[2].split())) == (gain < missed[1])
-    assert holds(" ".join(said[2].split()), "stop here", "c0002") == (gain < missed[1])
+    little = gain < missed[1] and gain < 0.1 * abs(ran[1].utility)
+    assert holds(" ".join(said[2].split()), "stop here", "c0002") == little
+    assert "stop here" not in said[1]  # which promises all of the cost
 
 
 def test_who_is_told_that_a_candidate_may_lose_is_told_where_to_stop(tmp_path, monkeypatch):
     folder = make(tmp_path / "w").folder
     grounded("-C", folder, "learn", "--trials", "1")
     monkeypatch.setattr(Candidate, "doubtful", property(lambda made: bool(made.base)))
+    done = grounded("-C", folder, "propose")
+    assert "c0002 may well lose" in " ".join(done.err.split()) and "stop here" not in done.err
+    monkeypatch.setattr("grounded_trials.workspace.handover.LITTLE", 10.0)
     done = grounded("-C", folder, "propose")
     assert holds(" ".join(done.err.split()), "c0002 may well lose", "stop here, with c0001")
     assert "stop here" not in done.out and last(done) == "grounded run"

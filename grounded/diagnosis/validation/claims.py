@@ -314,7 +314,7 @@ class Claims:
         """Whether two effects are the same thing, with other values of the parameters that move."""
         key = name, other
         if key not in self._same:
-            effects = {e.name: e for e in self.search.candidates}
+            effects = {e.name: e for e in (*self.search.joints.values(), *self.search.candidates)}
             like = (name, other) in {(one.effect, one.like) for one in self.alike}
             free = moving(self.data, self.best.hypothesis)
             pair = effects[name], effects[other]

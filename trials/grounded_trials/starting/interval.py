@@ -25,6 +25,7 @@ ENOUGH = 20  # times between changes
 NEARLY_ALL = 0.95  # of them are multiples of the interval
 ONCE = 0.25  # of them are the interval itself
 APART = 1.5  # rows, from which an interval is another one than theirs
+OFF = 0.05  # of an interval, that the mean of the times between changes may be from it
 EXACT, LOOSE = 0.1, 0.25  # of an interval: how far a multiple may be off it
 
 
@@ -90,7 +91,8 @@ def changes_every(gaps: Array, rows: float) -> float | None:
         near = step * min(max(EXACT, 1.05 * rows / step), LOOSE)
         whole = np.maximum(np.rint(gaps / step), 1)
         on = np.abs(gaps - whole * step) <= near
-        if on.mean() >= NEARLY_ALL and (on & (whole == 1)).mean() >= ONCE:
+        often = on.mean() >= NEARLY_ALL and (on & (whole == 1)).mean() >= ONCE
+        if often and abs(float((gaps / whole)[on].mean()) / step - 1) < OFF:
             return step
     return None
 

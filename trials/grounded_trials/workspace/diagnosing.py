@@ -101,6 +101,10 @@ def diagnose_in(
         run = f" ({identity}: {rendered(to_run(workspace, identity, identity))})" * bool(identity)
         found = replace(found, next_trial=f"{words}{run}", probe=identity)
         _keep(workspace, found)
+    if found.leftover and len(found.effects) == max_effects:
+        more = f"`grounded diagnose --max-effects {max_effects + 1}` looks for one more effect."
+        found = replace(found, next_trial=f"{more} {found.next_trial}".strip())
+        _keep(workspace, found)
     if undo := _in_vain(workspace, found):
         found = replace(found, next_trial=f"{undo} {found.next_trial}")
         _keep(workspace, found)

@@ -24,7 +24,7 @@ import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.policy import Policy
-from grounded.search.candidate import Candidate
+from grounded.search.candidate import LITTLE, Candidate
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.workspace.folder import Folder
@@ -234,7 +234,9 @@ class Check:
         made, name = self.candidate, self.candidate.id
         if made.doubtful and not self._trials(name):
             best = self.standing.incumbent
-            stop = f". You may stop here, with {best.candidate.id}, the best so far" if best else ""
+            stop = ""
+            if best and made.predicted_gain < LITTLE * abs(best.utility):
+                stop = f". You may stop here, with {best.candidate.id}, the best so far"
             yield (
                 f"{name} may well lose: it promises {made.predicted_gain:.3g} over {made.base}, "
                 f"and its model is likely to be off by {made.likely_off:.3g} there, as it was for "
