@@ -7,7 +7,7 @@ import pytest
 
 from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
-from grounded.diagnosis.hypotheses.plainest import fit_plainer, plain_forms
+from grounded.diagnosis.hypotheses.plainest import plain_forms, plainer
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
@@ -89,7 +89,8 @@ def test_what_holds_the_plain_friction_as_a_case_is_compared_with_it(search):
     effects = {e.name: e for e in search.candidates}
     assert JOINT not in effects
     loaded = fitted(search, (effects[LOADED], {"c": 0.31, "k": 0.2}), start=(0.09, 0.015))
-    (better,) = fit_plainer(search, [loaded])
+    (better,) = plainer(search, loaded)
+    assert search.score(better) > search.score(loaded)
     assert better.hypothesis.names == (JOINT,)
     assert better.hypothesis.values[0]["c"] == pytest.approx(FRICTION, rel=0.03)
     assert better.hypothesis.shift[0] == pytest.approx(K - 1.0, rel=0.2)

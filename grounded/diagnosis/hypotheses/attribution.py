@@ -13,7 +13,6 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from grounded.diagnosis.hypotheses.explored import CLAIM
-from grounded.diagnosis.hypotheses.plainest import fit_plainer
 from grounded.diagnosis.hypotheses.search import (
     LARGE,
     LARGE_GAIN,
@@ -121,7 +120,6 @@ def _explore(search: HypothesisSearch) -> Fitted:
         if same:
             break
     search.finished(search.of_size(1)[:HOPEFUL], TO_THE_TOP)
-    fit_plainer(search, search.of_size(1)[:HOPEFUL])
     tune(search, search.of_size(1)[:TUNED])
     best = search.of_size(1)[0]
     search.fair(best)
@@ -199,9 +197,8 @@ def _halves(search: HypothesisSearch, starts: Sequence[Fitted]) -> list[Fitted]:
 
 def _grow(search: HypothesisSearch, best: Fitted, most: int) -> None:
     """Second and further effects: add, then swap each for what goes better with the others."""
-    size, grown_from = len(best.hypothesis.effects), set[tuple[str, ...]]()
+    size = len(best.hypothesis.effects)
     while 1 <= size < most:
-        grown_from.add(best.hypothesis.names)
         starts = _starts(search, size, best)
         halves = _halves(search, starts) if size == 1 else []
         grown = [search.extended(start, 8) for start in starts]
@@ -211,13 +208,6 @@ def _grow(search: HypothesisSearch, best: Fitted, most: int) -> None:
         search.again(search.of_size(size + 1)[:2])
         search.finished(search.of_size(size + 1)[:TUNED], TO_THE_TOP)
         tune(search, search.of_size(size + 1)[:TUNED])
-        found = fit_plainer(search, search.of_size(size + 1)[:TUNED])
-        fewer = [f for f in found if f.hypothesis.names not in grown_from]
-        fewer = [f for f in fewer if len(f.hypothesis.names) == size]
-        plainest = max(fewer, key=search.score, default=best)
-        if search.score(plainest) > search.score(best):
-            best = plainest  # two frictions in one: there is room for another effect
-            continue
         larger = search.of_size(size + 1)
         if not larger or search.score(larger[0]) < search.score(best) + CLAIM:
             return

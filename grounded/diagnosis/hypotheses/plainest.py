@@ -8,28 +8,18 @@ rate holds nothing at rest; what does would win against it for that alone.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
 
-from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch, tune
+from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.noise import Structure
 from grounded.effects import Effect, places
 from grounded.effects.family import coupled
 from grounded.effects.joint import joint_friction, load_friction
-
-
-def fit_plainer(search: HypothesisSearch, fits: Sequence[Fitted]) -> list[Fitted]:
-    """Fits the plainer forms of some fits too; returns those that are likelier than theirs."""
-    better: list[Fitted] = []
-    for fit in fits:
-        likelier = [f for f in plainer(search, fit) if search.score(f) > search.score(fit)]
-        tune(search, likelier)
-        better += [search.fits[_key(f)] for f in likelier]
-    return better
 
 
 def plainer(search: HypothesisSearch, fit: Fitted) -> list[Fitted]:
