@@ -106,6 +106,21 @@ def test_two_names_of_one_friction_are_compared_with_one(search):
     assert plain.values[plain.names.index(JOINT)]["c"] == pytest.approx(5.2 * 0.05, rel=0.01)
 
 
+def test_a_friction_at_its_plainest_has_no_plainer_form(search):
+    """One whose viscous part is nothing was its own plainer form, for ever."""
+    joint = search.joints["w"]
+    both = tuple(replace(q, fixed=False) if q.name == "b" else q for q in joint.quantities)
+    viscous = replace(joint, quantities=both)
+    values = {**joint.fixed, "c": FRICTION, "b": 0.0}
+    dearer = search.price(viscous, values) - search.price(joint, values)
+    assert dearer == pytest.approx(0.5 * np.log(search.N))
+    fit = fitted(search, (viscous, values), start=(-0.1, 0.01))
+    fit = replace(fit, hypothesis=replace(fit.hypothesis, values=(values,)))
+    (plain,) = plainer(search, fit)
+    assert "b" in plain.hypothesis.effects[0].fixed
+    assert not plainer(search, plain)
+
+
 @pytest.mark.slow
 def test_a_dry_friction_that_holds_at_rest_is_one_cause_and_the_gain_is_right():
     found = diagnose(MOTOR, driven())

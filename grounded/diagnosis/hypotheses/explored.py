@@ -52,7 +52,7 @@ class FittedHypotheses:
 
     def price(self, effect: Effect, values: Mapping[str, float]) -> float:
         """What an effect pays beside its likelihood, in nats."""
-        key = (effect.name, *sorted(values.items()))
+        key = (effect.name, len(effect.free), *sorted(values.items()))
         if key not in self._prices:
             targets = self.crowd.get(effect.name, 1)
             self._prices[key] = price(self.predictor, effect, values, targets)

@@ -29,9 +29,15 @@ def plainer(search: HypothesisSearch, fit: Fitted) -> list[Fitted]:
         key = _key(replace(fit, hypothesis=h))
         if key not in search.fits or h.names == fit.hypothesis.names:
             search.refined([(h, fit.noise, fit.track)], TO_THE_TOP)
-        if key in search.fits:
-            found.append(search.fits[key])
+        plain_fit = search.fits.get(key)
+        if plain_fit is not None and _numbers(plain_fit) < _numbers(fit):
+            found.append(plain_fit)
     return found
+
+
+def _numbers(fit: Fitted) -> int:
+    """What a fit has to say: of two of one name the likelier is kept, the plainer or not."""
+    return len(fit.hypothesis.effects) + len(fit.hypothesis.theta)
 
 
 def _key(fit: Fitted) -> tuple[Structure, float, tuple[str, ...]]:
