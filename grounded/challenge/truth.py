@@ -96,7 +96,7 @@ class _Run:
         self.own_state: dict[str, Any] = {"rng": rng}
         latency = truth.latency or (0.0,) * model.m
         self.late = [divmod(seconds / self.fine, 1.0) for seconds in latency]
-        self.queues = [[held[j]] * (int(whole) + 1) for j, (whole, _) in enumerate(self.late)]
+        self.settle()
         self.gust, self.last, self.past = np.zeros(model.n), self.held, [self.x.copy()]
         pairs = ((n, partner(model, n)) for n in self.names)
         self.plant = None if truth.mechanism is None else truth.mechanism.plant(self.fine)
@@ -119,6 +119,20 @@ class _Run:
         states = np.array(logged)
         return Trial(states, np.array(inputs), self.dt, *names, start_inputs=self.held)
 
+    def settle(self) -> None:
+        """What was held before went through the effects on inputs, too, and their memories."""
+        u, names = self.held.copy(), self.truth.model.input_names
+        for index, (effect, values) in enumerate(self.truth.effects):
+            for target in effect.site.targets:
+                family = effect.family
+                if isinstance(family, InputFamily):
+                    j = names.index(target)
+                    u[j] = family.effect(u[j], 0.0, values)
+                elif isinstance(family, MemoryFamily):
+                    depth = family.depth(values, self.fine)
+                    self.memory[f"{index}{target}"] = (u[names.index(target)],) * depth
+        self.queues = [[u[j]] * (int(whole) + 1) for j, (whole, _) in enumerate(self.late)]
+
     def received(self, u: Array, t: float) -> Array:
         """What the actuators deliver over a fine step."""
         model, out = self.truth.model, u.copy()
@@ -132,8 +146,7 @@ class _Run:
                     out[j] = family.effect(out[j], t, values)
                 else:
                     key = f"{index}{target}"
-                    depth = family.depth(values, self.fine)
-                    z = self.memory.get(key, tuple([self.held[j]] * depth))
+                    z = self.memory[key]
                     out[j], self.memory[key] = family.advance(out[j], z, values, self.fine)
         for actuator in self.truth.actuators:
             out = actuator(out, self.own_state, t, self.fine)

@@ -28,8 +28,9 @@ from grounded.effects.family import (
     wrapping_order,
 )
 from grounded.effects.joint import one_friction
+from grounded.effects.memory import memory_of, memory_start
 from grounded.effects.registry import Library
-from grounded.effects.wrap import memory_of, memory_start, param_name, wrap
+from grounded.effects.wrap import param_name, wrap
 
 __all__ = [
     "Effect",

@@ -15,8 +15,8 @@ the rate of a model that has another of them in it. A limit acts inside the adde
 
 It is a `step` model in plain NumPy, so that it is traced and compiled where the original was.
 Memory (a lag's output, a queue, a clock) becomes further states, all of them functions of the
-commands and the measured states: `memory_of` recovers them along a recorded trial. In which order
-several effects are wrapped: `wrapping_order`.
+commands and the measured states (`memory`). In which order several effects are wrapped:
+`wrapping_order`.
 """
 
 from __future__ import annotations
@@ -44,9 +44,7 @@ from grounded.effects.joint import inputs_left
 from grounded.effects.registry import partner
 from grounded.effects.sensor import lagging
 from grounded.errors import GroundedError
-from grounded.frozen import Array
 from grounded.model import Model, Param
-from grounded.trial import Trial
 
 Step = Callable[[Any, Any, Any, Any], dict[str, Any]]
 
@@ -117,6 +115,7 @@ def wrap(effect: Effect, values: Mapping[str, float], dt: float) -> Model:
         raise GroundedError(f"effect '{effect.name}': its family can't be adopted")
     step, memory = build(effect, whole, dt)
     vars(step)["timestep"] = getattr(model.step, "timestep", 0.0)
+    vars(step)["settled"] = _settled(effect)
     return Model(
         states={**model.states, **memory},
         inputs=model.inputs,
@@ -195,6 +194,27 @@ def _memory_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[s
         return {**base(_own_state(model, s), _replaced(model, a, u), p, dt), **kept}
 
     return step, {z: model.inputs[n] for n, memory in names.items() for z in memory}
+
+
+def _settled(effect: Effect) -> Callable[[Any, Any], dict[str, Any]]:
+    """What memories of inputs hold after the commands a were held for long, by a target's name.
+
+    Each effect hands on what it makes of them to those that were wrapped before it.
+    """
+    model, family = effect.site.model, effect.family
+    inner = getattr(model.step, "settled", lambda a, p: {})
+
+    def settled(a: Any, p: Any) -> dict[str, Any]:
+        own = {}
+        if isinstance(family, MemoryFamily):
+            own = {f"{n}_{family.name}": a[n] for n in effect.site.targets}
+        elif isinstance(family, InputFamily):
+            c = _quantities(effect, p)
+            u = {n: family.effect(a[n], 0.0, c) for n in effect.site.targets}
+            a = _replaced(model, a, u)
+        return {**inner(a, p), **own}
+
+    return settled
 
 
 def _loss_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str, str]]:
@@ -367,33 +387,3 @@ def _sensor_lag_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, di
         return {**after, target: after[target] + off, memory: after[target]}
 
     return step, {memory: model.states[target]}
-
-
-def memory_of(wrapped: Model, base: Model, trial: Trial) -> Array:
-    """The memory states along a recorded trial, (T + 1, wrapped.n - base.n).
-
-    They start at what held before t = 0 (the held input, the first logged value, a clock at zero)
-    and follow the commands and the logged states.
-    """
-    found = [now := memory_start(wrapped, base, trial)]
-    for t in range(trial.steps):
-        x = np.concatenate([trial.states[t], now])[None]
-        after = wrapped.system.step(x, trial.inputs[t][None], wrapped.values, trial.dt)
-        now = after[0, base.n :]
-        found.append(now)
-    return np.array(found).reshape(trial.steps + 1, wrapped.n - base.n)
-
-
-def memory_start(wrapped: Model, base: Model, trial: Trial) -> Array:
-    """The memory states at t = 0, (wrapped.n - base.n,)."""
-    held, start = np.zeros(base.m) if trial.start_inputs is None else trial.start_inputs, []
-    for name in wrapped.state_names[base.n :]:
-        inputs = [i for i, n in enumerate(base.input_names) if name.startswith(f"{n}_")]
-        states = [i for i, n in enumerate(base.state_names) if name.startswith(f"{n}_true")]
-        if name.endswith("_clock"):
-            start.append(0.0)
-        elif states:
-            start.append(float(trial.states[0, states[-1]]))
-        else:
-            start.append(float(held[inputs[-1]]) if inputs else 0.0)
-    return np.array(start)

@@ -19,6 +19,9 @@ LIMIT = ("rate_limit:steering", {"r": 2.0})
 DELAY = ("delay:steering", {"d": 2 * DT})
 LAG = ("first_order_lag:steering", {"tau": 0.1})
 ZONE = ("dead_zone:steering", {"c": 0.1})
+WEAK = ("input_gain:throttle", {"g": -0.2})
+THROTTLE = ("first_order_lag:throttle", {"tau": 0.1})
+BIAS = ("input_bias:steering", {"b": 0.05})
 PULL = ("offset:delta", {"c": 0.1})
 HELD = np.array([0.0, 0.3])  # a dead zone leaves it as it is
 
@@ -98,6 +101,10 @@ def adopted(parts):
         (LAG, LIMIT),
         (LIMIT, LAG),
         (DELAY, ZONE, LAG),
+        (WEAK, THROTTLE),
+        (THROTTLE, WEAK),
+        (BIAS, LIMIT, DELAY),
+        (BIAS, ("backlash:steering", {"b": 0.1})),
     ],
     ids=lambda parts: " ".join(name.partition(":")[0] for name, _ in parts),
 )
@@ -105,6 +112,23 @@ def test_one_order_everywhere(parts):
     want = predicted(parts)
     np.testing.assert_allclose(probed(parts), want, atol=1e-9)
     np.testing.assert_allclose(adopted(parts), want, atol=1e-9)
+
+
+@pytest.mark.parametrize("parts", [(WEAK, THROTTLE), (BIAS, LAG, DELAY), (BIAS, LIMIT)])
+def test_what_was_held_before_went_through_all_effects(parts):
+    """An input that stays as it was held moves no memory."""
+    names = (car.state_names, car.input_names)
+    still = Trial(
+        np.full((STEPS + 1, car.n), 0.1),
+        np.tile(HELD, (STEPS, 1)),
+        DT,
+        *names,
+        start_inputs=HELD,
+    )
+    predictor = Predictor(prepare(car, [still], latency=np.full(2, 1.5 * DT)))
+    received = predictor.received(hypothesis(parts))[0]
+    np.testing.assert_allclose(received, np.tile(received[-1], (STEPS, 1)), atol=1e-12)
+    assert np.abs(received[0] - HELD).max() > 0.04
 
 
 def test_effects_on_inputs_do_not_commute():

@@ -102,11 +102,11 @@ class Data:
         flat = np.concatenate([per_step[i, :T] for i, T in enumerate(self.lengths)])
         return np.ascontiguousarray(flat[self.step_at].swapaxes(0, 1))
 
-    def delayed(self, inputs: Array) -> Array:
-        """What arrives of (S, T_max, m) after the latency that the task already models."""
+    def delayed(self, inputs: Array, held: Array) -> Array:
+        """What arrives of (S, T_max, m), `held` (S, m) before, after the latency of the task."""
         out = np.empty_like(inputs)
         for j, latency in enumerate(self.latency):
-            out[:, :, j] = shifted(inputs[:, :, j], self.held[:, j], latency / self.dt)
+            out[:, :, j] = shifted(inputs[:, :, j], held[:, j], latency / self.dt)
         return out
 
 

@@ -77,10 +77,10 @@ class Predictor(SentOnce):
 
         def found() -> Array:
             data, whole = self.data.in_use, np.zeros_like(self.data.commands)
-            u = data.commands
+            u, held = data.commands, data.held
             for effect, values in self.acting(h):
-                u = transformed(effect, values, u, data)
-            whole[data.used] = data.delayed(u)
+                u, held = transformed(effect, values, u, held, data)
+            whole[data.used] = data.delayed(u, held)
             return whole
 
         return self._kept("trials", h, found)
@@ -347,19 +347,25 @@ def sensor_offset(effect: Effect, values: Mapping[str, float], track: Array, dt:
     return np.asarray(old - track)
 
 
-def transformed(effect: Effect, values: Mapping[str, float], u: Array, data: Data) -> Array:
-    """Commands (S, T, m) after an input or memory effect."""
+def transformed(
+    effect: Effect, values: Mapping[str, float], u: Array, held: Array, data: Data
+) -> tuple[Array, Array]:
+    """Commands (S, T, m), and what was held before them (S, m), after an input or memory effect.
+
+    What was held went through the effects before, too; a memory has settled at it.
+    """
     family, names = effect.family, data.model.input_names
-    out = u.copy()
+    out, before = u.copy(), held.copy()
     for target in effect.site.targets:
         j = names.index(target)
         if isinstance(family, InputFamily):
             t = np.arange(u.shape[1]) * data.dt
             out[:, :, j] = family.effect(u[:, :, j], t[None, :], values)
+            before[:, j] = family.effect(held[:, j], 0.0, values)
         elif isinstance(family, MemoryFamily):
             if family.name == "delay":  # the same as its queue, at once
-                out[:, :, j] = shifted(u[:, :, j], data.held[:, j], values["d"] / data.dt)
+                out[:, :, j] = shifted(u[:, :, j], held[:, j], values["d"] / data.dt)
                 continue
-            before = family.along(u[:, :, j], data.held[:, j], values, data.dt)
-            out[:, :, j], _ = family.advance(u[:, :, j], (before,), values, data.dt)
-    return out
+            z = family.along(u[:, :, j], held[:, j], values, data.dt)
+            out[:, :, j], _ = family.advance(u[:, :, j], (z,), values, data.dt)
+    return out, before

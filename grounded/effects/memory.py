@@ -1,0 +1,46 @@
+"""What the memory states of adopted effects hold: when a trial begins, and all along it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from grounded.compile.names import Named
+from grounded.frozen import Array
+from grounded.model import Model
+from grounded.trial import Trial
+
+
+def memory_of(wrapped: Model, base: Model, trial: Trial) -> Array:
+    """The memory states along a recorded trial, (T + 1, wrapped.n - base.n).
+
+    They start at what held before t = 0 (`memory_start`), and follow the commands and the logged
+    states.
+    """
+    found = [now := memory_start(wrapped, base, trial)]
+    for t in range(trial.steps):
+        x = np.concatenate([trial.states[t], now])[None]
+        after = wrapped.system.step(x, trial.inputs[t][None], wrapped.values, trial.dt)
+        now = after[0, base.n :]
+        found.append(now)
+    return np.array(found).reshape(trial.steps + 1, wrapped.n - base.n)
+
+
+def memory_start(wrapped: Model, base: Model, trial: Trial) -> Array:
+    """The memory states at t = 0, (wrapped.n - base.n,): of a clock 0, of a sensor what it showed.
+
+    What was held before went through the input effects that stand before a memory.
+    """
+    held = np.zeros(base.m) if trial.start_inputs is None else trial.start_inputs
+    settled = getattr(wrapped.step, "settled", lambda a, p: {})
+    known = settled(
+        Named("input", base.input_names, list(held)),
+        Named("parameter", wrapped.param_names, list(wrapped.values)),
+    )
+    start = []
+    for name in wrapped.state_names[base.n :]:
+        states = [i for i, n in enumerate(base.state_names) if name.startswith(f"{n}_true")]
+        if states and not name.endswith("_clock"):
+            start.append(float(trial.states[0, states[-1]]))
+        else:
+            start.append(float(known.get(name.rpartition("_")[0], 0.0)))
+    return np.array(start)
