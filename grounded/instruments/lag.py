@@ -26,6 +26,8 @@ SHORTEST = 24  # samples of a pair that counts
 CLEAR = 0.9  # of the coherence: windows below it don't count
 BLOCKS = 16  # at least: the scatter over them is the uncertainty
 SCREENED, MAYBE = 4, 0.7  # half window and correlation from which two signals may be one
+SAME, ROUNDED = 0.01, 0.003  # of a scale: what matters, what steps of time may make
+SURELY = 3.0  # standard deviations that it is sure by
 FILTER = 0.9  # of the misfit of a delay: below it a filter is what it is
 
 
@@ -41,6 +43,7 @@ class Lag:
         low: lower bracket of the scale.
         high: upper bracket of the scale.
         coherence: 0 to 1, how much of both is the same.
+        scale_std: standard deviation of the scale.
     """
 
     delay: float
@@ -50,6 +53,13 @@ class Lag:
     low: float
     high: float
     coherence: float
+    scale_std: float = np.inf
+
+    @property
+    def one_size(self) -> bool:
+        """Whether both show the same, of one sign and one size: surely within SAME, maybe all."""
+        off, sure = max(1 - self.low, self.high - 1), SURELY * self.scale_std
+        return self.sign > 0 and off < max(ROUNDED, sure) and off + sure < SAME
 
 
 def lag_between(pairs: Pairs, dt: float) -> Lag | None:
@@ -172,9 +182,10 @@ def _measured(pieces: _Pieces, reach: int, dt: float) -> Lag | None:
     low, high = both / _dot(a, a), _dot(b, b) / max(both, 1e-300)
     tau = _filter(pieces, a, _dot(rest, rest)) if d > 0 else None
     late = d if tau is None else tau
-    return Lag(
-        late * dt, std * dt, tau is not None, 1 if s > 0 else -1, low, high, min(low / high, 1.0)
-    )
+    size_std = max(_scatter(rest * b, group) for group in pieces.groups) / max(_dot(b, b), 1e-300)
+    sign, coherence = 1 if s > 0 else -1, min(low / high, 1.0)
+    scale_std = size_std / max(s * s, 1e-300)
+    return Lag(late * dt, std * dt, tau is not None, sign, low, high, coherence, scale_std)
 
 
 def _dot(a: Array, b: Array) -> float:

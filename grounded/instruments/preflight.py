@@ -4,6 +4,7 @@ odd_trial     a whole trial in other units than the rest
 other_units   a position in mm beside a velocity in m/s
 swapped       two columns of a trial in each other's place
 single        each state by itself
+constant      a velocity that is off by a constant, against the way of its position
 kinematics    velocities against the rates of their positions, courses against headings
 inputs        copies of one another, at their limits or beyond, constant within each trial
 
@@ -21,6 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from grounded.frozen import Array
+from grounded.instruments.constant import constant_of
 from grounded.instruments.finding import Finding
 from grounded.instruments.kinematics import (
     AGREE,
@@ -68,6 +70,7 @@ class Preflight:
     findings: tuple[Finding, ...]
     trials: tuple[Trial, ...]
     in_step: frozenset[str] = frozenset()  # states whose sensors were seen to show one moment
+    refuted: frozenset[str] = frozenset()  # effects that would part two sensors that agree
 
     @property
     def filters(self) -> dict[str, float]:
@@ -78,7 +81,7 @@ class Preflight:
     def settled(self) -> frozenset[str]:
         """Sensor effects that can't be blamed any more, by name: corrected, or refuted."""
         mended = {f.signal for f in self.findings if f.corrected and f.kind in ("delay", "lag")}
-        return frozenset(
+        return self.refuted | frozenset(
             f"{family}:{name}"
             for name in self.in_step | mended
             for family in ("sensor_delay", "sensor_lag")
@@ -113,7 +116,8 @@ def preflight(
             *bench.plane(),
             *_inputs(subject, bench.trials),
         ]
-    return Preflight(tuple(found), tuple(bench.trials), frozenset(bench.in_step))
+    in_step, refuted = frozenset(bench.in_step), frozenset(bench.refuted)
+    return Preflight(tuple(found), tuple(bench.trials), in_step, refuted)
 
 
 class _Bench:
@@ -122,7 +126,7 @@ class _Bench:
     def __init__(self, model: Model, trials: list[Trial], hidden: set[str]) -> None:
         self.model, self.trials = model, trials
         self.shown = [i for i, n in enumerate(model.state_names) if n not in hidden]
-        self.in_step: set[str] = set()
+        self.in_step, self.refuted = set[str](), set[str]()
 
     @property
     def dt(self) -> float:
@@ -188,6 +192,8 @@ class _Bench:
             if lag is not None and lag.coherence > ALIKE:
                 yield from self.unit(relation, lag)
                 yield from self.late(relation, lag)
+            if relation.exact:
+                yield from self.constant(relation)
 
     def unit(self, relation: Integral, lag: Lag) -> Iterator[Finding]:
         """Sign and unit, which are put right; a scale, which may be either sensor's."""
@@ -202,6 +208,8 @@ class _Bench:
         if lag.low > 1 + OFF or lag.high < 1 - OFF:
             text = f"shows {100 * size:.3g} % of the rate of {q}; either may be wrong"
             yield Finding(w, text, "scale", scale=size)
+        elif relation.exact and lag.one_size:
+            self.refuted |= {f"sensor_scale:{w}", f"sensor_scale:{q}", f"rate_gain:{q}"}
 
     def turned_round(self, i: int, text: str) -> Finding:
         """With the sign of state i changed."""
@@ -234,6 +242,22 @@ class _Bench:
         else:
             self.put(i, [_earlier(x, d / self.dt) for x in self.column(i)])
             yield _mended(name, text, "delay", f"delay_s = {d:.3g}", delay_s=d, std_s=lag.std)
+
+    def constant(self, relation: Integral) -> Iterator[Finding]:
+        """A constant between the two: of the velocity's sensor, or a drift of the position.
+
+        Where there is none neither can be blamed: together they would cancel.
+        """
+        found = constant_of(self.model, relation, self.trials)
+        q, w = (self.model.state_names[k] for k in (relation.i, relation.j))
+        if found is None:
+            return
+        if found.refuted:
+            self.refuted |= {f"sensor_bias:{w}", f"offset:{q}"}
+        elif found.found:
+            unit, more = self.model.states[w], "more" if found.value > 0 else "less"
+            text = f"shows {abs(found.value):.3g} {unit} {more} than the rate of {q} throughout"
+            yield Finding(w, f"{text}; a sensor, or {q} drifts", "offset")
 
     def plane(self) -> Iterator[Finding]:
         """Of a heading and a speed with the way that was travelled."""

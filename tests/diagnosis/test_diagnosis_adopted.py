@@ -16,11 +16,13 @@ from grounded.diagnosis.excitation import probe
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.likelihood.linearise import linearise
+from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.report import Estimate
 from grounded.diagnosis.unconfirmed import unconfirmed
 from grounded.diagnosis.validation.decide import Doubtful
 from grounded.diagnosis.validation.limits import limits
-from grounded.effects import Library, memory_of, wrap
+from grounded.effects import Library, memory_of, memory_start, wrap
 from grounded.errors import NextCommand
 from grounded.policy import Policy
 from grounded.task import Task
@@ -81,6 +83,32 @@ def test_what_is_left_beside_an_adopted_lag_is_named():
     assert 0.8 < found.gap.after < 1.2
     text = json.dumps(found.to_json())
     assert memory[0] not in text.replace("first_order_lag_u_tau", "")
+
+
+def test_an_effect_on_an_input_moves_what_an_adopted_lag_begins_with():
+    """The lag has settled at what a gain makes of the input that was held, at every trial's begin.
+
+    It began at the input itself: beside a lag a bias and an offset that undoes it were likelier
+    than none by hundreds of nats.
+    """
+    model, runs = lagging(0.0, trials=2)
+    held = (0.8, -0.5)
+    runs = [replace(r, start_inputs=np.array([u])) for r, u in zip(runs, held, strict=True)]
+    better, lifted, memory = adopted(model, runs)
+    data = prepare(better, lifted, hidden=memory)
+    predictor, gain = Predictor(data), Library().effect("input_gain:u", better, data.scales)
+    h, i = Hypothesis().plus(gain, {"g": -0.3}), better.state_names.index(memory[0])
+    begun = predictor.begun(h)
+    assert predictor.begun(Hypothesis()) is None and len(data.valid) == 4  # two of each trial
+    twin = wrap(gain, {"g": -0.3}, DT)
+    for k, run in enumerate(lifted):
+        (want,) = memory_start(twin, model, run)
+        first, later = np.flatnonzero(data.trial_of == k)
+        assert begun[first, i] + data.y[0, first, i] == pytest.approx(want) == 0.7 * held[k]
+        assert not begun[later].any()
+        _, _, r = linearise(predictor, h, data.y)
+        assert r[0, first, i, :2] == pytest.approx([-0.3 * held[k], held[k]])
+    assert not np.delete(begun, i, axis=1).any()
 
 
 def test_nothing_is_left_beside_what_is_all():

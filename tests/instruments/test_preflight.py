@@ -8,6 +8,7 @@ import pytest
 from grounded import Model, Param, Trial
 from grounded.diagnosis.diagnose import diagnose
 from grounded.errors import GroundedError, NextCommand
+from grounded.instruments.constant import constant_of
 from grounded.instruments.kinematics import integrals, turned
 from grounded.instruments.lag import at_samples, lag_between
 from grounded.instruments.preflight import preflight
@@ -93,7 +94,8 @@ def test_sound_sensors_are_left_alone():
         found = preflight(ARM, trials)
         assert found.findings == ()
         assert found.in_step == {"q", "w"}
-        assert found.settled == {f"sensor_{of}:{n}" for of in ("delay", "lag") for n in "qw"}
+        sensors = {f"sensor_{of}:{n}" for of in ("delay", "lag", "scale") for n in "qw"}
+        assert found.settled == sensors | {"sensor_bias:w", "offset:q", "rate_gain:q"}
         for before, after in zip(trials, found.trials, strict=True):
             np.testing.assert_array_equal(before.states, after.states)
 
@@ -102,6 +104,38 @@ def test_sensors_too_noisy_to_be_held_against_each_other_may_still_be_late():
     rng = np.random.default_rng(1)
     found = preflight(ARM, arm(lambda y: y + rng.standard_normal(y.shape) * [0.03, 0.3]))
     assert not found.in_step and not found.settled
+
+
+@pytest.mark.parametrize("bias", [0.05, -0.02])
+def test_a_constant_of_a_velocity_is_held_against_the_way(bias):
+    """0.05 rad/s are 20 cm of way in a run of 4 s; which of the two is off, the physics says."""
+    found = preflight(ARM, arm(columns(w=lambda x: x + bias)))
+    (one,) = found.findings
+    assert (one.signal, one.kind, one.corrected) == ("w", "offset", False)
+    assert ("more" if bias > 0 else "less") in one.finding
+    assert not {"sensor_bias:w", "offset:q"} & found.settled
+    (tie,) = integrals(ARM)
+    for seed in range(4):
+        off = constant_of(ARM, tie, arm(columns(w=lambda x: x + bias), seed=seed))
+        assert off.value == pytest.approx(bias, abs=3 * off.std) and off.std < 0.002
+
+
+def test_a_constant_that_few_or_noisy_samples_would_not_show_may_be_there():
+    (tie,) = integrals(ARM)
+    assert constant_of(ARM, tie, arm(trials=1, steps=40)) is None
+    rng = np.random.default_rng(1)
+    noisy = arm(lambda y: y + rng.standard_normal(y.shape) * [0.3, 0.3])
+    off = constant_of(ARM, tie, noisy)
+    assert not off.refuted and not off.found
+    assert "sensor_bias:w" not in preflight(ARM, noisy).settled
+
+
+@pytest.mark.parametrize(("scale", "settled"), [(1.0, True), (1.01, False), (0.994, False)])
+def test_a_scale_between_two_sensors_that_agree_is_no_candidate(scale, settled):
+    found = preflight(ARM, arm(columns(w=lambda x: scale * x)))
+    assert not found.findings
+    scales = {"sensor_scale:w", "sensor_scale:q", "rate_gain:q"}
+    assert (scales <= found.settled) is settled and bool(scales & found.settled) is settled
 
 
 def stuck(x):

@@ -172,12 +172,16 @@ def price(
 
 def cancelling(predictor: Predictor, h: Hypothesis) -> bool:
     """Whether effects leave little of one another: two added rates, or three effects and more."""
-    units = predictor.data.model.states  # states of one unit, a position's two, share a scale
-    scales = predictor.data.scales
-    size = np.array(
+    size = sizes(predictor)
+    return _two_rates_cancel(predictor, h, size) or _several_cancel(predictor, h, size)
+
+
+def sizes(predictor: Predictor) -> Array:
+    """What changes of each state are measured in, (n,): those of one unit share a scale."""
+    units, scales = predictor.data.model.states, predictor.data.scales
+    return np.array(
         [max(scales.spread(n) for n in units if units[n] == unit) for unit in units.values()]
     )
-    return _two_rates_cancel(predictor, h, size) or _several_cancel(predictor, h, size)
 
 
 def _two_rates_cancel(predictor: Predictor, h: Hypothesis, size: Array) -> bool:

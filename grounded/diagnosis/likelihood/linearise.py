@@ -74,6 +74,8 @@ def linearise(
     offset = predictor.standing(h, shown)
     d[..., 0] = model.difference(after, track[1:])
     r[..., 0] = model.difference(y - here, np.asarray(offset))
+    if (begun := predictor.begun(h)) is not None:
+        r[0, ..., 0] += begun
     F, of_shifts = _sensitivities(predictor, h, x, u, after)
     theta, near = h.theta, tangent(predictor, h, x, u) if h.effects else predictor
     base = after if near is predictor else near.advance(h, x, u, data.time)
@@ -87,6 +89,8 @@ def linearise(
             other_shown = shown if delays is None else delays.moved(other).shown(ahead, track)
             shifted = predictor.standing(other, other_shown)
             by_r = (shown - other_shown + offset - shifted) / moved
+            if begun is not None and (other_begun := predictor.begun(other)) is not None:
+                by_r[0] += (other_begun - begun) / moved
             d[..., 1 + j], r[..., 1 + j] = by_d, by_r
             if by_d.any() or by_r.any():
                 break

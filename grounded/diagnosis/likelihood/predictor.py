@@ -19,15 +19,14 @@ from typing import Any
 import numpy as np
 
 from grounded.compile import Named
-from grounded.diagnosis.likelihood.data import Data, shifted
+from grounded.diagnosis.likelihood.arriving import arriving, memories_moved
+from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.delays import behind
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.simulated import Slopes, simulated
 from grounded.effects import (
     Effect,
-    InputFamily,
     LossFamily,
-    MemoryFamily,
     ParamFamily,
     RateFamily,
     SensorDelayFamily,
@@ -77,13 +76,19 @@ class Predictor(SentOnce):
 
         def found() -> Array:
             data, whole = self.data.in_use, np.zeros_like(self.data.commands)
-            u, held = data.commands, data.held
-            for effect, values in self.acting(h):
-                u, held = transformed(effect, values, u, held, data)
-            whole[data.used] = data.delayed(u, held)
+            whole[data.used] = data.delayed(*arriving(self.acting(h), data))
             return whole
 
         return self._kept("trials", h, found)
+
+    def begun(self, h: Hypothesis) -> Array | None:
+        """What effects on inputs add to the memories that trials begin with, by run (B, n).
+
+        None where the model has no memory, or a hypothesis no such effect.
+        """
+        if not (self.data.hidden and self.acting(h)):
+            return None
+        return self._kept("begun", h, lambda: memories_moved(self.acting(h), self.data))
 
     def _kept(self, what: str, h: Hypothesis, make: Callable[[], Array]) -> Array:
         """Made once for the same values."""
@@ -345,27 +350,3 @@ def sensor_offset(effect: Effect, values: Mapping[str, float], track: Array, dt:
     count = len(track)
     old = (1 - part) * line[1 : count + 1] + part * line[:count]
     return np.asarray(old - track)
-
-
-def transformed(
-    effect: Effect, values: Mapping[str, float], u: Array, held: Array, data: Data
-) -> tuple[Array, Array]:
-    """Commands (S, T, m), and what was held before them (S, m), after an input or memory effect.
-
-    What was held went through the effects before, too; a memory has settled at it.
-    """
-    family, names = effect.family, data.model.input_names
-    out, before = u.copy(), held.copy()
-    for target in effect.site.targets:
-        j = names.index(target)
-        if isinstance(family, InputFamily):
-            t = np.arange(u.shape[1]) * data.dt
-            out[:, :, j] = family.effect(u[:, :, j], t[None, :], values)
-            before[:, j] = family.effect(held[:, j], 0.0, values)
-        elif isinstance(family, MemoryFamily):
-            if family.name == "delay":  # the same as its queue, at once
-                out[:, :, j] = shifted(u[:, :, j], held[:, j], values["d"] / data.dt)
-                continue
-            z = family.along(u[:, :, j], held[:, j], values, data.dt)
-            out[:, :, j], _ = family.advance(u[:, :, j], (z,), values, data.dt)
-    return out, before

@@ -10,6 +10,7 @@ likeliest of every other structure of noise, are held against the `ruler`:
     a rival takes the place of the likeliest only where it predicts clearly better
     a cause without which predictions are as good, within their scatter, is dropped; a further
     effect that is beyond doubt, where white noise is all that is left, only if they gain nothing
+    an effect that a parameter's shift undoes is dropped: the parameter alone does both
     what is left then must be likelier than none by itself
     what predicts no better than the crude model is not claimed at all
     a likely effect that was dropped is doubtful: seen in too few trials, maybe
@@ -23,6 +24,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from grounded.diagnosis.hypotheses.counterpart import counterparts
 from grounded.diagnosis.hypotheses.explored import CLAIM, parametric
 from grounded.diagnosis.hypotheses.plainest import plainer
 from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch
@@ -213,7 +215,8 @@ def _pruned(
             return fit, without, doubtful
         gains = {name: ruler.gain(less, fit) for name, less in without.items()}
         least = SLIGHT * ruler.since_outset(fit)
-        idle = [
+        undone = counterparts(search.predictor, fit.hypothesis)
+        idle = undone or [
             name
             for name, less in without.items()
             if gains[name].channels.max() < least or not _pays(search, ruler, less, fit, white)
@@ -222,7 +225,7 @@ def _pruned(
             return fit, without, doubtful
         name = min(idle, key=lambda name: gains[name].mean)
         nats = search.score(fit) - search.score(without[name])
-        if nats > LIKELY and name in _effects(fit):
+        if nats > LIKELY and name in _effects(fit) and name not in undone:
             doubtful.append(Doubtful(name, nats, fit))
         fit = without[name]
 
