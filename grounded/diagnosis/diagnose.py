@@ -41,7 +41,7 @@ from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.report import Diagnosis, Estimate, Identifiable, NoiseLevels
-from grounded.diagnosis.ruler_words import open_noise
+from grounded.diagnosis.ruler_words import contested, open_noise
 from grounded.diagnosis.unconfirmed import another_look, unconfirmed, unrepeatable
 from grounded.diagnosis.validation.agreement import by_trial, changed
 from grounded.diagnosis.validation.claims import Claims
@@ -239,6 +239,8 @@ class _Writer:
         named = [row.effect for row in ranking if row.claimed]
         seen = unconfirmed(self.claims, self.decision.doubtful, groups)
         values, agreement = by_trial(self.best, data, named) if named else ((), ())
+        worse, adopted = contested(rows, agreement, named), self.options.but
+        lost = self.unrepeatable()
         return Diagnosis(
             verdict=verdict(
                 self.claims,
@@ -277,7 +279,7 @@ class _Writer:
             leftover=remainder,
             unconfirmed=seen,
             correction=correction(predictor, self.best, self.left, where),
-            next_trial=next_trial(self.claims, look, groups, seen, same, self.unrepeatable()),
+            next_trial=next_trial(self.claims, look, groups, seen, same, lost, worse, adopted),
             unknowable=self.known.sentences,
             noise=self.noise(),
             parameters=self.claims.parameters(),

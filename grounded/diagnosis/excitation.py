@@ -46,6 +46,7 @@ SIZES = (0.15, 0.35)  # of the input's range
 NOTHING = 0.1  # nats: less is nothing that a trial could tell
 REPLAYED = 4  # trials whose commands show what they should have told
 ADAPTED = 12  # iterations in which a rival adapts to a run
+TEACHES = 0.1  # of a value's standard deviation: a probe that takes off less teaches too little
 LITTLE = 1e-6  # of a value's own information, and of its size
 
 
@@ -54,12 +55,14 @@ class Probe:
     """A runnable policy, the evidence it is expected to bring [nats], and what it does.
 
     `about`: the two effects that it tells apart, or the value that it teaches most of.
+    `little`: that is too little to be worth a trial.
     """
 
     policy: Policy
     expected: float
     about: tuple[str, ...]
     sentence: str
+    little: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +136,8 @@ def probe(
     expected, chosen, words = best
     if expected < NOTHING:
         same = f"no probe tells {group[0]} from {group[1]}: with other values of the rest"
-        return Probe(chosen, expected, (group[0], group[1]), f"{same} they do the same")
+        text = f"{same} they do the same"
+        return Probe(chosen, expected, (group[0], group[1]), text, little=True)
     gain = f"{expected:,.{int(expected < 100)}f} nats"
     sentence = f"{words}: expected to tell {group[0]} from {group[1]} by {gain}" + (
         " (too little: try larger inputs or another manoeuvre)" if expected < TIE else ""
@@ -192,7 +196,9 @@ def _teaching(
     now = float(std[k]) * sizes.get(name, 1.0)
     then = now * float(shrunk[k])
     sentence = f"{words}: would tell {name} to +- {then:.2g}{unit} (now +- {now:.2g}{unit})"
-    return Probe(chosen, gain, (name,), sentence)
+    if little := bool(shrunk[k] > 1 - TEACHES):
+        sentence = f"no candidate inside the limits teaches much, not even {sentence}"
+    return Probe(chosen, gain, (name,), sentence, little)
 
 
 def _information(task: Task, runs: Sequence[Trial], h: Hypothesis, noise: _Noise) -> Array:

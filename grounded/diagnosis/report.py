@@ -23,6 +23,7 @@ from grounded.diagnosis.error_report import (
     Where,
     number,
 )
+from grounded.diagnosis.ruler_words import contested
 from grounded.errors import NextCommand
 from grounded.instruments.finding import Finding
 from grounded.result import Document
@@ -294,6 +295,11 @@ class Diagnosis(Document):
     def sentence(self) -> str:
         """The verdict in words."""
         return self.verdict.sentence
+
+    @property
+    def contested(self) -> bool:
+        """Whether what it claims is better not adopted: predictions get worse with it."""
+        return contested(self.prediction_error, self.agreement, self.effects)
 
     @property
     def no_cause(self) -> bool:

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from grounded.diagnosis.error_report import ABOVE, RulerRow, measured, noise_of, number
+
+if TYPE_CHECKING:
+    from grounded.diagnosis.report import Agreement
 
 NAMED = 3  # channels that a sentence names at most
 MATTERS = 0.05  # of the crude model's error: a rest below it is told as its share
@@ -64,17 +68,46 @@ def _ahead(row: RulerRow) -> str:
 
 def worsened(rows: Sequence[RulerRow]) -> str:
     """What predictions lose in the channel that loses most, "" where none loses over SHOWS."""
+    ratio, row, name = _lost_most(rows)
+    if row is None or not ratio > 1 + SHOWS:
+        return ""
+    now, then = (_measured(row, name, errors[name]) for errors in (row.with_effects, row.crude))
+    text = f"{_ahead(row)} miss {name} by {now} instead of {then}: that is worse"
+    return f"{text}." if outweighed(rows) else f"{text}, though over all states they gain."
+
+
+def outweighed(rows: Sequence[RulerRow]) -> bool:
+    """Whether those predictions lose more in what gets worse than they gain in other states."""
+    ratio, row, _ = _lost_most(rows)
+    if row is None or not ratio > 1 + SHOWS:
+        return False
+    told = [n for n, e in row.crude.items() if e > 0 and row.tells(n, "crude", "with_effects")]
+    ends = [(row.with_effects[n], row.crude[n], row.noise_floor.get(n, 0.0)) for n in told]
+    least = 1e-12
+    logs = [math.log(max(now, f, least) / max(then, f, least)) for now, then, f in ends]
+    return sum(value for value in logs if math.isfinite(value)) > 0
+
+
+def _lost_most(rows: Sequence[RulerRow]) -> tuple[float, RulerRow | None, str]:
+    """By what factor errors grow in the channel that loses most, where and in which."""
     losses = [
         (row.with_effects[name] / max(error, row.noise_floor.get(name, 0.0)), row, name)
         for row in rows
         for name, error in row.crude.items()
         if error > 0 and math.isfinite(row.with_effects[name]) and row.tells(name, "crude")
     ]
-    ratio, row, name = max(losses, key=lambda loss: loss[0], default=(0.0, None, ""))
-    if row is None or not ratio > 1 + SHOWS:
-        return ""
-    now, then = (_measured(row, name, errors[name]) for errors in (row.with_effects, row.crude))
-    return f"{_ahead(row)} miss {name} by {now} instead of {then}: that is worse."
+    return max(losses, key=lambda loss: loss[0], default=(0.0, None, ""))
+
+
+def contested(
+    rows: Sequence[RulerRow], agreement: Sequence[Agreement], effects: Sequence[str]
+) -> bool:
+    """Whether what is claimed is better not adopted: predictions get worse somewhere with it.
+
+    By more than they gain there, or while the trials differ in its values.
+    """
+    differ = {one.effect for one in agreement if not one.agrees} & set(effects)
+    return bool(effects) and (outweighed(rows) or bool(differ and worsened(rows)))
 
 
 def floor(row: RulerRow | None) -> str:

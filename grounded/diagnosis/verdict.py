@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -131,6 +131,8 @@ def next_trial(
     seen: Sequence[Unconfirmed] = (),
     same: tuple[tuple[str, ...], ...] = (),
     unrepeatable: Mapping[str, str] | None = None,
+    worse: bool = False,
+    adopted: Collection[str] = (),
 ) -> str:
     """A sentence; `excitation.probe` makes the trial itself.
 
@@ -141,13 +143,15 @@ def next_trial(
         seen: what only one trial shows.
         same: of the groups, what is one thing in the model.
         unrepeatable: the trials that can't or should not be run again, and why.
+        worse: predictions get worse with what is claimed (`Diagnosis.contested`).
+        adopted: the effects whose numbers are parameters of the model.
     """
     from grounded.effects import places
 
     if claims.known.no_cause:
         return "Run two or more trials in which every input changes."
     if groups and groups[0] in same:
-        return f"{told_apart(groups[0], same)}: no trial tells them apart, adopt either."
+        return f"{told_apart(groups[0], same)}: no trial tells them apart, either will do."
     if groups:
         made = f"A trial made for it would tell {tied(groups[0])}."
         turns = bool(places.plane(claims.data.model))
@@ -164,7 +168,28 @@ def next_trial(
         return look
     if not claims.names and not claims.blamed:
         return "Nothing is tied and nothing to adopt."
-    return f"Nothing is tied: adopt {'them' if len(claims.names) > 1 else 'it'}."
+    if worse:
+        return f"Nothing is tied, but predictions get worse with {_it(claims)}: {REPEAT}."
+    if _own_numbers(claims, adopted):
+        return "Nothing is tied: fit the model's parameters."
+    return f"Nothing is tied: adopt {_it(claims)}."
+
+
+REPEAT = "run another trial and diagnose again before you adopt anything"
+
+
+def _it(claims: Claims) -> str:
+    return "them" if len(claims.names or claims.blamed) > 1 else "it"
+
+
+def _own_numbers(claims: Claims, adopted: Collection[str]) -> bool:
+    """Whether all that is blamed is parameters that the model had before anything was adopted."""
+    from grounded.effects import ParamFamily, param_name
+
+    effects, theirs = claims.best.hypothesis.effects, tuple(param_name(n, "") for n in adopted)
+    names = [e.site.target if isinstance(e.family, ParamFamily) else "" for e in effects]
+    off = names if claims.names else _off(claims)
+    return all(off) and not any(theirs and name.startswith(theirs) for name in off)
 
 
 HINTS = {

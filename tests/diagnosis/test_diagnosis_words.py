@@ -9,8 +9,16 @@ import numpy as np
 from facts import holds
 from grounded import Trial
 from grounded.diagnosis.error_report import Credit, Region, Remainder, RulerRow, runaway
-from grounded.diagnosis.report import Estimate, Ranked, Unconfirmed
-from grounded.diagnosis.ruler_words import improvement, open_noise, rest, telling, worsened
+from grounded.diagnosis.report import Agreement, Estimate, Ranked, Unconfirmed
+from grounded.diagnosis.ruler_words import (
+    contested,
+    improvement,
+    open_noise,
+    outweighed,
+    rest,
+    telling,
+    worsened,
+)
 from grounded.diagnosis.unconfirmed import another_look, unrepeatable
 from grounded.diagnosis.verdict import LOG, LOST, next_trial, verdict
 from grounded.effects import Library
@@ -38,6 +46,44 @@ def test_what_got_worse_is_said_of_the_channel_that_lost_most():
     said = worsened((short, whole))
     assert "x" in said.split() and "3.8 m" in said and "2.1 m" in said
     assert "0.60 m/s" in worsened((short,))
+    assert outweighed((short, whole)) and not outweighed((short,))
+    assert said.endswith("that is worse.") and not worsened((short,)).endswith("that is worse.")
+
+
+def test_what_predictions_get_worse_with_is_contested_and_no_sentence_says_adopt():
+    short = row({"x": 0.2, "v": 0.5}, {"x": 0.1, "v": 0.6})
+    whole = row({"x": 2.12, "v": 0.5}, {"x": 3.79, "v": 0.3}, whole_trial=True, horizon_s=60.0)
+    alike, unlike = (Agreement("delay:u", "d", agrees=agrees) for agrees in (True, False))
+    assert contested((short, whole), (alike,), ("delay:u",))
+    assert not contested((short, whole), (alike,), ())
+    assert not contested((short,), (alike,), ("delay:u",))
+    assert contested((short,), (unlike,), ("delay:u",))
+    claims = _claiming(Library().effect("coulomb_friction:v", cart_task().model))
+    said = {worse: next_trial(claims, "", (), worse=worse) for worse in (False, True)}
+    assert said[False].endswith("adopt it.")
+    assert "worse" in said[True] and not said[True].endswith("adopt it.")
+
+
+def _claiming(*effects, **more):
+    hypothesis = SimpleNamespace(effects=effects)
+    names = tuple(effect.name for effect in effects)
+    return _claims(best=SimpleNamespace(hypothesis=hypothesis), names=names, **more)
+
+
+def test_numbers_of_the_model_are_fitted_those_of_adopted_effects_adopted():
+    """`next:` says so, and the sentence above it."""
+    names = ("mass", "viscous_friction_v_k")
+    data = SimpleNamespace(model=SimpleNamespace(param_names=names))
+
+    def said(*off):
+        blamed = tuple(SimpleNamespace(index=names.index(name)) for name in off)
+        claims = _claiming(data=data, blamed=blamed, moved=blamed)
+        return next_trial(claims, "", (), adopted=("viscous_friction:v",))
+
+    assert "fit" in said("mass") and "adopt" not in said("mass")
+    assert said(*names).endswith("adopt them.") and said(names[1]).endswith("adopt it.")
+    one = _claiming(Library().effect("parameter:mass", cart_task().model))
+    assert next_trial(one, "", ()) == said("mass")
 
 
 def test_predictions_that_run_away_are_compared_with_nothing():
@@ -75,7 +121,7 @@ def test_nothing_is_said_where_nothing_lost_or_only_within_the_noise():
 
 def _claims(**more):
     known = SimpleNamespace(no_cause=False)
-    return SimpleNamespace(known=known, names=(), blamed=(), **more)
+    return SimpleNamespace(**{"known": known, "names": (), "blamed": (), **more})
 
 
 def test_down_to_the_noise_is_said_at_the_floor_alone():

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from grounded.diagnosis import excitation
 from grounded.diagnosis.excitation import probes
 from grounded.effects import Library
 from grounded.errors import NextCommand
@@ -67,6 +68,21 @@ def test_the_sentence_of_a_probe_names_its_size_and_the_command_that_makes_it(di
     low, high = policy.low[0], policy.high[0]
     told = [said for said, _ in probes(policy, plain, [0])][1:]
     assert all(f"(limits {low:g} to {high:g}) added to force" in said for said in told)
+
+
+def test_a_trial_that_teaches_little_is_not_advised(diagnosed, monkeypatch):
+    """One that took 2 % off the +- of one value was; who asks for it gets the best there is."""
+    w, found = diagnosed
+    (w.folder / "grounded.toml").write_text(NOISY)
+    w.forget()
+    found = replace(found, indistinguishable=())
+    trials = [w.planner.lift(trial) for trial in w.task_trials()]
+    monkeypatch.setattr(excitation, "TEACHES", 0.999)
+    identity, sentence = _probe(w, found, trials, Library(), write=False)
+    assert identity == "" and "--probe" not in sentence
+    assert sentence.startswith(found.next_trial) and "teaches much" in sentence
+    identity, sentence = _probe(w, found, trials, Library(), write=True)
+    assert identity and "teaches much" in sentence
 
 
 def test_people_export_a_probe(diagnosed, tmp_path):

@@ -240,7 +240,8 @@ def _probe(
     """
     if found.no_cause:
         return "", ""
-    from grounded.diagnosis.excitation import NOTHING, probe
+    from grounded.diagnosis.excitation import probe
+    from grounded.diagnosis.verdict import sentence
     from grounded.search.safety import objections, spread
     from grounded_trials.workspace.handover import outside_limits
     from grounded_trials.workspace.proposing import standing_in
@@ -263,10 +264,10 @@ def _probe(
         made = None if inside is None else probe(inside, base, found, trials, library)
         if made is None:
             break
+        if made.little and not (write and not ties):  # asked for, the best of them is written
+            return "", made.sentence if ties else f"{found.next_trial} {sentence([made.sentence])}"
         if not offer:
             return "", f"{made.sentence} (`{rendered(PROBE)}` makes the candidate)"
-        if ties and made.expected < NOTHING:
-            return "", made.sentence
         candidate = _candidate_of(workspace, planner.narrowed(made.policy), best.candidate.id)
         reasons = (*outside_limits(task, candidate.policy), *objections(task, candidate, strays))
         if not reasons:

@@ -93,7 +93,7 @@ def after_diagnosis(workspace: Folder, found: Diagnosis) -> NextCommand:
 def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
     """What to do about the effects that a diagnosis claims, None where there is nothing to do."""
     new = diagnosis.open(workspace.config.model.effects, workspace.config.model.params)
-    if diagnosis.kind not in ("effect", "several") or not new or _contested(diagnosis):
+    if diagnosis.kind not in ("effect", "several") or not new or diagnosis.contested:
         return None
     from grounded_trials.workspace.adopting import declined
 
@@ -103,14 +103,6 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
     if own.issuperset(new):
         return NextCommand("fit")  # the model's form is right: all of its numbers at once
     return NextCommand("adopt", new)
-
-
-def _contested(diagnosis: Diagnosis) -> bool:
-    """Whether trials differ in what is claimed, and predictions get worse somewhere with it."""
-    from grounded.diagnosis.ruler_words import worsened
-
-    differ = {one.effect for one in diagnosis.agreement if not one.agrees}
-    return bool(differ & set(diagnosis.effects) and worsened(diagnosis.prediction_error))
 
 
 @dataclass(frozen=True)
