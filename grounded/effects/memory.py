@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from grounded.compile.names import Named
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.trial import Trial
+
+
+def settled(model: Model, a: Named, p: Named) -> dict[str, Any]:
+    """What the memories of inputs hold after the inputs a were held for long, by `input_family`."""
+    found = getattr(model.step, "settled", None)
+    return {} if found is None else dict(found(a, p))
 
 
 def memory_of(wrapped: Model, base: Model, trial: Trial) -> Array:
@@ -31,11 +39,9 @@ def memory_start(wrapped: Model, base: Model, trial: Trial) -> Array:
     What was held before went through the input effects that stand before a memory.
     """
     held = np.zeros(base.m) if trial.start_inputs is None else trial.start_inputs
-    settled = getattr(wrapped.step, "settled", lambda a, p: {})
-    known = settled(
-        Named("input", base.input_names, list(held)),
-        Named("parameter", wrapped.param_names, list(wrapped.values)),
-    )
+    inputs = Named("input", base.input_names, list(held))
+    params = Named("parameter", wrapped.param_names, list(wrapped.values))
+    known = settled(wrapped, inputs, params)
     start = []
     for name in wrapped.state_names[base.n :]:
         states = [i for i, n in enumerate(base.state_names) if name.startswith(f"{n}_true")]

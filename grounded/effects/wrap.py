@@ -202,7 +202,7 @@ def _settled(effect: Effect) -> Callable[[Any, Any], dict[str, Any]]:
     Each effect hands on what it makes of them to those that were wrapped before it.
     """
     model, family = effect.site.model, effect.family
-    inner = getattr(model.step, "settled", lambda a, p: {})
+    inner = getattr(model.step, "settled", None)
 
     def settled(a: Any, p: Any) -> dict[str, Any]:
         own = {}
@@ -212,7 +212,7 @@ def _settled(effect: Effect) -> Callable[[Any, Any], dict[str, Any]]:
             c = _quantities(effect, p)
             u = {n: family.effect(a[n], 0.0, c) for n in effect.site.targets}
             a = _replaced(model, a, u)
-        return {**inner(a, p), **own}
+        return own if inner is None else {**inner(a, p), **own}
 
     return settled
 

@@ -521,5 +521,8 @@ def test_what_trials_differ_in_and_predictions_lose_with_is_not_adopted(cart, tm
         diagnosed(folder, prediction_error=rows, agreement=[differs])
         adopts = last(grounded("-C", folder, "status")).startswith("grounded adopt")
         assert adopts == (after < 0.3)
-    diagnosed(folder, prediction_error=rows)
+    diagnosed(folder, prediction_error=rows)  # nor where trials agree, and "that is worse"
+    assert "adopt" not in last(grounded("-C", folder, "status"))
+    gains = {"unit_by_channel": {"v": "m/s", "x": "m"}, "crude": {"v": 0.3, "x": 4.0}}
+    diagnosed(folder, prediction_error=[rows[0] | gains | {"with_effects": {"v": 0.5, "x": 0.1}}])
     assert last(grounded("-C", folder, "status")).startswith("grounded adopt")

@@ -9,6 +9,7 @@ import numpy as np
 from grounded.compile import Named
 from grounded.diagnosis.likelihood.data import Data, shifted
 from grounded.effects import Effect, InputFamily, MemoryFamily
+from grounded.effects.memory import settled
 from grounded.frozen import Array
 
 Acting = Sequence[tuple[Effect, Mapping[str, float]]]
@@ -29,13 +30,11 @@ def memories_moved(acting: Acting, data: Data) -> Array:
     Only the begin of a trial is known; zeros elsewhere.
     """
     model, found = data.model, np.zeros((len(data.valid), data.model.n))
-    settled = getattr(model.step, "settled", None)
-    if settled is None:
-        return found
     _, held = arriving(acting, data)
     p = Named("parameter", model.param_names, list(model.values))
     before, after = (
-        settled(Named("input", model.input_names, list(one.T)), p) for one in (data.held, held)
+        settled(model, Named("input", model.input_names, list(one.T)), p)
+        for one in (data.held, held)
     )
     begins = np.isin(data.state_at[:, 0], np.cumsum([0, *(data.lengths + 1)]))
     for i in data.hidden:
