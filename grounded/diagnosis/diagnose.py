@@ -115,10 +115,13 @@ def diagnose(
         Interrupted: on Ctrl-C, with the best hypothesis so far and what it predicts.
         GroundedError: for trials that don't fit the model, or with nothing in them.
     """
-    if not isinstance(subject, Task | Model) or isinstance(trials, Trial):
+    some = [] if isinstance(trials, Trial) else trials
+    loose = [type(one).__name__ for one in some if not isinstance(one, Trial)]
+    if loose or isinstance(trials, Trial) or not isinstance(subject, Task | Model):
+        what = f"{type(trials).__name__}{f' of {loose[0]}' if loose else ''}"
         raise GroundedError(
-            "diagnose(task, trials) takes a Task or a Model and a list of trials, got "
-            f"{type(subject).__name__} and {type(trials).__name__}"
+            "diagnose(task, trials) takes a Task or a Model and a list of Trials, got "
+            f"{type(subject).__name__} and {what}"
         )
     options, tick = options or DiagnosisOptions(), Stages(progress, USUAL)
     model = subject.model if isinstance(subject, Task) else subject
