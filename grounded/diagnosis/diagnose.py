@@ -115,13 +115,16 @@ def diagnose(
         Interrupted: on Ctrl-C, with the best hypothesis so far and what it predicts.
         GroundedError: for trials that don't fit the model, or with nothing in them.
     """
-    some = [] if isinstance(trials, Trial) else trials
-    loose = [type(one).__name__ for one in some if not isinstance(one, Trial)]
-    if loose or isinstance(trials, Trial) or not isinstance(subject, Task | Model):
-        what = f"{type(trials).__name__}{f' of {loose[0]}' if loose else ''}"
+    given: Any = trials
+    loose = (
+        [type(t).__name__ for t in given if not isinstance(t, Trial)]
+        if hasattr(given, "__iter__")
+        else []
+    )
+    if loose or not hasattr(given, "__iter__") or not isinstance(subject, Task | Model):
         raise GroundedError(
             "diagnose(task, trials) takes a Task or a Model and a list of Trials, got "
-            f"{type(subject).__name__} and {what}"
+            f"{type(subject).__name__} and {' of '.join([type(given).__name__, *loose[:1]])}"
         )
     options, tick = options or DiagnosisOptions(), Stages(progress, USUAL)
     model = subject.model if isinstance(subject, Task) else subject
