@@ -15,10 +15,12 @@ from grounded_trials.workspace.off_target import OffTarget, off_target_of
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
 
+    from grounded.diagnosis.report import Diagnosis
     from grounded.figures.figure import Figure
     from grounded.search.candidate import Candidate
     from grounded.search.making import Proposal
     from grounded.search.standing import Standing
+    from grounded_trials.workspace.next_step import Since
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -59,6 +61,8 @@ class Status(Result):
     notes: tuple[str, ...] = ()  # of the search, where it has ended; trials of namesakes
     discarded: dict[str, str] = field(default_factory=dict)  # t0004 -> why it is set aside
     off_target: tuple[OffTarget, ...] = ()  # how far the runs of the best are off it, in units
+    diagnosis: Diagnosis | None = None  # the last one; a damaged one counts as none
+    since: Since | None = None  # what happened after it
 
     def summary(self) -> str:
         """The phase and the best candidate."""
@@ -238,6 +242,8 @@ def status_of(workspace: Folder, standing: Standing, notes: tuple[str, ...] = ()
         (*notes, *_namesakes(workspace)),
         workspace.discarded(),
         off_target_of(workspace.task, standing.incumbent.trials if standing.incumbent else ()),
+        found,
+        since,
     )
 
 
