@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.diagnosis.error_report import measured
 from grounded.result import percent
 from grounded.task import Task
 from grounded.trial import Trial
@@ -94,6 +93,8 @@ def _held_back(task: Task, first: Candidate) -> list[str]:
 
 def _most_missed(task: Task, plan: Trial) -> str:
     """What a plan misses by most, beside the way that its target asks for; "" for nothing much."""
+    from grounded.diagnosis.error_report import measured
+
     error, way, found = tracking_error(task, plan), np.vstack([task.start, task.target]), []
     for names, what in weighed_groups(task):
         states = [task.model.state_names.index(name) for name in names]
