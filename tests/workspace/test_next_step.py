@@ -12,6 +12,7 @@ import pytest
 from cli import grounded, plain, process
 from facts import holds
 from grounded.diagnosis.report import Diagnosis, Made
+from grounded.effects import Library
 from grounded.errors import GroundedError, NextCommand
 from grounded.search.candidate import Candidate
 from grounded_cli.main import COMMANDS, cli
@@ -409,7 +410,8 @@ def test_a_result_says_what_follows_it_without_the_command_line(cart, tmp_path):
     run = w.run("best").trial_file
     assert w.ingest(run).then == w.status().then  # the search has ended: not `propose`
     assert w.ingest(run, data=True).then == DIAGNOSE
-    found = w.diagnose(max_effects=1)
+    few = Library(tuple(map(Library().family, ("viscous_friction", "input_gain"))))
+    found = w.diagnose(max_effects=1, library=few)
     assert found.then is not None and found.then == w.status().then
     assert "then" not in found.to_json()
 
