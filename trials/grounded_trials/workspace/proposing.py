@@ -106,6 +106,11 @@ def propose_in(workspace: Folder) -> Proposed:
         from grounded_trials.workspace.first_plan import left_open
 
         notes += left_open(workspace, candidate)
+        if proposal.standing.ending == "not allowed":
+            notes.append(
+                "nothing was run yet: widen [safety], or draw a target whose run stays inside "
+                "(`target`), and propose again"
+            )
     proposal = replace(proposal, notes=(*proposal.notes, *notes))
     if candidate is None:
         return Proposed(proposal, None, status_of(workspace, proposal.standing).then)
