@@ -33,6 +33,16 @@ def numbers(values: Any, what: str) -> Any:
         raise GroundedError(f"{what}: expected an array of numbers, got {values!r:.80}") from None
 
 
+def positive(what: str, value: Any) -> None:
+    """Checks a number that a user gave.
+
+    Raises:
+        GroundedError: if it isn't a positive, finite number; the sentence begins with `what`.
+    """
+    if not isinstance(value, (int, float, np.number)) or not (np.isfinite(value) and value > 0):
+        raise GroundedError(f"{what} must be a positive number of seconds, got {value!r:.60}")
+
+
 def wrapped(d: Array, angles: ArrayLike) -> Array:
     """`d` (..., >= n) with the angles among its first n entries wrapped to [-pi, pi], in place.
 

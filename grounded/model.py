@@ -170,7 +170,10 @@ class Model:
         for name, param in dict[str, object](self.params).items():
             if not isinstance(param, Param):
                 found = type(param).__name__
-                raise GroundedError(f"model '{self.name}': params '{name}' is a {found}, no Param")
+                raise GroundedError(
+                    f"model '{self.name}': params '{name}' is a {found}, expected a Param: "
+                    f"{name}=Param(value, unit)"
+                )
         for name, unit in units.items():
             if not isinstance(unit, str):
                 found = type(unit).__name__

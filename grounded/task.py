@@ -15,7 +15,7 @@ import numpy as np
 
 from grounded.compile import Problem
 from grounded.errors import GroundedError
-from grounded.frozen import Array, numbers
+from grounded.frozen import Array, numbers, positive
 from grounded.model import Model
 from grounded.policy import Policy
 from grounded.trial import Trial
@@ -65,8 +65,19 @@ class Task:
     smoothing: float = 0.05
 
     def __post_init__(self) -> None:
+        for name, kind in (("model", Model), ("reward", Reward)):
+            if not isinstance(getattr(self, name), kind):
+                found = type(getattr(self, name)).__name__
+                raise GroundedError(f"task: {name} must be a {kind.__name__}, got a {found}")
         n, m = self.model.n, self.model.m
-        H = len(self.target) - 1
+        target = numbers(self.target, "task: target")
+        if target.ndim != 2 or target.shape[1] != n:
+            turned = ": transpose it" * (target.ndim == 2 and len(target) == n)
+            raise GroundedError(
+                f"task: target must have shape (H + 1, {n}), a row for each control step and one "
+                f"for the end, a column for each state; got {target.shape}{turned}"
+            )
+        H = len(target) - 1
         if not 1 <= H <= MAX_HORIZON:
             raise GroundedError(f"task: the horizon must be 1 to {MAX_HORIZON} steps, got {H}")
         defaults = {
@@ -79,6 +90,9 @@ class Task:
         shapes |= {"latency": (m,), "input_target": (H, m), "safety_low": (n,), "safety_high": (n,)}
         for name, shape in shapes.items():
             given = getattr(self, name)
+            if given is None and name not in defaults:
+                free = ", infinite where there is none" if name in ("low", "high") else ""
+                raise GroundedError(f"task: {name} must have shape {shape}{free}, got None")
             value = numbers(defaults[name] if given is None else given, f"task: {name}")
             if value.shape != shape:
                 raise GroundedError(f"task: {name} must have shape {shape}, got {value.shape}")
@@ -93,8 +107,7 @@ class Task:
         self._check_values()
 
     def _check_values(self) -> None:
-        if not (np.isfinite(self.dt) and self.dt > 0):
-            raise GroundedError(f"task: dt must be a positive number of seconds, got {self.dt}")
+        positive("task: dt", self.dt)
         if not (np.isfinite(self.smoothing) and self.smoothing >= 0):
             raise GroundedError(f"[model] smoothing must not be negative, got {self.smoothing}")
         assert self.latency is not None
@@ -202,7 +215,17 @@ class Task:
         """The reward of every step of a trial, (T + 1,); NaN where the trial is not finite.
 
         What a log holds after the horizon is not judged. With `reward`, by other weights.
+
+        Raises:
+            GroundedError: if it has other states or inputs than the model.
         """
+        names = (self.model.state_names, self.model.input_names)
+        if (trial.state_names, trial.input_names) != names:
+            raise GroundedError(
+                f"a trial of this task has the states {', '.join(names[0])} and the inputs "
+                f"{', '.join(names[1])}, in this order; got {', '.join(trial.state_names)} and "
+                f"{', '.join(trial.input_names)}"
+            )
         trial = trial.whole(self.horizon)
         T = trial.steps
         assert self.input_target is not None

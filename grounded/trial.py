@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from grounded.errors import GroundedError
-from grounded.frozen import Array, readonly, wrapped
+from grounded.frozen import Array, numbers, positive, wrapped
 
 MAX_GAP_S = 1.0  # a longer gap ends a trial
 LAST = 2  # steps that may be missing at the end of a run,
@@ -45,21 +45,38 @@ class Trial:
     start_inputs: Array | None = None  # (m,) held before t = 0; None: zero
 
     def __post_init__(self) -> None:
-        states, inputs = readonly(self.states), readonly(self.inputs)
-        n, m = len(self.state_names), len(self.input_names)
-        if states.ndim != 2 or states.shape[1] != n:
+        states = numbers(self.states, "trial: states")
+        inputs = numbers(self.inputs, "trial: inputs")
+        for kind in ("state_names", "input_names"):
+            names = getattr(self, kind)
+            if isinstance(names, str) or not all(isinstance(name, str) for name in names):
+                raise GroundedError(f"trial: {kind} must be a tuple of names, got {names!r:.60}")
+            object.__setattr__(self, kind, tuple(names))
+        positive("trial: dt", self.dt)
+        n, m, rows = len(self.state_names), len(self.input_names), len(states) if states.ndim else 0
+        if states.ndim != 2 or states.shape[1] != n or not rows:
+            turned = ": transpose it" * (states.ndim == 2 and rows == n)
             raise GroundedError(
-                f"a trial of {n} states needs an array (T+1, {n}), got {states.shape}"
+                f"a trial of {n} states needs an array (T+1, {n}), a row for each control step and "
+                f"one for the end; got {states.shape}{turned}"
             )
-        if inputs.shape != (len(states) - 1, m):
+        if inputs.shape != (rows - 1, m):
+            mend = {
+                (rows, m): ": the last state has no input, leave out the last row",
+                (rows - 1,): ": make it a column, inputs[:, None]" * (m == 1),
+                (m, rows - 1): ": transpose it",
+            }
             raise GroundedError(
-                f"a trial of {len(states)} states and {m} inputs needs inputs of shape "
-                f"({len(states) - 1}, {m}), got {inputs.shape}"
+                f"a trial with {rows} rows of states and {m} inputs needs inputs of shape "
+                f"({rows - 1}, {m}), got {inputs.shape}{mend.get(inputs.shape, '')}"
             )
         object.__setattr__(self, "states", states)
         object.__setattr__(self, "inputs", inputs)
         if self.start_inputs is not None:
-            object.__setattr__(self, "start_inputs", readonly(self.start_inputs))
+            held = numbers(self.start_inputs, "trial: start_inputs")
+            if held.shape != (m,):
+                raise GroundedError(f"trial: start_inputs must have shape ({m},), got {held.shape}")
+            object.__setattr__(self, "start_inputs", held)
 
     @property
     def steps(self) -> int:

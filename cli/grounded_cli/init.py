@@ -143,14 +143,17 @@ def _blank(folder: str, model: str | None, dt: float | None, json_: bool) -> Non
         raise click.UsageError("--blank needs your model: grounded init DIR --blank --model FILE")
     from grounded_trials import Workspace
 
-    Workspace.create(folder, model=model, dt=dt)
+    made = Workspace.create(folder, model=model, dt=dt)
     if json_:
         show_json({"workspace": folder, "model": model})
         return
     show(f"{folder} is a workspace for the model of {model}. Yours to fill in:")
-    show("  grounded.toml  dt, start, weights, limits")
+    show("  grounded.toml  dt, start, the input held before it, weights, limits")
     show("  target.csv     what the states are to do")
     show("  drive.py       measure() and send() of your robot")
+    if held := made.config.task.start:
+        told = ", ".join(f"{name} = {value:.6g}" for name, value in held.items())
+        sentence(f"{told} holds the model at zero: [task] start has it as held before the run")
     where = f"cd {shlex.quote(folder)} && " * (folder != ".")
     show(f"\nnext: edit these, then {where}grounded propose")
 

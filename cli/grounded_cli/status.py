@@ -25,7 +25,8 @@ LEGEND = "damp: penalty on leaving the last trial's inputs; +-: standard error"
 def command(json_: bool) -> None:
     """Show where the search stands: derived from the stored trials, nothing is written."""
     workspace = open_workspace()
-    from grounded_trials.report.settled import settled_now
+    from grounded_trials.report.settled import settled_in
+    from grounded_trials.workspace.next_step import Since
 
     with progress("reading trials"):
         status = workspace.status()
@@ -33,7 +34,7 @@ def command(json_: bool) -> None:
         show_json(status.to_json())
         return
     show(summary(status))
-    settled = settled_now(workspace)
+    settled = settled_in(workspace, status.diagnosis, status.since or Since())
     for note in status.notes:
         remark("note", note)
     for name, why in status.discarded.items():

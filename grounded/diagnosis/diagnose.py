@@ -115,10 +115,16 @@ def diagnose(
         Interrupted: on Ctrl-C, with the best hypothesis so far and what it predicts.
         GroundedError: for trials that don't fit the model, or with nothing in them.
     """
-    if not isinstance(subject, Task | Model) or isinstance(trials, Trial):
+    given: Any = trials
+    loose = (
+        [type(t).__name__ for t in given if not isinstance(t, Trial)]
+        if hasattr(given, "__iter__")
+        else []
+    )
+    if loose or not hasattr(given, "__iter__") or not isinstance(subject, Task | Model):
         raise GroundedError(
-            "diagnose(task, trials) takes a Task or a Model and a list of trials, got "
-            f"{type(subject).__name__} and {type(trials).__name__}"
+            "diagnose(task, trials) takes a Task or a Model and a list of Trials, got "
+            f"{type(subject).__name__} and {' of '.join([type(given).__name__, *loose[:1]])}"
         )
     options, tick = options or DiagnosisOptions(), Stages(progress, USUAL)
     model = subject.model if isinstance(subject, Task) else subject

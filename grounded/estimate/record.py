@@ -189,6 +189,13 @@ def records_of(model: Model, trials: Sequence[Trial | Record]) -> list[Record]:
     Raises:
         GroundedError: if there is none, or one that does not fit the model.
     """
+    trials = [trials] if isinstance(trials, Trial | Record) else list(trials)
+    for one in trials:
+        if not isinstance(one, Trial | Record):
+            raise GroundedError(
+                f"expected a list of Trials, one of them is of type {type(one).__name__}: make it "
+                "Trial(states, inputs, dt, state_names, input_names)"
+            )
     records = [t if isinstance(t, Record) else record_of(model, t) for t in trials]
     if not records:
         raise GroundedError("there are no trials to estimate from; ingest at least one")

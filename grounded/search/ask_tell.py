@@ -42,6 +42,8 @@ class Search:
         candidates: Iterable[Candidate] = (),
         trials: Iterable[Trial] = (),
     ) -> None:
+        if not isinstance(task, Task):
+            raise GroundedError(f"a Search needs a Task, got a {type(task).__name__}")
         self.task, self.options = task, options or SearchOptions()
         self._candidates, self._trials = list(candidates), list(trials)
         for trial in self._trials:
@@ -94,13 +96,15 @@ class Search:
 
     def _fits(self, trial: Trial) -> None:
         if not isinstance(trial, Trial):
-            raise GroundedError(f"a robot returns a Trial of what it ran, got {trial!r:.60}")
-        model = self.task.model
-        found = (trial.state_names, trial.input_names, trial.dt)
-        expected = (model.state_names, model.input_names, self.task.dt)
-        if found != expected:
             raise GroundedError(
-                f"a trial of this task has states, inputs and dt {expected}, found {found}"
+                f"a robot returns a Trial of what it ran, got one of type {type(trial).__name__}"
+            )
+        model = self.task.model
+        has = (trial.state_names, trial.input_names, trial.dt)
+        expected = (model.state_names, model.input_names, self.task.dt)
+        if has != expected:
+            raise GroundedError(
+                f"a trial of this task has states, inputs and dt {expected}, found {has}"
             )
 
     def tell(self, trial: Trial) -> None:

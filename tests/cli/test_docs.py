@@ -55,7 +55,7 @@ MARK = re.compile(
 RUN = ("console", "python", "bash", "sh", "shell", "toml", "json")
 SHOWN = ("", "text", "mermaid", "cpp", "c++", "c", "cmake", "csv", "diff", "yaml", "xml", "html")
 ALL = os.environ.get("GROUNDED_DOCS") == "all"
-LONG = ("README.md", "commands.md")  # pages that take more than ten seconds
+LONG = ("README.md", "commands.md", "python.md")  # pages that take more than four seconds
 
 
 @dataclass(frozen=True)

@@ -166,14 +166,14 @@ def test_closed_and_full_outputs(how: str, code: int, folder: Path) -> None:
 def test_an_interrupt_at_any_moment_leaves_no_traceback(folder: Path) -> None:
     """Fails on 0.1: an interrupt during imports was a traceback."""
     start = "from grounded_cli.start import main; main()"
-    for k in range(40):
+    for k in range(20):
         child = subprocess.Popen(
             [sys.executable, "-X", "utf8", "-c", start, "-C", str(folder), "propose"],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
         )
-        time.sleep(0.05 + 0.025 * k)  # Python's own start is out of our hands
+        time.sleep(0.05 + 0.05 * k)  # Python's own start is out of our hands
         child.send_signal(signal.SIGINT)
         _, err = child.communicate()
         assert "Traceback" not in err or "<string>" not in err, err

@@ -7,14 +7,21 @@ import pytest
 from test_diagnosis import cart
 
 from cli import grounded
-from grounded.diagnosis.diagnose import diagnose
+from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.report import Diagnosis
+from grounded.effects import Library
 from grounded_trials.report.diagnosis_words import agreement_lines
+
+FEW = (
+    *("coulomb_friction", "viscous_friction", "dead_zone"),
+    *("input_gain", "delay", "offset", "trend"),
+)
+OPTIONS = DiagnosisOptions(library=Library(tuple(map(Library().family, FEW))))
 
 
 def test_trials_of_one_system_agree():
     model, trials = cart(friction=0.3, trials=5)
-    found = diagnose(model, trials)
+    found = diagnose(model, trials, OPTIONS)
     assert [one.effect for one in found.agreement] == ["coulomb_friction:v"]
     assert found.agreement[0].agrees and found.agreement[0].chance > 1e-3
     assert [v.agrees for v in found.per_trial] == [True] * 5
@@ -24,7 +31,7 @@ def test_trials_of_one_system_agree():
 
 def test_a_value_that_differs_by_trial_is_told_with_what_it_goes_with():
     trials = [cart(friction=0.25 + 0.05 * k, trials=1, seed=k)[1][0] for k in range(6)]
-    found = diagnose(cart()[0], trials)
+    found = diagnose(cart()[0], trials, OPTIONS)
     (one,) = (a for a in found.agreement if a.effect == "coulomb_friction:v")
     assert not one.agrees and one.goes_with == "rises with the order of the trials"
     values = [v.value for v in found.per_trial if v.effect == one.effect]
@@ -42,7 +49,7 @@ def test_a_value_that_differs_by_trial_is_told_with_what_it_goes_with():
 )
 def test_what_changed_between_two_groups(first, second, effect, values):
     (model, before), (_, after) = cart(**first, trials=3, seed=1), cart(**second, trials=3, seed=2)
-    found = diagnose(model, before, compare=after)
+    found = diagnose(model, before, OPTIONS, compare=after)
     assert found.trials == 6 and found.changed is not None
     assert [one.effect for one in found.changed] == ([effect] if effect else [])
     for one in found.changed:

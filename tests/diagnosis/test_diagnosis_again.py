@@ -114,5 +114,7 @@ def test_a_gain_of_the_input_is_the_parameter_behind_it(name, same):
 def test_a_floor_from_trials_that_are_merely_alike_says_so():
     alike = [replace(t, candidate=f"c{i}") for i, t in enumerate(runs(1.5, alike=True))]
     again = [replace(t, candidate="c1") for t in alike]
-    sources = [diagnose(axis(1.0), some).prediction_error[0].floor_from for some in (alike, again)]
+    few = DiagnosisOptions(library=Library((Library().family("viscous_friction"),)))
+    found = [diagnose(axis(1.0), some, few) for some in (alike, again)]
+    sources = [one.prediction_error[0].floor_from for one in found]
     assert sources == ["alike", "repeats"]

@@ -251,7 +251,11 @@ def pushed_hard_once(seed=0):
 def rare():
     model, trials = pushed_hard_once()
     data = prepare(model, trials, np.zeros(1))
-    return attribute(data, Library().candidates(model, data.scales), max_effects=2)
+    families = ("viscous_friction", "saturation", "coulomb_friction", "quadratic_drag", "offset")
+    library = Library(
+        tuple(map(Library().family, (*families, "input_gain", "slew_limit", "delay")))
+    )
+    return attribute(data, library.candidates(model, data.scales), max_effects=2)
 
 
 @pytest.mark.slow

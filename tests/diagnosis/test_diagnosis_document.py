@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 from test_diagnosis import cart
 from test_diagnosis_split import task_of
 
-from grounded.diagnosis.diagnose import diagnose
+from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.error_report import Gap, Region, Remainder, UtilityPrediction, Where
 from grounded.diagnosis.report import Diagnosis, Estimate, Made, Ranked, Verdict
+from grounded.effects import Library
 from grounded.errors import GroundedError
 from grounded.result import Document
 from reported import DIAGNOSIS
@@ -33,7 +34,9 @@ def again(found: Document) -> Any:
 )
 def test_a_real_diagnosis_is_read_back_as_it_was(kind, trials, changes):
     model, runs = cart(trials=trials, steps=120, **changes)
-    found = diagnose(task_of(model), runs)
+    few = ("coulomb_friction", "viscous_friction", "input_gain", "delay", "offset")
+    library = Library(tuple(Library().family(name) for name in few))
+    found = diagnose(task_of(model), runs, DiagnosisOptions(library=library))
     assert found.kind == kind
     read = again(found)
     assert read == found and read.to_json() == found.to_json()

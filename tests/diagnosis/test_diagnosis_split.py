@@ -128,7 +128,8 @@ def test_a_copy_counts_once():
 
 def test_a_trial_beside_itself_confirms_nothing():
     model, trials = cart(friction=0.4, trials=1)
-    found = diagnose(model, [trials[0], trials[0]])
+    few = DiagnosisOptions(library=Library((Library().family("coulomb_friction"),)))
+    found = diagnose(model, [trials[0], trials[0]], few)
     assert found.no_cause and not found.effects and found.trials == 1
 
 

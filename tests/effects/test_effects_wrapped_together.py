@@ -93,6 +93,7 @@ def test_the_carried_heading_rate_stays_the_headings(parts):
     assert np.abs(drift[[20, 60]]).max() < 0.01
 
 
+@pytest.mark.slow
 def test_pairs_wrapped_in_any_order_are_one_model():
     one, models = trial(), []
     for parts in ((SLEW, FRICTION, GAIN), (GAIN, SLEW, FRICTION)):

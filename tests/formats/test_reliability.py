@@ -24,16 +24,16 @@ def test_every_truncation_is_refused() -> None:
 
 
 def test_every_flipped_bit_is_refused() -> None:
-    fine(reliability.read_damaged(flips=True, stride=1 if FULL else 3))
+    fine(reliability.read_damaged(flips=True, stride=1 if FULL else 7))
 
 
 def test_what_is_recovered_of_a_truncated_trial_is_right() -> None:
-    fine(reliability.recover_damaged(flips=False, stride=1 if FULL else 3))
+    fine(reliability.recover_damaged(flips=False, stride=1 if FULL else 11))
 
 
 @pytest.mark.slow
 def test_what_is_recovered_of_a_flipped_trial_is_right() -> None:
-    fine(reliability.recover_damaged(flips=True, stride=1 if FULL else 13))
+    fine(reliability.recover_damaged(flips=True, stride=1 if FULL else 37))
 
 
 def test_verify_finds_every_flipped_bit() -> None:

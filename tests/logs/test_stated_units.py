@@ -5,7 +5,12 @@ import pytest
 
 from cli import grounded
 from facts import holds
-from grounded_trials.logs.stated_units import factor_between, unit_in_name, without_unit
+from grounded_trials.logs.stated_units import (
+    factor_between,
+    same_unit,
+    unit_in_name,
+    without_unit,
+)
 
 MODEL = """from grounded import Model, Param
 model = Model(states={"x": "m", "v": "m/s", "theta": "rad"}, inputs={"volt": "V"},
@@ -27,10 +32,17 @@ model = Model(states={"x": "m", "v": "m/s", "theta": "rad"}, inputs={"volt": "V"
         ("%", "1", 0.01),
         ("m", "rad", None),
         ("furlong", "m", None),
+        ("km^400", "m", None),  # no power overflows
+        ("m^99999999999999999999", "m", None),
     ],
 )
 def test_the_factor_between_two_units(said, wanted, factor):
     assert factor_between(said, wanted) == (factor and pytest.approx(factor))
+
+
+def test_a_unit_is_the_same_whoever_writes_it():
+    assert same_unit("N·m", "N m") and same_unit("m/s²", "m / s^2") and same_unit("Nm", "N m")
+    assert not any(same_unit(one, "m/s") for one in ("mm/s", "m", "rad/s", "m/s^2"))
 
 
 def test_units_in_a_table_s_first_row_become_scales(tmp_path):

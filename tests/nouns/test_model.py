@@ -46,6 +46,7 @@ def test_differences_of_angles_wrap_and_the_arguments_stay():
         ({"states": {}}, holding("state")),
         ({"inputs": {}}, holding("input")),
         ({"inputs": {"x": "N"}}, holding("'x'", "twice")),
+        ({"params": {"mass": 1.0}}, holding("'mass'", "Param(value, unit)")),
         ({"params": {"v": Param(1.0)}}, holding("'v'", "twice")),
         ({"states": {"my state": "m"}}, holding("'my state'")),
         ({"angles": ("psi",)}, holding("angle", "'psi'", "x, v")),

@@ -135,14 +135,24 @@ def test_a_short_gap_is_bridged_as_in_a_workspace():
 
 def test_what_a_user_gets_wrong_in_python_is_said():
     model, n = TASK.model, TASK.model.n
-    reward = TASK.reward
+    reward, trial = TASK.reward, run(gr.Search(TASK).ask())
+    two = replace(model, derivative=lambda s, a: dict.fromkeys(model.states, 0.0))
     for mistake, told in (
         (lambda: replace(reward, state={"x": 3.0}), r"\[reward\] state: expected an array"),
         (lambda: replace(TASK, reward=replace(reward, state=np.ones(n + 1))), f"expected {n} weig"),
         (lambda: replace(TASK, start="here"), "task: start: expected an array"),
         (lambda: gr.Model(states=["x"], inputs={"u": "N"}, derivative=len), "dict by name"),
-        (lambda: gr.diagnose([], TASK), "list of trials, got list and Task"),
-        (lambda: gr.diagnose(model, run(gr.Search(TASK).ask())), "list of trials"),
+        (lambda: gr.diagnose([], TASK), "list of Trials, got list and Task"),
+        (lambda: gr.diagnose(model, run(gr.Search(TASK).ask())), "list of Trials"),
+        (lambda: gr.diagnose(model, [np.zeros((3, n))]), "list of ndarray"),
+        (lambda: gr.fit(model, [np.zeros((3, n))]), "ndarray"),
+        (lambda: gr.Search(model), "needs a Task, got a Model"),
+        (lambda: gr.Search(TASK).tell(np.zeros((3, n))), "ndarray"),
+        (
+            lambda: TASK.utility(replace(trial, state_names=trial.state_names[::-1])),
+            "in this order",
+        ),
+        (lambda: gr.Search(replace(TASK, model=two)).ask(), r"\(s, a, p\)"),
         (lambda: gr.learn(TASK, lambda candidate: None), "returns a Trial"),
     ):
         with pytest.raises(gr.GroundedError, match=told):

@@ -2,6 +2,7 @@
 
 import importlib.util
 import tomllib
+from functools import cache
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -88,6 +89,53 @@ def test_a_target_that_nobody_has_drawn_is_told(blank):
     assert any("`target`" in one for one in blank.propose().proposal.notes)
     blank.target({"x": np.linspace(0, 1, 41)})
     assert not any("`target`" in one for one in blank.propose().proposal.notes)
+
+
+HOVER = """from grounded import Model, Param
+
+def rate(s, a, p):
+    lift = p.k * (a.left * a.left + a.right * a.right) / p.m
+    return {"z": s.v, "v": lift - 9.81, "w": a.left - a.right}
+
+model = Model(states={"z": "m", "v": "m/s", "w": "rad/s"}, inputs={"left": "1", "right": "1"},
+              params={"k": Param(8.0, "N"), "m": Param(1.2, "kg")}, derivative=rate)
+"""
+
+
+def test_what_holds_the_start_is_held_before_it_or_asked_for(tmp_path):
+    """A quadrotor was planned from a thrust of 0, and dipped; after its end 0 was sent again."""
+    (tmp_path / "quad.py").write_text(HOVER)
+    told = grounded("init", tmp_path / "w", "--blank", "--model", tmp_path / "quad.py").out
+    w = Workspace(tmp_path / "w")
+    hover = (1.2 * 9.81 / 16) ** 0.5
+    assert list(w.config.task.start) == ["left", "right"] and "left = 0.8577" in told
+    np.testing.assert_allclose(w.task.past, hover, rtol=1e-5)
+    file = w.folder / "grounded.toml"
+    whole = file.read_text()
+    given = next(row for row in whole.splitlines() if row.startswith("start = "))
+
+    def notes(start, limits="[limits]"):
+        file.write_text(whole.replace(given, f"start = {start}").replace("[limits]", limits))
+        w.forget()
+        return [n for n in w.propose().proposal.notes if "counts as held" in n]
+
+    (note,) = notes("{ }")
+    assert "v changes" in note and "left = 0.8578, right = 0.8578" in note
+    assert not notes("{ }", "[limits]\nleft = [0, 0.8]")  # inside which nothing holds it
+    assert not notes("{ left = 0.0 }")  # somebody says so
+    assert not notes("{ v = 1.0 }")  # in motion, which no input holds
+
+
+def test_a_model_that_stands_without_input_needs_none(blank):
+    assert not blank.config.task.start and not blank.task.past.any()
+
+
+def test_a_target_is_read_once(blank, monkeypatch):
+    reads, read = [], blank.read_target.__wrapped__
+    monkeypatch.setattr(blank, "read_target", cache(lambda path: reads.append(path) or read(path)))
+    blank.propose()
+    assert len(reads) == 1 and blank.origin.horizon == blank.task.horizon
+    assert len(reads) == 1
 
 
 def test_a_workspace_in_a_folder_of_this_one_is_named(blank):

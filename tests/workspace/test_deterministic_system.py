@@ -30,6 +30,9 @@ write_trial(trial, made, about, policy=candidate.read_bytes(), **units)
 """
 
 
+EARLY = "tolerance = 0.02"  # the end comes after few trials, each a process
+
+
 @pytest.fixture
 def workspace(tmp_path):
     system = CONFIG[CONFIG.index("[system]") :]
@@ -43,7 +46,7 @@ def workspace(tmp_path):
 def test_learn_ends(workspace, repeats):
     """FACTS 7, reason 1: with two repeats 0.1 ran the first candidate again and again."""
     config = workspace.folder / "grounded.toml"
-    more = f"max_trials = 12\nrepeats = {repeats}"
+    more = f"max_trials = 12\nrepeats = {repeats}\n{EARLY}"
     config.write_text(config.read_text().replace("max_trials = 12", more))
     status = workspace.learn()
     assert status.standing.phase == "converged" and status.standing.ending
@@ -51,7 +54,8 @@ def test_learn_ends(workspace, repeats):
 
 
 def test_run_and_ingest_by_hand_end_too_and_an_old_file_is_no_repeat(workspace):
-    files = []
+    config, files = workspace.folder / "grounded.toml", []
+    config.write_text(config.read_text().replace("max_trials = 12", f"max_trials = 12\n{EARLY}"))
     for _ in range(12):
         if workspace.propose().candidate is None:
             break

@@ -11,6 +11,7 @@ from facts import holding, holds
 from grounded.errors import GroundedError, NextCommand
 from grounded_trials import Workspace
 from grounded_trials.store.candidate_file import candidate_bytes, read_candidate
+from grounded_trials.store.trial_file import read_trial, write_trial
 from grounded_trials.workspace.handover import checked_candidate, outside_limits
 from rewriting import with_metadata
 from workspaces import CONFIG, MODEL, make
@@ -138,6 +139,33 @@ def test_safety_that_was_narrowed_replaces_it_or_ends_the_search(w, tmp_path):
     assert any(holds(note, "c0001", "void") for note in made.proposal.notes)
     configure(w, CONFIG)
     assert w.propose().candidate.id == "c0001"
+
+
+def test_the_first_run_is_told_how_near_safety_it_is_to_come_and_then_that_it_left(tmp_path):
+    box = "[safety]\nx = [-1.0, 1.1]\nv = [-9.0, 9.0]\n"
+    w = Workspace(make(tmp_path / "w", config=CONFIG + box).folder)
+    first = w.propose().proposal
+    predicted = first.candidate.predicted_states[:, 0]
+    (note,) = [n for n in first.notes if "[safety]" in n]
+    assert f"{1.1 - predicted.max():.3g} m of the bound of x" in note and "of v" in note
+    ran, *_ = read_trial(w.run().trial_file)
+    states = ran.states + np.linspace(0, 0.5, len(ran.states))[:, None] * [1.0, 0.0]
+    file = tmp_path / "t.mcap"
+    write_trial(file, replace(ran, states=states), {"kind": "trial"})
+    (said,) = [one for one in w.ingest(file, candidate="c0001").warnings if "[safety]" in one]
+    k = int(np.argmax(states[:, 0]))
+    assert holds(said, "[safety] x = [-1, 1.1]", f"{states[k, 0]:.3g} m", f"{0.05 * k:.2f} s")
+    assert f"{predicted[k]:.3g} m was predicted" in said
+    assert not [n for n in w.propose().proposal.notes if "no run has tested" in n]
+
+
+def test_a_first_plan_that_safety_forbids_says_what_to_do_and_not_to_diagnose(tmp_path):
+    """There was no trial, and `next:` was to diagnose it."""
+    w = Workspace(make(tmp_path / "w", config=CONFIG + SAFETY.format(high=0.5)).folder)
+    done = w.propose()
+    assert done.candidate is None and done.then == NextCommand("propose")
+    assert holds(" ".join(done.proposal.notes), "outside [safety] x = [-1, 0.5]", "`target`")
+    assert w.status().then == NextCommand("propose")
 
 
 def test_a_step_that_safety_forbids_now_gives_way_to_another(ran):

@@ -83,6 +83,17 @@ def test_a_trial_that_does_not_say_what_it_ran_is_the_outstanding_ones(w, tmp_pa
     assert again.known and again.trial == found.trial
 
 
+@pytest.mark.parametrize(("sigma", "told"), [(0.1, False), (0.0, True)])
+def test_a_start_within_the_noise_of_its_sensor_is_no_warning(w, tmp_path, sigma, told):
+    ran, *_ = read_trial(run(w))
+    states = np.array(ran.states)
+    states[:, 0] += np.random.default_rng(1).normal(0, 1, len(states)) * sigma
+    states[0, 0] = 0.2  # of a range of 1: two standard deviations, or a wrong start
+    write_trial(tmp_path / "t.mcap", replace(ran, states=states), {"kind": "trial"})
+    warnings = ingest_log(w, tmp_path / "t.mcap", "c0001").warnings
+    assert any("started with x = 0.2" in one for one in warnings) is told
+
+
 @pytest.mark.parametrize("data", [False, True])
 def test_units_that_a_trial_states_must_be_the_models(w, tmp_path, data):
     """A trial in cm was stored as if it were in m."""

@@ -12,6 +12,7 @@ import pytest
 from cli import grounded, plain, process
 from facts import holds
 from grounded.diagnosis.report import Diagnosis, Made
+from grounded.effects import Library
 from grounded.errors import GroundedError, NextCommand
 from grounded.search.candidate import Candidate
 from grounded_cli.main import COMMANDS, cli
@@ -22,7 +23,7 @@ from grounded_trials.store.documents import write_document
 from grounded_trials.wording import folded
 from grounded_trials.workspace.adopting import diagnosed_again
 from grounded_trials.workspace.config import set_in_model
-from grounded_trials.workspace.diagnosing import _in_vain
+from grounded_trials.workspace.diagnosing import _in_vain, _one_more
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.next_step import DIAGNOSE, after_diagnosis, since_diagnosis
 from grounded_trials.workspace.proposing import standing_in
@@ -409,7 +410,8 @@ def test_a_result_says_what_follows_it_without_the_command_line(cart, tmp_path):
     run = w.run("best").trial_file
     assert w.ingest(run).then == w.status().then  # the search has ended: not `propose`
     assert w.ingest(run, data=True).then == DIAGNOSE
-    found = w.diagnose(max_effects=1)
+    few = Library(tuple(map(Library().family, ("viscous_friction", "input_gain"))))
+    found = w.diagnose(max_effects=1, library=few)
     assert found.then is not None and found.then == w.status().then
     assert "then" not in found.to_json()
 
@@ -461,6 +463,23 @@ def test_an_adoption_in_vain_is_told_how_to_be_undone(tmp_path, monkeypatch):
     assert said("none", False, False) == said("unknown", False) == ""
     assert said("unknown", False, False, True) == ""
     assert said("unknown", False, False, model="of yesterday") == ""
+
+
+def test_as_many_effects_as_were_asked_for_are_said_to_be_no_end():
+    """Three are blamed at most unless more are asked for; six are the most that can be."""
+    left = [{"channel": "x", "size": 0.1, "unit": "m", "share": 0.3}]
+    names = [f"{kind}:v" for kind in ("coulomb_friction", "stiction", "quadratic_drag")]
+
+    def said(effects, most, leftover=left):
+        verdict = DIAGNOSIS["verdict"] | {"effects": effects}
+        found = Diagnosis.from_json(DIAGNOSIS | {"verdict": verdict, "leftover": leftover})
+        return _one_more(found, most)
+
+    assert "diagnose --max-effects 4`" in said(names, 3)
+    assert "diagnose --max-effects 6`" in said([*names, "a:v", "b:v"], 5)
+    assert said(names[:2], 3) == said(names, 3, []) == said([*names, *"abc"], 6) == ""
+    six, seven = (grounded("diagnose", "--max-effects", str(k)).err for k in (6, 7))
+    assert "max-effects" in seven and "max-effects" not in six
 
 
 def test_an_adoption_is_undone_and_not_proposed_again_until_a_new_diagnosis(cart, tmp_path):

@@ -14,7 +14,7 @@ from grounded_trials import Workspace
 from grounded_trials.report.findings import improvements_in
 from grounded_trials.report.gathering import gather
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.off_target import off_target_of
+from grounded_trials.workspace.off_target import off_target_of, reaches
 from reported import cart, copied
 
 __all__ = ["cart"]
@@ -93,6 +93,21 @@ def test_what_only_the_end_weighs_is_told_there():
     assert holds(position.summary(), "0.20 cm at the end")
     both = off_target_of(task(terminal=np.array([1.0, 1.0, 0.1, 0.0]), **ALONG), [run(states)])[0]
     assert both.rms > 0.4 and both.end == pytest.approx(0.002)
+
+
+def test_where_something_is_to_be_reached_the_end_is_told_without_a_weight_of_its_own():
+    """The page of a task to get somewhere gave the rms over the way, and not where it ended."""
+    goal = replace(task(**ALONG), start=np.array([-1.0, 0.0, 0.0, 0.0]))
+    states = off(0.5)
+    states[-1, :2] = 0.003, 0.004
+    position, _ = off_target_of(goal, [run(states)])
+    assert position.rms > 0.4 and position.end == pytest.approx(0.005)
+    s = np.linspace(0, 1, H + 1)
+    way = np.zeros((H + 1, 4))
+    way[:, 0] = 10 * s**3 - 15 * s**4 + 6 * s**5
+    assert reaches(goal) and not reaches(task(**ALONG))  # which is to stay
+    assert not reaches(replace(goal, target=np.outer(s, [1.0, 0, 0, 0])))  # and one to go on
+    assert reaches(replace(goal, start=np.zeros(4), target=way))
 
 
 def test_a_run_that_ended_early_has_no_end_and_a_lost_one_no_line():

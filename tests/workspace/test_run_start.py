@@ -97,6 +97,25 @@ def test_an_aborted_run_crashed_with_a_lead_in_too(w, tmp_path, until):
     assert abs(w.trials()[-1].trial.steps - until / policy.dt) <= 1
 
 
+def test_a_log_that_ends_a_row_early_says_by_how_much_and_what_that_costs(w, tmp_path):
+    policy, states = w.candidate("c0002")[0].policy, "its last state 10 ms before"
+    path = record(w, tmp_path / "a.csv", policy, 0.0, after=0.01)
+    rows = path.read_text().splitlines()
+    whole = w.ingest(path)
+    assert whole.candidate == "c0002" and not any("steps" in one for one in whole.warnings)
+    (tmp_path / "b.csv").write_text("\n".join(rows[:-1]))
+    short = w.ingest(tmp_path / "b.csv", candidate="c0002")
+    (said,) = [one for one in short.warnings if "after 39 of 40 steps" in one]
+    assert states in said and "one more row" in said and np.isfinite(short.utility)
+    (tmp_path / "c.csv").write_text("\n".join(rows[:-4]))
+    (said,) = [
+        one
+        for one in w.ingest(tmp_path / "c.csv", candidate="c0002").warnings
+        if "after 39 of 40 steps" in one
+    ]
+    assert "its last state 40 ms before" in said
+
+
 def test_a_log_whose_start_is_sought_is_read_once(w, tmp_path, monkeypatch):
     reads = []
     counted = lambda *a: reads.append(a) or read(*a)  # noqa: E731

@@ -213,4 +213,8 @@ class DifferencedSystem(Interpreted):
 
     def _failure(self, error: Exception) -> GroundedError:
         line = raised_at(error, self.signature.function)
-        return GroundedError(f"{line}: the model raised {type(error).__name__}: {error}")
+        called = isinstance(error, TypeError) and "positional argument" in str(error)
+        return GroundedError(
+            f"{line}: the model raised {type(error).__name__}: {error}"
+            + "; it is called with states, inputs and parameters: (s, a, p)" * called
+        )

@@ -81,6 +81,7 @@ class Gridded:
     late_s: float  # the start was moved by this much, because a state was not known yet
     moved_s: float  # and by this much more, to where the commands change
     row_s: float  # by how much commands may be logged late: a table repeats them row by row
+    last_ns: int  # the last sample of the state whose samples end first, likewise
     reports: tuple[SignalReport, ...]  # of the states, then of the inputs
     warnings: tuple[str, ...]
 
@@ -148,6 +149,7 @@ def to_grid(
         late_s=late,
         moved_s=moved * 1e-9,
         row_s=max((held_rows(s.t, s.y) for s in sent), default=0.0),
+        last_ns=min(int(samples[name].t[-1]) for name in states),
         reports=tuple(reports),
         warnings=(*warnings_of(tuple(reports), late), *([uneven] if uneven else [])),
     )

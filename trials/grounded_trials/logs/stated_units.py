@@ -112,11 +112,17 @@ def factor_between(said: str, wanted: str) -> float | None:
     return one / other if a == b else None
 
 
+def same_unit(said: str, wanted: str) -> bool:
+    """Whether two ways of writing a unit mean one: `N·m`, `Nm` and `N m`."""
+    factor = factor_between(said, wanted)
+    return factor is not None and math.isclose(factor, 1.0)
+
+
 def _in_base(unit: str) -> tuple[Counter[str], float]:
     """The powers of a unit's parts that are no multiples of others, and its size in those."""
     powers, size = Counter[str](), 1.0
     for k, side in enumerate(unit.replace("²", "^2").replace("·", " ").split("/")):
-        for part in re.findall(r"[^\s*^()]+(?:\^-?\d+)?", side):
+        for part in re.findall(r"[^\s*^()]+(?:\^-?\d)?", side):
             name, _, power = part.partition("^")
             sign = (-1 if k else 1) * int(power or 1)
             inner, by = _in_base(_OF[name][0]) if name in _OF else (Counter({name: 1}), 1.0)

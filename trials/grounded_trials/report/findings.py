@@ -26,13 +26,14 @@ from grounded_trials.wording import figure, rendered, shown
 from grounded_trials.workspace.adopting import Better
 from grounded_trials.workspace.folder import Lost
 from grounded_trials.workspace.next_step import Since
-from grounded_trials.workspace.off_target import tracking_error, weighed_groups
+from grounded_trials.workspace.off_target import reaches, tracking_error, weighed_groups
 
 if TYPE_CHECKING:
     from grounded_trials.report.settled import Settled
 
 One = TypeVar("One")
 SHOWN = 4  # numbers of what improved
+AT_END = "at the end: "  # of what is to be reached, the first group is always told
 MOVED = 0.02  # of what the utility gained: a number that moved it less is left out
 WORSE = 1.05  # times the first trial's error, from which it is said that it rose
 TERMS = {  # tables of [reward]
@@ -199,7 +200,8 @@ class Improved:
 def improvements_in(findings: Findings) -> list[Improved]:
     """How far the model's own policy missed the target, and the best trial does, rms over the run.
 
-    Where the reward weighs the last state, that one too. What moved the utility most comes first.
+    Where the reward weighs the last state, or something is to be reached, that one too. What moved
+    the utility most comes first.
     """
     task, runs, found = findings.task, compared(findings), []
     if not runs:
@@ -207,6 +209,7 @@ def improvements_in(findings: Findings) -> list[Improved]:
     each = [one for _, r in runs for one in findings.runs_of(r.candidate.id)]
     short = [one.label for one in each if one.trial.finite_steps < task.horizon]
     note = f"; {', '.join(short)} ended early" if short else ""
+    arrives = reaches(task)
     worse = "; here the best trial is worse than the first, and better in other terms of the reward"
     for names, what in weighed_groups(task):
         states = [task.model.state_names.index(name) for name in names]
@@ -215,9 +218,9 @@ def improvements_in(findings: Findings) -> list[Improved]:
         far = "distance from the desired position" if len(names) > 1 else f"{what}, off its target"
         running, terminal = task.reward.state[states], task.reward.terminal[states]
         views = [(errors, running, f"{far}, rms")] * bool(running.any() or not terminal.any())
-        if terminal.any() and not short:
+        if (terminal.any() or arrives) and not short:
             last = [[e[[task.horizon]] for e in own] for own in errors]
-            views.append((last, terminal, f"at the end: {far}"))
+            views.append((last, terminal + arrives * running, f"{AT_END}{far}"))
         for parts, weights, words in views:
             missed = [float(np.linalg.norm(rms(part))) for part in parts]
             costs = [float(np.nansum(np.vstack(p) ** 2 @ weights)) / len(p) for p in parts]
@@ -225,9 +228,11 @@ def improvements_in(findings: Findings) -> list[Improved]:
             moved = abs(costs[0] - costs[-1]) if len(costs) > 1 else costs[0]
             paid = worse * (missed[-1] > WORSE * missed[0])
             found.append((moved, Improved(words + note + paid, unit, before, missed[-1])))
+    reached = next((one for _, one in found if arrives and one.what.startswith(AT_END)), None)
     found.sort(key=lambda each: -each[0])
     least = MOVED * sum(moved for moved, _ in found)
-    return [one for k, (moved, one) in enumerate(found[:SHOWN]) if not k or moved >= least]
+    told = [one for k, (moved, one) in enumerate(found[:SHOWN]) if not k or moved >= least]
+    return told if reached is None or reached in told else [*told[: SHOWN - 1], reached]
 
 
 def utility_terms(findings: Findings) -> tuple[list[tuple[str, ...]], tuple[str, ...]]:

@@ -67,11 +67,6 @@ def settled_in(workspace: Folder, diagnosis: Diagnosis | None, since: Since) -> 
     return Settled(tuple(clauses), text, still_open(diagnosis), closed=True)
 
 
-def settled_now(workspace: Folder) -> Settled | None:
-    """The same, of the last diagnosis as it is kept; a damaged one counts as none."""
-    return settled_in(workspace, *_last(workspace))
-
-
 def measured_now(workspace: Folder) -> str:
     """How far the model that plans now predicts, as the last diagnosis measured it, or ""."""
     found, since = _last(workspace)

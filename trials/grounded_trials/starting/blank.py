@@ -1,12 +1,16 @@
 """A workspace from a model file alone: what a robot that no example is like begins with.
 
 Everything that has to be said about the task is there with a value that runs, to be replaced: the
-target holds every state at zero, each weighs 1, no input has a limit. `drive.py` is the robot's
-program: it reads the candidate and writes the trial, and lacks two functions, `measure` and `send`.
+target holds every state at zero, each weighs 1, no input has a limit. Where the model stands there
+under some input (a quadrotor's hover), that is what counts as held before the start. `drive.py` is
+the robot's program: it reads the candidate and writes the trial, and lacks two functions, `measure`
+and `send`.
 """
 
 from __future__ import annotations
 
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +22,7 @@ from grounded.utility import Reward
 from grounded_trials.starting.examples import fresh_folder, toml_of
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.config import FILE
+from grounded_trials.workspace.first_plan import holding_input
 from grounded_trials.workspace.model_file import load_module, model_in
 from grounded_trials.workspace.task_file import write_target
 
@@ -30,6 +35,8 @@ DRIVE = '''"""The robot's program: runs a candidate, writes its trial. `grounded
 
 import sys
 import time
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -118,10 +125,10 @@ FILES = (FILE, "model.py", "target.csv", "drive.py")
 
 
 def _task(model: Model, dt: float) -> Task:
-    """Hold every state at zero for a hundred steps."""
+    """Hold every state at zero for a hundred steps, from the inputs that hold it there."""
     n, m = model.n, model.m
     free = np.full(m, np.inf)
-    return Task(
+    task = Task(
         model=model,
         dt=dt,
         target=np.zeros((HORIZON + 1, n)),
@@ -131,3 +138,7 @@ def _task(model: Model, dt: float) -> Task:
         low=-free,
         high=free,
     )
+    with suppress(GroundedError):  # a model that does not work says so when it is planned with
+        if (still := holding_input(task)) is not None:
+            return replace(task, past=np.array([float(f"{u:.6g}") for u in still]))
+    return task

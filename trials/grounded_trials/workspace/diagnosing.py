@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
 FILE = "diagnosis.json"
 LEAST_STEPS = 2
+MOST_EFFECTS = 6  # that may be blamed at once: `--max-effects`
 PROBE = NextCommand("diagnose", ("--probe",))
 
 
@@ -101,8 +102,7 @@ def diagnose_in(
         run = f" ({identity}: {rendered(to_run(workspace, identity, identity))})" * bool(identity)
         found = replace(found, next_trial=f"{words}{run}", probe=identity)
         _keep(workspace, found)
-    if found.leftover and len(found.effects) == max_effects:
-        more = f"`grounded diagnose --max-effects {max_effects + 1}` looks for one more effect."
+    if more := _one_more(found, max_effects):
         found = replace(found, next_trial=f"{more} {found.next_trial}".strip())
         _keep(workspace, found)
     if undo := _in_vain(workspace, found):
@@ -128,6 +128,13 @@ def _as_known(workspace: Folder, ranking: Sequence[Ranked], made: Made) -> tuple
         else one
         for one in ranking
     )
+
+
+def _one_more(found: Diagnosis, most: int) -> str:
+    """How to look for one more effect, where as many as were asked for leave something over."""
+    if not found.leftover or len(found.effects) != most or most >= MOST_EFFECTS:
+        return ""
+    return f"`grounded diagnose --max-effects {most + 1}` looks for one more effect."
 
 
 def _in_vain(workspace: Folder, found: Diagnosis) -> str:

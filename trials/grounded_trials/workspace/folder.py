@@ -14,7 +14,7 @@ import re
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -40,7 +40,7 @@ from grounded_trials.workspace.identity import (
     stored_candidate,
 )
 from grounded_trials.workspace.model_file import check_names, load_module, model_in
-from grounded_trials.workspace.task_file import build_task
+from grounded_trials.workspace.task_file import build_task, read_target
 
 if TYPE_CHECKING:
     from grounded.search.planner import Planner
@@ -48,7 +48,6 @@ if TYPE_CHECKING:
 
 MANY = 200  # trials: fewer are all read, more are indexed
 _ID = re.compile(r"c\d{4,}")
-CACHED = ("config", "_written", "base_model", "task", "planner", "_trials", "noted", "_index")
 
 
 @dataclass(frozen=True)
@@ -80,6 +79,7 @@ class Folder:
         self.store = Store(self.folder / "trials", prefix="t")
         self.notes = Notes(self.folder / "trials")
         self.reports = self.folder / "reports"
+        self.read_target = cache(read_target)
 
     @property
     def address(self) -> str | None:
@@ -106,12 +106,12 @@ class Folder:
     @cached_property
     def task(self) -> Task:
         """The task with the crude model: it judges trials."""
-        return build_task(self.config, self.base_model, self.folder)
+        return build_task(self.config, self.base_model, self.folder, self.read_target)
 
     @property
     def origin(self) -> Task:
         """The task with the model of model.py as it is: nothing fitted, nothing adopted."""
-        return build_task(self.config, self._written, self.folder)
+        return build_task(self.config, self._written, self.folder, self.read_target)
 
     @cached_property
     def planner(self) -> Planner:
@@ -135,7 +135,8 @@ class Folder:
 
     def forget(self) -> None:
         """Everything is read again when it is asked for next."""
-        for name in CACHED:
+        self.read_target.cache_clear()
+        for name in [n for n, kept in vars(Folder).items() if isinstance(kept, cached_property)]:
             vars(self).pop(name, None)
 
     def forget_trials(self) -> None:

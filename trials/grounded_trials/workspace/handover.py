@@ -27,12 +27,14 @@ from grounded.policy import Policy
 from grounded.search.candidate import LITTLE, Candidate
 from grounded.task import Task
 from grounded.trial import Trial
+from grounded_trials.wording import with_unit
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import StoredTrial, candidate_of, sha256
 
 if TYPE_CHECKING:
     from grounded.search.standing import Standing
 
+NEAREST = 2  # bounds of [safety] that are told: those nearest beside how far the run goes
 AGREES = 1e-6  # of an input's size: how well a policy repeats its own predicted inputs
 
 
@@ -249,6 +251,28 @@ class Check:
         elif self._changed:
             again = "predicted again" if self._predictable else "its prediction is the old one"
             yield f"the model was changed since {name} was made; {again}"
+        if self.same_task and not any(tried.trials for tried in self.standing.history):
+            yield from self._untried()
+
+    def _untried(self) -> Iterator[str]:
+        """How near the first run comes to [safety], which nothing but the bare model says."""
+        task, made = self.workspace.task, self.candidate
+        assert task.safety_low is not None and task.safety_high is not None
+        near = []
+        for i, (name, unit) in enumerate(task.model.states.items()):
+            low, high, values = task.safety_low[i], task.safety_high[i], made.predicted_states[:, i]
+            room = np.minimum(values - low, high - values)
+            t = int(np.argmin(room))
+            if np.isfinite(room[t]):
+                left = with_unit(f"{room[t]:.3g}", unit)
+                told = f"within {left} of the bound of {name} (at {t * task.dt:.4g} s)"
+                near.append((room[t] / max(np.ptp(values), 1e-12), told))
+        if near:
+            told = " and ".join(text for _, text in sorted(near)[:NEAREST])
+            yield (
+                f"[safety] holds of the prediction, which no run has tested: {made.id} is to come "
+                f"{told}. The robot may go further: be ready to stop it"
+            )
 
     @property
     def void(self) -> bool:

@@ -9,6 +9,7 @@ finds the first.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -20,6 +21,7 @@ from grounded.search.candidate import Candidate, Tried
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.logs.log_files import kind_of
 from grounded_trials.logs.samples import SignalReport
+from grounded_trials.logs.stated_units import same_unit
 from grounded_trials.plain_file import read_file
 from grounded_trials.store.own_files import CANDIDATE, FILE_LIMIT, TRIAL
 from grounded_trials.store.store import DIGITS
@@ -38,15 +40,8 @@ from grounded_trials.workspace.stored_before import (
     repeated,
     what_repeats,
 )
-from grounded_trials.workspace.trial_check import (
-    OTHERS,
-    other_units,
-    suspicion,
-    units_told,
-    warnings_about,
-)
-
-SPELT = str.maketrans({" ": "", "·": "", "*": "", "²": "^2"})  # a unit, whoever writes it
+from grounded_trials.workspace.trial_check import warnings_about
+from grounded_trials.workspace.who_drove import OTHERS, other_units, suspicion, units_told
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +53,7 @@ class _Read:
     notes: tuple[str, ...] = ()
     bare: bool = False  # it ran a candidate, and carries no copy of it
     log: ForeignLog | None = None
+    last_s: float = math.nan  # its last sample of every state, since the start; of a foreign log
 
 
 def ingest_log(
@@ -95,7 +91,7 @@ def ingest_log(
         workspace.notes.add({"note": "run", "trial": trial_hash, "sha256": ran}, again=False)
     workspace.forget_trials()
     trial = replace(read.trial, id=added.id)
-    warnings = (*read.warnings, *warnings_about(workspace, trial))
+    warnings = (*read.warnings, *warnings_about(workspace, trial, read.last_s))
     if before:
         warnings = (*warnings, f"it repeats {before} to the last bit: {what_repeats(workspace)}")
     if added.known and added.id in workspace.discarded():
@@ -244,8 +240,7 @@ def _other_units(workspace: Folder, meta: dict[str, str]) -> Iterator[str]:
     model = workspace.base_model
     for kind, own in (("states", model.states), ("inputs", model.inputs)):
         for name, unit in json.loads(meta[kind]).items():
-            said, wanted = (u.translate(SPELT) for u in (unit, own[name]))
-            if "1" not in (said, wanted) and said != wanted and said:
+            if unit and "1" not in (unit.strip(), own[name]) and not same_unit(unit, own[name]):
                 yield f"{name} is in {unit}, the model has {own[name]}"
 
 
@@ -296,6 +291,7 @@ def _cut(log: ForeignLog, candidate: str, start: float | None = None) -> _Read:
         found.reports,
         notes=() if candidate else tuple(begun(found, trial.dt)),
         log=log,
+        last_s=(found.last_ns - found.start_ns) * 1e-9,
     )
 
 

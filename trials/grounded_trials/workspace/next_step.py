@@ -41,7 +41,8 @@ def next_command(
         return another_trial(workspace, now)
     if diagnosis is None:
         logs = usable and not now.history  # what they show comes before the first candidate
-        return now.then or (PROPOSE if now.phase == "propose" and not logs else DIAGNOSE)
+        teach = usable and (logs or now.phase != "propose")
+        return now.then or (DIAGNOSE if teach else PROPOSE)
     if now.phase == "propose":
         return DIAGNOSE if follow and not now.history else PROPOSE
     if since.changed or since.newer:

@@ -1,7 +1,7 @@
 """How far runs are off their target, in the unit of the state: what a utility does not say.
 
 The states of a position count as one distance. What [reward] weighs along the way is told as its
-rms and its largest error, what it weighs at the end as the error there.
+rms and its largest error; what it weighs at the end, and what is to be reached, as the error there.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from grounded.task import Task
 from grounded.trial import Trial
 
 FEW = 2  # groups of states that are told: those that cost most
+REST = 0.1  # of the mean step of a target: one that moves less in the last step is at rest
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -30,7 +31,8 @@ class OffTarget(Document):
         rms: over the whole run; NaN where only its end is weighed.
         most: the largest.
         at_s: when that was, in seconds of the run.
-        end: rms at the last state; NaN where that has no weight of its own, or a run ended early.
+        end: rms at the last state; NaN where that has no weight of its own and nothing is to be
+            reached (see `reaches`), or a run ended early.
     """
 
     what: str
@@ -63,7 +65,7 @@ def off_target_of(task: Task, trials: Sequence[Trial]) -> tuple[OffTarget, ...]:
     whole = [trial.whole(task.horizon) for trial in trials]
     errors = [tracking_error(task, trial.until(max(trial.finite_steps, 0))) for trial in whole]
     ended = any(len(e) <= task.horizon for e in errors)
-    found = []
+    found, arrives = [], reaches(task)
     for names, what in weighed_groups(task):
         states = [task.model.state_names.index(name) for name in names]
         each = [e[:, states] for e in errors]
@@ -77,13 +79,24 @@ def off_target_of(task: Task, trials: Sequence[Trial]) -> tuple[OffTarget, ...]:
             worst = max(far, key=lambda d: float(d.max()))
             values["rms"] = float(np.sqrt(np.mean(np.concatenate(far) ** 2)))
             values |= {"most": float(worst.max()), "at_s": task.dt * int(np.argmax(worst))}
-        if terminal.any() and not ended:
+        if (terminal.any() or arrives) and not ended:
             values["end"] = float(np.sqrt(np.mean([e[-1] @ e[-1] for e in each])))
         found.append(
             (cost, OffTarget(what.removeprefix("the "), task.model.states[names[0]], **values))
         )
     least = sorted((cost for cost, _ in found), reverse=True)[:FEW][-1:]
     return tuple(one for cost, one in found if cost >= least[0])[:FEW]
+
+
+def reaches(task: Task) -> bool:
+    """Whether the task is to get somewhere: the first that its reward weighs is to end at rest."""
+    groups = weighed_groups(task)
+    if not groups:
+        return False
+    states = [task.model.state_names.index(name) for name in groups[0][0]]
+    way = task.model.difference(np.vstack([task.start, task.target]), task.start)[:, states]
+    steps = np.linalg.norm(np.diff(way, axis=0), axis=1)
+    return bool(steps.any() and steps[-1] <= REST * steps.mean())
 
 
 def weighed_groups(task: Task) -> list[tuple[list[str], str]]:

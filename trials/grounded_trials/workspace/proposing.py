@@ -6,33 +6,21 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from grounded.errors import GroundedError, NextCommand
-from grounded.result import Result, percent
-from grounded.task import Task
-from grounded.trial import Trial
-from grounded_trials.wording import with_unit
+from grounded.result import Result
 from grounded_trials.workspace.folder import Contents, Folder
 from grounded_trials.workspace.handover import Void, checked_candidate, outside_limits
-from grounded_trials.workspace.off_target import (
-    OffTarget,
-    off_target_of,
-    tracking_error,
-    weighed_groups,
-)
-
-MOSTLY = 0.9  # of a plan's cost
-HELD = 0.8  # of a plan's steps: an input is at a limit nearly all the time
-MISSED = 0.1  # of the way that a target asks for: the plan falls short
+from grounded_trials.workspace.off_target import OffTarget, off_target_of
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
 
+    from grounded.diagnosis.report import Diagnosis
     from grounded.figures.figure import Figure
     from grounded.search.candidate import Candidate
     from grounded.search.making import Proposal
     from grounded.search.standing import Standing
+    from grounded_trials.workspace.next_step import Since
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -73,6 +61,8 @@ class Status(Result):
     notes: tuple[str, ...] = ()  # of the search, where it has ended; trials of namesakes
     discarded: dict[str, str] = field(default_factory=dict)  # t0004 -> why it is set aside
     off_target: tuple[OffTarget, ...] = ()  # how far the runs of the best are off it, in units
+    diagnosis: Diagnosis | None = None  # the last one; a damaged one counts as none
+    since: Since | None = None  # what happened after it
 
     def summary(self) -> str:
         """The phase and the best candidate."""
@@ -113,7 +103,14 @@ def propose_in(workspace: Folder) -> Proposed:
         notes = notes or _void(workspace, before)
         notes = [f"{note}; run {candidate.id} in its place" for note in notes]
     if not proposal.standing.history:
-        notes += _unfinished(workspace, candidate)
+        from grounded_trials.workspace.first_plan import left_open
+
+        notes += left_open(workspace, candidate)
+        if proposal.standing.ending == "not allowed":
+            notes.append(
+                "nothing was run yet: widen [safety], or draw a target whose run stays inside "
+                "(`target`), and propose again"
+            )
     proposal = replace(proposal, notes=(*proposal.notes, *notes))
     if candidate is None:
         return Proposed(proposal, None, status_of(workspace, proposal.standing).then)
@@ -129,86 +126,6 @@ def to_run(workspace: Folder, candidate: str, *named: str) -> NextCommand:
     if any(any(folder.glob(f"{candidate}.*")) for folder in folders):
         return NextCommand("next", ("LOG",))
     return NextCommand("export", (candidate, "--runner"))
-
-
-def _unfinished(workspace: Folder, first: Candidate | None) -> list[str]:
-    """What a task leaves open, or out, that whoever runs its first plan should know."""
-    from grounded.utility import step_rewards
-    from grounded_trials.workspace.task_file import read_target
-
-    task, found = workspace.task, []
-    free = [
-        name
-        for name, *both in zip(task.model.input_names, task.low, task.high, strict=True)
-        if not np.isfinite(both).all()
-    ]
-    if np.allclose(task.target, task.start):
-        found.append(
-            "the target is to stay where the run starts, in every state: `target` draws another"
-        )
-    if free:
-        found.append(
-            f"[limits] has none for {', '.join(free)}: what a plan asks for is sent, however much"
-        )
-    if first is not None and first.predicted_utility < 0:
-        none = np.zeros(task.model.n)
-        reward, sent = replace(task.reward, state=none, terminal=none), first.predicted_inputs
-        error, aim = np.zeros((len(sent) + 1, len(none))), task.input_target
-        assert aim is not None
-        share = step_rewards(reward, error, sent, aim, task.past).sum() / first.predicted_utility
-        if share > MOSTLY:
-            found.append(
-                f"{percent(share)} of what the plan costs is [reward] input and input_change: with "
-                "less weight there, errors would count for more"
-            )
-    if first is not None:
-        found += _held_back(task, first)
-    name = str(workspace.config.task.target)
-    rows = len(read_target(workspace.folder / name)[1])
-    if rows > task.horizon + 1:
-        found.append(
-            f"{name} has {rows} rows, of which [task] horizon = {task.horizon} uses the first "
-            f"{task.horizon + 1}: the plan ends after {task.horizon * task.dt:g} s"
-        )
-    return found
-
-
-def _held_back(task: Task, first: Candidate) -> list[str]:
-    """Where [limits] keep a plan from its target: an input is at one nearly all the time."""
-    names, sent, aim = task.model.input_names, first.predicted_inputs, task.input_target
-    assert aim is not None
-    held = []
-    for j, name in enumerate(names):
-        for end in (float(task.low[j]), float(task.high[j])):
-            share = float(np.isclose(sent[:, j], end, rtol=1e-3, atol=1e-9).mean())
-            if np.isfinite(end) and share > HELD and not np.allclose(aim[:, j], end):
-                limit = with_unit(f"{end:.4g}", task.model.inputs[name])
-                held.append(f"{name} is at its limit of {limit} for {percent(share)} of the plan")
-    plan = Trial(first.predicted_states, sent, task.dt, task.model.state_names, names)
-    if not held or not (missed := _most_missed(task, plan)):
-        return []
-    return [
-        f"{' and '.join(held)}, and still {missed}: the target seems to ask for more "
-        "than [limits] allow. Widen them if the robot may get more, or draw a slower target"
-    ]
-
-
-def _most_missed(task: Task, plan: Trial) -> str:
-    """What a plan misses by most, beside the way that its target asks for; "" for nothing much."""
-    from grounded.diagnosis.error_report import measured
-
-    error, way, found = tracking_error(task, plan), np.vstack([task.start, task.target]), []
-    for names, what in weighed_groups(task):
-        states = [task.model.state_names.index(name) for name in names]
-        far = np.linalg.norm(error[:, states], axis=1)
-        k, asked = int(np.argmax(far)), float(np.linalg.norm(np.ptp(way[:, states], axis=0)))
-        text = (
-            f"{what} misses its target by {measured(far[k], task.model.states[names[0]])} at "
-            f"{k * task.dt:.4g} s"
-        )
-        found.append((float(far[k]) / max(asked, 1e-300), text))
-    share, text = max(found, default=(0.0, ""))
-    return text if share > MISSED else ""
 
 
 def _handed_over(workspace: Folder) -> tuple[Proposal, dict[str, str]]:
@@ -330,6 +247,8 @@ def status_of(workspace: Folder, standing: Standing, notes: tuple[str, ...] = ()
         (*notes, *_namesakes(workspace)),
         workspace.discarded(),
         off_target_of(workspace.task, standing.incumbent.trials if standing.incumbent else ()),
+        found,
+        since,
     )
 
 

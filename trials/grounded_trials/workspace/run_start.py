@@ -28,7 +28,7 @@ from grounded.trial import LAST, Trial, interpolate_gaps
 from grounded_trials.logs.command_steps import held_rows, phase_of
 from grounded_trials.logs.resample import Gridded, Span, to_grid
 from grounded_trials.logs.signals import Series
-from grounded_trials.workspace.trial_check import FINE, LEAST, SAME, UNLIKE, follows
+from grounded_trials.workspace.who_drove import FINE, LEAST, SAME, UNLIKE, follows
 
 TRIED = 5  # instants at which the commands fit best
 FINEST = 8  # parts of a step, between which the start is sought

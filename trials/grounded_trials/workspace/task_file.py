@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from io import TextIOWrapper
 from pathlib import Path
@@ -23,21 +23,29 @@ from grounded_trials.plain_file import open_file
 from grounded_trials.workspace.config import Config, set_target
 from grounded_trials.workspace.model_file import check_names
 
+Reader = Callable[[Path], tuple[list[str], Array]]  # of a target, as `read_target`
 
-def build_task(config: Config, model: Model, folder: Path) -> Task:
+
+def build_task(config: Config, model: Model, folder: Path, read: Reader | None = None) -> Task:
     """The task that the files describe; errors name the file and the key.
+
+    Args:
+        config: the checked grounded.toml.
+        model: whose states and inputs the target names.
+        folder: where they lie.
+        read: what reads the target; None: `read_target`.
 
     Raises:
         GroundedError: for a name that is not in the model, or sizes that do not fit.
     """
     try:
-        return _build(config, model, folder)
+        return _build(config, model, folder, read or read_target)
     except GroundedError as error:
         named = str(error).startswith((config.file.name, str(folder), config.task.target))
         raise GroundedError(f"{'' if named else config.file.name + ': '}{error}") from None
 
 
-def _build(config: Config, model: Model, folder: Path) -> Task:
+def _build(config: Config, model: Model, folder: Path, read: Reader) -> Task:
     states, inputs = list(model.state_names), list(model.input_names)
     table = config.task
     check_names(table.start, [*states, *inputs], "[task] start: state")
@@ -46,7 +54,7 @@ def _build(config: Config, model: Model, folder: Path) -> Task:
     if not path.is_relative_to(folder.resolve()):
         raise GroundedError(f"[task] target = '{table.target}' lies outside the workspace")
     if table.target:
-        target, input_target = target_arrays(path, states, inputs, table.dt, table.horizon)
+        target, input_target = target_arrays(path, states, inputs, table.dt, table.horizon, read)
     else:
         target, input_target = np.full((table.horizon + 1, len(states)), np.nan), None
     first = np.where(np.isfinite(target[0]), target[0], 0.0)
@@ -163,14 +171,19 @@ def _numbers(path: Path, line: int, names: list[str], row: list[str]) -> list[fl
 
 
 def target_arrays(
-    path: Path, states: list[str], inputs: list[str], dt: float, horizon: int
+    path: Path,
+    states: list[str],
+    inputs: list[str],
+    dt: float,
+    horizon: int,
+    read: Reader | None = None,
 ) -> tuple[Array, Array | None]:
     """The target (H + 1, n), NaN in free columns, and the inputs' target (H, m) if there is one.
 
     Raises:
         GroundedError: for an unknown column, too few rows, or times off the control grid.
     """
-    names, values = read_target(path)
+    names, values = (read or read_target)(path)
     for name in names[1:]:
         if name not in states and name not in inputs:
             raise GroundedError(

@@ -1,44 +1,35 @@
 """What a person should know about a trial before believing it, in sentences.
 
-Above all whether it ran the candidate: what the policy sends on the LOGGED states, feedback and
-clipping included, is compared with the logged commands (`follows`). A log may be a little late,
-noisy, or resampled; a person's driving, or another candidate, is something else.
+Whether it ran its candidate at all is asked in `who_drove.py`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-
 import numpy as np
 
-from grounded.frozen import Array
-from grounded.policy import Policy, z_difference
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import HUGE, Trial, interpolate_gaps
 from grounded_trials.wording import with_unit
-from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.who_drove import UNLIKE, follows, latest, second_differences
 
-FAR = 0.1  # of a state's range in the trial: a start this far from s_0 is worth a warning
-LEAST = 10  # steps: less says nothing of who drove
-UNLIKE = 0.25  # of the squared difference of unrelated commands; 1 - UNLIKE: concordance (Lin 1989)
-WINDOWS = 8  # parts of a trial that must each be alike, twice as loosely: somebody may take over
-DECISIVE = 12.0  # [nats] of evidence that another candidate ran: luck gives it to 1 run in 10^6
-SAME, CLEAR = 0.5, 0.01  # of the own one's difference, and of an input: it is the other's run
-ROUGH = 4.0  # steps over which noise keeps its sign: what strays for longer, somebody steers
-FINE = 1e-4  # of an input's size: how finely commands are logged at best
-BACK = (0.0, 0.5, 1.0, 1.5, 2.0, -0.5, -1.0)  # steps: states of the log older than those acted on
-AGES = 1.0  # steps by which that varies in a run: packets are lost, clocks drift and jitter
-THOUSAND = (1e-3, 1e3)
-ANGULAR = (("rad", "rad/s"), ("rad",), ("rad/s",))  # groups of units that may be in degrees
-NEARLY = 0.1  # of an input's size: what other units must leave of the difference
-OTHERS = 20  # candidates to compare with, the latest
+FAR = 0.1  # of a state's range in the trial: a start this far from s_0 is worth a warning,
+SURE = 3.0  # if it is so many standard deviations of the sensor's noise off, too
+WHITE = 0.6745 * 6**0.5  # the median of its second differences, in its standard deviations
 
 
-def warnings_about(workspace: Folder, trial: Trial) -> tuple[str, ...]:
-    """Gaps, exchanged columns, an early end, a start far from s_0, inputs beyond [limits]."""
+def warnings_about(
+    workspace: Folder, trial: Trial, last_s: float = float("nan")
+) -> tuple[str, ...]:
+    """Gaps, exchanged columns, an early end, a start far from s_0, what left [limits] or [safety].
+
+    Args:
+        workspace: whose task and candidates hold.
+        trial: as it is stored.
+        last_s: when the last of its states was logged, seconds of the run; NaN where all are on
+            the control grid.
+    """
     from grounded.instruments.swapped import exchanged, swapped_columns
 
     task = workspace.task
@@ -65,8 +56,8 @@ def warnings_about(workspace: Folder, trial: Trial) -> tuple[str, ...]:
         found.append(
             f"the run ended {ends}: a failed candidate; its data stay usable for fit and diagnose"
             if whole.whole(task.horizon) is whole
-            else f"the log ends {ends}: the rest is judged as if the robot had gone on as it did "
-            "last; keep recording for a second after the run"
+            else f"the log ends {ends}{_lacking(task, last_s)}: the rest is judged as if the robot "
+            "had gone on as it did last. Log at least one more row after the last command"
         )
     if whole.steps > task.horizon:
         found.append(
@@ -77,7 +68,8 @@ def warnings_about(workspace: Folder, trial: Trial) -> tuple[str, ...]:
     found += _start(task, whole)
     found += _inputs(task, whole)
     candidate, _ = workspace.candidate(trial.candidate)
-    ran = follows(candidate.policy, whole, _latest(task))
+    found += _unsafe(task, whole, candidate)
+    ran = follows(candidate.policy, whole, latest(task))
     if ran is not None and ran.alike and abs(ran.late) == 1 and ran.moved < UNLIKE:
         found.append(
             "the inputs fit the policy better when moved by one step: they seem to be logged a "
@@ -99,17 +91,49 @@ def _first_bad(trial: Trial) -> tuple[str, int]:
     return name, step
 
 
+def _lacking(task: Task, last_s: float) -> str:
+    """By how much a log of a run misses the last state of the plan, as a part of a sentence."""
+    missing = task.horizon * task.dt - last_s
+    if not missing > 0:  # its commands end, or its rows are the control steps
+        return ""
+    return f", its last state {1e3 * missing:.3g} ms before the plan's last"
+
+
 def _start(task: Task, trial: Trial) -> list[str]:
+    """Where a run did not start at s_0, by more than the noise that its sensor shows."""
     if trial.finite_steps < 0:
         return []
     off = task.model.difference(trial.states[0], task.start)
-    usual = np.ptp(trial.states[: trial.finite_steps + 1], axis=0)
+    states = trial.states[: trial.finite_steps + 1]
+    usual = np.ptp(states, axis=0)
+    jumps = np.abs(second_differences(states, task.model.angle_mask))
+    noise = np.median(jumps, axis=0) / WHITE if len(jumps) else np.zeros(len(usual))
     found = []
     for i, name in enumerate(trial.state_names):
-        if np.isfinite(off[i]) and abs(off[i]) > max(FAR * usual[i], 1e-9):
+        if np.isfinite(off[i]) and abs(off[i]) > max(FAR * usual[i], SURE * noise[i], 1e-9):
             found.append(
                 f"the run started with {name} = {trial.states[0, i]:.3g}, the task's start is "
                 f"{task.start[i]:.3g}: the search assumes one start state"
+            )
+    return found
+
+
+def _unsafe(task: Task, trial: Trial, ran: Candidate) -> list[str]:
+    """Where a run left [safety], which holds of predictions: by most, and what was predicted."""
+    assert task.safety_low is not None and task.safety_high is not None
+    states = trial.states[: trial.finite_steps + 1]
+    found = []
+    for i, (name, unit) in enumerate(task.model.states.items() if len(states) else ()):
+        low, high, values = task.safety_low[i], task.safety_high[i], states[:, i]
+        excess = np.maximum(low - values, values - high)
+        t = int(np.argmax(excess))
+        if excess[t] > 0:
+            first = float(np.argmax(excess > 0)) * trial.dt
+            predicted = with_unit(f"{ran.predicted_states[t, i]:.3g}", unit)
+            found.append(
+                f"the run left [safety] {name} = [{low:g}, {high:g}] at {first:.2f} s: {name} was "
+                f"{with_unit(f'{values[t]:.3g}', unit)} at {t * trial.dt:.2f} s, where "
+                f"{predicted} was predicted"
             )
     return found
 
@@ -137,212 +161,3 @@ def _beyond(task: Task, trial: Trial) -> list[str]:
         for i, name in enumerate(trial.input_names)
         if past[i]
     ]
-
-
-@dataclass(frozen=True)
-class Following:
-    """How the commands of a trial compare with what a policy sends on its states."""
-
-    alike: bool
-    error: float  # rms over steps and inputs, in units of each input's largest value
-    input: str  # the one that differs most
-    rms: float  # by so much, in its unit
-    until_s: float  # the commands are alike up to here
-    late: int  # steps by which the log is late
-    moved: float  # the squared difference at `late` over that without moving
-    off: Array  # (T, m) what was sent less what was asked; NaN: not compared
-    fine: Array  # (m,) how finely that is known
-
-
-def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
-    """Compares the commands of a trial with a policy's, at the alignment that fits best.
-
-    Args:
-        policy: what should have been run.
-        trial: of the policy's states and inputs, not longer than its horizon.
-        latest: steps by which inputs may be logged late.
-
-    Returns:
-        None where the trial is too short to tell, or is of other states or inputs.
-    """
-    T = min(trial.finite_steps, policy.horizon)
-    names = (policy.state_names, policy.input_names)
-    if T < LEAST or (trial.state_names, trial.input_names) != names:
-        return None
-    sent, past = np.clip(trial.inputs[:T], policy.low, policy.high), trial.start_inputs
-    width = policy.high - policy.low
-    states = np.stack([_earlier(trial.states[:T], back, policy.angles) for back in BACK])
-    free = policy.commands(states, policy.past if past is None else past)
-    size = np.maximum(np.abs(free).max(axis=1), np.abs(sent).max(axis=0))
-    size = size + np.where(np.isfinite(width), 0.1 * width, 1e-12)
-    fits = {}
-    for late in range(-1, latest + 1):
-        a, b = free[:, max(0, -late) : T - max(0, late)], sent[max(0, late) : T - max(0, -late)]
-        squares = (((a - b) / size[:, None]) ** 2).mean(axis=2)
-        usual, mean = np.median(squares, axis=1), squares.mean(axis=1)
-        for back, score in enumerate(usual + 1e-3 * mean):  # a takeover must not move the rest
-            fits[back, late] = (float(score), float(mean[back]), a[back], b, size[back])
-    back, late = min(fits, key=lambda key: fits[key][0])
-    _, error, asked, sent, size = fits[back, late]
-    apart = np.full(policy.feedforward[:T].shape, np.nan)
-    apart[max(0, late) :][: len(sent)] = sent - asked
-    unmoved = min(fit[1] for key, fit in fits.items() if key[1] == 0)
-    near = [k for k, other in enumerate(BACK) if abs(other - BACK[back]) <= AGES]
-    start = max(0, -late)
-    within = free[near, start : start + len(sent)]
-    off = (sent - np.clip(sent, within.min(axis=0), within.max(axis=0))) ** 2
-    unrelated = asked.var(axis=0) + sent.var(axis=0) + (asked - sent).mean(axis=0) ** 2
-    noise = _noise_sent(policy, trial.states[:T], free[0])  # between samples there is less
-    room = np.maximum(UNLIKE * unrelated, (0.02 * size) ** 2 + 4 * noise[: len(off)])
-    parts = np.array_split(np.arange(len(off)), min(WINDOWS, len(off) // LEAST))
-    bad = [bool((off[k].mean(axis=0) > 2 * room[k].mean(axis=0)).any()) for k in parts]
-    drawn_out = np.array([max(1.0, _steps_alike(column) / ROUGH) for column in (sent - asked).T])
-    share = off.mean(axis=0) / room.mean(axis=0) * drawn_out
-    first = parts[bad.index(True)] if any(bad) else parts[0][:1]
-    left = first[int(np.argmax((off[first] > 2 * room[first]).any(axis=1)))]
-    alike, j = bool(share.max() <= 1 and not any(bad)), int(np.argmax(share))
-    return Following(
-        alike=alike,
-        error=float(np.sqrt((off / size**2).mean())),
-        input=policy.input_names[j],
-        rms=float(np.sqrt(off[:, j].mean())),
-        until_s=float(left) * policy.dt,
-        late=late,
-        moved=error / unmoved if unmoved > 1e-4 else 1.0,
-        off=apart,
-        fine=FINE * size,
-    )
-
-
-def evidence(own: Following, other: Following) -> float:
-    """The log likelihood ratio of another policy over the own one [nats], given the commands.
-
-    What the other leaves is taken for noise, Gaussian, as large and as coloured as it is. If the
-    own policy ran, noise gives the other more than z^2/2 nats no more often than a normal number
-    exceeds z, however close the two are. But where the robot acted on other samples than the log
-    has, lower gains leave less, whichever ran: down to half the squares, which count for nothing.
-    """
-    known = np.isfinite(own.off + other.off).all(axis=1)
-    a, b = own.off[known], other.off[known]
-    noise = (b**2).mean(axis=0) + own.fine**2
-    return float(((a**2 / 2 - b**2) / (2 * noise)).sum()) / max(
-        _steps_alike(column) for column in b.T
-    )
-
-
-def _steps_alike(noise: Array) -> float:
-    """How many successive samples say as much as one: the autocorrelation, summed to its zero."""
-    noise = noise - noise.mean()
-    power = np.correlate(noise, noise, "full")[len(noise) - 1 :]
-    if not power[0] > 0:
-        return 1.0
-    end = int(np.argmax(power <= 0)) or len(power)
-    return float(2 * power[:end].sum() / power[0] - 1)
-
-
-@dataclass(frozen=True, eq=False)
-class Suspicion:
-    """What a trial's commands say of who drove."""
-
-    ran: Following | None  # beside what its candidate asks for
-    why: str = ""  # why it is not its candidate's run; "" where nothing says so
-    other: str = ""  # whose run it is
-
-
-def suspicion(task: Task, trial: Trial, own: Candidate, others: Sequence[Candidate]) -> Suspicion:
-    """Why a trial is not a run of its candidate, and whose it is.
-
-    Args:
-        task: whose latency and units hold.
-        trial: with gaps bridged; its candidate is `own`.
-        own: the candidate that it is said to have run.
-        others: those that it may have run instead, in order of proposal.
-    """
-    trial, latest = trial.until(task.horizon), _latest(task)
-    found = follows(own.policy, trial, latest)
-    if found is None or (found.alike and found.error < 1e-5):
-        return Suspicion(found)
-    rivals = [(follows(c.policy, trial, latest), c.id) for c in others[-OTHERS:] if c.id != own.id]
-    alike = [(evidence(found, f), n, f.error) for f, n in rivals if f is not None and f.alike]
-    nats, name, left = max(alike, default=(-np.inf, "", 0.0))
-    if nats > DECISIVE:
-        same = left < max(CLEAR, SAME * found.error)
-        looks = f"they are {'' if same else 'nearer to '}those of {name}"
-        name = name if same else ""
-    elif found.alike:
-        return Suspicion(found)
-    elif found.until_s >= LEAST * trial.dt:
-        looks = f"up to {found.until_s:.1f} s they are alike: somebody, or something, took over"
-    else:
-        looks = "somebody, or another controller, drove"
-    name = name if nats > DECISIVE else ""
-    differs = with_unit(f"{found.rms:.3g}", task.model.inputs[found.input])
-    why = (
-        f"its commands are not what {own.id} sends on the logged states: {found.input} differs by "
-        f"{differs} (rms); {looks}"
-    )
-    return Suspicion(found, why, name)
-
-
-def other_units(
-    task: Task, trial: Trial, own: Candidate, plain: Following | None
-) -> tuple[tuple[str, ...], float]:
-    """The signals with which a log is a run of its candidate once they are multiplied, and by what.
-
-    Degrees for radians or the other way round, thousandths or thousands; (), 1 where nothing helps,
-    or nothing needs to: a log so noisy that any commands could follow from it is nobody's.
-    `plain`: how its commands follow as they are.
-    """
-    if plain is None or (plain.alike and plain.error < NEARLY):
-        return (), 1.0
-    model, trial, latest = task.model, trial.until(task.horizon), _latest(task)
-    angular = [[n for n, u in model.states.items() if u in units] for units in ANGULAR]
-    angular += [[n] for n, u in (*model.states.items(), *model.inputs.items()) if u in ANGULAR[0]]
-    single = [[name] for name in (*model.state_names, *model.input_names)]
-    tried = [(names, factor) for factor in (np.pi / 180, 180 / np.pi) for names in angular if names]
-    for names, factor in tried + [(names, f) for f in (1e-3, 1e3) for names in single]:
-        by = [
-            np.array([factor if name in names else 1.0 for name in every])
-            for every in (trial.state_names, trial.input_names)
-        ]
-        turned = replace(trial, states=trial.states * by[0], inputs=trial.inputs * by[1])
-        found = follows(own.policy, turned, latest)
-        fits = found is not None and found.alike and found.error < NEARLY
-        if found and fits and (not plain.alike or evidence(plain, found) > DECISIVE):
-            return tuple(names), float(factor)
-    return (), 1.0
-
-
-def units_told(names: Sequence[str], by: float, mapped: bool) -> str:
-    """What is wrong with the units of a log, and what mends it; `mapped`: by a [log] table."""
-    which = " and ".join(names)
-    size = f"{max(by, 1 / by):.4g} times too {'large' if by < 1 else 'small'}"
-    degrees = "" if by in THOUSAND else " (in degrees)" if by < 1 else " (radians for degrees)"
-    mend = f"multiply the scale of {which} by {by:.6g} in {FILE}'s [log] (1 where none is given)"
-    if not mapped:
-        mend = f"append {which} times {by:.6g} and run it again, or take it in with --data"
-    return f"with {which} {size}{degrees}: {mend}"
-
-
-def _latest(task: Task) -> int:
-    """Steps by which a log of what the actuators got, not of what was sent, is late."""
-    assert task.latency is not None
-    return 1 + int(np.ceil(task.latency.max() / task.dt))
-
-
-def _earlier(states: Array, steps: float, angles: tuple[bool, ...]) -> Array:
-    """The states some steps ago, between samples by a straight line, (T, n)."""
-    whole, part = divmod(steps, 1)
-    at, last = np.arange(len(states)) - int(whole), len(states) - 1
-    now, before = states[np.clip(at, 0, last)], states[np.clip(at - 1, 0, last)]
-    earlier: Array = now - part * z_difference(now, before, angles)
-    return earlier
-
-
-def _noise_sent(policy: Policy, states: Array, asked: Array) -> Array:
-    """Square of what the policy makes of the noise of the states, found by adding it, (T, m)."""
-    change = z_difference(states[1:], states[:-1], policy.angles)
-    power = (np.diff(change, axis=0) ** 2).mean(axis=0) / 6  # second differences of white noise
-    noisy = states + np.random.default_rng(0).normal(size=states.shape) * np.sqrt(power)
-    squares: Array = (policy.commands(noisy[None], policy.past)[0] - asked) ** 2
-    return squares

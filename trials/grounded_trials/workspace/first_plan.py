@@ -1,0 +1,167 @@
+"""What the first plan of a task should tell whoever runs it: what is left open, or out.
+
+A task may name no limits, ask for more than they allow, weigh inputs so much that errors hardly
+count, or begin from an input under which the robot does not stay where it starts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from grounded.result import percent
+from grounded.task import Task
+from grounded.trial import Trial
+from grounded.utility import step_rewards
+from grounded_trials.wording import with_unit
+from grounded_trials.workspace.config import FILE
+from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.off_target import tracking_error, weighed_groups
+
+if TYPE_CHECKING:
+    from grounded.frozen import Array
+    from grounded.search.candidate import Candidate
+
+MOSTLY = 0.9  # of a plan's cost
+HELD = 0.8  # of a plan's steps: an input is at a limit nearly all the time
+MISSED = 0.1  # of the way that a target asks for: the plan falls short
+STILL = 1e-6  # of the rates under the held input: under another one the robot stands
+BEGUN = (0.0, 1.0, -1.0)  # beside the held input: a thrust by its square has no slope at 0
+
+
+def left_open(workspace: Folder, first: Candidate | None) -> list[str]:
+    """What a task leaves open, or out, that whoever runs its first plan should know."""
+    task, found = workspace.task, []
+    free = [
+        name
+        for name, *both in zip(task.model.input_names, task.low, task.high, strict=True)
+        if not np.isfinite(both).all()
+    ]
+    if np.allclose(task.target, task.start):
+        found.append(
+            "the target is to stay where the run starts, in every state: `target` draws another"
+        )
+    if free:
+        found.append(
+            f"[limits] has none for {', '.join(free)}: what a plan asks for is sent, however much"
+        )
+    if first is not None and first.predicted_utility < 0:
+        none = np.zeros(task.model.n)
+        reward, sent = replace(task.reward, state=none, terminal=none), first.predicted_inputs
+        error, aim = np.zeros((len(sent) + 1, len(none))), task.input_target
+        assert aim is not None
+        share = step_rewards(reward, error, sent, aim, task.past).sum() / first.predicted_utility
+        if share > MOSTLY:
+            found.append(
+                f"{percent(share)} of what the plan costs is [reward] input and input_change: with "
+                "less weight there, errors would count for more"
+            )
+    if first is not None:
+        found += _held_back(task, first)
+    found += _held_before(workspace)
+    name = str(workspace.config.task.target)
+    rows = len(workspace.read_target((workspace.folder / name).resolve())[1])
+    if rows > task.horizon + 1:
+        found.append(
+            f"{name} has {rows} rows, of which [task] horizon = {task.horizon} uses the first "
+            f"{task.horizon + 1}: the plan ends after {task.horizon * task.dt:g} s"
+        )
+    return found
+
+
+def _held_back(task: Task, first: Candidate) -> list[str]:
+    """Where [limits] keep a plan from its target: an input is at one nearly all the time."""
+    names, sent, aim = task.model.input_names, first.predicted_inputs, task.input_target
+    assert aim is not None
+    held = []
+    for j, name in enumerate(names):
+        for end in (float(task.low[j]), float(task.high[j])):
+            share = float(np.isclose(sent[:, j], end, rtol=1e-3, atol=1e-9).mean())
+            if np.isfinite(end) and share > HELD and not np.allclose(aim[:, j], end):
+                limit = with_unit(f"{end:.4g}", task.model.inputs[name])
+                held.append(f"{name} is at its limit of {limit} for {percent(share)} of the plan")
+    plan = Trial(first.predicted_states, sent, task.dt, task.model.state_names, names)
+    if not held or not (missed := _most_missed(task, plan)):
+        return []
+    return [
+        f"{' and '.join(held)}, and still {missed}: the target seems to ask for more "
+        "than [limits] allow. Widen them if the robot may get more, or draw a slower target"
+    ]
+
+
+def _most_missed(task: Task, plan: Trial) -> str:
+    """What a plan misses by most, beside the way that its target asks for; "" for nothing much."""
+    from grounded.diagnosis.error_report import measured
+
+    error, way, found = tracking_error(task, plan), np.vstack([task.start, task.target]), []
+    for names, what in weighed_groups(task):
+        states = [task.model.state_names.index(name) for name in names]
+        far = np.linalg.norm(error[:, states], axis=1)
+        k, asked = int(np.argmax(far)), float(np.linalg.norm(np.ptp(way[:, states], axis=0)))
+        text = (
+            f"{what} misses its target by {measured(far[k], task.model.states[names[0]])} at "
+            f"{k * task.dt:.4g} s"
+        )
+        found.append((float(far[k]) / max(asked, 1e-300), text))
+    share, text = max(found, default=(0.0, ""))
+    return text if share > MISSED else ""
+
+
+def _held_before(workspace: Folder) -> list[str]:
+    """That the robot does not stand at the start under the input held before, but would under one.
+
+    Nothing is said of an input whose value somebody gave, nor where it makes no difference: without
+    a price on changes and without latency the first command is as if nothing had been held.
+    """
+    task, config = workspace.task, workspace.config.task
+    assert task.latency is not None
+    if any(name in config.start for name in task.model.input_names):
+        return []
+    if not (task.reward.input_change.any() or task.latency.any()):
+        return []
+    still = holding_input(task)
+    if still is None:
+        return []
+    names, rate = task.model.input_names, moved_at_start(task, task.past) / task.dt
+    k = int(np.argmax(np.abs(rate)))
+    state = task.model.state_names[k]
+    unit = task.model.states[state]
+    both = zip(names, task.past, strict=True)
+    held = ", ".join(with_unit(f"{name} = {u:.4g}", task.model.inputs[name]) for name, u in both)
+    told = ", ".join(f"{name} = {u:.4g}" for name, u in zip(names, still, strict=True))
+    return [
+        f"before the start {held} counts as held, under which {state} changes at once, by "
+        f"{with_unit(f'{rate[k]:.3g}', unit)} a second; the plan begins from there, and after its "
+        f"end the runner holds it again. If the robot stands until then, give {FILE}'s [task] what "
+        f"holds it: start = {{ {told} }}"
+    ]
+
+
+def holding_input(task: Task) -> Array | None:
+    """Inputs (m,) inside the limits under which the start stays as it is.
+
+    None where the input held before the start does that, or nothing does: the start is in motion.
+    """
+    from grounded.search.first_guess import trim
+
+    away = np.abs(moved_at_start(task, task.past)).max()
+    if not away > 1e-9:
+        return None
+    still = np.tile(task.start, (2, 1))
+    for move in BEGUN:
+        begun = np.clip(task.past + move, task.low, task.high)
+        one = replace(task, target=still, input_target=None, past=begun)
+        u: Array = trim(one, still, np.ones(task.model.n, dtype=np.bool_))[1][0]
+        if np.abs(moved_at_start(task, u)).max() <= STILL * away:
+            return u
+    return None
+
+
+def moved_at_start(task: Task, inputs: Array) -> Array:
+    """By how much the start moves in the first step under an input, (n,)."""
+    problem = task.problem(exact=True)
+    with np.errstate(all="ignore"):
+        after = problem.system.step(task.start[None], inputs[None], problem.p, problem.dt)[0]
+    return task.model.difference(after, task.start)

@@ -1,0 +1,251 @@
+"""Whether a trial ran its candidate: who drove.
+
+What the policy sends on the LOGGED states, feedback and clipping included, is compared with the
+logged commands (`follows`). A log may be a little late, noisy, or resampled; a person's driving, or
+another candidate, is something else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from grounded.frozen import Array
+from grounded.policy import Policy, z_difference
+from grounded.search.candidate import Candidate
+from grounded.task import Task
+from grounded.trial import Trial
+from grounded_trials.wording import with_unit
+from grounded_trials.workspace.config import FILE
+
+LEAST = 10  # steps: less says nothing of who drove
+UNLIKE = 0.25  # of the squared difference of unrelated commands; 1 - UNLIKE: concordance (Lin 1989)
+WINDOWS = 8  # parts of a trial that must each be alike, twice as loosely: somebody may take over
+DECISIVE = 12.0  # [nats] of evidence that another candidate ran: luck gives it to 1 run in 10^6
+SAME, CLEAR = 0.5, 0.01  # of the own one's difference, and of an input: it is the other's run
+ROUGH = 4.0  # steps over which noise keeps its sign: what strays for longer, somebody steers
+FINE = 1e-4  # of an input's size: how finely commands are logged at best
+BACK = (0.0, 0.5, 1.0, 1.5, 2.0, -0.5, -1.0)  # steps: states of the log older than those acted on
+AGES = 1.0  # steps by which that varies in a run: packets are lost, clocks drift and jitter
+THOUSAND = (1e-3, 1e3)
+ANGULAR = (("rad", "rad/s"), ("rad",), ("rad/s",))  # groups of units that may be in degrees
+NEARLY = 0.1  # of an input's size: what other units must leave of the difference
+OTHERS = 20  # candidates to compare with, the latest
+
+
+@dataclass(frozen=True)
+class Following:
+    """How the commands of a trial compare with what a policy sends on its states."""
+
+    alike: bool
+    error: float  # rms over steps and inputs, in units of each input's largest value
+    input: str  # the one that differs most
+    rms: float  # by so much, in its unit
+    until_s: float  # the commands are alike up to here
+    late: int  # steps by which the log is late
+    moved: float  # the squared difference at `late` over that without moving
+    off: Array  # (T, m) what was sent less what was asked; NaN: not compared
+    fine: Array  # (m,) how finely that is known
+
+
+def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
+    """Compares the commands of a trial with a policy's, at the alignment that fits best.
+
+    Args:
+        policy: what should have been run.
+        trial: of the policy's states and inputs, not longer than its horizon.
+        latest: steps by which inputs may be logged late.
+
+    Returns:
+        None where the trial is too short to tell, or is of other states or inputs.
+    """
+    T = min(trial.finite_steps, policy.horizon)
+    names = (policy.state_names, policy.input_names)
+    if T < LEAST or (trial.state_names, trial.input_names) != names:
+        return None
+    sent, past = np.clip(trial.inputs[:T], policy.low, policy.high), trial.start_inputs
+    width = policy.high - policy.low
+    states = np.stack([_earlier(trial.states[:T], back, policy.angles) for back in BACK])
+    free = policy.commands(states, policy.past if past is None else past)
+    size = np.maximum(np.abs(free).max(axis=1), np.abs(sent).max(axis=0))
+    size = size + np.where(np.isfinite(width), 0.1 * width, 1e-12)
+    fits = {}
+    for late in range(-1, latest + 1):
+        a, b = free[:, max(0, -late) : T - max(0, late)], sent[max(0, late) : T - max(0, -late)]
+        squares = (((a - b) / size[:, None]) ** 2).mean(axis=2)
+        usual, mean = np.median(squares, axis=1), squares.mean(axis=1)
+        for back, score in enumerate(usual + 1e-3 * mean):  # a takeover must not move the rest
+            fits[back, late] = (float(score), float(mean[back]), a[back], b, size[back])
+    back, late = min(fits, key=lambda key: fits[key][0])
+    _, error, asked, sent, size = fits[back, late]
+    apart = np.full(policy.feedforward[:T].shape, np.nan)
+    apart[max(0, late) :][: len(sent)] = sent - asked
+    unmoved = min(fit[1] for key, fit in fits.items() if key[1] == 0)
+    near = [k for k, other in enumerate(BACK) if abs(other - BACK[back]) <= AGES]
+    start = max(0, -late)
+    within = free[near, start : start + len(sent)]
+    off = (sent - np.clip(sent, within.min(axis=0), within.max(axis=0))) ** 2
+    unrelated = asked.var(axis=0) + sent.var(axis=0) + (asked - sent).mean(axis=0) ** 2
+    noise = _noise_sent(policy, trial.states[:T], free[0])  # between samples there is less
+    room = np.maximum(UNLIKE * unrelated, (0.02 * size) ** 2 + 4 * noise[: len(off)])
+    parts = np.array_split(np.arange(len(off)), min(WINDOWS, len(off) // LEAST))
+    bad = [bool((off[k].mean(axis=0) > 2 * room[k].mean(axis=0)).any()) for k in parts]
+    drawn_out = np.array([max(1.0, _steps_alike(column) / ROUGH) for column in (sent - asked).T])
+    share = off.mean(axis=0) / room.mean(axis=0) * drawn_out
+    first = parts[bad.index(True)] if any(bad) else parts[0][:1]
+    left = first[int(np.argmax((off[first] > 2 * room[first]).any(axis=1)))]
+    alike, j = bool(share.max() <= 1 and not any(bad)), int(np.argmax(share))
+    return Following(
+        alike=alike,
+        error=float(np.sqrt((off / size**2).mean())),
+        input=policy.input_names[j],
+        rms=float(np.sqrt(off[:, j].mean())),
+        until_s=float(left) * policy.dt,
+        late=late,
+        moved=error / unmoved if unmoved > 1e-4 else 1.0,
+        off=apart,
+        fine=FINE * size,
+    )
+
+
+def evidence(own: Following, other: Following) -> float:
+    """The log likelihood ratio of another policy over the own one [nats], given the commands.
+
+    What the other leaves is taken for noise, Gaussian, as large and as coloured as it is. If the
+    own policy ran, noise gives the other more than z^2/2 nats no more often than a normal number
+    exceeds z, however close the two are. But where the robot acted on other samples than the log
+    has, lower gains leave less, whichever ran: down to half the squares, which count for nothing.
+    """
+    known = np.isfinite(own.off + other.off).all(axis=1)
+    a, b = own.off[known], other.off[known]
+    noise = (b**2).mean(axis=0) + own.fine**2
+    return float(((a**2 / 2 - b**2) / (2 * noise)).sum()) / max(
+        _steps_alike(column) for column in b.T
+    )
+
+
+def _steps_alike(noise: Array) -> float:
+    """How many successive samples say as much as one: the autocorrelation, summed to its zero."""
+    noise = noise - noise.mean()
+    power = np.correlate(noise, noise, "full")[len(noise) - 1 :]
+    if not power[0] > 0:
+        return 1.0
+    end = int(np.argmax(power <= 0)) or len(power)
+    return float(2 * power[:end].sum() / power[0] - 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Suspicion:
+    """What a trial's commands say of who drove."""
+
+    ran: Following | None  # beside what its candidate asks for
+    why: str = ""  # why it is not its candidate's run; "" where nothing says so
+    other: str = ""  # whose run it is
+
+
+def suspicion(task: Task, trial: Trial, own: Candidate, others: Sequence[Candidate]) -> Suspicion:
+    """Why a trial is not a run of its candidate, and whose it is.
+
+    Args:
+        task: whose latency and units hold.
+        trial: with gaps bridged; its candidate is `own`.
+        own: the candidate that it is said to have run.
+        others: those that it may have run instead, in order of proposal.
+    """
+    trial, late = trial.until(task.horizon), latest(task)
+    found = follows(own.policy, trial, late)
+    if found is None or (found.alike and found.error < 1e-5):
+        return Suspicion(found)
+    rivals = [(follows(c.policy, trial, late), c.id) for c in others[-OTHERS:] if c.id != own.id]
+    alike = [(evidence(found, f), n, f.error) for f, n in rivals if f is not None and f.alike]
+    nats, name, left = max(alike, default=(-np.inf, "", 0.0))
+    if nats > DECISIVE:
+        same = left < max(CLEAR, SAME * found.error)
+        looks = f"they are {'' if same else 'nearer to '}those of {name}"
+        name = name if same else ""
+    elif found.alike:
+        return Suspicion(found)
+    elif found.until_s >= LEAST * trial.dt:
+        looks = f"up to {found.until_s:.1f} s they are alike: somebody, or something, took over"
+    else:
+        looks = "somebody, or another controller, drove"
+    name = name if nats > DECISIVE else ""
+    differs = with_unit(f"{found.rms:.3g}", task.model.inputs[found.input])
+    why = (
+        f"its commands are not what {own.id} sends on the logged states: {found.input} differs by "
+        f"{differs} (rms); {looks}"
+    )
+    return Suspicion(found, why, name)
+
+
+def other_units(
+    task: Task, trial: Trial, own: Candidate, plain: Following | None
+) -> tuple[tuple[str, ...], float]:
+    """The signals with which a log is a run of its candidate once they are multiplied, and by what.
+
+    Degrees for radians or the other way round, thousandths or thousands; (), 1 where nothing helps,
+    or nothing needs to: a log so noisy that any commands could follow from it is nobody's.
+    `plain`: how its commands follow as they are.
+    """
+    if plain is None or (plain.alike and plain.error < NEARLY):
+        return (), 1.0
+    model, trial, late = task.model, trial.until(task.horizon), latest(task)
+    angular = [[n for n, u in model.states.items() if u in units] for units in ANGULAR]
+    angular += [[n] for n, u in (*model.states.items(), *model.inputs.items()) if u in ANGULAR[0]]
+    single = [[name] for name in (*model.state_names, *model.input_names)]
+    tried = [(names, factor) for factor in (np.pi / 180, 180 / np.pi) for names in angular if names]
+    for names, factor in tried + [(names, f) for f in (1e-3, 1e3) for names in single]:
+        by = [
+            np.array([factor if name in names else 1.0 for name in every])
+            for every in (trial.state_names, trial.input_names)
+        ]
+        turned = replace(trial, states=trial.states * by[0], inputs=trial.inputs * by[1])
+        found = follows(own.policy, turned, late)
+        fits = found is not None and found.alike and found.error < NEARLY
+        if found and fits and (not plain.alike or evidence(plain, found) > DECISIVE):
+            return tuple(names), float(factor)
+    return (), 1.0
+
+
+def units_told(names: Sequence[str], by: float, mapped: bool) -> str:
+    """What is wrong with the units of a log, and what mends it; `mapped`: by a [log] table."""
+    which = " and ".join(names)
+    size = f"{max(by, 1 / by):.4g} times too {'large' if by < 1 else 'small'}"
+    degrees = "" if by in THOUSAND else " (in degrees)" if by < 1 else " (radians for degrees)"
+    mend = f"multiply the scale of {which} by {by:.6g} in {FILE}'s [log] (1 where none is given)"
+    if not mapped:
+        mend = f"append {which} times {by:.6g} and run it again, or take it in with --data"
+    return f"with {which} {size}{degrees}: {mend}"
+
+
+def latest(task: Task) -> int:
+    """Steps by which a log of what the actuators got, not of what was sent, is late."""
+    assert task.latency is not None
+    return 1 + int(np.ceil(task.latency.max() / task.dt))
+
+
+def _earlier(states: Array, steps: float, angles: tuple[bool, ...]) -> Array:
+    """The states some steps ago, between samples by a straight line, (T, n)."""
+    whole, part = divmod(steps, 1)
+    at, last = np.arange(len(states)) - int(whole), len(states) - 1
+    now, before = states[np.clip(at, 0, last)], states[np.clip(at - 1, 0, last)]
+    earlier: Array = now - part * z_difference(now, before, angles)
+    return earlier
+
+
+def _noise_sent(policy: Policy, states: Array, asked: Array) -> Array:
+    """Square of what the policy makes of the noise of the states, found by adding it, (T, m)."""
+    change = second_differences(states, policy.angles)
+    power = (change**2).mean(axis=0) / 6  # of white noise
+    noisy = states + np.random.default_rng(0).normal(size=states.shape) * np.sqrt(power)
+    squares: Array = (policy.commands(noisy[None], policy.past)[0] - asked) ** 2
+    return squares
+
+
+def second_differences(states: Array, angles: Sequence[bool] | Array) -> Array:
+    """Of states (T, n), (T - 2, n): motion leaves little in them, noise most of it."""
+    turns = tuple(map(bool, angles))
+    change: Array = np.diff(z_difference(states[1:], states[:-1], turns), axis=0)
+    return change
