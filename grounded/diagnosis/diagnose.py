@@ -223,7 +223,7 @@ class _Writer:
         data, predictor = self.data, self.predictor
         self.tick("gap")
         where = horizon(predictor, self.best, self.options.horizon)
-        bare = self.decision.crude.track  # a prediction starts from its own hypothesis' states
+        bare = self.decision.crude.states  # a prediction starts from its own hypothesis' states
         shrunk = shrinkage(predictor, self.best, bare, where)
         gain = explained(predictor, Hypothesis(), self.best)
         if self.left:

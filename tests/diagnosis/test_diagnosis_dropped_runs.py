@@ -36,7 +36,7 @@ def known(monkeypatch):
     predictor = Predictor(prepare(model, found))
     assert predictor.data.time[0, :].tolist().count(0.0) == 3  # the beginnings of 0, 1 and 3
     assert len(predictor.data.valid) == 7
-    return predictor, SimpleNamespace(hypothesis=Hypothesis(), track=predictor.data.y), found
+    return predictor, SimpleNamespace(hypothesis=Hypothesis(), states=predictor.data.y), found
 
 
 def test_a_utility_is_predicted_from_the_trials_own_start(known):
@@ -61,7 +61,7 @@ def test_repeats_of_different_length_are_compared_where_they_begin_together(know
     monkeypatch.setattr(diagnosis_data, "MOST_NUMBERS", 6e6)
     short = replace(trials[2], states=trials[2].states[:351], inputs=trials[2].inputs[:350])
     some = Predictor(prepare(predictor.data.model, [trials[0], short]))
-    fit = SimpleNamespace(hypothesis=Hypothesis(shift=np.array([0.5, 0.0])), track=some.data.y)
+    fit = SimpleNamespace(hypothesis=Hypothesis(shift=np.array([0.5, 0.0])), states=some.data.y)
     np.testing.assert_allclose(Ruler(some).scatter(fit, [[0, 1]]), 0.0, atol=1e-9)
 
 
@@ -69,7 +69,7 @@ def test_a_repeat_in_another_unit_is_no_noise(known):
     predictor, _, trials = known
     odd = replace(trials[2], states=57.3 * trials[2].states)
     some = Predictor(prepare(predictor.data.model, [trials[0], odd, trials[2]]))
-    fit = SimpleNamespace(hypothesis=Hypothesis(shift=np.array([0.5, 0.0])), track=some.data.y)
+    fit = SimpleNamespace(hypothesis=Hypothesis(shift=np.array([0.5, 0.0])), states=some.data.y)
     np.testing.assert_allclose(Ruler(some).scatter(fit, [[0, 1, 2]]), 0.0, atol=1e-9)
     assert Ruler(some).scatter(fit, [[0, 1]]) is None
 

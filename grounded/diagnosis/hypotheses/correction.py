@@ -112,7 +112,7 @@ def _judged(
             continue
         part = Horizon(where.steps, where.at[at], where.run[at], where.spread[at])
         before, after = (
-            float(np.nanmean((errors(predictor, one, fit.track, part) / part.spread) ** 2))
+            float(np.nanmean((errors(predictor, one, fit.states, part) / part.spread) ** 2))
             for one in (h, _with(h, predictor, channel, curves, own))
         )
         gains.append(1 - after / before)

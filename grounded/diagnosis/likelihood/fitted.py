@@ -19,11 +19,13 @@ class Fitted:
 
     Per run (B): `gram` (B, C, C), `score` (B, C), `rss` (B,), `logdet` (B,) of the whitened columns
     in the order [effects' free values, shifts]; `white` (L, B, n) are the whitened innovations.
+    `states` is the track but where the model has kinks: there the track may not have followed the
+    filter, and be nearly as noisy as what was measured.
     """
 
     hypothesis: Hypothesis
     noise: NoiseModel
-    track: Array  # (L + 1, B, n)
+    track: Array  # (L + 1, B, n) about which it is linearised
     loglik: float  # of the data
     evidence: float  # log p(y | h): the shifts integrated out
     gram: Array
@@ -31,7 +33,7 @@ class Fitted:
     rss: Array
     logdet: Array
     white: Array
-    residual: Array  # (L, B, n) x_{t+1|t+1} - prediction: what the filter had to correct
+    states: Array  # (L + 1, B, n) filtered: what predictions start from
     settled: bool = False  # nothing rises from here: a fit that starts here ends here
 
     @property

@@ -360,5 +360,5 @@ def _scored(
         rss=rss,
         logdet=run_logdet,
         white=residual.copy(),  # not a view: it would keep all columns
-        residual=error[1:].copy(),
+        states=work.track + error,
     )

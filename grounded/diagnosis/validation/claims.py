@@ -139,7 +139,7 @@ class Claims:
         rows: list[Ranked] = []
         parts = self.parts()
         after = normalised(
-            held_out_errors(self.predictor, self.best, self.best.track, where), where
+            held_out_errors(self.predictor, self.best, self.best.states, where), where
         )
         for name in ordered(self.credit, self.names):
             claimed = not self.known.no_cause

@@ -46,7 +46,7 @@ class Shrinkage:
 def shrinkage(predictor: Predictor, fit: Fitted, bare: Array, where: Horizon) -> Shrinkage:
     """Held-out errors before, from the states `bare` (L + 1, B, n), and after, from its own."""
     before = errors(predictor, Hypothesis(), bare, where)
-    return Shrinkage(where, before, held_out_errors(predictor, fit, fit.track, where))
+    return Shrinkage(where, before, held_out_errors(predictor, fit, fit.states, where))
 
 
 def held_out_errors(predictor: Predictor, fit: Fitted, track: Array, where: Horizon) -> Array:
@@ -68,7 +68,7 @@ def held_out_errors(predictor: Predictor, fit: Fitted, track: Array, where: Hori
 
 def gaps_of(predictor: Predictor, fits: Sequence[Fitted], where: Horizon) -> list[float]:
     """The gap that each of several hypotheses leaves, held out."""
-    return [normalised(held_out_errors(predictor, fit, fit.track, where), where) for fit in fits]
+    return [normalised(held_out_errors(predictor, fit, fit.states, where), where) for fit in fits]
 
 
 FAR = 1e6  # a state beyond it has diverged
@@ -122,7 +122,7 @@ def utility_prediction(
         if data.time[0, first] > 0:  # the run that it began with was left out
             continue
         own = h if shifts is None else moved(data, h, shifts[groups.index(i)])
-        pairs = [(Hypothesis(), bare[0, first]), (own, fit.track[0, first])]
+        pairs = [(Hypothesis(), bare[0, first]), (own, fit.states[0, first])]
         parts = [task.utility(_again(predictor, g, trial, start, i)) for g, start in pairs]
         rows.append([real, *parts])
     found = np.array(rows).reshape(-1, 3)

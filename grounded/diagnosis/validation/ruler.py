@@ -127,7 +127,7 @@ class Ruler:
         states, latency = self.data.states[:, :n], self.origin.latency
         latency = np.zeros(model.m) if latency is None else latency
         data = replace(self.data, model=model, states=states, latency=latency, hidden=())
-        bare = replace(crude, hypothesis=Hypothesis(), track=crude.track[..., :n])
+        bare = replace(crude, hypothesis=Hypothesis(), states=crude.states[..., :n])
         found = Ruler(Predictor(data)).errors(bare)
         more = [(0, 0), (0, 0), (0, self.data.model.n - n)]
         return Errors(np.pad(found.total, more), np.pad(found.count, more))
@@ -152,7 +152,7 @@ class Ruler:
             groups = [np.flatnonzero(self.folds == fold) for fold in np.unique(self.folds)]
             each = [(moved(data, h, s), own) for s, own in zip(shifts, groups, strict=True)]
         for one, own in each:
-            self._add(found, one, fit.track, own)
+            self._add(found, one, fit.states, own)
         return found
 
     def _none(self) -> Errors:
@@ -238,7 +238,7 @@ class Ruler:
         """What a fit would gain by a rate (L, B, n) [unit/s] added along its log; its errors."""
         B, plain, other = len(self.data.valid), self._none(), self._none()
         for found, added in ((plain, None), (other, rate * self.data.dt)):
-            self._add(found, fit.hypothesis, fit.track, np.arange(B), added, whole=False)
+            self._add(found, fit.hypothesis, fit.states, np.arange(B), added, whole=False)
         return self.compared(plain, other), other
 
     def compared(self, before: Errors, after: Errors) -> Gain:
@@ -304,7 +304,7 @@ class Ruler:
         count = np.zeros_like(total)
         for group in repeats:
             runs = np.array([of_trial[i] for i in group if i in of_trial])
-            runs = self._alike(h, fit.track, runs)
+            runs = self._alike(h, fit.states, runs)
             if len(runs) < 2:
                 continue
             length = int(data.lengths[data.trial_of[runs]].min())
@@ -314,7 +314,7 @@ class Ruler:
                 moments = np.unique(np.linspace(min(1, last), last, MOMENTS).astype(int))
                 moments = np.zeros(1, int) if k == len(self.steps) else moments[moments >= 0]
                 at, run = np.tile(moments, len(runs)), np.repeat(runs, len(moments))
-                error = self._along(h, fit.track, at, run, steps)
+                error = self._along(h, fit.states, at, run, steps)
                 error = error[1:] if k == len(self.steps) else error[-1:]
                 error = error.reshape(len(error), len(runs), len(moments), -1)
                 there = np.isfinite(error).all(axis=1)
