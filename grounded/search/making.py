@@ -18,6 +18,7 @@ from grounded.search.safety import objections, spread
 from grounded.search.standing import SearchOptions, Standing, losers_of, wild
 from grounded.search.step_size import KEPT, Step
 from grounded.solve import ddp
+from grounded.solve.measured import measured_gains
 from grounded.task import Task
 from grounded.trial import mean_trial
 
@@ -120,7 +121,13 @@ class About:
         for step in options.steps_from(first):
             if step.damping not in directions:
                 directions[step.damping] = direction(
-                    plan, self.theta, self.grounding, options, step.damping, self.corrected
+                    plan,
+                    self.theta,
+                    self.grounding,
+                    options,
+                    step.damping,
+                    self.corrected,
+                    make.planner.task.model.n,
                 )
             policy = self.theta.toward(directions[step.damping], step.alpha)
             made = self.candidate(policy, step, self.way)
@@ -257,12 +264,14 @@ class Maker:
         run = predicted(problem, policy)
         factor = GENTLER**caution
         weight = factor * problem.input_weight + (factor - 1) * problem.change_weight
-        found = ddp.sweep(replace(problem, input_weight=weight), run.z, run.inputs)
+        gentle = replace(problem, input_weight=weight)
+        found = ddp.sweep(gentle, run.z, run.inputs)
         if not (found.ok and np.isfinite(run.z).all()):
             return policy
         plan, columns = self.planner.plan, _columns(problem, self.planner.plan)
-        gains, about = found.gains.K[:, :, columns], run.z[:-1, columns]
-        return self.planner.narrowed(plan.policy(run.inputs, gains, about))
+        K = measured_gains(gentle, run.z, run.inputs, found.gains.K, self.planner.task.model.n)
+        policy = plan.policy(run.inputs, K[:, :, columns], run.z[:-1, columns])
+        return self.planner.narrowed(policy)
 
     def checked(self, made: Candidate) -> Proposal:
         """A candidate that is finite, inside the limits and predicted to stay safe; or none."""
@@ -334,6 +343,7 @@ def direction(
     options: SearchOptions,
     damping: float = 1.0,
     corrected: Corrected | None = None,
+    measured: int | None = None,
 ) -> Policy:
     """Step 5: theta' such that d = theta' - theta improves the policy in the biased model.
 
@@ -344,6 +354,8 @@ def direction(
         options: which algorithm A.
         damping: lambda of `step_size`, the share of mu that leaving the trial's inputs costs.
         corrected: the model with slopes that trials have corrected; None: with its own.
+        measured: how many of the first states the robot measures; None: all of the task's. Gains
+            on others are made up for by those (`measured_gains`).
     """
     if options.method == "policy-gradient":
         from grounded.solve.policy_gradient import ascent
@@ -357,8 +369,9 @@ def direction(
         problem, z = corrected.on(problem), corrected.along(z)
     gains = ddp.sweep(problem, z, grounding.inputs).gains
     found = ddp.solve(problem, grounding.inputs, gains.K, z[:-1], PLANNING)
+    K = measured_gains(problem, found.z, found.u, found.K, measured or task.model.n)
     columns = _columns(problem, task)
-    return task.policy(found.u, found.K[:, :, columns], found.z[:-1, columns])
+    return task.policy(found.u, K[:, :, columns], found.z[:-1, columns])
 
 
 def _columns(problem: Problem, task: Task) -> list[int]:
