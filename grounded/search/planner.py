@@ -3,7 +3,8 @@
 They differ once effects are adopted: a lag, a backlash or a rate limit gives the model memory
 states that no sensor of the robot knows. Trials are LIFTED to the planning model (the memory
 follows from the commands), policies are NARROWED to what the robot measures (their gains are made
-for that, `measured_gains`; the memory's part of the feed-forward stays), and the predicted run is the narrowed policy's.
+for that, `measured_gains`; the memory's part of the feed-forward stays), and the predicted run is
+the narrowed policy's.
 """
 
 from __future__ import annotations

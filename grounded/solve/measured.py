@@ -1,7 +1,7 @@
 """Gains on what the robot measures, of gains on all that a model remembers.
 
 DDP feeds back the whole state z of the model that plans. A part of it no sensor of the robot knows:
-the output of an adopted lag, or what a corrected model mispredicted a step before. To drop the
+the output of an adopted lag, the play of a backlash. To drop the
 gains on that part leaves a loop that was designed for nobody: where gains are high, an unstable
 one. A predicted run doesn't show it, for it follows its own reference.
 
@@ -43,7 +43,7 @@ def measured_gains(problem: Problem, z: Array, u: Array, K: Array, measured: int
     """
     known = np.ones(problem.nz, bool)
     known[measured : problem.system.n] = False
-    dropped = np.where(known, K, 0.0)
+    dropped: Array = np.where(known, K, 0.0)
     if not K[:, :, ~known].any() or not np.isfinite(z).all():
         return dropped
     with np.errstate(all="ignore"):
