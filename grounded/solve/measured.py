@@ -61,7 +61,7 @@ def measured_gains(problem: Problem, z: Array, u: Array, K: Array, measured: int
 def _disturbances(problem: Problem, z: Array) -> Array:
     """Variance of what each column of z is disturbed by in a step (nz,); none of inputs sent."""
     moved = wrapped(np.diff(z, axis=0), problem.angles)
-    variance = np.mean(moved**2, axis=0)
+    variance: Array = np.mean(moved**2, axis=0)
     variance[problem.system.n :] = 0.0
     return variance
 
