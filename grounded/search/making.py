@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -158,8 +159,13 @@ class About:
         return doubted or unsafe
 
     def _ruinous(self, made: Candidate) -> bool:
-        """Whether it is foretold to lose more than all that the incumbent's run cost."""
-        return expected(made) < self.incumbent.utility
+        """Whether it is foretold to lose more than all that the incumbent costs there."""
+        return expected(made) < -max(self._disturbed, -self.incumbent.utility)
+
+    @cached_property
+    def _disturbed(self) -> float:
+        """What the incumbent's policy costs in the alternatives."""
+        return sum(a.cost(self.incumbent.candidate.policy) for a in self.alternatives)
 
     def _near(self, made: Candidate, lost: Rollout) -> bool:
         """Whether a candidate is to do nearly what one that lost would do in this model."""
@@ -171,9 +177,10 @@ class About:
 
         Those are the alternatives and the plain model, where that foretold the incumbent's trial.
         """
-        gains, run = [made.predicted_gain - made.likely_off], self.incumbent.candidate.policy
+        gains = [made.predicted_gain - made.likely_off]
         if self.alternatives:
-            gains.append(sum(a.cost(run) - a.cost(made.policy) for a in self.alternatives))
+            cost = sum(a.cost(made.policy) for a in self.alternatives)
+            gains.append(self._disturbed - cost)
         off = abs(self.plainly - self.incumbent.utility)
         if off < -self.incumbent.utility:
             gained = predicted(self.plain, made.policy).utility - self.plainly + off
