@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 GENTLER = 1e3  # factor on the price of inputs from which gentler gains are designed
 NEAR = 0.2  # of the way that one that lost would go: a step that ends so near is the same one
+FORETOLD = 0.2  # of the incumbent's cost: a plain model that is off by more there is no judge
 SWINGS = 6  # of an input about its plan, each as large as the plan's own range: a limit cycle
 
 
@@ -182,7 +183,7 @@ class About:
             cost = sum(a.cost(made.policy) for a in self.alternatives)
             gains.append(self._disturbed - cost)
         off = abs(self.plainly - self.incumbent.utility)
-        if off < -self.incumbent.utility:
+        if off < FORETOLD * -self.incumbent.utility:
             gained = predicted(self.plain, made.policy).utility - self.plainly + off
             gains += [gained] if gained < 0 else []
         return replace(made, likely_off=made.predicted_gain - min(gains))

@@ -139,7 +139,7 @@ def test_the_plain_model_judges_where_it_foretold_the_incumbent(noisy):
     lost = about.plainly - run
     told = about._told(replace(step, predicted_gain=0.0, likely_off=0.0))
     assert told.likely_off == pytest.approx(max(lost, 0.0))
-    about.plainly = -3.0 * cost  # as if it had not
+    about.plainly = -1.5 * cost  # as if it had not
     assert about._told(replace(step, likely_off=0.0)).likely_off == 0.0
 
 
