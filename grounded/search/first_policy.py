@@ -66,13 +66,7 @@ def first_policy(
     Raises:
         GroundedError: if the model computes other numbers than when it was read (random ones).
     """
-    if caution:
-        reward = replace(
-            task.reward,
-            input=task.reward.input * CAUTION**caution,
-            input_change=np.maximum(task.reward.input_change, 1e-3) * CAUTION**caution,
-        )
-        task = replace(task, reward=reward)
+    task = cautious(task, caution)
     problem, guess = task.problem(), first_guess(task)
     best = finished(problem, guess.inputs, guess.gain, guess.z[:-1], tick=tick)
     rivals = list(_rivals(task))
@@ -95,6 +89,18 @@ def first_policy(
     if np.isfinite(best.z).all():
         model.system.check(best.z[some, : model.n], best.u[some], model.values, task.dt)
     return task.policy(best.u, best.K, best.z[:-1]), best
+
+
+def cautious(task: Task, caution: int) -> Task:
+    """The task with inputs that cost CAUTION times more for each crash of a first policy."""
+    if not caution:
+        return task
+    reward = replace(
+        task.reward,
+        input=task.reward.input * CAUTION**caution,
+        input_change=np.maximum(task.reward.input_change, 1e-3) * CAUTION**caution,
+    )
+    return replace(task, reward=reward)
 
 
 def _followed(task: Task, widths: Sequence[str], tick: Tick | None) -> ddp.Solution:

@@ -12,7 +12,7 @@ true states.
 | 1, 2 | optimal policy of the crude model              | `first_policy` (`first_guess`, `ddp`)   |
 | 3    | run it, record the trial                       | people, robots: `run`, `ingest`         |
 | 4    | add a bias to the ORIGINAL model               | `bias.ground`                           |
-| 5    | direction d from algorithm A in that model     | `making.direction` (`mispredictions`)   |
+| 5    | direction d from algorithm A in that model     | `directions` (`mispredictions`)         |
 | 6    | theta + alpha d, line search on the real system| `Policy.toward`, `step_size`            |
 | 7    | none improves: return the current policy       | `standing`                              |
 
@@ -30,6 +30,7 @@ import numpy as np
 
 from grounded.errors import NextCommand
 from grounded.model import Model
+from grounded.result import figure
 from grounded.search.candidate import Candidate, Tried
 from grounded.search.making import About, Maker, Proposal
 from grounded.search.planner import Planner
@@ -112,6 +113,7 @@ def _improvement(make: Maker, incumbent: Tried, options: SearchOptions) -> Propo
         return make.checked(made)
     ways, promised = options.ways(incumbent.candidate), list[float]()
     unsafe: Proposal | None = None
+    ruinous: Candidate | None = None
     least = 0.0
     for way in ways[ways.index(now.way) :]:
         step = now.step
@@ -126,17 +128,22 @@ def _improvement(make: Maker, incumbent: Tried, options: SearchOptions) -> Propo
             found = own
         if found is not None and found.candidate is not None:
             return found
-        unsafe = unsafe or found
+        unsafe, ruinous = unsafe or found, ruinous or about.ruinous
         lost = losers_of(now.history, incumbent.candidate.id, make.fingerprint)
         if promised and not lost and 0 <= max(promised) <= least:
             break  # at the optimum as far as the model can tell: no trial is spent on another way
     return unsafe or Proposal(
-        _ended(make, incumbent, promised, least, options.tolerance), None, False
+        _ended(make, incumbent, promised, least, options.tolerance, ruinous), None, False
     )
 
 
 def _ended(
-    make: Maker, incumbent: Tried, promised: list[float], least: float, tolerance: float
+    make: Maker,
+    incumbent: Tried,
+    promised: list[float],
+    least: float,
+    tolerance: float,
+    ruinous: Candidate | None,
 ) -> Standing:
     """The standing when no step is worth a trial, with the true reason."""
     own, finite = incumbent.candidate.id, [gain for gain in promised if np.isfinite(gain)]
@@ -144,7 +151,14 @@ def _ended(
     ending: Ending
     then: NextCommand | None = NextCommand("diagnose")
     lost = len(losers_of(make.now.history, own, make.fingerprint))
-    if promised and not finite:
+    if ruinous is not None:
+        ending = "too doubtful"
+        sentence = (
+            f"the model promises {figure(ruinous.predicted_gain)} from a step and is likely to be "
+            f"off by {figure(ruinous.likely_off)}, more than all that {own} cost: no trial is "
+            f"spent on it; another trial of {own}, or a diagnosis, tells more"
+        )
+    elif promised and not finite:
         ending = "model diverges"
         sentence = (
             f"the model diverges when it is grounded on {own}, whatever the step: it is too far "

@@ -3,32 +3,34 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from grounded.compile import DescentOptions, Problem
+from grounded.compile import Problem
 from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.result import Result, document
 from grounded.rollout import Rollout, apart
 from grounded.search.candidate import Candidate, Slopes, Tried, Way
+from grounded.search.directions import base_columns, direction
 from grounded.search.planner import Planner, predicted
 from grounded.search.safety import objections, spread
 from grounded.search.standing import SearchOptions, Standing, losers_of, wild
 from grounded.search.step_size import KEPT, Step
 from grounded.solve import ddp
+from grounded.solve.measured import measured_gains
 from grounded.task import Task
 from grounded.trial import mean_trial
 
 if TYPE_CHECKING:
     from grounded.search.corrected import Corrected
     from grounded.search.feedback import Alternative
-    from grounded.solve.bias import Grounding
 
-PLANNING = DescentOptions(max_iterations=30, tolerance=1e-6)  # a direction needs no more digits
 GENTLER = 1e3  # factor on the price of inputs from which gentler gains are designed
 NEAR = 0.2  # of the way that one that lost would go: a step that ends so near is the same one
+FORETOLD = 0.2  # of the incumbent's cost: a plain model that is off by more there is no judge
 SWINGS = 6  # of an input about its plan, each as large as the plan's own range: a limit cycle
 
 
@@ -64,6 +66,9 @@ class About:
         already = predicted(self.real, incumbent.candidate.policy).utility
         self.already = already if np.isfinite(already) else incumbent.utility
         self.least = options.tolerance * abs(self.already)
+        self.plain = plan.problem(exact=True)  # no trial in it, hence no noise and no start
+        self.plainly = predicted(self.plain, incumbent.candidate.policy).utility
+        self.ruinous: Candidate | None = None  # a step that was foretold to lose, and not taken
 
     @property
     def slopes(self) -> Slopes:
@@ -102,6 +107,7 @@ class About:
         """The first step worth a trial; one that is not allowed, or None; adds to the promises.
 
         One that is likely to lose, for what the model misses, is left for when there is no other.
+        One that any of the models that explain the trials foretells to be a disaster is none.
         One whose run is nearly that of a candidate that lost is none: where the price on leaving
         the trial's inputs is small beside the others, ten times the damping is the same step.
 
@@ -116,11 +122,18 @@ class About:
         foretold = [predicted(self.real, candidate.policy) for candidate in lost]
         unsafe: Proposal | None = None
         doubted: Proposal | None = None
+        ruinous: Candidate | None = None
         directions: dict[float, Policy] = {}
         for step in options.steps_from(first):
             if step.damping not in directions:
                 directions[step.damping] = direction(
-                    plan, self.theta, self.grounding, options, step.damping, self.corrected
+                    plan,
+                    self.theta,
+                    self.grounding,
+                    options,
+                    step.damping,
+                    self.corrected,
+                    make.planner.task.model.n,
                 )
             policy = self.theta.toward(directions[step.damping], step.alpha)
             made = self.candidate(policy, step, self.way)
@@ -130,17 +143,30 @@ class About:
                 proposal = make.checked(made)
                 if proposal.candidate is None:
                     unsafe = proposal
-                elif expected(proposal.candidate) > self.least:
-                    return replace(proposal, candidate=self._told(proposal.candidate))
+                    continue
+                told = self._told(proposal.candidate)
+                proposal = replace(proposal, candidate=told)
+                if self._ruinous(told):
+                    ruinous = ruinous or told
+                elif expected(made) > self.least:
+                    return proposal
                 else:
                     doubted = doubted or proposal
                 continue
             promised.append(made.predicted_gain)
             if abs(made.predicted_gain) <= self.least:
                 break
-        if doubted is not None and doubted.candidate is not None:
-            return replace(doubted, candidate=self._told(doubted.candidate))
-        return unsafe
+        self.ruinous = ruinous
+        return doubted or unsafe
+
+    def _ruinous(self, made: Candidate) -> bool:
+        """Whether it is foretold to lose more than all that the incumbent costs there."""
+        return expected(made) < -max(self._disturbed, -self.incumbent.utility)
+
+    @cached_property
+    def _disturbed(self) -> float:
+        """What the incumbent's policy costs in the alternatives."""
+        return sum(a.cost(self.incumbent.candidate.policy) for a in self.alternatives)
 
     def _near(self, made: Candidate, lost: Rollout) -> bool:
         """Whether a candidate is to do nearly what one that lost would do in this model."""
@@ -148,12 +174,19 @@ class About:
         return apart(self.real, run, other) <= NEAR**2 * apart(self.real, self.run, other)
 
     def _told(self, made: Candidate) -> Candidate:
-        """The same; what it is likely to be off by is no less than what the alternatives say."""
-        run = self.incumbent.candidate.policy
-        if not self.alternatives:
-            return made
-        gain = sum(a.cost(run) - a.cost(made.policy) for a in self.alternatives)
-        return replace(made, likely_off=max(made.likely_off, made.predicted_gain - gain))
+        """The same; it is likely to be off by no less than what other models say.
+
+        Those are the alternatives and the plain model, where that foretold the incumbent's trial.
+        """
+        gains = [made.predicted_gain - made.likely_off]
+        if self.alternatives:
+            cost = sum(a.cost(made.policy) for a in self.alternatives)
+            gains.append(self._disturbed - cost)
+        off = abs(self.plainly - self.incumbent.utility)
+        if off < FORETOLD * -self.incumbent.utility:
+            gained = predicted(self.plain, made.policy).utility - self.plainly + off
+            gains += [gained] if gained < 0 else []
+        return replace(made, likely_off=made.predicted_gain - min(gains))
 
     def own_plan(self, rival: Proposal | None) -> Proposal | None:
         """A model that was changed since: its own new plan, where more is promised of that.
@@ -257,12 +290,14 @@ class Maker:
         run = predicted(problem, policy)
         factor = GENTLER**caution
         weight = factor * problem.input_weight + (factor - 1) * problem.change_weight
-        found = ddp.sweep(replace(problem, input_weight=weight), run.z, run.inputs)
+        gentle = replace(problem, input_weight=weight)
+        found = ddp.sweep(gentle, run.z, run.inputs)
         if not (found.ok and np.isfinite(run.z).all()):
             return policy
-        plan, columns = self.planner.plan, _columns(problem, self.planner.plan)
-        gains, about = found.gains.K[:, :, columns], run.z[:-1, columns]
-        return self.planner.narrowed(plan.policy(run.inputs, gains, about))
+        plan, columns = self.planner.plan, base_columns(problem, self.planner.plan)
+        K = measured_gains(gentle, run.z, run.inputs, found.gains.K, self.planner.task.model.n)
+        policy = plan.policy(run.inputs, K[:, :, columns], run.z[:-1, columns])
+        return self.planner.narrowed(policy)
 
     def checked(self, made: Candidate) -> Proposal:
         """A candidate that is finite, inside the limits and predicted to stay safe; or none."""
@@ -325,59 +360,3 @@ class Proposal(Result):
         )
         best = now.incumbent and now.incumbent.utility
         return known | document(best_utility=best, new=self.is_new) if made else known
-
-
-def direction(
-    task: Task,
-    policy: Policy,
-    grounding: Grounding,
-    options: SearchOptions,
-    damping: float = 1.0,
-    corrected: Corrected | None = None,
-) -> Policy:
-    """Step 5: theta' such that d = theta' - theta improves the policy in the biased model.
-
-    Args:
-        task: the manoeuvre, with the ORIGINAL model.
-        policy: theta, the policy that ran the trial.
-        grounding: the trial as the biased model replays it (step 4).
-        options: which algorithm A.
-        damping: lambda of `step_size`, the share of mu that leaving the trial's inputs costs.
-        corrected: the model with slopes that trials have corrected; None: with its own.
-    """
-    if options.method == "policy-gradient":
-        from grounded.solve.policy_gradient import ascent
-
-        return ascent(task, policy, grounding)
-    problem = grounding.on(task.problem())
-    if options.step == "damped":
-        problem = damped(problem, grounding.inputs, damping)
-    z = grounding.z
-    if corrected is not None:
-        problem, z = corrected.on(problem), corrected.along(z)
-    gains = ddp.sweep(problem, z, grounding.inputs).gains
-    found = ddp.solve(problem, grounding.inputs, gains.K, z[:-1], PLANNING)
-    columns = _columns(problem, task)
-    return task.policy(found.u, found.K[:, :, columns], found.z[:-1, columns])
-
-
-def _columns(problem: Problem, task: Task) -> list[int]:
-    """The columns of the problem's z that are the task's too."""
-    own = map(problem.system.states.index, task.model.state_names)
-    return [*own, *range(problem.system.n, problem.nz)]
-
-
-def damped(problem: Problem, inputs: Array, factor: float = 1.0) -> Problem:
-    """The problem with a price mu |u_t - inputs_t|^2 on leaving the trial's inputs (H, m).
-
-    The fully converged step goes to the optimum of the biased MODEL, and that need not be uphill in
-    the real system; with mu it turns towards the gradient, which is uphill while the
-    model's derivatives are within 90 degrees (section 3). mu = R + S, the problem's own weights on
-    inputs: the same idea as norm-optimal iterative learning control. Both quadratic penalties on
-    u_t are one: weight R + mu about (R u_target + mu inputs) / (R + mu).
-    """
-    mu = factor * (problem.input_weight + problem.change_weight)
-    weight = problem.input_weight + mu
-    mixed = problem.input_weight * problem.input_target + mu * inputs
-    safe = np.where(weight > 0, weight, 1.0)
-    return replace(problem, input_weight=weight, input_target=mixed / safe)

@@ -2,8 +2,9 @@
 
 They differ once effects are adopted: a lag, a backlash or a rate limit gives the model memory
 states that no sensor of the robot knows. Trials are LIFTED to the planning model (the memory
-follows from the commands), policies are NARROWED to what the robot measures (gains on memory are
-dropped; their part of the feed-forward stays), and the predicted run is the narrowed policy's.
+follows from the commands), policies are NARROWED to what the robot measures (their gains are made
+for that, `measured_gains`; the memory's part of the feed-forward stays), and the predicted run is
+the narrowed policy's.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from grounded.compile import Problem
 from grounded.model import Model
 from grounded.policy import Policy
 from grounded.rollout import Rollout, simulate
+from grounded.solve.measured import measured_gains
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded.utility import Reward
@@ -67,10 +69,15 @@ class Planner:
         return policy.laid_out(model.state_names, angles, policy.depths)
 
     def first_policy(self, caution: int = 0, tick: Tick | None = None) -> tuple[Policy, Solution]:
-        """The planning model's own policy, see `first_policy`."""
-        from grounded.search.first_policy import first_policy
+        """The planning model's own policy with gains on what the robot measures alone."""
+        from grounded.search.first_policy import cautious, first_policy
 
-        return first_policy(self.plan, caution, tick, self.widths)
+        policy, found = first_policy(self.plan, caution, tick, self.widths)
+        if self.plan.model.n == self.task.model.n or policy.gain is None:
+            return policy, found
+        problem = cautious(self.plan, caution).problem()
+        K = measured_gains(problem, found.z, found.u, found.K, self.task.model.n)
+        return dataclasses.replace(policy, gain=K), found
 
     def with_model(self, model: Model) -> Planner:
         """The same with other parameter values of the planning model."""

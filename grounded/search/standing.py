@@ -37,6 +37,7 @@ Ending = Literal[
     "nothing promised",  # the grounded model sees nothing more to gain
     "no step improved",  # step 7: real trials lost down to the smallest step
     "every step loses",  # in the grounded model already
+    "too doubtful",  # all that is promised would be lost many times over by other models
     "model diverges",  # grounded on the best trial
     "crashed",  # every first policy
     "not allowed",  # by [limits] or [safety]

@@ -3,7 +3,7 @@
 A step is two numbers:
 
     damping   lambda in [0, 1000]: the price lambda (R + S) |u - u_trial|^2 on leaving the trial's
-              inputs, within which DDP converges (`making.damped`)
+              inputs, within which DDP converges (`directions.damped`)
     alpha     the paper's step along the direction that results: 1, then halved (footnote 11)
 
 At lambda = 1 the step is the cautious one that a crude model deserves; at 0 it is the paper's, DDP

@@ -21,8 +21,8 @@ it. Three things are this project's own:
 
 `solve` runs to convergence: 4 iterations on a car (H = 200), 5 on a 6-DOF aircraft (H = 3000). What
 keeps the search close to a trial is a price on leaving its inputs, part of the problem itself
-(`making.damped`). The sweep itself belongs to a system (`interpreted.py`, or a compiled kernel);
-`sweep` here makes it succeed, by raising mu until every Q_uu is positive definite.
+(`directions.damped`). The sweep itself belongs to a system (`interpreted.py`, or a compiled
+kernel); `sweep` here makes it succeed, by raising mu until every Q_uu is positive definite.
 """
 
 from __future__ import annotations

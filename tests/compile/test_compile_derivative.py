@@ -9,6 +9,7 @@ from grounded.compile import system_of
 from grounded.compile.run.differenced import RELATIVE_STEP
 from grounded.compile.run.traced import TracedSystem
 from grounded.compile.trace.tracing import Signature, trace
+from grounded.model import Model, Param
 from problems import SPECS, system
 
 UNARY = {
@@ -183,3 +184,27 @@ def test_smoothing_narrows_to_the_exact_branch():
         np.abs(made.step(x, u, p, 0.05, eps) - exact).max() for eps in (0.1, 0.01, 1e-3, 1e-5)
     ]
     assert errors[0] > errors[1] > errors[-1] and errors[-1] < 1e-5
+
+
+def test_what_depends_on_parameters_alone_is_never_smoothed():
+    """A guard of a time constant is no corner of the run: 40 ms had been planned as 52 ms."""
+
+    def lag(s, a, p, dt):
+        tau = np.maximum(p.tau, 1e-6)
+        sign = np.where(p.tau > 0.03, 1.0, -1.0)
+        return {"y": s.y + sign * np.abs(p.tau) / tau * (1 - np.exp(-dt / tau)) * (a.u - s.y)}
+
+    model = Model(states={"y": "1"}, inputs={"u": "1"}, params={"tau": Param(0.04)}, step=lag)
+    twin = (
+        TracedSystem(model.signature, trace(model.signature, None, 0.02), "rk4", "")
+        if False
+        else None
+    )
+    assert twin is None
+    x, u, p = np.array([[0.2]]), np.array([[1.0]]), np.array([0.04])
+    exact = model.system.step(x, u, p, 0.02, 0.0)
+    np.testing.assert_array_equal(model.system.step(x, u, p, 0.02, 0.05), exact)
+    np.testing.assert_allclose(exact, 0.2 + (1 - np.exp(-0.5)) * 0.8)
+    assert model.system.linearise(x, u, p, 0.02, 0.05)[1][0, 0, 0] == pytest.approx(
+        1 - np.exp(-0.5)
+    )

@@ -116,6 +116,33 @@ def test_an_own_plan_must_promise_more_than_it_is_likely_off_by(noisy):
     assert about.own_plan(None) is None
 
 
+def test_a_step_that_is_foretold_to_be_a_disaster_is_not_proposed(noisy, monkeypatch):
+    """A quadrotor's step promised 0.25, was likely off by 24, and was flown all the same."""
+    about = noisy.about
+    step = about.step_from(Step(), []).candidate
+    assert step is not None and about.ruinous is None
+    about.alternatives, cost = (), -noisy.now.incumbent.utility
+    about.plainly, about._near = -cost, lambda made, lost: False
+    told = about._told(replace(step, predicted_gain=0.1, likely_off=cost + 1.0))
+    assert told.likely_off == pytest.approx(cost + 1.0) and about._ruinous(told)
+    monkeypatch.setattr(About, "_ruinous", lambda self, made: True)
+    assert about.step_from(Step(), []) is None
+    assert about.ruinous is not None and about.ruinous.predicted_gain > about.least
+
+
+def test_the_plain_model_judges_where_it_foretold_the_incumbent(noisy):
+    about = noisy.about
+    step = about.step_from(Step(), []).candidate
+    run, cost = predicted(about.plain, step.policy).utility, -noisy.now.incumbent.utility
+    about.alternatives = ()
+    about.plainly = noisy.now.incumbent.utility  # as if it had foretold it exactly
+    lost = about.plainly - run
+    told = about._told(replace(step, predicted_gain=0.0, likely_off=0.0))
+    assert told.likely_off == pytest.approx(max(lost, 0.0))
+    about.plainly = -1.5 * cost  # as if it had not
+    assert about._told(replace(step, likely_off=0.0)).likely_off == 0.0
+
+
 def test_a_candidate_says_that_it_may_well_lose():
     fields = dict.fromkeys(("id", "policy", "base", "model", "predicted_states"), "")
     fields |= {"iteration": 1, "alpha": 1.0, "predicted_inputs": "", "predicted_utility": -1.0}

@@ -19,9 +19,9 @@ from grounded.models import car, pendulum
 from grounded.plant import Plant
 from grounded.rollout import simulate
 from grounded.search.ask_tell import learn
+from grounded.search.directions import damped, direction
 from grounded.search.first_policy import first_policy
 from grounded.search.improve import propose
-from grounded.search.making import damped, direction
 from grounded.search.planner import model_fingerprint
 from grounded.search.standing import SearchOptions
 from grounded.solve.bias import ground

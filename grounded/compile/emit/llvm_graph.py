@@ -83,6 +83,7 @@ class Body:
         self.lanes = Lanes(f, width)
         self._known: dict[int, str] = dict(known or {})
         self._settings: dict[int, str] = {}
+        self._exact = False  # whether the node that is being written is never smoothed
 
     def values(self, outputs: Sequence[int]) -> list[str]:
         """Value names of outputs, written in topological order."""
@@ -110,6 +111,7 @@ class Body:
         if node.leaf is not None:
             return self.leaf(*node.leaf)
         args = [self._known[a] for a in node.args]
+        self._exact = not self.graph.varies(i)
         if node.op in PLAIN:
             return f.op(PLAIN[node.op], args[0], args[1], w)
         if node.op in INTRINSIC:
@@ -121,7 +123,9 @@ class Body:
         )
 
     def setting(self, slot: int) -> str:
-        """An entry eps or 1/eps of the table in every lane."""
+        """An entry eps or 1/eps of the table in every lane; 0 for what is never smoothed."""
+        if self._exact:
+            return self.const(0.0)
         if slot not in self._settings:
             self._settings[slot] = self.f.load_all(self.table, slot, self.width)
         return self._settings[slot]

@@ -15,6 +15,9 @@ the branch that the user wrote:
     max(a, b)        the larger                      (a + b + sqrt((a - b)^2 + eps^2)) / 2
     sign(x)          -1, 0, 1                        x / sqrt(x^2 + eps^2)
 
+What depends on no state and no input is no corner on the way, and is never smoothed: a guard like
+max(tau, 1e-6) of a parameter keeps tau as it is.
+
 A condition is a weight in [0, 1], so that "and", "or", "not" are w v, w + v - w v and 1 - w.
 A NaN or infinity on a branch that is not taken never reaches the result. The last operations
 (`slope`, `side`, `bend`, `gate`) only occur in derivatives.
@@ -130,8 +133,6 @@ NUMPY: dict[str, Callable[..., Any]] = {
     "slope": slope,
     "gate": gate,
 }
-SMOOTHED = frozenset({"above", "abs", "sign", "max", "side", "bend", "slope"})  # depend on eps
-
 
 MAX_NODES = 50_000
 
@@ -202,7 +203,7 @@ class Graph:
 
     def _simplified(self, op: str, args: tuple[int, ...]) -> int | None:
         values = [self.constant(i) for i in args]
-        if all(v is not None for v in values) and op not in SMOOTHED:
+        if all(v is not None for v in values):
             with np.errstate(all="ignore"):
                 result = float(NUMPY[op](0.0, *(np.float64(v) for v in values if v is not None)))
             return self.const(result)
@@ -238,19 +239,20 @@ class Program:
 
     def __init__(self, graph: Graph, outputs: Sequence[int]) -> None:
         self.outputs = list(outputs)
-        self._steps = [(i, graph.nodes[i]) for i in graph.live(outputs)]
+        self._steps = [(i, graph.nodes[i], graph.varies(i)) for i in graph.live(outputs)]
 
     def __call__(self, leaves: Mapping[tuple[str, int], Any], eps: float) -> list[Any]:
         """Values of the outputs: numbers or arrays of samples that broadcast."""
         values: dict[int, Any] = {}
         with np.errstate(all="ignore"):
-            for i, node in self._steps:
+            for i, node, varies in self._steps:
                 if node.leaf is not None:
                     values[i] = leaves[node.leaf]
                 elif node.op == "const":
                     values[i] = np.float64(node.value)
                 else:
-                    values[i] = NUMPY[node.op](eps, *(values[a] for a in node.args))
+                    width = eps if varies else 0.0
+                    values[i] = NUMPY[node.op](width, *(values[a] for a in node.args))
         return [values[i] for i in self.outputs]
 
 

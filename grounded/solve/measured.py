@@ -1,0 +1,120 @@
+"""Gains on what the robot measures, of gains on all that a model remembers.
+
+DDP feeds back the whole state z of the model that plans. A part of it no sensor of the robot knows:
+the output of an adopted lag, the play of a backlash. To drop the
+gains on that part leaves a loop that was designed for nobody: where gains are high, an unstable
+one. A predicted run doesn't show it, for it follows its own reference.
+
+So gains are sought on the known part y of z = [y, h] alone (Levine & Athans, "On the determination
+of the optimal constant output feedback gains", IEEE Trans. Autom. Control 15, 1970; here over a
+finite horizon). About the run, with dz_t the deviation and Q the quadratic model of the value,
+
+    du_t = K*_t dz_t,        K*_t = -Q_uu^-1 Q_uz              what DDP would feed back
+    du_t = F_t dy_t,         F_t  = K*_t E[dz_t | dy_t]        the best that y allows
+    E[dz | dy] = S_zy S_yy^-1 dy,                              S_t = E[dz_t dz_t'] of the loop
+
+S is propagated forward under the gains so far, and the value back under F: each needs the other, so
+a few passes alternate, and the gains with the least cost are kept. What disturbs the loop is as
+large, state by state, as what the run itself does in a step.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from grounded.compile import Problem
+from grounded.compile.run.interpreted import Quadratic, linearised
+from grounded.frozen import Array, wrapped
+
+PASSES = 4
+RIDGE = 1e-6  # of a known quantity's own variance
+
+
+def measured_gains(problem: Problem, z: Array, u: Array, K: Array, measured: int) -> Array:
+    """Gains (H, m, nz) that are zero on states that are not measured.
+
+    Args:
+        problem: whose optimum the run is.
+        z: the run (H + 1, nz).
+        u: its inputs (H, m).
+        K: gains on all of z (H, m, nz); an input without any at some step keeps none there.
+        measured: how many of the first states the robot measures; it knows the inputs it sent.
+    """
+    known = np.ones(problem.nz, bool)
+    known[measured : problem.system.n] = False
+    dropped: Array = np.where(known, K, 0.0)
+    if not K[:, :, ~known].any() or not np.isfinite(z).all():
+        return dropped
+    with np.errstate(all="ignore"):
+        q = linearised(problem.system, problem, z, u)
+        noise = _disturbances(problem, z)
+        best, least, gains = dropped, _cost(q, dropped, noise), K
+        for _ in range(PASSES):
+            gains = _swept(q, K, _estimates(q, gains, noise, known), known)
+            cost = _cost(q, gains, noise)
+            if cost < least:
+                best, least = gains, cost
+    return best
+
+
+def _disturbances(problem: Problem, z: Array) -> Array:
+    """Variance of what each column of z is disturbed by in a step (nz,); none of inputs sent."""
+    moved = wrapped(np.diff(z, axis=0), problem.angles)
+    variance: Array = np.mean(moved**2, axis=0)
+    variance[problem.system.n :] = 0.0
+    return variance
+
+
+def _estimates(q: Quadratic, K: Array, noise: Array, known: NDArray[np.bool_]) -> Array:
+    """E[dz | dy] as matrices (H, nz, nz) that are zero on columns that are not known."""
+    found = np.zeros_like(q.A)
+    found[:] = np.diag(known.astype(float))
+    S = np.diag(noise)
+    for t in range(len(K)):
+        size = np.sqrt(np.diag(S)[known]) + 1e-300
+        scaled = S[np.ix_(known, known)] / np.outer(size, size)
+        if np.isfinite(scaled).all():
+            solved = np.linalg.solve(scaled + RIDGE * np.eye(len(size)), np.diag(1.0 / size))
+            rows = (S[np.ix_(~known, known)] / size) @ solved
+            found[t][np.ix_(~known, known)] = rows
+        loop = q.A[t] + q.B[t] @ K[t]
+        S = loop @ S @ loop.T + np.diag(noise)
+    return found
+
+
+def _swept(q: Quadratic, K: Array, estimates: Array, known: NDArray[np.bool_]) -> Array:
+    """F, back in time, with the value of the loop that it makes."""
+    gains = np.zeros_like(K)
+    V = np.diag(q.l_zz[-1])
+    for t in range(len(K) - 1, -1, -1):
+        free = K[t].any(axis=1)
+        Q_zz, Q_uz, Q_uu = _quadratic(q, t, V)
+        if free.any():
+            full = -np.linalg.solve(Q_uu[np.ix_(free, free)], Q_uz[free])
+            gains[t][free] = np.where(known, full @ estimates[t], 0.0)
+        V = _closed(Q_zz, Q_uz, Q_uu, gains[t])
+    return gains
+
+
+def _cost(q: Quadratic, K: Array, noise: Array) -> float:
+    """What the disturbances cost in the loop of these gains."""
+    V = np.diag(q.l_zz[-1])
+    total = float(noise @ np.diag(V))
+    for t in range(len(K) - 1, -1, -1):
+        V = _closed(*_quadratic(q, t, V), K[t])
+        total += float(noise @ np.diag(V))
+    return total if np.isfinite(total) else np.inf
+
+
+def _quadratic(q: Quadratic, t: int, V: Array) -> tuple[Array, Array, Array]:
+    """Q_zz, Q_uz, Q_uu of a step, with the value V after it."""
+    A, B = q.A[t], q.B[t]
+    VA, VB = V @ A, V @ B
+    return np.diag(q.l_zz[t]) + A.T @ VA, q.l_uz + B.T @ VA, np.diag(q.l_uu) + B.T @ VB
+
+
+def _closed(Q_zz: Array, Q_uz: Array, Q_uu: Array, K: Array) -> Array:
+    """The value of a step with gains K."""
+    cross = K.T @ Q_uz
+    return Q_zz + cross + cross.T + K.T @ Q_uu @ K
