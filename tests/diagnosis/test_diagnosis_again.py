@@ -15,7 +15,7 @@ from grounded.diagnosis.likelihood.intervals import standard_deviations
 from grounded.diagnosis.likelihood.noise import NoiseModel, Structure
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.refine import refine
-from grounded.diagnosis.validation.ruler import folds
+from grounded.diagnosis.validation.ruler import Ruler, folds
 from grounded.effects import Library
 
 
@@ -94,6 +94,24 @@ def test_an_interval_is_as_wide_as_what_is_wrong_along_the_manoeuvre():
     assert abs(value - 1.5) < half < 0.5
     value, half, fisher = calibrated(runs(1.5, alike=True))
     assert abs(value - 1.5) < half < 4 * 1.96 * fisher
+
+
+def test_predictions_start_from_filtered_states_wherever_the_track_lies():
+    """Behind a kink a fit's track may stay where it was measured: nearly as noisy as the sensors."""
+    trials, quiet = runs(1.5, noise=20.0), runs(1.5, noise=0.0)
+    data = prepare(axis(1.5), trials)
+    predictor = Predictor(data)
+    truth = Predictor(prepare(axis(1.5), quiet)).data.y
+    logs = 2 * np.log(20 * np.array([1e-4, 5e-4]))
+    noise = NoiseModel(Structure(), np.full(2, -30.0), logs, logs.copy(), np.full(2, -60.0))
+    start = [(Hypothesis(), noise, data.y.copy())]
+    (held,) = refine(predictor, start, iterations=1, fixed_noise=True)
+    (risen,) = refine(predictor, start, iterations=20, fixed_noise=True)
+    off = [float(np.std(a[50:] - truth[50:])) for a in (held.track, held.states, risen.states)]
+    assert off[1] < 0.3 * off[0]
+    assert off[1] == pytest.approx(off[2], rel=0.05)
+    errors = [Ruler(predictor).errors(fit).rms[:-1] for fit in (held, risen)]
+    np.testing.assert_allclose(errors[0], errors[1], rtol=0.02)
 
 
 def test_constants_that_data_chose_stay_when_the_values_move():

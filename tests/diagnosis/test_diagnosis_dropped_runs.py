@@ -42,7 +42,7 @@ def known(monkeypatch):
 def test_a_utility_is_predicted_from_the_trials_own_start(known):
     predictor, fit, trials = known
     task = task_of(predictor.data.model, STEPS)
-    found = utility_prediction(predictor, fit, fit.track, task, trials)
+    found = utility_prediction(predictor, fit, fit.states, task, trials)
     assert len(found.real) == 3  # of trial 2 the beginning was left out
     np.testing.assert_allclose(found.before, found.real, rtol=1e-9)
     np.testing.assert_allclose(found.after, found.real, rtol=1e-9)
@@ -120,6 +120,6 @@ def test_a_long_log_that_ran_no_candidate_is_no_run_of_the_task(known):
     """A 40 s drive by hand of a 3.5 s task had a utility, which the model "missed by 368"."""
     predictor, fit, trials = known
     task = task_of(predictor.data.model, STEPS // 3)
-    assert not len(utility_prediction(predictor, fit, fit.track, task, trials).real)
+    assert not len(utility_prediction(predictor, fit, fit.states, task, trials).real)
     own = [replace(trial, candidate="c0001") for trial in trials]  # recorded for longer
-    assert len(utility_prediction(predictor, fit, fit.track, task, own).real) == 3
+    assert len(utility_prediction(predictor, fit, fit.states, task, own).real) == 3
