@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 MOST = 3  # target states whose range is told
 LAST = 3  # predictions whose misses are told
+UNLIKE = 0.2  # of a promised gain: how much luckier a trial is than the model says, to be told
 
 
 @click.command("propose")
@@ -65,13 +66,21 @@ def tell_proposed(workspace: Workspace, proposed: Proposed, *, last: bool = True
     show(field("what", _what(candidate, standing, workspace.task), "  "))
     show(field("predicted", f"utility {number(candidate.predicted_utility)}", "  "))
     if standing.incumbent is not None:
-        best = standing.incumbent
-        show(field("so far", f"{number(best.utility)} by {best.candidate.id}", "  "))
+        show(field("so far", _so_far(candidate, standing.incumbent), "  "))
     show(field("trust", _trust(candidate, standing, workspace), "  "))
     for name, text in _extent(candidate, workspace.task):
         show(field(name, text, "  "))
     if last:
         show(f"\n{next_line(proposed.then)}")
+
+
+def _so_far(candidate: Candidate, best: Tried) -> str:
+    """The best one's utility; beside it what the model gives it, where its runs were luckier."""
+    text = f"{number(best.utility)} by {best.candidate.id}"
+    same, gain = candidate.expected_of_base, candidate.predicted_gain
+    if candidate.base != best.candidate.id or not abs(same - best.utility) > UNLIKE * abs(gain):
+        return text
+    return f"{text}, to which the same model gives {number(same)}; the rest was luck or its start"
 
 
 def _what(candidate: Candidate, standing: Standing, task: Task) -> str:
@@ -182,8 +191,10 @@ def _came_true(candidate: Candidate, same: Sequence[Tried], standing: Standing) 
     best, tried = standing.incumbent, {one.candidate.id for one in standing.history}
     if best is None or candidate.id in tried or not math.isfinite(missed[-1]):
         return text
-    gain = candidate.predicted_utility - best.utility
-    if not gain > 0:  # the best one's runs were luckier than what is predicted of it
+    gain = candidate.predicted_gain
+    if candidate.base != best.candidate.id:
+        gain = candidate.predicted_utility - best.utility
+    if not gain > 0:
         return text
     promise = f"{text}; this one promises a gain of {number(gain)}"
     if not gain < max(missed[-1], candidate.likely_off):

@@ -62,6 +62,14 @@ class Candidate(Result):
         """Whether its model is likely to be off by more than it promises."""
         return 0 < self.likely_off >= self.predicted_gain
 
+    @property
+    def expected_of_base(self) -> float:
+        """What the same model gives the candidate that the step started from.
+
+        Noise and a start that was off make a trial luckier or less so; the gain leaves them out.
+        """
+        return self.predicted_utility - self.predicted_gain
+
     def summary(self) -> str:
         """Its name, its step and what the model predicts."""
         predicted = f"predicted utility {self.predicted_utility:.4g}"

@@ -52,7 +52,7 @@ REWARD = Reward(np.array([10.0, 0.0]), np.zeros(2), np.array([0.01]), np.array([
         ({"model": cart_task}, "model must be a Model, got a function"),
         ({"past": np.array([np.nan])}, "held before the start"),
     ],
-    ids=lambda v: str(v)[:45],
+    ids=lambda v: next(iter(v)) if isinstance(v, dict) else str(v)[:45],
 )
 def test_what_does_not_fit_is_refused(change, match):
     with pytest.raises(GroundedError, match=match):

@@ -11,12 +11,14 @@ import pytest
 
 from cli import grounded, plain, process
 from facts import holds
+from grounded.diagnosis.error_report import RulerRow
 from grounded.diagnosis.report import Diagnosis, Made
 from grounded.effects import Library
 from grounded.errors import GroundedError, NextCommand
 from grounded.search.candidate import Candidate
 from grounded_cli.main import COMMANDS, cli
 from grounded_cli.options import ELSEWHERE
+from grounded_cli.propose import _came_true, _so_far
 from grounded_trials import Workspace
 from grounded_trials.report.gathering import gather
 from grounded_trials.store.documents import write_document
@@ -431,6 +433,15 @@ def test_trust_sets_the_promised_gain_against_the_last_misses(tmp_path):
     little = gain < missed[1] and gain < 0.1 * abs(ran[1].utility)
     assert holds(" ".join(said[2].split()), "stop here", "c0002") == little
     assert "stop here" not in said[1]  # which promises all of the cost
+    made, best = ran[2].candidate, ran[1]
+    assert made.base == best.candidate.id and "model" not in _so_far(made, best)
+    lucky = replace(made, predicted_gain=made.predicted_gain + 5)  # a trial better than its policy
+    assert holds(_so_far(lucky, best), f"{lucky.predicted_utility - lucky.predicted_gain:.4g}")
+    assert f"{lucky.predicted_gain:.4g}" in _came_true(lucky, ran[:2], ran_standing(folder, best))
+
+
+def ran_standing(folder, best):
+    return replace(standing_in(Workspace(folder)), incumbent=best, history=(best,))
 
 
 def test_who_is_told_that_a_candidate_may_lose_is_told_where_to_stop(tmp_path, monkeypatch):
@@ -450,8 +461,10 @@ def test_an_adoption_in_vain_is_told_how_to_be_undone(tmp_path, monkeypatch):
     effect = '\neffects = [{name = "viscous_friction:v", k = 0.3}]\n\n[task]'
     w = make(tmp_path / "w", config=CONFIG.replace("\n\n[task]", effect))
 
-    def said(kind, *accepted, model=w.planner.fingerprint):
+    def said(kind, *accepted, model=w.planner.fingerprint, outset=None):
         found = Diagnosis.from_json(DIAGNOSIS | {"verdict": {"kind": kind, "effects": []}})
+        row = RulerRow(1.0, crude={"x": 0.2, "v": 0.1}, outset=outset or {})
+        found = replace(found, prediction_error=(row,))
         made = [(None, "other", True), *(("a", model, one) for one in accepted)]
         history = [NS(candidate=NS(id=i, model=m), accepted=one) for i, m, one in made]
         module = "grounded_trials.workspace.proposing.standing_in"
@@ -463,6 +476,9 @@ def test_an_adoption_in_vain_is_told_how_to_be_undone(tmp_path, monkeypatch):
     assert said("none", False, False) == said("unknown", False) == ""
     assert said("unknown", False, False, True) == ""
     assert said("unknown", False, False, model="of yesterday") == ""
+    before = {"x": 0.9, "v": 0.1}  # a boat, all of whose five causes were right
+    assert said("unknown", False, False, outset=before) == ""
+    assert "adopt --undo" in said("unknown", False, False, outset={"x": 0.1, "v": 0.1})
 
 
 def test_as_many_effects_as_were_asked_for_are_said_to_be_no_end():

@@ -138,12 +138,15 @@ def _one_more(found: Diagnosis, most: int) -> str:
 
 
 def _in_vain(workspace: Folder, found: Diagnosis) -> str:
-    """How to undo an adoption after which candidates lost in a row, and no cause is known."""
+    """How to undo an adoption after which candidates lost in a row, and no cause is known.
+
+    Where predictions are better with it than they were before it, the losses have another cause.
+    """
     from grounded.search.standing import LOST
     from grounded_trials.workspace.proposing import standing_in
 
     names = [str(effect["name"]) for effect in workspace.config.model.effects]
-    if not names or found.no_cause or found.kind != "unknown":
+    if not names or found.no_cause or found.kind != "unknown" or _paid(found):
         return ""
     lost, model = 0, workspace.planner.fingerprint
     for tried in reversed(standing_in(workspace).history):
@@ -156,6 +159,17 @@ def _in_vain(workspace: Folder, found: Diagnosis) -> str:
         f"The last {lost} candidates planned with the adopted {', '.join(names)} lost: "
         "`grounded adopt --undo` takes the last adoption back; then diagnose again."
     )
+
+
+def _paid(found: Diagnosis) -> bool:
+    """Whether predictions are better by what was adopted, on average over channels and horizons."""
+    ratios = [
+        math.log(row.outset[name] / now)
+        for row in found.prediction_error
+        for name, now in row.crude.items()
+        if now > 0 and row.outset.get(name, 0) > 0 and row.tells(name, "outset", "crude")
+    ]
+    return sum(ratios) > 0
 
 
 def instruments_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[Finding, ...]:
