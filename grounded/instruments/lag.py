@@ -4,7 +4,8 @@ Both are smoothed by the same window, b is moved by d, and d is where they diffe
 either adds the same to the difference whatever d is. The window is the one with the surest d; what
 others find instead adds to its uncertainty. The ratio of sizes only brackets s (Frisch): noise in a
 makes <a b> / <a a> too small, noise in b makes <b b> / <a b> too large. A first-order filter is
-told from a delay by a = b + tau b', where that fits better than any delay.
+told from a delay by a = b + tau b', where that fits better than any delay, or as well and leaves
+nothing of a difference in size: what a filter takes from fast swings passes for a scale of a delay.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ SCREENED, MAYBE = 4, 0.7  # half window and correlation from which two signals m
 SAME, ROUNDED = 0.01, 0.003  # of a scale: what matters, what steps of time may make
 SURELY = 3.0  # standard deviations that it is sure by
 FILTER = 0.9  # of the misfit of a delay: below it a filter is what it is
+EVEN, PLAIN = 1.05, 1 / 3  # of it, where a scale has to be so much nearer 1 to be one
 
 
 @dataclass(frozen=True)
@@ -178,10 +180,14 @@ def _measured(pieces: _Pieces, reach: int, dt: float) -> Lag | None:
     rest, pull = a - s * b, s * slope
     force = max(_scatter(rest * pull, group) for group in pieces.groups)
     std = force / max(_dot(pull, pull), 1e-300)
+    tau = _filter(pieces, a, _dot(rest, rest), s) if d > 0 else None
+    late = d if tau is None else tau
+    if tau is not None:  # its size is that of what went into it
+        b = pieces.moved(0.0) + tau * 0.5 * (pieces.moved(1.0) - pieces.moved(-1.0))
+        s = _dot(a, b) / max(_dot(b, b), 1e-300)
+        rest = a - s * b
     both = abs(_dot(a, b))
     low, high = both / _dot(a, a), _dot(b, b) / max(both, 1e-300)
-    tau = _filter(pieces, a, _dot(rest, rest)) if d > 0 else None
-    late = d if tau is None else tau
     size_std = max(_scatter(rest * b, group) for group in pieces.groups) / max(_dot(b, b), 1e-300)
     sign, coherence = 1 if s > 0 else -1, min(low / high, 1.0)
     scale_std = size_std / max(s * s, 1e-300)
@@ -198,13 +204,15 @@ def _scatter(force: Array, group: Any) -> float:
     return float(np.sqrt((parts**2).sum()))
 
 
-def _filter(pieces: _Pieces, a: Array, misfit: float) -> float | None:
-    """The time constant [samples] where a = s (b + tau b') fits better than a delay."""
+def _filter(pieces: _Pieces, a: Array, misfit: float, scale: float) -> float | None:
+    """The time constant [samples] where a = s (b + tau b') fits better than a scaled delay."""
     b, slope = pieces.moved(0.0), 0.5 * (pieces.moved(1.0) - pieces.moved(-1.0))
     columns = np.stack([b, slope], axis=1)
     s, both = np.linalg.lstsq(columns, a, rcond=None)[0]
     rest = float(((a - columns @ [s, both]) ** 2).sum())
-    return float(both / s) if rest < FILTER * misfit and both / s > 0 else None
+    off, plain = (abs(np.log(max(abs(size), 1e-300))) for size in (scale, s))
+    better = rest < FILTER * misfit or (rest < EVEN * misfit and plain < PLAIN * off)
+    return float(both / s) if better and both / s > 0 else None
 
 
 def at_samples(x: Array, at: Any) -> Array:
