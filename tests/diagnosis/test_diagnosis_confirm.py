@@ -84,7 +84,7 @@ def test_the_ruler_measures_what_open_loop_predictions_miss(wavy, ruler):
         first = data.step_at[b, 0] - 500 * trial + t
         if first + 25 > 500:
             continue
-        x = crude.track[t, b]
+        x = crude.states[t, b]
         for u in data.commands[trial, first : first + 25]:
             x = model.system.step(x[None], u[None], model.values, DT)[0]
         total += (data.states[501 * trial + first + 25] - x) ** 2

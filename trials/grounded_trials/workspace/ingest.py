@@ -33,7 +33,7 @@ from grounded_trials.workspace.ingested import Ingested
 from grounded_trials.workspace.next_step import after_log
 from grounded_trials.workspace.off_target import off_target_of
 from grounded_trials.workspace.proposing import candidate_named, standing_in
-from grounded_trials.workspace.run_start import elsewhere, pace_of, rival_in
+from grounded_trials.workspace.run_start import elsewhere, pace_of, rival_in, unit_of
 from grounded_trials.workspace.stored_before import (
     as_stored,
     refuse_as_another,
@@ -148,14 +148,16 @@ def _recognised(workspace: Folder, path: Path, read: _Read, candidate: str | Non
     units = () if other else units
     if not why and not units:
         return read
+    if log and not units and not other:
+        units, by = unit_of(log, workspace.task, own.policy)
     slow = pace_of(log, workspace.task, own.policy) if log and not units else None
     pace = slow and (
         f"a second of its stamps is {slow:g} s of the run (a recording played at another rate?): "
         f"correct the stamps, times {slow:g}, and ingest it again"
     )
     if candidate is not None:
-        seem = f"{' and '.join(units)} seem to be in another unit: times {by:.6g} they fit better"
-        doubts = [pace or why or seem]
+        seem = f"{' and '.join(units)}, times {by:.6g}, would be its run: another unit, or sign?"
+        doubts = [seem if units else pace or why]
         if log and not (found and found.opens_alike):
             doubts.append(
                 f"no start of {ran} was found in it: it is taken from {log.first:.3f} s on, its "

@@ -28,7 +28,15 @@ from grounded.trial import LAST, Trial, interpolate_gaps
 from grounded_trials.logs.command_steps import held_rows, phase_of
 from grounded_trials.logs.resample import Gridded, Span, to_grid
 from grounded_trials.logs.signals import Series
-from grounded_trials.workspace.who_drove import FINE, LEAST, SAME, UNLIKE, follows
+from grounded_trials.workspace.who_drove import (
+    FINE,
+    LEAST,
+    NEARLY,
+    SAME,
+    UNLIKE,
+    follows,
+    units_tried,
+)
 
 TRIED = 5  # instants at which the commands fit best
 FINEST = 8  # parts of a step, between which the start is sought
@@ -232,6 +240,29 @@ def pace_of(log: Recording, task: Task, policy: Policy) -> float | None:
         if found and found.alike:
             return pace
     return None
+
+
+def unit_of(log: Recording, task: Task, policy: Policy) -> tuple[tuple[str, ...], float]:
+    """Signals in another unit, times what a run of a policy begins in a log; (), 1 where none does.
+
+    Args:
+        log: in which none begins as it is.
+        task: whose steps it is cut into.
+        policy: what is sought.
+    """
+    for names, by in units_tried(task.model):
+        series = {
+            name: replace(one, values=one.values * by) if name in names else one
+            for name, one in log.series.items()
+        }
+        again = recording(series, task)
+        found = again.start_of(policy) if again else None
+        if again and found and found.alike:
+            run = again.trial_from(found.seconds)
+            fit = run and follows(policy, run.until(policy.horizon), 0)
+            if fit and fit.error < NEARLY:
+                return tuple(names), by
+    return (), 1.0
 
 
 def _paced(series: Series, pace: float) -> Series:

@@ -7,12 +7,13 @@ another candidate, is something else.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from grounded.frozen import Array
+from grounded.model import Model
 from grounded.policy import Policy, z_difference
 from grounded.search.candidate import Candidate
 from grounded.task import Task
@@ -96,13 +97,15 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
     share = off.mean(axis=0) / room.mean(axis=0) * drawn_out
     first = parts[bad.index(True)] if any(bad) else parts[0][:1]
     left = first[int(np.argmax((off[first] > 2 * room[first]).any(axis=1)))]
-    alike, j = bool(share.max() <= 1 and not any(bad)), int(np.argmax(share))
+    beyond = np.abs(trial.inputs[:T] - np.clip(trial.inputs[:T], policy.low, policy.high))
+    sane = not (beyond.mean(axis=0) > width).any()  # clipped, any such commands are alike
+    alike, j = bool(sane and share.max() <= 1 and not any(bad)), int(np.argmax(share))
     return Following(
         alike=alike,
         error=float(np.sqrt((off / size**2).mean())),
         input=policy.input_names[j],
         rms=float(np.sqrt(off[:, j].mean())),
-        until_s=float(left) * policy.dt,
+        until_s=float(left) * policy.dt if sane else 0.0,
         late=late,
         moved=error / unmoved if unmoved > 1e-4 else 1.0,
         off=apart,
@@ -191,12 +194,8 @@ def other_units(
     """
     if plain is None or (plain.alike and plain.error < NEARLY):
         return (), 1.0
-    model, trial, late = task.model, trial.until(task.horizon), latest(task)
-    angular = [[n for n, u in model.states.items() if u in units] for units in ANGULAR]
-    angular += [[n] for n, u in (*model.states.items(), *model.inputs.items()) if u in ANGULAR[0]]
-    single = [[name] for name in (*model.state_names, *model.input_names)]
-    tried = [(names, factor) for factor in (np.pi / 180, 180 / np.pi) for names in angular if names]
-    for names, factor in tried + [(names, f) for f in (1e-3, 1e3) for names in single]:
+    trial, late = trial.until(task.horizon), latest(task)
+    for names, factor in units_tried(task.model):
         by = [
             np.array([factor if name in names else 1.0 for name in every])
             for every in (trial.state_names, trial.input_names)
@@ -209,9 +208,22 @@ def other_units(
     return (), 1.0
 
 
+def units_tried(model: Model) -> Iterator[tuple[Sequence[str], float]]:
+    """Signals that may be in another unit together, or of the other sign, and what mends it."""
+    angular = [[n for n, u in model.states.items() if u in units] for units in ANGULAR]
+    angular += [[n] for n, u in (*model.states.items(), *model.inputs.items()) if u in ANGULAR[0]]
+    single = [[name] for name in (*model.state_names, *model.input_names)]
+    yield from ((names, f) for f in (np.pi / 180, 180 / np.pi) for names in angular if names)
+    yield from ((names, f) for f in (*THOUSAND, -1.0) for names in single)
+
+
 def units_told(names: Sequence[str], by: float, mapped: bool) -> str:
     """What is wrong with the units of a log, and what mends it; `mapped`: by a [log] table."""
     which = " and ".join(names)
+    if by < 0:
+        mend = f"multiply its scale by -1 in {FILE}'s [log] (1 where none is given)"
+        alone = "append it times -1 and run it again, or take it in with --data"
+        return f"with {which} of the other sign: {mend if mapped else alone}"
     size = f"{max(by, 1 / by):.4g} times too {'large' if by < 1 else 'small'}"
     degrees = "" if by in THOUSAND else " (in degrees)" if by < 1 else " (radians for degrees)"
     mend = f"multiply the scale of {which} by {by:.6g} in {FILE}'s [log] (1 where none is given)"
