@@ -151,6 +151,15 @@ def test_tables_with_holes_and_texts(tmp_path):
     assert found.values[[0, 2]].tolist() == [1.5, 2.5] and np.isnan(found.values[1])
 
 
+def test_decimal_commas_between_semicolons(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("time_ms;x;u\n10,5;0,25;-1\n20,5;1.5;2,0\n")
+    specs = {name: SignalSpec(f"/csv.{name}") for name in ("x", "u")}
+    found = read_signals(path, specs)
+    assert found["x"].values.tolist() == [0.25, 1.5] and found["u"].values.tolist() == [-1.0, 2.0]
+    assert np.diff(found["x"].t).tolist() == [10_000_000]
+
+
 def test_a_table_cut_in_its_last_row_ends_before_it_and_its_unit_counts(tmp_path):
     """A logger that was stopped; `Time [ms]` was read as seconds."""
     path = tmp_path / "log.csv"

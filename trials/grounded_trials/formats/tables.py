@@ -90,6 +90,8 @@ def _with_holes(stream: Any, mark: str, width: int, path: Path) -> Floats:
             raise GroundedError(
                 f"{path}, line {number}: it has {len(row)} cells, its first line names {width}"
             )
+        if mark != ",":  # half of Europe writes 0,5
+            row = [cell.replace(",", ".", 1) if "." not in cell else cell for cell in row]
         rows.append([_number(cell) for cell in row])
     return np.array(rows, dtype=float).reshape(-1, width)
 
