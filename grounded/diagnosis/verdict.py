@@ -24,6 +24,7 @@ if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
     from grounded.model import Model
 
 LOG, LOST = "is a log that no candidate made", "was lost"  # why a trial can't be run again
+MOST_EFFECTS, FURTHER = 6, 2  # that may be blamed at once; so many more are looked for next
 NAMED = 3  # parameters, channels and leftovers that a sentence names at most
 
 
@@ -75,8 +76,12 @@ def verdict(
     words = [sentence(map(str.__add__, causes, shares)), improvement(rows), worsened(rows)]
     words.append(runaway(rows))
     words += [f"{told_apart(group, same)}." for group in groups[:1]]
+    more = 0
     if remainder and len(claims.names) == most:
         words.append(f"More is left: {left}; beyond {most} effects nothing was looked for.")
+        more = min(most + FURTHER, MOST_EFFECTS) * any(one.above for one in remainder)
+        if more > most:
+            words.append(f"Before you adopt, run `grounded diagnose --max-effects {more}`.")
     elif remainder:
         words.append(f"Something is left that no known effect explains: {left}.")
     elif above := rest(rows):
@@ -84,7 +89,8 @@ def verdict(
     words += once
     kind: Kind = "effect" if len(claimed) == 1 else "several"
     effects, off = tuple(r.effect for r in claimed), tuple(_off(claims))
-    return replace(_said(kind, *words), effects=effects, causes=causes, parameters=off)
+    said = replace(_said(kind, *words), effects=effects, causes=causes, parameters=off)
+    return replace(said, look_for=more if more > most else 0)
 
 
 def _said(kind: Kind, *words: str) -> Verdict:

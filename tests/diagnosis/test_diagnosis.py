@@ -288,6 +288,32 @@ def test_leftovers_that_are_not_named_are_counted():
     assert verdict(claims, (), (), (), (errors(0.1),), ()).kind == "none"
 
 
+@pytest.mark.parametrize(
+    ("most", "error", "more"),
+    [(3, 0.056, 5), (5, 0.056, 6), (6, 0.056, 0), (2, 0.056, 0), (3, 0.033, 0)],
+)
+def test_where_as_many_as_were_looked_for_leave_more_than_noise_more_are_looked_for(
+    most, error, more
+):
+    """Of `most` or 3 effects; 0.033 m/s is within what noise alone may leave."""
+    claimed = [f"viscous_friction:{k}" for k in range(max(most, 3))]
+    rows = tuple(Ranked(name, {}, {}, 50.0, claimed=True) for name in claimed)
+    claims = SimpleNamespace(
+        known=SimpleNamespace(no_cause=False),
+        blamed=(),
+        moved=(),
+        names=claimed,
+        data=SimpleNamespace(model=pendulum),
+        best=SimpleNamespace(hypothesis=SimpleNamespace(effects=())),
+        parameters=dict,
+    )
+    credit = (Credit("calibration", 1.0),)
+    left = (Remainder("u", 0.1, "m/s^2", 9.0, None, error, 0.032, 1.0, "m/s", True),)
+    found = verdict(claims, rows, (), left, (), credit, most=most)
+    assert found.look_for == more
+    assert (f"--max-effects {more}`" in found.sentence) is bool(more)
+
+
 def test_a_rest_above_the_noise_that_is_no_leftover_is_said_with_its_reason():
     floor = {"omega": 0.001}
     row = errors(10.0, with_effects={"omega": 0.012}, noise_floor=floor)

@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -105,6 +106,7 @@ def unmoved(data: Data, fit: Fitted, column: int, shift: float) -> Fitted:
 
 
 UNTOLD = 1e6  # times a value: a standard deviation that says nothing was learnt of it
+LEAST_TOLD = 0.1  # standard deviations: a smaller strength is not listed, no number is known of it
 RANKED = 12  # explanations that are listed
 SAME = 0.95  # share of a parameter's signal from which an effect is the same thing
 
@@ -151,8 +153,9 @@ class Claims:
                 gap = gaps_of(self.predictor, [fit], where)[0]
                 rows.append(self._row(fit, name, evidence, gap, before, claimed=False))
                 listed.append(name)
-        singles = [f for f in self.whole.of_size(1) if f.hypothesis.names[0] not in listed]
-        singles = singles[: max(RANKED - len(rows), 3)]
+        others = (f for f in self.whole.of_size(1) if f.hypothesis.names[0] not in listed)
+        likely = (f for f in others if math.isfinite(self.whole.score(f)))  # an absurd one is not
+        singles = list(islice(filter(self._told, likely), max(RANKED - len(rows), 3)))
         gaps = gaps_of(self.predictor, singles, where)
         base = self.base if self.whole is self.search else self.whole.score(self.whole.best_null())
         for fit, gap in zip(singles, gaps, strict=True):
@@ -223,6 +226,12 @@ class Claims:
             shrinkage=1 - gap / before if before > 0 else 0.0,
             claimed=claimed,
         )
+
+    def _told(self, fit: Fitted) -> bool:
+        """Whether a fit of one effect says how strong that is: its coefficients, or thresholds."""
+        (effect,), (known,) = fit.hypothesis.effects, self.estimates(fit)
+        strengths = [q.name for q in effect.free if not q.grid] or list(known)
+        return not all(abs(known[n].value) < LEAST_TOLD * known[n].std for n in strengths)
 
     def estimates(self, fit: Fitted) -> list[dict[str, Estimate]]:
         """Values with intervals, effect by effect."""

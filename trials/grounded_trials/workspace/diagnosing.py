@@ -35,7 +35,6 @@ if TYPE_CHECKING:
 
 FILE = "diagnosis.json"
 LEAST_STEPS = 2
-MOST_EFFECTS = 6  # that may be blamed at once: `--max-effects`
 PROBE = NextCommand("diagnose", ("--probe",))
 
 
@@ -102,8 +101,9 @@ def diagnose_in(
         run = f" ({identity}: {rendered(to_run(workspace, identity, identity))})" * bool(identity)
         found = replace(found, next_trial=f"{words}{run}", probe=identity)
         _keep(workspace, found)
-    if more := _one_more(found, max_effects):
-        found = replace(found, next_trial=f"{more} {found.next_trial}".strip())
+    if more := found.verdict.look_for:
+        first = f"Before it, `grounded diagnose --max-effects {more}` looks for more effects."
+        found = replace(found, next_trial=f"{first} {found.next_trial}".strip())
         _keep(workspace, found)
     if undo := _in_vain(workspace, found):
         found = replace(found, next_trial=f"{undo} {found.next_trial}")
@@ -128,13 +128,6 @@ def _as_known(workspace: Folder, ranking: Sequence[Ranked], made: Made) -> tuple
         else one
         for one in ranking
     )
-
-
-def _one_more(found: Diagnosis, most: int) -> str:
-    """How to look for one more effect, where as many as were asked for leave something over."""
-    if not found.leftover or len(found.effects) != most or most >= MOST_EFFECTS:
-        return ""
-    return f"`grounded diagnose --max-effects {most + 1}` looks for one more effect."
 
 
 def _in_vain(workspace: Folder, found: Diagnosis) -> str:
