@@ -16,7 +16,7 @@ from grounded.diagnosis.hypotheses.leftover import whiteness
 from grounded.diagnosis.likelihood.data import prepare, shifted
 from grounded.diagnosis.report import Estimate, Ranked
 from grounded.diagnosis.ruler_words import rest
-from grounded.diagnosis.validation.claims import Blame, loss
+from grounded.diagnosis.validation.claims import Blame, has_size, loss
 from grounded.diagnosis.validation.prediction_error import _stump
 from grounded.diagnosis.verdict import meaning, sentence, verdict
 from grounded.effects import Library
@@ -276,6 +276,28 @@ def test_the_cause_that_makes_most_is_named_first(effect_first):
     assert found.kind == "effect" and min(damped, moved) >= 0
     assert (damped < moved) is effect_first
     assert "omega by 0.10 rad/s instead of 0.50 rad/s (noise: 0.090 rad/s)" in found.sentence
+
+
+@pytest.mark.parametrize(
+    ("name", "known", "listed"),
+    [
+        ("patch:v", {"c": (5e5, 4.5e8), "x0": (15.4, 143), "radius": (2.31, 1.8)}, False),
+        ("patch:v", {"c": (0.4, 0.5), "x0": (0.01, 143), "radius": (2.31, 1.8)}, True),
+        ("saturation:u", {"c": (0.0, 0.026)}, False),
+        ("saturation:u", {"c": (0.3, 0.026)}, True),
+        ("periodic:v", {"A": (1e-4, 0.1), "B": (0.3, 0.1), "omega": (2.0, 0.1)}, True),
+        ("offset:v", {"c": (-0.1, float("inf"))}, False),
+    ],
+)
+def test_an_explanation_without_a_size_is_not_listed(name, known, listed):
+    model = Model(
+        states={"x": "m", "v": "m/s"},
+        inputs={"u": "m/s^2"},
+        roles={"position": ("x",)},
+        derivative=lambda s, a, p: {"x": s.v, "v": a.u},
+    )
+    effect = Library().effect(name, model)
+    assert has_size(effect, {n: Estimate(*one) for n, one in known.items()}) is listed
 
 
 def test_leftovers_that_are_not_named_are_counted():

@@ -35,6 +35,7 @@ from grounded.diagnosis.validation.held_out import gaps_of, held_out_errors
 from grounded.diagnosis.validation.limits import Limits
 from grounded.diagnosis.validation.prediction_error import normalised
 from grounded.diagnosis.validation.ruler import Ruler, folds
+from grounded.effects import Effect
 from grounded.frozen import Array
 
 ENOUGH = 3.0  # nats that the parameters that are not named may still hold
@@ -111,6 +112,12 @@ RANKED = 12  # explanations that are listed
 SAME = 0.95  # share of a parameter's signal from which an effect is the same thing
 
 
+def has_size(effect: Effect, known: Mapping[str, Estimate]) -> bool:
+    """Whether estimates say how strong an effect is: its coefficients, or else its thresholds."""
+    strengths = [q.name for q in effect.free if not q.grid] or list(known)
+    return not all(abs(known[n].value) < LEAST_TOLD * known[n].std for n in strengths)
+
+
 class Claims:
     """What the best hypothesis blames: effects, or parameters where calibrating them is enough."""
 
@@ -155,7 +162,8 @@ class Claims:
                 listed.append(name)
         others = (f for f in self.whole.of_size(1) if f.hypothesis.names[0] not in listed)
         likely = (f for f in others if math.isfinite(self.whole.score(f)))  # an absurd one is not
-        singles = list(islice(filter(self._told, likely), max(RANKED - len(rows), 3)))
+        sized = (f for f in likely if has_size(f.hypothesis.effects[0], self.estimates(f)[0]))
+        singles = list(islice(sized, max(RANKED - len(rows), 3)))
         gaps = gaps_of(self.predictor, singles, where)
         base = self.base if self.whole is self.search else self.whole.score(self.whole.best_null())
         for fit, gap in zip(singles, gaps, strict=True):
@@ -226,12 +234,6 @@ class Claims:
             shrinkage=1 - gap / before if before > 0 else 0.0,
             claimed=claimed,
         )
-
-    def _told(self, fit: Fitted) -> bool:
-        """Whether a fit of one effect says how strong that is: its coefficients, or thresholds."""
-        (effect,), (known,) = fit.hypothesis.effects, self.estimates(fit)
-        strengths = [q.name for q in effect.free if not q.grid] or list(known)
-        return not all(abs(known[n].value) < LEAST_TOLD * known[n].std for n in strengths)
 
     def estimates(self, fit: Fitted) -> list[dict[str, Estimate]]:
         """Values with intervals, effect by effect."""
