@@ -25,6 +25,7 @@ if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
 
 LOG, LOST = "is a log that no candidate made", "was lost"  # why a trial can't be run again
 MOST_EFFECTS, FURTHER = 6, 2  # that may be blamed at once; so many more are looked for next
+AS_STRONG = 0.2  # of what is modelled: a turned input that is so near to it has the wrong sign
 NAMED = 3  # parameters, channels and leftovers that a sentence names at most
 
 
@@ -258,6 +259,7 @@ def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
     words: dict[str, str] = {name: quantity(e) for name, e in params.items()}
     words.setdefault("s", "s" if len(targets) == 1 else "")
     driven, _, source = effect.site.target.partition("<-")
+    words["log"] = "[log]"
     words["target"] = " and ".join(called(model, n) for n in targets)
     if isinstance(effect.family, ParamFamily):
         words["target"] = effect.site.target
@@ -291,9 +293,21 @@ def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
             words[name] = words[name].removeprefix("-")
         return negative if less else positive
 
-    text = re.sub(r"\[([^]]*)\]", kept, effect.family.sentence)
+    text = re.sub(r"\[([^]]*)\]", kept, _turned(effect, params) or effect.family.sentence)
     text = re.sub(r"\{(\w+)>([^{}|]+)\|([^{}|]+)\}", signed, text)
     return re.sub(r"\{(\w+)(%)?(?:([^{}|]+)\|([^{}|]+))?\}", filled, text)
+
+
+def _turned(effect: Effect, params: Mapping[str, Estimate]) -> str:
+    """The sentence of a gain whose sign is the other one; "" where it isn't."""
+    from grounded.effects import InputFamily
+
+    text, size = effect.family.turned, -1 - params["g"].value if "g" in params else 0.0
+    if not text or size <= 0:
+        return ""
+    if abs(size - 1) < AS_STRONG:
+        return text + ": check the sign ({log} scale = -1)" * isinstance(effect.family, InputFamily)
+    return f"{text} (by {number(100 * size)} % of what is modelled)"
 
 
 def sentence(clauses: Iterable[str]) -> str:

@@ -232,6 +232,13 @@ def test_sentences_are_english():
     assert said("offset:v", c=0.1) == "The speed v drifts by 0.1 m/s^2."
     assert said("offset:w", c=0.1) == "The state w drifts by 0.1 1/s."
     assert said("input_gain:throttle", g=-0.2) == "The throttle acts 20 % weaker than modelled."
+    assert said("input_gain:throttle", g=-1.5) == (
+        "The throttle acts the other way round (by 50 % of what is modelled)."
+    )
+    assert said("input_gain:throttle", g=-2.1) == (
+        "The throttle acts the other way round: check the sign ([log] scale = -1)."
+    )
+    assert said("rate_gain:v", g=-2.0) == "The speed v changes the other way round."
     assert said("input_fade:throttle", k=-0.05) == "The throttle gets 5 % stronger every second."
     assert said("input_fade:throttle", k=0.05) == (
         "The throttle gets 5 % weaker every second (a battery that sags)."
