@@ -50,6 +50,32 @@ def test_commands_beyond_their_limits_are_not_said_to_be_at_them(w):
     assert [one.kind for one in preflight(w.task, [clipped]).findings] == ["saturated"]
 
 
+LOG = """
+[log]
+state = { x = { path = "/csv.x" }, v = { path = "/csv.v" } }
+input = { force = { path = "/csv.force" } }
+"""
+
+
+def test_a_log_that_the_limits_were_read_off_is_not_said_to_be_at_them(tmp_path):
+    """It said `at its limits 24 % of the time` of the log whose range [limits] are."""
+    seen = NARROW.replace("force = [0.0, 1.17]", 'force = [0.0, 1.17]\nseen_in = "a.csv"')
+    w = Workspace(make(tmp_path / "w", config=seen + LOG).folder)
+
+    def ingested(name, most):
+        run = driven(most)
+        force = np.minimum(run.inputs[:, 0], 1.17)
+        rows = np.column_stack([T, run.states[:-1], force])
+        np.savetxt(tmp_path / name, rows, "%.9f", ",", header="t,x,v,force", comments="")
+        w.ingest(tmp_path / name, data=True)
+        return [one for one in w.preflight() if one.kind == "saturated"]
+
+    assert ingested("a.csv", 2.15) == []
+    (other,) = ingested("b.csv", 1.5)
+    at = (driven(1.5).inputs >= 1.17).mean() + (driven(1.5).inputs <= 1e-9).mean()
+    assert other.share == pytest.approx(float(at), abs=0.01)  # of the other log alone
+
+
 def test_a_side_without_a_limit_has_no_beyond(w):
     free = replace(w.task, low=np.array([-np.inf]), high=np.array([np.inf]))
     assert not beyond_limits(free, driven(1e6).inputs).any()

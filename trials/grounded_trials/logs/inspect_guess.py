@@ -139,7 +139,9 @@ def _candidates(
     return sorted(found, key=lambda c: -c.score)
 
 
-def _score(called: Sequence[str], topic: TopicReport, field: FieldReport, *, is_input: bool) -> float:
+def _score(
+    called: Sequence[str], topic: TopicReport, field: FieldReport, *, is_input: bool
+) -> float:
     path = field.path.lower()
     inside = field.path[len(topic.topic) :].lower().strip('".')
     bare = without_unit(field.path)[len(topic.topic) :].lower().strip('".')

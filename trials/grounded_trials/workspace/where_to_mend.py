@@ -12,7 +12,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from grounded_trials.workspace.identity import READ_BY
+from grounded_trials.workspace.task_file import seen_in
 
 if TYPE_CHECKING:
     from grounded.instruments.finding import Finding
@@ -38,6 +41,7 @@ def where_to_mend(
 ) -> tuple[Finding, ...]:
     """Findings with the whole key of [log], or with advice where it read none of the trials."""
     about = {one.stored.id: one.meta for one in workspace.trials()}
+    findings = _at_limits(workspace, used, findings, about)
     read = [meta for trial in used if "source_sha256" in (meta := about[trial.id])]
     if read:
         return tuple(replace(one, log=_whole(one, read[-1])) for one in findings)
@@ -52,6 +56,29 @@ def where_to_mend(
         else one
         for one in findings
     )
+
+
+def _at_limits(
+    workspace: Folder,
+    used: Sequence[Trial],
+    findings: Sequence[Finding],
+    about: Mapping[str, Mapping[str, str]],
+) -> Sequence[Finding]:
+    """Findings in which no log is at the limits that were read off it, as it must be."""
+    from grounded.instruments.limits import judge_limits
+
+    log = seen_in(workspace.config)
+    others = [trial for trial in used if not log or about[trial.id].get("source") != log]
+    if len(others) == len(used):
+        return findings
+    inputs = [trial.inputs[: trial.known_steps] for trial in others]
+    left = judge_limits(workspace.task, np.concatenate(inputs)) if inputs else ()
+    real = {one.signal: one for one in left if one.kind == "saturated"}
+    return [
+        real.get(one.signal, one) if one.kind == "saturated" else one
+        for one in findings
+        if one.kind != "saturated" or one.signal in real
+    ]
 
 
 def _whole(finding: Finding, meta: Mapping[str, str]) -> str:
