@@ -91,7 +91,8 @@ def _limits(config: Config, inputs: list[str]) -> tuple[Array, Array]:
 
 def seen_in(config: Config) -> str:
     """The log whose commands the limits were read off, by its file's name; "" for limits proper."""
-    return config.limits.take("seen_in", str, "")
+    log: str = config.limits.take("seen_in", str, "")
+    return log
 
 
 def _reward(config: Config, states: list[str], inputs: list[str]) -> Reward:

@@ -41,7 +41,7 @@ def where_to_mend(
 ) -> tuple[Finding, ...]:
     """Findings with the whole key of [log], or with advice where it read none of the trials."""
     about = {one.stored.id: one.meta for one in workspace.trials()}
-    findings = _at_limits(workspace, used, findings, about)
+    findings = _at_limits(workspace, used, findings)
     read = [meta for trial in used if "source_sha256" in (meta := about[trial.id])]
     if read:
         return tuple(replace(one, log=_whole(one, read[-1])) for one in findings)
@@ -59,19 +59,17 @@ def where_to_mend(
 
 
 def _at_limits(
-    workspace: Folder,
-    used: Sequence[Trial],
-    findings: Sequence[Finding],
-    about: Mapping[str, Mapping[str, str]],
+    workspace: Folder, used: Sequence[Trial], findings: Sequence[Finding]
 ) -> Sequence[Finding]:
-    """Findings in which no log is at the limits that were read off it, as it must be."""
+    """Findings in which only plans are at limits that were read off a log: no plan kept it to them.
+
+    The log itself is at them by its making, and so is what the same hand drove on the same stick.
+    """
     from grounded.instruments.limits import judge_limits
 
-    log = seen_in(workspace.config)
-    others = [trial for trial in used if not log or about[trial.id].get("source") != log]
-    if len(others) == len(used):
+    if not seen_in(workspace.config):
         return findings
-    inputs = [trial.inputs[: trial.known_steps] for trial in others]
+    inputs = [trial.inputs[: trial.known_steps] for trial in used if trial.candidate]
     left = judge_limits(workspace.task, np.concatenate(inputs)) if inputs else ()
     real = {one.signal: one for one in left if one.kind == "saturated"}
     return [
