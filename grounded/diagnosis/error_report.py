@@ -220,6 +220,11 @@ class Remainder(Document):
     error_unit: str = ""
     floor_at_most: bool = False
 
+    @property
+    def above(self) -> bool:
+        """Whether it is more than noise may be: a mere bound tells nothing below it."""
+        return not (self.floor > 0 and self.error <= ABOVE * self.floor)
+
     def sentence(self) -> str:
         """One clause."""
         where = "" if self.region is None else f", mostly where {self.region.when}"

@@ -41,7 +41,8 @@ class Verdict(Document):
 
     `sentences` is a line each and `sentence` their join; the first tells `causes`, a clause each
     in the order of `Diagnosis.credit`. `parameters` are the model's own that it calls off, beside
-    effects or alone.
+    effects or alone. `look_for` is how many effects to look for before any is adopted, where as
+    many as were looked for leave more than noise; 0 where none need be.
     """
 
     kind: str  # one of `Kind`
@@ -50,6 +51,7 @@ class Verdict(Document):
     causes: tuple[str, ...] = ()
     sentences: tuple[str, ...] = ()
     parameters: tuple[str, ...] = ()
+    look_for: int = 0
 
     @property
     def lines(self) -> tuple[str, ...]:

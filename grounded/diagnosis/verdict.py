@@ -24,6 +24,8 @@ if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
     from grounded.model import Model
 
 LOG, LOST = "is a log that no candidate made", "was lost"  # why a trial can't be run again
+MOST_EFFECTS, FURTHER = 6, 2  # that may be blamed at once; so many more are looked for next
+AS_STRONG = 0.2  # of what is modelled: a turned input that is so near to it has the wrong sign
 NAMED = 3  # parameters, channels and leftovers that a sentence names at most
 
 
@@ -75,8 +77,12 @@ def verdict(
     words = [sentence(map(str.__add__, causes, shares)), improvement(rows), worsened(rows)]
     words.append(runaway(rows))
     words += [f"{told_apart(group, same)}." for group in groups[:1]]
+    more = 0
     if remainder and len(claims.names) == most:
         words.append(f"More is left: {left}; beyond {most} effects nothing was looked for.")
+        more = min(most + FURTHER, MOST_EFFECTS) * any(one.above for one in remainder)
+        if more > most:
+            words.append(f"Before you adopt, run `grounded diagnose --max-effects {more}`.")
     elif remainder:
         words.append(f"Something is left that no known effect explains: {left}.")
     elif above := rest(rows):
@@ -84,7 +90,8 @@ def verdict(
     words += once
     kind: Kind = "effect" if len(claimed) == 1 else "several"
     effects, off = tuple(r.effect for r in claimed), tuple(_off(claims))
-    return replace(_said(kind, *words), effects=effects, causes=causes, parameters=off)
+    said = replace(_said(kind, *words), effects=effects, causes=causes, parameters=off)
+    return replace(said, look_for=more if more > most else 0)
 
 
 def _said(kind: Kind, *words: str) -> Verdict:
@@ -252,6 +259,7 @@ def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
     words: dict[str, str] = {name: quantity(e) for name, e in params.items()}
     words.setdefault("s", "s" if len(targets) == 1 else "")
     driven, _, source = effect.site.target.partition("<-")
+    words["log"] = "[log]"
     words["target"] = " and ".join(called(model, n) for n in targets)
     if isinstance(effect.family, ParamFamily):
         words["target"] = effect.site.target
@@ -285,9 +293,21 @@ def meaning(effect: Effect, params: Mapping[str, Estimate]) -> str:
             words[name] = words[name].removeprefix("-")
         return negative if less else positive
 
-    text = re.sub(r"\[([^]]*)\]", kept, effect.family.sentence)
+    text = re.sub(r"\[([^]]*)\]", kept, _turned(effect, params) or effect.family.sentence)
     text = re.sub(r"\{(\w+)>([^{}|]+)\|([^{}|]+)\}", signed, text)
     return re.sub(r"\{(\w+)(%)?(?:([^{}|]+)\|([^{}|]+))?\}", filled, text)
+
+
+def _turned(effect: Effect, params: Mapping[str, Estimate]) -> str:
+    """The sentence of a gain whose sign is the other one; "" where it isn't."""
+    from grounded.effects import InputFamily
+
+    text, size = effect.family.turned, -1 - params["g"].value if "g" in params else 0.0
+    if not text or size <= 0:
+        return ""
+    if abs(size - 1) < AS_STRONG:
+        return text + ": check the sign ({log} scale = -1)" * isinstance(effect.family, InputFamily)
+    return f"{text} (by {number(100 * size)} % of what is modelled)"
 
 
 def sentence(clauses: Iterable[str]) -> str:

@@ -84,8 +84,9 @@ input_gain = InputFamily(
     name="input_gain",
     equation="u_eff = (1 + g) u",
     sentence="{target} act{s} {g%stronger|weaker} than modelled",
+    turned="{target} act{s} the other way round",
     targets=_one_or_alike,
-    quantities=lambda site: (Quantity("g", "1", low=-1.5, high=5.0, absurd=4.0),),
+    quantities=lambda site: (Quantity("g", "1", low=-3.0, high=5.0, absurd=4.0),),
     lookalikes=("viscous_friction", "rate_gain", "parameter", "input_fade"),
     effect=lambda u, t, c: (1 + c["g"]) * u,
 )

@@ -171,6 +171,7 @@ class Family:
         quantities: the numbers to estimate at a site.
         lookalikes: families that the same data may explain.
         vague: nats that a family pays for naming no mechanism, so that a tie goes to one that does.
+        turned: of a gain, the sentence where 1 + g is below zero.
     """
 
     name: str
@@ -180,6 +181,7 @@ class Family:
     quantities: Callable[[Site], tuple[Quantity, ...]]
     lookalikes: tuple[str, ...] = ()
     vague: float = 0.0
+    turned: str = ""
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from grounded.diagnosis.hypotheses.leftover import whiteness
 from grounded.diagnosis.likelihood.data import prepare, shifted
 from grounded.diagnosis.report import Estimate, Ranked
 from grounded.diagnosis.ruler_words import rest
-from grounded.diagnosis.validation.claims import Blame, loss
+from grounded.diagnosis.validation.claims import Blame, has_size, loss
 from grounded.diagnosis.validation.prediction_error import _stump
 from grounded.diagnosis.verdict import meaning, sentence, verdict
 from grounded.effects import Library
@@ -232,6 +232,13 @@ def test_sentences_are_english():
     assert said("offset:v", c=0.1) == "The speed v drifts by 0.1 m/s^2."
     assert said("offset:w", c=0.1) == "The state w drifts by 0.1 1/s."
     assert said("input_gain:throttle", g=-0.2) == "The throttle acts 20 % weaker than modelled."
+    assert said("input_gain:throttle", g=-1.5) == (
+        "The throttle acts the other way round (by 50 % of what is modelled)."
+    )
+    assert said("input_gain:throttle", g=-2.1) == (
+        "The throttle acts the other way round: check the sign ([log] scale = -1)."
+    )
+    assert said("rate_gain:v", g=-2.0) == "The speed v changes the other way round."
     assert said("input_fade:throttle", k=-0.05) == "The throttle gets 5 % stronger every second."
     assert said("input_fade:throttle", k=0.05) == (
         "The throttle gets 5 % weaker every second (a battery that sags)."
@@ -278,6 +285,28 @@ def test_the_cause_that_makes_most_is_named_first(effect_first):
     assert "omega by 0.10 rad/s instead of 0.50 rad/s (noise: 0.090 rad/s)" in found.sentence
 
 
+@pytest.mark.parametrize(
+    ("name", "known", "listed"),
+    [
+        ("patch:v", {"c": (5e5, 4.5e8), "x0": (15.4, 143), "radius": (2.31, 1.8)}, False),
+        ("patch:v", {"c": (0.4, 0.5), "x0": (0.01, 143), "radius": (2.31, 1.8)}, True),
+        ("saturation:u", {"c": (0.0, 0.026)}, False),
+        ("saturation:u", {"c": (0.3, 0.026)}, True),
+        ("periodic:v", {"A": (1e-4, 0.1), "B": (0.3, 0.1), "omega": (2.0, 0.1)}, True),
+        ("offset:v", {"c": (-0.1, float("inf"))}, False),
+    ],
+)
+def test_an_explanation_without_a_size_is_not_listed(name, known, listed):
+    model = Model(
+        states={"x": "m", "v": "m/s"},
+        inputs={"u": "m/s^2"},
+        roles={"position": ("x",)},
+        derivative=lambda s, a, p: {"x": s.v, "v": a.u},
+    )
+    effect = Library().effect(name, model)
+    assert has_size(effect, {n: Estimate(*one) for n, one in known.items()}) is listed
+
+
 def test_leftovers_that_are_not_named_are_counted():
     claims = SimpleNamespace(known=SimpleNamespace(no_cause=False), blamed=(), names=())
     off = tuple(Remainder(name, 0.1, "m/s", 9.0, None) for name in "abcd")
@@ -286,6 +315,32 @@ def test_leftovers_that_are_not_named_are_counted():
     assert said[3].endswith("a is off by 0.1 m/s rms; 2 more.")
     assert verdict(claims, (), (), off[:1], (), ()).kind == "unknown"
     assert verdict(claims, (), (), (), (errors(0.1),), ()).kind == "none"
+
+
+@pytest.mark.parametrize(
+    ("most", "error", "more"),
+    [(3, 0.056, 5), (5, 0.056, 6), (6, 0.056, 0), (2, 0.056, 0), (3, 0.033, 0)],
+)
+def test_where_as_many_as_were_looked_for_leave_more_than_noise_more_are_looked_for(
+    most, error, more
+):
+    """Of `most` or 3 effects; 0.033 m/s is within what noise alone may leave."""
+    claimed = [f"viscous_friction:{k}" for k in range(max(most, 3))]
+    rows = tuple(Ranked(name, {}, {}, 50.0, claimed=True) for name in claimed)
+    claims = SimpleNamespace(
+        known=SimpleNamespace(no_cause=False),
+        blamed=(),
+        moved=(),
+        names=claimed,
+        data=SimpleNamespace(model=pendulum),
+        best=SimpleNamespace(hypothesis=SimpleNamespace(effects=())),
+        parameters=dict,
+    )
+    credit = (Credit("calibration", 1.0),)
+    left = (Remainder("u", 0.1, "m/s^2", 9.0, None, error, 0.032, 1.0, "m/s", True),)
+    found = verdict(claims, rows, (), left, (), credit, most=most)
+    assert found.look_for == more
+    assert (f"--max-effects {more}`" in found.sentence) is bool(more)
 
 
 def test_a_rest_above_the_noise_that_is_no_leftover_is_said_with_its_reason():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from grounded import Model, Param, Trial
-from grounded.diagnosis.diagnose import diagnose
+from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.hypotheses.lookalike import lookalikes
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.hypotheses.stand_in import moving, swap, twins
@@ -31,9 +31,9 @@ def turner(tau=0.10, gain=1.0, **known):
     )
 
 
-def trials(count=4, steps=150):
+def trials(count=4, steps=150, gain=0.88):
     """Runs from rest of one that turns 12 % less, and takes 20 % longer."""
-    real, rng, found = turner(0.12, 0.88), np.random.default_rng(2), []
+    real, rng, found = turner(0.12, gain), np.random.default_rng(2), []
     for _ in range(count):
         c = np.repeat(rng.uniform(-1.2, 1.2, steps // 10), 10)
         states = [np.zeros(2)]
@@ -117,3 +117,11 @@ def test_what_is_one_thing_beside_a_parameter_is_named_together():
     rows = {row.effect: row for row in found.ranking}
     assert pair <= set(rows) and sum(rows[name].claimed for name in pair) == 1
     assert not any({one.effect, one.like} == pair for one in found.lookalikes)
+
+
+def test_an_input_that_acts_the_other_way_round_is_found_at_its_size():
+    """A gain ended at its bound, g = -1.5, and was said to be 150 % weaker."""
+    library = Library(tuple(map(Library().family, ("input_gain", "offset"))))
+    found = diagnose(turner(0.12), trials(2, gain=-1.0), DiagnosisOptions(library=library))
+    assert found.effects == ("input_gain:c",)
+    assert found.ranking[0].params["g"].value == pytest.approx(-2.0, abs=0.02)

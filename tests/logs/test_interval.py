@@ -77,6 +77,7 @@ def test_a_table_of_rows_more_frequent_than_commands_has_the_commands_interval(t
     (tmp_path / "m.py").write_text(MODEL)
     found = begin(tmp_path / "w", table(tmp_path / "r.csv", every), model=tmp_path / "m.py")
     assert found.dt == dt
+    assert 'seen_in = "r.csv"' in (tmp_path / "w/grounded.toml").read_text()
     assert any("0.05 s" in note for note in found.notes) == (every == 5)
     given = begin(tmp_path / "g", tmp_path / "r.csv", model=tmp_path / "m.py", dt=0.02)
     assert given.dt == 0.02 and not any("--dt" in note for note in given.notes)

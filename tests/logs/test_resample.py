@@ -244,3 +244,11 @@ def test_any_jitter_any_loss_any_order_stays_near_the_truth(seed: int) -> None:
         return
     times = 0.05 * np.arange(len(found.states))
     np.testing.assert_allclose(found.states[:, 0], np.sin(times), atol=5e-3)
+
+
+@pytest.mark.parametrize("topic, late", [("/x", 0.02), ("/u", 0.0)])
+def test_only_rows_of_states_show_a_command_late(topic: str, late: float) -> None:
+    """`its rows come every 0.1 s` was said of messages that are stamped when they are sent."""
+    t = np.arange(0, 2, 0.02)
+    sent = series(t, np.floor(t / 0.1 + 1e-6), SignalSpec(f"{topic}.force", "log"))
+    assert grid(pose(np.sin), sent).row_s == pytest.approx(late)

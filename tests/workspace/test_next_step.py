@@ -25,7 +25,7 @@ from grounded_trials.store.documents import write_document
 from grounded_trials.wording import folded
 from grounded_trials.workspace.adopting import diagnosed_again
 from grounded_trials.workspace.config import set_in_model
-from grounded_trials.workspace.diagnosing import _in_vain, _one_more
+from grounded_trials.workspace.diagnosing import _in_vain
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.next_step import DIAGNOSE, after_diagnosis, since_diagnosis
 from grounded_trials.workspace.proposing import standing_in
@@ -481,19 +481,13 @@ def test_an_adoption_in_vain_is_told_how_to_be_undone(tmp_path, monkeypatch):
     assert "adopt --undo" in said("unknown", False, False, outset={"x": 0.1, "v": 0.1})
 
 
-def test_as_many_effects_as_were_asked_for_are_said_to_be_no_end():
-    """Three are blamed at most unless more are asked for; six are the most that can be."""
-    left = [{"channel": "x", "size": 0.1, "unit": "m", "share": 0.3}]
-    names = [f"{kind}:v" for kind in ("coulomb_friction", "stiction", "quadratic_drag")]
-
-    def said(effects, most, leftover=left):
-        verdict = DIAGNOSIS["verdict"] | {"effects": effects}
-        found = Diagnosis.from_json(DIAGNOSIS | {"verdict": verdict, "leftover": leftover})
-        return _one_more(found, most)
-
-    assert "diagnose --max-effects 4`" in said(names, 3)
-    assert "diagnose --max-effects 6`" in said([*names, "a:v", "b:v"], 5)
-    assert said(names[:2], 3) == said(names, 3, []) == said([*names, *"abc"], 6) == ""
+def test_more_effects_are_looked_for_before_those_at_the_limit_are_adopted(cart, tmp_path):
+    """It said `beyond 3 effects nothing was looked for`, and `next: adopt`."""
+    folder = copied(cart, tmp_path / "w")
+    names = two_claimed(folder)
+    verdict = {"kind": "several", "effects": names, "sentence": "Two.", "look_for": 5}
+    diagnosed(folder, verdict=verdict)
+    assert last(grounded("-C", folder, "status")) == "grounded diagnose --max-effects 5"
     six, seven = (grounded("diagnose", "--max-effects", str(k)).err for k in (6, 7))
     assert "max-effects" in seven and "max-effects" not in six
 

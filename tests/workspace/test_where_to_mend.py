@@ -35,8 +35,8 @@ def late(T: int = 400) -> Trial:
     return Trial(states, force[:-1, None], 0.05, ("x", "v"), ("force",))
 
 
-def found_in(w: Folder):
-    (one,) = (f for f in instruments_in(Folder(w.folder)) if f.kind == "delay")
+def found_in(w: Folder, kind: str = "delay"):
+    (one,) = (f for f in instruments_in(Folder(w.folder)) if f.kind == kind)
     return one
 
 
@@ -63,6 +63,37 @@ def test_a_late_sensor_of_a_foreign_log_is_mended_in_its_table(tmp_path):
     ingest_log(w, tmp_path / "log.csv", data=True)
     one = found_in(w)
     assert one.log.startswith("delay_s = 0.1") and not one.advice
+
+
+def keys_of(log: str) -> dict[str, float]:
+    return {key: float(value) for key, value in (part.split(" = ") for part in log.split(", "))}
+
+
+@pytest.mark.parametrize(
+    ("kind", "has", "logged", "mended"),
+    [
+        ("sign", "scale = -1.0", 1.0, {"scale": 1.0}),
+        ("sign", "scale = 0.5, offset = 0.25", lambda v: (-v - 0.25) / 0.5, None),
+        ("degrees", "scale = -1.0", -180 / np.pi, {"scale": -np.pi / 180}),
+        ("delay", "delay_s = 0.03", 1.0, {"delay_s": 0.1}),
+    ],
+)
+def test_what_log_has_already_is_counted(tmp_path, kind, has, logged, mended):
+    """`scale = -1` was said of a signal with `scale = -1`, which changed nothing."""
+    w, trial = make(tmp_path / "w"), late()
+    table = LOG.replace('v = { path = "/csv.v" }', f'v = {{ path = "/csv.v", {has} }}')
+    toml = w.folder / "grounded.toml"
+    toml.write_text(toml.read_text() + table)
+    t, x, v = 0.05 * np.arange(trial.steps), *trial.states[:-1].T
+    v = logged(v) if callable(logged) else logged * v
+    rows = np.column_stack([t, x, v, trial.inputs])
+    np.savetxt(tmp_path / "log.csv", rows, "%.9f", ",", header="t,x,v,force", comments="")
+    ingest_log(w, tmp_path / "log.csv", data=True)
+    keys = keys_of(found_in(w, kind).log)
+    assert keys == pytest.approx(mended or {"scale": -0.5, "offset": -0.25}, rel=0.05)
+    said = ", ".join(f"{key} = {value}" for key, value in keys.items())
+    toml.write_text(toml.read_text().replace(has, said))  # read as it was: the same is said
+    assert keys_of(found_in(w, kind).log) == keys
 
 
 @pytest.mark.parametrize("entry", ["[log.state.v]\ndelay_s = 0.02", "[log.input.force]\nscale = 2"])

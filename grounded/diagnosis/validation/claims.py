@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,7 @@ from grounded.diagnosis.validation.held_out import gaps_of, held_out_errors
 from grounded.diagnosis.validation.limits import Limits
 from grounded.diagnosis.validation.prediction_error import normalised
 from grounded.diagnosis.validation.ruler import Ruler, folds
+from grounded.effects import Effect
 from grounded.frozen import Array
 
 ENOUGH = 3.0  # nats that the parameters that are not named may still hold
@@ -105,8 +107,15 @@ def unmoved(data: Data, fit: Fitted, column: int, shift: float) -> Fitted:
 
 
 UNTOLD = 1e6  # times a value: a standard deviation that says nothing was learnt of it
+LEAST_TOLD = 0.1  # standard deviations: a smaller strength is not listed, no number is known of it
 RANKED = 12  # explanations that are listed
 SAME = 0.95  # share of a parameter's signal from which an effect is the same thing
+
+
+def has_size(effect: Effect, known: Mapping[str, Estimate]) -> bool:
+    """Whether estimates say how strong an effect is: its coefficients, or else its thresholds."""
+    strengths = [q.name for q in effect.free if not q.grid] or list(known)
+    return not all(abs(known[n].value) < LEAST_TOLD * known[n].std for n in strengths)
 
 
 class Claims:
@@ -151,8 +160,10 @@ class Claims:
                 gap = gaps_of(self.predictor, [fit], where)[0]
                 rows.append(self._row(fit, name, evidence, gap, before, claimed=False))
                 listed.append(name)
-        singles = [f for f in self.whole.of_size(1) if f.hypothesis.names[0] not in listed]
-        singles = singles[: max(RANKED - len(rows), 3)]
+        others = (f for f in self.whole.of_size(1) if f.hypothesis.names[0] not in listed)
+        likely = (f for f in others if math.isfinite(self.whole.score(f)))  # an absurd one is not
+        sized = (f for f in likely if has_size(f.hypothesis.effects[0], self.estimates(f)[0]))
+        singles = list(islice(sized, max(RANKED - len(rows), 3)))
         gaps = gaps_of(self.predictor, singles, where)
         base = self.base if self.whole is self.search else self.whole.score(self.whole.best_null())
         for fit, gap in zip(singles, gaps, strict=True):

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from grounded_trials.formats.message_path import parse_path
 from grounded_trials.formats.messages import Floats, Ints
 from grounded_trials.logs.samples import Samples
 
@@ -47,6 +48,16 @@ def held_rows(t: Ints, values: Floats) -> float:
     if len(t) <= 2 * FEW or np.mean(np.diff(values[order]) == 0) < HELD:
         return 0.0
     return float(np.median(np.diff(t[order]))) * 1e-9
+
+
+def rows_apart(inputs: Sequence[Samples], states: Sequence[Samples]) -> float:
+    """The time between rows that say what is measured and, each anew, what is commanded [s].
+
+    0 where commands have messages of their own: their stamps say when they were sent.
+    """
+    measured = {parse_path(s.spec.path).topic for s in states}
+    shared = [s for s in inputs if parse_path(s.spec.path).topic in measured]
+    return max((held_rows(s.t, s.y) for s in shared), default=0.0)
 
 
 def first_step(inputs: Sequence[Samples], start: int, dt: float, rest: Floats) -> tuple[int, str]:

@@ -24,8 +24,8 @@ SIMULATED_S = 1.0  # header stamps this far from the log's clock are not its tim
 
 _YAW = ("@rpy.yaw", "yaw", "heading", "theta", "psi")
 _MEANINGS: dict[str, tuple[str, ...]] = {
-    "x": ("position.x", "translation.x", "x"),
-    "y": ("position.y", "translation.y", "y"),
+    "x": ("position.x", "translation.x", "x", "north", "northing", "east", "easting"),
+    "y": ("position.y", "translation.y", "y", "east", "easting", "north", "northing"),
     "z": ("position.z", "translation.z", "z", "altitude", "height"),
     "psi": _YAW,
     "yaw": _YAW,
@@ -36,8 +36,8 @@ _MEANINGS: dict[str, tuple[str, ...]] = {
     "roll": ("@rpy.roll", "roll", "phi"),
     "v": ("linear.x", "speed", "velocity", "vel", "v"),
     "speed": ("speed", "linear.x", "velocity", "vel", "v"),
-    "u": ("linear.x", "u"),
-    "w": ("linear.z", "w"),
+    "u": ("linear.x", "u", "surge"),
+    "w": ("linear.z", "w", "heave"),
     "p": ("angular.x", "angular_velocity.x", "p"),
     "q": ("angular.y", "angular_velocity.y", "q"),
     "r": ("angular.z", "angular_velocity.z", "yaw_rate", "r"),
@@ -50,6 +50,9 @@ _MEANINGS: dict[str, tuple[str, ...]] = {
     "brake": ("brake",),
     "torque": ("torque", "effort", "tau"),
 }
+_BESIDE_U = ("linear.y", "v", "sway")  # what v is where u is a state, too: not the speed
+_COMPASS = (("north", "northing"), ("east", "easting"))  # a plane's axes, whichever x is
+_RATES = {"rate", "rates", "dot", "vel", "velocity"}  # words that make another thing of an angle's
 _COMMANDED = ("ref", "desired", "des", "target", "setpoint", "goal", "cmd", "command")
 _COMMAND_TOPIC = re.compile("control|cmd|command|setpoint|ref|target")
 _ANGLES = ("roll", "pitch", "yaw")
@@ -87,13 +90,15 @@ def guess_mapping(
     log: LogReport, states: Sequence[str], inputs: Sequence[str]
 ) -> tuple[tuple[Guess, ...], tuple[Guess, ...]]:
     """Guesses for the states and for the inputs, in their order."""
-    scored = {name: _candidates(log, name, is_input=False) for name in states}
+    meant = {name: _meanings(log, name, states) for name in states}
+    scored = {name: _candidates(log, name, meant[name], is_input=False) for name in states}
     homes = _homes(scored)
     found = tuple(_choose(log, name, scored[name], homes) for name in states)
     taken = {guess.path for guess in found}
     rest = []
     for name in inputs:
-        candidates = [c for c in _candidates(log, name, is_input=True) if c.field.path not in taken]
+        found_for = _candidates(log, name, _MEANINGS.get(name, (name,)), is_input=True)
+        candidates = [c for c in found_for if c.field.path not in taken]
         guess = _choose(log, name, candidates, {})
         rest.append(guess if guess.path or guess.others else _commands_of(log, guess, taken))
     return found, tuple(rest)
@@ -112,21 +117,35 @@ def _part(path: str) -> bool:
     return path.endswith(_QUATERNION)
 
 
-def _candidates(log: LogReport, name: str, *, is_input: bool) -> list[_Candidate]:
-    found = []
+def _meanings(log: LogReport, name: str, states: Sequence[str]) -> tuple[str, ...]:
+    """What a state may be called: north and east are places only where the log has both."""
+    if name == "v" and "u" in states:
+        return _BESIDE_U
+    said = {without_unit(f.path).lower().rpartition(".")[2] for t in log.topics for f in t.fields}
+    plane = all(said.intersection(axis) for axis in _COMPASS)
+    left = () if plane else {one for axis in _COMPASS for one in axis}
+    return tuple(one for one in _MEANINGS.get(name, (name,)) if one not in left)
+
+
+def _candidates(
+    log: LogReport, name: str, meanings: Sequence[str], *, is_input: bool
+) -> list[_Candidate]:
+    found, called = [], (name.lower(), *meanings)
     for topic in log.topics:
         for field in topic.fields:
-            score = _score(name, topic, field, is_input=is_input)
+            score = _score(called, topic, field, is_input=is_input)
             if score > 0:
                 found.append(_Candidate(score, topic, field))
     return sorted(found, key=lambda c: -c.score)
 
 
-def _score(name: str, topic: TopicReport, field: FieldReport, *, is_input: bool) -> float:
+def _score(
+    called: Sequence[str], topic: TopicReport, field: FieldReport, *, is_input: bool
+) -> float:
     path = field.path.lower()
     inside = field.path[len(topic.topic) :].lower().strip('".')
     bare = without_unit(field.path)[len(topic.topic) :].lower().strip('".')
-    best = max(_fit(name.lower(), one, topic.topic.lower()) for one in {inside, bare})
+    best = max(_fit(called, one, topic.topic.lower()) for one in {inside, bare})
     if best <= 0:
         return 0.0
     words = set(_WORD.findall(path))
@@ -142,19 +161,20 @@ def _score(name: str, topic: TopicReport, field: FieldReport, *, is_input: bool)
     return best
 
 
-def _fit(name: str, inside: str, topic: str) -> float:
+def _fit(called: Sequence[str], inside: str, topic: str) -> float:
     """How well a name fits: by the end of the path, or by the topic where the path says nothing."""
     best = 0.0
-    meanings = _MEANINGS.get(name, (name,))
-    for rank, meaning in enumerate((name, *meanings)):
+    for rank, meaning in enumerate(called):
         worth = 4.0 - 0.3 * max(rank - 1, 0)
         if inside == meaning or inside.endswith("." + meaning):
             best = max(best, worth + (0.5 if "." in meaning else 0.0))
         last = re.sub(r"[_\d]+$", "", topic.rsplit("/", 1)[-1])
         if inside in ("data", "value") and last == meaning:
             best = max(best, worth)
-        elif len(meaning) > 1 and meaning in _WORD.findall(_named(inside, last)):
-            best = max(best, worth - 1.0)
+        elif len(meaning) > 1:
+            words = set(_WORD.findall(_named(inside, last)))
+            rate = words & _RATES - set(_WORD.findall(meaning))  # `yaw_rate` is no yaw
+            best = max(best, worth - 1.0) if meaning in words and not rate else best
     return best
 
 

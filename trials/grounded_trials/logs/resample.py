@@ -20,7 +20,7 @@ import numpy as np
 
 from grounded.errors import GroundedError
 from grounded_trials.formats.messages import Floats
-from grounded_trials.logs.command_steps import first_step, held_rows, in_motion
+from grounded_trials.logs.command_steps import first_step, in_motion, rows_apart
 from grounded_trials.logs.samples import (
     Samples,
     SignalReport,
@@ -80,7 +80,7 @@ class Gridded:
     origin_ns: int  # the first sample of any signal, likewise
     late_s: float  # the start was moved by this much, because a state was not known yet
     moved_s: float  # and by this much more, to where the commands change
-    row_s: float  # by how much commands may be logged late: a table repeats them row by row
+    row_s: float  # by how much commands may be logged late: rows repeat them beside the states
     last_ns: int  # the last sample of the state whose samples end first, likewise
     reports: tuple[SignalReport, ...]  # of the states, then of the inputs
     warnings: tuple[str, ...]
@@ -148,7 +148,7 @@ def to_grid(
         origin_ns=origin,
         late_s=late,
         moved_s=moved * 1e-9,
-        row_s=max((held_rows(s.t, s.y) for s in sent), default=0.0),
+        row_s=rows_apart(sent, [samples[name] for name in states]),
         last_ns=min(int(samples[name].t[-1]) for name in states),
         reports=tuple(reports),
         warnings=(*warnings_of(tuple(reports), late), *([uneven] if uneven else [])),

@@ -7,6 +7,7 @@ marked.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -189,7 +190,8 @@ def _begin(
     table = mapping_toml(states, inputs, simulated=is_simulated(report))
 
     def write(columns: Mapping[str, Array], rows: int) -> None:
-        _write(folder, found, (step, whose), columns, rows, ranges, table, why)
+        name = Path(log).name
+        _write(folder, found, (step, whose), columns, rows, ranges, table, why, name)
 
     write({found.state_names[0]: np.zeros(2)}, 1)
     target, horizon, more = _recorded(folder, files, found, states, step, write)
@@ -331,6 +333,7 @@ def _write(
     ranges: Mapping[str, tuple[float, float] | None],
     table: str,
     why: str,
+    log: str,
 ) -> None:
     dt, whose = grid
     write_target(folder / "target.csv", dt, dict(columns))
@@ -361,6 +364,8 @@ def _write(
         "",
         "[limits]                      # SEEN in the log, and 0: put in what your robot may get",
         *limits,
+        *[f"seen_in = {json.dumps(log, ensure_ascii=False)}  # delete this line once you did"]
+        * bool(limits),
         "",
         "[search]",
         "max_trials = 40",

@@ -21,6 +21,7 @@ from grounded.errors import GroundedError, NextCommand, nearest
 from grounded_trials.store.documents import read_document, write_document
 from grounded_trials.wording import rendered
 from grounded_trials.workspace.identity import ROWS
+from grounded_trials.workspace.where_to_mend import where_to_mend
 
 if TYPE_CHECKING:
     from grounded.effects import Library
@@ -35,7 +36,6 @@ if TYPE_CHECKING:
 
 FILE = "diagnosis.json"
 LEAST_STEPS = 2
-MOST_EFFECTS = 6  # that may be blamed at once: `--max-effects`
 PROBE = NextCommand("diagnose", ("--probe",))
 
 
@@ -86,7 +86,7 @@ def diagnose_in(
     found = diagnose(
         planner.plan, lifted, options, compare=second, engine=engine, progress=progress
     )
-    seen = _where_to_mend(workspace, used + others, found.preflight)
+    seen = where_to_mend(workspace, used + others, found.preflight)
     known = _as_known(workspace, found.ranking, made)
     found = replace(found, made=made, preflight=seen, ranking=known)
     _keep(workspace, found)
@@ -102,8 +102,9 @@ def diagnose_in(
         run = f" ({identity}: {rendered(to_run(workspace, identity, identity))})" * bool(identity)
         found = replace(found, next_trial=f"{words}{run}", probe=identity)
         _keep(workspace, found)
-    if more := _one_more(found, max_effects):
-        found = replace(found, next_trial=f"{more} {found.next_trial}".strip())
+    if more := found.verdict.look_for:
+        first = f"Before it, `grounded diagnose --max-effects {more}` looks for more effects."
+        found = replace(found, next_trial=f"{first} {found.next_trial}".strip())
         _keep(workspace, found)
     if undo := _in_vain(workspace, found):
         found = replace(found, next_trial=f"{undo} {found.next_trial}")
@@ -128,13 +129,6 @@ def _as_known(workspace: Folder, ranking: Sequence[Ranked], made: Made) -> tuple
         else one
         for one in ranking
     )
-
-
-def _one_more(found: Diagnosis, most: int) -> str:
-    """How to look for one more effect, where as many as were asked for leave something over."""
-    if not found.leftover or len(found.effects) != most or most >= MOST_EFFECTS:
-        return ""
-    return f"`grounded diagnose --max-effects {most + 1}` looks for one more effect."
 
 
 def _in_vain(workspace: Folder, found: Diagnosis) -> str:
@@ -180,27 +174,7 @@ def instruments_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[Findi
     memory = planner.plan.model.state_names[planner.task.model.n :]
     used = _chosen(workspace, trials)
     found = preflight(planner.plan, [planner.lift(trial) for trial in used], memory).findings
-    return _where_to_mend(workspace, used, found)
-
-
-def _where_to_mend(
-    workspace: Folder, used: Sequence[Trial], findings: Sequence[Finding]
-) -> tuple[Finding, ...]:
-    """Findings with advice instead of a key of [log] where none of the trials was read by it."""
-    sources = {one.stored.id: one.meta for one in workspace.trials()}
-    if any("source_sha256" in sources[trial.id] for trial in used):
-        return tuple(findings)
-    fed = ": the runner's feedback gets it late, too" * workspace.config.task.feedback
-    late = f"should read it with less delay, or filter it less{fed}"
-    mend = {"delay": late, "lag": late, "sign": "should turn its sign"}
-    mend["degrees"] = "should write it in the model's unit"
-    whose = "the program that writes the trials"
-    return tuple(
-        replace(one, log="", advice=f"{whose} {mend[one.kind]}")
-        if one.corrected and one.kind in mend
-        else one
-        for one in findings
-    )
+    return where_to_mend(workspace, used, found)
 
 
 def _keep(workspace: Folder, found: Diagnosis) -> None:

@@ -34,6 +34,7 @@ from grounded_trials.workspace.config import FILE
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import StoredTrial, sha256
 from grounded_trials.workspace.run_start import Recording, recording
+from grounded_trials.workspace.where_to_mend import read_by
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,6 +163,7 @@ def read_foreign(workspace: Folder, path: Path, mapping: LogMapping) -> ForeignL
             "not measured with an [estimate] table (docs/real-logs.md)"
         )
     source = {"source": path.name, "source_sha256": _hashed(files)}
+    source |= read_by(mapping)
     if guessed := [name for name in model.state_names if name not in states]:
         source["estimated"] = ",".join(guessed)
     series = mapped_signals(files, mapping, states, model.input_names)

@@ -28,7 +28,7 @@ from grounded_trials.store.store import DIGITS
 from grounded_trials.store.trial_file import read_trial, trial_bytes
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.foreign import ForeignLog, begun, mapping_of, read_foreign
-from grounded_trials.workspace.identity import ROWS, sha256
+from grounded_trials.workspace.identity import READ_BY, ROWS, sha256
 from grounded_trials.workspace.ingested import Ingested
 from grounded_trials.workspace.next_step import after_log
 from grounded_trials.workspace.off_target import off_target_of
@@ -221,9 +221,8 @@ def _own(workspace: Folder, path: Path, candidate: str | None, data: bool) -> _R
     if data:
         if not trial.candidate:
             return _Read(trial, content)
-        about = {
-            k: v for k, v in meta.items() if k in ("system", "source", "source_sha256", "estimated")
-        }
+        kept = ("system", "source", "source_sha256", "estimated", READ_BY)
+        about = {k: v for k, v in meta.items() if k in kept}
         about |= {"kind": "data", "ran": trial.candidate}
         trial = replace(trial, candidate="")
         return _Read(trial, _encode(workspace, trial, about))

@@ -100,6 +100,8 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
 
     if set(new) <= set(declined(workspace)):
         return None  # adopted, and undone: whoever did that is not asked to do it again
+    if most := diagnosis.verdict.look_for:
+        return NextCommand("diagnose", ("--max-effects", str(most)))
     own = {f"parameter:{name}" for name in workspace.base_model.params}
     if own.issuperset(new):
         return NextCommand("fit")  # the model's form is right: all of its numbers at once

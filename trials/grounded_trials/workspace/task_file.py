@@ -83,9 +83,16 @@ def _build(config: Config, model: Model, folder: Path, read: Reader) -> Task:
 
 
 def _limits(config: Config, inputs: list[str]) -> tuple[Array, Array]:
+    seen_in(config)
     pairs = config.limits.pairs(inputs)
     both = np.array([pairs.get(name, (-np.inf, np.inf)) for name in inputs])
     return both[:, 0], both[:, 1]
+
+
+def seen_in(config: Config) -> str:
+    """The log whose commands the limits were read off, by its file's name; "" for limits proper."""
+    log: str = config.limits.take("seen_in", str, "")
+    return log
 
 
 def _reward(config: Config, states: list[str], inputs: list[str]) -> Reward:

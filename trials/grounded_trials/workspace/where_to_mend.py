@@ -1,0 +1,104 @@
+"""Where a person mends what instruments show: in [log], or in the program that writes the trials.
+
+A finding is about signals as they were read, so what mends it comes on top of how [log] read them:
+scales multiply, delays add. Each trial that was made from a log says how it was.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from grounded_trials.workspace.identity import READ_BY
+from grounded_trials.workspace.task_file import seen_in
+
+if TYPE_CHECKING:
+    from grounded.instruments.finding import Finding
+    from grounded.trial import Trial
+    from grounded_trials.logs.log_table import LogMapping
+    from grounded_trials.workspace.folder import Folder
+
+PLAIN = {"scale": 1.0, "offset": 0.0, "delay_s": 0.0}  # a signal that is read as it was logged
+
+
+def read_by(mapping: LogMapping) -> dict[str, str]:
+    """Metadata of a trial: the keys of [log] that changed its signals; {} where none did."""
+    found = {}
+    for name, spec in {**mapping.states, **mapping.inputs}.items():
+        keys = {key: float(getattr(spec, key)) for key in PLAIN}
+        if changed := {key: value for key, value in keys.items() if value != PLAIN[key]}:
+            found[name] = changed
+    return {READ_BY: json.dumps(found)} if found else {}
+
+
+def where_to_mend(
+    workspace: Folder, used: Sequence[Trial], findings: Sequence[Finding]
+) -> tuple[Finding, ...]:
+    """Findings with the whole key of [log], or with advice where it read none of the trials."""
+    about = {one.stored.id: one.meta for one in workspace.trials()}
+    findings = _at_limits(workspace, used, findings)
+    read = [meta for trial in used if "source_sha256" in (meta := about[trial.id])]
+    if read:
+        return tuple(replace(one, log=_whole(one, read[-1])) for one in findings)
+    fed = ": the runner's feedback gets it late, too" * workspace.config.task.feedback
+    late = f"should read it with less delay, or filter it less{fed}"
+    mend = {"delay": late, "lag": late, "sign": "should turn its sign"}
+    mend["degrees"] = "should write it in the model's unit"
+    whose = "the program that writes the trials"
+    return tuple(
+        replace(one, log="", advice=f"{whose} {mend[one.kind]}")
+        if one.corrected and one.kind in mend
+        else one
+        for one in findings
+    )
+
+
+def _at_limits(
+    workspace: Folder, used: Sequence[Trial], findings: Sequence[Finding]
+) -> Sequence[Finding]:
+    """Findings in which only plans are at limits that were read off a log: no plan kept it to them.
+
+    The log itself is at them by its making, and so is what the same hand drove on the same stick.
+    """
+    from grounded.instruments.limits import judge_limits
+
+    if not seen_in(workspace.config):
+        return findings
+    inputs = [trial.inputs[: trial.known_steps] for trial in used if trial.candidate]
+    left = judge_limits(workspace.task, np.concatenate(inputs)) if inputs else ()
+    real = {one.signal: one for one in left if one.kind == "saturated"}
+    return [
+        real.get(one.signal, one) if one.kind == "saturated" else one
+        for one in findings
+        if one.kind != "saturated" or one.signal in real
+    ]
+
+
+def _whole(finding: Finding, meta: Mapping[str, str]) -> str:
+    """What [log] has to say of a signal, given what it said when a trial was read."""
+    now = _keys(meta, finding.signal)
+    if not finding.log or not now:
+        return finding.log
+    keys = dict(part.split(" = ") for part in finding.log.split(", "))
+    if "scale" in keys:
+        by = float(keys["scale"])
+        keys["scale"] = f"{by * now['scale']:.8g}"
+        keys |= {"offset": f"{by * now['offset']:.8g}"} if now["offset"] else {}
+    if "delay_s" in keys:
+        keys["delay_s"] = f"{float(keys['delay_s']) + now['delay_s']:.3g}"
+    return ", ".join(f"{key} = {value}" for key, value in keys.items())
+
+
+def _keys(meta: Mapping[str, str], signal: str) -> dict[str, float]:
+    """How a signal was read, {} for as it was logged; a trial's file may come from anybody."""
+    try:
+        found = json.loads(meta.get(READ_BY, "{}")).get(signal, {})
+        keys = PLAIN | {key: float(found[key]) for key in PLAIN if key in found}
+    except (ValueError, TypeError, AttributeError, RecursionError):
+        return {}
+    return keys if all(map(math.isfinite, keys.values())) and keys != PLAIN else {}
