@@ -24,7 +24,7 @@ from grounded.model import Model
 from grounded.trial import Trial
 
 BAD, GROSS = 0.5, 0.7  # of what should move, unexplained: looked into, and stated
-MENDED, BETTER = 0.4, 4.0  # what a change may leave of it, and times less than before
+MENDED, BETTER = 0.4, 3.0  # what a change may leave of it, and times less than before
 CLOSE, ROUNDING = 2.0, 0.02  # times what the best change leaves: as good
 TOLD = 0.8  # of the other's error: a model that explains it better
 

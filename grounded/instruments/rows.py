@@ -42,7 +42,7 @@ class Gap:
     """How a row and its own sensor differ.
 
     Args:
-        share: rms of the difference, over how far the states of its unit move, or should.
+        share: rms of the difference, over how far the state moves or should, or those of its unit.
         rate: that difference over the length of a stretch [unit/s].
     """
 
@@ -115,13 +115,13 @@ def gaps(model: Model, trial: Trial, rows: Sequence[Row]) -> dict[Row, Gap]:
 def _over(
     model: Model, rows: Sequence[Row], far: Array, told: Array, noise: Array, length: float
 ) -> list[tuple[Row, Gap]]:
-    """Of each row, over stretches of one length [s]; rows of one unit share their size."""
+    """Of each row, over stretches of one length [s]; one that hardly moves beside others is small."""
     units = list(model.states.values())
-    sizes, off = np.maximum(_size(far), _size(told)), _size(far - told)
+    moved, said, off = _size(far), _size(told), _size(far - told)
     found = []
     for row in rows:
         same = [one.i for one in rows if units[one.i] == units[row.i]]
-        size = float(np.sqrt((sizes[same] ** 2).mean()))
+        size = float(max(moved[row.i], said[row.i], np.sqrt((said[same] ** 2).mean())))
         if size > 0 and noise[row.i] < NOISE * size:
             found.append((row, Gap(float(off[row.i]) / size, float(off[row.i]) / length)))
     return found
