@@ -14,11 +14,12 @@ from itertools import combinations
 import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
+from grounded.frozen import wrapped
 from grounded.instruments.finding import Finding
 from grounded.instruments.kinematics import integrals
 from grounded.instruments.odd_trial import DEGREES, Odd, missed, spread
 from grounded.instruments.other_units import FACTORS, described
-from grounded.instruments.rows import Gap, Row, gaps
+from grounded.instruments.rows import Gap, Row, gaps, per_step
 from grounded.instruments.swapped import exchanged
 from grounded.model import Model
 from grounded.trial import Trial
@@ -26,6 +27,7 @@ from grounded.trial import Trial
 BAD, GROSS = 0.5, 0.7  # of what should move, unexplained: looked into, and stated
 MENDED, BETTER = 0.4, 3.0  # what a change may leave of it, and times less than before
 CLOSE, ROUNDING = 2.0, 0.02  # times what the best change leaves: as good
+FOLDED = 0.5  # [rad] rms off a heading in degrees, modulo a turn; by chance it is 1.8
 TOLD = 0.8  # of the other's error: a model that explains it better
 
 
@@ -178,6 +180,35 @@ def stop_at(model: Model, trials: Sequence[Trial], found: Sequence[Mismatch]) ->
         f"given), and take it in again, without {'this one' if one else 'these'}",
         then=NextCommand("discard", tuple(names)) if trials[0].id else None,
     )
+
+
+def stop_at_folded(model: Model, trials: Sequence[Trial], rows: Sequence[Row]) -> None:
+    """Stops at an angle in degrees whose steps of more than pi degrees are lost.
+
+    Taken for radians as a log was resampled, 350 degrees are 350 - 56 x 2 pi: dividing the trial
+    by 57.3 mends nothing.
+
+    Raises:
+        GroundedError: with the scale to take the log in with.
+    """
+    for row in rows:
+        if not model.angle_mask[row.i]:
+            continue
+        steps = [per_step(model, trial, row) for trial in trials]
+        moved, said = (np.concatenate(z) for z in zip(*steps, strict=True))
+        turned = DEGREES * said
+        if len(moved) < 20 or not (np.abs(turned) > np.pi).mean() > 0.01:
+            continue
+        off = wrapped((moved - turned)[:, None], [True])
+        plain = wrapped((moved - said)[:, None], [True])
+        if np.sqrt((off**2).mean()) < min(FOLDED, np.sqrt((plain**2).mean()) / BETTER):
+            name, ids = model.state_names[row.i], tuple(t.id for t in trials if t.id)
+            raise GroundedError(
+                f"{name} is in degrees, and was folded as an angle in {model.states[name]} when "
+                f"it was taken in: set [log.state.{name}] scale = {1 / DEGREES:.8g} and take the "
+                "logs in again, without these",
+                then=NextCommand("discard", ids) if ids else None,
+            )
 
 
 def _said(model: Model, change: Change) -> str:

@@ -36,7 +36,7 @@ from grounded.instruments.kinematics import (
 )
 from grounded.instruments.lag import Lag, alike, at_samples, lag_between, reach_of
 from grounded.instruments.limits import judge_limits
-from grounded.instruments.mismatch import Mismatch, mismatches, stop_at, unexplained
+from grounded.instruments.mismatch import Mismatch, mismatches, stop_at, stop_at_folded, unexplained
 from grounded.instruments.odd_trial import (
     Odd,
     Ratios,
@@ -47,7 +47,7 @@ from grounded.instruments.odd_trial import (
     ratios_of,
 )
 from grounded.instruments.other_units import judge_units
-from grounded.instruments.rows import Row, kinematic_rows
+from grounded.instruments.rows import Row, kinematic_rows, tied
 from grounded.instruments.single import Signal, judge_signal
 from grounded.instruments.swapped import judge_columns
 from grounded.model import Model
@@ -132,7 +132,7 @@ class _Bench:
         self.model, self.trials = model, trials
         self.shown = [i for i, n in enumerate(model.state_names) if n not in hidden]
         self.in_step, self.refuted = set[str](), set[str]()
-        self.rows = kinematic_rows(model, self.shown)
+        self.rows = tied(kinematic_rows(model, self.shown))
 
     @property
     def dt(self) -> float:
@@ -150,11 +150,11 @@ class _Bench:
 
     def mismatched(self) -> Iterator[Finding]:
         """Of signs and degrees by rows of several sensors; stops at other units and exchanges."""
-        found = mismatches(self.model, self.trials, self.untold(), self.shown)
+        rows = self.untold()
+        stop_at_folded(self.model, self.trials, rows)
+        found = mismatches(self.model, self.trials, rows, self.shown)
         stop_at(self.model, self.trials, found)
         for one in found:
-            if one.others and len(self.rows) == 1:
-                continue
             yield from self.without(one)
 
     def without(self, one: Mismatch) -> Iterator[Finding]:

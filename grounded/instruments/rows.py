@@ -80,6 +80,15 @@ def kinematic_rows(model: Model, shown: Sequence[int]) -> list[Row]:
     return found
 
 
+def tied(rows: Sequence[Row]) -> list[Row]:
+    """Rows of three states and more, and those of two that share one with them.
+
+    What is off of a position and its velocity, and nothing else, two rows of one state can't tell.
+    """
+    several = frozenset[int]().union(*(row.states for row in rows if len(row.by) > 1))
+    return [row for row in rows if row.states & several]
+
+
 def gaps(model: Model, trial: Trial, rows: Sequence[Row]) -> dict[Row, Gap]:
     """Of each row, over the stretches over which it agrees best; nothing where noise hides it.
 
@@ -125,6 +134,18 @@ def _over(
         if size > 0 and noise[row.i] < NOISE * size:
             found.append((row, Gap(float(off[row.i]) / size, float(off[row.i]) / length)))
     return found
+
+
+def per_step(model: Model, trial: Trial, row: Row) -> tuple[Array, Array]:
+    """How far a row's state moves in each step, and how far the others say (steps,)."""
+    some = sorted(row.states)
+    moved, said = [np.empty(0)], [np.empty(0)]
+    for piece in pieces([trial], some) if _known(trial, row) else ():
+        x = np.zeros((len(piece), model.n))
+        x[:, some] = piece
+        moved.append(wrapped(np.diff(x, axis=0), model.angle_mask)[:, row.i])
+        said.append(_told(model, [row], x)[:, row.i] * trial.dt)
+    return np.concatenate(moved), np.concatenate(said)
 
 
 def _told(model: Model, rows: Sequence[Row], x: Array) -> Array:
