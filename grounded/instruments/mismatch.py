@@ -27,7 +27,7 @@ from grounded.trial import Trial
 BAD, GROSS = 0.5, 0.7  # of what should move, unexplained: looked into, and stated
 MENDED, BETTER = 0.4, 3.0  # what a change may leave of it, and times less than before
 CLOSE, ROUNDING = 2.0, 0.02  # times what the best change leaves: as good
-FOLDED = 0.5  # [rad] rms off a heading in degrees, modulo a turn; by chance it is 1.8
+FOLDED = 0.8  # [rad] rms off a heading in degrees, modulo a turn; by chance it is 1.8
 TOLD = 0.8  # of the other's error: a model that explains it better
 
 
@@ -201,7 +201,7 @@ def stop_at_folded(model: Model, trials: Sequence[Trial], rows: Sequence[Row]) -
             continue
         off = wrapped((moved - turned)[:, None], [True])
         plain = wrapped((moved - said)[:, None], [True])
-        if np.sqrt((off**2).mean()) < min(FOLDED, np.sqrt((plain**2).mean()) / BETTER):
+        if np.sqrt((off**2).mean()) < min(FOLDED, np.sqrt((plain**2).mean()) / 2):
             name, ids = model.state_names[row.i], tuple(t.id for t in trials if t.id)
             raise GroundedError(
                 f"{name} is in degrees, and was folded as an angle in {model.states[name]} when "
