@@ -16,7 +16,14 @@ import numpy as np
 from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import wrapped
 from grounded.instruments.finding import Finding
-from grounded.instruments.kinematics import integrals
+from grounded.instruments.kinematics import (
+    AGREE,
+    TURNED_AWAY,
+    Turned,
+    course,
+    integrals,
+    turned,
+)
 from grounded.instruments.odd_trial import DEGREES, Odd, missed, spread
 from grounded.instruments.other_units import FACTORS, described
 from grounded.instruments.rows import Gap, Row, gaps, per_step
@@ -97,6 +104,53 @@ def mismatches(
         found.append(Mismatch(tuple(odd), best[0], tuple(best[1:])))
         some, before = [best[0].mended(trial) for trial in some], choices[best[0]][1]
     return found
+
+
+def explained(
+    model: Model, trials: Sequence[Trial], rows: Sequence[Row], shown: Sequence[int]
+) -> list[Mismatch]:
+    """`mismatches`, but where a heading that is off by a constant explains as much.
+
+    Args:
+        model: however crude.
+        trials: any.
+        rows: kinematic ones, see `rows.kinematic_rows`.
+        shown: states that a sensor has.
+    """
+    found, away = mismatches(model, trials, rows, shown), _away(model, trials, shown)
+    if not found or away is None:
+        return found
+    relation, offset = away
+    plus = np.where(np.arange(model.n) == relation.k, offset, 0.0)
+    turned_back = [replace(trial, states=trial.states + plus) for trial in trials]
+    mended = list(trials)
+    for one in found:
+        for k in one.trials:
+            mended[k] = one.change.mended(mended[k])
+    left, other = (
+        sum(_pooled([gaps(model, trial, rows) for trial in some]).values())
+        for some in (mended, turned_back)
+    )
+    if left < TOLD * other:
+        return found
+    return mismatches(model, trials, _but(rows, relation), shown)
+
+
+def _away(
+    model: Model, trials: Sequence[Trial], shown: Sequence[int]
+) -> tuple[Turned, float] | None:
+    """A constant angle [rad] between a heading and the course that was travelled."""
+    relation = turned(model)
+    if relation is None or not {relation.i, relation.j, relation.k} <= set(shown):
+        return None
+    found = course(model, relation, trials)
+    if found is None or found.agrees <= AGREE or abs(found.offset) <= TURNED_AWAY:
+        return None
+    return relation, found.offset
+
+
+def _but(rows: Sequence[Row], relation: Turned) -> list[Row]:
+    return [row for row in rows if row.i not in (relation.i, relation.j)]
 
 
 def _agrees(
@@ -221,19 +275,23 @@ def _said(model: Model, change: Change) -> str:
 
 
 def unexplained(model: Model, trials: Sequence[Trial], rows: Sequence[Row]) -> Iterator[Finding]:
-    """Of rows that most trials contradict grossly; a position and its one velocity are no matter.
+    """Of rows that most trials contradict grossly; neither q' = w nor a heading that is turned.
 
     Args:
         model: however crude.
         trials: with what could be corrected corrected.
-        rows: those that nothing else has been said of.
+        rows: kinematic ones.
     """
+    away = _away(model, trials, range(model.n)) if rows else None
+    rows = rows if away is None else _but(rows, away[0])
     plain = {one.i for one in integrals(model)}
     every = [gaps(model, trial, rows) for trial in trials]
     for row in rows:
         some = [one[row] for one in every if row in one]
         if row.i in plain or not some or np.median([gap.share for gap in some]) < GROSS:
             continue
+        if np.median([gap.varying for gap in some]) < BAD:
+            continue  # at rest in a current
         name, *by = (model.state_names[i] for i in (row.i, *row.by))
         rate = float(np.median([gap.rate for gap in some]))
         what = " and ".join([", ".join(by[:-1]), by[-1]] if len(by) > 1 else by)

@@ -27,6 +27,7 @@ from grounded.instruments.constant import constant_of
 from grounded.instruments.finding import Finding
 from grounded.instruments.kinematics import (
     AGREE,
+    TURNED_AWAY,
     Integral,
     Turned,
     course,
@@ -36,7 +37,13 @@ from grounded.instruments.kinematics import (
 )
 from grounded.instruments.lag import Lag, alike, at_samples, lag_between, reach_of
 from grounded.instruments.limits import judge_limits
-from grounded.instruments.mismatch import Mismatch, mismatches, stop_at, stop_at_folded, unexplained
+from grounded.instruments.mismatch import (
+    Mismatch,
+    explained,
+    stop_at,
+    stop_at_folded,
+    unexplained,
+)
 from grounded.instruments.odd_trial import (
     Odd,
     Ratios,
@@ -47,7 +54,7 @@ from grounded.instruments.odd_trial import (
     ratios_of,
 )
 from grounded.instruments.other_units import judge_units
-from grounded.instruments.rows import Row, kinematic_rows, tied
+from grounded.instruments.rows import kinematic_rows, tied
 from grounded.instruments.single import Signal, judge_signal
 from grounded.instruments.swapped import judge_columns
 from grounded.model import Model
@@ -61,7 +68,6 @@ ALIKE = 0.9  # coherence from which two sensors are compared at all
 OFF = 0.03  # of a scale, beyond both of its brackets
 DEGREES = 180 / np.pi
 UNIT = 0.1  # relative, from which a scale is taken for one of degrees
-TURNED_AWAY = np.deg2rad(20)  # what no side slip makes
 COPY = 0.99  # coherence of two inputs that are one: two motors of one vehicle have 0.96
 SAME_WAY = 0.95  # of a speed and the way: below it something drifts or slips
 
@@ -118,7 +124,7 @@ def preflight(
             *bench.singles(),
             *bench.pairs(),
             *bench.plane(),
-            *bench.rest(),
+            *unexplained(model, bench.trials, bench.rows),
             *_inputs(subject, bench.trials),
         ]
     in_step, refuted = frozenset(bench.in_step), frozenset(bench.refuted)
@@ -150,10 +156,10 @@ class _Bench:
 
     def mismatched(self) -> Iterator[Finding]:
         """Of signs and degrees by rows of several sensors; stops at other units and exchanges."""
-        rows = self.untold()
-        stop_at_folded(self.model, self.trials, rows)
-        found = mismatches(self.model, self.trials, rows, self.shown)
+        found = explained(self.model, self.trials, self.rows, self.shown)
         stop_at(self.model, self.trials, found)
+        if not found:
+            stop_at_folded(self.model, self.trials, self.rows)
         for one in found:
             yield from self.without(one)
 
@@ -173,19 +179,6 @@ class _Bench:
             else:
                 text = f"has the wrong sign{where}: only so do positions move as the others say"
                 yield _mended(name, text, "sign", "scale = -1" * (not where), scale=-1.0)
-
-    def untold(self) -> list[Row]:
-        """The rows but those that a constant angle off the course explains."""
-        relation = turned(self.model)
-        if relation is None or not {relation.i, relation.j, relation.k} <= set(self.shown):
-            return self.rows
-        found = course(self.model, relation, self.trials)
-        off = found is not None and found.agrees > AGREE and abs(found.offset) > TURNED_AWAY
-        return [row for row in self.rows if not (off and row.i in (relation.i, relation.j))]
-
-    def rest(self) -> Iterator[Finding]:
-        """Of what moves otherwise than other sensors say, for whatever reason."""
-        yield from unexplained(self.model, self.trials, self.untold())
 
     def odd(self, ratios: Sequence[Ratios]) -> Iterator[Finding]:
         """Of trials that are in other units than the rest, as a whole or in one signal."""

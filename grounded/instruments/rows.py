@@ -43,10 +43,12 @@ class Gap:
 
     Args:
         share: rms of the difference, over how far the state moves or should, or those of its unit.
+        varying: the same without a constant difference.
         rate: that difference over the length of a stretch [unit/s].
     """
 
     share: float
+    varying: float
     rate: float
 
 
@@ -103,8 +105,8 @@ def gaps(model: Model, trial: Trial, rows: Sequence[Row]) -> dict[Row, Gap]:
     for piece in pieces([trial], some) if known else ():
         x = np.zeros((len(piece), model.n))
         x[:, some] = piece
-        steps = wrapped(np.diff(x, axis=0), model.angle_mask)
-        moved.append(np.cumsum(steps, axis=0))
+        each = wrapped(np.diff(x, axis=0), model.angle_mask)
+        moved.append(np.cumsum(each, axis=0))
         said.append(np.cumsum(_told(model, known, x), axis=0) * trial.dt)
     found: dict[Row, Gap] = {}
     longest = max((len(x) for x in moved), default=0)
@@ -124,15 +126,19 @@ def gaps(model: Model, trial: Trial, rows: Sequence[Row]) -> dict[Row, Gap]:
 def _over(
     model: Model, rows: Sequence[Row], far: Array, told: Array, noise: Array, length: float
 ) -> list[tuple[Row, Gap]]:
-    """Of each row, over stretches of one length [s]; one that hardly moves beside others is small."""
+    """Of each row, over stretches of one length [s]; beside others it may hardly move."""
     units = list(model.states.values())
     moved, said, off = _size(far), _size(told), _size(far - told)
+    varying = np.std(far - told, axis=0)
     found = []
     for row in rows:
         same = [one.i for one in rows if units[one.i] == units[row.i]]
         size = float(max(moved[row.i], said[row.i], np.sqrt((said[same] ** 2).mean())))
         if size > 0 and noise[row.i] < NOISE * size:
-            found.append((row, Gap(float(off[row.i]) / size, float(off[row.i]) / length)))
+            share, rest, rate = (
+                float(x[row.i]) / by for x, by in ((off, size), (varying, size), (off, length))
+            )
+            found.append((row, Gap(share, rest, rate)))
     return found
 
 

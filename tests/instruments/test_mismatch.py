@@ -130,8 +130,15 @@ def test_the_gap_of_a_row_is_what_its_change_is_off_by():
     assert turned.share > 1.5
 
 
+def adrift(x: Array) -> Array:
+    """At rest in a current."""
+    y = NOISE * np.random.default_rng(0).normal(size=x.shape)
+    y[:, :2] += np.linspace(0, 3.0, len(x))[:, None] * [1.0, -0.6]
+    return y
+
+
 @pytest.mark.parametrize("model", [BOAT, PLAIN])
-@pytest.mark.parametrize("fault", [lambda x: x, late])
+@pytest.mark.parametrize("fault", [lambda x: x, late, adrift])
 def test_a_current_a_bias_noise_and_a_late_sensor_are_no_mismatch(model, fault):
     found = preflight(model, logged(model, fault)).findings
     assert not {one.kind for one in found} & {"mismatch", "degrees", "sign"}
@@ -212,3 +219,13 @@ def test_what_no_single_change_mends_is_stated():
     assert {(one.signal, one.kind) for one in found} == {("x", "mismatch"), ("y", "mismatch")}
     assert not any(one.corrected for one in found)
     assert all("psi, u and v" in one.finding for one in found)
+
+
+@pytest.mark.parametrize("model", [BOAT, PLAIN])
+@pytest.mark.parametrize("angle", [np.pi / 2, np.pi])
+def test_a_heading_off_by_a_constant_is_no_exchange_and_no_sign(model, angle):
+    def off(x: Array) -> Array:
+        return x + angle * np.eye(6)[2]
+
+    (found,) = preflight(model, logged(model, off)).findings
+    assert (found.signal, found.kind, found.corrected) == ("psi", "offset", False)
