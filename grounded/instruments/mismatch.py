@@ -226,7 +226,9 @@ def stop_at(model: Model, trials: Sequence[Trial], found: Sequence[Mismatch]) ->
     where = "every trial" if every else f"trial{'s' * (not one)} {', '.join(names)}"
     clauses = []
     for mismatch in stops:
-        texts = [_said(model, c) for c in (mismatch.change, *mismatch.others)]
+        first, others = mismatch.change, mismatch.others
+        others = tuple(c for c in others if not any(_within(c, o) for o in (first, *others)))
+        texts = [_said(model, c) for c in (first, *others)]
         clauses.append(", or else ".join(texts))
     raise GroundedError(
         f"in {where} positions don't move as velocities and angles say: {'; '.join(clauses)}. "
@@ -234,6 +236,11 @@ def stop_at(model: Model, trials: Sequence[Trial], found: Sequence[Mismatch]) ->
         f"given), and take it in again, without {'this one' if one else 'these'}",
         then=NextCommand("discard", tuple(names)) if trials[0].id else None,
     )
+
+
+def _within(a: Change, b: Change) -> bool:
+    """Whether b is the same of more signals."""
+    return a.factor == b.factor and set(a.states) < set(b.states)
 
 
 def stop_at_folded(model: Model, trials: Sequence[Trial], rows: Sequence[Row]) -> None:

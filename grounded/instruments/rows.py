@@ -2,7 +2,8 @@
 
 A kinematic row is a state whose modelled rate is made of logged velocities, turned by logged angles
 or not at all: x' = u cos psi - v sin psi, psi' = r. Neither an input nor an uncertain parameter
-enters it. What it says of stretches of a log is compared with how far its own sensor moved.
+enters it but as a constant (a current). What it says of stretches of a log is compared with how far
+its own sensor moved.
 """
 
 from __future__ import annotations
@@ -71,8 +72,8 @@ def kinematic_rows(model: Model, shown: Sequence[int]) -> list[Row]:
     fixed = np.abs(f_u).max(axis=(0, 2)) / dt < size
     for values in _shifted(model):
         moved = (model.system.step(x, u, values, dt) - x) / dt
-        fixed &= np.abs(moved - rates).max(axis=0) < size
-    fixed &= ~fast & (np.abs(doubled - 2 * rates).max(axis=0) < size)
+        fixed &= np.ptp(moved - rates, axis=0) < size
+    fixed &= ~fast & (np.ptp(doubled - 2 * rates, axis=0) < size)
     found = []
     for i in shown:
         slope = np.abs(slopes[:, i]).max(axis=0)

@@ -121,6 +121,18 @@ def test_a_state_without_a_sensor_or_an_uncertain_parameter_makes_no_row():
     assert kinematic_rows(geared, [0, 1]) == []
 
 
+def test_a_constant_drift_that_was_adopted_leaves_the_rows():
+    drifting = Model(
+        name="drifting",
+        states=dict(BOAT.states),
+        inputs=dict(BOAT.inputs),
+        params={**SCALE, "a": Param(0.1, "m/s", -1.0, 1.0)},
+        angles=("psi",),
+        derivative=lambda s, a, p: {**(rate := moving(s, a, p)), "x": rate["x"] + p.a},
+    )
+    assert [row.i for row in kinematic_rows(drifting, range(6))] == [0, 1, 2]
+
+
 def test_the_gap_of_a_row_is_what_its_change_is_off_by():
     row = kinematic_rows(BOAT, range(6))[0]
     assert row == Row(0, (2, 3, 4))
