@@ -15,7 +15,7 @@ class Finding(Document):
         signal: a state or an input, or several joined by "+".
         finding: one clause.
         kind: delay, lag, scale, sign, degrees, wrapped, offset, stuck, held, dropout, missing,
-            quantised, saturated, beyond (its limits), constant or copy.
+            quantised, saturated, beyond (its limits), constant, copy or mismatch (with others).
         delay_s: how late the signal is [s].
         std_s: standard deviation of that.
         scale: what the signal shows, over what it should.

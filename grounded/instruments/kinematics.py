@@ -25,6 +25,7 @@ from grounded.trial import Trial, stretches
 SHORT = 1e-6  # [s], a step that shows the rates
 FAST = 0.2  # of the largest speed: below it a course means little
 AGREE = 0.9  # length of the mean of unit vectors that point the same way
+TURNED_AWAY = np.deg2rad(20)  # what no side slip makes
 
 
 @dataclass(frozen=True)

@@ -109,10 +109,10 @@ def _clause(
     first, second = _ranked(model, trials, one, found, shown)
     text = (
         f"{names[one.relation.i]} moves {ratio:.4g} times as fast as {names[one.relation.j]} says: "
-        f"{_said(model, first)}"
+        f"{described(model, first.states[0], first.factor)}"
     )
     if not one.sound:
-        text += f", or else {_said(model, second)}"
+        text += f", or else {described(model, second.states[0], second.factor)}"
         if slow_or_fast(model, ratios[one.trials[0]]) is not None:
             text += ", or the stamps are in milliseconds" if one.factor < 1 else ""
             text += ", or the stamps were taken for milliseconds" if one.factor > 1 else ""
@@ -150,12 +150,12 @@ def _unexplained(model: Model, trial: Trial, j: int, shown: Sequence[int]) -> fl
     return missed(model, trial, [j], shown) / change if change > 0 else np.inf
 
 
-def _said(model: Model, odd: Odd) -> str:
-    """One state as it seems to be logged, and the scale for it."""
-    name = model.state_names[odd.states[0]]
-    large, factor = odd.factor > 1, max(odd.factor, 1 / odd.factor)
+def described(model: Model, i: int, factor: float) -> str:
+    """One state as it seems to be logged, `factor` times too large, and the scale for it."""
+    name = model.state_names[i]
+    size = max(factor, 1 / factor)
     base, _, per = model.states[name].partition("/")
-    prefix = PREFIXES[factor] if large and base in SINGLE else ""
+    prefix = PREFIXES.get(factor, "") if base in SINGLE else ""
     unit = f" (in {prefix}{base}{'/' * bool(per)}{per})" if prefix else ""
-    size = f"{factor:g} times too {'large' if large else 'small'}"
-    return f"{name} looks {size}{unit}, [log.state.{name}] scale = {1 / odd.factor:g}"
+    text = f"{size:g} times too {'large' if factor > 1 else 'small'}{unit}"
+    return f"{name} looks {text}, [log.state.{name}] scale = {1 / factor:g}"

@@ -3,6 +3,7 @@
 odd_trial     a whole trial in other units than the rest
 other_units   a position in mm beside a velocity in m/s
 swapped       two columns of a trial in each other's place
+mismatch      a position that doesn't move as velocities and angles say
 single        each state by itself
 constant      a velocity that is off by a constant, against the way of its position
 kinematics    velocities against the rates of their positions, courses against headings
@@ -26,6 +27,7 @@ from grounded.instruments.constant import constant_of
 from grounded.instruments.finding import Finding
 from grounded.instruments.kinematics import (
     AGREE,
+    TURNED_AWAY,
     Integral,
     Turned,
     course,
@@ -35,6 +37,13 @@ from grounded.instruments.kinematics import (
 )
 from grounded.instruments.lag import Lag, alike, at_samples, lag_between, reach_of
 from grounded.instruments.limits import judge_limits
+from grounded.instruments.mismatch import (
+    Mismatch,
+    explained,
+    stop_at,
+    stop_at_folded,
+    unexplained,
+)
 from grounded.instruments.odd_trial import (
     Odd,
     Ratios,
@@ -45,6 +54,7 @@ from grounded.instruments.odd_trial import (
     ratios_of,
 )
 from grounded.instruments.other_units import judge_units
+from grounded.instruments.rows import kinematic_rows, tied
 from grounded.instruments.single import Signal, judge_signal
 from grounded.instruments.swapped import judge_columns
 from grounded.model import Model
@@ -58,7 +68,6 @@ ALIKE = 0.9  # coherence from which two sensors are compared at all
 OFF = 0.03  # of a scale, beyond both of its brackets
 DEGREES = 180 / np.pi
 UNIT = 0.1  # relative, from which a scale is taken for one of degrees
-TURNED_AWAY = np.deg2rad(20)  # what no side slip makes
 COPY = 0.99  # coherence of two inputs that are one: two motors of one vehicle have 0.96
 SAME_WAY = 0.95  # of a speed and the way: below it something drifts or slips
 
@@ -110,10 +119,12 @@ def preflight(
         judge_units(model, bench.trials, ratios, bench.shown)
         judge_columns(model, bench.trials, bench.shown)
         found = [
-            *bench.odd(ratios),
+            *bench.mismatched(),
+            *bench.odd(ratios_of(model, bench.trials, bench.shown)),
             *bench.singles(),
             *bench.pairs(),
             *bench.plane(),
+            *unexplained(model, bench.trials, bench.rows),
             *_inputs(subject, bench.trials),
         ]
     in_step, refuted = frozenset(bench.in_step), frozenset(bench.refuted)
@@ -127,6 +138,7 @@ class _Bench:
         self.model, self.trials = model, trials
         self.shown = [i for i, n in enumerate(model.state_names) if n not in hidden]
         self.in_step, self.refuted = set[str](), set[str]()
+        self.rows = tied(kinematic_rows(model, self.shown))
 
     @property
     def dt(self) -> float:
@@ -141,6 +153,32 @@ class _Bench:
             states = np.array(trial.states)
             states[:, i] = x
             self.trials[k] = replace(trial, states=states)
+
+    def mismatched(self) -> Iterator[Finding]:
+        """Of signs and degrees by rows of several sensors; stops at other units and exchanges."""
+        found = explained(self.model, self.trials, self.rows, self.shown)
+        stop_at(self.model, self.trials, found)
+        if not found:
+            stop_at_folded(self.model, self.trials, self.rows)
+        for one in found:
+            yield from self.without(one)
+
+    def without(self, one: Mismatch) -> Iterator[Finding]:
+        """With a sign or degrees put right."""
+        for k in one.trials:
+            self.trials[k] = one.change.mended(self.trials[k])
+        ids = [self.trials[k].id or f"number {k + 1}" for k in one.trials]
+        where = f" in trial{'s' * (len(ids) > 1)} {', '.join(ids)}"
+        where *= len(ids) < len(self.trials)
+        for i in one.change.states:
+            name = self.model.state_names[i]
+            if one.change.factor > 0:
+                text = f"is in degrees{where}, not in {self.model.states[name]}"
+                log = f"scale = {1 / DEGREES:.8g}" * (not where)
+                yield _mended(name, text, "degrees", log, scale=DEGREES)
+            else:
+                text = f"has the wrong sign{where}: only so do positions move as the others say"
+                yield _mended(name, text, "sign", "scale = -1" * (not where), scale=-1.0)
 
     def odd(self, ratios: Sequence[Ratios]) -> Iterator[Finding]:
         """Of trials that are in other units than the rest, as a whole or in one signal."""

@@ -1,0 +1,309 @@
+"""Rows that disagree with their own sensors, and the one change of a log that mends them.
+
+In the wrong unit, sign or column a sensor breaks every row that it enters, and the right change
+mends all of them at once; another one mends some and breaks others: heading and positions tell
+degrees in r from radians in psi, by x' = u cos psi - v sin psi beside psi' = r.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from grounded.errors import GroundedError, NextCommand
+from grounded.frozen import wrapped
+from grounded.instruments.finding import Finding
+from grounded.instruments.kinematics import (
+    AGREE,
+    TURNED_AWAY,
+    Turned,
+    course,
+    integrals,
+    turned,
+)
+from grounded.instruments.odd_trial import DEGREES, Odd, missed, spread
+from grounded.instruments.other_units import FACTORS, described
+from grounded.instruments.rows import Gap, Row, gaps, per_step
+from grounded.instruments.swapped import exchanged
+from grounded.model import Model
+from grounded.trial import Trial
+
+BAD, GROSS = 0.5, 0.7  # of what should move, unexplained: looked into, and stated
+MENDED, BETTER = 0.4, 3.0  # what a change may leave of it, and times less than before
+CLOSE, ROUNDING = 2.0, 0.02  # times what the best change leaves: as good
+FOLDED = 0.8  # [rad] rms off a heading in degrees, modulo a turn; by chance it is 1.8
+TOLD = 0.8  # of the other's error: a model that explains it better
+
+
+@dataclass(frozen=True)
+class Change:
+    """What may be wrong with some states: `factor` times what they should be, or exchanged."""
+
+    states: tuple[int, ...]
+    factor: float = 1.0
+
+    @property
+    def swap(self) -> bool:
+        """Two columns in each other's place."""
+        return self.factor == 1.0
+
+    @property
+    def corrected(self) -> bool:
+        """A sign or an angle in degrees is put right here; what else there is stops."""
+        return self.factor == -1.0 or abs(self.factor / DEGREES - 1) < 1e-9
+
+    def mended(self, trial: Trial) -> Trial:
+        """The trial without it."""
+        if not self.swap:
+            return Odd(0, self.factor, self.states).mended(trial)
+        x = np.array(trial.states)
+        x[:, self.states] = x[:, self.states[::-1]]
+        return replace(trial, states=x)
+
+
+@dataclass(frozen=True)
+class Mismatch:
+    """A change that mends what is odd in some trials; `others` mend it as well."""
+
+    trials: tuple[int, ...]
+    change: Change
+    others: tuple[Change, ...] = ()
+
+
+def mismatches(
+    model: Model, trials: Sequence[Trial], rows: Sequence[Row], shown: Sequence[int]
+) -> list[Mismatch]:
+    """The fewest changes after which rows agree; [] where they do, or where nothing mends them.
+
+    Args:
+        model: however crude.
+        trials: any.
+        rows: kinematic ones, see `rows.kinematic_rows`.
+        shown: states that a sensor has.
+    """
+    every = [gaps(model, trial, rows) for trial in trials]
+    odd = [k for k, one in enumerate(every) if any(gap.share > BAD for gap in one.values())]
+    some, found = [trials[k] for k in odd], []
+    before = _pooled([every[k] for k in odd])
+    while bad := {row for row, share in before.items() if share > BAD}:
+        choices = {}
+        for change in _changes(model, bad, rows):
+            after = _pooled([gaps(model, change.mended(trial), rows) for trial in some])
+            entered = [row for row in rows if row.states & set(change.states)]
+            if all(_agrees(row, before, after, bad) for row in entered if row in before):
+                choices[change] = (len(bad & set(entered)), after)
+        most = max((count for count, _ in choices.values()), default=0)
+        left = {c: sum(after.values()) for c, (count, after) in choices.items() if count == most}
+        least = CLOSE * min(left.values(), default=0.0) + ROUNDING
+        best = _ranked(model, some, [c for c, one in left.items() if one <= least], shown)
+        if not best:
+            return []  # part of an explanation is none
+        found.append(Mismatch(tuple(odd), best[0], tuple(best[1:])))
+        some, before = [best[0].mended(trial) for trial in some], choices[best[0]][1]
+    return found
+
+
+def explained(
+    model: Model, trials: Sequence[Trial], rows: Sequence[Row], shown: Sequence[int]
+) -> list[Mismatch]:
+    """`mismatches`, but where a heading that is off by a constant explains as much.
+
+    Args:
+        model: however crude.
+        trials: any.
+        rows: kinematic ones, see `rows.kinematic_rows`.
+        shown: states that a sensor has.
+    """
+    found, away = mismatches(model, trials, rows, shown), _away(model, trials, shown)
+    if not found or away is None:
+        return found
+    relation, offset = away
+    plus = np.where(np.arange(model.n) == relation.k, offset, 0.0)
+    turned_back = [replace(trial, states=trial.states + plus) for trial in trials]
+    mended = list(trials)
+    for one in found:
+        for k in one.trials:
+            mended[k] = one.change.mended(mended[k])
+    left, other = (
+        sum(_pooled([gaps(model, trial, rows) for trial in some]).values())
+        for some in (mended, turned_back)
+    )
+    if left < TOLD * other:
+        return found
+    return mismatches(model, trials, _but(rows, relation), shown)
+
+
+def _away(
+    model: Model, trials: Sequence[Trial], shown: Sequence[int]
+) -> tuple[Turned, float] | None:
+    """A constant angle [rad] between a heading and the course that was travelled."""
+    relation = turned(model)
+    if relation is None or not {relation.i, relation.j, relation.k} <= set(shown):
+        return None
+    found = course(model, relation, trials)
+    if found is None or found.agrees <= AGREE or abs(found.offset) <= TURNED_AWAY:
+        return None
+    return relation, found.offset
+
+
+def _but(rows: Sequence[Row], relation: Turned) -> list[Row]:
+    return [row for row in rows if row.i not in (relation.i, relation.j)]
+
+
+def _agrees(
+    row: Row, before: Mapping[Row, float], after: Mapping[Row, float], bad: set[Row]
+) -> bool:
+    """Whether a row that a change enters is mended, or no worse."""
+    left = after.get(row, np.inf)
+    return left < (min(MENDED, before[row] / BETTER) if row in bad else MENDED)
+
+
+def _pooled(every: Sequence[Mapping[Row, Gap]]) -> dict[Row, float]:
+    """The share of each row over several trials (rms)."""
+    found: dict[Row, list[float]] = {}
+    for one in every:
+        for row, gap in one.items():
+            found.setdefault(row, []).append(gap.share)
+    return {row: float(np.sqrt(np.mean(np.square(some)))) for row, some in found.items()}
+
+
+def _changes(model: Model, bad: set[Row], rows: Sequence[Row]) -> Iterator[Change]:
+    """What may be off: one signal, all positions or all velocities of a plane, two exchanged."""
+    units = list(model.states.values())
+    touched = sorted({i for row in bad for i in row.states})
+    like = {units[row.i] for row in bad}
+    owns = tuple(sorted(row.i for row in rows if units[row.i] in like and units[row.i] == "m"))
+    speeds = tuple(i for i in touched if units[i] == "m/s")
+    for i in touched:
+        yield Change((i,), -1.0)
+        if units[i] in ("rad", "rad/s"):
+            yield from (Change((i,), f) for f in (DEGREES, 1 / DEGREES))
+    single = [(i,) for i in touched if units[i] in ("m", "m/s")]
+    for group in dict.fromkeys([*single, *(g for g in (owns, speeds) if len(g) > 1)]):
+        yield from (Change(group, f) for f in FACTORS)
+    for row in rows:  # a compass that turns the other way, and the gyro with it
+        if model.angle_mask[row.i] and len(row.by) == 1 and row.i in touched:
+            yield Change((row.i, *row.by), -1.0)
+    for pair in combinations(touched, 2):
+        if units[pair[0]] == units[pair[1]] and units[pair[0]] in ("m", "m/s"):
+            yield Change(pair)
+
+
+def _ranked(
+    model: Model, trials: Sequence[Trial], some: Sequence[Change], shown: Sequence[int]
+) -> list[Change]:
+    """The likelier first: too large before too small, one signal before two; as the model says."""
+    order = sorted(some, key=lambda c: (not c.factor >= 1 and c.factor != -1, len(c.states)))
+    if len(order) < 2:
+        return order
+
+    def error(change: Change) -> float:
+        mended = [change.mended(trial) for trial in trials]
+        each = [missed(model, t, shown, shown, spread(t, shown)) for t in mended]
+        return float(np.nanmedian(each))
+
+    errors = [error(change) for change in order]
+    best = min(range(len(order)), key=lambda k: errors[k])
+    if errors[best] < TOLD * errors[0]:
+        order.insert(0, order.pop(best))
+    return order
+
+
+def stop_at(model: Model, trials: Sequence[Trial], found: Sequence[Mismatch]) -> None:
+    """Stops at lengths in another unit and at columns in each other's place.
+
+    Raises:
+        GroundedError: with the trials, the states and what mends them in [log].
+    """
+    stops = [one for one in found if not one.change.corrected]
+    if not stops:
+        return
+    names = [trials[k].id or f"number {k + 1}" for k in stops[0].trials]
+    one, every = len(names) == 1, len(names) == len(trials) > 1
+    where = "every trial" if every else f"trial{'s' * (not one)} {', '.join(names)}"
+    clauses = []
+    for mismatch in stops:
+        first, others = mismatch.change, mismatch.others
+        others = tuple(c for c in others if not any(_within(c, o) for o in (first, *others)))
+        texts = [_said(model, c) for c in (first, *others)]
+        clauses.append(", or else ".join(texts))
+    raise GroundedError(
+        f"in {where} positions don't move as velocities and angles say: {'; '.join(clauses)}. "
+        "Correct the log, or the paths and scales in [log] (multiply a scale, 1 where none is "
+        f"given), and take it in again, without {'this one' if one else 'these'}",
+        then=NextCommand("discard", tuple(names)) if trials[0].id else None,
+    )
+
+
+def _within(a: Change, b: Change) -> bool:
+    """Whether b is the same of more signals."""
+    return a.factor == b.factor and set(a.states) < set(b.states)
+
+
+def stop_at_folded(model: Model, trials: Sequence[Trial], rows: Sequence[Row]) -> None:
+    """Stops at an angle in degrees whose steps of more than pi degrees are lost.
+
+    Taken for radians as a log was resampled, 350 degrees are 350 - 56 x 2 pi: dividing the trial
+    by 57.3 mends nothing.
+
+    Raises:
+        GroundedError: with the scale to take the log in with.
+    """
+    for row in rows:
+        if not model.angle_mask[row.i]:
+            continue
+        steps = [per_step(model, trial, row) for trial in trials]
+        moved, said = (np.concatenate(z) for z in zip(*steps, strict=True))
+        turned = DEGREES * said
+        if len(moved) < 20 or not (np.abs(turned) > np.pi).mean() > 0.01:
+            continue
+        off = wrapped((moved - turned)[:, None], [True])
+        plain = wrapped((moved - said)[:, None], [True])
+        if np.sqrt((off**2).mean()) < min(FOLDED, np.sqrt((plain**2).mean()) / 2):
+            name, ids = model.state_names[row.i], tuple(t.id for t in trials if t.id)
+            raise GroundedError(
+                f"{name} is in degrees, and was folded as an angle in {model.states[name]} when "
+                f"it was taken in: set [log.state.{name}] scale = {1 / DEGREES:.8g} and take the "
+                "logs in again, without these",
+                then=NextCommand("discard", ids) if ids else None,
+            )
+
+
+def _said(model: Model, change: Change) -> str:
+    names = [model.state_names[i] for i in change.states]
+    if change.swap:
+        return exchanged(" and ".join(names))
+    if change.factor == -1.0:
+        return f"{' and '.join(names)}: the sign looks wrong, scale = -1"
+    return ", ".join(described(model, i, change.factor) for i in change.states)
+
+
+def unexplained(model: Model, trials: Sequence[Trial], rows: Sequence[Row]) -> Iterator[Finding]:
+    """Of rows that most trials contradict grossly; neither q' = w nor a heading that is turned.
+
+    Args:
+        model: however crude.
+        trials: with what could be corrected corrected.
+        rows: kinematic ones.
+    """
+    away = _away(model, trials, range(model.n)) if rows else None
+    rows = rows if away is None else _but(rows, away[0])
+    plain = {one.i for one in integrals(model)}
+    every = [gaps(model, trial, rows) for trial in trials]
+    for row in rows:
+        some = [one[row] for one in every if row in one]
+        if row.i in plain or not some or np.median([gap.share for gap in some]) < GROSS:
+            continue
+        if np.median([gap.varying for gap in some]) < BAD:
+            continue  # at rest in a current
+        name, *by = (model.state_names[i] for i in (row.i, *row.by))
+        rate = float(np.median([gap.rate for gap in some]))
+        what = " and ".join([", ".join(by[:-1]), by[-1]] if len(by) > 1 else by)
+        text = (
+            f"does not move as {what} {'say' if len(by) > 1 else 'says'} (its change is off by "
+            f"{rate:.3g} {model.states[name]} a second): check units, axes, signs"
+        )
+        yield Finding(name, text, "mismatch")

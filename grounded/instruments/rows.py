@@ -1,0 +1,191 @@
+"""Rows of a model that no physics touches: how a state moves, from other sensors alone.
+
+A kinematic row is a state whose modelled rate is made of logged velocities, turned by logged angles
+or not at all: x' = u cos psi - v sin psi, psi' = r. Neither an input nor an uncertain parameter
+enters it but as a constant (a current). What it says of stretches of a log is compared with how far
+its own sensor moved.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from grounded.effects import places
+from grounded.frozen import Array, wrapped
+from grounded.instruments.kinematics import SHORT, pieces
+from grounded.model import Model
+from grounded.trial import Trial
+
+STRETCH = 0.3  # [s], of the shortest stretches
+LEAST = 8  # stretches that a trial must hold
+NOISE = 0.3  # of what moves over a stretch: with more it tells nothing
+SMALL = 1e-4  # of a rate, or of its largest slope: none
+
+
+@dataclass(frozen=True)
+class Row:
+    """The rate of state i is made of the states `by` alone."""
+
+    i: int
+    by: tuple[int, ...]
+
+    @property
+    def states(self) -> frozenset[int]:
+        """All that it ties together."""
+        return frozenset((self.i, *self.by))
+
+
+@dataclass(frozen=True)
+class Gap:
+    """How a row and its own sensor differ.
+
+    Args:
+        share: rms of the difference, over how far the state moves or should, or those of its unit.
+        varying: the same without a constant difference.
+        rate: that difference over the length of a stretch [unit/s].
+    """
+
+    share: float
+    varying: float
+    rate: float
+
+
+def kinematic_rows(model: Model, shown: Sequence[int]) -> list[Row]:
+    """The rows of a model whose states all have sensors.
+
+    Args:
+        model: any; a simulator that can't make a short step has no such rows.
+        shown: states that a sensor has.
+    """
+    dt = places.probe(model, SHORT)
+    if dt > SHORT:
+        return []
+    x, u = places.samples(model, 8)
+    f_x, f_u = model.system.linearise(x, u, model.values, dt)
+    slopes = (f_x - np.eye(model.n)) / dt
+    fast = np.array([unit.endswith("/s") for unit in model.states.values()])
+    rates, doubled = (_rates(model, z) for z in (x, np.where(fast, 2 * x, x)))
+    size = SMALL * np.abs(rates).max(axis=0)
+    fixed = np.abs(f_u).max(axis=(0, 2)) / dt < size
+    for values in _shifted(model):
+        moved = (model.system.step(x, u, values, dt) - x) / dt
+        fixed &= np.ptp(moved - rates, axis=0) < size
+    fixed &= ~fast & (np.ptp(doubled - 2 * rates, axis=0) < size)
+    found = []
+    for i in shown:
+        slope = np.abs(slopes[:, i]).max(axis=0)
+        by = tuple(int(j) for j in np.flatnonzero(slope > SMALL * slope.max()))
+        if fixed[i] and i not in by and set(by) <= set(shown):
+            found.append(Row(i, by))
+    return found
+
+
+def tied(rows: Sequence[Row]) -> list[Row]:
+    """Rows of three states and more, and those of two that share one with them.
+
+    What is off of a position and its velocity, and nothing else, two rows of one state can't tell.
+    """
+    several = frozenset[int]().union(*(row.states for row in rows if len(row.by) > 1))
+    return [row for row in rows if row.states & several]
+
+
+def gaps(model: Model, trial: Trial, rows: Sequence[Row]) -> dict[Row, Gap]:
+    """Of each row, over the stretches over which it agrees best; nothing where noise hides it.
+
+    Args:
+        model: whose rows they are.
+        trial: with this model's states.
+        rows: of the model.
+    """
+    known = [row for row in rows if _known(trial, row)]
+    some = sorted(frozenset[int]().union(*(row.states for row in known)))
+    moved, said = [], []
+    for piece in pieces([trial], some) if known else ():
+        x = np.zeros((len(piece), model.n))
+        x[:, some] = piece
+        each = wrapped(np.diff(x, axis=0), model.angle_mask)
+        moved.append(np.cumsum(each, axis=0))
+        said.append(np.cumsum(_told(model, known, x), axis=0) * trial.dt)
+    found: dict[Row, Gap] = {}
+    longest = max((len(x) for x in moved), default=0)
+    steps = max(1, min(round(STRETCH / trial.dt), longest // LEAST))
+    while usable := [k for k, x in enumerate(moved) if len(x) > LEAST * steps]:
+        far, told = (
+            np.concatenate([z[k][steps:] - z[k][:-steps] for k in usable]) for z in (moved, said)
+        )
+        noise = np.concatenate([np.diff(moved[k], axis=0, n=2) for k in usable])
+        for row, gap in _over(model, known, far, told, _size(noise) / 3, steps * trial.dt):
+            if row not in found or gap.share < found[row].share:
+                found[row] = gap
+        steps *= 2
+    return found
+
+
+def _over(
+    model: Model, rows: Sequence[Row], far: Array, told: Array, noise: Array, length: float
+) -> list[tuple[Row, Gap]]:
+    """Of each row, over stretches of one length [s]; beside others it may hardly move."""
+    units = list(model.states.values())
+    moved, said, off = _size(far), _size(told), _size(far - told)
+    varying = np.std(far - told, axis=0)
+    found = []
+    for row in rows:
+        same = [one.i for one in rows if units[one.i] == units[row.i]]
+        size = float(max(moved[row.i], said[row.i], np.sqrt((said[same] ** 2).mean())))
+        if size > 0 and noise[row.i] < NOISE * size:
+            share, rest, rate = (
+                float(x[row.i]) / by for x, by in ((off, size), (varying, size), (off, length))
+            )
+            found.append((row, Gap(share, rest, rate)))
+    return found
+
+
+def per_step(model: Model, trial: Trial, row: Row) -> tuple[Array, Array]:
+    """How far a row's state moves in each step, and how far the others say (steps,)."""
+    some = sorted(row.states)
+    moved, said = [np.empty(0)], [np.empty(0)]
+    for piece in pieces([trial], some) if _known(trial, row) else ():
+        x = np.zeros((len(piece), model.n))
+        x[:, some] = piece
+        moved.append(wrapped(np.diff(x, axis=0), model.angle_mask)[:, row.i])
+        said.append(_told(model, [row], x)[:, row.i] * trial.dt)
+    return np.concatenate(moved), np.concatenate(said)
+
+
+def _told(model: Model, rows: Sequence[Row], x: Array) -> Array:
+    """What rows say of the rates over each step (T - 1, n); 0 where there is none."""
+    found = np.zeros((len(x) - 1, model.n))
+    for row in rows:
+        alone = np.full_like(x, 0.5)  # nothing else, however large, adds to it within the step
+        alone[:, row.by] = x[:, row.by]
+        rate = _rates(model, alone)[:, row.i]
+        found[:, row.i] = 0.5 * (rate[1:] + rate[:-1])
+    return found
+
+
+def _rates(model: Model, x: Array) -> Array:
+    """The modelled rates (T, n) at states (T, n), under some input."""
+    u = np.full((len(x), model.m), 0.5)
+    return np.asarray((model.system.step(x, u, model.values, SHORT) - x) / SHORT)
+
+
+def _shifted(model: Model) -> list[Array]:
+    """The values of the parameters, with each uncertain one moved."""
+    found = []
+    for k, one in enumerate(model.params.values()):
+        if one.low is not None or one.high is not None or one.std is not None:
+            values = np.array(model.values)
+            values[k] = 1.1 * values[k] + 0.01
+            found.append(values)
+    return found
+
+
+def _known(trial: Trial, row: Row) -> bool:
+    return bool(np.isfinite(trial.states[:, sorted(row.states)]).any(axis=0).all())
+
+
+def _size(x: Array) -> Array:
+    return np.asarray(np.sqrt((x**2).mean(axis=0)))
