@@ -207,10 +207,8 @@ def _came_true(candidate: Candidate, same: Sequence[Tried], standing: Standing) 
 
 def _measured(workspace: Workspace) -> str:
     """How far the model that plans now predicts, by the last diagnosis; "" where none says it."""
-    if not (
-        workspace.reports / "diagnosis.json"
-    ).is_file():  # then nothing that reads one is imported
-        return ""
+    if not (workspace.reports / "diagnosis.json").is_file():
+        return ""  # and nothing that reads one is imported
     from grounded_trials.report.settled import measured_now
 
     text = measured_now(workspace)

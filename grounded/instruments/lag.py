@@ -180,10 +180,9 @@ def _measured(pieces: _Pieces, reach: int, dt: float) -> Lag | None:
     rest, pull = a - s * b, s * slope
     force = max(_scatter(rest * pull, group) for group in pieces.groups)
     std = force / max(_dot(pull, pull), 1e-300)
-    tau = _filter(pieces, a, _dot(rest, rest), s) if d > 0 else None
-    late = d if tau is None else tau
-    if tau is not None:  # its size is that of what went into it
-        b = pieces.moved(0.0) + tau * 0.5 * (pieces.moved(1.0) - pieces.moved(-1.0))
+    behind = _filter(pieces, a, _dot(rest, rest), s) if d > 0 else None
+    if behind is not None:
+        d, b = behind  # the size is that of what went into the filter
         s = _dot(a, b) / max(_dot(b, b), 1e-300)
         rest = a - s * b
     both = abs(_dot(a, b))
@@ -191,7 +190,7 @@ def _measured(pieces: _Pieces, reach: int, dt: float) -> Lag | None:
     size_std = max(_scatter(rest * b, group) for group in pieces.groups) / max(_dot(b, b), 1e-300)
     sign, coherence = 1 if s > 0 else -1, min(low / high, 1.0)
     scale_std = size_std / max(s * s, 1e-300)
-    return Lag(late * dt, std * dt, tau is not None, sign, low, high, coherence, scale_std)
+    return Lag(d * dt, std * dt, behind is not None, sign, low, high, coherence, scale_std)
 
 
 def _dot(a: Array, b: Array) -> float:
@@ -204,15 +203,15 @@ def _scatter(force: Array, group: Any) -> float:
     return float(np.sqrt((parts**2).sum()))
 
 
-def _filter(pieces: _Pieces, a: Array, misfit: float, scale: float) -> float | None:
-    """The time constant [samples] where a = s (b + tau b') fits better than a scaled delay."""
+def _filter(pieces: _Pieces, a: Array, misfit: float, scale: float) -> tuple[float, Array] | None:
+    """Tau [samples] and b + tau b' where a = s (b + tau b') fits better than a scaled delay."""
     b, slope = pieces.moved(0.0), 0.5 * (pieces.moved(1.0) - pieces.moved(-1.0))
     columns = np.stack([b, slope], axis=1)
     s, both = np.linalg.lstsq(columns, a, rcond=None)[0]
     rest = float(((a - columns @ [s, both]) ** 2).sum())
     off, plain = (abs(np.log(max(abs(size), 1e-300))) for size in (scale, s))
     better = rest < FILTER * misfit or (rest < EVEN * misfit and plain < PLAIN * off)
-    return float(both / s) if better and both / s > 0 else None
+    return (float(both / s), b + both / s * slope) if better and both / s > 0 else None
 
 
 def at_samples(x: Array, at: Any) -> Array:

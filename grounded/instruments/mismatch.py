@@ -25,7 +25,7 @@ from grounded.instruments.kinematics import (
     turned,
 )
 from grounded.instruments.odd_trial import DEGREES, Odd, missed, spread
-from grounded.instruments.other_units import FACTORS, described
+from grounded.instruments.other_units import FACTORS, described, unusable
 from grounded.instruments.rows import Gap, Row, gaps, per_step
 from grounded.instruments.swapped import exchanged
 from grounded.model import Model
@@ -73,17 +73,10 @@ class Mismatch:
     others: tuple[Change, ...] = ()
 
 
-def mismatches(
+def _mending(
     model: Model, trials: Sequence[Trial], rows: Sequence[Row], shown: Sequence[int]
 ) -> list[Mismatch]:
-    """The fewest changes after which rows agree; [] where they do, or where nothing mends them.
-
-    Args:
-        model: however crude.
-        trials: any.
-        rows: kinematic ones, see `rows.kinematic_rows`.
-        shown: states that a sensor has.
-    """
+    """The fewest changes after which rows agree; [] where they do, or where nothing mends them."""
     every = [gaps(model, trial, rows) for trial in trials]
     odd = [k for k, one in enumerate(every) if any(gap.share > BAD for gap in one.values())]
     some, found = [trials[k] for k in odd], []
@@ -109,7 +102,9 @@ def mismatches(
 def explained(
     model: Model, trials: Sequence[Trial], rows: Sequence[Row], shown: Sequence[int]
 ) -> list[Mismatch]:
-    """`mismatches`, but where a heading that is off by a constant explains as much.
+    """The fewest changes after which rows agree; [] where they do, or where nothing mends them.
+
+    Where a heading that is off by a constant explains as much, it is not taken for another change.
 
     Args:
         model: however crude.
@@ -117,7 +112,7 @@ def explained(
         rows: kinematic ones, see `rows.kinematic_rows`.
         shown: states that a sensor has.
     """
-    found, away = mismatches(model, trials, rows, shown), _away(model, trials, shown)
+    found, away = _mending(model, trials, rows, shown), _away(model, trials, shown)
     if not found or away is None:
         return found
     relation, offset = away
@@ -133,7 +128,7 @@ def explained(
     )
     if left < TOLD * other:
         return found
-    return mismatches(model, trials, _but(rows, relation), shown)
+    return _mending(model, trials, _but(rows, relation), shown)
 
 
 def _away(
@@ -221,21 +216,15 @@ def stop_at(model: Model, trials: Sequence[Trial], found: Sequence[Mismatch]) ->
     stops = [one for one in found if not one.change.corrected]
     if not stops:
         return
-    names = [trials[k].id or f"number {k + 1}" for k in stops[0].trials]
-    one, every = len(names) == 1, len(names) == len(trials) > 1
-    where = "every trial" if every else f"trial{'s' * (not one)} {', '.join(names)}"
     clauses = []
     for mismatch in stops:
         first, others = mismatch.change, mismatch.others
         others = tuple(c for c in others if not any(_within(c, o) for o in (first, *others)))
         texts = [_said(model, c) for c in (first, *others)]
         clauses.append(", or else ".join(texts))
-    raise GroundedError(
-        f"in {where} positions don't move as velocities and angles say: {'; '.join(clauses)}. "
-        "Correct the log, or the paths and scales in [log] (multiply a scale, 1 where none is "
-        f"given), and take it in again, without {'this one' if one else 'these'}",
-        then=NextCommand("discard", tuple(names)) if trials[0].id else None,
-    )
+    scales = "the paths and scales in [log] (multiply a scale, 1 where none is given)"
+    said = f"positions don't move as velocities and angles say: {'; '.join(clauses)}"
+    raise unusable(trials, stops[0].trials, said, f"Correct the log, or {scales}")
 
 
 def _within(a: Change, b: Change) -> bool:

@@ -73,12 +73,25 @@ def judge_units(
         return
     clauses = [_clause(model, trials, ratios, one, found, shown) for one in found]
     odd = sorted({k for one in found for k in one.trials})
+    mend = "Multiply the scale in [log] (1 where none is given), or correct the log"
+    raise unusable(trials, odd, "; ".join(clauses), mend)
+
+
+def unusable(trials: Sequence[Trial], odd: Sequence[int], clauses: str, mend: str) -> GroundedError:
+    """That nothing can be said before some trials are taken in again, and the command for it.
+
+    Args:
+        trials: all of them.
+        odd: the numbers of those that are concerned.
+        clauses: what is wrong there.
+        mend: what to do about it, before the log is taken in again.
+    """
     names = [trials[k].id or f"number {k + 1}" for k in odd]
     one, every = len(odd) == 1, len(odd) == len(trials) > 1
     where = "in every trial" if every else f"in trial{'s' * (not one)} {', '.join(names)}"
-    raise GroundedError(
-        f"{where} {'; '.join(clauses)}. Multiply the scale in [log] (1 where none is given), or "
-        f"correct the log, and take it in again, without {'this one' if one else 'these'}",
+    return GroundedError(
+        f"{where} {clauses}. {mend}, and take it in again, without "
+        f"{'this one' if one else 'these'}",
         then=NextCommand("discard", tuple(names)) if trials[0].id else None,
     )
 

@@ -118,9 +118,10 @@ def preflight(
         judge_stamps(model, bench.trials, ratios)
         judge_units(model, bench.trials, ratios, bench.shown)
         judge_columns(model, bench.trials, bench.shown)
+        mended = list(bench.mismatched())
         found = [
-            *bench.mismatched(),
-            *bench.odd(ratios_of(model, bench.trials, bench.shown)),
+            *mended,
+            *bench.odd(ratios_of(model, bench.trials, bench.shown) if mended else ratios),
             *bench.singles(),
             *bench.pairs(),
             *bench.plane(),

@@ -101,14 +101,12 @@ def diagnose_in(
     if words:
         run = f" ({identity}: {rendered(to_run(workspace, identity, identity))})" * bool(identity)
         found = replace(found, next_trial=f"{words}{run}", probe=identity)
-        _keep(workspace, found)
     if more := found.verdict.look_for:
         first = f"Before it, `grounded diagnose --max-effects {more}` looks for more effects."
         found = replace(found, next_trial=f"{first} {found.next_trial}".strip())
-        _keep(workspace, found)
     if undo := _in_vain(workspace, found):
         found = replace(found, next_trial=f"{undo} {found.next_trial}")
-        _keep(workspace, found)
+    _keep(workspace, found)  # with what is said of the next trial
     return replace(found, then=after_diagnosis(workspace, found))
 
 

@@ -234,10 +234,7 @@ def pace_of(log: Recording, task: Task, policy: Policy) -> float | None:
         policy: what is sought.
     """
     for pace in PACES:
-        series = {name: _paced(one, pace) for name, one in log.series.items()}
-        again = recording(series, task)
-        found = again.start_of(policy) if again else None
-        if found and found.alike:
+        if _run_in({name: _paced(one, pace) for name, one in log.series.items()}, task, policy):
             return pace
     return None
 
@@ -255,14 +252,18 @@ def unit_of(log: Recording, task: Task, policy: Policy) -> tuple[tuple[str, ...]
             name: replace(one, values=one.values * by) if name in names else one
             for name, one in log.series.items()
         }
-        again = recording(series, task)
-        found = again.start_of(policy) if again else None
-        if again and found and found.alike:
-            run = again.trial_from(found.seconds)
-            fit = run and follows(policy, run.until(policy.horizon), 0)
-            if fit and fit.error < NEARLY:
-                return tuple(names), by
+        run = _run_in(series, task, policy)
+        fit = run and follows(policy, run.until(policy.horizon), 0)
+        if fit and fit.error < NEARLY:
+            return tuple(names), by
     return (), 1.0
+
+
+def _run_in(series: Mapping[str, Series], task: Task, policy: Policy) -> Trial | None:
+    """The run of a policy that begins in these samples, wherever; None where none does."""
+    log = recording(series, task)
+    found = log.start_of(policy) if log else None
+    return log.trial_from(found.seconds) if log and found and found.alike else None
 
 
 def _paced(series: Series, pace: float) -> Series:
