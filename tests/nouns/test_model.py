@@ -54,7 +54,7 @@ def test_differences_of_angles_wrap_and_the_arguments_stay():
         ({"roles": {"position": ("x", "y")}}, holding("position", "'y'")),
         ({"roles": {"position": ("x", "x", "x", "x")}}, holding("position", "4")),
     ],
-    ids=lambda v: str(v)[:40],
+    ids=lambda v: " ".join(v) if isinstance(v, dict) else str(v)[:40],
 )
 def test_a_wrong_declaration_says_what_is_wrong(change, match):
     with pytest.raises(GroundedError, match=match):
