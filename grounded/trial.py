@@ -78,6 +78,10 @@ class Trial:
                 raise GroundedError(f"trial: start_inputs must have shape ({m},), got {held.shape}")
             object.__setattr__(self, "start_inputs", held)
 
+    def __repr__(self) -> str:
+        names = f"states {', '.join(self.state_names)}; inputs {', '.join(self.input_names)}"
+        return f"Trial({self.id or 'new'}: {self.steps} steps of {self.dt:.4g} s; {names})"
+
     @property
     def steps(self) -> int:
         """T, the number of control steps that were run."""

@@ -244,8 +244,10 @@ def stop_at_folded(model: Model, trials: Sequence[Trial], rows: Sequence[Row]) -
     for row in rows:
         if not model.angle_mask[row.i]:
             continue
-        steps = [per_step(model, trial, row) for trial in trials]
-        moved, said = (np.concatenate(z) for z in zip(*steps, strict=True))
+        steps = [pair for trial in trials for pair in per_step(model, trial, [row])]
+        moved, said = (
+            np.concatenate([np.empty(0), *(pair[k][:, row.i] for pair in steps)]) for k in (0, 1)
+        )
         turned = DEGREES * said
         if len(moved) < 20 or not (np.abs(turned) > np.pi).mean() > 0.01:
             continue

@@ -7,6 +7,7 @@ mismatch      a position that doesn't move as velocities and angles say
 single        each state by itself
 constant      a velocity that is off by a constant, against the way of its position
 kinematics    velocities against the rates of their positions, courses against headings
+late_position both positions of a plane behind what velocities and a heading say
 inputs        copies of one another, at their limits or beyond, constant within each trial
 
 What is certain from sensors alone is put right in the trials that the diagnosis then takes: a late
@@ -25,6 +26,7 @@ import numpy as np
 from grounded.frozen import Array
 from grounded.instruments.constant import constant_of
 from grounded.instruments.finding import Finding
+from grounded.instruments.inputs import judge_inputs
 from grounded.instruments.kinematics import (
     AGREE,
     TURNED_AWAY,
@@ -35,8 +37,8 @@ from grounded.instruments.kinematics import (
     lag_of,
     turned,
 )
-from grounded.instruments.lag import Lag, alike, at_samples, lag_between, reach_of
-from grounded.instruments.limits import judge_limits
+from grounded.instruments.lag import LEAST_S, SURE, Lag, at_samples
+from grounded.instruments.late_position import late_positions
 from grounded.instruments.mismatch import (
     Mismatch,
     explained,
@@ -61,14 +63,11 @@ from grounded.model import Model
 from grounded.task import Task
 from grounded.trial import Trial
 
-SURE = 5.0  # standard deviations of a delay that is found
 LEAST_STEPS = 0.1  # of a time step: less is a matter of time stamps
-LEAST_S = 0.0005
 ALIKE = 0.9  # coherence from which two sensors are compared at all
 OFF = 0.03  # of a scale, beyond both of its brackets
 DEGREES = 180 / np.pi
 UNIT = 0.1  # relative, from which a scale is taken for one of degrees
-COPY = 0.99  # coherence of two inputs that are one: two motors of one vehicle have 0.96
 SAME_WAY = 0.95  # of a speed and the way: below it something drifts or slips
 
 
@@ -124,9 +123,10 @@ def preflight(
             *bench.odd(ratios_of(model, bench.trials, bench.shown) if mended else ratios),
             *bench.singles(),
             *bench.pairs(),
+            *bench.positions(),
             *bench.plane(),
             *unexplained(model, bench.trials, bench.rows),
-            *_inputs(subject, bench.trials),
+            *judge_inputs(subject, bench.trials),
         ]
     in_step, refuted = frozenset(bench.in_step), frozenset(bench.refuted)
     return Preflight(tuple(found), tuple(bench.trials), in_step, refuted)
@@ -272,15 +272,33 @@ class _Bench:
         i, name, other = (relation.i, q, f"{w} says")
         if lag.delay > 0:
             i, name, other = (relation.j, w, f"the derivative of {q}")
-        text = f"{d:.3g} s later than {other}"
         if i == relation.i and not relation.exact:  # a disturbed heading looks late as well
-            yield Finding(name, text, "delay", d, lag.std)
-        elif lag.filtered:  # the samples stay: moved, they would be too small wherever it is quick
-            text = f"follows {other} through a filter of {d:.3g} s"
-            yield _mended(name, text, "lag", "", delay_s=d, std_s=lag.std)
+            yield Finding(name, f"{d:.3g} s later than {other}", "delay", d, lag.std)
         else:
-            self.put(i, [_earlier(x, d / self.dt) for x in self.column(i)])
-            yield _mended(name, text, "delay", f"delay_s = {d:.3g}", delay_s=d, std_s=lag.std)
+            yield self.in_time(i, lag, other)
+
+    def in_time(self, i: int, lag: Lag, other: str) -> Finding:
+        """With state i as it was; what is filtered stays: moved, it is too small where it's quick.
+
+        Args:
+            i: the state.
+            lag: how late it is, of either sign.
+            other: what it is late behind, in words.
+        """
+        d, name = float(abs(lag.delay)), self.model.state_names[i]
+        if lag.filtered:
+            text = f"follows {other} through a filter of {d:.3g} s"
+            return _mended(name, text, "lag", "", delay_s=d, std_s=lag.std)
+        self.put(i, [_earlier(x, d / self.dt) for x in self.column(i)])
+        text, log = f"{d:.3g} s later than {other}", f"delay_s = {d:.3g}"
+        return _mended(name, text, "delay", log, delay_s=d, std_s=lag.std)
+
+    def positions(self) -> Iterator[Finding]:
+        """Of both positions of a plane that are late together."""
+        late = late_positions(self.model, self.trials, self.rows)
+        if late is not None:
+            for i in late.states:
+                yield self.in_time(i, late.lag, "velocities and angles say")
 
     def constant(self, relation: Integral) -> Iterator[Finding]:
         """A constant between the two: of the velocity's sensor, or a drift of the position.
@@ -360,33 +378,3 @@ def _earlier(x: Array, steps: float) -> Array:
     if abs(steps - whole) < 0.05:
         return np.concatenate([x[whole:], np.full(min(whole, len(x)), np.nan)])
     return at_samples(x, at)
-
-
-def _inputs(subject: Task | Model, trials: Sequence[Trial]) -> Iterator[Finding]:
-    """Of commands: copies of one another, at their limits or beyond, conditions of a trial."""
-    names = trials[0].input_names
-    columns = [[trial.inputs[:, j] for trial in trials] for j in range(len(names))]
-    fixed = [all(np.ptp(x) == 0 for x in some) for some in columns]
-    for j, name in enumerate(names):
-        values = sorted({float(x[0]) for x in columns[j]})
-        if fixed[j] and len(values) > 1:
-            shown = ", ".join(f"{v:.4g}" for v in values[:6])
-            yield Finding(name, f"constant within each trial ({shown})", "constant")
-    if isinstance(subject, Task):
-        yield from judge_limits(subject, np.concatenate([trial.inputs for trial in trials]))
-    longest = max(trials, key=lambda trial: trial.steps).inputs
-    for i, j in alike(longest, reach_of(len(longest), trials[0].dt)):
-        if fixed[i] or fixed[j]:
-            continue
-        lag = lag_between(list(zip(columns[i], columns[j], strict=True)), trials[0].dt)
-        if lag is not None and lag.coherence > COPY and 0.9 < lag.sign * lag.low < 1.1:
-            yield _copy(names[i], names[j], lag)
-
-
-def _copy(first: str, second: str, lag: Lag) -> Finding:
-    """Two inputs that are one signal, one perhaps later: a command and what was measured of it."""
-    if lag.delay < 0:
-        first, second = second, first
-    d = abs(lag.delay)
-    late = f", {d:.3g} s later" if d > max(SURE * lag.std, LEAST_S) else ""
-    return Finding(second, f"the same signal as {first}{late}", "copy", d, lag.std, lag.low)

@@ -101,14 +101,8 @@ def gaps(model: Model, trial: Trial, rows: Sequence[Row]) -> dict[Row, Gap]:
         rows: of the model.
     """
     known = [row for row in rows if _known(trial, row)]
-    some = sorted(frozenset[int]().union(*(row.states for row in known)))
-    moved, said = [], []
-    for piece in pieces([trial], some) if known else ():
-        x = np.zeros((len(piece), model.n))
-        x[:, some] = piece
-        each = wrapped(np.diff(x, axis=0), model.angle_mask)
-        moved.append(np.cumsum(each, axis=0))
-        said.append(np.cumsum(_told(model, known, x), axis=0) * trial.dt)
+    each = per_step(model, trial, known)
+    moved, said = ([np.cumsum(z[k], axis=0) for z in each] for k in (0, 1))
     found: dict[Row, Gap] = {}
     longest = max((len(x) for x in moved), default=0)
     steps = max(1, min(round(STRETCH / trial.dt), longest // LEAST))
@@ -143,16 +137,21 @@ def _over(
     return found
 
 
-def per_step(model: Model, trial: Trial, row: Row) -> tuple[Array, Array]:
-    """How far a row's state moves in each step, and how far the others say (steps,)."""
-    some = sorted(row.states)
-    moved, said = [np.empty(0)], [np.empty(0)]
-    for piece in pieces([trial], some) if _known(trial, row) else ():
+def per_step(model: Model, trial: Trial, rows: Sequence[Row]) -> list[tuple[Array, Array]]:
+    """How far rows' states move in each step (T - 1, n), and as the others say, by pieces.
+
+    Args:
+        model: whose rows they are.
+        trial: with this model's states; a piece has no gaps in what the rows tie together.
+        rows: columns of other states say nothing.
+    """
+    some, found = sorted(frozenset[int]().union(*(row.states for row in rows))), []
+    for piece in pieces([trial], some) if rows else ():
         x = np.zeros((len(piece), model.n))
         x[:, some] = piece
-        moved.append(wrapped(np.diff(x, axis=0), model.angle_mask)[:, row.i])
-        said.append(_told(model, [row], x)[:, row.i] * trial.dt)
-    return np.concatenate(moved), np.concatenate(said)
+        moved = wrapped(np.diff(x, axis=0), model.angle_mask)
+        found.append((moved, _told(model, rows, x) * trial.dt))
+    return found
 
 
 def _told(model: Model, rows: Sequence[Row], x: Array) -> Array:

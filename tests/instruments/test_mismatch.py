@@ -1,4 +1,4 @@
-"""Units, signs and axes that only several sensors together give away: a boat's."""
+"""What only several sensors together give away: a boat's units, signs, axes, late positions."""
 
 import numpy as np
 import pytest
@@ -67,13 +67,14 @@ def sailed(seed: int, current: tuple[float, float] = (0.1, -0.06)) -> tuple[Arra
 
 
 def logged(model: Model, fault=lambda x: x, trials: int = 3) -> list[Trial]:
-    """Trials with the states of a model, after a fault (T, 6) -> (T, 6)."""
+    """Trials with the states of a model, after a fault (T, 6) -> (T, 6), or less at the start."""
     found = []
     shown = [NAMES.index(name) for name in model.state_names]
     for seed in range(trials):
         states, inputs = sailed(seed)
         names = (model.state_names, model.input_names)
-        found.append(Trial(fault(states)[:, shown], inputs, DT, *names, id=f"t{seed:04}"))
+        seen = fault(states)[:, shown]
+        found.append(Trial(seen, inputs[len(states) - len(seen) :], DT, *names, id=f"t{seed:04}"))
     return found
 
 
@@ -241,3 +242,46 @@ def test_a_heading_off_by_a_constant_is_no_exchange_and_no_sign(model, angle):
 
     (found,) = preflight(model, logged(model, off)).findings
     assert (found.signal, found.kind, found.corrected) == ("psi", "offset", False)
+
+
+def positions_late(by: float):
+    def fault(x: Array) -> Array:
+        at, y = np.arange(len(x)) - by / DT, np.array(x)
+        for i in (0, 1):
+            y[:, i] = np.interp(at, np.arange(len(x)), x[:, i])
+        return y[int(np.ceil(by / DT)) :]
+
+    return fault
+
+
+def delayed(findings):
+    return {f.signal: f.delay_s for f in findings if f.kind == "delay" and f.corrected}
+
+
+@pytest.mark.parametrize("by", [0.15, 0.3])
+def test_positions_that_are_late_are_told_by_velocities_and_heading(by):
+    found = preflight(BOAT, logged(BOAT, positions_late(by)))
+    assert delayed(found.findings) == pytest.approx({"x": by, "y": by}, abs=0.01)
+    assert not delayed(preflight(BOAT, found.trials).findings)
+
+
+def test_what_nothing_measures_sideways_makes_no_position_late():
+    found = preflight(PLAIN, logged(PLAIN, positions_late(0.3)))
+    assert not delayed(found.findings)
+
+
+@pytest.mark.parametrize("model", [BOAT, PLAIN])
+def test_a_tracked_point_or_a_slip_makes_no_position_late(model):
+    def ahead(x: Array) -> Array:  # an antenna 0.4 m behind the middle
+        y = np.array(x)
+        y[:, 0] -= 0.4 * np.cos(x[:, 2])
+        y[:, 1] -= 0.4 * np.sin(x[:, 2])
+        return y
+
+    def slipping(x: Array) -> Array:  # a log that reads more the more it speeds up
+        y = np.array(x)
+        y[:, 3] += 0.3 * np.gradient(np.convolve(x[:, 3], np.ones(5) / 5, "same"), DT)
+        return y
+
+    for fault in (lambda x: x, ahead, slipping):
+        assert not delayed(preflight(model, logged(model, fault)).findings)

@@ -86,3 +86,11 @@ def test_finite_steps_end_before_the_first_bad_number(bad):
         inputs = np.zeros((5, 1))
         inputs[k] = bad
         assert trial(inputs=inputs).finite_steps == k  # s_k is known, and what led to it
+
+
+def test_a_trial_is_shown_in_one_short_line():
+    long = Trial(np.zeros((501, 2)), np.zeros((500, 1)), 0.02, ("q", "w"), ("u",), id="t0007")
+    shown = repr(long)
+    assert "\n" not in shown
+    assert len(shown) < 100
+    assert all(part in shown for part in ("t0007", "500", "0.02", "q, w"))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from facts import holds
-from grounded.instruments.limits import beyond_limits
+from grounded.instruments.inputs import beyond_limits
 from grounded.instruments.preflight import preflight
 from grounded.trial import Trial
 from grounded_trials import Workspace

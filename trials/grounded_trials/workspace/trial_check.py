@@ -152,7 +152,7 @@ def _inputs(task: Task, trial: Trial) -> list[str]:
 
 def _beyond(task: Task, trial: Trial) -> list[str]:
     """Where data show that the robot got more than a plan may ask for: [limits] of one log."""
-    from grounded.instruments.limits import beyond_limits, limits_of, span
+    from grounded.instruments.inputs import beyond_limits, limits_of, span
 
     past = np.any(beyond_limits(task, trial.inputs), axis=0)
     return [

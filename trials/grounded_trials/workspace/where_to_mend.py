@@ -65,7 +65,7 @@ def _at_limits(
 
     The log itself is at them by its making, and so is what the same hand drove on the same stick.
     """
-    from grounded.instruments.limits import judge_limits
+    from grounded.instruments.inputs import judge_limits
 
     if not seen_in(workspace.config):
         return findings

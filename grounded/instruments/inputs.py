@@ -1,0 +1,94 @@
+"""Commands: copies of one another, conditions of a trial, at their limits and beyond.
+
+Where a log goes beyond, the limits are too narrow: limits that were read off one log are those of
+that drive, not of the robot. A plan keeps to them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from grounded.frozen import Array
+from grounded.instruments.finding import Finding
+from grounded.instruments.lag import LEAST_S, SURE, Lag, alike, lag_between, reach_of
+from grounded.model import Model
+from grounded.task import Task
+from grounded.trial import Trial
+
+OFTEN = 0.1  # of the time
+COPY = 0.99  # coherence of two inputs that are one: two motors of one vehicle have 0.96
+ROUNDED = 0.01  # of the largest command: so much beyond a limit is a matter of digits
+
+
+def beyond_limits(task: Task, inputs: Array) -> Array:
+    """By how much each command (T, m) is beyond its limits, in its unit; 0 where it is not.
+
+    Args:
+        task: whose limits hold.
+        inputs: the commands (T, m) of a log; NaN counts for nothing.
+    """
+    inputs = np.nan_to_num(inputs)
+    excess = np.maximum(task.low - inputs, inputs - task.high)
+    slack = ROUNDED * np.abs(inputs).max(axis=0, initial=0.0)
+    return np.asarray(np.where(excess > slack, excess, 0.0))
+
+
+def judge_limits(task: Task, inputs: Array) -> Iterator[Finding]:
+    """Of commands (T, m) that are beyond their limits or at them for much of the time."""
+    past = beyond_limits(task, inputs) > 0
+    at = ((inputs <= task.low) | (inputs >= task.high)) & ~past
+    for j, name in enumerate(task.model.input_names):
+        share = float(past[:, j].mean())
+        if share > OFTEN:
+            text = (
+                f"beyond its limits, {limits_of(task, j)}, {100 * share:.0f} % of the time "
+                f"({span(inputs[:, j])}): widen [limits] if the robot may get that"
+            )
+            yield Finding(name, text, "beyond", share=share)
+        share = float(at[:, j].mean())
+        if share > OFTEN:
+            text = f"at its limits {100 * share:.0f} % of the time"
+            yield Finding(name, text, "saturated", share=share)
+
+
+def limits_of(task: Task, j: int) -> str:
+    """`0 to 1.17 m/s`."""
+    unit = task.model.inputs[task.model.input_names[j]]
+    return f"{span(np.array([task.low[j], task.high[j]]))}{'' if unit == '1' else f' {unit}'}"
+
+
+def span(values: Array) -> str:
+    """`-1.2 to 2.15`, the lowest to the highest of all values."""
+    return f"{np.nanmin(values):.4g} to {np.nanmax(values):.4g}"
+
+
+def judge_inputs(subject: Task | Model, trials: Sequence[Trial]) -> Iterator[Finding]:
+    """Of commands: copies of one another, at their limits or beyond, conditions of a trial."""
+    names = trials[0].input_names
+    columns = [[trial.inputs[:, j] for trial in trials] for j in range(len(names))]
+    fixed = [all(np.ptp(x) == 0 for x in some) for some in columns]
+    for j, name in enumerate(names):
+        values = sorted({float(x[0]) for x in columns[j]})
+        if fixed[j] and len(values) > 1:
+            shown = ", ".join(f"{v:.4g}" for v in values[:6])
+            yield Finding(name, f"constant within each trial ({shown})", "constant")
+    if isinstance(subject, Task):
+        yield from judge_limits(subject, np.concatenate([trial.inputs for trial in trials]))
+    longest = max(trials, key=lambda trial: trial.steps).inputs
+    for i, j in alike(longest, reach_of(len(longest), trials[0].dt)):
+        if fixed[i] or fixed[j]:
+            continue
+        lag = lag_between(list(zip(columns[i], columns[j], strict=True)), trials[0].dt)
+        if lag is not None and lag.coherence > COPY and 0.9 < lag.sign * lag.low < 1.1:
+            yield _copy(names[i], names[j], lag)
+
+
+def _copy(first: str, second: str, lag: Lag) -> Finding:
+    """Two inputs that are one signal, one perhaps later: a command and what was measured of it."""
+    if lag.delay < 0:
+        first, second = second, first
+    d = abs(lag.delay)
+    late = f", {d:.3g} s later" if d > max(SURE * lag.std, LEAST_S) else ""
+    return Finding(second, f"the same signal as {first}{late}", "copy", d, lag.std, lag.low)

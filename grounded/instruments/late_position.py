@@ -1,0 +1,109 @@
+"""Positions that are late behind what velocities and a heading say: a GPS receiver, a camera.
+
+What is late by d is off by -d S', the change of its velocity S. Other things are off along the way
+or across it as well: a slipping wheel by k S' along it, an unmodelled side slip by k S' across it,
+a point that is tracked l ahead of the modelled one by l omega across it. So a delay is what is left
+beside a tracked point; and of a body whose sideways velocity nothing measures, along and across
+both have to show it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from grounded.frozen import Array
+from grounded.instruments.kinematics import turned
+from grounded.instruments.lag import BLOCKS, SURE, Lag, at_samples, lag_between
+from grounded.instruments.rows import Row, per_step
+from grounded.model import Model
+from grounded.trial import Trial
+
+LIKE = 0.9  # coherence from which positions move as the others say
+LEAST_STEPS = 0.5  # of a time step: less is a matter of time stamps
+AGREE, CLOSE = 2.5, 0.15  # standard deviations, or of the delay: the same
+UNSURE = 0.25  # of the delay: less sure than that tells nothing
+SMOOTH_S = 0.3  # [s], half a window, or three samples
+
+Way = tuple[Array, Array]  # how far positions moved in each step, and as the others say (T, 2)
+
+
+@dataclass(frozen=True)
+class Late:
+    """Two positions (indices of states) that are late by one lag."""
+
+    states: tuple[int, int]
+    lag: Lag
+
+
+def late_positions(model: Model, trials: Sequence[Trial], rows: Sequence[Row]) -> Late | None:
+    """Both positions of a plane, where they are late as one; None where nothing says so surely.
+
+    Args:
+        model: however crude.
+        trials: of one time step, with what else is off put right.
+        rows: the model's kinematic ones, see `rows.kinematic_rows`.
+    """
+    plane = turned(model)
+    both = [row for row in rows if plane and row.i in (plane.i, plane.j)]
+    if plane is None or len(both) != 2:
+        return None
+    dt, columns = trials[0].dt, [row.i for row in both]
+    ways = [(z[:, columns], s[:, columns]) for t in trials for z, s in per_step(model, t, both)]
+    lag = lag_between([(said[:, k], moved[:, k]) for k in (0, 1) for moved, said in ways], dt)
+    if lag is None or lag.sign < 0 or lag.coherence < LIKE:
+        return None
+    if lag.delay < max(SURE * lag.std, LEAST_STEPS * dt):
+        return None
+    for left, std in _left(ways, lag.delay / dt, dt, apart=len(plane.speed) < 2):
+        if std > UNSURE * lag.delay or abs(left) > max(AGREE * std, CLOSE * lag.delay):
+            return None
+    return Late((both[0].i, both[1].i), lag)
+
+
+def _left(
+    ways: Sequence[Way], steps: float, dt: float, *, apart: bool
+) -> list[tuple[float, float]]:
+    """What is left of a delay [s] once positions are so many steps earlier, and how sure it is.
+
+    Args:
+        ways: of each piece.
+        steps: that they are taken to be late.
+        dt: [s].
+        apart: along the way and across it each by itself.
+    """
+    h = max(3, round(SMOOTH_S / dt))
+    window = np.hanning(2 * h + 3)[1:-1]
+    window /= window.sum()
+    rests, designs = [np.empty(0)], [np.empty((0, 4 if apart else 3))]
+    for moved, said in ways:
+        at = np.arange(len(moved)) + steps
+        early = np.stack([at_samples(moved[:, k], at) for k in (0, 1)], axis=1)
+        known = np.isfinite(early).all(axis=1)
+        if known.sum() < 3 * len(window):
+            continue
+        z, s = (
+            np.stack([np.convolve(one[known][:, k], window, "valid") for k in (0, 1)], axis=1) / dt
+            for one in (early, said)
+        )
+        slope, size = np.gradient(s, dt, axis=0), np.maximum(np.hypot(*s.T), 1e-9)[:, None]
+        ahead = s / size
+        side = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
+        along = (slope * ahead).sum(axis=1, keepdims=True) * ahead
+        turn = (slope * side).sum(axis=1, keepdims=True) / size
+        late = [along, slope - along] if apart else [slope]
+        design = np.stack([*(-one for one in late), turn * side, -turn * ahead], axis=2)
+        for k in (0, 1):
+            rests.append((z - s)[:, k] - (z - s)[:, k].mean())
+            designs.append(design[:, k] - design[:, k].mean(axis=0))
+    rest, design = np.concatenate(rests), np.concatenate(designs)
+    if len(rest) < BLOCKS or np.linalg.matrix_rank(design) < design.shape[1]:
+        return [(0.0, np.inf)]
+    spread = np.linalg.inv(design.T @ design)
+    found = spread @ design.T @ rest
+    forces = design * (rest - design @ found)[:, None]
+    parts = np.stack([part.sum(axis=0) for part in np.array_split(forces, 2 * BLOCKS)])
+    stds = np.sqrt(np.diag(spread @ parts.T @ parts @ spread))
+    return [(float(found[k]), float(stds[k])) for k in range(1 + apart)]
