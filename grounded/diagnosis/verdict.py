@@ -81,8 +81,6 @@ def verdict(
     if remainder and len(claims.names) == most:
         words.append(f"More is left: {left}; beyond {most} effects nothing was looked for.")
         more = min(most + FURTHER, MOST_EFFECTS) * any(one.above for one in remainder)
-        if more > most:
-            words.append(f"Before you adopt, run `grounded diagnose --max-effects {more}`.")
     elif remainder:
         words.append(f"Something is left that no known effect explains: {left}.")
     elif above := rest(rows):
@@ -140,6 +138,7 @@ def next_trial(
     unrepeatable: Mapping[str, str] | None = None,
     worse: bool = False,
     adopted: Collection[str] = (),
+    further: bool = False,
 ) -> str:
     """A sentence; `excitation.probe` makes the trial itself.
 
@@ -152,6 +151,7 @@ def next_trial(
         unrepeatable: the trials that can't or should not be run again, and why.
         worse: predictions get worse with what is claimed (`Diagnosis.contested`).
         adopted: the effects whose numbers are parameters of the model.
+        further: more effects are to be looked for first (`Verdict.look_for`).
     """
     from grounded.effects import places
 
@@ -177,6 +177,8 @@ def next_trial(
         return "Nothing is tied and nothing to adopt."
     if worse:
         return f"Nothing is tied, but predictions get worse with {_it(claims)}: {REPEAT}."
+    if further:
+        return "None is needed yet: nothing is tied, and more effects have to be looked for first."
     if _own_numbers(claims, adopted):
         return "Nothing is tied: fit the model's parameters."
     return f"Nothing is tied: adopt {_it(claims)}."
