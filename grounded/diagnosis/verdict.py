@@ -26,6 +26,7 @@ if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
 LOG, LOST = "is a log that no candidate made", "was lost"  # why a trial can't be run again
 MOST_EFFECTS, FURTHER = 6, 2  # that may be blamed at once; so many more are looked for next
 AS_STRONG = 0.2  # of what is modelled: a turned input that is so near to it has the wrong sign
+TURNED = ": turn its sign in model.py, or if only the log counts so, with {log} scale = -1"
 NAMED = 3  # parameters, channels and leftovers that a sentence names at most
 
 
@@ -308,7 +309,7 @@ def _turned(effect: Effect, params: Mapping[str, Estimate]) -> str:
     if not text or size <= 0:
         return ""
     if abs(size - 1) < AS_STRONG:
-        return text + ": check the sign ({log} scale = -1)" * isinstance(effect.family, InputFamily)
+        return text + TURNED * isinstance(effect.family, InputFamily)
     return f"{text} (by {number(100 * size)} % of what is modelled)"
 
 

@@ -236,7 +236,8 @@ def test_sentences_are_english():
         "The throttle acts the other way round (by 50 % of what is modelled)."
     )
     assert said("input_gain:throttle", g=-2.1) == (
-        "The throttle acts the other way round: check the sign ([log] scale = -1)."
+        "The throttle acts the other way round: turn its sign in model.py, or if only the log "
+        "counts so, with [log] scale = -1."
     )
     assert said("rate_gain:v", g=-2.0) == "The speed v changes the other way round."
     assert said("input_fade:throttle", k=-0.05) == "The throttle gets 5 % stronger every second."
