@@ -27,7 +27,7 @@ from grounded.search.improve import propose
 from grounded.search.planner import Planner
 from grounded.search.standing import SearchOptions
 from grounded.trial import Trial
-from grounded_trials.workspace.adopted import planner_with
+from grounded_trials.workspace.adopted import planner_of
 
 SHARES = (0.9, 0.97, 0.99)
 CLOSE = 0.005
@@ -137,7 +137,7 @@ def adopting(setup: Setup, after: int) -> str:
             own = {k: e.value for k, e in found.known_parameters.items() if k in task.model.params}
             named = [n for n in found.effects if not n.startswith("parameter:")]
             fitted = task.with_model(task.model.with_values(own))
-            planner = planner_with(fitted, [{"name": n, **found.values(n)} for n in named])
+            planner = planner_of(fitted, [{"name": n, **found.values(n)} for n in named])
             planner, claimed = replace(planner, task=task), " + ".join([*named, *own]) or "nothing"
         proposal = propose(task, candidates, trials, options, planner=planner)
         if (made := proposal.candidate) is None:

@@ -9,16 +9,19 @@ from typing import TYPE_CHECKING
 import click
 
 from grounded_cli import completion as complete
-from grounded_cli.options import (
-    as_json,
-    in_workspace,
-    next_line,
-    open_workspace,
-    parallel,
-    typed,
+from grounded_cli.options import as_json, in_workspace, next_line, open_workspace, parallel
+from grounded_cli.terminal import (
+    field,
+    lines,
+    names_in,
+    number,
+    show,
+    show_json,
+    stages,
+    table,
+    tinted,
 )
-from grounded_cli.terminal import field, names_in, number, show, show_json, stages, table, tinted
-from grounded_trials.wording import percent, rendered, with_unit, wrapped
+from grounded_trials.wording import percent, with_unit
 
 if TYPE_CHECKING:
     from grounded.diagnosis.report import Diagnosis, Ranked
@@ -103,15 +106,9 @@ def command(
     if json_:
         show_json(found.to_json())
     else:
-        from grounded_trials.workspace.proposing import to_run
-
-        text = found.next_trial
-        if found.probe:
-            run = to_run(workspace, found.probe, found.probe)
-            text = text.replace(rendered(run), typed(run))
         params = workspace.base_model.params
         _tell(found, {name: param.value for name, param in params.items()})
-        show("\n" + field("next trial", text))
+        show("\n" + field("next trial", found.next_trial))
         assert found.then is not None
         show(f"\n{next_line(found.then)}")
 
@@ -172,7 +169,7 @@ def _instruments(findings: Sequence[Finding]) -> None:
 
 def _note(text: str) -> None:
     """What a table's columns mean."""
-    show("\n".join(wrapped(text, "  ", "  ")))
+    show("\n".join(lines(text, "  ", "  ")))
 
 
 def _verdict(found: Diagnosis) -> str:
@@ -180,10 +177,10 @@ def _verdict(found: Diagnosis) -> str:
     from grounded_trials.report.diagnosis_words import verdict_lines
 
     causes, others = verdict_lines(found)
-    lines = [field("verdict", found.kind).replace(found.kind, tinted(found.kind), 1)]
+    shown = [field("verdict", found.kind).replace(found.kind, tinted(found.kind), 1)]
     for line in (*(f"- {cause}" for cause in causes), *others):
-        lines += wrapped(line, "  ", "    ")
-    return "\n".join(lines)
+        shown += lines(line, "  ", "    ")
+    return "\n".join(shown)
 
 
 def _places(found: Diagnosis) -> None:

@@ -88,11 +88,12 @@ class LazyGroup(click.Group):
         except Exception as error:
             from grounded.errors import GroundedError
 
-            if not isinstance(error, GroundedError) or error.then is None:
+            if not isinstance(error, GroundedError):
                 raise
-            from grounded_cli.options import next_line
+            from grounded_cli.options import next_line, placed
 
-            raise GroundedError(f"{error}\n{next_line(error.then)}") from None
+            then = "" if error.then is None else f"\n{next_line(error.then)}"
+            raise GroundedError(f"{placed(str(error))}{then}") from None
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
         """Names for the TAB key without importing any command."""

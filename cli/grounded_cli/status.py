@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from grounded_cli.options import as_json, in_workspace, next_line, open_workspace, typed
+from grounded_cli.options import as_json, in_workspace, next_line, open_workspace
 from grounded_cli.terminal import field, number, progress, remark, show, show_json, sparkline, table
-from grounded_trials.wording import count, legend, wrapped
+from grounded_trials.wording import count, legend, rendered, wrapped
 
 if TYPE_CHECKING:
     from grounded.search.candidate import Tried
@@ -82,7 +82,7 @@ def summary(status: Status) -> str:
         lines.append(field("best", text))
     if status.off_target:
         lines.append(field("off target", "; ".join(one.summary() for one in status.off_target)))
-    again = f"run the best one again: `{typed(status.again)}`"
+    again = f"run the best one again: `{rendered(status.again)}`"
     if certainty := last_improvement(standing.history, again):
         lines.append(field("certainty", certainty))
     lines.append(field("phase", f"{standing.outcome}: {standing.sentence}"))

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from typing import Any, TextIO
 
 from grounded.result import plain
+from grounded_cli.options import placed
 from grounded_trials.wording import MARKS, columns, figure, glued, wrapped
 
 number = figure
@@ -79,16 +80,21 @@ def _escaped(found: re.Match[str]) -> str:
     return found[0] if found[0].isprintable() else json.dumps(found[0])[1:-1]
 
 
+def lines(text: str, first: str, rest: str) -> list[str]:
+    """A sentence as lines of the terminal's width, begun as said; its commands as typed here."""
+    return wrapped(placed(text), first, rest)
+
+
 def field(label: str, text: str, indent: str = "") -> str:
     """A label and its text, wrapped to the terminal under itself; a number keeps its %."""
     head = f"{indent}{label:<10} "
-    first, *rest = wrapped(text, head, " " * len(head)) or [head.rstrip()]
+    first, *rest = lines(text, head, " " * len(head)) or [head.rstrip()]
     return "\n".join([first.replace(label, tinted(label), 1) if label else first, *rest])
 
 
 def remark(kind: str, text: str) -> None:
     """Narration with a word ahead, `note: ...`, wrapped to the terminal."""
-    first, *rest = wrapped(text, f"{kind}: ", "  ")
+    first, *rest = lines(text, f"{kind}: ", "  ")
     say("\n".join([first.replace(kind, tinted(kind), 1), *rest]))
 
 
@@ -136,7 +142,7 @@ def bar(text: str) -> Iterator[Callable[[int, int], None]]:
 
 def sentence(text: str) -> None:
     """A sentence on stdout, wrapped to the terminal."""
-    show("\n".join(wrapped(text, "", "  ")))
+    show("\n".join(lines(text, "", "  ")))
 
 
 def table(rows: Sequence[Sequence[str]], header: Sequence[str]) -> str:

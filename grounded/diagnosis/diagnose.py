@@ -246,19 +246,11 @@ class _Writer:
         seen = unconfirmed(self.claims, self.decision.doubtful, groups)
         values, agreement = by_trial(self.best, data, named) if named else ((), ())
         worse, adopted = contested(rows, agreement, named), self.options.but
-        lost = self.unrepeatable()
+        lost, most = self.unrepeatable(), self.options.max_effects
+        said = verdict(self.claims, ranking, groups, remainder, rows, credit, seen, same, most)
+        further = said.look_for > 0
         return Diagnosis(
-            verdict=verdict(
-                self.claims,
-                ranking,
-                groups,
-                remainder,
-                rows,
-                credit,
-                seen,
-                same,
-                self.options.max_effects,
-            ),
+            verdict=said,
             where=Where(
                 channels=self.channels(gain, rows),
                 times=tuple(by_time(gain.sum(axis=-1), data)),
@@ -285,7 +277,9 @@ class _Writer:
             leftover=remainder,
             unconfirmed=seen,
             correction=correction(predictor, self.best, self.left, where),
-            next_trial=next_trial(self.claims, look, groups, seen, same, lost, worse, adopted),
+            next_trial=next_trial(
+                self.claims, look, groups, seen, same, lost, worse, adopted, further
+            ),
             unknowable=self.known.sentences,
             noise=self.noise(),
             parameters=self.claims.parameters(),

@@ -227,6 +227,9 @@ class Made(Document):
     adopted: tuple[Mapping[str, Any], ...] = ()  # {"name": "dead_zone:throttle", "c": 0.146}
     params: Mapping[str, float] | None = field(metadata=BRIEF, default=None)  # of [model]
     nominal: Mapping[str, float] = field(default_factory=dict)  # the values of all parameters
+    named: tuple[str, ...] = ()  # the trials that were asked for, where not all that there are
+    compared: tuple[str, ...] = ()  # the second group
+    without: tuple[str, ...] = ()  # families that were not to be blamed
 
     def __post_init__(self) -> None:
         if not all("name" in effect for effect in self.adopted):

@@ -26,6 +26,7 @@ if TYPE_CHECKING:  # whoever reads a verdict needs none of what makes it
 LOG, LOST = "is a log that no candidate made", "was lost"  # why a trial can't be run again
 MOST_EFFECTS, FURTHER = 6, 2  # that may be blamed at once; so many more are looked for next
 AS_STRONG = 0.2  # of what is modelled: a turned input that is so near to it has the wrong sign
+TURNED = ": turn its sign in model.py, or if only the log counts so, with {log} scale = -1"
 NAMED = 3  # parameters, channels and leftovers that a sentence names at most
 
 
@@ -81,8 +82,6 @@ def verdict(
     if remainder and len(claims.names) == most:
         words.append(f"More is left: {left}; beyond {most} effects nothing was looked for.")
         more = min(most + FURTHER, MOST_EFFECTS) * any(one.above for one in remainder)
-        if more > most:
-            words.append(f"Before you adopt, run `grounded diagnose --max-effects {more}`.")
     elif remainder:
         words.append(f"Something is left that no known effect explains: {left}.")
     elif above := rest(rows):
@@ -140,6 +139,7 @@ def next_trial(
     unrepeatable: Mapping[str, str] | None = None,
     worse: bool = False,
     adopted: Collection[str] = (),
+    further: bool = False,
 ) -> str:
     """A sentence; `excitation.probe` makes the trial itself.
 
@@ -152,6 +152,7 @@ def next_trial(
         unrepeatable: the trials that can't or should not be run again, and why.
         worse: predictions get worse with what is claimed (`Diagnosis.contested`).
         adopted: the effects whose numbers are parameters of the model.
+        further: more effects are to be looked for first (`Verdict.look_for`).
     """
     from grounded.effects import places
 
@@ -177,6 +178,8 @@ def next_trial(
         return "Nothing is tied and nothing to adopt."
     if worse:
         return f"Nothing is tied, but predictions get worse with {_it(claims)}: {REPEAT}."
+    if further:
+        return "None is needed yet: nothing is tied, and more effects have to be looked for first."
     if _own_numbers(claims, adopted):
         return "Nothing is tied: fit the model's parameters."
     return f"Nothing is tied: adopt {_it(claims)}."
@@ -306,7 +309,7 @@ def _turned(effect: Effect, params: Mapping[str, Estimate]) -> str:
     if not text or size <= 0:
         return ""
     if abs(size - 1) < AS_STRONG:
-        return text + ": check the sign ({log} scale = -1)" * isinstance(effect.family, InputFamily)
+        return text + TURNED * isinstance(effect.family, InputFamily)
     return f"{text} (by {number(100 * size)} % of what is modelled)"
 
 

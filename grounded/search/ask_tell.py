@@ -11,17 +11,22 @@ that is a function call.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from grounded.errors import GroundedError, nearest
 from grounded.policy import Policy
 from grounded.search.candidate import Candidate, Tried
 from grounded.search.improve import propose
 from grounded.search.making import Proposal
+from grounded.search.planner import Planner, planner_with
 from grounded.search.standing import SearchOptions, Standing
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
+
+if TYPE_CHECKING:
+    from grounded.effects import Library
 
 
 class Search:
@@ -32,6 +37,7 @@ class Search:
         options: the [search] table; None: its defaults.
         candidates: those of a search that goes on, in the order in which they were asked for.
         trials: their trials, in the order in which they were told.
+        planner: plans with a better model (`adopt`); None: with the task's own.
     """
 
     def __init__(
@@ -41,10 +47,12 @@ class Search:
         *,
         candidates: Iterable[Candidate] = (),
         trials: Iterable[Trial] = (),
+        planner: Planner | None = None,
     ) -> None:
         if not isinstance(task, Task):
             raise GroundedError(f"a Search needs a Task, got a {type(task).__name__}")
         self.task, self.options = task, options or SearchOptions()
+        self.planner = planner or Planner(task, task)
         self._candidates, self._trials = list(candidates), list(trials)
         for trial in self._trials:
             self._fits(trial)
@@ -68,7 +76,9 @@ class Search:
         """What `ask` would return, or why there is nothing more to run."""
         if self._planned is None:
             whole = [interpolate_gaps(trial).trial for trial in self._trials]
-            self._planned = propose(self.task, self._candidates, whole, self.options)
+            self._planned = propose(
+                self.task, self._candidates, whole, self.options, planner=self.planner
+            )
         return self._planned
 
     @property
@@ -93,6 +103,29 @@ class Search:
             self._candidates.append(proposal.candidate)
             self._planned = None
         return proposal.candidate
+
+    def adopt(
+        self,
+        effects: Mapping[str, Mapping[str, float]],
+        params: Mapping[str, float] | None = None,
+        library: Library | None = None,
+    ) -> Search:
+        """The search from here on with a better model, whatever memory its effects have.
+
+        Args:
+            effects: quantities by effect, `{name: found.values(name) for name in found.effects}` of
+                a diagnosis of this search's task and trials; in place of those adopted before.
+            params: the model's own parameters that were calibrated beside them.
+            library: where the families are; None: the built-in ones.
+
+        Raises:
+            GroundedError: for an unknown effect or parameter, or a quantity that is missing.
+        """
+        task = self.task.with_model(self.task.model.with_values(params or {}))
+        planner = planner_with(task, list(effects.items()), library)
+        return Search(
+            task, self.options, candidates=self._candidates, trials=self._trials, planner=planner
+        )
 
     def _fits(self, trial: Trial) -> None:
         if not isinstance(trial, Trial):

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -18,6 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from grounded.compile import Problem
+from grounded.errors import GroundedError
 from grounded.model import Model
 from grounded.policy import Policy
 from grounded.rollout import Rollout, simulate
@@ -27,6 +29,7 @@ from grounded.trial import Trial
 from grounded.utility import Reward
 
 if TYPE_CHECKING:
+    from grounded.effects import Effect, Library
     from grounded.search.first_policy import Tick
     from grounded.solve.ddp import Solution
 
@@ -106,6 +109,58 @@ def predicted(problem: Problem, policy: Policy) -> Rollout:
     """A robot's policy in a model that may have more states than it measures."""
     angles = tuple(map(bool, problem.angles))
     return simulate(problem, policy.laid_out(problem.system.states, angles, problem.depths))
+
+
+Given = Mapping[str, float]  # an effect's quantities by name
+
+
+def planner_with(
+    task: Task,
+    effects: Sequence[tuple[str, Given]],
+    library: Library | None = None,
+    checked: Callable[[Effect, Given], Given] | None = None,
+) -> Planner:
+    """The planner of a task whose model got these effects, in the order in which they act.
+
+    A pure delay becomes latency of the task, a queue that the robot's runner knows; everything else
+    wraps the model, with memory states where the effect has a memory.
+
+    Args:
+        task: what is to be done, with the model as it was.
+        effects: names, `family:target`, and quantities.
+        library: where the families are; None: the built-in ones.
+        checked: an effect's quantities, all of them and in bounds; None: `Effect.complete`.
+
+    Raises:
+        GroundedError: for an unknown effect, or a quantity that is missing or unknown.
+    """
+    from grounded.effects import Library, param_name, wrap
+    from grounded.effects.family import Effect, Scales, Site, wrapping_order
+
+    library, checked = library or Library(), checked or Effect.complete
+    assert task.latency is not None
+    model, latency = task.model, np.array(task.latency)
+    families = [library.family(name.partition(":")[0]) for name, _ in effects]
+    for i in wrapping_order(families):
+        name, values = effects[i]
+        targets = tuple(name.partition(":")[2].split("+"))
+        if families[i].name == "delay":
+            reached = [_input(task, name, one) for one in targets]
+            site = Site(task.model, targets, Scales())
+            latency[reached] += checked(
+                Effect(families[i], site, families[i].quantities(site)), values
+            )["d"]
+            continue
+        effect = library.effect(name, model)
+        model = wrap(effect, checked(effect, values), task.dt)
+    widths = tuple(param_name(name, "width") for name, values in effects if "width" in values)
+    return dataclasses.replace(planner_for(task, model, latency), widths=widths)
+
+
+def _input(task: Task, name: str, target: str) -> int:
+    if target not in task.model.input_names:
+        raise GroundedError(f"effect '{name}': '{target}' is not an input of the model")
+    return task.model.input_names.index(target)
 
 
 def planner_for(task: Task, model: Model, latency: np.ndarray) -> Planner:

@@ -62,6 +62,7 @@ def test_what_predictions_get_worse_with_is_contested_and_no_sentence_says_adopt
     said = {worse: next_trial(claims, "", (), worse=worse) for worse in (False, True)}
     assert said[False].endswith("adopt it.")
     assert "worse" in said[True] and not said[True].endswith("adopt it.")
+    assert "adopt" not in next_trial(claims, "", (), further=True)
 
 
 def _claiming(*effects, **more):

@@ -12,7 +12,7 @@ from grounded.effects import Library, acting_order, memory_start, scales_of, wra
 from grounded.models.car import model as car
 from grounded.task import Task
 from grounded.utility import Reward
-from grounded_trials.workspace.adopted import planner_with
+from grounded_trials.workspace.adopted import planner_of
 
 DT, STEPS = 0.05, 60
 LIMIT = ("rate_limit:steering", {"r": 2.0})
@@ -75,7 +75,7 @@ def probed(parts):
 
 def adopted(parts):
     """What the adopted model plans with: a delay is latency, the rest is in the model."""
-    plan = planner_with(task(), [{"name": name, **values} for name, values in parts]).plan
+    plan = planner_of(task(), [{"name": name, **values} for name, values in parts]).plan
     still = Trial(
         np.full((2, car.n), 0.1),
         commands()[:1],

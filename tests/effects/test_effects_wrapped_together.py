@@ -13,7 +13,7 @@ from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects import Library, memory_start, wrap
 from grounded.effects.wrap import plain_step
 from grounded.models.car import model as car
-from grounded_trials.workspace.adopted import planner_with
+from grounded_trials.workspace.adopted import planner_of
 
 FRICTION = ("viscous_friction:v", {"k": 0.8})
 GAIN = ("rate_gain:v", {"g": 0.2})
@@ -51,7 +51,7 @@ def trial():
 
 
 def adopted(parts):
-    return planner_with(task(), [{"name": name, **values} for name, values in parts]).plan.model
+    return planner_of(task(), [{"name": name, **values} for name, values in parts]).plan.model
 
 
 def drive(model, one):

@@ -9,7 +9,7 @@ import numpy as np
 from grounded.solve.bias import residuals
 from grounded.trial import Trial
 from grounded_trials.report.forecast import anchored, forecast, forecast_error
-from grounded_trials.workspace.adopted import planner_with
+from grounded_trials.workspace.adopted import planner_of
 from small_tasks import cart, cart_task
 
 DELAY = 2  # steps by which x is logged late
@@ -27,22 +27,22 @@ def _logged(task, drag):
 
 def test_a_late_log_is_not_taken_for_what_the_model_lacks():
     task = cart_task()
-    planner = planner_with(task, [{"name": "sensor_delay:x", "d": DELAY * task.dt}])
+    planner = planner_of(task, [{"name": "sensor_delay:x", "d": DELAY * task.dt}])
     right, wrong = _logged(task, 0.2), _logged(task, 0.6)
     assert np.abs(residuals(planner.plan, anchored(planner, right))[:, 0]).max() < 1e-9
     free = residuals(planner.plan, planner.lift(wrong))[:, 0]
     kept = residuals(planner.plan, anchored(planner, wrong))[:, 0]
     assert np.abs(kept).max() < 0.2 * np.abs(free).max()
-    assert forecast_error(planner, wrong)[0] < forecast_error(planner_with(task, []), wrong)[0]
+    assert forecast_error(planner, wrong)[0] < forecast_error(planner_of(task, []), wrong)[0]
 
 
 def test_without_memory_a_trial_stays_as_it_is():
-    planner, trial = planner_with(cart_task(), []), _logged(cart_task(), 0.2)
+    planner, trial = planner_of(cart_task(), []), _logged(cart_task(), 0.2)
     assert anchored(planner, trial) is trial
 
 
 def test_a_forecast_along_a_trial_ends_where_its_windows_end():
-    planner, trial = planner_with(cart_task(), []), _logged(cart_task(), 0.6)
+    planner, trial = planner_of(cart_task(), []), _logged(cart_task(), 0.6)
     found = forecast(planner, replace(trial, states=trial.states))
     assert found is not None
     along = found.along(trial)

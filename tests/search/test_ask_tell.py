@@ -56,6 +56,31 @@ def test_a_search_goes_on_from_its_candidates_and_trials(search):
     assert numbers([half.ask()]) == numbers([search.candidates[2]])
 
 
+def test_a_search_goes_on_with_effects_that_have_a_memory():
+    """A wrapped delay made states that no target had: "task: target must have shape"."""
+    begun = gr.Search(TASK, OPTIONS)
+    begun.tell(run(begun.ask()))
+    delays = {"delay:speed": {"d": 0.01}, "delay:turn": {"d": 0.04}}  # the plant's, less the task's
+    late = begun.adopt(delays)
+    lagging = begun.adopt({"first_order_lag:turn": {"tau": 0.06}})
+    assert np.allclose(late.planner.plan.latency, 0.06) and (late.task.latency < 0.06).all()
+    assert lagging.planner.plan.model.n == TASK.model.n + 1
+    for search in (late, lagging):
+        candidate = search.ask()
+        assert candidate.base == "c0001" and candidate.model != begun.candidates[0].model
+        search.tell(run(candidate))
+        assert search.trials[1].states.shape[1] == TASK.model.n
+    told = [late.planner.lift(trial) for trial in late.trials]
+    assert abs(late.candidates[1].predicted_utility - late.task.utility(late.trials[1])) < abs(
+        begun.candidates[0].predicted_utility - TASK.utility(told[0])
+    )
+    name = next(iter(TASK.model.params))
+    value = 1.01 * TASK.model.params[name].value
+    assert begun.adopt({}, {name: value}).planner.plan.model.params[name].value == value
+    with pytest.raises(gr.GroundedError, match="spede"):
+        begun.adopt({"delay:spede": {"d": 0.06}})
+
+
 def test_the_best_policy_is_that_of_the_best_candidate(search):
     assert gr.Search(TASK).policy is None
     best = max(search.standing.history, key=lambda tried: tried.utility)

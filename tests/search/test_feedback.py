@@ -18,7 +18,7 @@ from grounded.search.planner import Planner, model_fingerprint, planner_for, pre
 from grounded.search.standing import SearchOptions, standing
 from grounded.search.step_size import Step
 from grounded.utility import Reward
-from grounded_trials.workspace.adopted import planner_with
+from grounded_trials.workspace.adopted import planner_of
 from small_tasks import cart_task, drive
 
 OPTIONS = SearchOptions()
@@ -157,7 +157,7 @@ def test_a_plan_with_dry_friction_is_followed_from_a_wider_kink(monkeypatch):
     monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[2]))
     task = importlib.import_module("benchmarks.foreign.mechanisms").cart_task("gentle")
     friction = {"name": "joint_friction:force<-x_vel", "c": 0.8, "b": 0.0, "width": 0.005}
-    planner = planner_with(task, [friction])
+    planner = planner_of(task, [friction])
     assert planner.widths == ("joint_friction_force_from_x_vel_width",)
     _, plain = first_policy(planner.plan)
     _, followed = planner.first_policy()

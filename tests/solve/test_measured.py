@@ -10,7 +10,7 @@ from grounded.search.first_policy import first_policy
 from grounded.solve.measured import measured_gains
 from grounded.task import Task
 from grounded.utility import Reward
-from grounded_trials.workspace.adopted import planner_with
+from grounded_trials.workspace.adopted import planner_of
 
 
 def roll(s, a, p):
@@ -37,7 +37,7 @@ def lagging():
         low=np.array([-20.0]),
         high=np.array([20.0]),
     )
-    return planner_with(task, [{"name": "first_order_lag:moment", "tau": 0.08}])
+    return planner_of(task, [{"name": "first_order_lag:moment", "tau": 0.08}])
 
 
 def disturbed(problem, run, K):

@@ -16,7 +16,7 @@ from grounded.rollout import simulate
 from grounded.trial import Trial
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import write_trial
-from grounded_trials.workspace.adopted import planner_with
+from grounded_trials.workspace.adopted import planner_of
 from reported import cart, copied
 from workspaces import CONFIG, make
 
@@ -151,7 +151,7 @@ effects = [
     folder = make(tmp_path / "w", config=CONFIG.replace('file = "model.py"', listed)).folder
     w, rng = Workspace(folder), np.random.default_rng(0)
     true = w.task.with_model(w.base_model.with_values({"mass": 1.4, "drag": 0.5}))
-    robot = planner_with(true, w.config.model.effects).plan
+    robot = planner_of(true, w.config.model.effects).plan
     names = (w.base_model.state_names, w.base_model.input_names)
     for k in range(8):
         force = np.repeat(rng.uniform(-4, 4, (5, 1)), 8, axis=0)

@@ -287,3 +287,26 @@ def test_another_part_of_a_recording_is_another_trial(w, tmp_path):
     file.write_text(whole + "[log.span]\nstart = 6.0\nend = 12.0\n")
     with pytest.raises(GroundedError, match=holding("t0002")):
         ingest_log(Folder(w.folder), log, data=True)
+
+
+def test_a_state_without_a_sensor_gets_the_lines_that_estimate_it(w, tmp_path):
+    """The error named the table and a page; the lines had to be found there."""
+    log, file = table_in(w, tmp_path)
+    bare = file.read_text().replace('v = { path = "/csv.v" }\n', "")
+    file.write_text(bare)
+    with pytest.raises(GroundedError, match=holding("'v'", "[estimate]")) as refused:
+        ingest_log(Folder(w.folder), log, data=True)
+    lines = str(refused.value).partition("\n")[2]
+    file.write_text(f"{bare}\n{lines}\n")
+    found = Folder(w.folder)
+    ingest_log(found, log, data=True)
+    (kept,) = found.trials()
+    assert kept.meta["estimated"] == "v"
+    file.write_text(f"{bare}\n{lines.replace('x = ', 'v = 0.1, x = ')}\n")
+    with pytest.raises(GroundedError, match=holding("'v'", "measured", "take it out")):
+        ingest_log(Folder(w.folder), log, data=True)
+    unheard = f"{bare}\n{lines}\n".replace('force = { path = "/csv.force" }', "")
+    file.write_text(unheard)
+    with pytest.raises(GroundedError, match="'force'") as refused:
+        ingest_log(Folder(w.folder), log, data=True)
+    assert "[estimate]" not in str(refused.value)

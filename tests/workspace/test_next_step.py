@@ -17,12 +17,12 @@ from grounded.effects import Library
 from grounded.errors import GroundedError, NextCommand
 from grounded.search.candidate import Candidate
 from grounded_cli.main import COMMANDS, cli
-from grounded_cli.options import ELSEWHERE
+from grounded_cli.options import ELSEWHERE, placed
 from grounded_cli.propose import _came_true, _so_far
 from grounded_trials import Workspace
 from grounded_trials.report.gathering import gather
 from grounded_trials.store.documents import write_document
-from grounded_trials.wording import folded
+from grounded_trials.wording import folded, rendered
 from grounded_trials.workspace.adopting import diagnosed_again
 from grounded_trials.workspace.config import set_in_model
 from grounded_trials.workspace.diagnosing import _in_vain
@@ -190,6 +190,25 @@ def test_printed_commands_work_from_where_the_user_is(tmp_path):
     assert process("propose", cwd=tmp_path / "my cart").out.endswith("next: grounded run\n")
 
 
+def test_commands_inside_sentences_work_from_where_the_user_is(cart, tmp_path, monkeypatch):
+    """`next:` had the -C, `run grounded diagnose --probe` above it hadn't."""
+    folder = copied(cart, tmp_path / "my cart")
+    config = folder / "grounded.toml"
+    config.write_text(re.sub("(?m)^target = .*$", "", config.read_text()))
+    done = grounded("-C", folder, "propose")
+    assert done.code == 1 and f"`grounded -C '{folder}' target`" in done.err
+    monkeypatch.chdir(folder)
+    assert "`grounded target`" in grounded("propose").err
+    with click.Context(cli, obj={}) as ctx:
+        ctx.meta["grounded_cli.folder"] = "my cart"
+        kept = "`grounded -C x run`", "`grounded init DIR`", "`grounded it's`", "grounded run"
+        assert placed(" ".join(kept)) == " ".join(kept)
+        assert (
+            placed("a `grounded ingest LOG --data`.")
+            == "a `grounded -C 'my cart' ingest LOG --data`."
+        )
+
+
 def test_an_error_names_the_workspace_too_and_init_does_not(tmp_path):
     make(tmp_path / "cart")
     done = process("-C", "cart", "adopt", "delay:force", cwd=tmp_path)
@@ -355,8 +374,8 @@ def test_a_rerun_after_the_end_goes_on_as_status_does(cart, tmp_path):
 
 def test_a_single_run_asks_for_another_by_its_command(cart, tmp_path):
     folder = copied(cart, tmp_path / "w")
-    out = " ".join(plain(grounded("-C", folder, "status").out).split())
-    assert "run the best one again: `grounded run best`" in out
+    out = " ".join(grounded("-C", folder, "status").out.split())
+    assert f"run the best one again: `grounded -C {folder} run best`" in out
     config = folder / "grounded.toml"
     config.write_text(config.read_text().partition("[system]")[0])
     out = " ".join(plain(grounded("-C", folder, "status").out).split())
@@ -488,6 +507,15 @@ def test_more_effects_are_looked_for_before_those_at_the_limit_are_adopted(cart,
     verdict = {"kind": "several", "effects": names, "sentence": "Two.", "look_for": 5}
     diagnosed(folder, verdict=verdict)
     assert last(grounded("-C", folder, "status")) == "grounded diagnose --max-effects 5"
+    made = {"trials": ["t0001", "t0002"], "params": {}, "without": ["delay"]}
+    asked = {
+        " --trials t0001,t0002": {"named": ["t0001", "t0002"]},
+        " --compare t0001 t0002": {"named": ["t0001"], "compared": ["t0002"]},
+    }
+    for words, one in asked.items():
+        found = Diagnosis.from_json({**DIAGNOSIS, "verdict": verdict, "diagnosed": made | one})
+        then = after_diagnosis(Folder(folder), found)
+        assert rendered(then) == f"grounded diagnose{words} --without delay --max-effects 5"
     six, seven = (grounded("diagnose", "--max-effects", str(k)).err for k in (6, 7))
     assert "max-effects" in seven and "max-effects" not in six
 

@@ -95,6 +95,35 @@ def test_what_only_the_end_weighs_is_told_there():
     assert both.rms > 0.4 and both.end == pytest.approx(0.002)
 
 
+ARM = Model(
+    states={"shoulder": "rad", "elbow": "rad", "d_shoulder": "rad/s", "d_elbow": "rad/s"},
+    inputs={"a": "1", "b": "1"},
+    params={},
+    derivative=lambda s, a, p: {
+        "shoulder": s.d_shoulder,
+        "elbow": s.d_elbow,
+        "d_shoulder": a.a,
+        "d_elbow": a.b,
+    },
+)
+
+
+def test_angles_are_told_before_their_rates_whatever_those_cost():
+    """Of an arm that stopped 5 degrees off, only how fast it still turned was told."""
+    arm = replace(task(), model=ARM, target=np.zeros((H + 1, 4)))
+    states = off(0.09, 0.02)
+    states[:, 2:] = 3.0, 4.0
+    trial = replace(run(states), state_names=ARM.state_names, input_names=ARM.input_names)
+
+    def told(**weights):
+        reward = replace(arm.reward, **{k: np.array(v, float) for k, v in weights.items()})
+        return [one.what for one in off_target_of(replace(arm, reward=reward), [trial])]
+
+    assert told(terminal=[1, 1, 1, 1]) == ["shoulder", "elbow"]
+    assert told(terminal=[1, 0, 1, 1]) == ["shoulder", "d_elbow"]
+    assert told(terminal=[0, 0, 1, 1]) == ["d_shoulder", "d_elbow"]
+
+
 def test_where_something_is_to_be_reached_the_end_is_told_without_a_weight_of_its_own():
     """The page of a task to get somewhere gave the rms over the way, and not where it ended."""
     goal = replace(task(**ALONG), start=np.array([-1.0, 0.0, 0.0, 0.0]))

@@ -228,10 +228,8 @@ def undiagnosed(folder: Path, *, again: bool = False) -> list[str]:
 
 def diagnose_case(folder: str, name: str, without: Sequence[str]) -> dict[str, Any]:
     """A job: one case, diagnosed in its workspace."""
-    from grounded.effects import Library
-
     begin = time.process_time()
-    diagnose_in(Folder(Path(folder) / name), library=Library().without(without))
+    diagnose_in(Folder(Path(folder) / name), without=without)
     return {"case": name, "cpu_s": time.process_time() - begin}
 
 

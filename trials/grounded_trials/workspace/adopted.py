@@ -3,26 +3,21 @@
     [model]
     effects = [ { name = "dead_zone:throttle", c = 0.146 } ]
 
-Families come with grounded and with other packages (`installed_effects`). A pure delay becomes
-latency of the task, a queue that the robot's runner knows; everything else wraps the model
-(`grounded.effects`), with memory states where the effect has a memory.
+Families come with grounded and with other packages (`installed_effects`); how they
+join the model: `grounded.search.planner.planner_with`.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
-from grounded.effects.family import Effect, Family, Scales, Site, wrapping_order
+from grounded.effects.family import Effect, Family, Scales, Site
 from grounded.effects.registry import Library
-from grounded.effects.wrap import param_name, wrap
 from grounded.errors import GroundedError
 from grounded.model import Model
-from grounded.search.planner import Planner, planner_for
+from grounded.search.planner import Planner, planner_with
 from grounded.task import Task
 
 
@@ -53,35 +48,20 @@ def installed_effects() -> Library:
     return Library().with_families(found)
 
 
-def planner_with(task: Task, effects: Sequence[Mapping[str, Any]]) -> Planner:
+def planner_of(task: Task, effects: Sequence[Mapping[str, Any]]) -> Planner:
     """The planner of a task whose model got these effects, in the order in which they act.
 
     Raises:
         GroundedError: for an unknown effect, or a quantity that is missing or unknown.
     """
-    library = installed_effects() if effects else Library()
-    assert task.latency is not None
-    model, latency = task.model, np.array(task.latency)
-    families = [library.family(str(entry["name"]).partition(":")[0]) for entry in effects]
-    for i in wrapping_order(families):
-        entry = effects[i]
-        name = str(entry["name"])
-        targets = name.partition(":")[2].split("+")
-        if families[i].name == "delay":
-            reached = [_input(task, name, one) for one in targets]
-            effect = _effect(families[i], task.model, targets, Scales())
-            latency[reached] += _checked(effect, entry)["d"]
-            continue
-        effect = library.effect(name, model)
-        model = wrap(effect, _checked(effect, entry), task.dt)
-    widths = tuple(param_name(str(e["name"]), "width") for e in effects if "width" in e)
-    return replace(planner_for(task, model, latency), widths=widths)
+    library = installed_effects() if effects else None
+    given = [(str(e["name"]), {k: v for k, v in e.items() if k != "name"}) for e in effects]
+    return planner_with(task, given, library, _checked)
 
 
-def _checked(effect: Effect, entry: Mapping[str, Any]) -> Mapping[str, float]:
+def _checked(effect: Effect, values: Mapping[str, Any]) -> Mapping[str, float]:
     """The quantities of an effect as grounded.toml has them: numbers, all there, in bounds."""
     where = f"grounded.toml: [model] effects: {effect.name}"
-    values = {key: value for key, value in entry.items() if key != "name"}
     for key, value in values.items():
         number = isinstance(value, int | float) and not isinstance(value, bool)
         if not number or not math.isfinite(value):
@@ -126,9 +106,3 @@ def _bounds(effect: Effect) -> dict[str, tuple[float, float]]:
 def _effect(family: Family, model: Model, targets: Sequence[str], scales: Scales) -> Effect:
     site = Site(model, tuple(targets), scales)
     return Effect(family, site, family.quantities(site))
-
-
-def _input(task: Task, name: str, target: str) -> int:
-    if target not in task.model.input_names:
-        raise GroundedError(f"grounded.toml: [model] effects: '{name}': '{target}' is not an input")
-    return task.model.input_names.index(target)

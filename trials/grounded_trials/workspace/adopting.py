@@ -352,11 +352,11 @@ def better_model(workspace: Folder, diagnosis: Diagnosis | None) -> Better | Non
     values = _parameters(workspace, diagnosis)
     if diagnosis is None or not (values or len(effects) > len(adopted)):
         return Better(workspace.planner, "with adopted effects") if adopted else None
-    from grounded_trials.workspace.adopted import planner_with
+    from grounded_trials.workspace.adopted import planner_of
 
     task = workspace.task
     estimated = task.with_model(task.model.with_values(values))
-    return Better(planner_with(estimated, effects), "as diagnosed")
+    return Better(planner_of(estimated, effects), "as diagnosed")
 
 
 def _new(diagnosis: Diagnosis | None, adopted: set[str]) -> list[Effect]:

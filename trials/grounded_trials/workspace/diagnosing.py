@@ -44,6 +44,7 @@ def diagnose_in(
     *,
     trials: Sequence[str] = (),
     max_effects: int = 3,
+    without: Sequence[str] = (),
     library: Library | None = None,
     compare: Sequence[str] = (),
     probe: bool = False,
@@ -65,7 +66,7 @@ def diagnose_in(
     effects = [dict(effect) for effect in workspace.config.model.effects]
     names = [str(effect["name"]) for effect in effects]
     adopted = {name for name in names if not name.startswith("delay:")}  # whose d is no parameter
-    library = library or Library()
+    library = (library or Library()).without(without)
     planner, used = workspace.planner, _chosen(workspace, trials)
     others = _chosen(workspace, compare) if compare else []
     memory = planner.plan.model.state_names[planner.task.model.n :]
@@ -82,6 +83,9 @@ def diagnose_in(
         adopted=tuple(effects),
         params=dict(workspace.config.model.params),
         nominal={name: p.value for name, p in planner.plan.model.params.items()},
+        named=tuple(trial.id for trial in used) if trials or compare else (),
+        compared=tuple(compare),
+        without=tuple(without),
     )
     found = diagnose(
         planner.plan, lifted, options, compare=second, engine=engine, progress=progress
@@ -99,11 +103,9 @@ def diagnose_in(
         why = str(error) or type(error).__name__
         identity, words = "", f"{found.next_trial.rstrip('.')}; no probe could be computed ({why})"
     if words:
-        run = f" ({identity}: {rendered(to_run(workspace, identity, identity))})" * bool(identity)
+        run = f" ({identity}: `{rendered(to_run(workspace, identity, identity))}`)"
+        run *= bool(identity)
         found = replace(found, next_trial=f"{words}{run}", probe=identity)
-    if more := found.verdict.look_for:
-        first = f"Before it, `grounded diagnose --max-effects {more}` looks for more effects."
-        found = replace(found, next_trial=f"{first} {found.next_trial}".strip())
     if undo := _in_vain(workspace, found):
         found = replace(found, next_trial=f"{undo} {found.next_trial}")
     _keep(workspace, found)  # with what is said of the next trial

@@ -120,9 +120,9 @@ class Folder:
 
         if not self.config.model.effects:
             return Planner(self.task, self.task)
-        from grounded_trials.workspace.adopted import planner_with
+        from grounded_trials.workspace.adopted import planner_of
 
-        return planner_with(self.task, self.config.model.effects)
+        return planner_of(self.task, self.config.model.effects)
 
     @cached_property
     def _trials(self) -> tuple[StoredTrial, ...]:

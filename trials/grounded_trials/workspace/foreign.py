@@ -158,16 +158,32 @@ def read_foreign(workspace: Folder, path: Path, mapping: LogMapping) -> ForeignL
     missing = [s for s in states if s not in mapping.states]
     missing += [i for i in model.input_names if i not in mapping.inputs]
     if missing:
-        raise GroundedError(
-            f"[log] maps no '{missing[0]}': map it, or let the smoother find a state that is "
-            "not measured with an [estimate] table (docs/real-logs.md)"
-        )
+        raise _unmapped(model, mapping, missing[0], estimated=estimate is not None)
     source = {"source": path.name, "source_sha256": _hashed(files)}
     source |= read_by(mapping)
     if guessed := [name for name in model.state_names if name not in states]:
         source["estimated"] = ",".join(guessed)
     series = mapped_signals(files, mapping, states, model.input_names)
     return ForeignLog(workspace, path, mapping, states, estimate, series, source)
+
+
+def _unmapped(model: Model, mapping: LogMapping, name: str, *, estimated: bool) -> GroundedError:
+    """What to do about a state or an input that [log] does not map."""
+    if name in model.input_names:
+        return GroundedError(f"[log] maps no '{name}': every input has to be logged, map it")
+    if estimated:
+        return GroundedError(
+            f"[log] maps no '{name}', which [estimate] says is measured: map it, or take it out "
+            "of measured"
+        )
+    known = [f"{one} = 0.01" for one in model.state_names if one in mapping.states]
+    if not known:
+        return GroundedError(f"[log] maps no '{name}', nor any other state: map what is measured")
+    return GroundedError(
+        f"[log] maps no '{name}': map it. Where no sensor measures it, a smoother finds it from "
+        "the others: add to grounded.toml, each with its own noise (standard deviation, in the "
+        f"state's unit),\n[estimate]\nmeasured = {{ {', '.join(known)} }}"
+    )
 
 
 def _hashed(files: Sequence[Path]) -> str:

@@ -101,11 +101,23 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
     if set(new) <= set(declined(workspace)):
         return None  # adopted, and undone: whoever did that is not asked to do it again
     if most := diagnosis.verdict.look_for:
-        return NextCommand("diagnose", ("--max-effects", str(most)))
+        return _with_more(most, diagnosis.made or Made())
     own = {f"parameter:{name}" for name in workspace.base_model.params}
     if own.issuperset(new):
         return NextCommand("fit")  # the model's form is right: all of its numbers at once
     return NextCommand("adopt", new)
+
+
+def _with_more(effects: int, made: Made) -> NextCommand:
+    """The same diagnosis, of the same trials, with more effects at once."""
+    asked: tuple[str, ...] = ()
+    if made.compared:
+        asked = ("--compare", ",".join(made.named), ",".join(made.compared))
+    elif made.named:
+        asked = ("--trials", ",".join(made.named))
+    if made.without:
+        asked += ("--without", ",".join(made.without))
+    return NextCommand("diagnose", (*asked, "--max-effects", str(effects)))
 
 
 @dataclass(frozen=True)

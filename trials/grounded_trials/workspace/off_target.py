@@ -17,7 +17,7 @@ from grounded.result import Document
 from grounded.task import Task
 from grounded.trial import Trial
 
-FEW = 2  # groups of states that are told: those that cost most
+FEW = 2  # groups of states that are told: positions and angles before their rates, then by cost
 REST = 0.1  # of the mean step of a target: one that moves less in the last step is at rest
 
 
@@ -65,8 +65,11 @@ def off_target_of(task: Task, trials: Sequence[Trial]) -> tuple[OffTarget, ...]:
     whole = [trial.whole(task.horizon) for trial in trials]
     errors = [tracking_error(task, trial.until(max(trial.finite_steps, 0))) for trial in whole]
     ended = any(len(e) <= task.horizon for e in errors)
-    found, arrives = [], reaches(task)
-    for names, what in weighed_groups(task):
+    groups, arrives = weighed_groups(task), reaches(task)
+    units = [task.model.states[names[0]] for names, _ in groups]
+    ranked: list[tuple[bool, float, int]] = []
+    found: dict[int, OffTarget] = {}
+    for k, (names, what) in enumerate(groups):
         states = [task.model.state_names.index(name) for name in names]
         each = [e[:, states] for e in errors]
         if not all(np.isfinite(e).all() for e in each) or not each:
@@ -81,11 +84,9 @@ def off_target_of(task: Task, trials: Sequence[Trial]) -> tuple[OffTarget, ...]:
             values |= {"most": float(worst.max()), "at_s": task.dt * int(np.argmax(worst))}
         if (terminal.any() or arrives) and not ended:
             values["end"] = float(np.sqrt(np.mean([e[-1] @ e[-1] for e in each])))
-        found.append(
-            (cost, OffTarget(what.removeprefix("the "), task.model.states[names[0]], **values))
-        )
-    least = sorted((cost for cost, _ in found), reverse=True)[:FEW][-1:]
-    return tuple(one for cost, one in found if cost >= least[0])[:FEW]
+        ranked.append((any(units[k] == f"{unit}/s" for unit in units), -cost, k))
+        found[k] = OffTarget(what.removeprefix("the "), units[k], **values)
+    return tuple(found[k] for k in sorted(k for *_, k in sorted(ranked)[:FEW]))
 
 
 def reaches(task: Task) -> bool:
