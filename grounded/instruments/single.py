@@ -139,7 +139,9 @@ def _held(s: Signal) -> Found | None:
         old[runs(x)[0]] = False
         gone.append(old & np.isfinite(x))
     text = f"has a new value every {each * s.dt:.3g} s only, each is logged {each:g} times"
-    return Finding(s.name, text, "held", share=_share(gone), corrected=True), s.without(gone)
+    advice = "in a table, leave its cell empty in the rows that repeat it"
+    found = Finding(s.name, text, "held", share=_share(gone), corrected=True, advice=advice)
+    return found, s.without(gone)
 
 
 def _stuck(s: Signal) -> Found | None:

@@ -119,7 +119,7 @@ def last_improvement(history: Sequence[Tried], again: str = "run the best one ag
         return ""
     before, after = accepted[-2], accepted[-1]
     gain = after.utility - before.utility
-    error, freedom = _error_between(before, after, history)
+    error, freedom = error_between(before, after, history)
     if not freedom:
         return (
             f"the last gain is {gain:.3g}; both candidates were run once, so the noise of a "
@@ -146,7 +146,7 @@ def student(x: float, freedom: float) -> float:
     return 0.5 + math.copysign(0.5, x) * float(reached)
 
 
-def _error_between(before: Tried, after: Tried, history: Sequence[Tried]) -> tuple[float, float]:
+def error_between(before: Tried, after: Tried, history: Sequence[Tried]) -> tuple[float, float]:
     """Standard error of the difference of two means, and its degrees of freedom; 0 for unknown."""
     each = [(t.standard_error**2, len(t.utilities)) for t in (before, after)]
     if all(count > 1 and math.isfinite(square) for square, count in each):

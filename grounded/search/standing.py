@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result, document
 from grounded.search.candidate import Candidate, Slopes, Tried, Way
-from grounded.search.certainty import judged, last_improvement
+from grounded.search.certainty import error_between, judged, last_improvement
 from grounded.search.step_size import Step, after_failure, after_success
 from grounded.task import Task
 from grounded.trial import Trial
@@ -275,21 +275,27 @@ def standing(
 
 
 def _hardly(history: tuple[Tried, ...], tolerance: float, model: str) -> tuple[Ending, str] | None:
-    """The ending where the last candidates of this model gained too little for what they cost."""
-    before = [t.utility for t in history[:-PATIENCE] if t.accepted]
+    """The ending where the last candidates of this model gained too little for what they cost.
+
+    Too little is less than the tolerance each, or less in all than the standard error of that gain,
+    where repeats tell it: a search under noise would go from one lucky run to the next. How the
+    model's own policy scatters says nothing of the policies that came after it.
+    """
+    before = [t for t in history[:-PATIENCE] if t.accepted]
     last = history[-PATIENCE:]
     if not before or any(t.candidate.model != model for t in last):
         return None
-    best = max(t.utility for t in history if t.accepted)
-    gained = best - max(before)
+    old, best = before[-1], [t for t in history if t.accepted][-1]
+    gained = best.utility - old.utility
     if gained == 0.0:
         return "no step improved", f"the last {PATIENCE} candidates did not improve"
-    if gained >= PATIENCE * tolerance * abs(best):
-        return None
-    return "too little gained", (
-        f"the last {PATIENCE} candidates gained {gained:.3g} in all, less than "
-        f"{100 * tolerance:g} % each ([search] tolerance)"
-    )
+    told = f"the last {PATIENCE} candidates gained {gained:.3g} in all, less than"
+    if gained < PATIENCE * tolerance * abs(best.utility):
+        return "too little gained", f"{told} {100 * tolerance:g} % each ([search] tolerance)"
+    error, known = error_between(old, best, history)
+    if old.candidate.base and known and gained < error:
+        return "too little gained", f"{told} its standard error, {error:.2g} by repeats"
+    return None
 
 
 def _suspicion(history: tuple[Tried, ...], incumbent: Tried, model: str) -> str:

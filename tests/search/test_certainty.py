@@ -9,10 +9,11 @@ from scipy.stats import t, ttest_ind
 from facts import holds
 from grounded.search.candidate import Tried
 from grounded.search.certainty import last_improvement, student, utility_noise
+from grounded.search.standing import _hardly
 
 
 def tried(*utilities, accepted=True, base="c0001"):
-    candidate = SimpleNamespace(base=base)
+    candidate = SimpleNamespace(base=base, model="m")
     return Tried(candidate=candidate, trials=(), utilities=utilities, accepted=accepted)
 
 
@@ -60,6 +61,21 @@ def test_the_wild_first_policy_says_nothing_of_the_noise_of_later_ones():
     assert "probability" not in last_improvement([wild, gentler, tried(-5.0), tried(-4.0)])
 
 
+def test_a_gain_within_its_own_standard_error_ends_a_search():
+    """Each of four candidates was a little luckier than the one before it, on and on."""
+    small = (tried(-1.05), tried(-1.3, accepted=False), tried(-1.2, accepted=False))
+
+    def ending(best, repeated=(-1.2, -1.0), tolerance=1e-3, base="c0001"):
+        before = (tried(-9.0, base=""), tried(*repeated, base=base))
+        found = _hardly((*before, *small, tried(best)), tolerance, "m")
+        return found and found[0]
+
+    assert ending(-1.02) == "too little gained" and ending(-0.5) is None
+    assert ending(-1.02, repeated=(-1.1,)) is None  # nobody knows the noise
+    assert ending(-1.02, repeated=(-1.1,), tolerance=0.05) == "too little gained"
+    assert ending(-0.9, repeated=(-9.0, -0.2, -4.0), base="") is None  # the wild first policy
+
+
 def test_failed_runs_are_left_out_and_trials_that_agree_say_so():
     assert utility_noise([tried(-5.0, -np.inf)])[1] == 0
     found = last_improvement([tried(-5.0, -5.0), tried(-4.0, -4.0)])
@@ -87,6 +103,6 @@ def test_a_crash_is_called_a_crash():
     ],
 )
 def test_a_verdict_is_one_of_a_few_words(accepted, base, doubt, trials, last, word):
-    candidate = SimpleNamespace(base=base)
+    candidate = SimpleNamespace(base=base, model="m")
     tried = Tried(candidate, (None,) * trials, (), accepted, in_doubt=doubt)
     assert tried.verdict(last) == word

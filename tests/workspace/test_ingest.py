@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from cli import grounded
-from facts import holding
+from facts import holding, holds
 from grounded.errors import GroundedError
 from grounded.trial import Trial
 from grounded_trials.store.trial_file import TrialWriter, read_trial, trial_bytes, write_trial
@@ -310,3 +310,30 @@ def test_a_state_without_a_sensor_gets_the_lines_that_estimate_it(w, tmp_path):
     with pytest.raises(GroundedError, match="'force'") as refused:
         ingest_log(Folder(w.folder), log, data=True)
     assert "[estimate]" not in str(refused.value)
+
+
+def test_samples_of_a_slow_sensor_that_a_table_holds_are_told(w, tmp_path):
+    """GPS of 10 Hz in a table of 50 Hz was 40 ms late, without a word."""
+    t = np.arange(0, 6, 0.02)
+    x, v = np.sin(t), np.cos(t)
+    file = w.folder / "grounded.toml"
+    file.write_text(file.read_text() + LOG_OF_A_TABLE)
+
+    def taken(name, position):
+        columns = zip(t, position, v, np.sin(3 * np.floor(t / 0.05) * 0.05), strict=True)
+        rows = ["t,x,v,force", *(f"{a:.3f},{b},{c:.6f},{d:.6f}" for a, b, c, d in columns)]
+        (tmp_path / name).write_text("\n".join(rows))
+        found = ingest_log(w, tmp_path / name, data=True)
+        stored = {one.stored.id: one.trial for one in w.trials()}[found.trial]
+        return found.warnings, stored.states[:100, 0] - np.sin(0.05 * np.arange(100))
+
+    held = np.repeat(x[::5], 5)
+    told, off = taken("held.csv", [f"{one:.6f}" for one in held])
+    assert [one for one in told if holds(one, "'x'", "5 rows", "10 Hz", "0.04 s", "empty")]
+    empty = [f"{one:.6f}" if k % 5 == 0 else "" for k, one in enumerate(held)]
+    told, mended = taken("empty.csv", empty)
+    assert not any("held" in one for one in told)
+    assert np.abs(mended).max() < 0.1 * np.abs(off).max()
+    for good in (x, np.round(x, 2)):  # a coarse sensor is no slow one
+        told, _ = taken(f"{len(w.trials())}.csv", [f"{one:.6f}" for one in good])
+        assert not any("held" in one for one in told)

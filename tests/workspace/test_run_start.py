@@ -125,6 +125,33 @@ def test_a_log_whose_start_is_sought_is_read_once(w, tmp_path, monkeypatch):
     assert found.notes and len(reads) == 1
 
 
+@pytest.mark.parametrize("before", [0.0, 1.0])
+@pytest.mark.parametrize("late", [0, 1, 2, 3])
+def test_commands_that_are_logged_steps_late_are_told(w, tmp_path, before, late):
+    """One step was told, two were taken without a word."""
+    policy = w.candidate("c0002")[0].policy
+    table = np.loadtxt(record(w, tmp_path / "a.csv", policy, before), delimiter=",", skiprows=1)
+    rows = late * round(policy.dt * RATE)
+    table[rows:, 3] = table[: len(table) - rows, 3]
+    np.savetxt(tmp_path / "b.csv", table, "%.5f", ",", header="t,x,v,force", comments="")
+    told = [one for one in w.ingest(tmp_path / "b.csv").warnings if "seem to be" in one]
+    assert len(told) == bool(late) and all(f"logged {late} step" in one for one in told)
+
+
+def test_a_start_is_no_surer_than_its_states_are_the_controller_s(w, tmp_path):
+    """Velocities that were made of positions afterwards moved the start by 6 ms, unsaid."""
+    policy = w.candidate("c0002")[0].policy
+    path = record(w, tmp_path / "a.csv", policy, 1.0)
+    table = np.loadtxt(path, delimiter=",", skiprows=1)
+    table[1:, 2] = np.diff(table[:, 1]) * RATE
+    np.savetxt(tmp_path / "b.csv", table, "%.5f", ",", header="t,x,v,force", comments="")
+    told = [one for one in w.ingest(tmp_path / "b.csv").warnings if "known to 10 ms" in one]
+    assert len(told) == 1 and "c0002" in told[0]
+    w.propose()
+    own = record(w, tmp_path / "c.csv", w.candidate("c0003")[0].policy, 1.0)
+    assert not any("known to" in one for one in w.ingest(own).warnings)
+
+
 def test_the_operator_jogged_the_cart_first(w, tmp_path):
     policy = w.candidate("c0002")[0].policy
     found = w.ingest(record(w, tmp_path / "a.csv", policy, 7.0, jog=1.5))

@@ -26,6 +26,7 @@ from grounded_trials.logs.samples import (
     SignalReport,
     check_clocks,
     report_of,
+    staircase,
     tidy,
     warnings_of,
 )
@@ -137,6 +138,8 @@ def to_grid(
         value = samples[name].linear if how[name] == "linear" else samples[name].hold
         columns.append(value(at, dt, start))
         reports.append(report_of(samples[name], series[name], columns[-1], at, start))
+    tracked = [samples[name] for name in states if how[name] == "linear"]
+    stairs = [staircase(s, start, int(grid[-1]), dt) for s in tracked]
     held = np.array([s.before(start - round(dt * 0.5e9)) for s in sent])
     if rest is not None and in_motion(sent, start, rest):
         held = np.where(np.isfinite(held), held, [s.y[0] for s in sent])
@@ -151,7 +154,7 @@ def to_grid(
         row_s=rows_apart(sent, [samples[name] for name in states]),
         last_ns=min(int(samples[name].t[-1]) for name in states),
         reports=tuple(reports),
-        warnings=(*warnings_of(tuple(reports), late), *([uneven] if uneven else [])),
+        warnings=(*warnings_of(tuple(reports), late), *filter(None, (uneven, *stairs))),
     )
 
 

@@ -25,6 +25,8 @@ MIXED_S = 1.0  # signals on different clocks whose clocks differ by more don't f
 SKEW_S = 0.1  # and by more than this, they may be shifted
 SPARSE = 50.0  # steps between two samples: the log's time is in another unit
 BRIDGED = 1.9  # a value between samples this many intervals apart was bridged
+LEAST_RUNS, REPEATED = 20, 0.8  # runs of equal samples, and those of two and more: it is held
+COARSE = 2.5  # times its least change is the median one of a signal that is not quantised
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,6 +279,36 @@ def _furthest(skews: Mapping[str, float | None]) -> tuple[str, str, float]:
     known = {name: skew or 0.0 for name, skew in skews.items()}
     first, last = min(known, key=known.__getitem__), max(known, key=known.__getitem__)
     return first, last, known[last] - known[first]
+
+
+def staircase(samples: Samples, first: int, last: int, dt: float) -> str:
+    """What a signal whose rows repeat each value loses by it, "" where it does not matter.
+
+    A table has a row for its fastest signal; a slower sensor's last sample stands in several. A
+    quantised signal repeats values, too, but changes by few different steps.
+
+    Args:
+        samples: of a state.
+        first: the trial's first moment [ns].
+        last: and its last.
+        dt: the control step [s]; samples that are held for less than half of it are as good as new.
+    """
+    inside = (samples.t >= first) & (samples.t <= last)
+    y = samples.y[inside]
+    new = np.flatnonzero(np.append(True, np.diff(y) != 0)) if len(y) else np.empty(0, int)
+    lengths, sizes = np.diff(new), np.abs(np.diff(y[new]))
+    if len(lengths) < LEAST_RUNS or np.mean(lengths >= 2) < REPEATED:
+        return ""
+    each = float(np.median(lengths))
+    apart = each * samples.interval
+    if apart <= dt / 2 or float(np.median(sizes)) < COARSE * float(sizes.min()):
+        return ""
+    late = (each - 1) / 2 * samples.interval
+    return (
+        f"'{samples.name}' changes every {each:g} rows only: samples of {1 / apart:.3g} Hz that "
+        f"are held, {late:.2g} s late on average. Leave its cell empty in the rows that repeat it "
+        "(or log the sensor's own messages): then it is interpolated"
+    )
 
 
 def warnings_of(reports: tuple[SignalReport, ...], late: float) -> tuple[str, ...]:

@@ -33,7 +33,14 @@ from grounded_trials.workspace.ingested import Ingested
 from grounded_trials.workspace.next_step import after_log
 from grounded_trials.workspace.off_target import off_target_of
 from grounded_trials.workspace.proposing import candidate_named, standing_in
-from grounded_trials.workspace.run_start import elsewhere, pace_of, rival_in, unit_of
+from grounded_trials.workspace.run_start import (
+    LOOSE,
+    elsewhere,
+    loosely,
+    pace_of,
+    rival_in,
+    unit_of,
+)
 from grounded_trials.workspace.stored_before import (
     as_stored,
     refuse_as_another,
@@ -143,6 +150,8 @@ def _recognised(workspace: Folder, path: Path, read: _Read, candidate: str | Non
             there = judged(rival)  # as it lies where that one fits best
             told = there if there.other else seen if seen.why else replace(seen, why=there.why)
             seen = replace(told, ran=seen.ran)
+    if found and found.alike and found.loose_s > LOOSE * workspace.task.dt:
+        read = replace(read, warnings=(*read.warnings, loosely(found.loose_s, ran)))
     why, other = seen.why, seen.other
     units, by = other_units(workspace.task, whole, own, seen.ran)
     units = () if other else units

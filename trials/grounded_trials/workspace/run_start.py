@@ -45,6 +45,10 @@ SHORT = 4  # at least 1 / SHORT of a run tells that it was one
 ALIGNED = 0.75  # of the time between samples: a start nearer than that is as good
 CLEARLY = 0.7  # of the commands' difference at the first command: the start is elsewhere
 KNOWN = 0.25  # of a row: the standard deviation from which feedback tells when in it a run began
+EXACT = (
+    0.1  # of what a row's lateness does to the commands: with less, the states were the policy's
+)
+LOOSE = 0.1  # of a step: a start that is known no better is told
 PACES = (2.0, 0.5)  # of a recording that was played twice as fast, or half
 BATCH = 256  # instants compared at once
 
@@ -58,6 +62,7 @@ class Start:
     alike: bool  # the commands are the policy's from there on
     opens_alike: bool  # they are at the beginning at least; somebody may have taken over
     between_rows: bool = False  # found below the time between rows, by the feedback
+    loose_s: float = 0.0  # it may be off by as much
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,13 +111,14 @@ class Recording:
             k = int(np.argmin(left))
             left[max(0, k - self.parts) : k + self.parts + 1] = np.inf
             on_step = self._on_step(policy, self.first + k * self.dt / self.parts)
-            seconds = self._between_rows(policy, on_step)
+            seconds, loose = self._between_rows(policy, on_step)
             trial = self.trial_from(seconds)
             fit = None if trial is None else follows(policy, trial.until(policy.horizon), 0)
             if trial is not None and fit is not None:
                 alike = fit.alike and not fit.late and _close(policy, trial)
                 opens = alike or fit.until_s >= LEAST * self.dt
-                found.append(Start(seconds, float(apart[k]), alike, opens, seconds < on_step))
+                between = seconds < on_step
+                found.append(Start(seconds, float(apart[k]), alike, opens, between, loose))
         return min(found, key=lambda one: (not one.alike, one.apart), default=None)
 
     def apart_at(self, policy: Policy, start: float) -> float:
@@ -132,16 +138,20 @@ class Recording:
         tried = [start + phase + move * dt for move in (-1, 0, 1)]
         return min(tried, key=lambda one: self.apart_at(policy, one))
 
-    def _between_rows(self, policy: Policy, start: float) -> float:
-        """A start moved back by less than a row, to where the feedback says that it was."""
+    def _between_rows(self, policy: Policy, start: float) -> tuple[float, float]:
+        """A start moved back by less than a row, to where the feedback says that it was [s].
+
+        And how far it may be off: a row, where what was sent is not what the policy makes of the
+        logged states at any time within it.
+        """
         if policy.gain is None or not self.row:
-            return start
+            return start, 0.0
         late, early = self.trial_from(start), self.trial_from(start - self.row)
         if late is None or early is None:
-            return start
+            return start, 0.0
         T = min(late.finite_steps, early.finite_steps, policy.horizon)
         if T < LEAST:
-            return start
+            return start, 0.0
         states = np.stack([late.states[:T], early.states[:T]])
         asked, before = policy.commands(states, policy.past)
         sent = np.clip(late.inputs[:T], policy.low, policy.high)
@@ -150,12 +160,13 @@ class Recording:
         slope, off = (((v - asked) / unit)[free] for v in (before, sent))
         power = float(slope @ slope)
         if not power:
-            return start
+            return start, 0.0
         share = float(slope @ off) / power
         left = float(((off - share * slope) ** 2).mean())
+        loose = self.row if left * len(off) > EXACT**2 * power else 0.0
         if left > KNOWN**2 * power or not -KNOWN < share < 1 + KNOWN:
-            return start
-        return start - float(np.clip(share, 0.0, 1.0)) * self.row
+            return start, loose
+        return start - float(np.clip(share, 0.0, 1.0)) * self.row, loose
 
     def _apart(self, policy: Policy, instants: range | None = None) -> Array:
         """The mean difference of the commands at every instant, infinite where none can be."""
@@ -282,6 +293,16 @@ def elsewhere(log: Recording, found: Start, policy: Policy, why: str) -> bool:
     if not found.opens_alike or abs(found.seconds - log.first) <= ALIGNED * log.interval:
         return False
     return bool(why) or found.apart < CLEARLY * log.apart_at(policy, log.first)
+
+
+def loosely(seconds: float, ran: str) -> str:
+    """What a person should know of a start that the feedback does not tell within a row."""
+    return (
+        f"where the run begins is known to {1e3 * seconds:.3g} ms only, the time between the log's "
+        f"rows: its commands are not exactly what {ran} sends on the logged states, which would "
+        "tell. Log the states that the controller used (no velocities that were differentiated or "
+        "filtered afterwards), or the time at which it sent each command"
+    )
 
 
 def rival_in(

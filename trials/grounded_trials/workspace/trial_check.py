@@ -10,12 +10,13 @@ import numpy as np
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import HUGE, Trial, interpolate_gaps
-from grounded_trials.wording import with_unit
+from grounded_trials.wording import count, with_unit
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.who_drove import UNLIKE, follows, latest, second_differences
 
 FAR = 0.1  # of a state's range in the trial: a start this far from s_0 is worth a warning,
 SURE = 3.0  # if it is so many standard deviations of the sensor's noise off, too
+LATEST = 3  # steps by which inputs may be logged late, and are told so
 WHITE = 0.6745 * 6**0.5  # the median of its second differences, in its standard deviations
 
 
@@ -69,12 +70,13 @@ def warnings_about(
     found += _inputs(task, whole)
     candidate, _ = workspace.candidate(trial.candidate)
     found += _unsafe(task, whole, candidate)
-    ran = follows(candidate.policy, whole, latest(task))
-    if ran is not None and ran.alike and abs(ran.late) == 1 and ran.moved < UNLIKE:
+    ran = follows(candidate.policy, whole, max(LATEST, latest(task)))
+    if ran is not None and ran.alike and ran.late and ran.moved < UNLIKE:
+        by = count(abs(ran.late), "step")
         found.append(
-            "the inputs fit the policy better when moved by one step: they seem to be logged a "
-            f"step {'late' if ran.late > 0 else 'early'}. Log each command at the time it is sent; "
-            f"if it is, [log.span] start is a step too {'early' if ran.late > 0 else 'late'}"
+            f"the inputs fit the policy better when moved by {by}: they seem to be logged {by} "
+            f"{'late' if ran.late > 0 else 'early'}. Log each command at the time it is sent; "
+            f"if it is, [log.span] start is {by} too {'early' if ran.late > 0 else 'late'}"
         )
     return tuple(found)
 
