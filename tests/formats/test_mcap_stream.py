@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ class Both:
         self.stream = McapStream(self.ours, "ros2", "grounded")
         self.package = Writer(self.theirs, compression=CompressionType.NONE, enable_data_crcs=True)
         self.package.start(profile="ros2", library="grounded")
+        self.numbers: Counter[int] = Counter()
 
     def channel(self, topic: str, message: str) -> int:
         schema = self.package.register_schema(message, "protobuf", message.encode())
@@ -34,9 +36,10 @@ class Both:
         self.package.add_attachment(0, 0, name, "text/plain", data)
         self.stream.attachment(name, "text/plain", data)
 
-    def message(self, channel: int, time: int, data: bytes, sequence: int) -> None:
-        self.package.add_message(channel, time, data, time, sequence)
-        self.stream.message(channel, time, data, sequence)
+    def message(self, channel: int, time: int, data: bytes) -> None:
+        self.package.add_message(channel, time, data, time, self.numbers[channel])
+        self.stream.message(channel, time, data)
+        self.numbers[channel] += 1
 
     def flush(self) -> None:
         self.package.flush()  # type: ignore[no-untyped-call]
@@ -64,7 +67,7 @@ def test_records_in_any_order(seed: int) -> None:
             both.flush()
         else:
             size, time = int(rng.integers(200)), int(rng.integers(2**62))
-            both.message(int(rng.choice(channels)), time, rng.bytes(size), k)
+            both.message(int(rng.choice(channels)), time, rng.bytes(size))
     both.finish()
 
 
@@ -73,9 +76,9 @@ def test_chunks_that_fill_up() -> None:
     both.about("grounded")
     channel = both.channel("/state", "State")
     for k in range(5):
-        both.message(channel, k, bytes(CHUNK_SIZE // 2), k)
+        both.message(channel, k, bytes(CHUNK_SIZE // 2))
     late = both.channel("/input", "Input")
-    both.message(late, 3, b"", 0)
+    both.message(late, 3, b"")
     assert len(both.finish()) > 2 * CHUNK_SIZE
 
 

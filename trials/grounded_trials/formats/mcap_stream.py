@@ -62,7 +62,7 @@ class McapStream:
     def __init__(self, stream: IO[bytes], profile: str, library: str) -> None:
         self._stream, self._offset, self._crc = stream, 0, 0
         self._summary: dict[int, list[bytes]] = {opcode: [] for opcode in SUMMARY}
-        self._counts: dict[int, int] = {}  # messages of each channel
+        self._counts: dict[int, int] = {}  # messages of each channel, in finished chunks
         self._span: list[int] = []  # first and last time of each chunk
         self._parts: list[bytes] = []  # of the chunk
         self._size = 0
@@ -111,11 +111,12 @@ class McapStream:
         self._summary[opcode].append(record)
         self._put(record)
 
-    def message(self, channel: int, time: int, data: bytes, sequence: int) -> None:
-        """Adds a message that was sampled and logged at `time`."""
-        self._index.setdefault(channel, []).extend((time, self._size))
-        length = MESSAGE_HEADER + len(data)
-        self._put(_MESSAGE.pack(MESSAGE, length, channel, sequence, time, time) + data)
+    def message(self, channel: int, time: int, data: bytes) -> None:
+        """Adds a message that was sampled and logged at `time`; each channel's are numbered."""
+        row = self._index.setdefault(channel, [])
+        number, length = self._counts.get(channel, 0) + len(row) // 2, MESSAGE_HEADER + len(data)
+        row += (time, self._size)
+        self._put(_MESSAGE.pack(MESSAGE, length, channel, number, time, time) + data)
 
     def _put(self, record: bytes) -> None:
         self._parts.append(record)

@@ -28,28 +28,19 @@ from grounded_trials.formats.protobuf import double_tag, doubles_tag, varint
 LIBRARY = "grounded"
 
 
-class LogWriter:
+class LogWriter(McapStream):
     """Writes one file: metadata and attachments first, then messages, flushed in time."""
 
     def __init__(self, stream: IO[bytes]) -> None:
-        self._file = McapStream(stream, "", LIBRARY)
-        self.metadata, self.attachment = self._file.metadata, self._file.attachment
-        self.flush, self.finish = self._file.flush, self._file.finish
-        self._sequences: dict[int, int] = {}
+        super().__init__(stream, "", LIBRARY)
 
-    def channel(
+    def channel_of_doubles(
         self, topic: str, message: str, names: Sequence[str], *, repeated: bool = False
     ) -> int:
         """Opens a protobuf channel; its message has one double (or list of doubles) a name."""
         descriptor = file_descriptor_set(message, names, repeated=repeated)
-        schema = self._file.schema(f"grounded.{message}", "protobuf", descriptor)
-        return self._file.channel(topic, "protobuf", schema)
-
-    def message(self, channel: int, time_ns: int, data: bytes) -> None:
-        """Adds a message that was sampled, and logged, at `time_ns`."""
-        sequence = self._sequences.get(channel, 0)
-        self._sequences[channel] = sequence + 1
-        self._file.message(channel, time_ns, data, sequence)
+        schema = self.schema(f"grounded.{message}", "protobuf", descriptor)
+        return self.channel(topic, "protobuf", schema)
 
 
 class CopyWriter:
