@@ -68,7 +68,7 @@ def test_early_plans_are_among_the_starts(mechanisms, monkeypatch):
     early = [weight for weight in weights if not np.array_equal(weight, own)]
     assert len(early) == 4
     begins = [int(np.argmax((weight == own[-1]).all(axis=1))) for weight in early]
-    assert len(set(begins)) == 4 and 0 < min(begins) and max(begins) < task.horizon
+    assert len(set(begins)) == 4 and min(begins) > 0 and max(begins) < task.horizon
     for weight, begin in zip(early, begins, strict=True):
         assert (weight[:begin] == own[:begin]).all() and (weight[begin:] == own[-1]).all()
 
