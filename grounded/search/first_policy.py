@@ -8,8 +8,10 @@ until it has converged, and the plan with the lowest cost wins:
     the reference    a closed-loop run of the model near the target (`first_guess`)
     zero inputs      and the inputs held before the start, where they are others
     smooth inputs    random, by fixed seeds: only where a solve takes milliseconds
-    more of them     where those have shown local optima that are nearly as good; every other one
-                     the best plan so far, kicked for a while, which leads to other valleys
+    more of them     where those have shown local optima that are nearly as good: random ones, the
+                     best plan so far, kicked for a while, which leads to other valleys, and
+    early plans      every other one: to be where the task ends already on the way, and to stay
+                     there. A quick swing-up lies in a valley too narrow to be met by chance
     a wider kink     of an adopted dry friction, narrowed step by step: what sticks has no slope
 """
 
@@ -35,6 +37,8 @@ MANY = 300  # more, where there are local optima
 KNOTS = (5, 8, 14)  # of a random start's inputs, in turn
 AMPLITUDES = (0.05, 0.15, 0.4)  # of its knots, standard deviation as a share of an input's range
 KICK, KICKED = 0.3, (5.0, 40.0)  # a kick: its height as AMPLITUDES, its width in steps
+EARLY = (0.3, 0.8)  # shares of the task after which a plan has to be where it ends
+STAYED = 100  # iterations for such a plan
 WORSE = 1.01  # times the best cost: a plan above it has converged somewhere else
 WORK = 4e7  # iterations x H x (n + m)^2 that all rivals of the reference may take
 SKETCH, PROMISING = 40, 1.3  # iterations after which a plan of so many times the cost is dropped
@@ -125,8 +129,14 @@ def _hopped(
     rng, size = np.random.default_rng(STARTS), problem.horizon * (problem.nz + task.model.m) ** 2
     work = MORE_WORK
     for i in range(MANY):
-        inputs = _random(task, rng, i // 2) if i % 2 else _kicked(task, rng, best.u)
-        found = _pursued(problem, inputs, best, SKETCH, tick)
+        if i % 2:
+            early = _early(task, problem, rng, i // 2)
+            work -= size * len(early.trace)
+            start = (early.u, early.K, early.z[:-1])
+            found = finished(problem, *start, most=SKETCH, tick=tick) if early.ok else None
+        else:
+            inputs = _random(task, rng, i // 4) if i % 4 else _kicked(task, rng, best.u)
+            found = _pursued(problem, inputs, best, SKETCH, tick)
         work -= size * (len(found.trace) if found else 1)
         if found is not None and found.status == "max iterations":
             if found.cost > PROMISING * best.cost:
@@ -220,6 +230,14 @@ def _random(task: Task, rng: np.random.Generator, i: int) -> Array:
     """Wilder random inputs (H, m), of four kinds in turn."""
     smooth = _smooth(task, rng, KNOTS[1 + i % 2], AMPLITUDES[1 + i // 2 % 2])
     return np.clip(smooth, task.low, task.high)
+
+
+def _early(task: Task, problem: Problem, rng: np.random.Generator, i: int) -> ddp.Solution:
+    """A plan that pays for all states from some step on at least what it pays for the last."""
+    weight, begin = problem.state_weight.copy(), int(task.horizon * rng.uniform(*EARLY))
+    weight[begin:] = np.maximum(weight[begin:], weight[-1])
+    inputs = _random(task, rng, i)
+    return finished(replace(problem, state_weight=weight), inputs, most=STAYED)
 
 
 def _kicked(task: Task, rng: np.random.Generator, inputs: Array) -> Array:

@@ -16,6 +16,7 @@ import pytest
 
 from grounded import Model
 from grounded.plant import Plant
+from grounded.search import first_policy as starts
 from grounded.search import making, mispredictions
 from grounded.search.ask_tell import Search, learn
 from grounded.search.first_guess import filled_target
@@ -46,9 +47,30 @@ def test_the_first_plan_is_finished_and_the_best_of_many_starts(mechanisms):
     """Reason 2: 0.1 stopped this swing-up after 100 iterations, unconverged, at -431."""
     task = mechanisms.cart_task("smooth")
     _, plan = first_policy(task)
-    assert plan.status == "converged" and plan.cost < 93.0
+    assert plan.status == "converged"
+    assert plan.cost < 84.0  # no start leads there but a plan to be upright early; others to 91.9
     held = ddp.solve(task.problem(), np.tile(task.past, (task.horizon, 1)))
     assert plan.cost < 0.9 * held.cost  # a valley that the held input does not lead to
+
+
+def test_early_plans_are_among_the_starts(mechanisms, monkeypatch):
+    """Every other further start pays for all states from some step on what it pays for the last."""
+    task, weights, solve = mechanisms.cart_task("smooth"), [], starts.finished
+
+    def finished(problem, *start, **options):
+        weights.append(problem.state_weight)
+        return solve(problem, *start, **options)
+
+    monkeypatch.setattr(starts, "finished", finished)
+    monkeypatch.setattr(starts, "MANY", 8)
+    first_policy(task)
+    own = task.problem().state_weight
+    early = [weight for weight in weights if not np.array_equal(weight, own)]
+    assert len(early) == 4
+    begins = [int(np.argmax((weight == own[-1]).all(axis=1))) for weight in early]
+    assert len(set(begins)) == 4 and min(begins) > 0 and max(begins) < task.horizon
+    for weight, begin in zip(early, begins, strict=True):
+        assert (weight[:begin] == own[:begin]).all() and (weight[begin:] == own[-1]).all()
 
 
 def test_only_columns_that_are_weighed_shape_the_guess(mechanisms):

@@ -128,11 +128,17 @@ def read_target(path: Path) -> tuple[list[str], Array]:
             _check_header(path, names)
             rows: list[list[float]] = []
             for line, row in enumerate(reader, start=2):
-                if not any(cell.strip() for cell in row):
-                    continue
                 if len(rows) > ROW_LIMIT:
                     raise GroundedError(f"{path.name} has more than {ROW_LIMIT} rows")
-                rows.append(_numbers(path, line, names, row))
+                try:
+                    values = [*map(float, row)]
+                except ValueError:
+                    values = []
+                if len(values) != len(names) or not math.isfinite(sum(values)):
+                    if not any(cell.strip() for cell in row):
+                        continue
+                    values = _numbers(path, line, names, row)
+                rows.append(values)
     except FileNotFoundError:
         raise GroundedError(f"{path} does not exist; [task] target asks for it") from None
     except IsADirectoryError:
