@@ -230,8 +230,8 @@ def foreign_log(path, seed):
     values = np.random.default_rng(seed).normal(size=(81, 3))
     with path.open("wb") as stream:
         log = LogWriter(stream)
-        state = log.channel_of_doubles("/state", "State", ["x", "v"])
-        force = log.channel_of_doubles("/input", "Input", ["force"])
+        state = log.channel("/state", "State", ["x", "v"])
+        force = log.channel("/input", "Input", ["force"])
         rows = zip(encode_doubles(values[:, :2]), encode_doubles(values[:, 2:]), strict=True)
         for k, (x, u) in enumerate(rows):
             log.message(state, k * 25_000_000, x)

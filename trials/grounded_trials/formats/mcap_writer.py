@@ -1,14 +1,13 @@
 """Writing MCAP: protobuf channels of named doubles, a table of strings, attached files.
 
-Files are not compressed: a trial is small, its numbers compress badly, and so equal input gives
-equal bytes whatever the version of a compressor. The only importer of the mcap package, which
-copies other people's files.
+The only importer of the mcap package. Files are not compressed: a trial is small, its numbers
+compress badly, and so equal input gives equal bytes whatever the version of a compressor.
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import IO, Any
 
 import numpy as np
@@ -22,29 +21,13 @@ from grounded_trials.formats.mcap_records import (
     Metadata,
     Schema,
 )
-from grounded_trials.formats.mcap_stream import McapStream
 from grounded_trials.formats.protobuf import double_tag, doubles_tag, varint
 
 LIBRARY = "grounded"
 
 
-class LogWriter(McapStream):
-    """Writes one file: metadata and attachments first, then messages, flushed in time."""
-
-    def __init__(self, stream: IO[bytes]) -> None:
-        super().__init__(stream, "", LIBRARY)
-
-    def channel_of_doubles(
-        self, topic: str, message: str, names: Sequence[str], *, repeated: bool = False
-    ) -> int:
-        """Opens a protobuf channel; its message has one double (or list of doubles) a name."""
-        descriptor = file_descriptor_set(message, names, repeated=repeated)
-        schema = self.schema(f"grounded.{message}", "protobuf", descriptor)
-        return self.channel(topic, "protobuf", schema)
-
-
-class CopyWriter:
-    """Writes records as they were read, by the mcap package; ids are given anew."""
+class _Writer:
+    """An MCAP file being written to a stream."""
 
     def __init__(self, stream: IO[bytes], header: Header, *, compressed: bool) -> None:
         from mcap.writer import CompressionType, Writer
@@ -53,12 +36,53 @@ class CopyWriter:
         self._stream = stream
         self._writer = Writer(stream, compression=kind, enable_data_crcs=True)
         self._writer.start(profile=header.profile, library=header.library)
-        self._schemas: dict[Schema, int] = {}
 
     def finish(self) -> None:
         """Ends the file; the stream stays open."""
         self._writer.finish()  # type: ignore[no-untyped-call]
         self._stream.flush()
+
+
+class LogWriter(_Writer):
+    """Writes one file: metadata and attachments first, then messages, flushed in time."""
+
+    def __init__(self, stream: IO[bytes]) -> None:
+        super().__init__(stream, Header("", LIBRARY), compressed=False)
+        self._sequences: dict[int, int] = {}
+
+    def metadata(self, name: str, table: Mapping[str, str]) -> None:
+        """Adds a table of strings."""
+        self._writer.add_metadata(name, dict(table))
+
+    def attachment(self, name: str, media_type: str, data: bytes) -> None:
+        """Adds a file."""
+        self._writer.add_attachment(0, 0, name, media_type, data)
+
+    def channel(
+        self, topic: str, message: str, names: Sequence[str], *, repeated: bool = False
+    ) -> int:
+        """Opens a protobuf channel; its message has one double (or list of doubles) a name."""
+        descriptor = file_descriptor_set(message, names, repeated=repeated)
+        schema = self._writer.register_schema(f"grounded.{message}", "protobuf", descriptor)
+        return self._writer.register_channel(topic, "protobuf", schema)
+
+    def message(self, channel: int, time_ns: int, data: bytes) -> None:
+        """Adds a message that was sampled, and logged, at `time_ns`."""
+        sequence = self._sequences.get(channel, 0)
+        self._sequences[channel] = sequence + 1
+        self._writer.add_message(channel, time_ns, data, time_ns, sequence)
+
+    def flush(self) -> None:
+        """Hands everything written so far to the operating system."""
+        self._writer.flush()  # type: ignore[no-untyped-call]
+
+
+class CopyWriter(_Writer):
+    """Writes records as they were read; ids are given anew."""
+
+    def __init__(self, stream: IO[bytes], header: Header, *, compressed: bool) -> None:
+        super().__init__(stream, header, compressed=compressed)
+        self._schemas: dict[Schema, int] = {}
 
     def channel(self, channel: Channel, schema: Schema | None) -> int:
         """Adds a channel with its schema; returns the id for its messages."""

@@ -76,11 +76,9 @@ def candidate_bytes(
     log = LogWriter(stream)
     log.metadata("grounded", table)
     log.attachment("about", "text/plain", _ABOUT)
-    topic = log.channel_of_doubles(
-        "/policy", "Policy", ["feedforward", "gain", "reference"], repeated=True
-    )
-    state = log.channel_of_doubles("/predicted_state", "State", policy.state_names)
-    input = log.channel_of_doubles("/predicted_input", "Input", policy.input_names)
+    topic = log.channel("/policy", "Policy", ["feedforward", "gain", "reference"], repeated=True)
+    state = log.channel("/predicted_state", "State", policy.state_names)
+    input = log.channel("/predicted_input", "Input", policy.input_names)
     controls, moves = encode_lists(_controls(policy)), encode_doubles(inputs)
     for k, reached in enumerate(encode_doubles(states)):
         time = round(k * policy.dt * 1e9)

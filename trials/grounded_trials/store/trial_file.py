@@ -80,8 +80,8 @@ class TrialWriter:
             self._log.attachment("about", "text/plain", b"A trial; no policy was run.")
         else:
             self._log.attachment("policy", "application/octet-stream", policy)
-        self._state = self._log.channel_of_doubles("/state", "State", list(states))
-        self._input = self._log.channel_of_doubles("/input", "Input", list(inputs))
+        self._state = self._log.channel("/state", "State", list(states))
+        self._input = self._log.channel("/input", "Input", list(inputs))
         self._flushed = max(start_ns, 0)
         self._log.flush()
 
