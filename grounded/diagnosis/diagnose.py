@@ -59,7 +59,7 @@ from grounded.diagnosis.validation.measured import Measured, root_mean_square
 from grounded.diagnosis.validation.prediction_error import by_region, by_time, explained, horizon
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.diagnosis.verdict import next_trial, verdict
-from grounded.effects import Library
+from grounded.effects import Library, acting_order, wrapping_order
 from grounded.engine import Engine, running, steady
 from grounded.errors import GroundedError
 from grounded.instruments.preflight import preflight
@@ -196,6 +196,14 @@ def _identified(
     return identifiable(uncertain, best, {name: e.std for name, e in known.items()})
 
 
+def _in_action(h: Hypothesis, claimed: Sequence[str]) -> tuple[str, ...]:
+    """Claimed effects in the order in which they act; parameters last."""
+    families = [effect.family for effect in h.effects]
+    order, whole = acting_order(families), wrapping_order(families)
+    names = [h.names[i] for i in (*order, *(i for i in whole if i not in order))]
+    return tuple(n for n in dict.fromkeys((*names, *claimed)) if n in claimed)
+
+
 class _Writer:
     """Turns a decision into a Diagnosis."""
 
@@ -260,6 +268,7 @@ class _Writer:
                 tempering=self.search.tempering.factor,
             ),
             ranking=ranking,
+            acting=_in_action(self.best.hypothesis, said.effects),
             indistinguishable=groups,
             equivalent=same,
             lookalikes=alike,

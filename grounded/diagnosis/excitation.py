@@ -152,7 +152,7 @@ def _teaching(
     known, task = _calibrated(task, diagnosis)
     scales, h = _scales(task, trials), Hypothesis()
     spreads: dict[str, tuple[float, str]] = {}  # by column: standard deviation, unit
-    for name in (n for n in diagnosis.effects if not n.startswith("parameter:")):
+    for name in (n for n in diagnosis.joining if not n.startswith("parameter:")):
         row, effect = diagnosis.ranked(name), library.effect(name, task.model, scales)
         if row is None:
             return None
@@ -269,14 +269,15 @@ def _rivals(
     """The calibrated task, and two hypotheses in which whatever was calibrated may still move."""
     known, task = _calibrated(task, diagnosis)
     scales, h = _scales(task, trials), Hypothesis()
-    for name in diagnosis.effects:
-        if name not in pair and not name.startswith("parameter:"):
-            h = h.plus(library.effect(name, task.model, scales), diagnosis.values(name))
+    names = [name for name in diagnosis.joining if not name.startswith("parameter:")]
+    names = names if pair[0] in names else [*names, pair[0]]
     if known:
         h = replace(h, shift=np.zeros(task.model.system.k), spread=1.0)
-    one, other = (
-        h.plus(library.effect(name, task.model, scales), diagnosis.values(name)) for name in pair
-    )
+    one = other = h
+    for name in (n for n in names if n != pair[1]):
+        rival = pair[1] if name == pair[0] else name  # it acts where the other one does
+        one = one.plus(library.effect(name, task.model, scales), diagnosis.values(name))
+        other = other.plus(library.effect(rival, task.model, scales), diagnosis.values(rival))
     return task, one, other
 
 

@@ -251,6 +251,7 @@ class Diagnosis(Document):
     indistinguishable: tuple[tuple[str, ...], ...] = ()
     equivalent: tuple[tuple[str, ...], ...] = ()  # in any trial
     lookalikes: tuple[Likeness, ...] = ()  # that hardly differ from a claimed effect
+    acting: tuple[str, ...] = ()  # the claimed effects in the order in which they act
     gap: Gap = field(default_factory=Gap)
     utility_prediction: UtilityPrediction | None = None  # where the subject was a task
     whole_run: Mapping[str, RunChange] = field(default_factory=dict)
@@ -295,6 +296,16 @@ class Diagnosis(Document):
     def effects(self) -> tuple[str, ...]:
         """Those that the verdict claims."""
         return self.verdict.effects
+
+    @property
+    def joining(self) -> dict[str, dict[str, float]]:
+        """The claimed effects' quantities, in the order in which they act: for `Search.adopt`.
+
+        Beside `known_parameters`: what is one of these is not among them.
+        """
+        known = self.known_parameters
+        own = {n for n in self.effects if n.removeprefix("parameter:") not in known}
+        return {n: self.values(n) for n in self.acting or self.effects if n in own}
 
     @property
     def sentence(self) -> str:

@@ -346,6 +346,21 @@ def acting_order(families: Sequence[Family]) -> list[int]:
     return sorted(own, key=lambda i: getattr(families[i], "transport", False))
 
 
+def joining_order(old: Sequence[Family], new: Sequence[Family]) -> list[tuple[bool, int]]:
+    """The order in which new effects join a model that has others: (whether new, which one).
+
+    They were fitted on the model with the old ones in it: on commands they act before these, on all
+    else after them.
+    """
+    first = [i for i, f in enumerate(new) if isinstance(f, InputFamily | MemoryFamily)]
+    last = [i for i in range(len(new)) if i not in first]
+    return [
+        *((True, i) for i in first),
+        *((False, i) for i in range(len(old))),
+        *((True, i) for i in last),
+    ]
+
+
 def wrapping_order(families: Sequence[Family]) -> list[int]:
     """Indices of all effects, the one that is wrapped first (the innermost) first."""
     inputs = acting_order(families)

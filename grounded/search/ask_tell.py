@@ -113,8 +113,8 @@ class Search:
         """The search from here on with a better model, whatever memory its effects have.
 
         Args:
-            effects: quantities by effect, `{name: found.values(name) for name in found.effects}` of
-                a diagnosis of this search's task and trials; in place of those adopted before.
+            effects: quantities by effect, in the order in which they act, `joining` of a diagnosis
+                of this search's task and trials; in place of those adopted before.
             params: the model's own parameters that were calibrated beside them.
             library: where the families are; None: the built-in ones.
 

@@ -4,21 +4,25 @@ import numpy as np
 import pytest
 
 from grounded import Trial
+from grounded.diagnosis.diagnose import _in_action
 from grounded.diagnosis.excitation import _run
 from grounded.diagnosis.likelihood.data import prepare, shifted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
+from grounded.diagnosis.report import Diagnosis, Estimate, Ranked, Verdict
 from grounded.effects import Library, acting_order, memory_start, scales_of, wrapping_order
 from grounded.models.car import model as car
 from grounded.task import Task
 from grounded.utility import Reward
-from grounded_trials.workspace.adopted import planner_of
+from grounded_trials.workspace.adopted import in_order, planner_of
+from grounded_trials.workspace.adopting import joined
 
 DT, STEPS = 0.05, 60
 LIMIT = ("rate_limit:steering", {"r": 2.0})
 DELAY = ("delay:steering", {"d": 2 * DT})
 LAG = ("first_order_lag:steering", {"tau": 0.1})
 ZONE = ("dead_zone:steering", {"c": 0.1})
+WEAKER = ("input_gain:steering", {"g": -0.2})
 WEAK = ("input_gain:throttle", {"g": -0.2})
 THROTTLE = ("first_order_lag:throttle", {"tau": 0.1})
 BIAS = ("input_bias:steering", {"b": 0.05})
@@ -45,21 +49,21 @@ def task():
     )
 
 
-def hypothesis(parts):
+def hypothesis(parts, model=car):
     start = np.full((2, car.n), 0.1)
     scales = scales_of(car, start, commands(), DT, STEPS * DT)
     h = Hypothesis()
     for name, values in parts:
-        h = h.plus(Library().effect(name, car, scales), values)
+        h = h.plus(Library().effect(name, model, scales), values)
     return h
 
 
-def predicted(parts):
+def predicted(parts, model=car):
     """The diagnosis' own prediction from the start, (STEPS + 1, n)."""
     names = (car.state_names, car.input_names)
     empty = np.full((STEPS + 1, car.n), 0.1)
-    predictor = Predictor(prepare(car, [Trial(empty, commands(), DT, *names, start_inputs=HELD)]))
-    h = hypothesis(parts)
+    predictor = Predictor(prepare(model, [Trial(empty, commands(), DT, *names, start_inputs=HELD)]))
+    h = hypothesis(parts, model)
     received = predictor.received(h)[0]
     x = [np.full(car.n, 0.1)]
     for t in range(STEPS):
@@ -138,6 +142,37 @@ def test_effects_on_inputs_do_not_commute():
 
 def test_a_delay_acts_last_whenever_it_was_claimed():
     np.testing.assert_array_equal(predicted((LIMIT, DELAY)), predicted((DELAY, LIMIT)))
+
+
+@pytest.mark.parametrize("new", [WEAKER, BIAS, LIMIT, LAG])
+def test_what_is_found_on_an_adopted_model_acts_before_what_it_has(new):
+    """What adopting writes is what was diagnosed: a gain was written behind the dead zone."""
+    old = [{"name": ZONE[0], **ZONE[1]}]
+    model = planner_of(task(), old).plan.model
+    want = predicted((new,), model)
+    found = in_order(old, [{"name": new[0], **new[1]}])
+    parts = [(e["name"], {k: v for k, v in e.items() if k != "name"}) for e in found]
+    np.testing.assert_allclose(adopted(parts), want, atol=1e-9)
+
+
+def test_effects_are_adopted_in_the_order_in_which_they_were_fitted():
+    """By credit the gain comes first, as `next:` prints it; the dead zone acts first."""
+    fitted = (ZONE, WEAKER, DELAY)
+    by_credit = (DELAY, WEAKER, ZONE)
+    names = tuple(name for name, _ in by_credit)
+    ranking = tuple(
+        Ranked(name, claimed=True, params={q: Estimate(v) for q, v in values.items()})
+        for name, values in by_credit
+    )
+    order = _in_action(hypothesis(fitted), names)
+    assert order == (ZONE[0], WEAKER[0], DELAY[0])
+    found = Diagnosis(Verdict("several", effects=names), ranking=ranking, acting=order)
+    assert list(found.joining) == list(order)
+    _, effects = joined(found, names, [], {}, {})
+    np.testing.assert_allclose(
+        adopted([(e.pop("name"), e) for e in effects]), predicted(fitted), atol=1e-9
+    )
+    assert np.abs(predicted(by_credit) - predicted(fitted)).max() > 1e-3
 
 
 def test_what_is_wrapped_last_acts_first():

@@ -13,7 +13,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from grounded.effects.family import Effect, Family, Scales, Site
+from grounded.effects.family import Effect, Family, Scales, Site, joining_order
 from grounded.effects.registry import Library
 from grounded.errors import GroundedError
 from grounded.model import Model
@@ -46,6 +46,20 @@ def installed_effects() -> Library:
             raise GroundedError(f"'{point.value}' must be an effect family or a sequence of them")
         found += families
     return Library().with_families(found)
+
+
+def in_order(
+    old: Sequence[Mapping[str, Any]], new: Sequence[Mapping[str, Any]]
+) -> list[dict[str, Any]]:
+    """Effects that a model has and those that were diagnosed on it, in the order in which they act.
+
+    Args:
+        old: of the model, as [model] effects has them.
+        new: in the order of the diagnosis (`Diagnosis.joining`).
+    """
+    library, both = installed_effects(), (old, new)
+    families = [[library.family(str(e["name"]).partition(":")[0]) for e in some] for some in both]
+    return [dict(both[late][i]) for late, i in joining_order(*families)]
 
 
 def planner_of(task: Task, effects: Sequence[Mapping[str, Any]]) -> Planner:

@@ -198,15 +198,18 @@ def joined(
 
     Args:
         found: the diagnosis.
-        names: of its effects.
+        names: of its effects, in any order: they join in that in which they were fitted.
         effects: that the model has already.
         nominal: the value from which each parameter that is adopted by name counts.
         calibrated: the parameters that come along.
     """
+    from grounded_trials.workspace.adopted import in_order
+
     before = {} if found.made is None else found.made.effects
-    adopted: list[Effect] = [dict(effect) for effect in effects]
+    adopted, new = [dict(effect) for effect in effects], list[Effect]()
     params = {key: _rounded(estimate.value) for key, estimate in calibrated.items()}
-    for name in names:
+    fitted = {name: k for k, name in enumerate(found.joining)}
+    for name in sorted(names, key=lambda name: fitted.get(name, len(fitted))):
         values = {key: _rounded(value) for key, value in found.values(name).items()}
         family, _, target = name.partition(":")
         if family == "parameter":
@@ -215,8 +218,8 @@ def joined(
             values["d"] = _rounded(float(before[name]["d"]) + values["d"])
             adopted = [e | values if e["name"] == name else e for e in adopted]
         else:
-            adopted.append({"name": name, **values})
-    return settled(params, adopted)
+            new.append({"name": name, **values})
+    return settled(params, in_order(adopted, new))
 
 
 def _curves(found: Diagnosis) -> list[str]:
@@ -347,13 +350,14 @@ def better_model(workspace: Folder, diagnosis: Diagnosis | None) -> Better | Non
     Raises:
         GroundedError: if the diagnosis names an effect or a quantity that is not known.
     """
+    from grounded_trials.workspace.adopted import in_order, planner_of
+
     adopted = [dict(effect) for effect in workspace.config.model.effects]
-    effects = adopted + _new(diagnosis, {str(effect["name"]) for effect in adopted})
+    new = _new(diagnosis, {str(effect["name"]) for effect in adopted})
+    effects = in_order(adopted, new)
     values = _parameters(workspace, diagnosis)
     if diagnosis is None or not (values or len(effects) > len(adopted)):
         return Better(workspace.planner, "with adopted effects") if adopted else None
-    from grounded_trials.workspace.adopted import planner_of
-
     task = workspace.task
     estimated = task.with_model(task.model.with_values(values))
     return Better(planner_of(estimated, effects), "as diagnosed")
@@ -365,10 +369,8 @@ def _new(diagnosis: Diagnosis | None, adopted: set[str]) -> list[Effect]:
         return []
     return [
         {"name": name, **diagnosis.values(name)}
-        for name in diagnosis.effects
-        if name not in adopted
-        and diagnosis.ranked(name) is not None
-        and name.removeprefix("parameter:") not in diagnosis.known_parameters
+        for name in diagnosis.joining
+        if name not in adopted and diagnosis.ranked(name) is not None
     ]
 
 
