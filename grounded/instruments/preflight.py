@@ -5,6 +5,7 @@ other_units   a position in mm beside a velocity in m/s
 swapped       two columns of a trial in each other's place
 mismatch      a position that doesn't move as velocities and angles say
 single        each state by itself
+dead          a velocity that stays at one value while its position moves
 constant      a velocity that is off by a constant, against the way of its position
 kinematics    velocities against the rates of their positions, courses against headings
 late_position both positions of a plane behind what velocities and a heading say
@@ -25,6 +26,7 @@ import numpy as np
 
 from grounded.frozen import Array
 from grounded.instruments.constant import constant_of
+from grounded.instruments.dead import judge_dead
 from grounded.instruments.finding import Finding
 from grounded.instruments.inputs import judge_inputs
 from grounded.instruments.kinematics import (
@@ -119,6 +121,7 @@ def preflight(
         judge_columns(model, bench.trials, bench.shown)
         mended = list(bench.mismatched())
         found = [
+            *bench.dead(),
             *mended,
             *bench.odd(ratios_of(model, bench.trials, bench.shown) if mended else ratios),
             *bench.singles(),
@@ -180,6 +183,16 @@ class _Bench:
             else:
                 text = f"has the wrong sign{where}: only so do positions move as the others say"
                 yield _mended(name, text, "sign", "scale = -1" * (not where), scale=-1.0)
+
+    def dead(self) -> Iterator[Finding]:
+        """With the samples of velocities that show nothing missing."""
+        for k, one in judge_dead(self.model, self.trials, self.shown):
+            states = np.array(self.trials[k].states)
+            states[:, one.relation.j] = np.nan
+            where = f" in trial {self.trials[k].id or f'number {k + 1}'}"
+            self.trials[k] = replace(self.trials[k], states=states)
+            name = self.model.state_names[one.relation.j]
+            yield Finding(name, one.told(self.model, where), "stuck", corrected=True)
 
     def odd(self, ratios: Sequence[Ratios]) -> Iterator[Finding]:
         """Of trials that are in other units than the rest, as a whole or in one signal."""

@@ -167,6 +167,41 @@ def test_samples_that_show_nothing_become_missing(fault, kind, lost):
     assert one.share == pytest.approx(sum(gone) / 402)
 
 
+def dead(x):
+    return np.column_stack([x[:, 0], np.full(len(x), 0.25)])
+
+
+def test_a_velocity_that_shows_nothing_in_one_log_becomes_missing_there():
+    trials = arm()
+    trials[1] = replace(trials[1], states=dead(trials[1].states))
+    found = preflight(ARM, trials)
+    (one,) = (f for f in found.findings if f.kind == "stuck")
+    assert one.signal == "w" and one.corrected and "number 2" in one.finding
+    assert [bool(np.isnan(t.states[:, 1]).all()) for t in found.trials] == [
+        False,
+        True,
+        False,
+        False,
+    ]
+
+
+def test_a_velocity_that_no_log_shows_stops_the_diagnosis():
+    with pytest.raises(GroundedError, match=r"w stays at 0\.25 .*\[log\.state\.w\]"):
+        preflight(ARM, arm(dead))
+
+
+def test_what_stands_still_has_no_dead_sensor():
+    rest = [replace(t, states=t.states * 0 + [0.3, 0.0]) for t in arm()]
+    rolling = [
+        replace(
+            t, states=np.column_stack([0.5 * DT * np.arange(t.steps + 1), t.states[:, 1] * 0 + 0.5])
+        )
+        for t in arm()
+    ]
+    for trials in (rest, rolling):
+        assert not any(f.kind == "stuck" for f in preflight(ARM, trials).findings)
+
+
 def test_coarse_missing_and_clipped_samples_are_stated_and_left():
     def coarse(y):
         y = np.round(y / [0.2, 1e-9]) * [0.2, 1e-9]

@@ -68,7 +68,7 @@ def test_all_claimed_effects_are_adopted_at_once(cart, tmp_path):
     command = last(grounded("-C", folder, "status"))
     assert command == "grounded adopt viscous_friction:v delay:force"
     done = grounded("-C", folder, *shlex.split(command)[1:], "--json").json
-    assert [effect["name"] for effect in done["effects"]] == names
+    assert [effect["name"] for effect in done["effects"]] == names[::-1]  # commands first
     assert done["params"] == {"mass": 1.4}
     assert last(grounded("-C", folder, "status")) == "grounded diagnose"  # with the model as it is
 

@@ -23,7 +23,7 @@ WHITE = 0.6745 * 6**0.5  # the median of its second differences, in its standard
 def warnings_about(
     workspace: Folder, trial: Trial, last_s: float = float("nan")
 ) -> tuple[str, ...]:
-    """Gaps, exchanged columns, an early end, a start far from s_0, what left [limits] or [safety].
+    """Gaps, odd columns, an early end, a start far from s_0, what left [limits] or [safety].
 
     Args:
         workspace: whose task and candidates hold.
@@ -31,6 +31,7 @@ def warnings_about(
         last_s: when the last of its states was logged, seconds of the run; NaN where all are on
             the control grid.
     """
+    from grounded.instruments.dead import dead_rates
     from grounded.instruments.swapped import exchanged, swapped_columns
 
     task = workspace.task
@@ -50,6 +51,12 @@ def warnings_about(
         )
     if pair := swapped_columns(workspace.base_model, whole.until(whole.known_steps)):
         found.append(exchanged(pair))
+    model = workspace.base_model
+    found += [
+        f"{model.state_names[one.relation.j]} {one.told(model)}: is [log] its column, is its "
+        "sensor on?"
+        for one in dead_rates(model, whole)
+    ]
     if not trial.candidate:
         return (*found, *_beyond(task, whole))
     if whole.steps < task.horizon:
