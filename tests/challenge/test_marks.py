@@ -114,6 +114,15 @@ def test_a_second_name_that_nothing_makes_is_counted():
     assert not marks_of("parameter:L", ["parameter:L"], param_error=0.05)["false_second"]
 
 
+def test_beside_parameters_that_are_off_the_effect_has_to_be_first_of_the_others():
+    named = ["parameter:L", "delay:a", "stall:a"]
+    assert marks_of("delay:a", named, param_error=0.05)["first"]
+    assert not marks_of("stall:a", named, param_error=0.05)["first"]
+    assert not marks_of("delay:a", named)["first"]  # the model's parameters are right
+    assert not marks_of("delay:a", ["parameter:L"], param_error=0.05)["first"]
+    assert not marks_of("parameter:a1", named, param_error=0.05)["first"]
+
+
 def test_wrong_places_worse_predictions_and_false_effects_are_counted():
     assert marks_of("delay:a", ["delay:b"])["wrong_place"]
     assert not marks_of("delay:a", ["stall:a"])["wrong_place"]

@@ -124,20 +124,18 @@ def _own_numbers(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> Fitted:
     params = {e.name for e in search.candidates if isinstance(e.family, ParamFamily)}
     for name in _effects(fit) if h.spread == 0 else ():
         rest = {*h.names} - {name}
-        swapped = [
-            f
-            for f in search.of_size(len(h.names))
-            if f.hypothesis.spread == 0
-            and rest < {*f.hypothesis.names}
-            and {*f.hypothesis.names} - rest <= params
-        ]
-        near = [f for f in swapped if score(fit) - score(f) < 2 * TIE]
-        search.finished(near[:1], TO_THE_TOP)
-        names = near[0].hypothesis.names if near else ()
-        ties = [f for f in search.of_size(len(names)) if near and f.hypothesis.names == names]
-        for other in ties[:1]:
-            if score(fit) - score(other) < TIE and not ruler.gain(other, fit).beyond(*BETTER):
-                return _own_numbers(search, other, ruler)
+        sets = {tuple(sorted({*rest, param})) for param in params - rest}
+
+        def likeliest(sets: set[tuple[str, ...]] = sets) -> Fitted:
+            exact = [f for (_, w, names), f in search.fits.items() if names in sets and not w]
+            return max(exact, key=score, default=fit)
+
+        if score(fit) - score(likeliest()) < 2 * TIE:
+            search.finished([likeliest()], TO_THE_TOP)
+        other = likeliest()
+        ties = other is not fit and score(fit) - score(other) < TIE
+        if ties and not ruler.gain(other, fit).beyond(*BETTER):
+            return _own_numbers(search, other, ruler)
     return fit
 
 
@@ -184,13 +182,14 @@ def _pays(
         less = (search.score(f) for f in fits if set(f.hypothesis.names) <= rest)
         sure = sure and search.score(after) - max(less) > CLAIM
     further = effects > max(1, len(before.hypothesis.effects))
-    if sure and white and new and gain.largest > LEAST:
-        shown = borne_out(search, before, after, ruler.folds)
-        if shown and gain.mean > -gain.scatter and gain.pieces.sum() > 0:
-            return True
-        if further and gain.mean > 0 and _in_several(search, after, new):
-            return True
-    return gain.pays(*(ALONE if sure and effects < 2 else PAYS))
+    if gain.pays(*(ALONE if sure and effects < 2 else PAYS)):
+        return True
+    if not (sure and white and new and gain.largest > LEAST):
+        return False
+    if further and gain.mean > 0 and _in_several(search, after, new):
+        return True
+    near = gain.mean > -gain.scatter and gain.pieces.sum() > 0
+    return bool(near) and borne_out(search, before, after)
 
 
 def _in_several(search: HypothesisSearch, fit: Fitted, names: set[str]) -> bool:
@@ -198,7 +197,7 @@ def _in_several(search: HypothesisSearch, fit: Fitted, names: set[str]) -> bool:
     return not any(few_trials(search.data, acting(search.predictor, fit, n)) for n in names)
 
 
-def _beyond_doubt(search: HypothesisSearch, ruler: Ruler, found: Fitted, rival: Fitted) -> bool:
+def _beyond_doubt(search: HypothesisSearch, found: Fitted, rival: Fitted) -> bool:
     """Whether steps of several trials tell a rival under the same noise from what is likelier.
 
     Where nothing but white noise is left: neither noise nor parameters can hide a gap from the one
@@ -207,7 +206,7 @@ def _beyond_doubt(search: HypothesisSearch, ruler: Ruler, found: Fitted, rival: 
     same = rival.noise.structure == found.noise.structure
     same = same and rival.hypothesis.spread == found.hypothesis.spread
     sure = search.score(found) - search.score(rival) > SURE
-    return same and sure and borne_out(search, rival, found, ruler.folds)
+    return same and sure and borne_out(search, rival, found)
 
 
 def _overrules(
@@ -233,10 +232,8 @@ def _proposed(
         rivals.append(null)
     found, at = best, search
     for rival in rivals:
-        if white and _beyond_doubt(search, ruler, found, rival):
-            continue
         if _overrules(ruler, crude, found, rival, BETTER):
-            found = rival
+            found = found if white and _beyond_doubt(search, found, rival) else rival
     for structure, spread in dict.fromkeys((s, w) for s, w, _ in search.fits):
         other = search.under(structure, spread)
         if other is None or (structure, spread) == (best.noise.structure, best.hypothesis.spread):
