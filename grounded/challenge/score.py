@@ -145,7 +145,8 @@ def judge(
     sensors = [f"{LATE[f['kind']]}:{f['signal']}" for f in mended]  # found before any physics
     off = [f"parameter:{name}" for name in diagnosis["verdict"].get("parameters", ())]
     named = list(dict.fromkeys([*sensors, *diagnosis["verdict"]["effects"], *off]))
-    order = sensors + [r["effect"] for r in diagnosis["ranking"]]
+    listed = [r["effect"] for r in diagnosis["ranking"]]
+    order = sensors + listed if named else []  # the likeliest of what nobody claims is no name
     if label["param_error"] and _physical(named, label):  # rightly named beside it, too
         order = [name for name in order if name in truth or not name.startswith("parameter:")]
     group = set(order[:1])
