@@ -5,6 +5,9 @@ else: a case counts as detectable where its evidence exceeds 3 nats, as distingu
 also 3 nats ahead of the likeliest others that the diagnosis ranked, fitted in the same way. What a
 diagnosis predicts, held out and in units, is compared with what the oracle predicts.
 
+Parameters that are off in a case beside its effect are rightly named with it: of the others the
+effect has to be first, whether they are calibrated all at once or named one by one.
+
 Besides a first name that is wrong there are a second one that nothing makes (`false_second`), the
 right family at the wrong place (`wrong_place`), names that predict worse than the model without
 them (`worse`), and how much of the error in units is gone (`units_shrinkage`). `summary` gives each
@@ -142,7 +145,10 @@ def judge(
     sensors = [f"{LATE[f['kind']]}:{f['signal']}" for f in mended]  # found before any physics
     off = [f"parameter:{name}" for name in diagnosis["verdict"].get("parameters", ())]
     named = list(dict.fromkeys([*sensors, *diagnosis["verdict"]["effects"], *off]))
-    order = sensors + [r["effect"] for r in diagnosis["ranking"]]
+    listed = [r["effect"] for r in diagnosis["ranking"]]
+    order = sensors + listed if named else []  # the likeliest of what nobody claims is no name
+    if label["param_error"] and _physical(named, label):  # rightly named beside it, too
+        order = [name for name in order if name in truth or not name.startswith("parameter:")]
     group = set(order[:1])
     for g in diagnosis["indistinguishable"]:
         if order and order[0] in g:

@@ -114,6 +114,25 @@ def test_a_second_name_that_nothing_makes_is_counted():
     assert not marks_of("parameter:L", ["parameter:L"], param_error=0.05)["false_second"]
 
 
+def test_what_is_likeliest_and_not_named_is_not_first():
+    label = {"effects": [{"effect": "delay:a", "params": {}}], "case": "x", "kind": "single"}
+    label |= {"noise": "white", "system": "car", "param_error": 0.0}
+    found = {"verdict": {"kind": "none", "effects": []}, "indistinguishable": []}
+    found |= {"gap": {"after": 1.0}, "leftover": [], "prediction_error": []}
+    found["ranking"] = [{"effect": "delay:a", "params": {}, "claimed": False}]
+    marks = judge(label, found, None)
+    assert not (marks["first"] or marks["in_group"] or marks["top3"])
+
+
+def test_beside_parameters_that_are_off_the_effect_has_to_be_first_of_the_others():
+    named = ["parameter:L", "delay:a", "stall:a"]
+    assert marks_of("delay:a", named, param_error=0.05)["first"]
+    assert not marks_of("stall:a", named, param_error=0.05)["first"]
+    assert not marks_of("delay:a", named)["first"]  # the model's parameters are right
+    assert not marks_of("delay:a", ["parameter:L"], param_error=0.05)["first"]
+    assert not marks_of("parameter:a1", named, param_error=0.05)["first"]
+
+
 def test_wrong_places_worse_predictions_and_false_effects_are_counted():
     assert marks_of("delay:a", ["delay:b"])["wrong_place"]
     assert not marks_of("delay:a", ["stall:a"])["wrong_place"]

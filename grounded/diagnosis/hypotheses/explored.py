@@ -63,7 +63,7 @@ class FittedHypotheses:
         h = fit.hypothesis
         if self.cancelling(h):
             return -math.inf
-        paid = sum(self.price(e, v) for e, v in h.pairs)
+        paid = self.paid(h)
         extra = fit.noise.structure.numbers(self.data.model.n)
         calibration = 1.0 if h.spread > 0 else 0.0
         return (
@@ -72,6 +72,10 @@ class FittedHypotheses:
             - 0.5 * extra * math.log(self.N)
             - calibration
         )
+
+    def paid(self, h: Hypothesis) -> float:
+        """What all effects of a hypothesis pay beside its likelihood [nats]."""
+        return sum(self.price(e, v) for e, v in h.pairs)
 
     def cancelling(self, h: Hypothesis) -> bool:
         """Whether effects of a hypothesis all but cancel: none of them is a finding."""

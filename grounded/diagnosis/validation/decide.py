@@ -25,12 +25,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from grounded.diagnosis.hypotheses.counterpart import counterparts
-from grounded.diagnosis.hypotheses.explored import CLAIM, parametric
+from grounded.diagnosis.hypotheses.explored import CLAIM, TIE, parametric
 from grounded.diagnosis.hypotheses.plainest import plainer
 from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.noise import Structure
 from grounded.diagnosis.validation.ruler import Ruler
+from grounded.diagnosis.validation.single_steps import borne_out
 from grounded.diagnosis.validation.visits import acting, few_trials
 from grounded.effects import ParamFamily
 
@@ -92,8 +93,8 @@ def decide(search: HypothesisSearch, best: Fitted, ruler: Ruler, most: int) -> D
     whole, crude = search, search.exact_null()
     white = search.tempering.factor > WHITE
     ruler.beside(crude)
-    search, proposed = _proposed(search, best, crude, ruler, most)
-    proposed = _plainest(search, proposed, ruler, white)
+    search, proposed = _proposed(search, best, crude, ruler, most, white)
+    proposed = _own_numbers(search, _plainest(search, proposed, ruler, white), ruler)
     fit, without, doubtful = _pruned(search, proposed, ruler, white)
     if proposed.hypothesis.spread > 0 and (other := _likelier(search, fit, ruler)):
         fit, without, more = _pruned(search, other, ruler, white)
@@ -111,6 +112,30 @@ def _plainest(search: HypothesisSearch, fit: Fitted, ruler: Ruler, white: bool) 
     for plain_form in plainer(search, fit) if ruler.held_out else ():
         if not _pays(search, ruler, plain_form, fit, white):
             return _plainest(search, plain_form, ruler, white)
+    return fit
+
+
+def _own_numbers(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> Fitted:
+    """The fit with a parameter in the place of each effect that ties with its shift.
+
+    A number that its owner calls uncertain is off sooner than the equations lack something.
+    """
+    h, score = fit.hypothesis, search.score
+    params = {e.name for e in search.candidates if isinstance(e.family, ParamFamily)}
+    for name in _effects(fit) if h.spread == 0 else ():
+        rest = {*h.names} - {name}
+        sets = {tuple(sorted({*rest, param})) for param in params - rest}
+
+        def likeliest(sets: set[tuple[str, ...]] = sets) -> Fitted:
+            exact = [f for (_, w, names), f in search.fits.items() if names in sets and not w]
+            return max(exact, key=score, default=fit)
+
+        if score(fit) - score(likeliest()) < 2 * TIE:
+            search.finished([likeliest()], TO_THE_TOP)
+        other = likeliest()
+        ties = other is not fit and score(fit) - score(other) < TIE
+        if ties and not ruler.gain(other, fit).beyond(*BETTER):
+            return _own_numbers(search, other, ruler)
     return fit
 
 
@@ -144,7 +169,8 @@ def _pays(
 
     A second ahead noise that has added up hides what single steps show. So where nothing but white
     noise is left, a further effect that is likely beyond doubt, and not for one trial alone, need
-    only gain anything. Where more is left, thousands of nats are no certainty.
+    only gain anything; any effect that single steps of several trials bear out need only gain up
+    to a second ahead. Where more is left, thousands of nats are no certainty.
     """
     gain, effects = ruler.gain(before, after), len(after.hypothesis.effects)
     sure = search.score(after) - search.score(before) > SURE
@@ -156,14 +182,31 @@ def _pays(
         less = (search.score(f) for f in fits if set(f.hypothesis.names) <= rest)
         sure = sure and search.score(after) - max(less) > CLAIM
     further = effects > max(1, len(before.hypothesis.effects))
-    if sure and white and further and _in_several(search, after, new):
-        return gain.mean > 0 and gain.largest > LEAST
-    return gain.pays(*(ALONE if sure and effects < 2 else PAYS))
+    if gain.pays(*(ALONE if sure and effects < 2 else PAYS)):
+        return True
+    if not (sure and white and new and gain.largest > LEAST):
+        return False
+    if further and gain.mean > 0 and _in_several(search, after, new):
+        return True
+    near = gain.mean > -gain.scatter and gain.pieces.sum() > 0
+    return bool(near) and borne_out(search, before, after)
 
 
 def _in_several(search: HypothesisSearch, fit: Fitted, names: set[str]) -> bool:
     """Whether more than few trials show each of these effects of a fit."""
     return not any(few_trials(search.data, acting(search.predictor, fit, n)) for n in names)
+
+
+def _beyond_doubt(search: HypothesisSearch, found: Fitted, rival: Fitted) -> bool:
+    """Whether steps of several trials tell a rival under the same noise from what is likelier.
+
+    Where nothing but white noise is left: neither noise nor parameters can hide a gap from the one
+    that they don't hide from the other, and a second ahead is a coarser look at the same.
+    """
+    same = rival.noise.structure == found.noise.structure
+    same = same and rival.hypothesis.spread == found.hypothesis.spread
+    sure = search.score(found) - search.score(rival) > SURE
+    return same and sure and borne_out(search, rival, found)
 
 
 def _overrules(
@@ -175,7 +218,7 @@ def _overrules(
 
 
 def _proposed(
-    search: HypothesisSearch, best: Fitted, crude: Fitted, ruler: Ruler, most: int
+    search: HypothesisSearch, best: Fitted, crude: Fitted, ruler: Ruler, most: int, white: bool
 ) -> tuple[HypothesisSearch, Fitted]:
     """The likeliest hypothesis, or one that predicts clearly better."""
     if not ruler.held_out:
@@ -190,7 +233,7 @@ def _proposed(
     found, at = best, search
     for rival in rivals:
         if _overrules(ruler, crude, found, rival, BETTER):
-            found = rival
+            found = found if white and _beyond_doubt(search, found, rival) else rival
     for structure, spread in dict.fromkeys((s, w) for s, w, _ in search.fits):
         other = search.under(structure, spread)
         if other is None or (structure, spread) == (best.noise.structure, best.hypothesis.spread):
