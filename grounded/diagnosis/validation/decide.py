@@ -169,8 +169,8 @@ def _pays(
 
     A second ahead noise that has added up hides what single steps show. So where nothing but white
     noise is left, a further effect that is likely beyond doubt, and not for one trial alone, need
-    only gain anything; any effect that single steps of several trials bear out need only gain up
-    to a second ahead. Where more is left, thousands of nats are no certainty.
+    only gain anything; so need any effect that single steps of several trials bear out. Where more
+    is left, thousands of nats are no certainty.
     """
     gain, effects = ruler.gain(before, after), len(after.hypothesis.effects)
     sure = search.score(after) - search.score(before) > SURE
@@ -188,7 +188,7 @@ def _pays(
         return False
     if further and gain.mean > 0 and _in_several(search, after, new):
         return True
-    near = gain.mean > -gain.scatter and gain.pieces.sum() > 0
+    near = gain.mean > 0 and gain.pieces.sum() > 0
     return bool(near) and borne_out(search, before, after)
 
 
