@@ -14,7 +14,7 @@ sent answers to where the robot was then.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -52,6 +52,9 @@ LOOSE = 0.1  # of a step: a start that is known no better is told
 PACES = (2.0, 0.5)  # of a recording that was played twice as fast, or half
 BATCH = 256  # instants compared at once
 
+# the samples of a log, with those of the states that nothing measures: estimated from the others
+Complete = Callable[[Mapping[str, Series]], Mapping[str, Series]]
+
 
 @dataclass(frozen=True)
 class Start:
@@ -69,7 +72,8 @@ class Start:
 class Recording:
     """A foreign log, to be cut anywhere; on a grid of `parts` instants a control step."""
 
-    series: Mapping[str, Series]
+    series: Mapping[str, Series]  # of every state and input
+    complete: Complete
     names: tuple[tuple[str, ...], tuple[str, ...]]
     angles: tuple[str, ...]
     dt: float
@@ -211,12 +215,13 @@ def _close(policy: Policy, trial: Trial) -> bool:
     return bool((np.abs(sent - asked).mean(axis=0) <= UNLIKE * usual + finest).all())
 
 
-def recording(series: Mapping[str, Series], task: Task) -> Recording | None:
+def recording(series: Mapping[str, Series], task: Task, complete: Complete) -> Recording | None:
     """A log whose run may begin anywhere; None where it can't be cut.
 
     Args:
         series: the samples of every state and input.
         task: whose steps it is cut into.
+        complete: how they come of those that were logged.
     """
     model, dt = task.model, task.dt
     names = (model.state_names, model.input_names)
@@ -232,7 +237,7 @@ def recording(series: Mapping[str, Series], task: Task) -> Recording | None:
     changes = (at - whole.origin_ns) * 1e-9
     row = max((held_rows(s.t, s.values) for s in sent), default=0.0)
     return Recording(
-        series, names, model.angles, dt, task.horizon, parts, whole, changes, interval, row
+        series, complete, names, model.angles, dt, task.horizon, parts, whole, changes, interval, row
     )
 
 
@@ -245,7 +250,7 @@ def pace_of(log: Recording, task: Task, policy: Policy) -> float | None:
         policy: what is sought.
     """
     for pace in PACES:
-        if _run_in({name: _paced(one, pace) for name, one in log.series.items()}, task, policy):
+        if _run_in(log, {n: _paced(one, pace) for n, one in log.series.items()}, task, policy):
             return pace
     return None
 
@@ -263,16 +268,18 @@ def unit_of(log: Recording, task: Task, policy: Policy) -> tuple[tuple[str, ...]
             name: replace(one, values=one.values * by) if name in names else one
             for name, one in log.series.items()
         }
-        run = _run_in(series, task, policy)
+        run = _run_in(log, series, task, policy)
         fit = run and follows(policy, run.until(policy.horizon), 0)
         if fit and fit.error < NEARLY:
             return tuple(names), by
     return (), 1.0
 
 
-def _run_in(series: Mapping[str, Series], task: Task, policy: Policy) -> Trial | None:
+def _run_in(
+    whole: Recording, series: Mapping[str, Series], task: Task, policy: Policy
+) -> Trial | None:
     """The run of a policy that begins in these samples, wherever; None where none does."""
-    log = recording(series, task)
+    log = recording(whole.complete(series), task, whole.complete)
     found = log.start_of(policy) if log else None
     return log.trial_from(found.seconds) if log and found and found.alike else None
 
