@@ -113,7 +113,9 @@ class ForeignLog:
 
     def complete(self, series: Mapping[str, Series]) -> Mapping[str, Series]:
         """Signals as this log holds them, and those of the states that nothing measures."""
-        return with_estimates(series, self.estimate, self.workspace.task) if self.estimate else series
+        return (
+            with_estimates(series, self.estimate, self.workspace.task) if self.estimate else series
+        )
 
     @cached_property
     def whole(self) -> Mapping[str, Series]:
