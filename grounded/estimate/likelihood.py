@@ -48,6 +48,7 @@ def maximum_likelihood(
     *,
     rounds: int = ROUNDS,
     wide: bool = False,
+    held: bool = False,
 ) -> NoiseEstimate:
     """Climbs from `start` to the most likely noise.
 
@@ -59,15 +60,16 @@ def maximum_likelihood(
         start: where to begin, see `first_noise`.
         rounds: how often to linearise anew at most.
         wide: see `grounded.estimate.steps`.
+        held: the measurement noise of `start` is known.
     """
     steps = ModelSteps(system, p, batch, wide)
-    noise, best = _expectation(batch, measurement, start, steps, FIRST_STEPS)
+    noise, best = _expectation(batch, measurement, start, steps, FIRST_STEPS, held)
     status = "converged"
     for round_ in range(rounds):
         if not np.isfinite(best.loglik):
             status = best.status
             break
-        trial = _climb(batch, noise, best, start)
+        trial = _climb(batch, noise, best, start, held)
         after = filter_batch(batch, measurement, trial, steps, best)
         gain = after.loglik - best.loglik
         if gain > 0:
@@ -80,7 +82,12 @@ def maximum_likelihood(
 
 
 def _expectation(
-    batch: RecordBatch, measurement: Measurement, noise: NoiseStd, steps: ModelSteps, rounds: int
+    batch: RecordBatch,
+    measurement: Measurement,
+    noise: NoiseStd,
+    steps: ModelSteps,
+    rounds: int,
+    held: bool,
 ) -> tuple[NoiseStd, Filtered]:
     """Expectation-maximisation: each variance becomes what the smoother expects of it.
 
@@ -99,7 +106,7 @@ def _expectation(
         share = np.concatenate([np.full(n, steps_seen), samples])
         factor = np.clip(1 + 2 * slope / share, 1e-2, 1e2)
         std = np.sqrt(variance * factor)
-        trial = NoiseStd(std[:n], std[n:], noise.dt)
+        trial = NoiseStd(std[:n], noise.measurement if held else std[n:], noise.dt)
         after = filter_batch(batch, measurement, trial, steps, best)
         if not after.loglik > best.loglik:
             break
@@ -142,7 +149,9 @@ def enough(records: Sequence[Record], rng: np.random.Generator | None = None) ->
     return kept
 
 
-def _climb(batch: RecordBatch, noise: NoiseStd, about: Filtered, start: NoiseStd) -> NoiseStd:
+def _climb(
+    batch: RecordBatch, noise: NoiseStd, about: Filtered, start: NoiseStd, held: bool
+) -> NoiseStd:
     """The best noise for a fixed linearisation."""
     from scipy.optimize import minimize
 
@@ -163,7 +172,10 @@ def _climb(batch: RecordBatch, noise: NoiseStd, about: Filtered, start: NoiseStd
     visible = np.concatenate([start.process, start.measurement])
     theta = 2 * np.log(np.concatenate([noise.process, noise.measurement]))
     low = 2 * np.log(FLOOR * visible)
-    bounds = list(zip(low, 2 * np.log(1e4 * visible), strict=True))
+    high = 2 * np.log(1e4 * visible)
+    if held:
+        low[n:] = high[n:] = theta[n:]
+    bounds = list(zip(low, high, strict=True))
     options = {"maxiter": 60, "ftol": 1e-9, "gtol": 1e-6}
     found = minimize(cost, theta, jac=True, method="L-BFGS-B", bounds=bounds, options=options).x
     std = np.exp(0.5 * found)

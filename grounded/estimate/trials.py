@@ -85,13 +85,15 @@ def noise_of(
     *,
     latency: Array | None = None,
     measurement: Measurement | None = None,
+    known: Array | None = None,
     rng: np.random.Generator | None = None,
 ) -> NoiseEstimate:
     """Process and measurement noise of a model on trials, by maximum likelihood.
 
     What the model gets wrong counts as process noise here: fit the model first, or take it as a
     measure of the model. Of more than 8,000 samples a draw of whole trials is used (`rng`).
-    Arguments as `smooth_trials`.
+    `known`: the measurement noise, (ny,), where only the process noise is to be found. Other
+    arguments as `smooth_trials`.
 
     Raises:
         GroundedError: if a trial does not fit the model, or no trial has two samples.
@@ -103,7 +105,10 @@ def noise_of(
     delay = np.zeros(model.m) if latency is None else np.asarray(latency, float)
     batch = batch_of(enough(records, rng), measurement, model.n, delay)
     start = first_noise(batch, measurement)
-    return maximum_likelihood(model.system, model.values, batch, measurement, start)
+    if known is not None:
+        start = NoiseStd(start.process, known, start.dt)
+    held = known is not None
+    return maximum_likelihood(model.system, model.values, batch, measurement, start, held=held)
 
 
 def _estimates(

@@ -321,7 +321,7 @@ class Ruler:
                 spread = np.where(there, np.nan_to_num(error).var(axis=1, ddof=1), 0.0)
                 total[k] += spread.sum(axis=(0, 1))
                 count[k] += there.sum(axis=(0, 1))
-        if not (count[:-1][:, self.shown] > 0).all():
+        if not (count[:-1][:, self._watched] > 0).all():
             return None
         return np.where(count > 0, np.sqrt(total / np.maximum(count, 1)), np.nan)
 
@@ -335,9 +335,18 @@ class Ruler:
             at, steps = np.arange(1, int(self.data.valid[run].sum())), self.steps[0]
             at = at[:: max(1, len(at) // MOMENTS)]
             error = self._along(h, track, at, np.full(len(at), run), steps)[-1]
-            own.append(np.sqrt(np.nanmean(error[:, self.shown] ** 2, axis=0)))
-        least = np.nanmin(own, axis=0) + self.fine[self.shown] if len(own) else 0.0
-        return runs[[bool((one <= ODD * least).all()) for one in own]] if len(own) else runs
+            squares = error[:, self._watched] ** 2
+            count = np.isfinite(squares).sum(axis=0)
+            own.append(np.where(count, np.sqrt(np.nansum(squares, axis=0) / count.clip(1)), np.nan))
+        if not own:
+            return runs
+        least = np.fmin.reduce(own) + self.fine[self._watched]
+        return runs[[not (one > ODD * least).any() for one in own]]  # what one lacks tells nothing
+
+    @property
+    def _watched(self) -> list[int]:
+        """The shown states that are measured at all."""
+        return [i for i in self.shown if self.data.seen[..., i].any()]
 
 
 def _jackknife(each: Array) -> Array:

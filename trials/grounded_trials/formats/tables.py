@@ -256,9 +256,17 @@ def _times(columns: Columns, path: Path) -> tuple[str, Any]:
     top = float(np.abs(finite).max(initial=0.0))
     if not unit:
         unit = "ns" if top > 1e17 else "us" if top > 1e14 else "ms" if top > 1e11 else "s"
-    if len(finite) < len(values) or top * UNITS[unit] > LATEST:
+    if lost := len(values) - len(finite):
         raise GroundedError(
-            f"{path}: '{name}' holds times that are not finite or not on a calendar"
+            f"{path}: '{name}' is no number in {lost} of {len(values)} rows. Times are read as "
+            "numbers: seconds, or in the unit that the column's name ends with, _ms, _us or _ns. "
+            "Text such as 2026-11-21 10:05:00.250 is not read: write the seconds since the first "
+            "row in its place"
+        )
+    if top * UNITS[unit] > LATEST:
+        raise GroundedError(
+            f"{path}: '{name}' goes up to {top:g}, beyond every calendar when read in {unit}: let "
+            "its name end with the unit, _ms, _us or _ns"
         )
     return name, np.rint(values * UNITS[unit]).astype(np.int64)
 

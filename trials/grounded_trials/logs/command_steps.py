@@ -18,23 +18,59 @@ from grounded_trials.logs.samples import Samples
 
 FEW = 5  # changes, which are too few to say when the steps begin
 IN_STEP = 0.8  # mean of the changes' phases, as unit vectors: the commands come in steps
+IN_ROWS = 0.9  # of the changes can have been at one phase, each within its row: likewise
+COARSEST = 0.6  # of a step: longer rows would allow any changes
+TOUCH = 0.01  # of a step: how exactly commands come in steps
+TRIED = 256  # changes whose phases are tried
 MOVED = 0.05  # of a step; a start that is nearer to a change is left where it is
 HELD = 0.5  # of a table's rows repeat the one before: it was not made where commands change
 STEADY_S, STEADY_STEPS = 0.25, 4  # without a change, both: what was commanded before is known
 LOOK_S, LOOK = 3.0, 0.2  # how far into a log, and into what share of it, such a moment is sought
 
 
-def phase_of(changes: Floats, dt: float) -> float | None:
-    """When within a step of dt commands change [s], -dt / 2 to dt / 2; None: not in steps.
+def phase_of(changes: Floats, dt: float, late: Floats | None = None) -> tuple[float, float] | None:
+    """When within a step commands change, and by how much earlier that may be; None: not in steps.
+
+    Rows that are not in step with the commands show each change late by another part of a row; all
+    of them together leave little room.
 
     Args:
-        changes: (K,) when one changed, counted from the beginning of a step [s].
+        changes: (K,) when one was seen to change, counted from the beginning of a step [s].
         dt: the step [s].
+        late: (K,) by how much each may have been seen late [s]; None: by nothing.
+
+    Returns:
+        The latest such instant, -dt / 2 to dt / 2, and the room before it [s].
     """
-    turns = np.exp(2j * np.pi * changes / dt)
-    if len(turns) <= FEW or abs(turns.mean()) < IN_STEP:
+    if len(changes) <= FEW:
         return None
-    return float(np.angle(turns.mean())) / (2 * np.pi) * dt
+    if late is not None and 0 < np.median(late) <= COARSEST * dt:
+        tried = changes[np.unique(np.linspace(0, len(changes) - 1, TRIED).astype(int))]
+        after = (changes - tried[:, None] + TOUCH * dt) % dt  # (tried, K)
+        fits = after < late + 2 * TOUCH * dt
+        best = int(np.argmax(fits.sum(axis=1)))
+        if fits[best].mean() >= IN_ROWS:
+            room = (late - after[best])[fits[best]].min() + TOUCH * dt
+            phase = (float(tried[best]) + dt / 2) % dt - dt / 2
+            return phase, float(np.clip(room, 0.0, np.median(late)))
+    turns = np.exp(2j * np.pi * changes / dt)
+    if abs(turns.mean()) < IN_STEP:
+        return None
+    room = 0.0 if late is None else float(np.median(late))
+    return float(np.angle(turns.mean())) / (2 * np.pi) * dt, room
+
+
+def changes_of(t: Ints, values: Floats) -> tuple[Ints, Ints]:
+    """When a command was seen to change (K,), and by how much that may be late (K,) [ns].
+
+    Args:
+        t: (N,) stamps [ns].
+        values: (N,) as for `held_rows`.
+    """
+    rows, order = held_rows(t, values) > 0, np.argsort(t, kind="stable")
+    t, values = t[order], values[order]
+    new = np.flatnonzero(np.diff(values) != 0)
+    return t[1:][new], np.diff(t)[new] if rows else np.zeros(len(new), np.int64)
 
 
 def held_rows(t: Ints, values: Floats) -> float:
@@ -69,9 +105,14 @@ def first_step(inputs: Sequence[Samples], start: int, dt: float, rest: Floats) -
         dt: the step [s].
         rest: (m,) what the inputs hold before a run.
     """
-    found = np.unique(np.concatenate([s.t[1:][np.diff(s.y) != 0] for s in inputs]))
-    later = found[found >= start - round(dt * 0.5e9)]
-    phase, moved, warning = phase_of((later - start) * 1e-9, dt), 0, ""
+    at, late = (
+        np.concatenate(x) for x in zip(*(changes_of(s.t, s.y) for s in inputs), strict=True)
+    )
+    found, first = np.unique(at, return_index=True)
+    here = found >= start - round(dt * 0.5e9)
+    later, late = found[here], late[first][here]
+    known, moved, warning = phase_of((later - start) * 1e-9, dt, late * 1e-9), 0, ""
+    phase = known and known[0]
     if phase is not None and abs(phase) >= MOVED * dt:
         moved = round((phase if phase > 0 else phase + dt) * 1e9)
     elif phase is None and len(later) > FEW:

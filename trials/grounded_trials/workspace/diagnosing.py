@@ -298,11 +298,16 @@ def _candidate_of(workspace: Folder, policy: Policy, base: str) -> Candidate:
 def _near(task: Task, trials: Sequence[Trial]) -> Task:
     """A task whose states without [safety] stay near where trials have been: half as far again.
 
-    Doublets that sharpen a number have flown a quadrotor 100 m below the ground.
+    Doublets that sharpen a number have flown a quadrotor 100 m below the ground. A state that
+    nothing measures may go anywhere.
     """
-    been = np.vstack([trial.states[np.isfinite(trial.states).all(axis=1)] for trial in trials])
-    low, high = been.min(axis=0), been.max(axis=0)
-    free = task.model.angle_mask | (np.arange(task.model.n) >= been.shape[1])
+    been = np.vstack([trial.states for trial in trials])
+    known = np.isfinite(been)
+    low = np.where(known, been, np.inf).min(axis=0)
+    high = np.where(known, been, -np.inf).max(axis=0)
+    unknown = ~known.any(axis=0) | (np.arange(task.model.n) >= been.shape[1])
+    low, high = np.where(unknown, 0.0, low), np.where(unknown, 0.0, high)
+    free = task.model.angle_mask | unknown
     room = np.where(free, np.inf, 0.5 * (high - low))
     own_low, own_high = task.safety_low, task.safety_high
     assert own_low is not None and own_high is not None

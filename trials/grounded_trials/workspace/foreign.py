@@ -1,20 +1,11 @@
 """A log that grounded did not write: read once, mapped by [log], cut to the trial it holds.
 
-States that no sensor gives come from the smoother of `grounded.estimate`, never from bare
-differences:
-
-    [estimate]
-    measured = { x = 0.002, y = 0.002, psi = 0.005 }   # standard deviation of each measured state
-    process = { v = 0.05 }                             # optional, a control step; else estimated
-
-The measured states of [log] are filtered forth and back through the crude model, whose process
-noise is estimated from the same log by maximum likelihood. Measured states stay as they
-were measured.
+States that no sensor gives are estimated along the whole of it, see `estimating`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -29,8 +20,12 @@ from grounded_trials.logs.log_table import LogMapping, log_mapping, mapped_signa
 from grounded_trials.logs.resample import Gridded, Span, to_grid
 from grounded_trials.logs.signals import Series
 from grounded_trials.store.store import hash_file
-from grounded_trials.toml_table import Table
 from grounded_trials.workspace.config import FILE
+from grounded_trials.workspace.estimating import (
+    EstimateTable,
+    read_estimate,
+    with_estimates,
+)
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import StoredTrial, sha256
 from grounded_trials.workspace.run_start import Recording, recording
@@ -44,9 +39,8 @@ class ForeignLog:
     workspace: Folder
     path: Path
     mapping: LogMapping
-    states: tuple[str, ...]  # that are measured
     estimate: EstimateTable | None
-    series: dict[str, Series]
+    series: dict[str, Series]  # what it holds
     source: dict[str, str]  # its name, hash and estimated states, for the trial's metadata
 
     def cut(self, candidate: str, start: float | None = None) -> tuple[Trial, Gridded]:
@@ -62,17 +56,17 @@ class ForeignLog:
         model, task = self.workspace.base_model, self.workspace.config.task
         rest = np.array([task.start.get(name, 0.0) for name in model.input_names])
         found = to_grid(
-            self.series,
+            self.whole,
             task.dt,
-            self.states,
+            model.state_names,
             model.input_names,
             self.mapping.span if start is None else Span(start=start),
             angles=model.angles,
             steps=task.horizon if candidate else None,
             rest=None if candidate else rest,
         )
-        if self.estimate:
-            found = smoothed(self.workspace, found, self.estimate)
+        logged = tuple(one for one in found.reports if one.name in self.series)
+        found = replace(found, reports=logged)
         if candidate and found.late_s > task.dt / 2:
             raise GroundedError(
                 f"{self.path}: the run starts {found.late_s:.2f} s before every state is known: "
@@ -117,12 +111,23 @@ class ForeignLog:
         trials = self.workspace.whole_trials()
         return tuple(one for one in trials if one.meta.get(key) == self.source[key])
 
+    def complete(self, series: Mapping[str, Series]) -> Mapping[str, Series]:
+        """Signals as this log holds them, and those of the states that nothing measures."""
+        return (
+            with_estimates(series, self.estimate, self.workspace.task) if self.estimate else series
+        )
+
+    @cached_property
+    def whole(self) -> Mapping[str, Series]:
+        """The samples of every state and input."""
+        return self.complete(self.series)
+
     @property
     def recording(self) -> Recording | None:
-        """The log where its run may begin anywhere; None where [log.span] or [estimate] is set."""
-        if self.estimate or self.workspace.config.log.sub("span").names():
+        """The log where its run may begin anywhere; None where [log.span] is set."""
+        if self.workspace.config.log.sub("span").names():
             return None
-        return recording(self.series, self.workspace.task)
+        return recording(self.whole, self.workspace.task, self.complete)
 
 
 def mapping_of(workspace: Folder, path: Path) -> LogMapping:
@@ -164,7 +169,7 @@ def read_foreign(workspace: Folder, path: Path, mapping: LogMapping) -> ForeignL
     if guessed := [name for name in model.state_names if name not in states]:
         source["estimated"] = ",".join(guessed)
     series = mapped_signals(files, mapping, states, model.input_names)
-    return ForeignLog(workspace, path, mapping, states, estimate, series, source)
+    return ForeignLog(workspace, path, mapping, estimate, series, source)
 
 
 def _unmapped(model: Model, mapping: LogMapping, name: str, *, estimated: bool) -> GroundedError:
@@ -204,68 +209,3 @@ def begun(found: Gridded, dt: float) -> Iterator[str]:
             f"its rows come every {found.row_s:.3g} s, so a command was sent up to that much "
             "before it is seen, and a delay is known no better"
         )
-
-
-@dataclass(frozen=True)
-class EstimateTable:
-    """[estimate]: which states are measured, and how well."""
-
-    measured: dict[str, float]
-    process: dict[str, float]
-
-
-def read_estimate(table: Table, model: Model) -> EstimateTable:
-    """The checked [estimate] table, what is measured in the model's order.
-
-    Raises:
-        GroundedError: for an unknown state, or a standard deviation that is not positive.
-    """
-    measured = table.numbers("measured", model.state_names)
-    process = table.numbers("process", model.state_names)
-    table.finish()
-    for kind, values in (("measured", measured), ("process", process)):
-        for name, std in values.items():
-            if std <= 0:
-                raise table.error(f"{kind}.{name}", f"must be a positive deviation, found {std:g}")
-    if not measured:
-        raise table.error("measured", "names no state; give { x = 0.002, ... }")
-    ordered = {name: measured[name] for name in model.state_names if name in measured}
-    return EstimateTable(ordered, process)
-
-
-def smoothed(workspace: Folder, found: Gridded, table: EstimateTable) -> Gridded:
-    """A log of the measured states with all states: the smoother's, the measured ones as they are.
-
-    Raises:
-        GroundedError: if the smoother fails on this log.
-    """
-    from grounded.estimate import NoiseStd, Record, noise_of, of_states, smooth_trials
-
-    model, task = workspace.base_model, workspace.task
-    measured, dt = list(table.measured), task.dt
-    times = np.arange(len(found.states), dtype=np.float64) * dt
-    record = Record(
-        times=times,
-        measured=found.states,
-        command_times=times[:-1],
-        commands=found.inputs,
-        past=found.start_inputs,
-    )
-    measurement = of_states(model, measured)
-    options = {"latency": task.latency, "measurement": measurement}
-    noise = noise_of(model, [record], **options).noise  # type: ignore[arg-type]
-    process = np.array(noise.process)
-    for name, std in table.process.items():
-        process[model.state_names.index(name)] = std
-    known = np.array(list(table.measured.values()))
-    noise = NoiseStd(process=process, measurement=known, dt=noise.dt)
-    smooth = smooth_trials(model, [record], noise, **options)[0]  # type: ignore[arg-type]
-    if not np.isfinite(smooth.states).all():
-        raise GroundedError(
-            f"the smoother finds no finite states for this log ({smooth.status}): the crude model "
-            "is too far off to tell what was not measured; check its units and the [log] mapping"
-        )
-    states = np.array(smooth.states)
-    for column, name in enumerate(measured):
-        states[:, model.state_names.index(name)] = found.states[:, column]
-    return replace(found, states=states)

@@ -138,6 +138,8 @@ def _recognised(workspace: Folder, path: Path, read: _Read, candidate: str | Non
     judged = partial(suspicion, workspace.task, own=own, others=candidates)
     whole = interpolate_gaps(read.trial).trial
     seen = judged(whole)
+    if read.bare and (alone := judged(whole, others=())).why:
+        seen = alone  # it may be of another workspace: that it looks like one of these is luck
     log, found = read.log.recording if read.log else None, None
     if read.log and log:
         found = log.start_of(own.policy)
@@ -177,6 +179,13 @@ def _recognised(workspace: Folder, path: Path, read: _Read, candidate: str | Non
         raise GroundedError(f"{path} ran {ran}, {units_told(units, by, read.log is not None)}")
     if pace:
         raise GroundedError(f"{path} ran {ran}, but {pace}")
+    if read.bare:
+        raise GroundedError(
+            f"{path} says that it ran {ran}, but carries no copy of it, and {why}. If it ran the "
+            f"{ran} of another workspace, ingest it there. Take it in with --data for fitting and "
+            f"diagnosis, or with --candidate {ran} all the same",
+            NextCommand("ingest", (str(path), "--data")),
+        )
     what = f"; with --candidate {other} for what it seems to have run" * bool(other)
     begins = "; [log.span] start = SECONDS says where the run begins" * (read.log is not None)
     raise GroundedError(

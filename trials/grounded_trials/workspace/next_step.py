@@ -20,6 +20,7 @@ from grounded_trials.workspace.proposing import standing_in, status_of, to_run
 PROPOSE = NextCommand("propose")
 DIAGNOSE = NextCommand("diagnose")
 EXPORT = NextCommand("export", ("best", "--runner"))
+TARGET = NextCommand("target", ("SHAPE",))
 
 
 def next_command(
@@ -39,6 +40,8 @@ def next_command(
         return follow
     if now.phase == "await-trial":
         return another_trial(workspace, now)
+    if now.ending == "not allowed" and not now.history:
+        return TARGET  # what was asked of the model leaves [safety]; to propose it again helps none
     if diagnosis is None:
         logs = usable and not now.history  # what they show comes before the first candidate
         teach = usable and (logs or now.phase != "propose")

@@ -14,7 +14,7 @@ sent answers to where the robot was then.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,7 +25,7 @@ from grounded.policy import Policy
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import LAST, Trial, interpolate_gaps
-from grounded_trials.logs.command_steps import held_rows, phase_of
+from grounded_trials.logs.command_steps import changes_of, phase_of
 from grounded_trials.logs.resample import Gridded, Span, to_grid
 from grounded_trials.logs.signals import Series
 from grounded_trials.workspace.who_drove import (
@@ -52,6 +52,9 @@ LOOSE = 0.1  # of a step: a start that is known no better is told
 PACES = (2.0, 0.5)  # of a recording that was played twice as fast, or half
 BATCH = 256  # instants compared at once
 
+# the samples of a log, with those of the states that nothing measures: estimated from the others
+Complete = Callable[[Mapping[str, Series]], Mapping[str, Series]]
+
 
 @dataclass(frozen=True)
 class Start:
@@ -69,16 +72,17 @@ class Start:
 class Recording:
     """A foreign log, to be cut anywhere; on a grid of `parts` instants a control step."""
 
-    series: Mapping[str, Series]
+    series: Mapping[str, Series]  # of every state and input
+    complete: Complete
     names: tuple[tuple[str, ...], tuple[str, ...]]
     angles: tuple[str, ...]
     dt: float
     steps: int
     parts: int
     whole: Gridded
-    changes: Array  # when a command changed, seconds after the log's first sample
+    changes: Array  # when a command was seen to change, seconds after the log's first sample
+    late: Array  # by how much each may have been seen late [s]; 0 where it has its own stamp
     interval: float  # between samples [s]
-    row: float  # by how much a held command may be logged late [s]; 0 where each has its own stamp
 
     @property
     def first(self) -> float:
@@ -110,8 +114,8 @@ class Recording:
         while len(found) < TRIED and np.isfinite(left).any():
             k = int(np.argmin(left))
             left[max(0, k - self.parts) : k + self.parts + 1] = np.inf
-            on_step = self._on_step(policy, self.first + k * self.dt / self.parts)
-            seconds, loose = self._between_rows(policy, on_step)
+            on_step, room = self._on_step(policy, self.first + k * self.dt / self.parts)
+            seconds, loose = self._between_rows(policy, on_step, room)
             trial = self.trial_from(seconds)
             fit = None if trial is None else follows(policy, trial.until(policy.horizon), 0)
             if trial is not None and fit is not None:
@@ -127,26 +131,28 @@ class Recording:
         inside = 0 <= k < len(self.whole.inputs)
         return float(self._apart(policy, range(k, k + 1))[k]) if inside else np.inf
 
-    def _on_step(self, policy: Policy, start: float) -> float:
-        """A start moved to where the commands change, by less than a step."""
+    def _on_step(self, policy: Policy, start: float) -> tuple[float, float]:
+        """A start moved to where commands change, by less than a step, and the room before it."""
         dt, length = self.dt, self.dt * policy.horizon
-        inside = self.changes[(self.changes > start - dt / 2) & (self.changes < start + length)]
-        if (phase := phase_of(inside - start, dt)) is None:
-            return start
+        inside = (self.changes > start - dt / 2) & (self.changes < start + length)
+        late = self.late[inside]
+        if (found := phase_of(self.changes[inside] - start, dt, late)) is None:
+            return start, float(np.median(late)) if len(late) else 0.0
+        phase, room = found
         if abs(phase) < self.dt / self.parts:
-            return start + phase
+            return start + phase, room
         tried = [start + phase + move * dt for move in (-1, 0, 1)]
-        return min(tried, key=lambda one: self.apart_at(policy, one))
+        return min(tried, key=lambda one: self.apart_at(policy, one)), room
 
-    def _between_rows(self, policy: Policy, start: float) -> tuple[float, float]:
+    def _between_rows(self, policy: Policy, start: float, row: float) -> tuple[float, float]:
         """A start moved back by less than a row, to where the feedback says that it was [s].
 
         And how far it may be off: a row, where what was sent is not what the policy makes of the
-        logged states at any time within it.
+        logged states at any time within it. `row`: what the changes of the commands leave of it.
         """
-        if policy.gain is None or not self.row:
+        if policy.gain is None or not row:
             return start, 0.0
-        late, early = self.trial_from(start), self.trial_from(start - self.row)
+        late, early = self.trial_from(start), self.trial_from(start - row)
         if late is None or early is None:
             return start, 0.0
         T = min(late.finite_steps, early.finite_steps, policy.horizon)
@@ -163,10 +169,10 @@ class Recording:
             return start, 0.0
         share = float(slope @ off) / power
         left = float(((off - share * slope) ** 2).mean())
-        loose = self.row if left * len(off) > EXACT**2 * power else 0.0
+        loose = row if left * len(off) > EXACT**2 * power else 0.0
         if left > KNOWN**2 * power or not -KNOWN < share < 1 + KNOWN:
             return start, loose
-        return start - float(np.clip(share, 0.0, 1.0)) * self.row, loose
+        return start - float(np.clip(share, 0.0, 1.0)) * row, loose
 
     def _apart(self, policy: Policy, instants: range | None = None) -> Array:
         """The mean difference of the commands at every instant, infinite where none can be."""
@@ -211,12 +217,13 @@ def _close(policy: Policy, trial: Trial) -> bool:
     return bool((np.abs(sent - asked).mean(axis=0) <= UNLIKE * usual + finest).all())
 
 
-def recording(series: Mapping[str, Series], task: Task) -> Recording | None:
+def recording(series: Mapping[str, Series], task: Task, complete: Complete) -> Recording | None:
     """A log whose run may begin anywhere; None where it can't be cut.
 
     Args:
         series: the samples of every state and input.
         task: whose steps it is cut into.
+        complete: how they come of those that were logged.
     """
     model, dt = task.model, task.dt
     names = (model.state_names, model.input_names)
@@ -228,11 +235,21 @@ def recording(series: Mapping[str, Series], task: Task) -> Recording | None:
     except GroundedError:
         return None
     sent = [series[name] for name in model.input_names]
-    at = np.concatenate([s.t[1:][np.diff(s.values) != 0] for s in sent])
-    changes = (at - whole.origin_ns) * 1e-9
-    row = max((held_rows(s.t, s.values) for s in sent), default=0.0)
+    seen = [changes_of(s.t, s.values) for s in sent]
+    at, late = (np.concatenate(x) for x in zip(*seen, strict=True))
+    changes, late = (at - whole.origin_ns) * 1e-9, late * 1e-9
     return Recording(
-        series, names, model.angles, dt, task.horizon, parts, whole, changes, interval, row
+        series,
+        complete,
+        names,
+        model.angles,
+        dt,
+        task.horizon,
+        parts,
+        whole,
+        changes,
+        late,
+        interval,
     )
 
 
@@ -245,7 +262,7 @@ def pace_of(log: Recording, task: Task, policy: Policy) -> float | None:
         policy: what is sought.
     """
     for pace in PACES:
-        if _run_in({name: _paced(one, pace) for name, one in log.series.items()}, task, policy):
+        if _run_in(log, {n: _paced(one, pace) for n, one in log.series.items()}, task, policy):
             return pace
     return None
 
@@ -263,16 +280,18 @@ def unit_of(log: Recording, task: Task, policy: Policy) -> tuple[tuple[str, ...]
             name: replace(one, values=one.values * by) if name in names else one
             for name, one in log.series.items()
         }
-        run = _run_in(series, task, policy)
+        run = _run_in(log, series, task, policy)
         fit = run and follows(policy, run.until(policy.horizon), 0)
         if fit and fit.error < NEARLY:
             return tuple(names), by
     return (), 1.0
 
 
-def _run_in(series: Mapping[str, Series], task: Task, policy: Policy) -> Trial | None:
+def _run_in(
+    whole: Recording, series: Mapping[str, Series], task: Task, policy: Policy
+) -> Trial | None:
     """The run of a policy that begins in these samples, wherever; None where none does."""
-    log = recording(series, task)
+    log = recording(whole.complete(series), task, whole.complete)
     found = log.start_of(policy) if log else None
     return log.trial_from(found.seconds) if log and found and found.alike else None
 

@@ -63,6 +63,7 @@ def warnings_about(
         ends = f"after {whole.steps} of {task.horizon} steps ({whole.steps * trial.dt:.2f} s)"
         found.append(
             f"the run ended {ends}: a failed candidate; its data stay usable for fit and diagnose"
+            f"{_ran_before(workspace, trial)}"
             if whole.whole(task.horizon) is whole
             else f"the log ends {ends}{_lacking(task, last_s)}: the rest is judged as if the robot "
             "had gone on as it did last. Log at least one more row after the last command"
@@ -86,6 +87,22 @@ def warnings_about(
             f"if it is, [log.span] start is {by} too {'early' if ran.late > 0 else 'late'}"
         )
     return tuple(found)
+
+
+def _ran_before(workspace: Folder, trial: Trial) -> str:
+    """What to do about a short log of a candidate that once ran to the end; "" for others."""
+    horizon = workspace.task.horizon
+    ran = [
+        one.id
+        for one in workspace.task_trials()
+        if one.candidate == trial.candidate and one.whole(horizon).finite_steps >= horizon
+    ]
+    if not ran:
+        return ""
+    return (
+        f". {trial.candidate} ran to the end before ({', '.join(ran)}): if only the log was cut, "
+        f"`discard` {trial.id}"
+    )
 
 
 def _first_bad(trial: Trial) -> tuple[str, int]:
