@@ -117,13 +117,13 @@ def test_what_steps_of_several_trials_bear_out_need_not_stand_out_a_second_ahead
     def pays(before, after, ruler, white=True):
         return decide._pays(search, ruler, before, after, white)
 
-    assert pays(bare, rubs, Coarse(0.0)) and pays(rest, both, Coarse(0.0))
-    assert not pays(rubs, both, Coarse(0.0))  # one trial's
-    assert not pays(bare, rubs, Coarse(0.0), white=False)
-    assert not pays(bare, rubs, Coarse(-0.5))  # worse up to a second ahead
-    assert not pays(bare, rubs, Coarse(0.0, largest=0.001))  # nothing that matters
+    assert pays(bare, rubs, Coarse(0.01)) and pays(rest, both, Coarse(0.01))
+    assert not pays(rubs, both, Coarse(0.01))  # one trial's
+    assert not pays(bare, rubs, Coarse(0.01), white=False)
+    assert not pays(bare, rubs, Coarse(-0.01))  # worse
+    assert not pays(bare, rubs, Coarse(0.01, largest=0.001))  # nothing that matters
     monkeypatch.setattr(search, "tempering", Tempering(1e-6))
-    assert not pays(bare, rubs, Coarse(0.0))
+    assert not pays(bare, rubs, Coarse(0.01))
 
 
 def test_a_rival_under_the_same_noise_does_not_overrule_what_steps_bear_out(search):

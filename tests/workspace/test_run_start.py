@@ -24,15 +24,21 @@ LOGGED = CONFIG + "".join(
 RATE = 100  # [Hz]
 
 
-def record(w, path, policy, before, seed=0, until=None, after=1.0, jog=0.0):
-    """Runs a policy on the model, with a load the policy fights, and logs all of it as a table."""
+def record(w, path, policy, before, seed=0, until=None, after=1.0, jog=0.0, late=0):
+    """Runs a policy on the model, with a load the policy fights, and logs all of it as a table.
+
+    `late`: rows by which the program and the log get the position late.
+    """
     model, dt, rng = w.task.model, policy.dt, np.random.default_rng(seed)
     z, force, rows, sent = np.array(w.task.start, float), 0.0, [], policy.past.copy()
+    past = []
     every, begin = round(dt * RATE), round(before * RATE)
     end = begin + every * policy.horizon if until is None else begin + round(until * RATE)
     last = end + round(after * RATE) if until is None else end
     for k in range(last):
         felt = z + rng.normal(0, [0.002, 0.01])
+        past.append(felt[0])
+        felt[0] = past[max(0, k - late)]
         step, part = divmod(k - begin, every)
         if 0 <= step < policy.horizon and part == 0:
             force = float(follow(policy, step, felt, sent)[0])
@@ -82,6 +88,26 @@ def test_a_run_with_feedback_is_found_to_the_log_s_sample(w, tmp_path, before, f
     k = round(before * RATE) + 5 * np.arange(policy.horizon)
     np.testing.assert_allclose(stored.inputs[:, 0], table[k, 3], atol=1e-4)
     np.testing.assert_allclose(stored.states[:-1], table[k, 1:3], atol=1e-3)
+
+
+@pytest.mark.parametrize("before", [0.0, 1.0])
+def test_a_run_on_late_states_is_found_though_the_log_is_corrected_for_them(tmp_path, before):
+    """Its feedback saw the states as they were logged, not as [log] delay_s moves them."""
+    late = LOGGED.replace('path = "/csv.x"\n', 'path = "/csv.x"\ndelay_s = 0.12\n')
+    w = Workspace(make(tmp_path / "w", config=late).folder)
+    w.propose()
+    w.ingest(record(w, tmp_path / "a.csv", w.candidate("c0001")[0].policy, 0.0, late=12))
+    policy = w.propose().candidate.policy
+    assert policy.gain is not None
+    log = record(w, tmp_path / "b.csv", policy, before, late=12)
+    found = w.ingest(log)
+    assert found.candidate == "c0002"
+    stored, table = w.trials()[-1].trial, np.loadtxt(log, delimiter=",", skiprows=1)
+    k = round(before * RATE) + 5 * np.arange(policy.horizon)
+    np.testing.assert_allclose(stored.inputs[:, 0], table[k, 3], atol=1e-4)
+    assert not any("known to" in warning for warning in found.warnings)
+    np.testing.assert_allclose(stored.states[:-1, 0], table[k + 12, 1], atol=1e-3)
+    np.testing.assert_allclose(stored.states[:-1, 1], table[k, 2], atol=1e-3)
 
 
 def test_a_log_that_begins_with_the_run_is_taken_as_it_is(w, tmp_path):

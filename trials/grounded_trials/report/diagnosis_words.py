@@ -139,7 +139,7 @@ def instrument_lines(findings: Iterable[Finding]) -> list[str]:
     lines = []
     for one in findings:
         done = "; corrected here" * one.corrected
-        more = f", in [log]: {one.log}" if one.log else f"; {one.advice}" if one.advice else ""
+        more = f", in [log]: {one.log}" * bool(one.log) + f"; {one.advice}" * bool(one.advice)
         lines.append(f"{one.signal}: {one.finding}{done}{more}")
     return lines
 

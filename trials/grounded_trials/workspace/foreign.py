@@ -122,6 +122,14 @@ class ForeignLog:
         """The samples of every state and input."""
         return self.complete(self.series)
 
+    @cached_property
+    def as_seen(self) -> ForeignLog | None:
+        """The log with its late states as late as the robot's program had them; None: none is."""
+        states = self.workspace.base_model.state_names
+        late = {n: s for n, s in self.series.items() if n in states and s.spec.delay_s}
+        seen = {n: replace(s, spec=replace(s.spec, delay_s=0.0)) for n, s in late.items()}
+        return replace(self, series={**self.series, **seen}) if seen else None
+
     @property
     def recording(self) -> Recording | None:
         """The log where its run may begin anywhere; None where [log.span] is set."""

@@ -18,6 +18,7 @@ from pathlib import Path
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.search.candidate import Candidate, Tried
+from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.logs.log_files import kind_of
 from grounded_trials.logs.samples import SignalReport
@@ -135,23 +136,12 @@ def _recognised(workspace: Folder, path: Path, read: _Read, candidate: str | Non
     if not ran or sha256(read.data)[:DIGITS] in workspace.store.digests():
         return read
     (own, _), candidates = workspace.candidate(ran), _latest(workspace)
-    judged = partial(suspicion, workspace.task, own=own, others=candidates)
-    whole = interpolate_gaps(read.trial).trial
-    seen = judged(whole)
-    if read.bare and (alone := judged(whole, others=())).why:
-        seen = alone  # it may be of another workspace: that it looks like one of these is luck
-    log, found = read.log.recording if read.log else None, None
-    if read.log and log:
-        found = log.start_of(own.policy)
-        if found and elsewhere(log, found, own.policy, seen.why):
-            note = f"the log begins {found.seconds:.3f} s before {ran} does: it is taken from there"
-            read = replace(_cut(read.log, ran, found.seconds), notes=(note,))
-            whole = interpolate_gaps(read.trial).trial
-            seen = judged(whole)
-        if (rival := rival_in(log, found, ran, candidates)) is not None:
-            there = judged(rival)  # as it lies where that one fits best
-            told = there if there.other else seen if seen.why else replace(seen, why=there.why)
-            seen = replace(told, ran=seen.ran)
+    logs = [read.log]
+    if read.log and (late := read.log.as_seen):  # its program may have acted on these
+        logs.append(late)
+    looks = [_Look(read, one, own, candidates, workspace.task) for one in logs]
+    look = min(looks, key=lambda one: one.doubt)
+    read, log, found, whole, seen = look.read, look.log, look.found, look.whole, look.suspicion
     if found and found.alike and found.loose_s > LOOSE * workspace.task.dt:
         read = replace(read, warnings=(*read.warnings, loosely(found.loose_s, ran)))
     why, other = seen.why, seen.other
@@ -193,6 +183,66 @@ def _recognised(workspace: Folder, path: Path, read: _Read, candidate: str | Non
         f"or with --candidate {ran} all the same{begins}",
         NextCommand("ingest", (str(path), *(("--candidate", other) if other else ("--data",)))),
     )
+
+
+class _Look:
+    """Where a candidate's run begins in a log, and whether it is its run.
+
+    Args:
+        read: the trial that would be stored.
+        log: the log that its commands are judged in; None: `read` is a trial of ours.
+        own: the candidate.
+        candidates: that may have been run instead.
+        task: of all of them.
+    """
+
+    def __init__(
+        self,
+        read: _Read,
+        log: ForeignLog | None,
+        own: Candidate,
+        candidates: list[Candidate],
+        task: Task,
+    ) -> None:
+        ran, judged = read.trial.candidate, partial(suspicion, task, own=own, others=candidates)
+        self.read, self.found = read, None
+        self.whole = interpolate_gaps(read.trial if log is read.log else self._cut(log, ran)).trial
+        seen = judged(self.whole)
+        if read.bare and (alone := judged(self.whole, others=())).why:
+            seen = alone  # it may be of another workspace: that it looks like one of these is luck
+        self.log = log.recording if log else None
+        if log and read.log and self.log:
+            self.found = found = self.log.start_of(own.policy)
+            if found and elsewhere(self.log, found, own.policy, seen.why):
+                begins = found.seconds + (0 if log is read.log else self._sooner(log, read.log))
+                note = f"the log begins {begins:.3f} s before {ran} does: it is taken from there"
+                self.read = replace(_cut(read.log, ran, begins), notes=(note,))
+                self.whole = interpolate_gaps(
+                    self.read.trial if log is read.log else self._cut(log, ran, found.seconds)
+                ).trial
+                seen = judged(self.whole)
+            if (rival := rival_in(self.log, found, ran, candidates)) is not None:
+                there = judged(rival)  # as it lies where that one fits best
+                told = there if there.other else seen if seen.why else replace(seen, why=there.why)
+                seen = replace(told, ran=seen.ran)
+        self.suspicion = seen
+
+    @property
+    def doubt(self) -> tuple[bool, float]:
+        """Whether it is another's run, and how far the commands are from the candidate's."""
+        ran = self.suspicion.ran
+        return bool(self.suspicion.why), math.inf if ran is None else ran.error
+
+    @staticmethod
+    def _cut(log: ForeignLog | None, ran: str, start: float | None = None) -> Trial:
+        assert log is not None
+        return log.cut(ran, start)[0]
+
+    @staticmethod
+    def _sooner(log: ForeignLog, stored: ForeignLog) -> float:
+        """By how much the first sample of the log that is stored comes sooner [s]."""
+        first, other = (one.cut("")[1].origin_ns for one in (log, stored))
+        return (first - other) * 1e-9
 
 
 def _latest(workspace: Folder) -> list[Candidate]:

@@ -44,7 +44,18 @@ def where_to_mend(
     findings = _at_limits(workspace, used, findings)
     read = [meta for trial in used if "source_sha256" in (meta := about[trial.id])]
     if read:
-        return tuple(replace(one, log=_whole(one, read[-1])) for one in findings)
+        driven = workspace.config.task.feedback and any(
+            meta.get("kind") == "trial" for meta in read
+        )
+        ahead = "the robot's program gets it late, too, and should predict it ahead by as much"
+        return tuple(
+            replace(
+                one,
+                log=_whole(one, read[-1]),
+                advice=ahead if driven and one.kind == "delay" and one.corrected else one.advice,
+            )
+            for one in findings
+        )
     fed = ": the runner's feedback gets it late, too" * workspace.config.task.feedback
     late = f"should read it with less delay, or filter it less{fed}"
     mend = {"delay": late, "lag": late, "sign": "should turn its sign"}
