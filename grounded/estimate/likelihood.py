@@ -114,15 +114,17 @@ def _expectation(
     return noise, best
 
 
-def first_noise(batch: RecordBatch, measurement: Measurement) -> NoiseStd:
+def first_noise(
+    batch: RecordBatch, measurement: Measurement, sizes: Array | float = 1.0
+) -> NoiseStd:
     """A rough noise, from how smooth the measurements are: robust, and only a place to begin.
 
     Second differences of a smooth signal are measurement noise (times sqrt 6), fourth differences
     (times sqrt 70) also of one that turns; a tenth of the first differences is what the model may
-    miss in a step.
+    miss in a step. `sizes` (n,) are those of the states that nothing measures.
     """
     n, dt = batch.start.shape[1], round(float(np.median(batch.dt[batch.valid])), 9)
-    r, q = np.empty(measurement.ny), np.full(n, 0.05 * np.sqrt(dt))
+    r, q = np.empty(measurement.ny), 0.05 * np.sqrt(dt) * np.broadcast_to(sizes, n)
     for c, i in enumerate(measurement.states):
         y = np.where(batch.seen[..., c], batch.y[..., c], np.nan)
         one = np.diff(y, axis=0)

@@ -86,14 +86,15 @@ def noise_of(
     latency: Array | None = None,
     measurement: Measurement | None = None,
     known: Array | None = None,
+    sizes: Array | float = 1.0,
     rng: np.random.Generator | None = None,
 ) -> NoiseEstimate:
     """Process and measurement noise of a model on trials, by maximum likelihood.
 
     What the model gets wrong counts as process noise here: fit the model first, or take it as a
     measure of the model. Of more than 8,000 samples a draw of whole trials is used (`rng`).
-    `known`: the measurement noise, (ny,), where only the process noise is to be found. Other
-    arguments as `smooth_trials`.
+    `known`: the measurement noise, (ny,), where only the process noise is to be found. `sizes`:
+    about how large the states are that nothing measures, (n,). Other arguments as `smooth_trials`.
 
     Raises:
         GroundedError: if a trial does not fit the model, or no trial has two samples.
@@ -104,7 +105,7 @@ def noise_of(
         raise GroundedError("noise can't be estimated: no trial has more than two samples")
     delay = np.zeros(model.m) if latency is None else np.asarray(latency, float)
     batch = batch_of(enough(records, rng), measurement, model.n, delay)
-    start = first_noise(batch, measurement)
+    start = first_noise(batch, measurement, sizes)
     if known is not None:
         start = NoiseStd(start.process, known, start.dt)
     held = known is not None

@@ -1,5 +1,7 @@
 """States that were measured seldom or never: no effect is made of what nobody looked at."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -42,7 +44,7 @@ def seen_every(trials, state, every):
             keep[::every] = True
         states = trial.states.copy()
         states[~keep, state] = np.nan
-        yield Trial(states, trial.inputs, DT, trial.state_names, trial.input_names)
+        yield replace(trial, states=states)
 
 
 @pytest.mark.parametrize("seed", [1, 2])
@@ -63,6 +65,22 @@ def test_a_state_that_is_measured_now_and_then_leaves_its_noise_to_be_found(stat
     assert np.exp(noise.floor[state] / 2) < 0.1 * DISTURBED[state]
     found = diagnose(pendulum, trials)
     assert found.kind == "none" and 0.85 < found.gap.after < 1.15
+
+
+def test_repeats_without_a_speed_tell_the_noise_of_what_was_measured():
+    """One state without a sensor, and no run was taken for a repeat of another."""
+    first = swings(1, 150, 3)[0]
+    rng, runs = np.random.default_rng(4), []
+    for _ in range(4):
+        x = [np.zeros(2)]
+        for value in first.inputs[:, 0]:
+            z = pendulum.system.step(x[-1][None], np.array([[value]]), pendulum.values, DT)[0]
+            x.append(z + DISTURBED * rng.standard_normal(2))
+        y = np.array(x) + MEASURED * rng.standard_normal((151, 2))
+        names = (first.state_names, first.input_names)
+        runs.append(Trial(y, first.inputs, DT, *names, candidate="c0001"))
+    found = diagnose(pendulum, list(seen_every(runs, 1, 0)))
+    assert found.prediction_error[0].floor_from == "repeats"
 
 
 @pytest.mark.slow

@@ -238,6 +238,13 @@ def test_the_noise_is_recovered_and_the_filter_is_consistent():
     assert (after < 0.6 * raw).all()
 
 
+def test_a_measurement_noise_that_is_known_is_kept():
+    _, trials = simulated(SPRING, np.random.default_rng(5), SPRING_NOISE, B=6, T=150)
+    found = noise_of(SPRING, trials, known=SPRING_NOISE.measurement)
+    np.testing.assert_allclose(found.noise.measurement, SPRING_NOISE.measurement)
+    assert np.allclose(np.log(found.noise.process / SPRING_NOISE.process), 0, atol=0.35)
+
+
 def test_a_filter_with_the_wrong_noise_is_called_inconsistent():
     truth, trials = simulated(SPRING, np.random.default_rng(12), SPRING_NOISE)
     wrong = NoiseStd(SPRING_NOISE.process / 3, SPRING_NOISE.measurement, DT)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from grounded_trials.logs.command_steps import changes_of, phase_of
 from grounded_trials.starting.begin import begin
 from grounded_trials.starting.interval import changes_every
 
@@ -81,3 +82,29 @@ def test_a_table_of_rows_more_frequent_than_commands_has_the_commands_interval(t
     assert any("0.05 s" in note for note in found.notes) == (every == 5)
     given = begin(tmp_path / "g", tmp_path / "r.csv", model=tmp_path / "m.py", dt=0.02)
     assert given.dt == 0.02 and not any("--dt" in note for note in given.notes)
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.0003])
+def test_changes_that_rows_show_late_tell_their_phase_together(jitter):
+    rng = np.random.default_rng(0)
+    rows = np.arange(0, 4, 0.010) + jitter * rng.standard_normal(400)
+    sent = 0.0173 + 0.025 * np.arange(150)
+    values = np.searchsorted(sent, rows, "right").astype(float)
+    at, late = changes_of(np.round(rows * 1e9).astype(np.int64), values)
+    phase, room = phase_of(at * 1e-9, 0.025, late * 1e-9)
+    assert phase - room - 5e-4 < 0.0173 - 0.025 < phase + 5e-4 and room < 0.0055
+
+
+def test_changes_at_any_time_are_in_no_step():
+    rng = np.random.default_rng(1)
+    rows = np.arange(0, 20, 0.010)
+    values = np.searchsorted(np.sort(rng.uniform(0, 20, 300)), rows, "right").astype(float)
+    at, late = changes_of(np.round(rows * 1e9).astype(np.int64), values)
+    assert phase_of(at * 1e-9, 0.025, late * 1e-9) is None
+
+
+def test_commands_with_stamps_of_their_own_are_late_by_nothing():
+    t = np.round((0.003 + 0.02 * np.arange(50)) * 1e9).astype(np.int64)
+    at, late = changes_of(t, np.arange(50.0))
+    assert not late.any()
+    assert phase_of(at * 1e-9, 0.02, late * 1e-9) == (pytest.approx(0.003), 0.0)

@@ -177,7 +177,8 @@ def test_a_table_cut_in_its_last_row_ends_before_it_and_its_unit_counts(tmp_path
         ("a,b\n3,4\n", ("a, b", "'t'")),
         ("t,b\n0,4\n1\n", ("line 3", "1", "2")),
         ("t,b\n0,4\n1\n2,4", ("line 3", "1", "2")),
-        ("t,b\n1e30,4\n", ("'t'",)),
+        ("t,b\n1e30,4\n", ("'t'", "calendar", "_ms")),
+        ("time,b\n2026-11-21 10:05:00,4\n", ("'time'", "1 of 1", "Text", "seconds", "_ms")),
         ("", ("log.csv",)),
     ],
 )

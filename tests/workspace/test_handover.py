@@ -160,10 +160,10 @@ def test_the_first_run_is_told_how_near_safety_it_is_to_come_and_then_that_it_le
 
 
 def test_a_first_plan_that_safety_forbids_says_what_to_do_and_not_to_diagnose(tmp_path):
-    """There was no trial, and `next:` was to diagnose it."""
+    """There was no trial, and `next:` was to diagnose it; then it was to propose it again."""
     w = Workspace(make(tmp_path / "w", config=CONFIG + SAFETY.format(high=0.5)).folder)
     done = w.propose()
-    assert done.candidate is None and done.then == NextCommand("propose")
+    assert done.candidate is None and done.then == NextCommand("target", ("SHAPE",))
     assert holds(" ".join(done.proposal.notes), "outside [safety] x = [-1, 0.5]", "`target`")
     assert w.status().then == NextCommand("propose")
 

@@ -10,7 +10,7 @@ from grounded.diagnosis.excitation import probes
 from grounded.effects import Library
 from grounded.errors import NextCommand
 from grounded_trials import Workspace
-from grounded_trials.workspace.diagnosing import _probe, read_diagnosis
+from grounded_trials.workspace.diagnosing import _near, _probe, read_diagnosis
 from grounded_trials.workspace.handover import checked_candidate
 from grounded_trials.workspace.proposing import to_run
 from workspaces import CONFIG, make
@@ -50,6 +50,21 @@ def test_every_probe_that_is_offered_is_handed_over(diagnosed):
     bounded(w, reached.min() - 0.01, reached.max() + 0.5)
     identity, sentence = offered(w, found)
     assert identity == "" and "[safety]" in sentence
+
+
+def test_a_state_that_nothing_measured_bounds_no_probe(diagnosed):
+    """A crane without speeds: the trials had no row with every state, and a traceback."""
+    w, trials = diagnosed[0], []
+    (w.folder / "grounded.toml").write_text(NOISY)
+    w.forget()
+    for trial in w.task_trials():
+        states = trial.states.copy()
+        states[:, 1] = np.nan
+        trials.append(replace(trial, states=states))
+    task = _near(w.planner.plan, trials)
+    reached = np.concatenate([trial.states[:, 0] for trial in trials])
+    assert task.safety_low[0] == pytest.approx(reached.min() - 0.5 * np.ptp(reached))
+    assert np.isinf(task.safety_low[1]) and np.isinf(task.safety_high[1])
 
 
 def test_the_sentence_of_a_probe_names_its_size_and_the_command_that_makes_it(diagnosed):

@@ -178,6 +178,71 @@ def test_a_start_is_no_surer_than_its_states_are_the_controller_s(w, tmp_path):
     assert not any("known to" in one for one in w.ingest(own).warnings)
 
 
+ONLY_POSITIONS = LOGGED.replace('[log.state.v]\npath = "/csv.v"\n', "") + (
+    "[estimate]\nmeasured = { x = 0.002 }\n"
+)
+
+
+@pytest.fixture
+def blind(tmp_path):
+    """Nothing measures its speed; it waits for c0002, and its controller had its own estimate."""
+    w = Workspace(make(tmp_path / "w", config=ONLY_POSITIONS).folder)
+    w.ingest(record(w, tmp_path / "first.csv", w.propose().candidate.policy, 0.0, seed=9))
+    w.propose()
+    return w
+
+
+@pytest.mark.parametrize("before", [0.0, 0.1, 0.8])
+def test_a_run_is_found_where_speeds_are_estimated(blind, tmp_path, before):
+    """With [estimate] no start was sought: "somebody drove" of every log with a lead-in."""
+    policy = blind.candidate("c0002")[0].policy
+    path = record(blind, tmp_path / "a.csv", policy, before)
+    found = blind.ingest(path)
+    assert found.candidate == "c0002" and bool(found.notes) == bool(before)
+    table = np.loadtxt(path, delimiter=",", skiprows=1)
+    k = round(before * RATE) + 5 * np.arange(policy.horizon)
+    np.testing.assert_allclose(blind.trials()[-1].trial.inputs[:, 0], table[k, 3], atol=1e-4)
+    assert {one.name for one in found.signals} == {"x", "force"}  # what was logged
+
+
+def test_what_nobody_sent_is_refused_where_speeds_are_estimated(blind, tmp_path):
+    policy = blind.candidate("c0002")[0].policy
+    other = replace(policy, feedforward=np.roll(policy.feedforward, 12, axis=0))
+    path = record(blind, tmp_path / "a.csv", other, 0.8)
+    with pytest.raises(GroundedError, match="did not run c0002"):
+        blind.ingest(path)
+
+
+def test_an_estimated_speed_knows_what_came_before_the_run_and_after_it(blind, tmp_path):
+    """The load drives another way than the model says: the first speeds were off by 0.1 m/s."""
+    policy, off = blind.candidate("c0002")[0].policy, []
+    for seed in range(3):
+        path = record(blind, tmp_path / f"{seed}.csv", policy, 0.8, seed=seed)
+        blind.ingest(path, candidate="c0002")
+        table = np.loadtxt(path, delimiter=",", skiprows=1)
+        truth = table[80 + 5 * np.arange(policy.horizon + 1), 2]  # measured, to 0.01 m/s
+        off.append(blind.trials()[-1].trial.states[:, 1] - truth)
+    assert np.abs(np.mean(off, axis=0)[[0, -1]]).max() < 0.03
+    assert np.sqrt(np.mean(np.square(off))) < 0.03
+
+
+@pytest.mark.parametrize("row", [0.007, 0.011, 0.013])
+def test_rows_out_of_step_with_the_commands_tell_together_when_a_run_begins(w, tmp_path, row):
+    """Each row shows a change late by another part of it: 10 ms were left, of a row of 10 ms."""
+    policy = w.candidate("c0002")[0].policy
+    path = record(w, tmp_path / "a.csv", policy, 0.8)
+    table = np.loadtxt(path, delimiter=",", skiprows=1)
+    t = np.arange(table[0, 0] + 0.003, table[-1, 0], row)
+    at = np.floor((t - table[0, 0]) * RATE + 1e-6).astype(int)
+    rows = [t, *(np.interp(t, table[:, 0], table[:, k]) for k in (1, 2)), table[at, 3]]
+    named = {"header": "t,x,v,force", "comments": ""}
+    np.savetxt(tmp_path / "b.csv", np.transpose(rows), "%.5f", ",", **named)
+    found = w.ingest(tmp_path / "b.csv")
+    assert found.candidate == "c0002" and not any("known to" in one for one in found.warnings)
+    begun = w.trials()[-1].meta["start_ns"]
+    assert int(begun) * 1e-9 - table[0, 0] == pytest.approx(0.8, abs=0.0025)
+
+
 def test_the_operator_jogged_the_cart_first(w, tmp_path):
     policy = w.candidate("c0002")[0].policy
     found = w.ingest(record(w, tmp_path / "a.csv", policy, 7.0, jog=1.5))

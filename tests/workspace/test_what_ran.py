@@ -157,6 +157,31 @@ def test_the_log_of_another_candidate_says_so(waiting, tmp_path):
     assert w.ingest(tmp_path / "again.mcap", candidate="c0001").candidate == "c0001"
 
 
+def test_a_trial_that_names_its_candidate_is_not_given_to_another(waiting, tmp_path):
+    """A run of another workspace's c0002 was said to be one of c0001, and refused as that."""
+    w, ran, _ = waiting
+    trial, _, _ = read_trial(ran)
+    write_trial(tmp_path / "x.mcap", replace(trial, candidate="c0002"), {"kind": "trial"})
+    with pytest.raises(GroundedError, match="another workspace") as refused:
+        w.ingest(tmp_path / "x.mcap")
+    assert "says that it ran c0002" in str(refused.value)
+    assert "--candidate c0001" not in str(refused.value)  # which would be refused in turn
+    assert refused.value.then == NextCommand("ingest", (str(tmp_path / "x.mcap"), "--data"))
+    assert w.ingest(tmp_path / "x.mcap", candidate="c0002").candidate == "c0002"
+
+
+def test_a_cut_log_of_a_candidate_that_ran_well_says_how_to_take_it_back(waiting, tmp_path):
+    w, ran, _ = waiting
+    trial, _, _ = read_trial(ran)
+    for name, candidate in (("c0001", "c0001"), ("c0002", "c0002")):
+        short = replace(trial.until(20), candidate="")
+        write_trial(tmp_path / f"{name}.mcap", short, {"kind": "trial"})
+        found = w.ingest(tmp_path / f"{name}.mcap", candidate=candidate)
+        (said,) = [one for one in found.warnings if "ended after 20" in one]
+        assert (f"`discard` {found.trial}" in said) == (candidate == "c0001")
+        assert found.verdict == "crashed" or candidate == "c0001"
+
+
 def test_a_discarded_trial_counts_nowhere_until_it_is_restored(waiting):
     w, _, driven = waiting
     w.ingest(w.run().trial_file)

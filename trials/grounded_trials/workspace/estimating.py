@@ -31,7 +31,8 @@ FINEST = 8  # rows of the smoother in a control step
 PIECE_S = 10.0  # of the log in one call: half an hour costs little more than a minute
 LEAST = 3  # rows that can be smoothed
 MARGIN_S = 0.5  # of motion after the last change of a command
-WIDE = 10.0  # times as far as a state gets in a log: what is known of its first value
+WIDE = 10.0  # times as large as a state gets in a log: what is known of its first value
+SIZED = 256  # moments at which that is asked
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,7 @@ def with_estimates(
     records = _records(samples, sent, clock, task.dt)
     if not records:
         return dict(series)
-    times, states = _smoothed(records, table, task)
+    times, states = _smoothed(records, table, task, _sizes(samples, task))
     t, first = clock.stamps(times), series[next(iter(table.measured))]
     found = dict(series)
     for name in guessed:
@@ -145,32 +146,48 @@ def _records(
     ]
 
 
-def _smoothed(records: list[Record], table: EstimateTable, task: Task) -> tuple[Array, Array]:
+def _sizes(samples: Sequence[Samples], task: Task) -> Array:
+    """About how large states get, (n,): as what they make of measured ones in a step; else 1."""
+    model, n = task.model, task.model.n
+    own = [model.state_names.index(s.name) for s in samples]
+    first, last = max(s.t[0] for s in samples), min(s.t[-1] for s in samples)
+    t = np.linspace(first, last, SIZED)
+    x = np.zeros((SIZED, n))
+    moved = np.empty(len(own))
+    for k, s in enumerate(samples):
+        x[:, own[k]] = np.interp(t, s.t, s.y)
+        moved[k] = np.percentile(np.abs(np.interp(t + task.dt * 1e9, s.t, s.y) - x[:, own[k]]), 95)
+    A = model.system.linearise(x, np.zeros((SIZED, model.m)), model.values, task.dt)[0]
+    by = np.median(np.abs(A), axis=0)[own]  # (measured, n)
+    tells = (by > np.finfo(float).eps) & (moved[:, None] > 0)
+    sizes = np.where(tells, moved[:, None] / np.where(tells, by, 1.0), np.inf).min(axis=0)
+    sizes[own] = 1.0
+    return np.where(np.isfinite(sizes), sizes, 1.0)
+
+
+def _smoothed(
+    records: list[Record], table: EstimateTable, task: Task, sizes: Array
+) -> tuple[Array, Array]:
     """When states are known, (N,) [s], and the states, (N, n)."""
     from grounded.estimate import NoiseStd, noise_of, of_states, smooth_trials
 
     model, known = task.model, np.array(list(table.measured.values()))
     measurement = of_states(model, list(table.measured))
     options = {"latency": task.latency, "measurement": measurement}
-    noise = noise_of(model, _moving(records), known=known, **options).noise  # type: ignore[arg-type]
-    process = np.array(noise.process)
+    records = [replace(record, start_std=WIDE * sizes) for record in records]
+    found = noise_of(model, _moving(records), known=known, sizes=sizes, **options)  # type: ignore[arg-type]
+    process = np.array(found.noise.process)
     for name, std in table.process.items():
-        process[model.state_names.index(name)] = std * np.sqrt(noise.dt / task.dt)
-    noise = NoiseStd(process=process, measurement=known, dt=noise.dt)
-    for _ in range(2):  # the second begins where the first found it: nothing pulls to 0
-        smooth = smooth_trials(model, records, noise, **options)  # type: ignore[arg-type]
-        states = np.concatenate([one.states for one in smooth])
-        if not np.isfinite(states).all():
-            raise GroundedError(
-                f"the smoother finds no finite states for this log ({smooth[0].status}): the crude "
-                "model is too far off to tell what was not measured; check its units and the "
-                "[log] mapping"
-            )
-        far = WIDE * np.maximum(np.abs(states).max(axis=0), 1e-6)
-        records = [
-            replace(record, start=one.states[0], start_std=far)
-            for record, one in zip(records, smooth, strict=True)
-        ]
+        process[model.state_names.index(name)] = std * np.sqrt(found.noise.dt / task.dt)
+    noise = NoiseStd(process=process, measurement=known, dt=found.noise.dt)
+    smooth = smooth_trials(model, records, noise, **options)  # type: ignore[arg-type]
+    states = np.concatenate([one.states for one in smooth])
+    if not np.isfinite(states).all():
+        raise GroundedError(
+            f"the smoother finds no finite states for this log ({smooth[0].status}): the crude "
+            "model is too far off to tell what was not measured; check its units and the [log] "
+            "mapping"
+        )
     return np.concatenate([record.times for record in records]), states
 
 

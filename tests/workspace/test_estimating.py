@@ -1,0 +1,102 @@
+"""Speeds that no sensor gives, along a whole log: gaps, slow sensors, units, the noise."""
+
+import numpy as np
+import pytest
+
+from grounded_trials.logs.signals import Series, SignalSpec
+from grounded_trials.workspace.estimating import EstimateTable, with_estimates
+from workspaces import CONFIG, MODEL, make
+
+TABLE = EstimateTable({"x": 0.002}, {})
+
+
+def series(t, values, path="/csv.x"):
+    stamps = np.round(1e9 * (1000 + t)).astype(np.int64)
+    return Series(SignalSpec(path, "log"), stamps, values, stamps, len(t), "table", False)
+
+
+def driven(every=0.01, until=6.0, size=1.0, noise=0.002, seed=0):
+    """A cart heavier than the model's, pushed to and fro at 20 Hz: samples, and the true speed."""
+    fine = 1e-3
+    t = np.arange(0, until, fine)
+    force = np.where(t < 1, 0.0, 2 * np.sin(2 * np.floor(t / 0.05) * 0.05))
+    x = v = 0.0
+    path = []
+    for u in force:
+        path.append((x, v))
+        x, v = x + fine * v, v + fine * (u - 0.4 * v) / 1.3
+    x, v = size * np.transpose(path)
+    at = np.arange(0, len(t), round(every / fine))
+    rng = np.random.default_rng(seed)
+    found = {
+        "x": series(t[at], x[at] + size * noise * rng.standard_normal(len(at))),
+        "force": series(t[::10], force[::10], "/csv.force"),
+    }
+    return found, t, v
+
+
+@pytest.fixture
+def task(tmp_path):
+    return make(tmp_path / "w").task
+
+
+def off(found, t, v):
+    """The error of the estimated speed, and when [s]."""
+    at = (found["v"].t - 1000 * 10**9) * 1e-9
+    inside = (at >= 0) & (at <= t[-1])
+    return found["v"].values[inside] - np.interp(at[inside], t, v), at[inside]
+
+
+@pytest.mark.parametrize("every", [0.001, 0.01, 0.03, 0.05])
+def test_a_speed_is_estimated_whatever_the_sensor_s_rate(task, every):
+    logged, t, v = driven(every)
+    error, at = off(with_estimates(logged, TABLE, task), t, v)
+    assert np.sqrt(np.mean(error**2)) < 0.06 and np.abs(error[at < 0.8]).max() < 0.05
+
+
+def test_samples_that_were_lost_part_a_log(task):
+    logged, t, v = driven()
+    x = logged["x"]
+    kept = (x.t < 1002 * 10**9) | (x.t > 1004 * 10**9)
+    log = {**logged, "x": series(t[::10][kept], x.values[kept])}
+    found = with_estimates(log, TABLE, task)
+    error, at = off(found, t, v)
+    assert not ((at > 2.01) & (at < 3.99)).any()
+    assert np.sqrt(np.mean(error**2)) < 0.06
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_log_that_begins_at_speed_is_estimated_alike_in_any_unit(tmp_path, seed):
+    """A speed was taken to begin at 0, give or take 1: 635 mm/s were off by 135 all along."""
+    in_mm = MODEL.replace("(a.force - p.drag * s.v)", "(1000 * a.force - p.drag * s.v)")
+    errors = []
+    for size, model in ((1.0, MODEL), (1000.0, in_mm)):
+        task = make(tmp_path / f"{size}", model=model, config=CONFIG).task
+        logged, t, v = driven(size=size, seed=seed)
+        first = int(np.argmax(v)) // 10
+        log = {
+            name: series(t[10 * first :: 10], one.values[first:], one.spec.path)
+            for name, one in logged.items()
+        }
+        table = EstimateTable({"x": 0.002 * size}, {})
+        errors.append(off(with_estimates(log, table, task), t, v)[0] / size)
+    np.testing.assert_allclose(errors[1], errors[0], atol=1e-6)
+    assert v[10 * first] > 400 and np.abs(errors[0][:5]).max() < 0.05
+
+
+def test_a_process_noise_that_is_given_is_that_of_a_control_step(task):
+    """With hardly any, the speed is the model's; with much, it follows the samples."""
+    logged, t, v = driven()
+    errors = {}
+    for std in (1e-5, 5.0):
+        given = EstimateTable({"x": 0.002}, {"x": 1e-6, "v": std})
+        errors[std] = off(with_estimates(logged, given, task), t, v)[0]
+    rough = {k: np.std(np.diff(e)) for k, e in errors.items()}
+    assert rough[5.0] > 10 * rough[1e-5]
+
+
+def test_nothing_is_estimated_where_everything_is_measured(task):
+    logged, t, v = driven()
+    logged["v"] = series(t[::10], v[::10], "/csv.v")
+    table = EstimateTable({"x": 0.002, "v": 0.01}, {})
+    assert with_estimates(logged, table, task) == logged
