@@ -251,7 +251,7 @@ class SensorFamily(Family):
 
 @dataclass(frozen=True)
 class SensorDelayFamily(Family):
-    """The logged value of the target state is `delay` seconds old."""
+    """The logged values of the target states are `d` seconds old, all by the same."""
 
 
 @dataclass(frozen=True)

@@ -220,9 +220,10 @@ def _named(h: Hypothesis, data: Data) -> dict[int, list[float]]:
     found = {i: [0.0, tau / data.dt] for i, tau in data.filters.items()}
     for effect, values in h.pairs:
         if isinstance(effect.family, SensorDelayFamily | SensorLagFamily):
-            steps = found.setdefault(data.model.state_names.index(effect.site.target), [0.0, 0.0])
             late = isinstance(effect.family, SensorDelayFamily)
-            steps[0 if late else 1] = float(values["d" if late else "tau"]) / data.dt
+            for name in effect.site.targets:
+                steps = found.setdefault(data.model.state_names.index(name), [0.0, 0.0])
+                steps[0 if late else 1] += float(values["d" if late else "tau"]) / data.dt
     return found
 
 

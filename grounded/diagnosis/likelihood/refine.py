@@ -186,7 +186,7 @@ def _of_one_shape(works: list[Work]) -> list[list[int]]:
     for i, work in enumerate(works):
         if work.still or work.given_up:
             continue
-        late = {e.site.target for e in work.h.effects if isinstance(e.family, LATE)}
+        late = {n for e in work.h.effects if isinstance(e.family, LATE) for n in e.site.targets}
         groups.setdefault(len(late), []).append(i)
     return [groups[count] for count in sorted(groups)]
 
