@@ -6,6 +6,7 @@ which order. `tune` sets constants of large effects, which are no parameters.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -14,13 +15,20 @@ import numpy as np
 from grounded.diagnosis.hypotheses.explored import FittedHypotheses, parametric
 from grounded.diagnosis.hypotheses.scan import Look, scan_candidates
 from grounded.diagnosis.likelihood.data import Data
+from grounded.diagnosis.likelihood.delays import delayed
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.noise import NoiseModel, Structure, noise_guess
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.refine import refine
 from grounded.diagnosis.likelihood.simulated import simulated
-from grounded.effects import Effect, ParamFamily, SensorLagFamily, one_friction
+from grounded.effects import (
+    Effect,
+    ParamFamily,
+    SensorDelayFamily,
+    SensorLagFamily,
+    one_friction,
+)
 from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import Array
 
@@ -33,6 +41,7 @@ BESIDE = 4  # effects that are fitted with the parameters freed
 FIRST, COARSE, LAST = 3.0, 1.4, 1.05  # factors by which a constant is moved
 ROUNDS = 12
 WIDEST, TRIED = 100.0, 7  # a constant from end to end: its range, and values tried in it
+LOUD = 0.45  # of what a step leaves: the noise of a delayed sensor at the start of a fit
 LARGE_GAIN = 50.0  # nats from which a hypothesis is also started by itself
 TO_THE_TOP = 25  # iterations of fits that decide: most need fewer, and stop by themselves
 LARGE = 8  # states; above, or of a simulator, one correlation time and half the shortlist do
@@ -107,7 +116,12 @@ class HypothesisSearch(FittedHypotheses):
         residual = data.model.difference(predicted, track[1:])
         scale = np.array([data.scales.spread(n) for n in data.model.state_names])
         scale[list(data.hidden)] = 0.0  # nothing disturbs a memory
-        return h, noise_guess(residual, data.seen, scale), track
+        noise = noise_guess(residual, data.seen, scale)
+        if late := delayed(h, data):
+            log_r = noise.log_r.copy()  # a delay hides it: from above, it finds its way down
+            log_r[late] = np.logaddexp(noise.log_q, log_r + math.log(2))[late] + math.log(LOUD)
+            noise = replace(noise, log_r=log_r)
+        return h, noise, track
 
     def again(self, fits: Sequence[Fitted]) -> list[Fitted]:
         """Large effects from a start of their own: the noise without them is far away."""
@@ -244,8 +258,8 @@ class HypothesisSearch(FittedHypotheses):
                 (h.plus(look.effect, values), fit.noise, fit.track)
                 for values in (look.values, *look.others)
             ]
-            if isinstance(look.effect.family, SensorLagFamily):
-                # what passes a filter is far quicker than what it shows: so is its noise
+            if isinstance(look.effect.family, SensorDelayFamily | SensorLagFamily):
+                # what a late sensor shows is moved by other noise than what it seems to show
                 late, noise, track = self.fresh(h.plus(look.effect, look.values))
                 noise = noise.allowing(fit.noise.structure, self.data.dt)
                 weight_w, weight_v = fit.noise.weight_w, fit.noise.weight_v

@@ -215,6 +215,12 @@ def delays_of(h: Hypothesis, data: Data) -> Delays | None:
     return Delays(data, tuple(named), tuple(int(k) for k in whole), part, tau)
 
 
+def delayed(h: Hypothesis, data: Data) -> list[int]:
+    """The states whose sensors a hypothesis delays."""
+    late = [e for e in h.effects if isinstance(e.family, SensorDelayFamily)]
+    return sorted({data.model.state_names.index(name) for e in late for name in e.site.targets})
+
+
 def _named(h: Hypothesis, data: Data) -> dict[int, list[float]]:
     """By late channel its delay and its time constant, in steps; the instruments' filters first."""
     found = {i: [0.0, tau / data.dt] for i, tau in data.filters.items()}
