@@ -7,7 +7,7 @@ which order. `tune` sets constants of large effects, which are no parameters.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -22,13 +22,7 @@ from grounded.diagnosis.likelihood.noise import NoiseModel, Structure, noise_gue
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.refine import refine
 from grounded.diagnosis.likelihood.simulated import simulated
-from grounded.effects import (
-    Effect,
-    ParamFamily,
-    SensorDelayFamily,
-    SensorLagFamily,
-    one_friction,
-)
+from grounded.effects import Effect, ParamFamily, SensorLagFamily, one_friction
 from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import Array
 
@@ -42,9 +36,13 @@ FIRST, COARSE, LAST = 3.0, 1.4, 1.05  # factors by which a constant is moved
 ROUNDS = 12
 WIDEST, TRIED = 100.0, 7  # a constant from end to end: its range, and values tried in it
 LOUD = 0.45  # of what a step leaves: the noise of a delayed sensor at the start of a fit
+LATE = slice(1, 4, 2)  # of the grid: where the delay of two states together starts
 LARGE_GAIN = 50.0  # nats from which a hypothesis is also started by itself
 TO_THE_TOP = 25  # iterations of fits that decide: most need fewer, and stop by themselves
 LARGE = 8  # states; above, or of a simulator, one correlation time and half the shortlist do
+
+
+Start = tuple[Hypothesis, NoiseModel, Array]
 
 
 class HypothesisSearch(FittedHypotheses):
@@ -70,6 +68,8 @@ class HypothesisSearch(FittedHypotheses):
         self.taus = self.taus or [k * data.dt for k in SLOW[: len(taus)]]
         self.most = SHORTLIST // 2 if large else SHORTLIST
         self.beside = BESIDE // 2 if large else BESIDE
+        # the scan can't see them: it has the noise and the track of a log that is not late
+        self.together = [e for e in candidates if len(delayed([e])) > 1]
 
     def refined(
         self,
@@ -109,7 +109,7 @@ class HypothesisSearch(FittedHypotheses):
             self.calibrated(self.best_null())
         return self.best_null()
 
-    def fresh(self, h: Hypothesis) -> tuple[Hypothesis, NoiseModel, Array]:
+    def fresh(self, h: Hypothesis) -> Start:
         """Where a hypothesis starts by itself: about the log, with the noise it leaves there."""
         data, track = self.data, self.data.y.copy()
         predicted = self.predictor.next(h, track[:-1])
@@ -117,11 +117,18 @@ class HypothesisSearch(FittedHypotheses):
         scale = np.array([data.scales.spread(n) for n in data.model.state_names])
         scale[list(data.hidden)] = 0.0  # nothing disturbs a memory
         noise = noise_guess(residual, data.seen, scale)
-        if late := delayed(h, data):
+        if late := [data.model.state_names.index(name) for name in delayed(h.effects)]:
             log_r = noise.log_r.copy()  # a delay hides it: from above, it finds its way down
             log_r[late] = np.logaddexp(noise.log_q, log_r + math.log(2))[late] + math.log(LOUD)
             noise = replace(noise, log_r=log_r)
         return h, noise, track
+
+    def anew(self, fit: Fitted, effect: Effect, values: Mapping[str, float]) -> Start:
+        """An effect beside a fit's own, with noise and track of a start by itself."""
+        h, noise, track = self.fresh(fit.hypothesis.plus(effect, values))
+        noise = noise.allowing(fit.noise.structure, self.data.dt)
+        weight_w, weight_v = fit.noise.weight_w, fit.noise.weight_v
+        return h, replace(noise, weight_w=weight_w, weight_v=weight_v), track
 
     def again(self, fits: Sequence[Fitted]) -> list[Fitted]:
         """Large effects from a start of their own: the noise without them is far away."""
@@ -258,13 +265,12 @@ class HypothesisSearch(FittedHypotheses):
                 (h.plus(look.effect, values), fit.noise, fit.track)
                 for values in (look.values, *look.others)
             ]
-            if isinstance(look.effect.family, SensorDelayFamily | SensorLagFamily):
-                # what a late sensor shows is moved by other noise than what it seems to show
-                late, noise, track = self.fresh(h.plus(look.effect, look.values))
-                noise = noise.allowing(fit.noise.structure, self.data.dt)
-                weight_w, weight_v = fit.noise.weight_w, fit.noise.weight_v
-                noise = replace(noise, weight_w=weight_w, weight_v=weight_v)
-                starts.append((late, noise, track))
+            if isinstance(look.effect.family, SensorLagFamily):
+                # what passes a filter is far quicker than what it shows: so is its noise
+                starts.append(self.anew(fit, look.effect, look.values))
+        for effect in self.together:
+            if not delayed([effect]) & delayed(fit.hypothesis.effects):
+                starts += [self.anew(fit, effect, {"d": d}) for d in effect.free[0].grid[LATE]]
         return self.refined(starts, iterations, rivals=True)[1:]
 
     def without(self, fit: Fitted, name: str) -> Fitted:

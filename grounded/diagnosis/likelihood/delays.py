@@ -21,6 +21,7 @@ Noise (its weights) and adjoints belong to samples: outside the filter they stay
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -30,7 +31,7 @@ import numpy as np
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.noise import NoiseModel
-from grounded.effects import SensorDelayFamily, SensorLagFamily
+from grounded.effects import Effect, SensorDelayFamily, SensorLagFamily
 from grounded.effects.sensor import lagging
 from grounded.filter.augmented import Delayed
 from grounded.filter.kalman import Adjoint
@@ -215,10 +216,10 @@ def delays_of(h: Hypothesis, data: Data) -> Delays | None:
     return Delays(data, tuple(named), tuple(int(k) for k in whole), part, tau)
 
 
-def delayed(h: Hypothesis, data: Data) -> list[int]:
-    """The states whose sensors a hypothesis delays."""
-    late = [e for e in h.effects if isinstance(e.family, SensorDelayFamily)]
-    return sorted({data.model.state_names.index(name) for e in late for name in e.site.targets})
+def delayed(effects: Sequence[Effect]) -> set[str]:
+    """The states whose sensors some effects delay."""
+    late = [effect for effect in effects if isinstance(effect.family, SensorDelayFamily)]
+    return {name for effect in late for name in effect.site.targets}
 
 
 def _named(h: Hypothesis, data: Data) -> dict[int, list[float]]:

@@ -138,9 +138,9 @@ def knowable(data: Data, effects: Sequence[Effect]) -> tuple[Effect, ...]:
         sensors = SensorFamily | SensorDelayFamily | SensorLagFamily
         if isinstance(family, sensors) and targets & (dead | unmoved):
             continue
-        if isinstance(family, SensorDelayFamily) and len(targets) > 1:
-            if not told_by(data.model, effect.site.targets) - dead - unmoved - memory:
-                continue
+        late = isinstance(family, SensorDelayFamily) and len(targets) > 1
+        if late and not told_by(data.model, effect.site.targets) - dead - unmoved - memory:
+            continue
         kept.append(effect)
     return tuple(kept)
 
