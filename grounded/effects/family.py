@@ -23,7 +23,8 @@ Several effects act in one order, for prediction, probes and adopted models alik
 A transport delay commutes with all that does not depend on time, so it may as well act last; there
 a fraction of a step blends two samples of what is delivered, not two commands that a nonlinear
 effect has yet to see. Of two effects the one that is wrapped LAST acts FIRST on a command, so
-wrapping goes from the model outwards: parameters, losses, limits of rates, rates, sensors, inputs.
+wrapping goes from the model outwards: parameters, losses, limits of rates, rates, sensors (late ones
+last, delays before filters), inputs.
 """
 
 from __future__ import annotations
@@ -358,4 +359,6 @@ def _depth(family: Family) -> int:
         return 0 if isinstance(family, ParamFamily) else 1
     if isinstance(family, RateFamily):
         return 2 if family.parts else 3
+    if isinstance(family, SensorDelayFamily | SensorLagFamily):  # their memories begin at the log
+        return 5 if isinstance(family, SensorDelayFamily) else 6
     return 4

@@ -245,6 +245,7 @@ class HypothesisSearch(FittedHypotheses):
             for e in self.candidates
             if e.name not in taken
             and not any(one_friction(e, known) for known in fit.hypothesis.effects)
+            and not delayed([e]) & delayed(fit.hypothesis.effects)
             and not (isinstance(e.family, ParamFamily) and fit.hypothesis.spread > 0)
         ]
         self.tick("scan")
