@@ -23,8 +23,8 @@ Several effects act in one order, for prediction, probes and adopted models alik
 A transport delay commutes with all that does not depend on time, so it may as well act last; there
 a fraction of a step blends two samples of what is delivered, not two commands that a nonlinear
 effect has yet to see. Of two effects the one that is wrapped LAST acts FIRST on a command, so
-wrapping goes from the model outwards: parameters, losses, limits of rates, rates, sensors (late ones
-last, delays before filters), inputs.
+wrapping goes from the model outwards: parameters, losses, limits of rates, rates, sensors (late
+ones last, delays before filters), inputs.
 """
 
 from __future__ import annotations
