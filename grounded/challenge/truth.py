@@ -223,13 +223,13 @@ class _Run:
         noise = self.truth.disturbance
         y = self.x.copy()
         for effect, values in self.truth.effects:
-            i = self.names.index(effect.site.target) if effect.site.target in self.names else -1
-            if isinstance(effect.family, SensorFamily):
-                y[i] = effect.family.measure(y[i], values)
-            elif isinstance(effect.family, SensorDelayFamily):
-                y[i] += self._old(i, values["d"]) - self.x[i]
-            elif isinstance(effect.family, SensorLagFamily):
-                y[i] += self._filtered(i, values["tau"]) - self.x[i]
+            for i in [self.names.index(n) for n in effect.site.targets if n in self.names]:
+                if isinstance(effect.family, SensorFamily):
+                    y[i] = effect.family.measure(y[i], values)
+                elif isinstance(effect.family, SensorDelayFamily):
+                    y[i] += self._old(i, values["d"]) - self.x[i]
+                elif isinstance(effect.family, SensorLagFamily):
+                    y[i] += self._filtered(i, values["tau"]) - self.x[i]
         scale = np.array([noise.measurement.get(n, 0.0) for n in self.names])
         v = self._draw(len(scale))
         if noise.kind == "heavy":

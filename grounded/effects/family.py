@@ -23,7 +23,8 @@ Several effects act in one order, for prediction, probes and adopted models alik
 A transport delay commutes with all that does not depend on time, so it may as well act last; there
 a fraction of a step blends two samples of what is delivered, not two commands that a nonlinear
 effect has yet to see. Of two effects the one that is wrapped LAST acts FIRST on a command, so
-wrapping goes from the model outwards: parameters, losses, limits of rates, rates, sensors, inputs.
+wrapping goes from the model outwards: parameters, losses, limits of rates, rates, sensors (late
+ones last, delays before filters), inputs.
 """
 
 from __future__ import annotations
@@ -251,7 +252,7 @@ class SensorFamily(Family):
 
 @dataclass(frozen=True)
 class SensorDelayFamily(Family):
-    """The logged value of the target state is `delay` seconds old."""
+    """The logged values of the target states are `d` seconds old, all by the same."""
 
 
 @dataclass(frozen=True)
@@ -373,4 +374,6 @@ def _depth(family: Family) -> int:
         return 0 if isinstance(family, ParamFamily) else 1
     if isinstance(family, RateFamily):
         return 2 if family.parts else 3
+    if isinstance(family, SensorDelayFamily | SensorLagFamily):  # their memories begin at the log
+        return 5 if isinstance(family, SensorDelayFamily) else 6
     return 4

@@ -153,6 +153,29 @@ def integrated(model: Model) -> dict[str, tuple[str, float]]:
     return found
 
 
+def told_by(model: Model, pair: Sequence[str]) -> set[str]:
+    """States that could tell whether sensors of a pair are late: what moves it, or moves with it.
+
+    What nothing ties to the rest but itself and inputs of its own is late as its inputs are.
+    """
+    names = (*model.state_names, *model.input_names)
+    f_x, f_u = model.system.linearise(*samples(model, 8), model.values, probe(model, 1e-2))
+    slopes = np.abs(np.concatenate([f_x, f_u], axis=2)).max(axis=0)
+    tied = np.zeros((len(names), len(names)), bool)
+    tied[: model.n] = np.nan_to_num(slopes) > 1e-9
+    tied |= tied.T | np.eye(len(names), dtype=bool)
+    found = np.isin(names, pair)
+    for _ in names:
+        found = tied[found].any(axis=0)
+    return {name for name, at in zip(model.state_names, found, strict=False) if at} - set(pair)
+
+
+def late_together(model: Model) -> list[str]:
+    """`q+w`: a position and its own velocity (q' = c w), which one sensor may give."""
+    pairs = [(q, w) for q, (w, _) in integrated(model).items()]
+    return ["+".join(pair) for pair in pairs if told_by(model, pair)]
+
+
 def following(model: Model) -> list[str]:
     """States that follow an input by themselves: a steering angle, a motor's speed, a servo.
 

@@ -88,7 +88,7 @@ sensor_delay = SensorDelayFamily(
     name="sensor_delay",
     equation="y(t) = s(t - d)",
     sentence="the log of {target} is {d} old",
-    targets=places.states,
+    targets=lambda model: [*places.states(model), *places.late_together(model)],
     quantities=_delay,
     lookalikes=("delay", "first_order_lag", "side_slip"),
 )

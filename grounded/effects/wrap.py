@@ -357,28 +357,39 @@ def _sensor_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[s
 
 
 def _sensor_delay_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str, str]]:
-    """The true value and its past become memory; the state itself is the logged, old value."""
-    model, target = effect.site.model, effect.site.target
+    """True values and their past become memory; the states themselves are the logged, old ones."""
+    model, targets = effect.site.model, effect.site.targets
     depth = max(1, int(np.ceil(whole["d"] / dt - 1e-9)))
-    memory = [f"{target}_true", *[f"{target}_true_{i + 1}" for i in range(depth)]]
+    true = {n: _true_name(model, n) for n in targets}
+    memory = {n: [z, *[f"{z}_{i + 1}" for i in range(depth)]] for n, z in true.items()}
     base = plain_step(model)
 
     def step(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
         behind = _quantities(effect, p)["d"] / dt
-        after = base(_own_state(model, s, {target: memory[0]}), a, p, dt)
-        line = [after[target], *[s[z] for z in memory]]
-        logged: Any = 0.0
-        for i, value in enumerate(line):
-            logged = logged + np.maximum(1 - np.abs(behind - i), 0.0) * value
-        return {**after, target: logged, **dict(zip(memory, line, strict=False))}
+        after = base(_own_state(model, s, true), a, p, dt)
+        found = dict(after)
+        for n, past in memory.items():
+            line = [after[n], *[s[z] for z in past]]
+            parts = [np.maximum(1 - np.abs(behind - i), 0.0) for i in range(len(line))]
+            found |= {n: sum(part * value for part, value in zip(parts, line, strict=True))}
+            found |= dict(zip(past, line, strict=False))
+        return found
 
-    return step, dict.fromkeys(memory, model.states[target])
+    return step, {z: model.states[n] for n, past in memory.items() for z in past}
+
+
+def _true_name(model: Model, target: str) -> str:
+    """What the state is called that the log of `target` shows late; its log may be late twice."""
+    name = f"{target}_true"
+    while name in model.states:
+        name += "_true"
+    return name
 
 
 def _sensor_lag_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str, str]]:
     """The true value becomes memory; the state itself is the logged, filtered one."""
     model, target = effect.site.model, effect.site.target
-    base, memory = plain_step(model), f"{target}_true"
+    base, memory = plain_step(model), _true_name(model, target)
 
     def step(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
         after = base(_own_state(model, s, {target: memory}), a, p, dt)

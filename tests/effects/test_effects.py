@@ -16,11 +16,14 @@ from grounded.effects import (
     RateFamily,
     Scales,
     memory_of,
+    memory_start,
+    places,
     scales_of,
     wrap,
 )
 from grounded.models.aircraft import model as aircraft
 from grounded.models.car import model as car
+from grounded.models.cart_pole import model as cart_pole
 from grounded.models.pendulum import model as pendulum
 
 DT = 0.05
@@ -230,6 +233,41 @@ def test_sensor_delay():
     names = wrapped.state_names
     # d = 2 steps: the log of step 21 is the truth of step 19, which step 20 calls "one ago"
     assert after[names.index("psi")] == pytest.approx(z[names.index("psi_true_1")], abs=1e-12)
+
+
+def test_a_position_and_its_own_velocity_are_late_together():
+    """Their logs are the true ones of 1.4 steps ago, both; the motion itself is the model's."""
+    effect = Library().effect("sensor_delay:theta+theta_vel", cart_pole)
+    wrapped = wrap(effect, {"d": 1.4 * DT}, DT)
+    u = np.sin(np.arange(12) / 3)[:, None]
+    true, z = [np.array([0.1, 3.0, 0.2, -0.3])], [np.zeros(wrapped.n)]
+    for row in u:
+        true.append(cart_pole.system.step(true[-1][None], row[None], cart_pole.values, DT)[0])
+    still = Trial(true[0][None], u[:0], DT, cart_pole.state_names, cart_pole.input_names)
+    z = [np.concatenate([true[0], memory_start(wrapped, cart_pole, still)])]
+    for row in u:
+        z.append(wrapped.system.step(z[-1][None], row[None], wrapped.values, DT)[0])
+    x, logged = np.array(true), np.array(z)[:, :4]
+    np.testing.assert_allclose(logged[:, [0, 2]], x[:, [0, 2]], atol=1e-12)
+    late = 0.6 * x[1:-1] + 0.4 * x[:-2]
+    np.testing.assert_allclose(logged[2:, [1, 3]], late[:, [1, 3]], atol=1e-12)
+
+
+def test_only_what_the_rest_could_tell_is_late_together():
+    assert places.late_together(cart_pole) == ["x+x_vel", "theta+theta_vel"]
+    assert not places.late_together(pendulum)  # late as its torque is
+    axes = Model(
+        states={"x": "m", "v": "m/s", "y": "m", "w": "m/s"},
+        inputs={"a": "m/s^2", "b": "m/s^2"},
+        derivative=lambda s, a, p: {"x": s.v, "v": a.a, "y": s.w, "w": a.b},
+    )
+    assert not places.late_together(axes)
+
+
+def test_a_log_that_is_late_twice_keeps_both_memories():
+    model = wrap(Library().effect("sensor_delay:theta+theta_vel", cart_pole), {"d": DT}, DT)
+    again = wrap(Library().effect("sensor_lag:theta_vel", model), {"tau": DT}, DT)
+    assert again.n == model.n + 1 == cart_pole.n + 4 + 1
 
 
 def test_missing_and_unknown_quantities_are_named():

@@ -208,6 +208,9 @@ def _grow(search: HypothesisSearch, best: Fitted, most: int) -> None:
         search.again(search.of_size(size + 1)[:2])
         search.finished(search.of_size(size + 1)[:TUNED], TO_THE_TOP)
         tune(search, search.of_size(size + 1)[:TUNED])
+        for fit in search.of_size(size + 1)[:TUNED]:
+            search.structures(fit)
+            search.calibrated(fit)
         larger = search.of_size(size + 1)
         if not larger or search.score(larger[0]) < search.score(best) + CLAIM:
             return

@@ -209,11 +209,12 @@ class _Context(SentOnce):
 
     def _sensor(self, i: int, point: int, effect: Effect, grid: dict[str, float]) -> list[_Column]:
         data = self.predictor.data
-        k = data.model.state_names.index(effect.site.target)
+        shown = [data.model.state_names.index(name) for name in effect.site.targets]
         found = []
         for name, amount, values in self._tried(effect, grid):
             r = np.zeros_like(self.fit.track)
-            r[..., k] = -sensor_offset(effect, values, self.ahead[..., k], data.dt) / amount
+            for k in shown:
+                r[..., k] = -sensor_offset(effect, values, self.ahead[..., k], data.dt) / amount
             r = r if self.delays is None else self.delays.aligned(r)
             found.append(_Column(i, point, name, _EMPTY, r))
         return found

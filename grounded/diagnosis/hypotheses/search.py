@@ -6,7 +6,8 @@ which order. `tune` sets constants of large effects, which are no parameters.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,7 @@ import numpy as np
 from grounded.diagnosis.hypotheses.explored import FittedHypotheses, parametric
 from grounded.diagnosis.hypotheses.scan import Look, scan_candidates
 from grounded.diagnosis.likelihood.data import Data
+from grounded.diagnosis.likelihood.delays import delayed
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.noise import NoiseModel, Structure, noise_guess
@@ -33,9 +35,14 @@ BESIDE = 4  # effects that are fitted with the parameters freed
 FIRST, COARSE, LAST = 3.0, 1.4, 1.05  # factors by which a constant is moved
 ROUNDS = 12
 WIDEST, TRIED = 100.0, 7  # a constant from end to end: its range, and values tried in it
+LOUD = 0.45  # of what a step leaves: the noise of a delayed sensor at the start of a fit
+LATE = slice(1, 4, 2)  # of the grid: where the delay of two states together starts
 LARGE_GAIN = 50.0  # nats from which a hypothesis is also started by itself
 TO_THE_TOP = 25  # iterations of fits that decide: most need fewer, and stop by themselves
 LARGE = 8  # states; above, or of a simulator, one correlation time and half the shortlist do
+
+
+Start = tuple[Hypothesis, NoiseModel, Array]
 
 
 class HypothesisSearch(FittedHypotheses):
@@ -61,6 +68,8 @@ class HypothesisSearch(FittedHypotheses):
         self.taus = self.taus or [k * data.dt for k in SLOW[: len(taus)]]
         self.most = SHORTLIST // 2 if large else SHORTLIST
         self.beside = BESIDE // 2 if large else BESIDE
+        # the scan can't see them: it has the noise and the track of a log that is not late
+        self.together = [e for e in candidates if len(delayed([e])) > 1]
 
     def refined(
         self,
@@ -100,14 +109,26 @@ class HypothesisSearch(FittedHypotheses):
             self.calibrated(self.best_null())
         return self.best_null()
 
-    def fresh(self, h: Hypothesis) -> tuple[Hypothesis, NoiseModel, Array]:
+    def fresh(self, h: Hypothesis) -> Start:
         """Where a hypothesis starts by itself: about the log, with the noise it leaves there."""
         data, track = self.data, self.data.y.copy()
         predicted = self.predictor.next(h, track[:-1])
         residual = data.model.difference(predicted, track[1:])
         scale = np.array([data.scales.spread(n) for n in data.model.state_names])
         scale[list(data.hidden)] = 0.0  # nothing disturbs a memory
-        return h, noise_guess(residual, data.seen, scale), track
+        noise = noise_guess(residual, data.seen, scale)
+        if late := [data.model.state_names.index(name) for name in delayed(h.effects)]:
+            log_r = noise.log_r.copy()  # a delay hides it: from above, it finds its way down
+            log_r[late] = np.logaddexp(noise.log_q, log_r + math.log(2))[late] + math.log(LOUD)
+            noise = replace(noise, log_r=log_r)
+        return h, noise, track
+
+    def anew(self, fit: Fitted, effect: Effect, values: Mapping[str, float]) -> Start:
+        """An effect beside a fit's own, with noise and track of a start by itself."""
+        h, noise, track = self.fresh(fit.hypothesis.plus(effect, values))
+        noise = noise.allowing(fit.noise.structure, self.data.dt)
+        weight_w, weight_v = fit.noise.weight_w, fit.noise.weight_v
+        return h, replace(noise, weight_w=weight_w, weight_v=weight_v), track
 
     def again(self, fits: Sequence[Fitted]) -> list[Fitted]:
         """Large effects from a start of their own: the noise without them is far away."""
@@ -224,6 +245,7 @@ class HypothesisSearch(FittedHypotheses):
             for e in self.candidates
             if e.name not in taken
             and not any(one_friction(e, known) for known in fit.hypothesis.effects)
+            and not delayed([e]) & delayed(fit.hypothesis.effects)
             and not (isinstance(e.family, ParamFamily) and fit.hypothesis.spread > 0)
         ]
         self.tick("scan")
@@ -246,11 +268,10 @@ class HypothesisSearch(FittedHypotheses):
             ]
             if isinstance(look.effect.family, SensorLagFamily):
                 # what passes a filter is far quicker than what it shows: so is its noise
-                late, noise, track = self.fresh(h.plus(look.effect, look.values))
-                noise = noise.allowing(fit.noise.structure, self.data.dt)
-                weight_w, weight_v = fit.noise.weight_w, fit.noise.weight_v
-                noise = replace(noise, weight_w=weight_w, weight_v=weight_v)
-                starts.append((late, noise, track))
+                starts.append(self.anew(fit, look.effect, look.values))
+        for effect in self.together:
+            if not delayed([effect]) & delayed(fit.hypothesis.effects):
+                starts += [self.anew(fit, effect, {"d": d}) for d in effect.free[0].grid[LATE]]
         return self.refined(starts, iterations, rivals=True)[1:]
 
     def without(self, fit: Fitted, name: str) -> Fitted:

@@ -21,6 +21,7 @@ Noise (its weights) and adjoints belong to samples: outside the filter they stay
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -30,7 +31,7 @@ import numpy as np
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.noise import NoiseModel
-from grounded.effects import SensorDelayFamily, SensorLagFamily
+from grounded.effects import Effect, SensorDelayFamily, SensorLagFamily
 from grounded.effects.sensor import lagging
 from grounded.filter.augmented import Delayed
 from grounded.filter.kalman import Adjoint
@@ -215,14 +216,21 @@ def delays_of(h: Hypothesis, data: Data) -> Delays | None:
     return Delays(data, tuple(named), tuple(int(k) for k in whole), part, tau)
 
 
+def delayed(effects: Sequence[Effect]) -> set[str]:
+    """The states whose sensors some effects delay."""
+    late = [effect for effect in effects if isinstance(effect.family, SensorDelayFamily)]
+    return {name for effect in late for name in effect.site.targets}
+
+
 def _named(h: Hypothesis, data: Data) -> dict[int, list[float]]:
     """By late channel its delay and its time constant, in steps; the instruments' filters first."""
     found = {i: [0.0, tau / data.dt] for i, tau in data.filters.items()}
     for effect, values in h.pairs:
         if isinstance(effect.family, SensorDelayFamily | SensorLagFamily):
-            steps = found.setdefault(data.model.state_names.index(effect.site.target), [0.0, 0.0])
             late = isinstance(effect.family, SensorDelayFamily)
-            steps[0 if late else 1] = float(values["d" if late else "tau"]) / data.dt
+            for name in effect.site.targets:
+                steps = found.setdefault(data.model.state_names.index(name), [0.0, 0.0])
+                steps[0 if late else 1] += float(values["d" if late else "tau"]) / data.dt
     return found
 
 

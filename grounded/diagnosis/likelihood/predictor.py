@@ -304,8 +304,9 @@ class Predictor(SentOnce):
             old[..., i] += behind(old[..., i], tau / dt)
         for effect, values in h.pairs:
             if isinstance(effect.family, SensorDelayFamily | SensorLagFamily):
-                i, old = names.index(effect.site.target), old.copy()
-                old[..., i] += sensor_offset(effect, values, old[..., i], dt)
+                old = old.copy()
+                for i in map(names.index, effect.site.targets):
+                    old[..., i] += sensor_offset(effect, values, old[..., i], dt)
         standing = self.standing(h, old)
         return standing if old is track else standing + old - track
 

@@ -42,7 +42,6 @@ from grounded.diagnosis.likelihood.noise import (
 )
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.step import ProposedStep, inside, proposed
-from grounded.effects import SensorDelayFamily, SensorLagFamily
 from grounded.engine import each
 from grounded.filter import kalman
 from grounded.filter.augmented import Delayed, joined
@@ -53,7 +52,6 @@ MOST_NUMBERS = 1e5  # of one (L, B, N, N) array: what fits in the cache goes fas
 SHORTEST = 0.05  # part of a step that is still tried
 HALVED = 4  # iterations after which only the better half of rivals goes on
 CLOSE = 10.0  # nats behind the best within which all go on
-LATE = SensorDelayFamily | SensorLagFamily
 LITTLE = 0.1  # nats that part of a step must promise to be tried where the step fails
 NOTHING = 0.01  # nats: what promises less, after it hardly rose, is not tried at all
 
@@ -149,7 +147,7 @@ def _after(
     tick: Callable[[], None] | None,
 ) -> list[Work]:
     """The works after some iterations, blocks of at most `size` of one shape side by side."""
-    shapes = _of_one_shape(works)
+    shapes = _of_one_shape(works, predictor.data)
     blocks = [a[at : at + size] for a in shapes for at in range(0, len(a), size)]
     many, some = len(blocks), [[works[i] for i in block] for block in blocks]
     found = each(_climb, [predictor] * many, some, [(iterations, fixed_noise)] * many, done=tick)
@@ -180,14 +178,14 @@ def _halve(works: list[Work], worth: Callable[[Fitted], float]) -> None:
             work.given_up = True
 
 
-def _of_one_shape(works: list[Work]) -> list[list[int]]:
+def _of_one_shape(works: list[Work], data: Data) -> list[list[int]]:
     """Indices of works that go on, by the size of their filters' states: so many late sensors."""
     groups: dict[int, list[int]] = {}
     for i, work in enumerate(works):
         if work.still or work.given_up:
             continue
-        late = {e.site.target for e in work.h.effects if isinstance(e.family, LATE)}
-        groups.setdefault(len(late), []).append(i)
+        late = delays_of(work.h, data)
+        groups.setdefault(0 if late is None else len(late.channel), []).append(i)
     return [groups[count] for count in sorted(groups)]
 
 

@@ -27,6 +27,7 @@ from grounded.effects import (
     SensorFamily,
     SensorLagFamily,
 )
+from grounded.effects.places import told_by
 from grounded.filter import kalman
 from grounded.frozen import Array
 from grounded.model import Model, Param
@@ -136,6 +137,9 @@ def knowable(data: Data, effects: Sequence[Effect]) -> tuple[Effect, ...]:
             continue
         sensors = SensorFamily | SensorDelayFamily | SensorLagFamily
         if isinstance(family, sensors) and targets & (dead | unmoved):
+            continue
+        late = isinstance(family, SensorDelayFamily) and len(targets) > 1
+        if late and not told_by(data.model, effect.site.targets) - dead - unmoved - memory:
             continue
         kept.append(effect)
     return tuple(kept)
